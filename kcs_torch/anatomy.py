@@ -26,8 +26,9 @@ _CENTRE: dict[str, Point] = {
     "spine_low": (0.0, 1.065, 0.0),
     "spine_sixth": (0.0, 1.090, 0.0),
     "spine1": (0.0, 1.152, 0.0),
-    "spine": (0.0, 1.200, 0.0),
+    "spine": (0.0, 1.165, 0.0),
     "spine2": (0.0, 1.276, 0.0),
+    "chest": (0.0, 1.300, 0.0),
     "spine3": (0.0, 1.340, 0.0),
     "thorax": (0.0, 1.400, 0.0),
     "neck": (0.0, 1.450, 0.0),
@@ -67,6 +68,7 @@ _LEFT: dict[str, Point] = {
     "ear": (0.075, 1.620, 0.0),
     "mouth": (0.025, 1.555, 0.100),
 }
+_FACE = ("eye", "eyeinner", "eyeouter", "ear", "mouth")
 
 # A right hand with the palm to the viewer: towards the thumb, along the fingers, out of the palm.
 _FINGERS: dict[str, tuple[Point, Point, Point, Point]] = {
@@ -76,7 +78,7 @@ _FINGERS: dict[str, tuple[Point, Point, Point, Point]] = {
     "ring": ((-0.017, 0.089, 0.0), (-0.020, 0.131, 0.005), (-0.022, 0.157, 0.012), (-0.024, 0.180, 0.020)),
     "pinky": ((-0.036, 0.078, 0.0), (-0.042, 0.110, 0.005), (-0.045, 0.129, 0.012), (-0.048, 0.149, 0.020)),
 }
-_FINGER_JOINTS = {"thumb": ("cmc", "mcp", "ip", "tip")} | {f: ("mcp", "pip", "dip", "tip") for f in list(_FINGERS)[1:]}
+_FINGER_JOINTS = dict.fromkeys(_FINGERS, ("mcp", "pip", "dip", "tip")) | {"thumb": ("cmc", "mcp", "ip", "tip")}
 
 
 def _hand_points() -> dict[str, Point]:
@@ -107,7 +109,8 @@ _CENTRE_NAMES = _spellings(
         "spine1": "spine1",
         "spine2": "spine2",
         "spine3": "spine3",
-        "thorax": "thorax chest upperchest spineshoulder spinechest",
+        "chest": "chest spinechest",
+        "thorax": "thorax upperchest spineshoulder",
         "neck": "neck neckbase basenneck midshoulder shouldercenter shouldercentre neckroot",
         "neck1": "neck1",
         "neck2": "neck2",
@@ -170,7 +173,9 @@ def _hand_names() -> dict[str, str]:
 
 _HAND_NAMES = _hand_names()
 # Parts of animals and marker sets that are written with a glued l or r: they have a twin, but no place in a template.
-_GLUED_ONLY = frozenset("fhd bhd sho upa elb frm wra wrb fin asi psi thi kne tib ank hee".split())
+_GLUED_ONLY = frozenset(
+    ["fhd", "bhd", "sho", "upa", "elb", "frm", "wra", "wrb", "fin", "asi", "psi", "thi", "kne", "tib", "ank", "hee"]
+)
 _TWIN = {"left": "right", "right": "left", "l": "r", "r": "l"}
 _LEG_TWIN = {"lf": "rf", "lm": "rm", "lh": "rh", "fl": "fr", "ml": "mr", "hl": "hr"}  # left front, middle, hind
 _LEG_TWIN |= {b: a for a, b in _LEG_TWIN.items()}
@@ -219,7 +224,8 @@ def template_by_names(kind: str, names: Sequence[str]) -> tuple[Point, ...]:
 
     Some words depend on their neighbours: a ``foot`` beside an ``ankle`` is the ball of the foot and the ankle
     otherwise; a ``shoulder`` above an ``arm`` is the collar bone; ``pelvis`` is the middle of the hips, but the
-    sacrum below a numbered spine, as motion capture has it.
+    sacrum below a numbered spine, as motion capture has it; ``neck`` is between the shoulders, but higher beside
+    a ``thorax``.
 
     Args:
         kind: "human" or "hand". A hand of unknown side is a right one.
@@ -247,13 +253,14 @@ def template_by_names(kind: str, names: Sequence[str]) -> tuple[Point, ...]:
     if kind == "hand":
         return _place_hand([(side, part or "") for side, part in parts])
     present = {part or "" for _, part in parts}
-    if not present & set(_LEFT) - {"eye", "eyeinner", "eyeouter", "ear", "mouth"} and not present & {"femur", "arm"}:
-        raise SkeletonError("template 'human': expected at least one joint of an arm or leg; a head alone may be any animal's")
+    if not any(side != "centre" and part not in _FACE for side, part in parts):
+        raise SkeletonError("template 'human': expected a joint of an arm or a leg; a head alone may be any animal's")
     out = []
     for side, part in parts:
         place = _resolve(part or "", side, present)
         x, height, forward = _CENTRE[place] if side == "centre" else _LEFT[place]
-        out.append((-x if side == "right" else x, round(_CENTRE["midhip"][1] - height, 6), -forward if forward else 0.0))
+        y = round(_CENTRE["midhip"][1] - height, 6)
+        out.append((-x if side == "right" else x, y, -forward if forward else 0.0))
     return tuple(out)
 
 
@@ -267,6 +274,7 @@ def _resolve(part: str, side: str, present: set[str]) -> str:
             "upperback": "spine2",
             "spine0": "spine_low",
             "spine": "spine_sixth" if "spine1" in present else "spine",
+            "neck": "upperneck" if "thorax" in present else "neck",
             "lowerneck": "neck1",
             "upperneck": "neck2" if "lowerneck" in present else "upperneck",
             "head": "headtop" if present & {"neck2", "lowerneck"} and "headtop" not in present else "head",

@@ -1,0 +1,68 @@
+"""The skeletons that ship with the package, and finding one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+
+from kcs_torch.errors import SkeletonError, unknown
+from kcs_torch.skeleton.core import Skeleton
+
+__all__ = ["SKELETONS", "get_skeleton", "guess_skeleton"]
+
+
+class _BuiltIn(Mapping[str, Skeleton]):
+    """The skeletons that ship with the package, one YAML file each; read when first asked for."""
+
+    folder = Path(__file__).parents[1] / "skeletons"
+
+    def __getitem__(self, name: str) -> Skeleton:
+        if not isinstance(name, str) or name not in self._names():
+            raise KeyError(name)
+        return self._load(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names())
+
+    def __len__(self) -> int:
+        return len(self._names())
+
+    @staticmethod
+    @cache
+    def _names() -> tuple[str, ...]:
+        return tuple(sorted(p.stem for p in _BuiltIn.folder.glob("*.yaml")))
+
+    @staticmethod
+    @cache
+    def _load(name: str) -> Skeleton:
+        return Skeleton.load(_BuiltIn.folder / f"{name}.yaml")
+
+
+SKELETONS: Mapping[str, Skeleton] = _BuiltIn()
+"""The built-in skeletons by name."""
+
+
+def get_skeleton(skeleton: str | Path | Skeleton) -> Skeleton:
+    """Return a skeleton from itself, a built-in name, or a YAML/JSON file.
+
+    Raises:
+        SkeletonError: no built-in skeleton has that name.
+        FormatError: the file cannot be read.
+    """
+    if isinstance(skeleton, Skeleton):
+        return skeleton
+    if isinstance(skeleton, Path) or str(skeleton).lower().endswith((".yaml", ".yml", ".json")):
+        return Skeleton.load(skeleton)
+    if skeleton not in SKELETONS:
+        raise unknown("skeleton", skeleton, SKELETONS, SkeletonError)
+    return SKELETONS[skeleton]
+
+
+def guess_skeleton(joint_names: Sequence[str]) -> Skeleton | None:
+    """Return the built-in skeleton whose observed joints carry exactly these names in this order, if any."""
+    names = tuple(str(j) for j in joint_names)
+    for skeleton in SKELETONS.values():
+        if skeleton.joints[: skeleton.num_observed] == names:
+            return skeleton
+    return None

@@ -1,0 +1,75 @@
+"""What a skeleton must satisfy."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from kcs_torch.errors import SkeletonError
+
+if TYPE_CHECKING:
+    from kcs_torch.skeleton.core import Skeleton
+
+__all__ = ["check_facts", "check_tree"]
+
+
+def check_facts(body: Skeleton) -> None:
+    """Raise SkeletonError where names, indices or numbers of a skeleton are inconsistent."""
+    n, where = body.num_joints, f"skeleton '{body.name}'"
+    if n < 2:
+        raise SkeletonError(f"{where}: expected at least 2 joints, got {n}")
+    doubled = sorted({j for j in body.joints if body.joints.count(j) > 1})
+    if doubled:
+        raise SkeletonError(f"{where}: joint names must differ; given twice: {', '.join(doubled)}")
+    seen: set[frozenset[int]] = set()
+    for a, b in body.bones:
+        if not (0 <= a < n and 0 <= b < n):
+            raise SkeletonError(f"{where}: bone ({a}, {b}): expected joint indices 0..{n - 1}")
+        if a == b:
+            raise SkeletonError(f"{where}: bone {body.joints[a]}-{body.joints[b]} joins a joint to itself")
+        if frozenset((a, b)) in seen:
+            raise SkeletonError(f"{where}: bone {body.joints[a]}-{body.joints[b]} is given twice")
+        seen.add(frozenset((a, b)))
+    if body.virtual and [v for v, _ in body.virtual] != list(range(body.num_observed, n)):
+        raise SkeletonError(f"{where}: virtual joints must follow the observed ones")
+    for v, sources in body.virtual:
+        if not sources or any(not 0 <= s < v for s in sources):
+            raise SkeletonError(f"{where}: virtual joint '{body.joints[v]}' needs sources that come before it")
+    for a, b in body.mirror:
+        if not (0 <= a < n and 0 <= b < n) or a == b:
+            raise SkeletonError(f"{where}: mirror ({a}, {b}): expected two different joint indices in 0..{n - 1}")
+    for i in body.flexible:
+        if not 0 <= i < body.num_bones:
+            raise SkeletonError(f"{where}: flexible {i}: expected bone indices 0..{body.num_bones - 1}")
+    if body.template is not None:
+        if len(body.template) != n:
+            raise SkeletonError(f"{where}: template: expected {n} positions, got {len(body.template)}")
+        for joint, p in zip(body.joints, body.template, strict=True):
+            if len(p) != 3 or not all(map(math.isfinite, p)):
+                raise SkeletonError(f"{where}: template: '{joint}': expected 3 finite numbers, got {p}")
+    if body.proportions is not None:
+        if len(body.proportions) != body.num_bones:
+            raise SkeletonError(f"{where}: proportions: expected {body.num_bones} lengths, got {len(body.proportions)}")
+        for bone, length in zip(body.bone_names, body.proportions, strict=True):
+            if not 0 < length < math.inf:
+                raise SkeletonError(f"{where}: proportions: bone {bone}: expected a positive number, got {length}")
+
+
+def check_tree(body: Skeleton) -> None:
+    """Raise SkeletonError, naming the cycle or the loose joints, where the bones are not one tree."""
+    cycle = body.cycle()
+    if cycle is not None:
+        loop = " - ".join(body.joints[i] for i in [*cycle, cycle[0]])
+        raise SkeletonError(
+            f"skeleton '{body.name}': expected a tree, got a closed chain {loop}. "
+            "Remove one of its bones, or pass tree=False to keep it as a graph of rigid links."
+        )
+    pieces = body.pieces()
+    if len(pieces) > 1:
+        main = max(pieces, key=len)
+        loose = [body.joints[i] for p in pieces if p is not main for i in p]
+        raise SkeletonError(
+            f"skeleton '{body.name}': expected one connected tree, got {len(pieces)} pieces; not joined to "
+            f"'{body.joints[main[0]]}': {', '.join(loose)}. Add a bone to each piece, drop those joints, "
+            "or pass tree=False."
+        )

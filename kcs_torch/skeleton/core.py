@@ -1,0 +1,372 @@
+"""The skeleton of an articulated body."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcs_torch.anatomy import template_by_names
+from kcs_torch.errors import FormatError, SkeletonError, unknown
+from kcs_torch.skeleton.check import check_facts, check_tree
+from kcs_torch.skeleton.graph import find_cycle, find_pieces
+from kcs_torch.skeleton.parse import arguments, find_mirror
+
+__all__ = ["Skeleton"]
+
+Pair = tuple[int, int]
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """Which joints exist, which bones join them, and what is known of the body's shape.
+
+    A skeleton is immutable and hashable. Bones run (parent, child). By default they must form one tree;
+    ``tree=False`` admits any graph of rigid links: closed chains (two hands on one sword), separate
+    pieces and loose joints.
+
+    Args:
+        joints: joint names, observed ones first, virtual ones last.
+        bones: (parent, child) joint indices.
+        name: what to call it.
+        mirror: (left, right) pairs of joint indices.
+        virtual: ``(joint, sources)`` for each joint that no detector reports: it is the mean of its sources.
+        template: a rest pose, one (x right, y down, z away from the viewer) per joint, any unit; or None.
+        proportions: relative bone lengths, one per bone, any unit; taken from the template if None.
+        flexible: indices of bones that may change their length (a spine drawn as one stick, say).
+        tree: False admits cycles and separate pieces.
+
+    Raises:
+        SkeletonError: a name is doubled, an index is out of range, a bone joins a joint to itself or is
+            given twice, or the bones are not one tree (the message names the cycle or the loose joint).
+
+    >>> arm = Skeleton.from_names(["shoulder", "elbow", "wrist"], [("shoulder", "elbow"), ("elbow", "wrist")])
+    >>> arm.num_joints, arm.num_bones, arm.bone_names
+    (3, 2, ('shoulder-elbow', 'elbow-wrist'))
+    """
+
+    joints: tuple[str, ...]
+    bones: tuple[Pair, ...]
+    name: str = "custom"
+    mirror: tuple[Pair, ...] = ()
+    virtual: tuple[tuple[int, tuple[int, ...]], ...] = ()
+    template: tuple[tuple[float, float, float], ...] | None = None
+    proportions: tuple[float, ...] | None = None
+    flexible: tuple[int, ...] = ()
+    tree: bool = True
+
+    def __post_init__(self) -> None:
+        settle = object.__setattr__  # lists become tuples, so that a skeleton can be hashed
+        settle(self, "joints", tuple(self.joints))
+        settle(self, "bones", tuple((int(a), int(b)) for a, b in self.bones))
+        settle(self, "mirror", tuple((int(a), int(b)) for a, b in self.mirror))
+        settle(self, "virtual", tuple((int(v), tuple(sources)) for v, sources in self.virtual))
+        settle(self, "flexible", tuple(self.flexible))
+        if self.template is not None:
+            settle(self, "template", tuple(tuple(float(c) for c in p) for p in self.template))
+        if self.proportions is not None:
+            settle(self, "proportions", tuple(float(p) for p in self.proportions))
+        check_facts(self)
+        if self.tree:
+            self.validate()
+
+    # ------------------------------------------------------------------ constructors
+
+    @classmethod
+    def from_names(
+        cls,
+        joints: Sequence[str],
+        bones: Iterable[tuple[str, str]],
+        *,
+        name: str = "custom",
+        mirror: Iterable[tuple[str, str]] | None = None,
+        virtual: Mapping[str, Sequence[str]] | None = None,
+        template: str | Mapping[str, Sequence[float]] | None = None,
+        proportions: Mapping[str, float] | None = None,
+        flexible: Iterable[tuple[str, str]] = (),
+        tree: bool = True,
+    ) -> Skeleton:
+        """Build a skeleton from joint names and pairs of names.
+
+        Args:
+            joints: names of the joints that tracks have, in their order.
+            bones: (parent, child) names.
+            name: what to call it.
+            mirror: (left, right) names; found from the names if None ("left_hip"/"right_hip", "LHip"/"RHip").
+            virtual: ``{joint: sources}``, each the mean of its sources; appended after ``joints``.
+            template: ``"human"`` (positions by joint name), ``{joint: (x, y, z)}``, or None.
+            proportions: ``{"parent-child": relative length}`` for every bone.
+            flexible: bones that may change their length.
+            tree: False admits cycles and separate pieces.
+
+        Raises:
+            SkeletonError: a name is unknown, or the skeleton is inconsistent.
+        """
+        return cls(
+            **arguments(
+                joints,
+                bones,
+                name=name,
+                mirror=mirror,
+                virtual=virtual,
+                template=template,
+                proportions=proportions,
+                flexible=flexible,
+                tree=tree,
+            )
+        )
+
+    @classmethod
+    def from_edges(
+        cls,
+        edges: Iterable[Sequence[int]],
+        joints: int | Sequence[str],
+        *,
+        name: str = "custom",
+        tree: bool = True,
+    ) -> Skeleton:
+        """Build a skeleton from index pairs; mirror pairs and a template are found from the names.
+
+        Args:
+            edges: (B, 2) pairs (parent, child).
+            joints: joint names, or how many joints there are (named ``joint0``, ``joint1``, ...).
+            name: what to call it.
+            tree: False admits cycles and separate pieces.
+
+        Raises:
+            SkeletonError: an index is out of range, or the edges are not one tree.
+        """
+        from kcs_torch.skeleton.builtin import guess_skeleton  # the built-in ones are made by this class
+
+        names = tuple(f"joint{i}" for i in range(joints)) if isinstance(joints, int) else tuple(map(str, joints))
+        pairs = []
+        for edge in edges:
+            if len(edge) != 2:
+                raise SkeletonError(f"edges of skeleton '{name}': expected pairs of joint indices, got {edge!r}")
+            pairs.append((int(edge[0]), int(edge[1])))
+        plain = cls(joints=names, bones=tuple(pairs), name=name, tree=tree)
+        known = guess_skeleton(names)
+        template = None if known is None or known.template is None else known.template[: len(names)]
+        for kind in ("human", "hand"):
+            if template is None:
+                try:
+                    template = template_by_names(kind, names)
+                except SkeletonError:
+                    continue
+        if template is not None and any(math.dist(template[a], template[b]) < 1e-6 for a, b in pairs):
+            template = None  # two names for one place: this body is built otherwise
+        return replace(plain, mirror=find_mirror(names), template=template)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any], *, source: str = "skeleton") -> Skeleton:
+        """Build a skeleton from the keys of :meth:`from_names`, as a YAML or JSON file holds them.
+
+        Raises:
+            FormatError: a key is unknown or missing, or a value has the wrong type.
+        """
+        if not isinstance(data, Mapping):
+            raise FormatError(f"{source}: expected a mapping with 'joints' and 'bones', got {type(data).__name__}")
+        known = ("name", "joints", "bones", "mirror", "virtual", "template", "proportions", "flexible", "tree")
+        for key in data:
+            if key not in known:
+                raise unknown(f"key in {source}", key, known, FormatError)
+        for key in ("joints", "bones"):
+            if not isinstance(data.get(key), (list, tuple)):
+                raise FormatError(f"{source}: expected a list under '{key}', got {type(data.get(key)).__name__}")
+        options = {k: v for k, v in data.items() if k not in ("joints", "bones") and v is not None}
+        try:
+            return cls.from_names(data["joints"], data["bones"], **options)
+        except SkeletonError as error:
+            raise SkeletonError(f"{source}: {error}") from None
+        except (TypeError, AttributeError, ValueError, IndexError) as error:
+            raise FormatError(f"{source}: expected a skeleton as Skeleton.to_dict gives it, got {error}") from error
+
+    @classmethod
+    def load(cls, path: str | Path) -> Skeleton:
+        """Read a skeleton from a YAML or JSON file (keys as in :meth:`from_names`).
+
+        Raises:
+            FormatError: the file cannot be read, or is not a skeleton.
+        """
+        import yaml
+
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+            loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C is several times faster
+            data = json.loads(text) if path.suffix.lower() == ".json" else yaml.load(text, Loader=loader)
+        except OSError as error:
+            raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
+            message = f"{path}: expected a YAML or JSON skeleton, got text that does not parse: {error}"
+            raise FormatError(message) from None
+        if isinstance(data, dict):
+            data.setdefault("name", path.stem)
+        return cls.from_dict(data, source=str(path))
+
+    # ------------------------------------------------------------------ facts
+
+    @property
+    def num_joints(self) -> int:
+        return len(self.joints)
+
+    @property
+    def num_bones(self) -> int:
+        return len(self.bones)
+
+    @property
+    def num_observed(self) -> int:
+        """Joints that tracks have; the virtual ones follow them."""
+        return len(self.joints) - len(self.virtual)
+
+    @cached_property
+    def bone_names(self) -> tuple[str, ...]:
+        return tuple(f"{self.joints[a]}-{self.joints[b]}" for a, b in self.bones)
+
+    @cached_property
+    def rigid(self) -> tuple[int, ...]:
+        """Indices of the bones whose length is constant."""
+        return tuple(i for i in range(self.num_bones) if i not in set(self.flexible))
+
+    @cached_property
+    def mirror_bones(self) -> tuple[Pair, ...]:
+        """(left, right) pairs of bone indices, twins under ``mirror``."""
+        twin = {i: i for i in range(self.num_joints)}
+        for a, b in self.mirror:
+            twin[a], twin[b] = b, a
+        where = {frozenset(b): i for i, b in enumerate(self.bones)}
+        out = []
+        for i, (a, b) in enumerate(self.bones):
+            j = where.get(frozenset((twin[a], twin[b])))
+            if j is not None and j > i:
+                left = {m[0] for m in self.mirror}
+                out.append((i, j) if a in left or b in left else (j, i))
+        return tuple(out)
+
+    def side(self, joint: int) -> str:
+        """'left', 'right' or 'centre'."""
+        return {**{a: "left" for a, _ in self.mirror}, **{b: "right" for _, b in self.mirror}}.get(joint, "centre")
+
+    def index(self, joint: str) -> int:
+        """Index of a joint by name.
+
+        Raises:
+            SkeletonError: there is none of that name.
+        """
+        if joint not in self.joints:
+            raise unknown(f"joint of skeleton '{self.name}'", joint, self.joints, SkeletonError)
+        return self.joints.index(joint)
+
+    def bone_index(self, *, device: torch.device | str | None = None) -> Tensor:
+        """Bones as an integer tensor (B, 2) of (parent, child)."""
+        return torch.tensor(self.bones, dtype=torch.long, device=device).reshape(-1, 2)
+
+    def template_points(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
+        """The rest pose as a tensor (N, 3).
+
+        Raises:
+            SkeletonError: the skeleton has no template.
+        """
+        if self.template is None:
+            raise SkeletonError(f"skeleton '{self.name}' has no template pose: give one, or use a body's joint names")
+        return torch.tensor(self.template, dtype=dtype, device=device)
+
+    def relative_lengths(
+        self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+    ) -> Tensor | None:
+        """Relative bone lengths (B,) with mean 1, or None where nothing is known of them."""
+        if self.proportions is not None:
+            lengths = torch.tensor(self.proportions, dtype=dtype, device=device)
+        elif self.template is not None and self.bones:
+            points = self.template_points(dtype=dtype, device=device)
+            index = self.bone_index(device=device)
+            lengths = (points[index[:, 1]] - points[index[:, 0]]).norm(dim=-1)
+        else:
+            return None
+        return lengths / lengths.mean()
+
+    # ------------------------------------------------------------------ checks
+
+    def pieces(self) -> list[list[int]]:
+        """Connected components, as sorted lists of joint indices; a loose joint is a piece of its own."""
+        return find_pieces(self.num_joints, self.bones)
+
+    def cycle(self) -> list[int] | None:
+        """Joint indices along one closed chain, or None where there is none."""
+        return find_cycle(self.num_joints, self.bones)
+
+    def validate(self) -> None:
+        """Check that the bones form one tree.
+
+        Raises:
+            SkeletonError: they do not; the message names the cycle or the loose joints, and the fix.
+        """
+        check_tree(self)
+
+    @property
+    def is_tree(self) -> bool:
+        return len(self.pieces()) == 1 and len(self.bones) == self.num_joints - 1
+
+    # ------------------------------------------------------------------ changes
+
+    def with_links(self, links: Iterable[tuple[str, str]]) -> Skeleton:
+        """Add rigid links between joints, which may close chains (two hands that hold one sword).
+
+        >>> body = SKELETONS["coco17"].with_links([("left_wrist", "right_wrist")])
+        >>> body.is_tree, body.bone_names[-1]
+        (False, 'left_wrist-right_wrist')
+        """
+        extra = tuple((self.index(a), self.index(b)) for a, b in links)
+        return replace(self, bones=self.bones + extra, proportions=None, tree=False)
+
+    def connected(self) -> Skeleton:
+        """Join separate pieces by flexible bones, so that bone vectors determine the whole pose."""
+        pieces = self.pieces()
+        if len(pieces) == 1:
+            return self
+        main = max(pieces, key=len)
+        extra = tuple((main[0], p[0]) for p in pieces if p is not main)
+        first = self.num_bones
+        flexible = self.flexible + tuple(range(first, first + len(extra)))
+        return replace(self, bones=self.bones + extra, flexible=flexible, proportions=None, tree=False)
+
+    def complete(self, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Append the virtual joints to observed tracks.
+
+        Args:
+            points: (..., num_observed, D), finite.
+            weights: (..., num_observed), 0 where unseen.
+
+        Returns:
+            points (..., N, D) and weights (..., N). A virtual joint is seen where all its sources are.
+        """
+        for _, sources in self.virtual:
+            index = torch.tensor(sources, device=points.device)
+            points = torch.cat([points, points.index_select(-2, index).mean(-2, keepdim=True)], -2)
+            weights = torch.cat([weights, weights.index_select(-1, index).amin(-1, keepdim=True)], -1)
+        return points, weights
+
+    def to_dict(self) -> dict[str, Any]:
+        """The skeleton as plain lists and mappings: what :meth:`from_dict` and a YAML file take."""
+        out: dict[str, Any] = {"name": self.name, "joints": list(self.joints[: self.num_observed])}
+        if self.virtual:
+            out["virtual"] = {self.joints[v]: [self.joints[s] for s in sources] for v, sources in self.virtual}
+        out["bones"] = [[self.joints[a], self.joints[b]] for a, b in self.bones]
+        out["mirror"] = [[self.joints[a], self.joints[b]] for a, b in self.mirror]
+        if self.flexible:
+            out["flexible"] = [out["bones"][i][:] for i in self.flexible]
+        if self.template is not None:
+            out["template"] = {j: list(p) for j, p in zip(self.joints, self.template, strict=True)}
+        if self.proportions is not None:
+            out["proportions"] = dict(zip(self.bone_names, self.proportions, strict=True))
+        if not self.tree:
+            out["tree"] = False
+        return out

@@ -1,0 +1,104 @@
+"""From names to indices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from kcs_torch.anatomy import mirror_name, side_of, template_by_names
+from kcs_torch.errors import SkeletonError, unknown
+
+__all__ = ["arguments", "find_mirror"]
+
+Pair = tuple[int, int]
+Point = tuple[float, float, float]
+
+
+def arguments(
+    joints: Sequence[str],
+    bones: Iterable[tuple[str, str]],
+    *,
+    name: str,
+    mirror: Iterable[tuple[str, str]] | None,
+    virtual: Mapping[str, Sequence[str]] | None,
+    template: str | Mapping[str, Sequence[float]] | None,
+    proportions: Mapping[str, float] | None,
+    flexible: Iterable[tuple[str, str]],
+    tree: bool,
+) -> dict[str, Any]:
+    """Return the arguments of ``Skeleton`` from those of ``Skeleton.from_names``."""
+    virtual = {str(v): tuple(sources) for v, sources in (virtual or {}).items()}
+    names = (*(str(j) for j in joints), *virtual)
+    position = {n: i for i, n in enumerate(names)}
+
+    def at(joint: object, what: str) -> int:
+        if str(joint) not in position:
+            raise unknown(f"joint in {what} of skeleton '{name}'", joint, names, SkeletonError)
+        return position[str(joint)]
+
+    def pairs(items: Iterable[tuple[str, str]], what: str) -> tuple[Pair, ...]:
+        out = []
+        for item in items:
+            if isinstance(item, str) or len(item) != 2:
+                raise SkeletonError(f"{what} of skeleton '{name}': expected pairs of joint names, got {item!r}")
+            out.append((at(item[0], what), at(item[1], what)))
+        return tuple(out)
+
+    bone_pairs = pairs(bones, "bones")
+    bone_names = [f"{names[a]}-{names[b]}" for a, b in bone_pairs]
+    soft = {frozenset(p) for p in pairs(flexible, "flexible")}
+    if soft - {frozenset(p) for p in bone_pairs}:
+        raise SkeletonError(f"flexible of skeleton '{name}': expected bones, one of {', '.join(bone_names)}")
+    lengths = None
+    if proportions is not None:
+        _check_keys(f"proportions of skeleton '{name}'", proportions, bone_names, bone_names)
+        lengths = tuple(float(proportions[b]) for b in bone_names)
+    return {
+        "joints": names,
+        "bones": bone_pairs,
+        "name": name,
+        "mirror": find_mirror(names) if mirror is None else pairs(mirror, "mirror"),
+        "virtual": tuple((position[v], tuple(at(s, "virtual") for s in sources)) for v, sources in virtual.items()),
+        "template": None if template is None else _read_template(template, names, virtual, name),
+        "proportions": lengths,
+        "flexible": tuple(i for i, b in enumerate(bone_pairs) if frozenset(b) in soft),
+        "tree": tree,
+    }
+
+
+def find_mirror(names: Sequence[str]) -> tuple[Pair, ...]:
+    """Return (left, right) indices of the joints whose names are twins."""
+    position = {n: i for i, n in enumerate(names)}
+    twins = ((n, mirror_name(n)) for n in names if side_of(n) == "left")
+    return tuple((position[a], position[b]) for a, b in twins if b in position)
+
+
+def _read_template(
+    template: str | Mapping[str, Sequence[float]],
+    names: Sequence[str],
+    virtual: Mapping[str, Sequence[str]],
+    name: str,
+) -> tuple[Point, ...]:
+    """Positions of all joints; a virtual one that has none of its own is the mean of its sources."""
+    given: dict[str, Sequence[float]]
+    if isinstance(template, str):
+        real = [n for n in names if n not in virtual]
+        given = dict(zip(real, template_by_names(template, real), strict=True))
+    else:
+        given = {str(n): tuple(float(c) for c in p) for n, p in template.items()}
+        _check_keys(f"template of skeleton '{name}'", given, names, [n for n in names if n not in virtual])
+    for joint, sources in virtual.items():
+        if joint not in given and all(s in given for s in sources):
+            columns = zip(*(given[s] for s in sources), strict=True)
+            given[joint] = tuple(sum(column) / len(sources) for column in columns)
+    return tuple(tuple(given[n]) for n in names if n in given)  # type: ignore[misc]
+
+
+def _check_keys(what: str, given: Iterable[str], known: Sequence[str], needed: Sequence[str]) -> None:
+    """Every needed key is there, and no unknown one."""
+    given = set(given)
+    for key in sorted(given - set(known)):
+        raise unknown(f"name in {what}", key, known, SkeletonError)
+    missing = [n for n in needed if n not in given]
+    if missing:
+        raise SkeletonError(f"{what}: expected an entry for each of {len(needed)}, none for {', '.join(missing)}")
