@@ -72,6 +72,7 @@ _NAMES = {
     "types": ("Diagnostics", "Reconstruction", "Tracks"),
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names}
+_MODULES = ("data", "errors", "functional", "io", "methods", "nn", "skeleton", "solvers", "types", "viewer")
 
 
 class _Package(ModuleType):
@@ -95,7 +96,7 @@ def __getattr__(name: str) -> Any:
         value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
         setattr(sys.modules[__name__], name, value)
         return value
-    if name in __all__:
+    if name in _MODULES:
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

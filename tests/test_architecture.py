@@ -1,0 +1,179 @@
+"""The imports run one way, and `import kcs_torch` stays light."""
+
+import ast
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "kcs_torch"
+
+# What each part may import of the package; "errors" is open to all.
+BASE = {"anatomy", "skeleton", "types"}
+ALLOWED = {
+    "errors": set(),
+    "anatomy": set(),
+    "skeleton": {"anatomy"},
+    "functional": set(),
+    "types": {"skeleton"},
+    "solvers": {"functional"},
+    "nn": {"functional", "solvers"} | BASE,
+    "methods": {"functional", "solvers", "nn"} | BASE,
+    "metrics": {"functional"} | BASE,
+    "data": {"functional"} | BASE,
+    "viewer": {"functional"} | BASE,
+    "io": {"functional", "viewer"} | BASE,
+    "reconstruct": {"functional", "solvers", "nn", "methods"} | BASE,
+    "training": {"functional", "solvers", "nn", "methods", "metrics", "data"} | BASE,
+    "cli": {"", "functional", "methods", "reconstruct", "io", "data", "viewer", "metrics"} | BASE,
+    "": {"functional", "solvers", "nn", "methods", "reconstruct", "io"} | BASE,
+}
+# Imports made only when called, against the direction: a convenience of the object that the user holds.
+LATE = {("types", "io")}
+
+# Who may import a package that is slow to load or not part of the core installation.
+OUTSIDE = {
+    "lightning": {"training"},
+    "hydra": set(),
+    "omegaconf": set(),
+    "torchmetrics": {"metrics", "training"},
+    "plotly": {"viewer"},
+    "matplotlib": {"viewer"},
+    "scipy": {"io", "data"},
+    "typer": {"cli"},
+    "rich": {"cli"},
+    "yaml": {"skeleton", "cli"},
+}
+
+
+def part(path: Path) -> str:
+    """The first-level part of the package that a file belongs to; '' for the package itself."""
+    first = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    return "" if first == "__init__" else first
+
+
+def imports(path: Path):
+    """Yield (dotted name, line, whether inside a function) of every import in a file."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    late = {
+        id(node)
+        for function in ast.walk(tree)
+        if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef))
+        for node in ast.walk(function)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            module = node.module or ""
+            if node.level:
+                folder = path.relative_to(ROOT).parts[: -node.level]
+                module = ".".join([*folder, *([module] if module else [])])
+            names = [f"{module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in names:
+            yield name, node.lineno, id(node) in late
+
+
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+def test_every_part_has_a_place():
+    unplaced = {part(f) for f in FILES} - set(ALLOWED)
+    assert not unplaced, f"say in ALLOWED what {unplaced} may import"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_run_one_way(path):
+    own = part(path)
+    wrong = []
+    for name, line, late in imports(path):
+        words = name.split(".")
+        if words[0] == "kcs_torch":
+            other = words[1] if len(words) > 1 else ""
+            if not (PACKAGE / other).is_dir() and not (PACKAGE / f"{other}.py").exists():
+                other = ""  # a public name, taken from the package itself
+            allowed = other in ALLOWED[own] | {own, "errors"} or (late and (own, other) in LATE)
+        else:
+            allowed = words[0] not in OUTSIDE or own in OUTSIDE[words[0]]
+        if not allowed:
+            wrong.append(f"{path.relative_to(ROOT)}:{line} imports {name}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_functional_needs_torch_only():
+    for path in (PACKAGE / "functional").glob("*.py"):
+        outside = {name.split(".")[0] for name, _, _ in imports(path)} - sys.stdlib_module_names
+        assert outside <= {"torch", "roma", "kcs_torch"}, path
+
+
+def loaded(code: str) -> set[str]:
+    """Names of the top-level modules that a fresh interpreter has after running ``code``."""
+    code += "\nimport json, sys; print(json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_import_is_light():
+    code = "import kcs_torch as kt\nfor name in kt.__all__: getattr(kt, name)"
+    names = loaded(code)
+    assert "torch" in names  # the names were really loaded
+    assert not names & {"lightning", "hydra", "plotly", "scipy", "matplotlib", "yaml", "typer", "rich", "torchmetrics"}
+
+
+def test_command_line_loads_without_torch():
+    names = loaded("import kcs_torch.cli")
+    assert "typer" in names
+    assert not names & {"torch", "numpy", "scipy", "plotly", "matplotlib", "yaml"}
+
+
+def test_help_loads_without_torch():
+    code = (
+        "import sys; sys.argv = ['kcs-torch', '--help']\n"
+        "from kcs_torch.cli import main\n"
+        "try: main()\nexcept SystemExit as end: assert not end.code, end.code"
+    )
+    assert not loaded(code) & {"torch", "numpy"}
+
+
+def test_public_names_exist_and_are_listed():
+    import kcs_torch as kt
+
+    assert sorted(kt.__all__) == sorted(set(kt.__all__))
+    assert set(kt.__all__) <= set(dir(kt))
+    for name in kt.__all__:
+        assert getattr(kt, name) is not None
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = kt.no_such_name
+
+
+def test_typed_names_are_the_public_names():
+    """The names that type checkers see are those that exist at run time."""
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    block = next(n for n in tree.body if isinstance(n, ast.If))
+    typed = {alias.name for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    import kcs_torch as kt
+
+    assert typed == set(kt.__all__)
+
+
+def test_importing_a_submodule_does_not_hide_a_function():
+    code = (
+        "import kcs_torch.reconstruct, kcs_torch as kt\n"
+        "assert callable(kt.reconstruct) and kt.reconstruct.__name__ == 'reconstruct'"
+    )
+    assert "torch" in loaded(code)
+
+
+def test_version_is_that_of_the_project():
+    import tomllib
+
+    import kcs_torch as kt
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert kt.__version__ == project["version"]
+    assert f"version: {project['version']}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
