@@ -1,0 +1,47 @@
+"""The command line ``kcs-torch``. Commands load torch only when they run, so that ``--help`` answers at once."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from kcs_torch.cli import demo, inspect, lift, skeletons
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="kcs-torch",
+    help="Turn 2D joint tracks into 3D motion of articulated bodies, without training data.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command()(demo.demo)
+app.command()(lift.lift)
+app.command()(inspect.info)
+app.command()(inspect.view)
+app.add_typer(skeletons.app, name="skeletons")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        import kcs_torch
+
+        typer.echo(f"kcs-torch {kcs_torch.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+) -> None:
+    pass
+
+
+def main() -> None:
+    """Run the command line; the console script ``kcs-torch`` calls this."""
+    app()

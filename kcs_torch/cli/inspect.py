@@ -1,0 +1,117 @@
+"""``kcs-torch info`` and ``kcs-torch view``: look at tracks and at results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from kcs_torch.cli.options import AsJson, FormatName, Threshold, TracksPath, UseSkeleton, check_outputs
+from kcs_torch.cli.report import answer, one_line, print_json, progress
+
+if TYPE_CHECKING:
+    from kcs_torch.types import Tracks
+
+__all__ = ["info", "view"]
+
+
+def info(
+    tracks: TracksPath,
+    format: FormatName = None,
+    skeleton: UseSkeleton = None,
+    threshold: Threshold = 0.3,
+    as_json: AsJson = False,
+) -> None:
+    """Show what is in a file of tracks: frames, people, skeleton, joints, and how much is unseen."""
+    with answer(as_json):
+        from kcs_torch.io import detect_format, load_people
+
+        with progress(f"reading {tracks}"):
+            people = load_people(tracks, format=format, skeleton=skeleton, threshold=threshold)
+            facts = _facts(tracks, format or detect_format(tracks), people)
+        if as_json:
+            print_json(facts)
+        else:
+            typer.echo(_spoken(facts))
+
+
+def _facts(path: str, format: str, people: list[Tracks]) -> dict[str, Any]:
+    first = people[0]
+    body = first.skeleton
+    rows = []
+    for number, one in enumerate(people):
+        weights = one.weights[:, : one.skeleton.num_observed]
+        seen = weights > 0
+        rows.append(
+            {
+                "person": number,
+                "frames_seen": int(seen.any(1).sum()),
+                "mean_confidence": float(weights[seen].double().mean()),
+                "unseen_share": one.unseen_share,
+            }
+        )
+    return {
+        "path": path,
+        "format": format,
+        "frames": first.num_frames,
+        "fps": first.fps,
+        "units": first.units,
+        "skeleton": body.name,
+        "joints": list(body.joints[: body.num_observed]),
+        "virtual_joints": list(body.joints[body.num_observed :]),
+        "bones": [list(pair) for pair in body.bones],
+        "tree": body.is_tree,
+        "people": rows,
+        "notes": list(dict.fromkeys(note for one in people for note in one.notes)),
+    }
+
+
+def _spoken(facts: dict[str, Any]) -> str:
+    rate = f"{facts['fps']:g} frames a second" if facts["fps"] else "frames a second unknown"
+    shape = "a tree" if facts["tree"] else "not a tree"
+    virtual = f" and virtual {', '.join(facts['virtual_joints'])}" if facts["virtual_joints"] else ""
+    lines = [
+        f"{facts['path']}: format {facts['format']}, {facts['frames']} frames, {rate}, in {facts['units']}",
+        f"skeleton {facts['skeleton']}: {len(facts['joints'])} joints, {len(facts['bones'])} bones, {shape}",
+        f"joints: {', '.join(facts['joints'])}{virtual}",
+        "person  frames seen  mean confidence  joints unseen",
+    ]
+    lines += [
+        f"{p['person']:>6}  {p['frames_seen']:>11}  {p['mean_confidence']:>15.2f}  {100 * p['unseen_share']:>11.1f} %"
+        for p in facts["people"]
+    ]
+    return "\n".join([*lines, *(f"note: {one_line(note)}" for note in facts["notes"])])
+
+
+def view(
+    result: Annotated[
+        Path, typer.Argument(metavar="RESULT", help="A result written by `kcs-torch lift` (.npz).", show_default=False)
+    ],
+    output: Annotated[
+        list[Path],
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="Where to write: .html (a player), .png (key frames), .csv or .json; may be repeated. "
+            "RESULT with the suffix .html if not given.",
+            show_default=False,
+        ),
+    ] = [],  # noqa: B006 (typer reads it and never changes it)
+    mirror: Annotated[bool, typer.Option("--mirror", help="Show the mirror image in depth.")] = False,
+) -> None:
+    """Show a result: write a page with a 3D player, or a sheet of key frames."""
+    with answer():
+        from kcs_torch.io import load_reconstruction
+
+        outputs = output or [result.with_suffix(".html")]
+        check_outputs(outputs, source=str(result))
+        with progress(f"reading {result}"):
+            motion = load_reconstruction(result)
+        if mirror:
+            motion = motion.mirrored()
+        for path in outputs:
+            with progress(f"writing {path}"):
+                motion.save(path)
+            typer.echo(f"wrote {path}")

@@ -1,0 +1,135 @@
+"""``kcs-torch lift``: 2D tracks in, 3D motion out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from kcs_torch.cli.options import (
+    AsJson,
+    FormatName,
+    Threshold,
+    TracksPath,
+    UseSkeleton,
+    check_outputs,
+    use_one_thread,
+)
+from kcs_torch.cli.report import answer, describe, print_json, progress, summary
+
+if TYPE_CHECKING:
+    from kcs_torch.types import Tracks
+
+__all__ = ["MethodName", "Settings", "lift", "method_fields"]
+
+MethodName = Annotated[
+    str, typer.Option("--method", "-m", metavar="NAME", help="auto, kcs or sfam; auto chooses by the tracks.")
+]
+Settings = Annotated[
+    list[str],
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Set a field of the method; may be repeated. A wrong name is answered with the right ones.",
+        show_default=False,
+    ),
+]
+
+
+def lift(
+    tracks: TracksPath,
+    output: Annotated[
+        list[Path],
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="Where to write: .npz (everything), .csv, .json, .html (a player) or .png; may be repeated.",
+            show_default=False,
+        ),
+    ],
+    method: MethodName = "auto",
+    settings: Settings = [],  # noqa: B006 (typer reads it and never changes it)
+    skeleton: UseSkeleton = None,
+    format: FormatName = None,
+    person: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NUMBER|all",
+            help="Whom to take, counted from 0, the most seen first; or all, each to a file of its own (OUT_0, OUT_1).",
+        ),
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(metavar="NUMBER", help="Frames a second; as TRACKS says if not given.")
+    ] = None,
+    threshold: Threshold = 0.3,
+    mirror: Annotated[
+        bool, typer.Option("--mirror", help="Write the mirror image in depth, which fits the tracks as well.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Turn 2D joint tracks into 3D motion."""
+    with answer(as_json):
+        check_outputs(output, source=tracks)
+        fields = method_fields(method, settings)
+        with progress(f"reading {tracks}"):
+            people = _people(tracks, person, format=format, skeleton=skeleton, fps=fps, threshold=threshold)
+        use_one_thread()
+        reports = []
+        for number, one in people:
+            names = [_numbered(path, number) if person == "all" else path for path in output]
+            check_outputs(names, source=tracks)
+            reports.append(_lift_one(one, method, fields, mirror, names))
+            if not as_json:
+                typer.echo(describe(reports[-1]))
+                typer.echo(f"  wrote {', '.join(map(str, names))}")
+            reports[-1] |= {"person": number, "files": names}
+        if as_json:
+            print_json({"people": reports})
+
+
+def method_fields(method: str, settings: list[str]) -> dict[str, Any]:
+    """Check the method's name and read ``--set`` by its fields; by those of all methods for ``auto``.
+
+    Raises:
+        OptionError: the method, a field or a value is wrong.
+    """
+    from kcs_torch.cli.fields import parse_settings
+    from kcs_torch.errors import unknown
+    from kcs_torch.methods import METHODS
+
+    if method != "auto" and method not in METHODS:
+        raise unknown("method", method, ["auto", *METHODS])
+    return parse_settings(settings, list(METHODS.values()) if method == "auto" else [METHODS[method]])
+
+
+def _people(tracks: str, person: str | None, **options: Any) -> list[tuple[int, Tracks]]:
+    """The chosen people, each with their number."""
+    from kcs_torch.errors import OptionError
+    from kcs_torch.io import load_people, load_tracks
+
+    if person == "all":
+        return list(enumerate(load_people(tracks, **options)))
+    if person is not None and not (person.isascii() and person.isdigit()):
+        raise OptionError(f"--person: expected a number from 0, or all, got {person!r}")
+    number = None if person is None else int(person)
+    return [(number or 0, load_tracks(tracks, person=number, **options))]
+
+
+def _numbered(path: Path, number: int) -> Path:
+    return path.with_name(f"{path.stem}_{number}{path.suffix}")
+
+
+def _lift_one(tracks: Tracks, method: str, fields: dict[str, Any], mirror: bool, outputs: list[Path]) -> dict[str, Any]:
+    """Reconstruct one person and write the result; return what there is to say of it."""
+    import kcs_torch as kt
+
+    with progress(f"reconstructing {tracks.num_frames} frames of {tracks.num_joints} joints"):
+        result = kt.reconstruct(tracks, method=method, **fields)
+    if mirror:
+        result = result.mirrored()
+    for path in outputs:
+        with progress(f"writing {path}"):
+            result.save(path)
+    return summary(result)

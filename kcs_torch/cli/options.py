@@ -1,0 +1,69 @@
+"""Options that several commands share, and checks made before long work begins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["AsJson", "FormatName", "Threshold", "TracksPath", "UseSkeleton", "check_outputs", "use_one_thread"]
+
+TracksPath = Annotated[
+    str,
+    typer.Argument(
+        metavar="TRACKS",
+        help="2D joint tracks: a file, a folder of files (OpenPose), or the beginning of their names.",
+        show_default=False,
+    ),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
+FormatName = Annotated[
+    str | None, typer.Option("--format", metavar="NAME", help="Format of TRACKS; found by content if not given.")
+]
+UseSkeleton = Annotated[
+    str | None,
+    typer.Option(
+        "--skeleton",
+        metavar="NAME|FILE",
+        help="A built-in skeleton (see `kcs-torch skeletons`) or a YAML or JSON file; as TRACKS says if not given.",
+    ),
+]
+Threshold = Annotated[
+    float, typer.Option("--threshold", metavar="0..1", help="A joint with less confidence counts as unseen.")
+]
+
+
+class _NothingWritten(Exception):
+    pass
+
+
+def check_outputs(outputs: Sequence[Path], source: str | None = None) -> None:
+    """Make sure that results can be written, before time is spent on them.
+
+    Raises:
+        OutputError: a suffix is unknown, a place cannot be written to, or an output would replace the input.
+    """
+    from kcs_torch.errors import OutputError
+    from kcs_torch.io import WRITERS
+    from kcs_torch.io.atomic import atomic_path
+
+    for path in outputs:
+        if path.suffix.lower() not in WRITERS:
+            got = f"'{path.suffix}'" if path.suffix else "none"
+            raise OutputError(f"{path}: expected a file with one of the suffixes {', '.join(WRITERS)}, got {got}")
+        if source is not None and path.exists() and path.resolve() == Path(source).resolve():
+            raise OutputError(f"{path}: expected another file than the tracks, which it would replace")
+        try:
+            with atomic_path(path):
+                raise _NothingWritten
+        except _NothingWritten:
+            pass
+
+
+def use_one_thread() -> None:
+    """Let torch use one thread: for matrices as small as a skeleton's, more threads only wait for each other."""
+    import torch
+
+    torch.set_num_threads(1)

@@ -1,0 +1,120 @@
+"""How commands speak: results and JSON to standard output; progress, warnings and errors to standard error."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from kcs_torch.types import Reconstruction
+
+__all__ = ["answer", "describe", "one_line", "print_json", "progress", "summary"]
+
+
+def one_line(text: object) -> str:
+    """A message without line breaks."""
+    return " ".join(str(text).split())
+
+
+@contextmanager
+def answer(as_json: bool = False) -> Iterator[None]:
+    """Run a command's body: an error of bad input becomes one line and exit code 2, a warning one line."""
+    from kcs_torch.errors import KcsError, KcsWarning
+
+    usual = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
+        if issubclass(category, KcsWarning):
+            typer.echo(f"warning: {one_line(message)}", err=True)
+        else:
+            usual(message, category, *rest)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", KcsWarning)
+        warnings.showwarning = show  # type: ignore[assignment]
+        try:
+            yield
+        except KcsError as error:
+            typer.echo(f"error: {one_line(error)}", err=True)
+            if as_json:
+                print_json({"error": one_line(error), "type": type(error).__name__})
+            raise typer.Exit(2) from None
+
+
+@contextmanager
+def progress(text: str) -> Iterator[None]:
+    """Show that something is under way, on a terminal only."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        bar.add_task(text.replace("[", r"\["), total=None)
+        yield
+
+
+def print_json(value: Any) -> None:
+    """Print data as JSON; numbers that JSON lacks (NaN, infinity) become null."""
+    typer.echo(json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    return str(value)
+
+
+def summary(result: Reconstruction) -> dict[str, Any]:
+    """What there is to say of a result, as plain data."""
+    facts, tracks = result.diagnostics, result.tracks
+    return {
+        "source": tracks.source,
+        "frames": tracks.num_frames,
+        "joints": tracks.skeleton.num_observed,
+        "skeleton": tracks.skeleton.name,
+        "fps": tracks.fps,
+        "units": result.units,
+        "method": result.method,
+        "unseen_share": facts.unseen_share,
+        "viewpoint_turn": facts.viewpoint_turn,
+        "bone_variation": facts.bone_variation,
+        "reprojection_rms": facts.reprojection_rms,
+        "converged": facts.converged,
+        "iterations": facts.iterations,
+        "seconds": facts.seconds,
+        "notes": list(dict.fromkeys((*tracks.notes, *facts.notes))),
+    }
+
+
+def describe(facts: dict[str, Any]) -> str:
+    """The same for a reader: a heading and a line a fact."""
+    rate = f", {facts['fps']:g} frames a second" if facts["fps"] else ""
+    ended = "converged" if facts["converged"] else "did not converge"
+    pace = 1000 * facts["seconds"] / facts["frames"]
+    took = "" if math.isnan(pace) else f", {facts['seconds']:.2f} s ({pace:.1f} ms a frame)"
+    rows = {
+        "unseen joints": f"{100 * facts['unseen_share']:.1f} %",
+        "method": f"{facts['method']}: {ended}, {facts['iterations']} iterations{took}",
+        "viewpoint turn": f"{facts['viewpoint_turn']:.0f} degrees",
+        "bone variation": f"{facts['bone_variation']:.2f} %",
+        "reprojection": f"{facts['reprojection_rms']:.3g} {facts['units']} (root mean square)",
+    }
+    head = f"{facts['source']}: {facts['frames']} frames, {facts['joints']} joints ({facts['skeleton']}){rate}"
+    lines = [head, *(f"  {name:<15} {text}" for name, text in rows.items())]
+    return "\n".join([*lines, *(f"  note: {one_line(note)}" for note in facts["notes"])])

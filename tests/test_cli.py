@@ -1,0 +1,369 @@
+"""The command line: what it writes, what it says, and how it answers mistakes."""
+
+import csv
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import kcs_torch as kt
+from kcs_torch.cli import app
+from kcs_torch.cli.fields import parse_settings
+
+runner = CliRunner()
+
+
+def run(*words, code=0):
+    """Run a command in this process; returns what it printed to standard output, or the whole result."""
+    done = runner.invoke(app, [str(w) for w in words])
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    assert done.exit_code == code, done.output
+    return done
+
+
+# ---------------------------------------------------------------------- the whole program
+
+
+def test_help_lists_every_command():
+    text = run("--help").stdout
+    for command in ("demo", "lift", "info", "view", "skeletons"):
+        assert command in text
+
+
+@pytest.mark.parametrize("command", ["lift", "demo"])
+def test_help_names_every_method(command):
+    text = run(command, "--help").stdout
+    for name in ["auto", *kt.METHODS]:
+        assert name in text
+
+
+def test_help_names_every_suffix():
+    from kcs_torch.io import WRITERS
+
+    for suffix in WRITERS:
+        assert suffix in run("lift", "--help").stdout
+
+
+def test_version():
+    assert run("--version").stdout.strip() == f"kcs-torch {kt.__version__}"
+
+
+def test_console_script_answers_an_error_with_one_line(tmp_path):
+    code = "import sys; from kcs_torch.cli import main; sys.argv[0] = 'kcs-torch'; main()"
+    words = [sys.executable, "-c", code, "lift", "absent.npz", "-o", str(tmp_path / "out.npz")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    assert "absent.npz" in done.stderr
+
+
+# ---------------------------------------------------------------------- lift
+
+
+@pytest.fixture(scope="module")
+def lifted(openpose_folder, tmp_path_factory):
+    """A result in every format, and the JSON that the command printed."""
+    from kcs_torch.io import WRITERS
+
+    folder = tmp_path_factory.mktemp("lifted")
+    outputs = [folder / f"walk{suffix}" for suffix in WRITERS]
+    words = [w for path in outputs for w in ("-o", path)]
+    done = run("lift", openpose_folder, *words, "--fps", 25, "--json")
+    return folder, json.loads(done.stdout)
+
+
+def test_lift_writes_every_format_and_nothing_else(lifted):
+    from kcs_torch.io import WRITERS
+
+    folder, _ = lifted
+    assert {p.name for p in folder.iterdir()} == {f"walk{suffix}" for suffix in WRITERS}
+
+
+def test_lift_writes_what_the_library_computes(lifted, openpose_folder):
+    folder, report = lifted
+    saved = np.load(folder / "walk.npz", allow_pickle=False)
+    result = kt.reconstruct(kt.load_tracks(openpose_folder, fps=25))
+    np.testing.assert_allclose(saved["points3d"], result.points, rtol=1e-6, atol=1e-6)
+    (person,) = report["people"]
+    assert person["frames"] == 40 and person["joints"] == 25 and person["skeleton"] == "body25"
+    assert person["fps"] == 25
+    assert person["method"] == result.method
+    assert person["unseen_share"] == pytest.approx(1 / 25)
+    assert person["converged"] is result.diagnostics.converged
+    assert person["bone_variation"] == pytest.approx(result.diagnostics.bone_variation)
+    assert [Path(f).name for f in person["files"]] == [f"walk{s}" for s in kt.io.WRITERS]
+
+
+def test_lift_reports_in_words(openpose_folder, tmp_path):
+    done = run("lift", openpose_folder, "-o", tmp_path / "a.npz")
+    for words in ("40 frames, 25 joints (body25)", "unseen joints", "4.0 %", "viewpoint turn", "bone variation"):
+        assert words in done.stdout
+    assert "2 people found" in done.stdout
+    assert str(tmp_path / "a.npz") in done.stdout
+
+
+@pytest.mark.parametrize("method", kt.METHODS)
+def test_lift_by_each_method(openpose_folder, tmp_path, method):
+    done = run("lift", openpose_folder, "-o", tmp_path / "a.npz", "--method", method, "--json")
+    assert json.loads(done.stdout)["people"][0]["method"] == method
+
+
+def test_lift_mirror_turns_depth_round(lifted, openpose_folder, tmp_path):
+    run("lift", openpose_folder, "-o", tmp_path / "a.npz", "--mirror")
+    plain = np.load(lifted[0] / "walk.npz")["points3d"]
+    mirrored = np.load(tmp_path / "a.npz")["points3d"]
+    np.testing.assert_allclose(mirrored, plain * [1, 1, -1], rtol=1e-6, atol=1e-6)
+
+
+def test_lift_everybody(openpose_folder, tmp_path):
+    done = run("lift", openpose_folder, "-o", tmp_path / "a.npz", "--person", "all", "--json")
+    people = json.loads(done.stdout)["people"]
+    assert [p["person"] for p in people] == [0, 1]
+    assert {p.name for p in tmp_path.iterdir()} == {"a_0.npz", "a_1.npz"}
+    assert people[0]["unseen_share"] < 0.1 < people[1]["unseen_share"]
+
+
+def test_lift_one_of_several(openpose_folder, tmp_path):
+    done = run("lift", openpose_folder, "-o", tmp_path / "a.npz", "--person", 1, "--json")
+    (person,) = json.loads(done.stdout)["people"]
+    assert person["unseen_share"] > 0.4
+
+
+def test_lift_with_the_users_own_skeleton(openpose_folder, tmp_path):
+    own = kt.SKELETONS["body25"].to_dict() | {"name": "mine"}
+    (tmp_path / "mine.json").write_text(json.dumps(own))
+    done = run("lift", openpose_folder, "-o", tmp_path / "a.npz", "--skeleton", tmp_path / "mine.json", "--json")
+    assert json.loads(done.stdout)["people"][0]["skeleton"] == "mine"
+
+
+def test_lift_sets_fields(openpose_folder, tmp_path):
+    from dataclasses import fields
+
+    method, cls = next(iter(kt.METHODS.items()))
+    field = next(f for f in fields(cls) if isinstance(f.default, (int, float)) and not isinstance(f.default, bool))
+    out = tmp_path / "a.npz"
+    run("lift", openpose_folder, "-o", out, "-m", method, "--set", f"{field.name}={field.default}")
+    plain = np.load(out)["points3d"]
+    run("lift", openpose_folder, "-o", out, "-m", method)
+    np.testing.assert_array_equal(np.load(out)["points3d"], plain)
+
+
+def test_lift_csv_has_a_row_for_every_joint_or_frame(lifted):
+    rows = list(csv.reader((lifted[0] / "walk.csv").open(newline="")))
+    assert len(rows) > 40
+
+
+MISTAKES = {
+    "no such file": (["lift", "absent.json", "-o", "OUT.npz"], "FormatError", "absent.json"),
+    "method": (["lift", "IN", "-o", "OUT.npz", "-m", "sfma"], "OptionError", "did you mean 'sfam'"),
+    "field": (["lift", "IN", "-o", "OUT.npz", "-m", "sfam", "--set", "betta=1"], "OptionError", "did you mean 'beta'"),
+    "no value": (["lift", "IN", "-o", "OUT.npz", "-m", "sfam", "--set", "beta"], "OptionError", "name=value"),
+    "bad value": (["lift", "IN", "-o", "OUT.npz", "-m", "sfam", "--set", "beta=much"], "OptionError", "a number"),
+    "skeleton": (["lift", "IN", "-o", "OUT.npz", "--skeleton", "body52"], "SkeletonError", "did you mean 'body25'"),
+    "wrong skeleton": (["lift", "IN", "-o", "OUT.npz", "--skeleton", "coco17"], "SkeletonError", "coco17"),
+    "format": (["lift", "IN", "-o", "OUT.npz", "--format", "opnpose"], "OptionError", "did you mean 'openpose'"),
+    "person": (["lift", "IN", "-o", "OUT.npz", "--person", "7"], "FormatError", "2 people"),
+    "person's name": (["lift", "IN", "-o", "OUT.npz", "--person", "-1"], "OptionError", "a number from 0, or all"),
+    "threshold": (["lift", "IN", "-o", "OUT.npz", "--threshold", "2"], "OptionError", "0 to 1"),
+    "fps": (["lift", "IN", "-o", "OUT.npz", "--fps", "-5"], "OptionError", "fps"),
+    "suffix": (["lift", "IN", "-o", "OUT.doc"], "OutputError", ".npz"),
+    "no suffix": (["lift", "IN", "-o", "OUT"], "OutputError", ".npz"),
+    "output is a folder": (["lift", "IN", "-o", "FOLDER.npz"], "OutputError", "folder"),
+    "info": (["info", "absent.json"], "FormatError", "absent.json"),
+    "skeletons show": (["skeletons", "show", "body52"], "SkeletonError", "did you mean 'body25'"),
+    "demo": (["demo", "-o", "OUT", "-m", "kc"], "OptionError", "did you mean 'kcs'"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_get_one_line_and_write_nothing(name, openpose_folder, tmp_path):
+    words, kind, hint = MISTAKES[name]
+    (tmp_path / "FOLDER.npz").mkdir()
+    place = {"IN": openpose_folder} | {w: tmp_path / w for w in words if w.startswith(("OUT", "FOLDER"))}
+    done = run(*(place.get(w, w) for w in words), "--json", code=2)
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    answer = json.loads(done.stdout)
+    assert answer["type"] == kind
+    assert hint in answer["error"] and hint in done.stderr
+    assert [p.name for p in tmp_path.rglob("*")] == ["FOLDER.npz"]
+
+
+def test_a_late_mistake_leaves_earlier_outputs_alone(openpose_folder, tmp_path):
+    (tmp_path / "old.npz").write_bytes(b"old")
+    run("lift", openpose_folder, "-o", tmp_path / "old.npz", "-o", tmp_path / "new.doc", code=2)
+    assert (tmp_path / "old.npz").read_bytes() == b"old"
+
+
+def test_lift_refuses_to_replace_the_tracks(lifted, tmp_path):
+    tracks = tmp_path / "walk.npz"
+    tracks.write_bytes((lifted[0] / "walk.npz").read_bytes())
+    done = run("lift", tracks, "-o", tracks, code=2)
+    assert "replace" in done.stderr
+    assert tracks.read_bytes() == (lifted[0] / "walk.npz").read_bytes()
+
+
+def test_warnings_are_one_line_on_standard_error(openpose_folder, tmp_path, monkeypatch):
+    import warnings
+
+    plain = kt.reconstruct
+
+    def warned(*args, **options):
+        warnings.warn("stopped at its limit\nafter 3 steps", kt.ConvergenceWarning, stacklevel=2)
+        return plain(*args, **options)
+
+    monkeypatch.setattr(kt, "reconstruct", warned)
+    done = run("lift", openpose_folder, "-o", tmp_path / "a.npz", "--json")
+    assert "warning: stopped at its limit after 3 steps\n" in done.stderr
+    assert json.loads(done.stdout)["people"]
+
+
+# ---------------------------------------------------------------------- info, view, skeletons
+
+
+def test_info(openpose_folder):
+    facts = json.loads(run("info", openpose_folder, "--json").stdout)
+    assert facts["format"] == "openpose" and facts["frames"] == 40 and facts["skeleton"] == "body25"
+    assert facts["joints"] == list(kt.SKELETONS["body25"].joints[:25])
+    first, second = facts["people"]
+    assert (first["frames_seen"], second["frames_seen"]) == (40, 20)
+    assert first["mean_confidence"] == pytest.approx(0.9)
+    assert first["unseen_share"] == pytest.approx(1 / 25)
+    assert second["unseen_share"] == pytest.approx(1 - 0.5 * 24 / 25)
+
+
+def test_info_in_words(openpose_folder):
+    text = run("info", openpose_folder).stdout
+    assert "format openpose, 40 frames" in text and "body25" in text and "52.0 %" in text
+
+
+def test_info_reads_a_result(lifted):
+    facts = json.loads(run("info", lifted[0] / "walk.npz", "--json").stdout)
+    assert facts["frames"] == 40 and facts["fps"] == 25 and facts["skeleton"] == "body25"
+
+
+def test_view_writes_beside_the_result(lifted, tmp_path):
+    result = tmp_path / "walk.npz"
+    result.write_bytes((lifted[0] / "walk.npz").read_bytes())
+    run("view", result)
+    assert "<html" in (tmp_path / "walk.html").read_text(encoding="utf-8").lower()
+    run("view", result, "-o", tmp_path / "sheet.png")
+    assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_view_of_tracks_says_what_it_wants(shared, tmp_path):
+    tracks = shared / "data" / "cmu" / "cmu_35_01.npz"
+    done = run("view", tracks, "-o", tmp_path / "a.html", code=2)
+    assert done.stderr.startswith("error: ") and "cmu_35_01.npz" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", [["skeletons"], ["skeletons", "list"]])
+def test_skeletons_lists_all(words):
+    text = run(*words).stdout
+    for name in kt.SKELETONS:
+        assert name in text
+
+
+def test_skeletons_list_as_json():
+    rows = json.loads(run("skeletons", "list", "--json").stdout)
+    assert [row["name"] for row in rows] == list(kt.SKELETONS)
+    assert next(row for row in rows if row["name"] == "body25")["joints"] == 25
+
+
+@pytest.mark.parametrize("name", kt.SKELETONS)
+def test_skeletons_show_every_joint(name):
+    text = run("skeletons", "show", name).stdout
+    for joint in kt.SKELETONS[name].joints:
+        assert joint in text
+
+
+def test_skeletons_show_is_a_skeleton_file(tmp_path):
+    path = tmp_path / "mine.json"
+    path.write_text(run("skeletons", "show", "coco17", "--json").stdout, encoding="utf-8")
+    assert kt.Skeleton.load(path) == kt.SKELETONS["coco17"]
+
+
+def test_skeletons_show_a_graph_that_is_no_tree(tmp_path):
+    path = tmp_path / "ring.json"
+    ring = {"joints": ["a", "b", "c"], "bones": [["a", "b"], ["b", "c"], ["c", "a"]], "tree": False}
+    path.write_text(json.dumps(ring))
+    assert "c-a" in run("skeletons", "show", path).stdout
+
+
+def test_skeletons_show_draws_the_template(tmp_path):
+    run("skeletons", "show", "coco17", "-o", tmp_path / "coco17.png")
+    assert (tmp_path / "coco17.png").read_bytes().startswith(b"\x89PNG")
+
+
+# ---------------------------------------------------------------------- demo
+
+
+def test_demo_beats_the_flat_guess(tmp_path):
+    facts = json.loads(run("demo", "-o", tmp_path / "demo", "--json").stdout)
+    assert {p.name for p in (tmp_path / "demo").iterdir()} == {"walk.npz", "walk.html", "walk.png"}
+    assert facts["error"] < 0.5 * facts["error_flat"]
+
+
+# ---------------------------------------------------------------------- --set
+
+
+@dataclass(frozen=True)
+class Fake:
+    beta: float = 1.5
+    rank: int | None = None
+    smooth: bool = False
+    start: Literal["flat", "template"] = "flat"
+    links: tuple[tuple[str, str], ...] = ()
+    sizes: tuple[float, ...] = ()
+    label: str | None = None
+
+
+@dataclass(frozen=True)
+class Other:
+    beta: int = 1
+    gamma: float = 0.0
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("beta=2", 2.0),
+        ("beta = 1e-3", 1e-3),
+        ("rank=3", 3),
+        ("rank=none", None),
+        ("smooth=true", True),
+        ("smooth=no", False),
+        ("start=template", "template"),
+        ("links=[[left_wrist, right_wrist]]", (("left_wrist", "right_wrist"),)),
+        ("links=[]", ()),
+        ("sizes=1,2.5,1e-3", (1.0, 2.5, 1e-3)),
+        ("label=a=b", "a=b"),
+        ("label=none", None),
+    ],
+)
+def test_settings_follow_the_fields_types(text, value):
+    (got,) = parse_settings([text], [Fake]).values()
+    assert got == value and type(got) is type(value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["beta=x", "beta=", "rank=2.5", "smooth=perhaps", "start=other", "links=[[a, b, c]]", "links=[[a", "sizes=a"],
+)
+def test_settings_of_the_wrong_type(text):
+    with pytest.raises(kt.OptionError, match=f"--set {text.partition('=')[0]}: expected "):
+        parse_settings([text], [Fake])
+
+
+def test_settings_of_several_methods():
+    assert parse_settings(["beta=0.5", "gamma=1"], [Fake, Other]) == {"beta": 0.5, "gamma": 1.0}
+    with pytest.raises(kt.OptionError, match="gamma"):
+        parse_settings(["gama=1"], [Fake, Other])
