@@ -1,0 +1,168 @@
+"""Measure a method on suites of the measuring protocol, which lies beside the repository in ``../shared``.
+
+    python scripts/benchmark.py method=sfam suite=akhter
+    python scripts/benchmark.py -m method=kcs,sfam suite=static_walk,orbit
+    python scripts/benchmark.py method=sfam suite=akhter cameras=true +method.beta=0
+
+Writes SUITE/CASE.npz (the prediction) and results.csv (a row a case) to the run's folder under ``outputs/``, and
+prints the means of each suite. Inputs, truth and figures are the protocol's own. A case that fails is a row with its
+error, and makes the exit code 1.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import hydra
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+import kcs_torch as kt
+
+FACTS = ("suite", "case", "method", "options", "cameras", "frames", "joints", "seconds", "ms_per_frame", "converged")
+failed = 0  # cases of all jobs; Hydra hands no exit code through
+
+
+def load_protocol(shared: Path) -> ModuleType:
+    """Import protocol.py by its path."""
+    path = shared / "protocol" / "protocol.py"
+    if not path.is_file():
+        raise SystemExit(f"shared={shared}: expected a folder with protocol/protocol.py and data/, found none")
+    spec = importlib.util.spec_from_file_location("protocol", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def chosen(protocol: ModuleType, suites: str | list[str], pattern: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the (suite, case) pairs to run."""
+    known = protocol.suites()
+    names = list(known) if suites == "all" else [suites] if isinstance(suites, str) else list(suites)
+    for name in names:
+        if name not in known:
+            raise SystemExit(f"suite={name}: expected all or some of {', '.join(known)}")
+    for name in names:
+        for case in known[name]:
+            if fnmatch(protocol.case_name(case), pattern):
+                yield name, case
+
+
+def load_input(given: dict[str, Any], name: str) -> kt.Tracks:
+    """Read a case's input as a user's file is read."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.npz"
+        np.savez(path, **given)
+        return kt.load_tracks(path)
+
+
+def true_cameras(protocol: ModuleType, data: Path, case: dict[str, Any]) -> torch.Tensor | None:
+    """The first two rows of each frame's rotation (T, 2, 3), where the data has them."""
+    source = protocol.load(data, case["src"])
+    return torch.from_numpy(source["R"].astype(float)) if "R" in source.files else None
+
+
+def run_case(
+    protocol: ModuleType, data: Path, case: dict[str, Any], method: kt.Method, target: Path, cameras: bool
+) -> dict[str, Any]:
+    """Reconstruct one case, write the prediction, and return its figures and facts."""
+    given, truth = protocol.build(data, case)
+    tracks = load_input(given, protocol.case_name(case))
+    known = true_cameras(protocol, data, case) if cameras else None
+    start = time.perf_counter()
+    result = method(tracks) if known is None else method(tracks, cameras=known)
+    seconds = time.perf_counter() - start
+    prediction = {"points3d": result.observed.numpy(), "cameras": result.cameras.numpy()}
+    target.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(target, **prediction)
+    figures = protocol.score(
+        prediction["points3d"], truth["points3d"], truth["edges"], prediction["cameras"], truth["world"]
+    )
+    return figures | {
+        "cameras": "estimated" if known is None else "true",
+        "frames": tracks.num_frames,
+        "joints": tracks.skeleton.num_observed,
+        "seconds": round(seconds, 4),
+        "ms_per_frame": round(1000 * seconds / tracks.num_frames, 4),
+        "converged": result.diagnostics.converged,
+    }
+
+
+def table(rows: list[dict[str, Any]], figures: tuple[str, ...]) -> str:
+    """The means of each suite, over the cases that did not fail."""
+    names = [f for f in (*figures, "ms_per_frame") if any(f in row for row in rows)]
+    lines = [f"{'suite':<16}{'method':<12}{'cases':>9}" + "".join(f"{n:>14}" for n in names)]
+    for suite, method in dict.fromkeys((row["suite"], row["method"]) for row in rows):
+        group = [row for row in rows if (row["suite"], row["method"]) == (suite, method)]
+        good = [row for row in group if "error" not in row]
+        line = f"{suite:<16}{method:<12}{len(good):>5}/{len(group):<3}"
+        for name in names:
+            values = [row[name] for row in good if name in row]
+            line += f"{np.mean(values):>14.4f}" if values else f"{'-':>14}"
+        lines.append(line)
+    return "\n".join(lines)
+
+
+def write_rows(path: Path, rows: list[dict[str, Any]], columns: tuple[str, ...]) -> None:
+    """Write rows to a CSV file, after those that an earlier job of the same sweep wrote."""
+    new = not path.exists()
+    with path.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns)
+        if new:
+            writer.writeheader()
+        writer.writerows(rows)
+
+
+@hydra.main(version_base="1.3", config_path="../configs", config_name="benchmark")
+def main(config: DictConfig) -> None:
+    """Run every chosen case and write results.csv."""
+    global failed
+    torch.set_num_threads(config.threads)
+    job = HydraConfig.get()
+    folder = Path(job.runtime.output_dir)
+    shared = Path(config.shared)
+    protocol = load_protocol(shared)
+    method = instantiate(config.method, _convert_="all")
+    options = {k: v for k, v in OmegaConf.to_container(config.method).items() if k != "_target_"}
+    name = job.runtime.choices.method
+    text = " ".join(f"{k}={v}" for k, v in options.items())
+    rows: list[dict[str, Any]] = []
+    suites = config.suite if isinstance(config.suite, str) else list(config.suite)
+    for suite, case in chosen(protocol, suites, config.case):
+        label = protocol.case_name(case)
+        row: dict[str, Any] = {"suite": suite, "case": label, "method": name, "options": text}
+        try:
+            row |= run_case(protocol, shared / "data", case, method, folder / suite / f"{label}.npz", config.cameras)
+            shown = "  ".join(f"{f} {row[f]:.4f}" for f in protocol.FIGURES if f in row)
+            print(f"{suite}/{label}  {shown}  {row['ms_per_frame']:.2f} ms a frame", flush=True)
+        except (Exception, SystemExit) as error:  # the protocol leaves by SystemExit where a prediction is no good
+            row["error"] = f"{type(error).__name__}: {error}"
+            failed += 1
+            print(f"{suite}/{label}  {row['error']}", flush=True)
+        rows.append(row)
+    if not rows:
+        raise SystemExit(f"case={config.case}: matches no case of suite={config.suite}")
+    columns = (*FACTS, *protocol.FIGURES, "error")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_rows(folder / "results.csv", rows, columns)
+    if job.mode == RunMode.MULTIRUN:
+        write_rows(Path(job.sweep.dir) / "results.csv", rows, columns)
+    print(f"\n{table(rows, protocol.FIGURES)}\n{folder / 'results.csv'}")
+
+
+if __name__ == "__main__":
+    main()
+    sys.exit(1 if failed else 0)

@@ -1,0 +1,101 @@
+"""scripts/benchmark.py, on a small protocol made here and on a case of the real one."""
+
+import csv
+import subprocess
+import sys
+
+import pytest
+
+PROTOCOL = '''
+import numpy as np
+FIGURES = ("rigid", "bone_cv")
+EDGES = np.array([(0, 1), (1, 2), (2, 3), (1, 4)])
+
+def suites():
+    return {"turn": [dict(src="a"), dict(src="b")], "broken": [dict(src="nan"), dict(src="a")]}
+
+def case_name(case):
+    return "case_" + case["src"]
+
+def load(data, src):
+    raise FileNotFoundError(src)
+
+def build(data, case):
+    t = np.linspace(0, 3, 30)[:, None]
+    rest = np.array([[0, 0, 0], [0, -10, 1], [3, -14, 2], [5, -18, 0], [-4, -13, -2]], float)
+    x, z = rest[:, 0] + np.sin(4 * t), rest[:, 2] + np.cos(3 * t)
+    X = np.stack([x * np.cos(t) + z * np.sin(t), rest[:, 1] + 0 * t, z * np.cos(t) - x * np.sin(t)], -1)
+    W = X[..., :2].copy()
+    if case["src"] == "nan":
+        W[:] = np.nan
+    names = np.array(["root", "neck", "shoulder", "hand", "head"])
+    confidence = np.isfinite(W).all(-1) * 1.0
+    given = dict(points2d=W, confidence=confidence, edges=EDGES, joint_names=names, fps=30.0, units="mm")
+    return given, dict(points3d=X, edges=EDGES, world=None)
+
+def score(pred, truth, edges, cameras=None, world=None):
+    assert pred.shape == truth.shape and cameras.shape == (30, 2, 3)
+    return dict(rigid=float(abs(pred - truth).mean()), bone_cv=1.0)
+'''
+
+
+def benchmark(root, folder, *words):
+    command = [sys.executable, str(root / "scripts" / "benchmark.py"), *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def rows(path):
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "shared" / "protocol").mkdir(parents=True)
+    (tmp_path / "shared" / "protocol" / "protocol.py").write_text(PROTOCOL, encoding="utf-8")
+    (tmp_path / "work").mkdir()
+    return tmp_path / "work"
+
+
+def test_multirun_writes_predictions_and_one_table(root, folder):
+    done = benchmark(root, folder, "-m", "method=kcs,sfam", "suite=turn", "hydra.sweep.dir=out")
+    assert done.returncode == 0, done.stderr
+    table = rows(folder / "out" / "results.csv")
+    assert [(r["method"], r["case"]) for r in table] == [
+        (m, c) for m in ("kcs", "sfam") for c in ("case_a", "case_b")
+    ]
+    for row in table:
+        assert row["suite"] == "turn" and row["frames"] == "30" and row["joints"] == "5" and not row["error"]
+        assert float(row["ms_per_frame"]) == pytest.approx(1000 * float(row["seconds"]) / 30, rel=0.05, abs=0.01)
+    for method in ("0_kcs", "1_sfam"):
+        assert {p.name for p in (folder / "out" / method / "turn").iterdir()} == {"case_a.npz", "case_b.npz"}
+        assert len(rows(folder / "out" / method / "results.csv")) == 2
+
+
+def test_a_failing_case_is_a_row_and_an_exit_code(root, folder):
+    done = benchmark(root, folder, "method=sfam", "suite=[broken]", "hydra.run.dir=out", "+method.beta=0.5")
+    assert done.returncode == 1
+    bad, good = rows(folder / "out" / "results.csv")
+    assert bad["error"].startswith("ShapeError: ") and not bad["rigid"]
+    assert good["rigid"] and not good["error"]
+    assert good["options"] == "beta=0.5"
+
+
+@pytest.mark.parametrize(
+    ("word", "hint"),
+    [("suite=walks", "turn, broken"), ("shared=nowhere", "protocol/protocol.py"), ("case=x*", "matches no case")],
+)
+def test_wrong_choices(root, folder, word, hint):
+    words = ["suite=turn", *([] if word.startswith("shared") else ["shared=../shared"]), word]
+    done = benchmark(root, folder, *words)
+    assert done.returncode == 1
+    assert hint in done.stderr + done.stdout
+
+
+def test_real_case_with_true_cameras(root, shared, tmp_path):
+    words = ["method=sfam", "suite=akhter", "case=*pickup", f"shared={shared}", "cameras=true", "hydra.run.dir=out"]
+    done = benchmark(root, tmp_path, *words)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (row,) = rows(tmp_path / "out" / "results.csv")
+    assert row["cameras"] == "true"
+    assert float(row["e3d_world"]) == pytest.approx(float(row["e3d"]), rel=0.2)
