@@ -320,6 +320,7 @@ class Skeleton:
     def with_links(self, links: Iterable[tuple[str, str]]) -> Skeleton:
         """Add rigid links between joints, which may close chains (two hands that hold one sword).
 
+        >>> from kcs_torch.skeleton import SKELETONS
         >>> body = SKELETONS["coco17"].with_links([("left_wrist", "right_wrist")])
         >>> body.is_tree, body.bone_names[-1]
         (False, 'left_wrist-right_wrist')

@@ -1,0 +1,210 @@
+"""Sides, twins and templates are read from joint names in any usual spelling."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kcs_torch.anatomy import canonical_name, mirror_name, side_of, template_by_names
+from kcs_torch.errors import SkeletonError
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+
+# name, side, part, twin
+SPELLINGS = [
+    ("left_hip", "left", "hip", "right_hip"),
+    ("l_hip", "left", "hip", "r_hip"),
+    ("hip_l", "left", "hip", "hip_r"),
+    ("LHip", "left", "hip", "RHip"),
+    ("LeftHip", "left", "hip", "RightHip"),
+    ("lhip", "left", "hip", "rhip"),
+    ("LEFTHIP", "left", "hip", "RIGHTHIP"),
+    ("hip.R", "right", "hip", "hip.L"),
+    ("left_hip_joint", "left", "hipjoint", "right_hip_joint"),
+    ("mixamorig:LeftUpLeg", "left", "hip", "mixamorig:RightUpLeg"),
+    ("LeftLeg", "left", "knee", "RightLeg"),
+    ("LeftFoot", "left", "foot", "RightFoot"),
+    ("RightForeArm", "right", "elbow", "LeftForeArm"),
+    ("lefthand", "left", "hand", "righthand"),
+    ("L_WRIST", "left", "wrist", "R_WRIST"),
+    ("Left_wrist", "left", "wrist", "Right_wrist"),
+    ("mouth_left", "left", "mouth", "mouth_right"),
+    ("left_eye_inner", "left", "eyeinner", "right_eye_inner"),
+    ("LBigToe", "left", "bigtoe", "RBigToe"),
+    ("left_foot_index", "left", "bigtoe", "right_foot_index"),
+    ("l_toe_base", "left", "toebase", "r_toe_base"),
+    ("lfemur", "left", "femur", "rfemur"),
+    ("REar", "right", "ear", "LEar"),
+    ("leftear", "left", "ear", "rightear"),
+    ("L_INDEX_MCP", "left", "index_mcp", "R_INDEX_MCP"),
+    ("INDEX_FINGER_TIP", "centre", "index_tip", "INDEX_FINGER_TIP"),
+    ("UpperNeck", "centre", "upperneck", "UpperNeck"),
+    ("HeadTop", "centre", "headtop", "HeadTop"),
+    ("head_top", "centre", "headtop", "head_top"),
+    ("MidHip", "centre", "midhip", "MidHip"),
+    ("Hip", "centre", "midhip", "Hip"),
+    ("Hips", "centre", "pelvis", "Hips"),
+    ("root", "centre", "pelvis", "root"),
+    ("spine1", "centre", "spine1", "spine1"),
+    ("lower_back", "centre", "lowerback", "lower_back"),
+    # no part of a person, but sided
+    ("r_forepaw", "right", None, "l_forepaw"),
+    ("wingL", "left", None, "wingR"),
+    ("forelegR4", "right", None, "forelegL4"),
+    ("LF_body_coxa", "left", None, "RF_body_coxa"),
+    ("RH_tarsus_tip", "right", None, "LH_tarsus_tip"),
+    ("FL_paw", "left", None, "FR_paw"),
+    ("LASI", "left", None, "RASI"),
+    # false friends
+    ("rear", "centre", None, "rear"),
+    ("lip", "centre", None, "lip"),
+    ("elbow", "centre", None, "elbow"),
+    ("leg", "centre", None, "leg"),
+    ("upright", "centre", None, "upright"),
+    ("leftover", "centre", None, "leftover"),
+    ("righthanded", "centre", None, "righthanded"),
+    ("L5", "centre", None, "L5"),
+    ("joint_l_r", "centre", None, "joint_l_r"),
+    ("tail1", "centre", None, "tail1"),
+    ("", "centre", None, ""),
+]
+
+
+@pytest.mark.parametrize(("name", "side", "part", "twin"), SPELLINGS)
+def test_names(name, side, part, twin):
+    assert side_of(name) == side
+    assert mirror_name(name) == twin
+    assert canonical_name(name) == (None if part is None else (side, part))
+
+
+@given(
+    st.text(max_size=20)
+    | st.from_regex(r"[LRlr]?[_. ]?(Left|right|Toe|hip|[A-Z]){0,3}[0-9]?[_.]?[LRlr]?", fullmatch=True)
+)
+def test_mirror_is_its_own_inverse(name):
+    twin = mirror_name(name)
+    assert mirror_name(twin) == name
+    opposite = {"left": "right", "right": "left", "centre": "centre"}
+    assert side_of(twin) == opposite[side_of(name)]
+    assert (twin == name) == (side_of(name) == "centre")
+
+
+def place(*names, kind="human"):
+    return dict(zip(names, template_by_names(kind, names), strict=True))
+
+
+def test_person_faces_the_viewer():
+    body = place(
+        "LHip", "LKnee", "LAnkle", "LHeel", "LBigToe", "LSmallToe", "LElbow", "LShoulder", "LWrist", "Nose", "Head"
+    )
+    assert body["LHip"][0] > 0  # the person's left is at the viewer's right
+    assert body["LHip"][1] < body["LKnee"][1] < body["LAnkle"][1] < body["LHeel"][1]  # y down
+    assert body["Nose"][2] < body["Head"][2] < body["LHeel"][2]  # z away from the viewer
+    assert body["LBigToe"][2] < body["LAnkle"][2] < body["LHeel"][2]
+    assert body["LBigToe"][0] < body["LSmallToe"][0]
+    # a knee bends forwards, an elbow backwards: before and behind the line between its neighbours
+    assert body["LKnee"][2] < min(body["LHip"][2], body["LAnkle"][2])
+    assert body["LElbow"][2] > max(body["LShoulder"][2], body["LWrist"][2])
+
+
+def test_stature_and_twins():
+    body = place("head_top", "left_heel", "right_heel", "left_wrist", "right_wrist")
+    assert 1.65 < body["left_heel"][1] - body["head_top"][1] < 1.75
+    for part in ("heel", "wrist"):
+        x, y, z = body[f"left_{part}"]
+        assert body[f"right_{part}"] == (-x, y, z)
+
+
+def test_words_depend_on_their_neighbours():
+    hips = place("pelvis", "left_hip")
+    assert hips["pelvis"][1] == hips["left_hip"][1]
+    capture = place("pelvis", "left_hip", "spine1")
+    assert capture["spine1"][1] < capture["pelvis"][1] < capture["left_hip"][1]  # a root above the hips
+    assert place("left_foot", "left_knee")["left_foot"] == place("left_ankle")["left_ankle"]
+    smpl = place("left_ankle", "left_foot")
+    assert smpl["left_foot"][2] < smpl["left_ankle"][2]
+    bvh = place("LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand")
+    assert bvh["LeftShoulder"][0] < bvh["LeftArm"][0]
+    assert bvh["LeftArm"] == place("left_shoulder")["left_shoulder"]
+    assert bvh["LeftHand"] == place("left_wrist")["left_wrist"]
+    assert place("right_wrist", "right_hand")["right_hand"][1] > bvh["LeftHand"][1]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [
+            "root",
+            "spine",
+            "chest",
+            "neck",
+            "head",
+            "r_shoulder",
+            "r_upperarm",
+            "r_elbow",
+            "r_wrist",
+            "r_forepaw",
+            "tail1",
+        ],
+        ["base", "panda_joint1", "panda_joint3", "panda_grasptarget_hand"],
+        ["base", "shoulder_pan_joint", "elbow_joint", "wrist_1_joint"],
+        ["left_eye", "right_eye", "nose", "neck", "root_of_tail", "left_shoulder", "left_front_paw"],
+        ["head", "thorax", "abdomen", "wingL", "wingR", "forelegL4"],
+        ["snout", "leftear", "rightear", "tailbase"],
+        ["nose", "left_ear", "right_ear"],  # a head alone may be any animal's
+        ["joint0", "joint1"],
+    ],
+)
+def test_no_person_where_there_is_none(names):
+    for kind in ("human", "hand"):
+        with pytest.raises(SkeletonError):
+            template_by_names(kind, names)
+
+
+def test_unknown_joints_are_named():
+    with pytest.raises(SkeletonError, match="'tail1', 'wing'"):
+        template_by_names("human", ["left_hip", "tail1", "wing"])
+    with pytest.raises(SkeletonError, match="did you mean 'human'"):
+        template_by_names("humann", ["left_hip"])
+
+
+def test_hands():
+    hand = place("wrist", "thumb_tip", "index_finger_tip", "pinky_tip", kind="hand")
+    assert hand["pinky_tip"][0] < hand["index_finger_tip"][0] < hand["thumb_tip"][0]  # a right palm to the viewer
+    assert hand["index_finger_tip"][1] < hand["wrist"][1]
+    numbered = template_by_names("hand", [f"hand{i}" for i in range(21)])
+    assert numbered[0] == hand["wrist"] and numbered[20] == hand["pinky_tip"]
+    both = place("L_WRIST", "L_THUMB_TIP", "R_WRIST", "R_THUMB_TIP", kind="hand")
+    assert both["R_THUMB_TIP"][0] < both["L_THUMB_TIP"][0]
+    assert both["L_THUMB_TIP"][0] == pytest.approx(-both["R_THUMB_TIP"][0])
+
+
+@pytest.mark.skipif(not (DATA / "cmu").is_dir(), reason="needs the motion capture data beside the checkout")
+def test_bones_agree_with_motion_capture():
+    """Within 15 per cent of the mean over subjects, each scaled to the same size."""
+    from kcs_torch.skeleton import SKELETONS
+
+    body = SKELETONS["cmu21"]
+    bones = np.array(body.bones)
+    subjects = {}
+    for file in sorted((DATA / "cmu").glob("cmu_[0-9]*.npz")):
+        with np.load(file) as data:
+            frame = data["points3d"][0].astype(float)
+            assert tuple(data["joint_names"]) == body.joints
+        lengths = np.linalg.norm(frame[bones[:, 0]] - frame[bones[:, 1]], axis=-1)
+        subjects[file.stem.split("_")[1]] = lengths / lengths.mean()
+    mean = np.mean(list(subjects.values()), axis=0)
+    ours = body.relative_lengths().numpy()
+    assert len(subjects) >= 10
+    assert np.abs(ours / mean - 1).max() < 0.15
+
+
+@pytest.mark.skipif(not (DATA / "hand").is_dir(), reason="needs the hand motion capture beside the checkout")
+def test_two_axis_thumb_has_length():
+    with np.load(DATA / "hand" / "manipnet_mug1_rightHand.npz") as data:
+        names, edges = [str(n) for n in data["joint_names"]], data["edges"]
+    points = template_by_names("hand", names)
+    assert min(math.dist(points[a], points[b]) for a, b in edges) > 0.005

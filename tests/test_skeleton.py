@@ -1,0 +1,418 @@
+"""Skeletons: construction, checks, the built-in ones, files, changes."""
+
+import json
+import math
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kcs_torch.anatomy import mirror_name, side_of
+from kcs_torch.errors import FormatError, SkeletonError
+from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+BUILT_IN = sorted(SKELETONS)
+ARM = Skeleton.from_names(["shoulder", "elbow", "wrist"], [("shoulder", "elbow"), ("elbow", "wrist")], name="arm")
+
+# As published by each detector or data set, sides as l and r.
+COCO = (
+    "nose l_eye r_eye l_ear r_ear l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist l_hip r_hip "
+    "l_knee r_knee l_ankle r_ankle"
+)
+PUBLISHED = {
+    "coco17": COCO,
+    "coco18": (
+        "nose neck r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist r_hip r_knee r_ankle l_hip l_knee "
+        "l_ankle r_eye l_eye r_ear l_ear"
+    ),
+    "body25": (
+        "nose neck r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist midhip r_hip r_knee r_ankle l_hip "
+        "l_knee l_ankle r_eye l_eye r_ear l_ear l_bigtoe l_smalltoe l_heel r_bigtoe r_smalltoe r_heel"
+    ),
+    "body25b": COCO + " upperneck headtop l_bigtoe l_smalltoe l_heel r_bigtoe r_smalltoe r_heel",
+    "halpe26": COCO + " head neck hip l_bigtoe r_bigtoe l_smalltoe r_smalltoe l_heel r_heel",
+    "mpi15": (
+        "head neck r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist r_hip r_knee r_ankle l_hip l_knee "
+        "l_ankle chest"
+    ),
+    "mpii16": (
+        "r_ankle r_knee r_hip l_hip l_knee l_ankle pelvis thorax upperneck headtop r_wrist r_elbow r_shoulder "
+        "l_shoulder l_elbow l_wrist"
+    ),
+    "h36m17": (
+        "pelvis r_hip r_knee r_ankle l_hip l_knee l_ankle spine thorax neck head l_shoulder l_elbow l_wrist "
+        "r_shoulder r_elbow r_wrist"
+    ),
+    "smpl24": (
+        "pelvis l_hip r_hip spine1 l_knee r_knee spine2 l_ankle r_ankle spine3 l_foot r_foot neck l_collar "
+        "r_collar head l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist l_hand r_hand"
+    ),
+    "ap10k": (
+        "l_eye r_eye nose neck rootoftail l_shoulder l_elbow l_frontpaw r_shoulder r_elbow r_frontpaw l_hip "
+        "l_knee l_backpaw r_hip r_knee r_backpaw"
+    ),
+    "mediapipe33": (
+        "nose l_eyeinner l_eye l_eyeouter r_eyeinner r_eye r_eyeouter l_ear r_ear l_mouth r_mouth l_shoulder "
+        "r_shoulder l_elbow r_elbow l_wrist r_wrist l_pinky r_pinky l_index r_index l_thumb r_thumb l_hip "
+        "r_hip l_knee r_knee l_ankle r_ankle l_heel r_heel l_footindex r_footindex"
+    ),
+}
+
+
+def plain(name):
+    """'LBigToe' and 'left_big_toe' as 'l_bigtoe'."""
+    side = side_of(name)
+    bare = name.lower().replace("_", "").replace("left", "").replace("right", "")
+    if side == "centre":
+        return bare
+    return f"{side[0]}_{bare if 'left' in name or 'right' in name else bare[1:]}"
+
+
+# ---------------------------------------------------------------- construction and checks
+
+
+def test_from_names():
+    body = Skeleton.from_names(
+        ["LHip", "RHip", "Neck"],
+        [("Mid", "LHip"), ("Mid", "RHip"), ("Mid", "Neck")],
+        virtual={"Mid": ["LHip", "RHip"]},
+        flexible=[("Neck", "Mid")],
+        proportions={"Mid-LHip": 1, "Mid-RHip": 1, "Mid-Neck": 4},
+        template={"LHip": (1, 0, 0), "RHip": (-1, 0, 0), "Neck": (0, -4, 0)},
+    )
+    assert body.joints == ("LHip", "RHip", "Neck", "Mid")
+    assert body.num_observed == 3 and body.virtual == ((3, (0, 1)),)
+    assert body.mirror == ((0, 1),) and body.mirror_bones == ((0, 1),)
+    assert body.flexible == (2,) and body.rigid == (0, 1)
+    assert [body.side(i) for i in range(4)] == ["left", "right", "centre", "centre"]
+    assert body.template_points(dtype=torch.float64)[3].tolist() == [0, 0, 0]
+    assert body.relative_lengths().tolist() == [0.5, 0.5, 2.0]
+    assert body.bone_index().tolist() == [[3, 0], [3, 1], [3, 2]]
+
+
+def test_from_edges_finds_what_names_tell():
+    body = Skeleton.from_edges([[0, 1], [1, 2]], ["left_hip", "left_knee", "left_ankle"])
+    assert body.template is not None
+    assert Skeleton.from_edges([[0, 1]], ["tail1", "tail2"]).template is None
+    assert Skeleton.from_edges([[0, 1]], 2).joints == ("joint0", "joint1")
+    hand = SKELETONS["hand21"]
+    assert Skeleton.from_edges(hand.bones, hand.joints).template == hand.template
+    # names of a built-in skeleton take its template, also where the names alone would say otherwise
+    cmu = SKELETONS["cmu17"]
+    assert Skeleton.from_edges(cmu.bones, cmu.joints).template == cmu.template
+    # two names for one place: no template rather than a bone without length
+    assert Skeleton.from_edges([[0, 1]], ["left_toe", "left_ball"]).template is None
+
+
+def test_lists_become_tuples():
+    body = Skeleton(joints=["a", "b"], bones=[[0, 1]], template=[[0, 0, 0], [0, 1, 0]])
+    assert hash(body) == hash(Skeleton(("a", "b"), ((0, 1),), template=((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))))
+    assert pickle.loads(pickle.dumps(body)) == body
+
+
+def test_a_cycle_is_named():
+    with pytest.raises(SkeletonError, match="closed chain") as error:
+        Skeleton.from_names(["a", "b", "c", "d"], [("a", "b"), ("b", "c"), ("c", "a"), ("c", "d")], name="ring")
+    message = str(error.value)
+    assert "'ring'" in message and "tree=False" in message
+    chain = message.split("closed chain ")[1].split(".")[0].split(" - ")
+    assert set(chain) == {"a", "b", "c"} and chain[0] == chain[-1]
+
+
+def test_loose_joints_are_named():
+    with pytest.raises(SkeletonError, match=r"3 pieces.*: d, e, f"):
+        Skeleton.from_names(["a", "b", "c", "d", "e", "f"], [("a", "b"), ("b", "c"), ("d", "e")])
+
+
+def test_graphs_are_admitted_when_asked_for():
+    body = Skeleton.from_names(["a", "b", "c", "d"], [("a", "b"), ("b", "c"), ("c", "a")], tree=False)
+    assert not body.is_tree and body.pieces() == [[0, 1, 2], [3]] and sorted(body.cycle()) == [0, 1, 2]
+    with pytest.raises(SkeletonError, match="closed chain"):
+        body.validate()
+    assert ARM.is_tree and ARM.cycle() is None
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Skeleton(("a", "b", "a"), ((0, 1), (1, 2))), "given twice: a"),
+        (lambda: Skeleton(("a",), ()), "at least 2 joints, got 1"),
+        (lambda: Skeleton((), ()), "at least 2 joints, got 0"),
+        (lambda: Skeleton(("a", "b"), ((0, 2),)), r"bone \(0, 2\): expected joint indices 0..1"),
+        (lambda: Skeleton(("a", "b"), ((-1, 0),)), "expected joint indices 0..1"),
+        (lambda: Skeleton(("a", "b"), ((0, 0),)), "joins a joint to itself"),
+        (lambda: Skeleton(("a", "b"), ((0, 1), (1, 0))), "is given twice"),
+        (lambda: Skeleton(("a", "b"), ((0, 1),), mirror=((0, 5),)), "mirror"),
+        (lambda: Skeleton(("a", "b"), ((0, 1),), flexible=(1,)), "flexible 1"),
+        (lambda: Skeleton(("a", "b"), ((0, 1),), template=((0, 0, 0),)), "expected 2 positions, got 1"),
+        (lambda: Skeleton(("a", "b"), ((0, 1),), template=((0, 0, 0), (0, math.nan, 0))), "'b': expected 3 finite"),
+        (lambda: Skeleton(("a", "b"), ((0, 1),), template=((0, 0, 0), (0, 1))), "'b': expected 3 finite"),
+        (lambda: Skeleton(("a", "b"), ((0, 1),), proportions=(1.0, 2.0)), "expected 1 lengths, got 2"),
+        (lambda: Skeleton(("a", "b"), ((0, 1),), proportions=(0.0,)), "bone a-b: expected a positive number"),
+        (lambda: Skeleton(("v", "a", "b"), ((0, 1), (1, 2)), virtual=((0, (1, 2)),)), "must follow the observed"),
+        (lambda: Skeleton(("a", "b"), ((0, 1),), virtual=((1, ()),)), "needs sources"),
+        (lambda: Skeleton.from_names(["a", "elbow"], [("a", "elbo")]), "did you mean 'elbow'"),
+        (lambda: Skeleton.from_names(["a", "b"], ["ab"]), "expected pairs of joint names"),
+        (lambda: Skeleton.from_names(["a", "b"], [("a", "b")], template={"a": (0, 0, 0)}), "none for b"),
+        (lambda: Skeleton.from_names(["a", "b"], [("a", "b")], template={"c": (0, 0, 0)}), "unknown name in template"),
+        (lambda: Skeleton.from_names(["a", "b"], [("a", "b")], template="human"), "'a', 'b'"),
+        (lambda: Skeleton.from_names(["a", "b"], [("a", "b")], proportions={}), "none for a-b"),
+        (lambda: Skeleton.from_names(["a", "b"], [("a", "b")], proportions={"b-a": 1}), "choices are a-b"),
+        (lambda: Skeleton.from_names(["a", "b"], [("a", "b")], virtual={"c": ["a", "x"]}), "unknown joint in virtual"),
+        (
+            lambda: Skeleton.from_names(["a", "b", "c"], [("a", "b"), ("b", "c")], flexible=[("a", "c")]),
+            "expected bones",
+        ),
+        (lambda: Skeleton.from_edges([[0, 1, 2]], 3), "expected pairs of joint indices"),
+        (lambda: ARM.index("elbw"), "did you mean 'elbow'"),
+        (lambda: ARM.template_points(), "has no template"),
+        (lambda: get_skeleton("mpi16"), "did you mean 'mpii16'"),
+    ],
+)
+def test_errors(make, message):
+    with pytest.raises(SkeletonError, match=message):
+        make()
+
+
+# ---------------------------------------------------------------- built-in ones
+
+
+def test_the_list_of_built_in_skeletons():
+    expected = {
+        "h36m17",
+        "coco17",
+        "coco18",
+        "body25",
+        "body25b",
+        "mpi15",
+        "mpii16",
+        "halpe26",
+        "mediapipe33",
+        "hand21",
+    }
+    assert expected | {"cmu31", "cmu21", "cmu17", "ap10k", "smpl24"} <= set(SKELETONS)
+    assert "nothing" not in SKELETONS and SKELETONS.get("nothing") is None and 3 not in SKELETONS
+    assert SKELETONS["coco17"] is SKELETONS["coco17"]
+    assert [SKELETONS[n].num_joints for n in ("cmu31", "cmu21", "cmu17", "hand21")] == [31, 21, 17, 21]
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_built_in(name):
+    body = SKELETONS[name]
+    assert body.name == name
+    assert body.is_tree
+    # every sided joint has its twin, and pairs follow the names
+    pairs = {(body.joints[a], body.joints[b]) for a, b in body.mirror}
+    assert pairs == {(j, mirror_name(j)) for j in body.joints if side_of(j) == "left"}
+    assert {j for j in body.joints if side_of(j) == "right"} == {b for _, b in pairs}
+    # twin bones too
+    sided = [i for i, (a, b) in enumerate(body.bones) if {body.side(a), body.side(b)} != {"centre"}]
+    assert sorted(i for pair in body.mirror_bones for i in pair) == sided
+    # the template is symmetrical, and no bone is a point
+    points = body.template_points(dtype=torch.float64)
+    flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+    for a, b in body.mirror:
+        assert torch.equal(points[a], points[b] * flip)
+        assert points[a, 0] > 0
+    index = body.bone_index()
+    lengths = (points[index[:, 1]] - points[index[:, 0]]).norm(dim=-1)
+    assert lengths.min() > 0.01
+    assert body.relative_lengths(dtype=torch.float64).mean() == pytest.approx(1)
+    # virtual joints sit where their sources put them
+    for joint, sources in body.virtual:
+        assert torch.allclose(points[joint], points[list(sources)].mean(0), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", sorted(PUBLISHED))
+def test_published_order(name):
+    body = SKELETONS[name]
+    assert [plain(j) for j in body.joints[: body.num_observed]] == PUBLISHED[name].split()
+
+
+def test_hand_order():
+    hand = SKELETONS["hand21"]
+    fingers = [j.split("_")[0] for j in hand.joints]
+    assert fingers == ["wrist", *(f for f in ("thumb", "index", "middle", "ring", "pinky") for _ in range(4))]
+    assert {b: a for a, b in hand.bones} == {i: 0 if i % 4 == 1 else i - 1 for i in range(1, 21)}
+
+
+def test_each_file_names_its_source():
+    for file in (Path(__file__).parents[1] / "kcs_torch" / "skeletons").glob("*.yaml"):
+        assert file.read_text(encoding="utf-8").startswith("# "), file.name
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="needs the data sets beside the checkout")
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("cmu21", "cmu/cmu_35_01"),
+        ("body25b", "human_2d3d/pose2sim_balancing_openpose"),
+        ("mediapipe33", "human_2d3d/pose2sim_balancing_mediapipe"),
+    ],
+)
+def test_order_of_real_files(name, file):
+    with np.load(DATA / f"{file}.npz") as data:
+        assert guess_skeleton(data["joint_names"]) is SKELETONS[name]
+
+
+def test_guess_skeleton():
+    for body in SKELETONS.values():
+        assert guess_skeleton(body.joints[: body.num_observed]) is body
+    assert guess_skeleton(["a", "b"]) is None
+    assert guess_skeleton(SKELETONS["h36m17"].joints[::-1]) is None
+
+
+def test_get_skeleton(tmp_path):
+    assert get_skeleton(ARM) is ARM
+    assert get_skeleton("coco17") is SKELETONS["coco17"]
+    file = tmp_path / "arm.json"
+    file.write_text(json.dumps(ARM.to_dict()))
+    assert get_skeleton(file) == get_skeleton(str(file)) == ARM
+
+
+# ---------------------------------------------------------------- files
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_round_trip_of_built_in(name, tmp_path):
+    body = SKELETONS[name]
+    data = body.to_dict()
+    assert Skeleton.from_dict(data) == body
+    (tmp_path / "a.json").write_text(json.dumps(data))
+    (tmp_path / "a.yaml").write_text(yaml.safe_dump(data, sort_keys=False))
+    assert Skeleton.load(tmp_path / "a.json") == Skeleton.load(tmp_path / "a.yaml") == body
+
+
+@st.composite
+def trees(draw):
+    """Random trees with random extras."""
+    names = draw(st.lists(st.text(min_size=1, max_size=8), min_size=2, max_size=12, unique=True))
+    bones = [(draw(st.integers(0, i - 1)), i) for i in range(1, len(names))]
+    bones = [b if draw(st.booleans()) else b[::-1] for b in bones]
+    number = st.floats(-1e3, 1e3)
+    extras = {}
+    if draw(st.booleans()):
+        extras["template"] = [draw(st.tuples(number, number, number)) for _ in names]
+    if draw(st.booleans()):
+        extras["proportions"] = [draw(st.floats(1e-6, 1e6)) for _ in bones]
+    if draw(st.booleans()):
+        extras["flexible"] = sorted(draw(st.sets(st.integers(0, len(bones) - 1))))
+    return Skeleton(joints=names, bones=draw(st.permutations(bones)), name=draw(st.text(max_size=5)), **extras)
+
+
+@given(trees())
+def test_round_trip_of_random_trees(body):
+    assert body.is_tree and body.cycle() is None and len(body.pieces()) == 1
+    data = body.to_dict()
+    keys = {f"{a}-{b}" for a, b in ((body.joints[a], body.joints[b]) for a, b in body.bones)}
+    if body.proportions is None or len(keys) == body.num_bones:  # "a-" + "b" and "a" + "-b" may collide
+        assert Skeleton.from_dict(json.loads(json.dumps(data))) == body
+
+
+@given(trees(), st.data())
+def test_one_more_bone_closes_a_chain(body, data):
+    free = [
+        (a, b)
+        for a in range(body.num_joints)
+        for b in range(a)
+        if (a, b) not in body.bones and (b, a) not in body.bones
+    ]
+    if free:
+        extra = data.draw(st.sampled_from(free))
+        with pytest.raises(SkeletonError, match="closed chain"):
+            Skeleton(body.joints, (*body.bones, extra))
+    if body.num_bones > 1:
+        with pytest.raises(SkeletonError, match="2 pieces"):
+            Skeleton(body.joints, body.bones[1:])
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "message"),
+    [
+        ("joints: [a, b]\nbones: [[a, b]]\ncolour: red\n", FormatError, "unknown key.*colour"),
+        ("joints: [a, b]\nbone: [[a, b]]\n", FormatError, "did you mean 'bones'"),
+        ("joints: [a, b]\n", FormatError, "a list under 'bones'"),
+        ("joints: ab\nbones: [[a, b]]\n", FormatError, "a list under 'joints', got str"),
+        ("- a\n- b\n", FormatError, "expected a mapping"),
+        ("", FormatError, "expected a mapping"),
+        ("joints: [a, b\n", FormatError, "does not parse"),
+        ("joints: [a, b]\nbones: [[a, c]]\n", SkeletonError, "arm.yaml: unknown joint in bones"),
+        ("joints: [a, b]\nbones: [3]\n", FormatError, "arm.yaml"),
+        ("joints: [a, b]\nbones: [[a, b]]\ntemplate: {a: [0, 0, 0], b: here}\n", FormatError, "arm.yaml"),
+        ("joints: [a, b]\nbones: [[a, b]]\ntemplate: {a: [0, 0, 0], b: [1]}\n", SkeletonError, "3 finite numbers"),
+        ("joints: [a, b]\nbones: [[a, b]]\nproportions: 3\n", FormatError, "arm.yaml"),
+        ("joints: [a, b]\nbones: [[a, b]]\nvirtual: [c]\n", FormatError, "arm.yaml"),
+        ("joints: [a]\nbones: []\n", SkeletonError, "arm.yaml: .*at least 2 joints"),
+    ],
+)
+def test_bad_files(tmp_path, text, error, message):
+    file = tmp_path / "arm.yaml"
+    file.write_text(text)
+    with pytest.raises(error, match=message):
+        Skeleton.load(file)
+
+
+def test_unreadable_files(tmp_path):
+    with pytest.raises(FormatError, match="cannot be read"):
+        Skeleton.load(tmp_path / "none.yaml")
+    with pytest.raises(FormatError, match="cannot be read"):
+        Skeleton.load(tmp_path)
+    (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FormatError, match="does not parse"):
+        Skeleton.load(tmp_path / "binary.json")
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    with pytest.raises(FormatError, match="does not parse"):
+        Skeleton.load(tmp_path / "deep.json")
+
+
+def test_name_of_a_file_without_a_name(tmp_path):
+    (tmp_path / "horse.yaml").write_text("joints: [a, b]\nbones: [[a, b]]\n")
+    assert Skeleton.load(tmp_path / "horse.yaml").name == "horse"
+
+
+# ---------------------------------------------------------------- changes
+
+
+def test_with_links():
+    body = SKELETONS["coco17"]
+    held = body.with_links([("left_wrist", "right_wrist")])
+    assert held.num_bones == body.num_bones + 1 and not held.is_tree and held.flexible == body.flexible
+    assert {held.joints[i] for i in held.cycle()} >= {"left_wrist", "right_wrist", "neck"}
+    with pytest.raises(SkeletonError, match="given twice"):
+        body.with_links([("left_knee", "left_hip")])
+    with pytest.raises(SkeletonError, match="did you mean 'left_wrist'"):
+        body.with_links([("left_wrst", "right_wrist")])
+
+
+def test_connected():
+    assert ARM.connected() is ARM
+    body = Skeleton.from_names(["a", "b", "c", "d", "e", "f"], [("a", "b"), ("c", "d"), ("d", "e")], tree=False)
+    whole = body.connected()
+    assert len(whole.pieces()) == 1 and whole.bones[: body.num_bones] == body.bones
+    assert [whole.bones[i] for i in whole.flexible] == [(2, 0), (2, 5)]
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
+def test_complete(batch):
+    body = SKELETONS["coco17"]
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(*batch, 17, 2, generator=generator, dtype=torch.float64)
+    weights = torch.rand(*batch, 17, generator=generator, dtype=torch.float64)
+    hip = body.index("left_hip")
+    weights[..., hip] = 0
+    before = points.clone()
+    more, seen = body.complete(points, weights)
+    assert more.shape == (*batch, 19, 2) and seen.shape == (*batch, 19)
+    assert torch.equal(points, before) and torch.equal(more[..., :17, :], before)
+    shoulders = [body.index("left_shoulder"), body.index("right_shoulder")]
+    assert torch.allclose(more[..., body.index("neck"), :], points[..., shoulders, :].mean(-2))
+    assert torch.equal(seen[..., body.index("neck")], weights[..., shoulders].amin(-1))
+    assert (seen[..., body.index("pelvis")] == 0).all()
+    same = ARM.complete(points[..., :3, :], weights[..., :3])
+    assert torch.equal(same[0], points[..., :3, :])
