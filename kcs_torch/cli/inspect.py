@@ -39,6 +39,7 @@ def info(
 def _facts(path: str, format: str, people: list[Tracks]) -> dict[str, Any]:
     first = people[0]
     body = first.skeleton
+    common = [note for note in first.notes if all(note in one.notes for one in people)]
     rows = []
     for number, one in enumerate(people):
         weights = one.weights[:, : one.skeleton.num_observed]
@@ -49,6 +50,7 @@ def _facts(path: str, format: str, people: list[Tracks]) -> dict[str, Any]:
                 "frames_seen": int(seen.any(1).sum()),
                 "mean_confidence": float(weights[seen].double().mean()),
                 "unseen_share": one.unseen_share,
+                "notes": [note for note in one.notes if note not in common],
             }
         )
     return {
@@ -63,7 +65,7 @@ def _facts(path: str, format: str, people: list[Tracks]) -> dict[str, Any]:
         "bones": [list(pair) for pair in body.bones],
         "tree": body.is_tree,
         "people": rows,
-        "notes": list(dict.fromkeys(note for one in people for note in one.notes)),
+        "notes": common,
     }
 
 
@@ -77,11 +79,13 @@ def _spoken(facts: dict[str, Any]) -> str:
         f"joints: {', '.join(facts['joints'])}{virtual}",
         "person  frames seen  mean confidence  joints unseen",
     ]
+    rows = facts["people"]
     lines += [
         f"{p['person']:>6}  {p['frames_seen']:>11}  {p['mean_confidence']:>15.2f}  {100 * p['unseen_share']:>11.1f} %"
-        for p in facts["people"]
+        for p in rows
     ]
-    return "\n".join([*lines, *(f"note: {one_line(note)}" for note in facts["notes"])])
+    lines += [f"note: {one_line(note)}" for note in facts["notes"]]
+    return "\n".join([*lines, *(f"person {p['person']}: {one_line(note)}" for p in rows for note in p["notes"])])
 
 
 def view(
