@@ -1,0 +1,128 @@
+"""Read the arrays of an .npz file that nobody vouches for: no pickle, no bomb, no crash."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcs_torch.errors import FormatError
+from kcs_torch.io.registry import read_error
+
+__all__ = ["Archive"]
+
+LIMIT = 4 * 2**30  # bytes of one file's arrays, unpacked
+RATIO = 200  # unpacked over packed bytes, above which a large array is no measurement
+LARGE = 256 * 2**20
+
+
+class Archive:
+    """The arrays of an .npz file, each read when asked for.
+
+    Raises:
+        FormatError: the file is no zip archive, is cut short, or unpacks to more than 4 GiB.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            with zipfile.ZipFile(path) as archive:
+                members = archive.infolist()
+        except OSError as error:
+            raise read_error(path, error) from None
+        except Exception as error:  # zipfile raises many kinds on damaged files
+            raise FormatError(f"{path}: expected an .npz archive, got a damaged or truncated one: {error}") from None
+        self.members = {m.filename.removesuffix(".npy"): m for m in members if m.filename.endswith(".npy")}
+        for key, member in self.members.items():
+            packed = max(member.compress_size, 1)
+            if member.file_size > LIMIT or (member.file_size > LARGE and member.file_size > RATIO * packed):
+                raise FormatError(
+                    f"{path}: '{key}' unpacks from {packed} to {member.file_size} bytes: refused as a zip bomb; "
+                    "save it with np.savez if it is genuine"
+                )
+        if sum(m.file_size for m in self.members.values()) > LIMIT:
+            raise FormatError(f"{path}: its arrays unpack to more than {LIMIT // 2**30} GiB: refused; split the file")
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.members
+
+    @property
+    def keys(self) -> list[str]:
+        """Names of the arrays."""
+        return list(self.members)
+
+    def array(self, key: str, kinds: str, ndim: int | None = None) -> NDArray[Any]:
+        """Read one array.
+
+        Args:
+            key: its name.
+            kinds: the numpy kinds to admit: "f" floats, "iu" integers, "US" text, "b" truth values.
+            ndim: how many dimensions it must have; any if None.
+
+        Raises:
+            FormatError: it is missing, damaged, of another kind or shape, or holds pickled objects.
+        """
+        if key not in self.members:
+            raise FormatError(f"{self.path}: expected an array '{key}', got {', '.join(self.keys) or 'none'}")
+        try:
+            array = self._read(key)
+        except FormatError:
+            raise
+        except OSError as error:
+            raise read_error(f"{self.path}: '{key}'", error) from None
+        except Exception as error:  # zipfile, zlib and numpy raise many kinds on damaged files
+            raise FormatError(f"{self.path}: '{key}' is damaged or truncated: {error}") from None
+        if array.dtype.kind not in kinds:
+            raise FormatError(f"{self.path}: '{key}': expected {_say(kinds)}, got an array of {array.dtype}")
+        if ndim is not None and array.ndim != ndim:
+            raise FormatError(f"{self.path}: '{key}': expected {ndim} dimensions, got shape {array.shape}")
+        return array
+
+    def number(self, key: str) -> float:
+        """Read one number. Raises as :meth:`array`."""
+        return float(self._single(key, "fiu"))
+
+    def text(self, key: str) -> str:
+        """Read one string. Raises as :meth:`array`."""
+        return _decode(self._single(key, "US"))
+
+    def texts(self, key: str) -> list[str]:
+        """Read a list of strings. Raises as :meth:`array`."""
+        return [_decode(v) for v in self.array(key, "US", 1)]
+
+    def _single(self, key: str, kinds: str) -> Any:
+        array = self.array(key, kinds)
+        if array.size != 1:
+            raise FormatError(f"{self.path}: '{key}': expected one value, got shape {array.shape}")
+        return array.reshape(-1)[0]
+
+    def _read(self, key: str) -> NDArray[Any]:
+        member = self.members[key]
+        with zipfile.ZipFile(self.path) as archive:
+            with archive.open(member) as stream:
+                file = cast(BinaryIO, stream)
+                # Versions above 2 are for arrays of records, which no file of ours holds.
+                new = np.lib.format.read_magic(file) > (1, 0)
+                header = np.lib.format.read_array_header_2_0 if new else np.lib.format.read_array_header_1_0
+                shape, _, dtype = header(file)
+                start = stream.tell()
+            if dtype.hasobject:
+                raise FormatError(f"{self.path}: '{key}' holds pickled objects, which could run code: refused")
+            # Before numpy reserves what the header claims.
+            if math.prod(shape) * dtype.itemsize != member.file_size - start:
+                raise FormatError(f"{self.path}: '{key}': its size does not fit its shape {shape} of {dtype}")
+            with archive.open(member) as stream:
+                return np.lib.format.read_array(cast(BinaryIO, stream), allow_pickle=False)
+
+
+def _decode(value: Any) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _say(kinds: str) -> str:
+    names = {"f": "floating-point numbers", "i": "integers", "U": "text", "b": "truth values"}
+    return " or ".join(names[k] for k in kinds if k in names)

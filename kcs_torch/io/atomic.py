@@ -1,0 +1,78 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+
+from kcs_torch.errors import KcsError, OutputError
+
+__all__ = ["atomic_path"]
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Give a temporary path beside ``path``, which takes its place when the block ends well.
+
+    Missing parent folders are created. Whatever goes wrong, the temporary file and the folders made for it are
+    removed again, and what was at ``path`` before stays as it was. A link is followed: its target is replaced.
+
+    Raises:
+        OutputError: ``path`` is a folder or a device, or cannot be written to.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> with atomic_path(folder / "new" / "a.txt") as temporary:
+    ...     _ = temporary.write_text("whole")
+    >>> (folder / "new" / "a.txt").read_text(), len(list((folder / "new").iterdir()))
+    ('whole', 1)
+    """
+    target = _target(path)
+    made: list[Path] = []
+    # Short, so that it fits wherever the target's own name fits; the suffix tells some libraries the format.
+    temporary = target.parent / f".{secrets.token_hex(4)}{target.suffix}"
+    done = False
+    try:
+        _make_folders(target.parent, made)
+        temporary.open("xb").close()  # with the permissions that the user's umask gives, unlike the tempfile module's
+        yield temporary
+        os.replace(temporary, target)
+        done = True
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        if not done:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                for folder in reversed(made):
+                    folder.rmdir()
+
+
+def _target(path: str | Path) -> Path:
+    """The file that a path means, links followed."""
+    try:
+        target = Path(os.path.realpath(path))
+        if target.is_dir():
+            raise OutputError(f"{path}: expected the name of a file, got a folder: add a file name")
+        if target.exists() and not target.is_file():
+            raise OutputError(f"{path}: expected the name of a file, got a device or pipe, which is not replaced")
+    except KcsError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
+        raise OutputError(f"{str(path)!r}: cannot be written: {getattr(error, 'strerror', None) or error}") from None
+    return target
+
+
+def _make_folders(folder: Path, made: list[Path]) -> None:
+    """Create a folder and its parents; each one created is added to ``made`` at once."""
+    missing = []
+    while not folder.exists():
+        missing.append(folder)
+        folder = folder.parent
+    for new in reversed(missing):
+        new.mkdir()
+        made.append(new)

@@ -1,0 +1,93 @@
+"""From the arrays of a file to :class:`Tracks`, with joints matched by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcs_torch.errors import SkeletonError
+from kcs_torch.io.registry import Options
+from kcs_torch.skeleton import Skeleton, get_skeleton
+from kcs_torch.types import Tracks
+
+__all__ = ["build_tracks"]
+
+
+def build_tracks(
+    points: NDArray[Any],
+    confidence: NDArray[Any] | None,
+    options: Options,
+    *,
+    source: str,
+    names: Sequence[str] | None = None,
+    edges: Any = None,
+    skeleton: str | Skeleton | None = None,
+    fps: float | None = None,
+    units: str = "px",
+    notes: Sequence[str] = (),
+) -> Tracks:
+    """Wrap what a reader found in a file, as the caller's ``options`` want it.
+
+    Args:
+        points: (T, N, 2), NaN where unseen.
+        confidence: (T, N), or None.
+        options: of the caller; they go before what the file says.
+        source: the path.
+        names: the file's joint names.
+        edges: the file's (B, 2) bones.
+        skeleton: the file's own skeleton.
+        fps: the file's frames per second.
+        units: the file's units.
+        notes: sentences for the user.
+
+    Raises:
+        ShapeError: the numbers are no tracks.
+        SkeletonError: the joints do not fit the skeleton that the caller wants.
+    """
+    remarks = list(notes)
+    chosen = options.skeleton if options.skeleton is not None else skeleton
+    if chosen is not None:
+        body = get_skeleton(chosen)
+        if names is None and skeleton is not None:
+            own = get_skeleton(skeleton)
+            names = own.joints[: own.num_observed]
+        if names is not None and len(names) == points.shape[1]:
+            order = _order(names, body, source, remarks)
+            if order is not None:
+                points = points[:, order]
+                confidence = None if confidence is None or confidence.ndim != 2 else confidence[:, order]
+        chosen, names, edges = body, None, None
+    return Tracks.from_arrays(
+        points,
+        confidence,
+        skeleton=chosen,
+        joint_names=names,
+        edges=edges,
+        fps=options.fps if options.fps is not None else fps,
+        units=units,
+        threshold=options.threshold,
+        source=source,
+        notes=remarks,
+    )
+
+
+def _order(names: Sequence[str], body: Skeleton, source: str, notes: list[str]) -> NDArray[np.int64] | None:
+    """Where each joint of ``body`` stands among ``names``; None: take the joints in their order."""
+    wanted = body.joints[: body.num_observed]
+    if tuple(names) == wanted:
+        return None
+    where = {n: i for i, n in enumerate(names)}
+    missing = [n for n in wanted if n not in where]
+    if not missing:
+        notes.append(f"joints matched by name with skeleton '{body.name}'; {len(names) - len(wanted)} left out")
+        return np.array([where[n] for n in wanted])
+    if len(names) == len(wanted):
+        notes.append(f"joints taken in their order as those of skeleton '{body.name}': their names differ")
+        return None
+    raise SkeletonError(
+        f"{source}: expected the {len(wanted)} joints of skeleton '{body.name}', got {len(names)} joints, none of them "
+        f"named {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''}; they are {', '.join(names)}"
+    )

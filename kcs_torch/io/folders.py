@@ -1,0 +1,80 @@
+"""Files of a folder in the order that people mean: ``f2`` before ``f10``, and their frame numbers."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+__all__ = ["frame_numbers", "natural_key", "sibling_files"]
+
+_SPARSE = 20  # frames per file, above which numbers in file names are no frame numbers (time stamps, say)
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key that compares runs of digits as numbers.
+
+    >>> sorted(["f10", "f2", "f1"], key=natural_key)
+    ['f1', 'f2', 'f10']
+    """
+    parts = re.split(r"([0-9]+)", name)
+    return [(1, int(p), "") if i % 2 else (0, 0, p) for i, p in enumerate(parts)]
+
+
+def sibling_files(path: Path) -> list[Path]:
+    """The files of a folder in natural order; of a path that does not exist, those whose names begin like it.
+
+    ``shots/cam01`` and ``shots/cam01*`` both mean the files of the folder ``shots`` whose names begin with ``cam01``.
+    Hidden files are left out.
+    """
+    if path.is_dir():
+        found = list(path.iterdir())
+    elif path.exists() or not path.name or not path.parent.is_dir():
+        found = []
+    else:
+        pattern = path.name if "*" in path.name else f"{path.name}*"
+        rule = re.compile(".*".join(map(re.escape, pattern.split("*"))) + r"\Z", re.DOTALL)
+        found = [f for f in path.parent.iterdir() if rule.match(f.name)]
+    files = [f for f in found if not f.name.startswith(".") and f.is_file()]
+    return sorted(files, key=lambda f: natural_key(f.name))
+
+
+def frame_numbers(numbers: Sequence[int | None], notes: list[str]) -> list[int]:
+    """Turn the numbers of a folder's files, ascending, into frame indices that begin at 0.
+
+    Files numbered 7, 8, 10 are frames 0, 1, 3. A common step (0, 5, 10) is taken for a frame's width. What was
+    assumed is added to ``notes``.
+
+    Args:
+        numbers: the number of each file, None where its name holds none.
+        notes: sentences for the user; added to.
+
+    >>> notes = []
+    >>> frame_numbers([7, 8, 10], notes), notes
+    ([0, 1, 3], ['1 of 4 frames has no file (number 9): unseen'])
+    """
+    known = [n for n in numbers if n is not None]
+    if len(numbers) < 2:
+        return list(range(len(numbers)))
+    steps = [b - a for a, b in itertools.pairwise(known)]
+    if len(known) < len(numbers) or min(steps) < 1:
+        notes.append("the file names hold no frame numbers: frames are taken in the order of the names")
+        return list(range(len(numbers)))
+    step = math.gcd(*steps)
+    frames = [(n - known[0]) // step for n in known]
+    if frames[-1] + 1 > _SPARSE * len(frames):
+        notes.append(
+            f"the numbers of the {len(frames)} file names run from {known[0]} to {known[-1]}, too far apart for "
+            "frame numbers: frames are taken in the order of the names"
+        )
+        return list(range(len(numbers)))
+    if step > 1:
+        notes.append(f"the file names count in steps of {step}: each step is taken as one frame")
+    gaps = sorted(set(range(frames[-1] + 1)) - set(frames))
+    if gaps:
+        shown = ", ".join(str(known[0] + g * step) for g in gaps[:5]) + (", ..." if len(gaps) > 5 else "")
+        verb, plural = ("has", "") if len(gaps) == 1 else ("have", "s")
+        notes.append(f"{len(gaps)} of {frames[-1] + 1} frames {verb} no file (number{plural} {shown}): unseen")
+    return frames

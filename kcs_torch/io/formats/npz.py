@@ -1,0 +1,200 @@
+"""The native .npz: tracks in, everything out. Plain arrays, no pickle.
+
+Tracks are ``points2d`` (T, N, 2) with NaN where unseen, ``confidence`` (T, N), ``edges`` (B, 2), ``joint_names``
+(N,), ``fps`` (NaN: unknown) and ``units``; all but the first may be absent. A result adds, for the same N joints,
+``points3d`` (T, N, 3), and
+
+- ``points3d_all`` (T, M, 3) and ``joint_names_all`` (M,): with the virtual joints, which come last; ``bones`` (B, 2)
+  are (parent, child) indices into them and ``lengths`` (B,) their lengths;
+- ``cameras`` (T, 2, 3), ``scales`` (T,), ``units3d``, ``method``, and ``uncertainty`` (T, M) where there is one;
+- ``skeleton``, ``diagnostics`` and ``notes`` as JSON text.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcs_torch.errors import FormatError, KcsError
+from kcs_torch.io.archive import Archive
+from kcs_torch.io.build import build_tracks
+from kcs_torch.io.registry import Options, Probe, Reader, Writer
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.types import Diagnostics, Reconstruction, Tracks
+
+__all__ = ["READERS", "WRITERS", "load_reconstruction", "plain"]
+
+
+def recognises(probe: Probe) -> bool:
+    """Tell a zip archive of .npy files, damaged ones included, by its first member."""
+    return probe.head.startswith(b"PK\x03\x04") and b".npy" in probe.head[:512]
+
+
+def read(path: Path, options: Options) -> list[Tracks]:
+    """Read the one body's tracks of a native file."""
+    file = Archive(path)
+    if "points2d" not in file and "points3d" in file:
+        raise FormatError(
+            f"{path}: expected 2D tracks under 'points2d', got 3D motion only (points3d): "
+            "project it first, or give a file of tracks"
+        )
+    points = file.array("points2d", "fiu", 3)
+    return [
+        build_tracks(
+            points,
+            file.array("confidence", "fiub", 2) if "confidence" in file else None,
+            options,
+            source=str(path),
+            names=file.texts("joint_names") if "joint_names" in file else None,
+            edges=file.array("edges", "iu") if "edges" in file else None,
+            skeleton=_skeleton(file) if "skeleton" in file else None,
+            fps=file.number("fps") if "fps" in file else None,
+            units=file.text("units") if "units" in file else "px",
+            notes=_json(file, "notes", list) if "notes" in file else (),
+        )
+    ]
+
+
+def write(result: Reconstruction, path: Path) -> None:
+    """Write everything that a result holds, so that :func:`load_reconstruction` gives it back exactly."""
+    tracks, body = result.tracks, result.skeleton
+    n = body.num_observed
+    points, weights = plain(tracks.points), plain(tracks.weights)
+    inside = [b for b in body.bones if max(b) < n]
+    arrays: dict[str, Any] = {
+        "points2d": np.where(weights[:, :n, None] > 0, points[:, :n], np.nan),
+        "confidence": weights[:, :n],
+        "joint_names": np.array(body.joints[:n]),
+        "edges": np.array(inside, np.int64).reshape(-1, 2),
+        "fps": np.float64(math.nan if tracks.fps is None else tracks.fps),
+        "units": np.array(tracks.units),
+        "points3d": plain(result.observed),
+        "points3d_all": plain(result.points),
+        "joint_names_all": np.array(body.joints),
+        "bones": np.array(body.bones, np.int64).reshape(-1, 2),
+        "lengths": plain(result.lengths),
+        "cameras": plain(result.cameras),
+        "scales": plain(result.scales),
+        "units3d": np.array(result.units),
+        "method": np.array(result.method),
+        "source": np.array(tracks.source),
+        "skeleton": np.array(json.dumps(body.to_dict())),
+        "diagnostics": np.array(json.dumps(_diagnostics_out(result.diagnostics))),
+        "notes": np.array(json.dumps(tracks.notes)),
+    }
+    if body.virtual:
+        arrays |= {"points2d_virtual": points[:, n:], "confidence_virtual": weights[:, n:]}
+    if result.uncertainty is not None:
+        arrays["uncertainty"] = plain(result.uncertainty)
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def load_reconstruction(path: str | Path) -> Reconstruction:
+    """Read back what :func:`kcs_torch.save` wrote to an .npz file: the same numbers, bit by bit.
+
+    Args:
+        path: the file.
+
+    Raises:
+        FormatError: it is no such file.
+    """
+    probe = Probe(path)
+    if not recognises(probe):
+        raise FormatError(f"{path}: expected an .npz file that save() wrote, got something else")
+    file = Archive(probe.path)
+    wanted = ("points2d", "confidence", "points3d_all", "cameras", "scales", "lengths", "skeleton", "diagnostics")
+    missing = [k for k in wanted if k not in file]
+    if missing:
+        raise FormatError(
+            f"{path}: expected a result that save() wrote, got a file without {', '.join(missing)}; "
+            "load_tracks() reads tracks"
+        )
+    body = _skeleton(file)
+
+    def tensor(key: str, *shape: int) -> Tensor:
+        array = file.array(key, "f", len(shape))
+        if array.shape != shape or array.dtype.itemsize not in (4, 8):
+            raise FormatError(f"{path}: '{key}': expected {shape} floats, got {array.shape} of {array.dtype}")
+        return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
+
+    t, n, m = len(file.array("points2d", "f", 3)), body.num_observed, body.num_joints
+    points, weights = tensor("points2d", t, n, 2), tensor("confidence", t, n)
+    points = torch.where(weights[..., None] > 0, points, torch.zeros_like(points))
+    if body.virtual:
+        points = torch.cat([points, tensor("points2d_virtual", t, m - n, 2)], 1)
+        weights = torch.cat([weights, tensor("confidence_virtual", t, m - n)], 1)
+    if not (torch.isfinite(points).all() and (weights >= 0).all()):
+        raise FormatError(f"{path}: 'points2d': expected finite numbers wherever the confidence is above 0")
+    fps = file.number("fps") if "fps" in file else math.nan
+    tracks = Tracks(
+        points,
+        weights,
+        body,
+        None if math.isnan(fps) else fps,
+        file.text("units") if "units" in file else "px",
+        file.text("source") if "source" in file else str(path),
+        tuple(map(str, _json(file, "notes", list))) if "notes" in file else (),
+    )
+    return Reconstruction(
+        points=tensor("points3d_all", t, m, 3),
+        cameras=tensor("cameras", t, 2, 3),
+        scales=tensor("scales", t),
+        lengths=tensor("lengths", body.num_bones),
+        tracks=tracks,
+        method=file.text("method") if "method" in file else "unknown",
+        diagnostics=_diagnostics_in(file),
+        uncertainty=tensor("uncertainty", t, m) if "uncertainty" in file else None,
+        units=file.text("units3d") if "units3d" in file else "",
+    )
+
+
+def plain(tensor: Tensor) -> NDArray[Any]:
+    """A tensor of any device and dtype as an array; half precision becomes float32, which holds it exactly."""
+    tensor = tensor.detach().cpu()
+    return (tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()).numpy()
+
+
+def _skeleton(file: Archive) -> Skeleton:
+    try:
+        return Skeleton.from_dict(_json(file, "skeleton", dict), source=f"{file.path}: 'skeleton'")
+    except KcsError as error:
+        raise FormatError(str(error)) from None
+
+
+def _json(file: Archive, key: str, kind: type) -> Any:
+    try:
+        value = json.loads(file.text(key))
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise FormatError(f"{file.path}: '{key}': expected JSON text, got {error}") from None
+    if not isinstance(value, kind):
+        raise FormatError(f"{file.path}: '{key}': expected a JSON {kind.__name__}, got {type(value).__name__}")
+    return value
+
+
+def _diagnostics_out(diagnostics: Diagnostics) -> dict[str, Any]:
+    """As JSON holds it, which has no NaN: null instead."""
+    values = dataclasses.asdict(diagnostics)
+    return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}
+
+
+def _diagnostics_in(file: Archive) -> Diagnostics:
+    values = _json(file, "diagnostics", dict)
+    known = {f.name: values[f.name] for f in dataclasses.fields(Diagnostics) if f.name in values}
+    known = {k: math.nan if v is None else tuple(v) if isinstance(v, list) else v for k, v in known.items()}
+    try:
+        return Diagnostics(**known)
+    except TypeError as error:
+        raise FormatError(f"{file.path}: 'diagnostics': {error}") from None
+
+
+READERS = (Reader("npz", "native .npz: points2d, and confidence, edges, joint_names, fps, units", recognises, read),)
+WRITERS = (Writer(".npz", "native .npz: everything, exactly; readable again as tracks and as a result", write),)

@@ -1,0 +1,88 @@
+"""Results as text: .csv for spreadsheets and pandas, .json for other programs. All joints, virtual ones last."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from kcs_torch.io.formats.npz import plain
+from kcs_torch.io.registry import Writer
+from kcs_torch.types import Reconstruction
+
+__all__ = ["WRITERS"]
+
+
+def write_csv(result: Reconstruction, path: Path) -> None:
+    """Write one row a frame: ``frame, time [s], nose_x [px], nose_y [px], nose_z [px], ...``.
+
+    ``time [s]`` is empty where the frame rate is unknown.
+    """
+    points = plain(result.points)
+    header = ["frame", "time [s]"]
+    header += [f"{_cell(joint)}_{axis} [{result.units}]" for joint in result.skeleton.joints for axis in "xyz"]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        for frame, row in enumerate(points.reshape(len(points), -1).tolist()):
+            time = f"{frame / result.fps:.6g}" if result.fps else ""
+            writer.writerow([frame, time, *(f"{v:.9g}" for v in row)])
+
+
+def write_json(result: Reconstruction, path: Path) -> None:
+    """Write one object with the keys of the native .npz, but ``points3d``, ``joint_names`` and ``edges`` of all joints.
+
+    Numbers have 9 significant digits; what is not a number is null.
+    """
+    body = result.skeleton
+    data = {
+        "method": result.method,
+        "units": result.units,
+        "fps": result.fps,
+        "joint_names": list(body.joints),
+        "num_observed": body.num_observed,
+        "edges": [list(b) for b in body.bones],
+        "points3d": _listed(result.points),
+        "lengths": _listed(result.lengths),
+        "cameras": _listed(result.cameras),
+        "scales": _listed(result.scales),
+        "uncertainty": None if result.uncertainty is None else _listed(result.uncertainty),
+        "skeleton": body.to_dict(),
+        "diagnostics": _finite(dataclasses.asdict(result.diagnostics)),
+        "notes": list(result.tracks.notes),
+        "source": result.tracks.source,
+    }
+    path.write_text(json.dumps(data, allow_nan=False), encoding="utf-8")
+
+
+def _cell(name: str) -> str:
+    """A name that no spreadsheet takes for a formula: names come from files that others wrote."""
+    return f"'{name}" if name.startswith(("=", "+", "-", "@", "\t", "\r")) else name
+
+
+def _listed(tensor: Tensor) -> Any:
+    """Nested lists of a tensor's numbers, to 9 significant digits."""
+    array = plain(tensor)
+    short = np.array([float(f"{v:.9g}") for v in array.ravel().tolist()], object).reshape(array.shape)
+    return _finite(short.tolist())
+
+
+def _finite(value: Any) -> Any:
+    """The same nest with None for what is not finite, which JSON cannot say."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+WRITERS = (
+    Writer(".csv", "one row a frame: frame, time, and x, y, z of each joint", write_csv),
+    Writer(".json", "joints, bones, 3D points, cameras, lengths and diagnostics", write_json),
+)

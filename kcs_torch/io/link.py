@@ -1,0 +1,147 @@
+"""Follow people over frames, where a detector lists them in a different order in each frame.
+
+Frame by frame, the detections are assigned to the people seen so far so that the sum of distances is least. A
+person's pose is carried on at constant velocity, so that two who cross keep their names, and stays open for a while
+after it was last seen, so that a gap does not make two people of one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["link_people"]
+
+Array = NDArray[np.float64]
+
+_REACH = 0.5  # distance, in sizes of the person, beyond which a detection is somebody else ...
+_REACH_GROWTH = 0.05  # ... and by how much that grows with each frame of a gap ...
+_REACH_MOST = 1.0  # ... up to this
+_MISSING = 0.3  # cost of a detection that shows none of the joints last seen; keeps partial doubles from winning
+_YOUNG = 0.1  # cost of a person seen in fewer frames than ...
+_YOUNG_FRAMES = 5  # ... this, so that a ghost does not take over from somebody known
+_SIZE = 0.2  # cost of a size that differs by a factor of e
+_VELOCITY = 0.4  # share of the newest displacement in the running velocity
+_COAST = 0.9  # the velocity fades by this factor with each frame of a gap
+_BIG = 1e6
+
+
+@dataclass
+class _Person:
+    """Somebody seen so far: pose at the last sight, and how it moves on."""
+
+    pose: Array  # (N, 3) last seen place of each joint, and its confidence, which fades while it is unseen
+    size: float
+    frame: int  # when last seen
+    velocity: Array  # (2,) of the whole body, per frame
+    seen: list[tuple[int, int]]  # (frame, index among its detections)
+
+
+def link_people(detections: Sequence[Array], *, max_gap: int = 30) -> list[Array]:
+    """Link the detections of each frame into one track a person.
+
+    Args:
+        detections: for each of T frames an array (P, N, 3) of P people's joints as (x, y, confidence); P may differ
+            from frame to frame and be 0. Joints of confidence 0 are unseen.
+        max_gap: frames after which somebody unseen who comes back counts as somebody new.
+
+    Returns:
+        One array (T, N, 3) a person, zero where unseen; the most seen (sum of confidences) first. Nothing is dropped:
+        short-lived ghosts come last.
+
+    >>> still, moving = np.array([[0.0, 0, 1], [0, 9, 1]]), np.array([[50.0, 0, 1], [50, 9, 1]])
+    >>> step = np.array([1.0, 0, 0])
+    >>> a, b = link_people([np.stack([still, moving]), np.stack([moving + step, still])])
+    >>> a[:, 0, 0].tolist(), b[:, 0, 0].tolist()
+    ([0.0, 0.0], [50.0, 51.0])
+    """
+    people: list[_Person] = []
+    open_people: list[_Person] = []
+    for t, found in enumerate(detections):
+        visible = np.flatnonzero((found[..., 2] > 0).any(-1)) if len(found) else np.zeros(0, int)
+        open_people = [p for p in open_people if t - p.frame <= max_gap]
+        taken = _assign(open_people, found[visible], t) if len(visible) else {}
+        for k, index in enumerate(visible):
+            person = taken.get(k)
+            if person is None:
+                person = _Person(found[index].copy(), _sizes(found[index][None])[0], t, np.zeros(2), [(t, int(index))])
+                people.append(person)
+                open_people.append(person)
+            else:
+                _update(person, found[index], t)
+                person.seen.append((t, int(index)))
+    tracks = []
+    for person in people:
+        shape = detections[person.seen[0][0]].shape[1:]
+        track = np.zeros((len(detections), *shape))
+        for t, index in person.seen:
+            track[t] = detections[t][index]
+        tracks.append(track)
+    return sorted(tracks, key=lambda a: -float(a[..., 2].sum()))
+
+
+def _assign(people: list[_Person], found: Array, frame: int) -> dict[int, _Person]:
+    """Who each detection (P, N, 3) is; those who are nobody known are left out."""
+    if not people:
+        return {}
+    gap = np.array([frame - p.frame for p in people], float)
+    drift = np.array([p.velocity for p in people]) * ((1 - _COAST**gap) / (1 - _COAST))[:, None]
+    poses = np.array([p.pose for p in people])
+    where = poses[..., :2] + drift[:, None]  # (K, N, 2)
+    size = np.array([p.size for p in people])
+    own = _sizes(found)
+    scale = np.maximum(size[:, None], own[None])  # (K, P)
+    reach = np.minimum(_REACH + _REACH_GROWTH * (gap - 1), _REACH_MOST)[:, None]
+
+    joint = np.linalg.norm(where[:, None] - found[None, ..., :2], axis=-1) / scale[..., None]  # (K, P, N)
+    weight = np.minimum(poses[:, None, :, 2], found[None, ..., 2])
+    total = weight.sum(-1)
+    # A joint may be far off (left and right confused, say) without making somebody else of the person.
+    distance = (np.minimum(joint, 2 * reach[..., None]) * weight).sum(-1) / np.maximum(total, 1e-9)
+    apart = np.linalg.norm(_centres(poses)[:, None] + drift[:, None] - _centres(found)[None], axis=-1) / scale
+    distance = np.where(total > 0, distance, apart)
+    covered = total / np.maximum(poses[..., 2].sum(-1), 1e-9)[:, None]
+    cost = distance + _MISSING * (1 - np.minimum(covered, 1))
+    cost += _SIZE * np.abs(np.log(size[:, None] / own[None]))
+    cost += _YOUNG * np.array([len(p.seen) < _YOUNG_FRAMES for p in people])[:, None]
+
+    cost = np.where(distance < reach, cost, _BIG)
+    if cost.shape == (1, 1):
+        pairs = [(0, 0)]
+    else:
+        from scipy.optimize import linear_sum_assignment
+
+        pairs = list(zip(*linear_sum_assignment(cost), strict=True))
+    return {int(p): people[int(k)] for k, p in pairs if cost[k, p] < _BIG}
+
+
+def _update(person: _Person, found: Array, frame: int) -> None:
+    """Move somebody to where they were found."""
+    seen = found[:, 2] > 0
+    gap = frame - person.frame
+    both = np.minimum(person.pose[:, 2], found[:, 2])
+    if both.sum() > 0:
+        step = ((found[:, :2] - person.pose[:, :2]) * both[:, None]).sum(0) / both.sum() / gap
+        person.velocity = step if len(person.seen) == 1 else (1 - _VELOCITY) * person.velocity + _VELOCITY * step
+    moved = person.pose[:, :2] + person.velocity * gap  # a joint that is unseen now moves with the body ...
+    faded = person.pose[:, 2] * 0.9**gap  # ... and counts less and less
+    person.pose = np.where(seen[:, None], found, np.column_stack([moved, faded]))
+    person.size = 0.8 * person.size + 0.2 * _sizes(found[None])[0] if seen.sum() > 1 else person.size
+    person.frame = frame
+
+
+def _centres(poses: Array) -> Array:
+    """Weighted mean of the joints: (K, N, 3) -> (K, 2)."""
+    weight = poses[..., 2:]
+    return (poses[..., :2] * weight).sum(1) / np.maximum(weight.sum(1), 1e-9)
+
+
+def _sizes(poses: Array) -> Array:
+    """Diagonal of the box around the seen joints: (K, N, 3) -> (K,), at least 1e-6."""
+    seen = poses[..., 2:] > 0
+    high = np.where(seen, poses[..., :2], -np.inf).max(1)
+    low = np.where(seen, poses[..., :2], np.inf).min(1)
+    return np.maximum(np.linalg.norm(high - low, axis=-1), 1e-6)

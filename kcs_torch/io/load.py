@@ -1,0 +1,136 @@
+"""Read tracks from a path: find out its format, read everybody in it, choose one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+from kcs_torch.errors import FormatError, OptionError, unknown
+from kcs_torch.io.registry import Options, Probe, Reader, discover
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.types import Tracks
+
+__all__ = ["READERS", "WRITERS", "detect_format", "load_people", "load_tracks"]
+
+READERS, WRITERS = discover()
+
+
+def detect_format(path: str | Path) -> str:
+    """Tell the format of a file or folder from its content; a name in ``READERS``.
+
+    Raises:
+        FormatError: nothing is there, it is empty, or no reader recognises it.
+    """
+    probe = Probe(path)
+    found = [reader.name for reader in READERS.values() if reader.recognises(probe)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise FormatError(f"{path}: may be {' or '.join(found)}: say which with format=...")
+    raise FormatError(f"{path}: expected tracks in one of the formats {', '.join(READERS)}, got {_describe(probe)}")
+
+
+def load_people(
+    path: str | Path,
+    *,
+    format: str | None = None,
+    skeleton: str | Path | Skeleton | None = None,
+    fps: float | None = None,
+    threshold: float = 0.3,
+) -> list[Tracks]:
+    """Read the tracks of everybody in a file or folder, the most seen (sum of weights) first.
+
+    Args:
+        path: a file, a folder of files, or the beginning of the names of a folder's files (``shots/cam01``).
+        format: a name in ``kcs_torch.io.READERS``; found by content if None.
+        skeleton: a :class:`Skeleton`, a built-in name or a YAML/JSON file; as the file says if None. Joints are
+            matched by name where the file names them, by their order otherwise.
+        fps: frames per second; as the file says if None.
+        threshold: a joint with less confidence counts as unseen, 0..1.
+
+    Returns:
+        At least one :class:`Tracks`; all have the same number of frames.
+
+    Raises:
+        FormatError: the path cannot be read as tracks.
+        ShapeError: its numbers are no tracks (infinite, negative confidence, nothing seen).
+        SkeletonError: the joints do not fit the skeleton.
+        OptionError: an option is unknown or out of range.
+    """
+    if format is not None and format not in READERS:
+        raise unknown("format", format, READERS)
+    if not 0 <= threshold <= 1:
+        raise OptionError(f"threshold: expected a number from 0 to 1, got {threshold}")
+    if fps is not None and not 0 < fps < float("inf"):
+        raise OptionError(f"fps: expected a positive number or None, got {fps}")
+    probe = Probe(path)
+    reader: Reader = READERS[detect_format(path) if format is None else format]
+    people = reader.read(probe.path, Options(skeleton, fps, threshold))
+    return sorted(people, key=_amount_seen, reverse=True)
+
+
+def load_tracks(
+    path: str | Path,
+    *,
+    format: str | None = None,
+    person: int | None = None,
+    skeleton: str | Path | Skeleton | None = None,
+    fps: float | None = None,
+    threshold: float = 0.3,
+) -> Tracks:
+    """Read one person's tracks from a file or folder. Arguments as of :func:`load_people`.
+
+    Args:
+        path: a file, a folder of files, or the beginning of the names of a folder's files.
+        format: a name in ``kcs_torch.io.READERS``; found by content if None.
+        person: which one, counted from 0 in the order of :func:`load_people`; the most seen if None.
+        skeleton: a :class:`Skeleton`, a built-in name or a YAML/JSON file; as the file says if None.
+        fps: frames per second; as the file says if None.
+        threshold: a joint with less confidence counts as unseen, 0..1.
+
+    Returns:
+        The tracks; ``notes`` say what was assumed.
+
+    Raises:
+        FormatError: the path cannot be read as tracks, or holds fewer people.
+        ShapeError: its numbers are no tracks (infinite, negative confidence, nothing seen).
+        SkeletonError: the joints do not fit the skeleton.
+        OptionError: an option is unknown or out of range.
+    """
+    if person is not None and (isinstance(person, bool) or not isinstance(person, int) or person < 0):
+        raise OptionError(f"person: expected None or a number from 0, got {person!r}")
+    people = load_people(path, format=format, skeleton=skeleton, fps=fps, threshold=threshold)
+    if person is not None:
+        if person >= len(people):
+            some = "1 person" if len(people) == 1 else f"{len(people)} people"
+            raise FormatError(f"{path}: expected a person number {person} (counted from 0), got {some}")
+        return people[person]
+    if len(people) == 1:
+        return people[0]
+    note = f"{len(people)} people found: this is the most seen one, number 0"
+    return replace(people[0], notes=(*people[0].notes, note))
+
+
+def _amount_seen(tracks: Tracks) -> float:
+    return float(tracks.weights[:, : tracks.skeleton.num_observed].double().sum())
+
+
+def _describe(probe: Probe) -> str:
+    """What a path that no reader recognises holds, in a few words."""
+    if probe.files:
+        suffixes = sorted({f.suffix or f.name for f in probe.files})
+        shown = ", ".join(suffixes[:5]) + (", ..." if len(suffixes) > 5 else "")
+        kind = "a folder without tracks" if probe.is_folder else "files without tracks"
+        return f"{kind} ({len(probe.files)} files: {shown})"
+    if probe.suffix == ".json":
+        try:
+            json.loads(probe.path.read_bytes())
+        except RecursionError:
+            return "JSON that is nested too deeply"
+        except (OSError, ValueError) as error:
+            return f"text that is not JSON ({error})"
+        return "JSON with other content"
+    if probe.head.startswith((b"\x89HDF", b"PK\x03\x04", b"\x80")):
+        return "a binary file with other content"
+    return f"a file that begins with {probe.head[:16]!r}"
