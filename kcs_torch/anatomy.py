@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 from kcs_torch.errors import SkeletonError, unknown
 
-__all__ = ["canonical_name", "mirror_name", "side_of", "template_by_names"]
+__all__ = ["canonical_name", "mirror_name", "places_by_names", "side_of", "template_by_names"]
 
 Point = tuple[float, float, float]
 
@@ -243,6 +243,34 @@ def template_by_names(kind: str, names: Sequence[str]) -> tuple[Point, ...]:
     """
     if kind not in ("human", "hand"):
         raise unknown("template", kind, ["human", "hand"], SkeletonError)
+    if kind == "hand":
+        return _place_hand(_known_parts(kind, names))
+    out = []
+    for side, place in places_by_names(names):
+        x, height, forward = _CENTRE[place] if side == "centre" else _LEFT[place]
+        y = round(_CENTRE["midhip"][1] - height, 6)
+        out.append((-x if side == "right" else x, y, -forward if forward else 0.0))
+    return tuple(out)
+
+
+def places_by_names(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Return (side, place) of each joint of a person, after its neighbours have been looked at.
+
+    Raises:
+        SkeletonError: as :func:`template_by_names`.
+
+    >>> places_by_names(["LeftUpLeg", "LeftLeg", "LeftFoot", "Hips"])
+    [('left', 'hip'), ('left', 'knee'), ('left', 'ankle'), ('centre', 'midhip')]
+    """
+    parts = _known_parts("human", names)
+    present = {part for _, part in parts}
+    if not any(side != "centre" and part not in _FACE for side, part in parts):
+        raise SkeletonError("template 'human': expected a joint of an arm or a leg; a head alone may be any animal's")
+    return [(side, _resolve(part, side, present)) for side, part in parts]
+
+
+def _known_parts(kind: str, names: Sequence[str]) -> list[tuple[str, str]]:
+    """(side, part) of every joint; all must be known."""
     parts = [(side_of(n), _part(n, kind)) for n in names]
     strange = [n for n, (_, part) in zip(names, parts, strict=True) if part is None]
     if strange:
@@ -250,18 +278,7 @@ def template_by_names(kind: str, names: Sequence[str]) -> tuple[Point, ...]:
             f"template '{kind}': expected joints of a {kind}, got {', '.join(map(repr, strange))}. "
             "Rename them, or give a position for every joint."
         )
-    if kind == "hand":
-        return _place_hand([(side, part or "") for side, part in parts])
-    present = {part or "" for _, part in parts}
-    if not any(side != "centre" and part not in _FACE for side, part in parts):
-        raise SkeletonError("template 'human': expected a joint of an arm or a leg; a head alone may be any animal's")
-    out = []
-    for side, part in parts:
-        place = _resolve(part or "", side, present)
-        x, height, forward = _CENTRE[place] if side == "centre" else _LEFT[place]
-        y = round(_CENTRE["midhip"][1] - height, 6)
-        out.append((-x if side == "right" else x, y, -forward if forward else 0.0))
-    return tuple(out)
+    return [(side, part or "") for side, part in parts]
 
 
 def _resolve(part: str, side: str, present: set[str]) -> str:
