@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kcs_torch.anatomy import mirror_name, side_of
-from kcs_torch.errors import FormatError, SkeletonError
+from kcs_torch.errors import FormatError, KcsError, SkeletonError
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -169,6 +169,8 @@ def test_graphs_are_admitted_when_asked_for():
             lambda: Skeleton.from_names(["a", "b", "c"], [("a", "b"), ("b", "c")], flexible=[("a", "c")]),
             "expected bones",
         ),
+        (lambda: Skeleton.from_edges([[0, math.nan]], 3), "expected pairs of joint indices"),
+        (lambda: Skeleton.from_edges([[0, 1.5]], 3), "expected pairs of joint indices"),
         (lambda: Skeleton.from_edges([[0, 1, 2]], 3), "expected pairs of joint indices"),
         (lambda: ARM.index("elbw"), "did you mean 'elbow'"),
         (lambda: ARM.template_points(), "has no template"),
@@ -343,11 +345,14 @@ def test_one_more_bone_closes_a_chain(body, data):
         ("", FormatError, "expected a mapping"),
         ("joints: [a, b\n", FormatError, "does not parse"),
         ("joints: [a, b]\nbones: [[a, c]]\n", SkeletonError, "arm.yaml: unknown joint in bones"),
-        ("joints: [a, b]\nbones: [3]\n", FormatError, "arm.yaml"),
+        ("joints: [a, b]\nbones: [3]\n", SkeletonError, "arm.yaml.*expected pairs"),
         ("joints: [a, b]\nbones: [[a, b]]\ntemplate: {a: [0, 0, 0], b: here}\n", FormatError, "arm.yaml"),
         ("joints: [a, b]\nbones: [[a, b]]\ntemplate: {a: [0, 0, 0], b: [1]}\n", SkeletonError, "3 finite numbers"),
         ("joints: [a, b]\nbones: [[a, b]]\nproportions: 3\n", FormatError, "arm.yaml"),
         ("joints: [a, b]\nbones: [[a, b]]\nvirtual: [c]\n", FormatError, "arm.yaml"),
+        ("joints: [a, b]\nbones: [{a: 1, b: 2}]\n", SkeletonError, "expected pairs of joint names"),
+        ("joints: [a, b]\nbones: [[a, b]]\nname: [a]\n", FormatError, "name: expected a str"),
+        ("joints: [a, b]\nbones: [[a, b]]\ntree: 3\n", FormatError, "tree: expected a bool"),
         ("joints: [a]\nbones: []\n", SkeletonError, "arm.yaml: .*at least 2 joints"),
     ],
 )
@@ -356,6 +361,29 @@ def test_bad_files(tmp_path, text, error, message):
     file.write_text(text)
     with pytest.raises(error, match=message):
         Skeleton.load(file)
+
+
+LEAVES = st.none() | st.booleans() | st.integers(-3, 5) | st.floats() | st.sampled_from(["a", "b", "c", "human", ""])
+VALUES = st.recursive(
+    LEAVES,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["a", "b", "a-b"]), inner, max_size=3),
+    max_leaves=8,
+)
+OPTIONAL = ("name", "mirror", "virtual", "template", "proportions", "flexible", "tree")
+
+
+@given(
+    st.fixed_dictionaries(
+        {"joints": st.just(["a", "b"]) | VALUES, "bones": st.just([["a", "b"]]) | VALUES},
+        optional=dict.fromkeys(OPTIONAL, VALUES),
+    )
+)
+def test_wild_mappings_give_a_skeleton_or_one_of_our_errors(data):
+    try:
+        body = Skeleton.from_dict(data)
+    except KcsError:
+        return
+    assert Skeleton.from_dict(body.to_dict()) == body and hash(body) is not None
 
 
 def test_unreadable_files(tmp_path):

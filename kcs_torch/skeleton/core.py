@@ -149,7 +149,7 @@ class Skeleton:
         names = tuple(f"joint{i}" for i in range(joints)) if isinstance(joints, int) else tuple(map(str, joints))
         pairs = []
         for edge in edges:
-            if len(edge) != 2:
+            if len(edge) != 2 or not all(float(e).is_integer() for e in edge):
                 raise SkeletonError(f"edges of skeleton '{name}': expected pairs of joint indices, got {edge!r}")
             pairs.append((int(edge[0]), int(edge[1])))
         plain = cls(joints=names, bones=tuple(pairs), name=name, tree=tree)
@@ -181,6 +181,9 @@ class Skeleton:
         for key in ("joints", "bones"):
             if not isinstance(data.get(key), (list, tuple)):
                 raise FormatError(f"{source}: expected a list under '{key}', got {type(data.get(key)).__name__}")
+        for key, kind in (("name", str), ("tree", bool)):
+            if not isinstance(data.get(key), (kind, type(None))):
+                raise FormatError(f"{source}: {key}: expected a {kind.__name__}, got {data[key]!r}")
         options = {k: v for k, v in data.items() if k not in ("joints", "bones") and v is not None}
         try:
             return cls.from_names(data["joints"], data["bones"], **options)

@@ -39,7 +39,7 @@ def arguments(
     def pairs(items: Iterable[tuple[str, str]], what: str) -> tuple[Pair, ...]:
         out = []
         for item in items:
-            if isinstance(item, str) or len(item) != 2:
+            if not isinstance(item, (list, tuple)) or len(item) != 2:
                 raise SkeletonError(f"{what} of skeleton '{name}': expected pairs of joint names, got {item!r}")
             out.append((at(item[0], what), at(item[1], what)))
         return tuple(out)
