@@ -1,0 +1,67 @@
+"""What can go wrong, said in the user's words.
+
+Every error that bad input causes is a :class:`KcsError`, which is a ``ValueError``. Messages read
+*what: expected ..., got ...* and end with the fix.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+__all__ = [
+    "ConvergenceWarning",
+    "FormatError",
+    "KcsError",
+    "KcsWarning",
+    "OptionError",
+    "OutputError",
+    "ShapeError",
+    "SkeletonError",
+    "unknown",
+]
+
+
+class KcsError(ValueError):
+    """Base of every error that this library raises for bad input."""
+
+
+class ShapeError(KcsError):
+    """An array has the wrong shape, type or values."""
+
+
+class SkeletonError(KcsError):
+    """A skeleton is inconsistent, unknown, or does not fit the tracks."""
+
+
+class FormatError(KcsError):
+    """A file cannot be read as the format it claims or seems to be."""
+
+
+class OptionError(KcsError):
+    """An option, method or field name is unknown, or its value is out of range."""
+
+
+class OutputError(KcsError):
+    """A result cannot be written to where it was asked to go."""
+
+
+class KcsWarning(UserWarning):
+    """Base of the warnings of this library."""
+
+
+class ConvergenceWarning(KcsWarning):
+    """An iteration stopped at its limit before it converged; the result says ``converged=False``."""
+
+
+def unknown(what: str, name: object, choices: Iterable[str], error: type[KcsError] = OptionError) -> KcsError:
+    """Build the error for a name that is not among ``choices``; it suggests the nearest ones.
+
+    >>> str(unknown("method", "sfma", ["kcs", "sfam"]))
+    "unknown method 'sfma': did you mean 'sfam'? (choices: kcs, sfam)"
+    """
+    choices = sorted(choices)
+    close = difflib.get_close_matches(str(name), choices, n=2)
+    hint = f": did you mean {' or '.join(repr(c) for c in close)}?" if close else ":"
+    listing = f"(choices: {', '.join(choices)})" if close else f"choices are {', '.join(choices)}"
+    return error(f"unknown {what} {name!r}{hint} {listing}")

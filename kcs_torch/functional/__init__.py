@@ -1,0 +1,51 @@
+"""The mathematics: plain functions of tensors with any leading batch dimensions."""
+
+from kcs_torch.functional.align import centre, nearest_rotation, procrustes, similarity
+from kcs_torch.functional.camera import (
+    back_project,
+    complete_rotation,
+    factorize,
+    orthonormality_defect,
+    project,
+    rows_to_cameras,
+    viewpoint_turn,
+)
+from kcs_torch.functional.chain import (
+    bone_lengths,
+    bone_vectors,
+    chain_inverse,
+    incidence,
+    kcs_matrix,
+    points_from_bones,
+)
+from kcs_torch.functional.spectral import dct_basis, log_det, nuclear_norm, psd_shrink, singular_values, svt
+from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
+
+__all__ = [
+    "back_project",
+    "blend_windows",
+    "bone_lengths",
+    "bone_vectors",
+    "centre",
+    "chain_inverse",
+    "complete_rotation",
+    "dct_basis",
+    "factorize",
+    "incidence",
+    "interpolate",
+    "kcs_matrix",
+    "log_det",
+    "nearest_rotation",
+    "nuclear_norm",
+    "orthonormality_defect",
+    "points_from_bones",
+    "procrustes",
+    "project",
+    "psd_shrink",
+    "rows_to_cameras",
+    "similarity",
+    "singular_values",
+    "svt",
+    "viewpoint_turn",
+    "window_starts",
+]

@@ -1,0 +1,100 @@
+"""Alignment of point sets: Procrustes rotations with batch dimensions (Kabsch 1976, Umeyama 1991)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ShapeError
+
+__all__ = ["centre", "nearest_rotation", "procrustes", "similarity"]
+
+
+def centre(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Subtract the weighted mean over joints.
+
+    Args:
+        points: (..., N, D).
+        weights: (..., N), 0 where a joint does not count; all 1 where None. All-zero weights give the mean 0.
+
+    Returns:
+        centred points (..., N, D) and the mean (..., 1, D).
+    """
+    if weights is None:
+        mean = points.mean(-2, keepdim=True)
+    else:
+        total = weights.sum(-1)[..., None, None]
+        mean = (points * weights[..., None]).sum(-2, keepdim=True) / torch.where(total > 0, total, torch.ones_like(total))
+    return points - mean, mean
+
+
+def nearest_rotation(matrix: Tensor, *, reflect: bool = False) -> Tensor:
+    """Return the rotation Q that maximises trace(Q^T matrix): the polar factor, of determinant 1.
+
+    Args:
+        matrix: (..., D, D).
+        reflect: True also admits reflections.
+
+    Returns:
+        (..., D, D), orthogonal. Not meant to be differentiated where singular values coincide.
+    """
+    u, _, vt = torch.linalg.svd(matrix)
+    if not reflect:
+        sign = torch.linalg.det(u @ vt).sign()
+        u = torch.cat([u[..., :-1], u[..., -1:] * sign[..., None, None]], -1)
+    return u @ vt
+
+
+def procrustes(
+    source: Tensor, target: Tensor, weights: Tensor | None = None, *, reflect: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Return the rotation Q that minimises sum_n w_n |source_n Q - target_n|^2 for centred point sets.
+
+    Args:
+        source: (..., N, D), centred.
+        target: (..., N, D), centred.
+        weights: (..., N) or None.
+        reflect: True also admits reflections.
+
+    Returns:
+        Q (..., D, D), and the least-squares scale (...), so that ``scale * source @ Q`` is nearest to ``target``.
+
+    Raises:
+        ShapeError: the shapes differ.
+
+    >>> X = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 2, 0], [0, -2, 0]])
+    >>> Q, scale = procrustes(X, 2 * X)
+    >>> torch.allclose(Q, torch.eye(3)), round(scale.item(), 5)
+    (True, 2.0)
+    """
+    if source.shape[-2:] != target.shape[-2:]:
+        raise ShapeError(f"procrustes: expected equal shapes, got {tuple(source.shape)} and {tuple(target.shape)}")
+    left = source if weights is None else source * weights[..., None]
+    rotation = nearest_rotation(left.mT @ target, reflect=reflect)
+    size = (left * source).sum((-2, -1))
+    overlap = ((left @ rotation) * target).sum((-2, -1))
+    return rotation, overlap / torch.where(size > 0, size, torch.ones_like(size))
+
+
+def similarity(source: Tensor, target: Tensor, *, sequence: bool = False, scale: bool = True, reflect: bool = False) -> Tensor:
+    """Return ``source`` moved onto ``target`` by rotation, translation and optionally scale.
+
+    Args:
+        source: (..., T, N, D).
+        target: (..., T, N, D).
+        sequence: True fits one rotation and scale to all frames together (frames are still centred one by one);
+            False fits each frame.
+        scale: False keeps the source's size.
+        reflect: True also admits reflections.
+
+    Returns:
+        (..., T, N, D).
+    """
+    a, _ = centre(source)
+    b, mean = centre(target)
+    flat = (lambda x: x.flatten(-3, -2)) if sequence else (lambda x: x)
+    rotation, factor = procrustes(flat(a), flat(b), reflect=reflect)
+    if sequence:
+        rotation, factor = rotation[..., None, :, :], factor[..., None]
+    moved = a @ rotation
+    return (moved * factor[..., None, None] if scale else moved) + mean

@@ -1,0 +1,118 @@
+"""Weak-perspective cameras: projection, its adjoint, factorisation and the metric upgrade."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ShapeError
+from kcs_torch.functional.align import nearest_rotation
+
+__all__ = [
+    "back_project",
+    "complete_rotation",
+    "factorize",
+    "orthonormality_defect",
+    "project",
+    "rows_to_cameras",
+    "viewpoint_turn",
+]
+
+
+def project(points: Tensor, cameras: Tensor) -> Tensor:
+    """Return R_t X_t: points (..., T, N, 3) seen by camera rows (..., T, 2, 3), as (..., T, N, 2).
+
+    >>> project(torch.tensor([[[1.0, 2, 3]]]), torch.eye(3)[None, :2]).tolist()
+    [[[1.0, 2.0]]]
+    """
+    return points @ cameras.mT
+
+
+def back_project(tracks: Tensor, cameras: Tensor) -> Tensor:
+    """Return R_t^T w_t, the adjoint of :func:`project`: (..., T, N, 2) to (..., T, N, 3)."""
+    return tracks @ cameras
+
+
+def complete_rotation(cameras: Tensor) -> Tensor:
+    """Append the viewing direction r1 x r2 to camera rows.
+
+    Args:
+        cameras: (..., 2, 3), orthonormal rows.
+
+    Returns:
+        (..., 3, 3) rotations, world to camera.
+    """
+    return torch.cat([cameras, torch.linalg.cross(cameras[..., :1, :], cameras[..., 1:, :])], -2)
+
+
+def factorize(tracks: Tensor, rank: int) -> tuple[Tensor, Tensor]:
+    """Return motion M and shape S with ``stack(tracks) ~ M @ S``, the best of the given rank (Tomasi, Kanade 1992).
+
+    Args:
+        tracks: (..., T, N, 2), centred per frame.
+        rank: at most min(2T, N).
+
+    Returns:
+        M (..., T, 2, rank) whose columns carry the singular values, in falling order, and S (..., rank, N) with
+        orthonormal rows.
+
+    Raises:
+        ShapeError: the rank is out of range.
+    """
+    frames, joints = tracks.shape[-3:-1]
+    if not 1 <= rank <= min(2 * frames, joints):
+        raise ShapeError(f"factorize: expected a rank within 1..{min(2 * frames, joints)}, got {rank}")
+    stacked = tracks.mT.flatten(-3, -2)  # (..., 2T, N), rows x1, y1, x2, y2, ...
+    if stacked.shape[-2] >= joints:
+        _, vectors = torch.linalg.eigh(stacked.mT @ stacked)
+        shape = vectors.flip(-1)[..., :rank].mT
+    else:
+        shape = torch.linalg.svd(stacked, full_matrices=False)[2][..., :rank, :]
+    motion = stacked @ shape.mT
+    return motion.unflatten(-2, (frames, 2)), shape
+
+
+def orthonormality_defect(rows: Tensor) -> Tensor:
+    """Return how far row pairs are from equal length and right angle: ((a.a - b.b)/2)^2 + (a.b)^2.
+
+    Args:
+        rows: (..., 2, 3) pairs a, b; scaled by the root of the defect's dimension, length^4.
+
+    Returns:
+        (...).
+    """
+    a, b = rows[..., 0, :], rows[..., 1, :]
+    return ((a.square().sum(-1) - b.square().sum(-1)) / 2).square() + (a * b).sum(-1).square()
+
+
+def rows_to_cameras(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the nearest orthonormal camera rows and the scale of each frame.
+
+    Args:
+        rows: (..., 2, 3), any pair of rows.
+
+    Returns:
+        cameras (..., 2, 3) with orthonormal rows and scales (...), non-negative: ``rows ~ scale * cameras``.
+        Rows that vanish or are parallel give an arbitrary valid camera.
+    """
+    square = torch.cat([rows, torch.zeros_like(rows[..., :1, :])], -2)
+    cameras = nearest_rotation(square, reflect=True)[..., :2, :]
+    return cameras, (rows * cameras).sum((-2, -1)) / 2
+
+
+def viewpoint_turn(cameras: Tensor) -> Tensor:
+    """Return the largest angle in degrees between two viewing directions of a clip.
+
+    Args:
+        cameras: (..., T, 2, 3), orthonormal rows.
+
+    Returns:
+        (...). Turning about the optical axis does not count: it tells nothing of depth.
+    """
+    view = complete_rotation(cameras)[..., 2, :]  # (..., T, 3)
+    far = (view @ view.mean(-2, keepdim=True).mT).squeeze(-1).argmin(-1, keepdim=True)
+    for _ in range(2):  # the farthest from the mean, the farthest from that, and once more
+        anchor = view.gather(-2, far[..., None].expand(*far.shape, 3))
+        cosine = (view @ anchor.mT).squeeze(-1)
+        far = cosine.argmin(-1, keepdim=True)
+    return torch.rad2deg(torch.arccos(cosine.amin(-1).clamp(-1, 1)))

@@ -1,0 +1,143 @@
+"""Bones: incidence matrices, bone vectors, lengths and the KCS matrix (Wandt et al. 2018, section 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ShapeError
+
+__all__ = ["bone_lengths", "bone_vectors", "chain_inverse", "incidence", "kcs_matrix", "points_from_bones"]
+
+
+def incidence(bones: Tensor | Sequence[Sequence[int]], num_joints: int, *, dtype: torch.dtype | None = None) -> Tensor:
+    """Return C with +1 at each bone's child and -1 at its parent, so that bones are ``C.mT @ points``.
+
+    Args:
+        bones: (B, 2) integer (parent, child) pairs.
+        num_joints: N.
+        dtype: of the result; torch's default if None.
+
+    Returns:
+        (N, B) incidence matrix (KCS eq. 4), on the device of ``bones``.
+
+    Raises:
+        ShapeError: ``bones`` is not (B, 2), or an index is outside 0..N-1.
+
+    >>> incidence([(0, 1), (1, 2)], 3).tolist()
+    [[-1.0, 0.0], [1.0, -1.0], [0.0, 1.0]]
+    """
+    index = _pairs(bones)
+    if index.numel() and (int(index.min()) < 0 or int(index.max()) >= num_joints):
+        raise ShapeError(f"bones: expected joint indices 0..{num_joints - 1}, got {int(index.min())}..{int(index.max())}")
+    matrix = torch.zeros(num_joints, len(index), dtype=dtype or torch.get_default_dtype(), device=index.device)
+    column = torch.arange(len(index), device=index.device)
+    matrix[index[:, 0], column] = -1
+    matrix[index[:, 1], column] = 1
+    return matrix
+
+
+def chain_inverse(matrix: Tensor) -> Tensor:
+    """Return D = pinv(C).mT, the map back from bones to joints: ``D @ bones`` has joint mean zero.
+
+    For a tree it is exact. For a closed chain it is the least-squares pose; each separate piece is centred by itself.
+
+    Args:
+        matrix: (N, B) incidence matrix C.
+
+    Returns:
+        (N, B) matrix D (the D of KCS Algorithm 1, transposed as points are rows here).
+
+    >>> C = incidence([(0, 1), (1, 2)], 3)
+    >>> X = torch.tensor([[0.0, 0, 0], [0, 1, 0], [0, 2, 0]])
+    >>> (chain_inverse(C) @ (C.mT @ X)).round(decimals=5).tolist()
+    [[0.0, -1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    """
+    return torch.linalg.pinv(matrix).mT
+
+
+def points_from_bones(vectors: Tensor, inverse: Tensor) -> Tensor:
+    """Return joint positions with joint mean zero, ``D @ bones``.
+
+    Args:
+        vectors: (..., B, D) bone vectors.
+        inverse: (N, B) from :func:`chain_inverse`.
+
+    Returns:
+        (..., N, D) points.
+    """
+    return inverse @ vectors
+
+
+def bone_vectors(points: Tensor, bones: Tensor | Sequence[Sequence[int]]) -> Tensor:
+    """Return child minus parent for each bone: ``C.mT @ points`` without the matrix product (KCS eq. 5).
+
+    Args:
+        points: (..., N, D).
+        bones: (B, 2) integer (parent, child) pairs.
+
+    Returns:
+        (..., B, D), in the unit of the points.
+
+    Raises:
+        ShapeError: ``bones`` is not (B, 2).
+
+    >>> bone_vectors(torch.tensor([[0.0, 0], [1, 2]]), [(0, 1)]).tolist()
+    [[1.0, 2.0]]
+    """
+    index = _pairs(bones).to(points.device)
+    return points.index_select(-2, index[:, 1]) - points.index_select(-2, index[:, 0])
+
+
+def bone_lengths(points: Tensor, bones: Tensor | Sequence[Sequence[int]]) -> Tensor:
+    """Return the length of each bone; the gradient at a zero-length bone is zero, never NaN.
+
+    Args:
+        points: (..., N, D).
+        bones: (B, 2) integer (parent, child) pairs.
+
+    Returns:
+        (..., B), in the unit of the points.
+
+    >>> bone_lengths(torch.tensor([[0.0, 0, 0], [0, 3, 4]]), [(0, 1)]).tolist()
+    [5.0]
+    """
+    return safe_norm(bone_vectors(points, bones))
+
+
+def kcs_matrix(vectors: Tensor) -> Tensor:
+    """Return Psi = B B^T, the inner products of all bones; squared lengths on its diagonal (KCS eq. 7).
+
+    Args:
+        vectors: (..., B, D) bone vectors.
+
+    Returns:
+        (..., B, B), in squared units; unchanged by any rotation or reflection of the pose.
+
+    >>> kcs_matrix(torch.tensor([[3.0, 0], [1, 2]])).tolist()
+    [[9.0, 3.0], [3.0, 5.0]]
+    """
+    return vectors @ vectors.mT
+
+
+def safe_norm(vectors: Tensor) -> Tensor:
+    """Euclidean norm over the last dimension, with gradient 0 where it is 0.
+
+    Scaled by the largest component first, so that no square under- or overflows.
+    """
+    top = vectors.detach().abs().amax(-1, keepdim=True)
+    scale = torch.where(top > 0, top, torch.ones_like(top))
+    unit = vectors / scale
+    square = unit.square().sum(-1)
+    zero = top.squeeze(-1) == 0
+    root = torch.where(zero, torch.ones_like(square), square).sqrt()
+    return torch.where(zero, torch.zeros_like(square), root * scale.squeeze(-1))
+
+
+def _pairs(bones: Tensor | Sequence[Sequence[int]]) -> Tensor:
+    index = bones if isinstance(bones, Tensor) else torch.tensor([tuple(b) for b in bones], dtype=torch.long).reshape(-1, 2)
+    if index.ndim != 2 or index.shape[-1] != 2:
+        raise ShapeError(f"bones: expected shape (B, 2) of (parent, child), got {tuple(index.shape)}")
+    return index

@@ -1,0 +1,80 @@
+"""Time: gaps, windows and their seams."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import OptionError
+
+__all__ = ["blend_windows", "interpolate", "window_starts"]
+
+
+def interpolate(values: Tensor, seen: Tensor) -> Tensor:
+    """Fill gaps linearly in time, and ends with the nearest seen value.
+
+    Args:
+        values: (..., T, N, D), finite.
+        seen: (..., T, N), True where ``values`` hold.
+
+    Returns:
+        (..., T, N, D). A joint never seen takes the mean of the seen joints of each frame (0 where there is none).
+    """
+    frames = values.shape[-3]
+    time = torch.arange(frames, device=values.device)[:, None].expand(seen.shape)
+    before = torch.where(seen, time, -1).cummax(-2).values
+    after = torch.where(seen, time, frames).flip(-2).cummin(-2).values.flip(-2)
+    before, after = torch.where(before < 0, after, before), torch.where(after >= frames, before, after)
+    start, stop = before.clamp(0, frames - 1), after.clamp(0, frames - 1)  # clamped only where never seen
+    gap = (stop - start).clamp_min(1).to(values.dtype)
+    share = ((time - start).to(values.dtype) / gap).clamp(0, 1)[..., None]
+    pick = lambda index: values.gather(-3, index[..., None].expand(*index.shape, values.shape[-1]))  # noqa: E731
+    filled = pick(start) * (1 - share) + pick(stop) * share
+    never = ~seen.any(-2, keepdim=True)
+    known = (~never).to(values.dtype)[..., None]
+    middle = (filled * known).sum(-2, keepdim=True) / known.sum(-2, keepdim=True).clamp_min(1)
+    return torch.where(never[..., None], middle, filled)
+
+
+def window_starts(length: int, window: int, overlap: int) -> list[int]:
+    """First frames of equally long windows that cover ``length`` frames and overlap by at least ``overlap``.
+
+    Raises:
+        OptionError: the overlap is not below the window.
+
+    >>> window_starts(10, 4, 1), window_starts(3, 4, 1)
+    ([0, 3, 6], [0])
+    """
+    if not 0 <= overlap < window:
+        raise OptionError(f"windows: expected an overlap within 0..{window - 1}, got {overlap}")
+    if length <= window:
+        return [0]
+    count = math.ceil((length - overlap) / (window - overlap))
+    return [round(i * (length - window) / (count - 1)) for i in range(count)]
+
+
+def blend_windows(parts: Tensor, starts: list[int], length: int) -> Tensor:
+    """Join overlapping windows by a weighted mean that fades each window in and out.
+
+    Args:
+        parts: (W, T_w, ...) values of each window.
+        starts: first frame of each window.
+        length: T.
+
+    Returns:
+        (T, ...).
+    """
+    window = parts.shape[1]
+    ramp = torch.arange(1, window + 1, dtype=parts.dtype, device=parts.device)
+    ramp = torch.minimum(ramp, ramp.flip(0))
+    overlap = max([a + window - b for a, b in zip(starts, starts[1:], strict=False)], default=1)
+    ramp = ramp.clamp_max(max(overlap, 1))
+    index = torch.tensor(starts, device=parts.device)[:, None] + torch.arange(window, device=parts.device)
+    shaped = ramp.reshape(1, -1, *[1] * (parts.ndim - 2))
+    total = torch.zeros(length, *parts.shape[2:], dtype=parts.dtype, device=parts.device)
+    total = total.index_add(0, index.flatten(), (parts * shaped).flatten(0, 1))
+    weight = torch.zeros(length, dtype=parts.dtype, device=parts.device)
+    weight = weight.index_add(0, index.flatten(), ramp.repeat(len(starts)))
+    return total / weight.reshape(-1, *[1] * (parts.ndim - 2))

@@ -1,0 +1,153 @@
+"""What every method shares: the call, the checks, the diagnostics."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+import warnings
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ConvergenceWarning, KcsWarning, OptionError, ShapeError, unknown
+from kcs_torch.functional.camera import viewpoint_turn
+from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.types import Diagnostics, Reconstruction, Tracks
+
+__all__ = ["Estimate", "Method"]
+
+WEAK_TURN = 30.0
+"""Degrees of viewpoint turn below which depth is weakly determined."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a method finds, in normalised units: centred per frame, root mean square of the tracks 1.
+
+    Attributes:
+        points: (T, N, 3) in the camera frame.
+        cameras: (T, 2, 3) orthonormal rows.
+        scales: (T,) relative weak-perspective scale, mean 1.
+        converged: whether the stopping rule was met.
+        iterations: steps made.
+        notes: sentences for the user.
+    """
+
+    points: Tensor
+    cameras: Tensor
+    scales: Tensor
+    converged: bool
+    iterations: int
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Method(ABC):
+    """A recipe from 2D tracks to 3D motion; its fields are its hyper-parameters.
+
+    Subclasses write :meth:`solve`; calling a method adds units, bone lengths and diagnostics.
+    """
+
+    name: ClassVar[str] = ""
+
+    @abstractmethod
+    def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
+        """Reconstruct normalised tracks; ``cameras`` (T, 2, 3) are given or to be found."""
+
+    def __call__(self, tracks: Tracks, cameras: Tensor | None = None) -> Reconstruction:
+        """Reconstruct one body.
+
+        Args:
+            tracks: what to reconstruct.
+            cameras: (T, 2, 3) known camera rows, world to camera; found from the tracks if None.
+
+        Returns:
+            The reconstruction, on the device and in the dtype of the tracks.
+
+        Raises:
+            ShapeError: the cameras do not fit the tracks.
+
+        Warns:
+            KcsWarning: depth is weakly determined, or joints were never seen.
+            ConvergenceWarning: the iteration stopped at its limit.
+        """
+        begin = time.perf_counter()
+        if cameras is not None:
+            cameras = torch.as_tensor(cameras).to(tracks.points)
+            if cameras.shape != (tracks.num_frames, 2, 3) or not torch.isfinite(cameras).all():
+                raise ShapeError(f"cameras: expected finite ({tracks.num_frames}, 2, 3), got {tuple(cameras.shape)}")
+        with torch.no_grad():
+            weights = tracks.weights
+            total = weights.sum(-1)[:, None, None]
+            middle = (tracks.points * weights[..., None]).sum(-2, keepdim=True) / torch.where(total > 0, total, torch.ones_like(total))
+            middle = _carry(middle, total[:, 0, 0] > 0)
+            centred = (tracks.points - middle) * (weights > 0)[..., None]
+            size = (centred.square() * weights[..., None]).sum() / weights.sum()
+            size = torch.where(size > 0, size, torch.ones_like(size)).sqrt()
+            found = self.solve(dataclasses.replace(tracks, points=centred / size), cameras)
+            points = found.points * size
+            seen = points[..., :2] * found.scales[:, None, None]
+            shift = ((tracks.points - seen) * weights[..., None]).sum(-2, keepdim=True) / torch.where(total > 0, total, torch.ones_like(total))
+            shift = _carry(shift, total[:, 0, 0] > 0)
+            points = points + torch.nn.functional.pad(shift, (0, 1))
+            return self._finish(tracks, points, seen + shift, found, time.perf_counter() - begin)
+
+    def _finish(self, tracks: Tracks, points: Tensor, seen: Tensor, found: Estimate, seconds: float) -> Reconstruction:
+        body = tracks.skeleton
+        size = bone_lengths(points, body.bone_index(device=points.device))
+        lengths = size.median(0).values
+        rigid = list(body.rigid)
+        mean = size.mean(0)
+        variation = size.std(0, unbiased=False) / torch.where(mean > 0, mean, torch.ones_like(mean))
+        error = (seen - tracks.points).square().sum(-1)
+        count = tracks.seen.sum()
+        turn = float(viewpoint_turn(found.cameras))
+        notes = list(found.notes)
+        if turn < WEAK_TURN:
+            notes.append(f"the viewpoint turned by {turn:.0f} degrees only: depth rests on the skeleton's template and lengths")
+        if not found.converged:
+            notes.append(f"{self.name} did not settle within {found.iterations} steps")
+            warnings.warn(f"{tracks.source}: {notes[-1]}", ConvergenceWarning, stacklevel=3)
+        never = [body.joints[n] for n in (tracks.weights == 0).all(0).nonzero().flatten().tolist()]
+        if never:
+            warnings.warn(f"{tracks.source}: never seen, so placed by the skeleton alone: {', '.join(never)}", KcsWarning, stacklevel=3)
+        diagnostics = Diagnostics(
+            viewpoint_turn=turn,
+            unseen_share=tracks.unseen_share,
+            bone_variation=float(100 * variation[rigid].median()) if rigid else math.nan,
+            reprojection_rms=float((error * tracks.seen).sum().div(count).sqrt()),
+            converged=found.converged,
+            iterations=found.iterations,
+            seconds=seconds,
+            notes=tuple(notes),
+        )
+        return Reconstruction(points, found.cameras, found.scales, lengths, tracks, self.name, diagnostics)
+
+    @classmethod
+    def from_options(cls, **options: object) -> Method:
+        """Build the method from field values; wrong names are answered with the right ones.
+
+        Raises:
+            OptionError: a field is unknown.
+        """
+        names = [f.name for f in dataclasses.fields(cls)]
+        for option in options:
+            if option not in names:
+                raise unknown(f"option of method '{cls.name}'", option, names)
+        return cls(**options)
+
+    def _expect(self, rule: bool, field: str, expected: str) -> None:
+        """Raise an OptionError for ``field`` unless the rule holds."""
+        if not rule:
+            raise OptionError(f"{self.name}: {field}: expected {expected}, got {getattr(self, field)!r}")
+
+
+def _carry(values: Tensor, known: Tensor) -> Tensor:
+    """Fill the rows of unknown frames (T, ...) linearly from their neighbours."""
+    from kcs_torch.functional.temporal import interpolate
+
+    return interpolate(values, known[:, None])

@@ -1,0 +1,25 @@
+"""Modules: layers, energies that are losses and solver terms at once, and unrolled solvers."""
+
+from kcs_torch.nn.energies import (
+    BoneLengthEnergy,
+    LowRankEnergy,
+    ReprojectionEnergy,
+    SmoothnessEnergy,
+    SymmetryEnergy,
+)
+from kcs_torch.nn.layers import SVT, BoneLengths, BoneVectors, KCSMatrix
+from kcs_torch.nn.unrolled import UnrolledFPC, UnrolledSfAM
+
+__all__ = [
+    "SVT",
+    "BoneLengthEnergy",
+    "BoneLengths",
+    "BoneVectors",
+    "KCSMatrix",
+    "LowRankEnergy",
+    "ReprojectionEnergy",
+    "SmoothnessEnergy",
+    "SymmetryEnergy",
+    "UnrolledFPC",
+    "UnrolledSfAM",
+]

@@ -1,0 +1,225 @@
+"""Energies: one module is the loss of a network and the term of a solver.
+
+Each returns energies per frame (..., T) or per clip (...); the reduction is left to the caller. Weights of 0 take a
+joint out; an energy over nothing is 0, not NaN.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.camera import back_project, project
+from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.spectral import log_det, nuclear_norm, svt
+from kcs_torch.nn.layers import SkeletonModule
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.solvers.lm import fit_bones
+
+__all__ = ["BoneLengthEnergy", "LowRankEnergy", "ReprojectionEnergy", "SmoothnessEnergy", "SymmetryEnergy"]
+
+
+class BoneLengthEnergy(SkeletonModule):
+    """1/2 sum_b w_b (|b| - L_b)^2 of each frame: bones keep their length (SfAM eq. 13).
+
+    Args:
+        skeleton: a :class:`Skeleton`, a built-in name or a file. Its flexible bones do not count.
+
+    >>> energy = BoneLengthEnergy("h36m17")
+    >>> energy(torch.randn(4, 30, 17, 3)).shape
+    torch.Size([4, 30])
+    """
+
+    rigid: Tensor
+
+    def __init__(self, skeleton: str | Path | Skeleton) -> None:
+        super().__init__(skeleton)
+        rigid = torch.zeros(self.skeleton.num_bones)
+        rigid[list(self.skeleton.rigid)] = 1
+        self.register_buffer("rigid", rigid, persistent=False)
+
+    def forward(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
+        """Return the energy of each frame.
+
+        Args:
+            points: (..., T, N, 3).
+            lengths: (..., B) target lengths; None takes each bone's own (weighted) mean over the T frames, which
+                makes this half the bone's variance.
+            weights: (..., T, N) of the joints; a bone weighs as much as the lesser of its two ends.
+
+        Returns:
+            (..., T), in squared units.
+        """
+        self.check(points)
+        size = bone_lengths(points, self.bones)  # (..., T, B)
+        share = self.rigid.to(size.dtype).expand_as(size)
+        if weights is not None:
+            share = share * torch.minimum(weights[..., self.bones[:, 0]], weights[..., self.bones[:, 1]])
+        if lengths is None:
+            total = share.sum(-2, keepdim=True)
+            lengths = (size * share).sum(-2, keepdim=True) / torch.where(total > 0, total, torch.ones_like(total))
+        else:
+            lengths = lengths[..., None, :]
+        return 0.5 * (share * (size - lengths).square()).sum(-1)
+
+    def prox(self, points: Tensor, lengths: Tensor, stiffness: Tensor | float = 1.5, *, num_steps: int = 3) -> Tensor:
+        """argmin_A stiffness * energy(A) + 1/2 |A - points|^2, by :func:`kcs_torch.solvers.fit_bones`.
+
+        Args:
+            points: (..., T, N, 3).
+            lengths: (..., B).
+            stiffness: the paper's beta.
+            num_steps: Levenberg-Marquardt steps.
+
+        Returns:
+            (..., T, N, 3).
+        """
+        self.check(points)
+        beta = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device) * self.rigid.to(points.dtype)
+        return fit_bones(points, lengths[..., None, :], self.bones, stiffness=beta, num_steps=num_steps)
+
+
+class ReprojectionEnergy(nn.Module):
+    """1/2 sum_n w_n |R x_n + t - y_n|^2 of each frame, the translation t at its optimum.
+
+    Args:
+        translation: False leaves t at 0 (points and tracks already share an origin).
+        huber: residuals above this length count linearly, in the unit of the tracks; None is plain least squares.
+
+    Raises:
+        OptionError: ``huber`` is not positive.
+    """
+
+    def __init__(self, *, translation: bool = True, huber: float | None = None) -> None:
+        super().__init__()
+        if huber is not None and not huber > 0:
+            raise OptionError(f"ReprojectionEnergy: expected a positive huber length or None, got {huber}")
+        self.translation, self.huber = translation, huber
+
+    def forward(self, points: Tensor, tracks: Tensor, cameras: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
+        """Return the energy of each frame.
+
+        Args:
+            points: (..., T, N, 3).
+            tracks: (..., T, N, 2).
+            cameras: (..., T, 2, 3), scaled rows allowed; None: points are in the camera frame.
+            weights: (..., T, N) confidences; 0 where unseen.
+
+        Returns:
+            (..., T), in squared units of the tracks.
+        """
+        square = self.residual(points, tracks, cameras, weights).square().sum(-1)
+        if self.huber is not None:
+            far = square > self.huber**2
+            root = torch.where(far, square, torch.ones_like(square)).sqrt()
+            square = torch.where(far, 2 * self.huber * root - self.huber**2, square)
+        return 0.5 * (square if weights is None else square * weights).sum(-1)
+
+    def residual(self, points: Tensor, tracks: Tensor, cameras: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
+        """R x + t - y, (..., T, N, 2)."""
+        seen = points[..., :2] if cameras is None else project(points, cameras)
+        if seen.shape[-2:] != tracks.shape[-2:]:
+            raise ShapeError(f"ReprojectionEnergy: expected tracks (..., {seen.shape[-2]}, 2), got {tuple(tracks.shape)}")
+        return centred_residual(seen, tracks, weights) if self.translation else seen - tracks
+
+    def grad(self, points: Tensor, tracks: Tensor, cameras: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Gradient in ``points`` of the plain least-squares energy, R^T (w o residual): (..., T, N, 3)."""
+        residual = self.residual(points, tracks, cameras, weights)
+        return back_project(residual if weights is None else residual * weights[..., None], cameras)
+
+
+class LowRankEnergy(nn.Module):
+    """How far a clip's poses are from few shapes: the nuclear norm of S# (T x 3N), or a log-determinant.
+
+    Args:
+        kind: "nuclear" (SfAM, KCS), or "log_det": T/2 log det(Sigma + eps I) of the poses' covariance, a tighter
+            surrogate of rank.
+        eps: of the log-determinant, relative to the mean variance of a coordinate.
+
+    Raises:
+        OptionError: the kind is unknown, or eps is not positive.
+    """
+
+    def __init__(self, kind: str = "nuclear", *, eps: float = 1e-3) -> None:
+        super().__init__()
+        if kind not in ("nuclear", "log_det") or not eps > 0:
+            raise OptionError(f"LowRankEnergy: expected kind 'nuclear' or 'log_det' and eps > 0, got {kind!r} and {eps}")
+        self.kind, self.eps = kind, eps
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Return the energy (...) of clips (..., T, N, D)."""
+        matrix = points.flatten(-2)
+        if self.kind == "nuclear":
+            return nuclear_norm(matrix)
+        frames = matrix.shape[-2]
+        centred = matrix - matrix.mean(-2, keepdim=True)
+        covariance = centred.mT @ centred / frames
+        scale = covariance.diagonal(dim1=-2, dim2=-1).mean(-1).detach()
+        level = self.eps * torch.where(scale > 0, scale, torch.ones_like(scale))
+        return frames / 2 * log_det(covariance, level)
+
+    def prox(self, points: Tensor, threshold: Tensor | float) -> Tensor:
+        """Singular value shrinkage of S#, the nuclear norm's proximal map: (..., T, N, D)."""
+        return svt(points.flatten(-2), threshold).unflatten(-1, points.shape[-2:])
+
+
+class SmoothnessEnergy(nn.Module):
+    """1/2 |n-th difference in time|^2 of the joints, per frame; the first n frames have none and give 0.
+
+    Args:
+        order: 1 speed, 2 acceleration, 3 jerk.
+
+    Raises:
+        OptionError: the order is below 1.
+    """
+
+    def __init__(self, order: int = 2) -> None:
+        super().__init__()
+        if order < 1:
+            raise OptionError(f"SmoothnessEnergy: expected order >= 1, got {order}")
+        self.order = order
+
+    def forward(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return (..., T) of points (..., T, N, D); a difference weighs as much as the least of its frames."""
+        frames = points.shape[-3]
+        if frames <= self.order:
+            return points.new_zeros(points.shape[:-2]) + 0 * points.sum((-2, -1))
+        square = points.diff(n=self.order, dim=-3).square().sum(-1)  # (..., T - n, N)
+        if weights is not None:
+            square = square * weights.unfold(-2, self.order + 1, 1).amin(-1)
+        return nn.functional.pad(0.5 * square.sum(-1), (self.order, 0))
+
+
+class SymmetryEnergy(SkeletonModule):
+    """1/2 sum over mirror bones of (|left| - |right|)^2, per frame.
+
+    Raises:
+        SkeletonError: see :class:`Skeleton`; a skeleton without mirror pairs gives 0.
+    """
+
+    pairs: Tensor
+
+    def __init__(self, skeleton: str | Path | Skeleton) -> None:
+        super().__init__(skeleton)
+        pairs = torch.tensor(self.skeleton.mirror_bones, dtype=torch.long).reshape(-1, 2)
+        self.register_buffer("pairs", pairs, persistent=False)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Return (..., T) of points (..., T, N, 3)."""
+        self.check(points)
+        size = bone_lengths(points, self.bones)
+        return 0.5 * (size[..., self.pairs[:, 0]] - size[..., self.pairs[:, 1]]).square().sum(-1)
+
+
+def centred_residual(seen: Tensor, tracks: Tensor, weights: Tensor | None) -> Tensor:
+    """``seen - tracks`` minus its weighted mean over joints: the translation at its optimum."""
+    difference = seen - tracks
+    if weights is None:
+        return difference - difference.mean(-2, keepdim=True)
+    share = weights[..., None]
+    total = share.sum(-2, keepdim=True)
+    mean = (difference * share).sum(-2, keepdim=True) / torch.where(total > 0, total, torch.ones_like(total))
+    return difference - mean

@@ -1,0 +1,118 @@
+"""Layers: bones, their lengths, the KCS matrix and singular value thresholding as ``nn.Module``s."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.chain import bone_lengths, bone_vectors, kcs_matrix
+from kcs_torch.functional.spectral import svt
+from kcs_torch.skeleton import Skeleton, get_skeleton
+
+__all__ = ["SVT", "BoneLengths", "BoneVectors", "KCSMatrix"]
+
+
+class SkeletonModule(nn.Module):
+    """Base of modules that know a skeleton: holds its bones as a buffer and checks what comes in."""
+
+    bones: Tensor
+
+    def __init__(self, skeleton: str | Path | Skeleton) -> None:
+        super().__init__()
+        self.skeleton = get_skeleton(skeleton)
+        self.register_buffer("bones", self.skeleton.bone_index(), persistent=False)
+
+    def check(self, points: Tensor) -> None:
+        """Raise a ShapeError unless ``points`` are (..., N, D) with this skeleton's N."""
+        if points.ndim < 2 or points.shape[-2] != self.skeleton.num_joints:
+            raise ShapeError(
+                f"{type(self).__name__}: expected points (..., {self.skeleton.num_joints}, 3) for skeleton "
+                f"'{self.skeleton.name}', got {tuple(points.shape)}"
+            )
+
+    def extra_repr(self) -> str:
+        return f"skeleton='{self.skeleton.name}'"
+
+
+class BoneVectors(SkeletonModule):
+    """Child minus parent for each bone: (..., N, D) to (..., B, D). See :func:`kcs_torch.functional.bone_vectors`.
+
+    >>> BoneVectors("h36m17")(torch.zeros(2, 17, 3)).shape
+    torch.Size([2, 16, 3])
+    """
+
+    def forward(self, points: Tensor) -> Tensor:
+        self.check(points)
+        return bone_vectors(points, self.bones)
+
+
+class BoneLengths(SkeletonModule):
+    """Length of each bone: (..., N, D) to (..., B). See :func:`kcs_torch.functional.bone_lengths`."""
+
+    def forward(self, points: Tensor) -> Tensor:
+        self.check(points)
+        return bone_lengths(points, self.bones)
+
+
+class KCSMatrix(SkeletonModule):
+    """The KCS matrix Psi = B B^T: (..., N, D) to (..., B, B). See :func:`kcs_torch.functional.kcs_matrix`.
+
+    Args:
+        skeleton: a :class:`Skeleton`, a built-in name or a file.
+        normalise: divide by the mean squared bone length of each pose, which frees Psi of scale.
+
+    >>> KCSMatrix("h36m17")(torch.zeros(2, 17, 3)).shape
+    torch.Size([2, 16, 16])
+    """
+
+    def __init__(self, skeleton: str | Path | Skeleton, *, normalise: bool = False) -> None:
+        super().__init__(skeleton)
+        self.normalise = normalise
+
+    def forward(self, points: Tensor) -> Tensor:
+        self.check(points)
+        matrix = kcs_matrix(bone_vectors(points, self.bones))
+        if not self.normalise:
+            return matrix
+        size = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
+        return matrix / torch.where(size > 0, size, torch.ones_like(size))
+
+
+class SVT(nn.Module):
+    """Singular value thresholding of (..., M, N) matrices. See :func:`kcs_torch.functional.svt`.
+
+    Args:
+        threshold: non-negative; in the unit of the matrix, or with ``relative`` as a share of its Frobenius norm.
+        learnable: make the threshold a parameter, kept positive by a softplus.
+        relative: scale the threshold with each matrix.
+
+    Raises:
+        OptionError: the threshold is negative, or zero where it is to be learned.
+    """
+
+    def __init__(self, threshold: float, *, learnable: bool = False, relative: bool = False) -> None:
+        super().__init__()
+        if not (threshold >= 0 and math.isfinite(threshold)) or (learnable and threshold == 0):
+            raise OptionError(f"SVT: expected a {'positive' if learnable else 'non-negative'} threshold, got {threshold}")
+        self.relative = relative
+        self.raw = nn.Parameter(inverse_softplus(torch.tensor(float(threshold)))) if learnable else None
+        self.fixed = float(threshold)
+
+    @property
+    def threshold(self) -> Tensor | float:
+        return self.fixed if self.raw is None else nn.functional.softplus(self.raw)
+
+    def forward(self, matrix: Tensor) -> Tensor:
+        level = self.threshold
+        if self.relative:
+            level = level * torch.linalg.matrix_norm(matrix.detach())
+        return svt(matrix, level)
+
+
+def inverse_softplus(value: Tensor) -> Tensor:
+    """x with softplus(x) = value, for positive values, without overflow."""
+    return value + torch.log(-torch.expm1(-value))

@@ -1,0 +1,298 @@
+"""Unrolled solvers: a fixed number of steps of FPC and SfAM as layers, with learnable step sizes and weights.
+
+Untrained they are the method: :class:`kcs_torch.SfAM` runs the same steps through :func:`shape_step`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.camera import back_project, project
+from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.spectral import singular_values, svt
+from kcs_torch.nn.energies import centred_residual
+from kcs_torch.nn.layers import inverse_softplus
+from kcs_torch.skeleton import Skeleton, get_skeleton
+from kcs_torch.solvers.iterate import iterate
+from kcs_torch.solvers.lm import fit_bones
+
+__all__ = ["UnrolledFPC", "UnrolledSfAM", "continuation", "data_scale", "estimate_lengths", "shape_step"]
+
+
+def continuation(num_weights: int, mu: float = 0.5, final: float = 3e-5) -> list[float]:
+    """Weights that fall geometrically from ``mu`` to ``final``, shares of the data's largest singular value.
+
+    >>> [round(w, 3) for w in continuation(3, 1.0, 0.01)]
+    [1.0, 0.1, 0.01]
+    """
+    if num_weights < 1 or not 0 < final <= mu:
+        raise OptionError(f"continuation: expected num_weights >= 1 and 0 < final <= mu, got {num_weights}, {final}, {mu}")
+    ratio = (final / mu) ** (1 / max(num_weights - 1, 1))
+    return [mu * ratio**k for k in range(num_weights)]
+
+
+def data_scale(tracks: Tensor, cameras: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Largest singular value of the back-projected, centred tracks as S# (T x 3N): the unit of the shrinkage, (...).
+
+    Args:
+        tracks: (..., T, N, 2).
+        cameras: (..., T, 2, 3).
+        weights: (..., T, N).
+    """
+    with torch.no_grad():
+        data = -centred_residual(torch.zeros_like(tracks), tracks, weights)
+        if weights is not None:
+            data = data * weights[..., None]
+        return singular_values(back_project(data, cameras).flatten(-2))[..., 0]
+
+
+def estimate_lengths(shape: Tensor, bones: Tensor, weights: Tensor | None = None, *, graded: bool = False) -> tuple[Tensor, Tensor]:
+    """Return each bone's median length over time, and how rigid it is.
+
+    Args:
+        shape: (..., T, N, 3).
+        bones: (B, 2).
+        weights: (..., T, N); lengths are taken from frames in which both ends are seen, if there are any.
+        graded: True grades bones by how little their length varies beside the steadiest quarter of all bones, for
+            links that nobody has declared rigid; False trusts all.
+
+    Returns:
+        lengths (..., B) and rigidity (..., B) in [0, 1].
+    """
+    size = bone_lengths(shape, bones)
+    if weights is not None:
+        seen = torch.minimum(weights[..., bones[:, 0]], weights[..., bones[:, 1]]) > 0
+        seen = seen | ~seen.any(-2, keepdim=True)
+        lengths = torch.where(seen, size, torch.nan).nanmedian(-2).values
+    else:
+        lengths = size.median(-2).values
+    if not graded or size.shape[-1] == 0:
+        return lengths, torch.ones_like(lengths)
+    with torch.no_grad():
+        variation = (size - lengths[..., None, :]).abs().mean(-2) / lengths.clamp_min(torch.finfo(size.dtype).tiny)
+        steady = variation.quantile(0.25, -1, keepdim=True)
+        ratio = variation / torch.where(steady > 0, steady, torch.ones_like(steady))
+        return lengths, 1 / (1 + ratio.square()).square()
+
+
+def shape_step(
+    shape: Tensor,
+    tracks: Tensor,
+    cameras: Tensor,
+    weights: Tensor | None,
+    threshold: Tensor,
+    step: Tensor | float,
+    *,
+    bones: Tensor | None = None,
+    lengths: Tensor | None = None,
+    stiffness: Tensor | None = None,
+) -> Tensor:
+    """One step of SfAM: S <- shrink(S - tau (R^T w (R S + t - W) + (S - A)), tau mu), A the bone-length step.
+
+    Args:
+        shape: S (..., T, N, 3) in the world frame.
+        tracks: W (..., T, N, 2).
+        cameras: R (..., T, 2, 3).
+        weights: w (..., T, N) or None.
+        threshold: mu (...), in the unit of S#'s singular values.
+        step: tau.
+        bones: (B, 2), or None for plain FPC without A.
+        lengths: (..., B) target lengths.
+        stiffness: (..., B), the paper's beta of each bone.
+
+    Returns:
+        (..., T, N, 3).
+
+    Kovalenko et al. 2019, Algorithm 1, lines 5-10. With points as rows ``S.flatten(-2)`` is the reshuffled S#.
+    """
+    residual = centred_residual(project(shape, cameras), tracks, weights)
+    gradient = back_project(residual if weights is None else residual * weights[..., None], cameras)
+    if bones is not None and lengths is not None and stiffness is not None:
+        articulated = fit_bones(shape, lengths[..., None, :], bones, stiffness=stiffness[..., None, :], num_steps=1)
+        gradient = gradient + (shape - articulated)
+    return svt((shape - step * gradient).flatten(-2), step * threshold).unflatten(-1, shape.shape[-2:])
+
+
+class UnrolledFPC(nn.Module):
+    """``num_steps`` steps of fixed-point continuation from 2D tracks and cameras to 3D shape.
+
+    Args:
+        num_steps: steps; each has its own step size and threshold.
+        mu: first threshold, a share of the data's largest singular value.
+        final: last threshold; between them they fall geometrically.
+        tau: step size.
+        learnable: step sizes and thresholds are parameters (positive through a softplus); else constants.
+        grad_steps: record only the last so many steps for autograd; None all.
+
+    Raises:
+        OptionError: a number is out of range.
+
+    >>> cameras = torch.eye(3)[:2].expand(50, 2, 3)
+    >>> UnrolledFPC(num_steps=5)(torch.randn(50, 17, 2), cameras).shape
+    torch.Size([50, 17, 3])
+    """
+
+    raw_threshold: Tensor
+    raw_step: Tensor
+
+    def __init__(
+        self,
+        num_steps: int = 10,
+        *,
+        mu: float = 0.5,
+        final: float = 3e-5,
+        tau: float = 1.0,
+        learnable: bool = True,
+        grad_steps: int | None = None,
+    ) -> None:
+        super().__init__()
+        if num_steps < 1 or not tau > 0:
+            raise OptionError(f"{type(self).__name__}: expected num_steps >= 1 and tau > 0, got {num_steps} and {tau}")
+        self.num_steps, self.learnable, self.grad_steps = num_steps, learnable, grad_steps
+        self._positive("threshold", continuation(num_steps, mu, final))
+        self._positive("step", [tau] * num_steps)
+
+    def forward(self, tracks: Tensor, cameras: Tensor, *, weights: Tensor | None = None, start: Tensor | None = None) -> Tensor:
+        """Return the shape in the world frame of the cameras.
+
+        Args:
+            tracks: (..., T, N, 2).
+            cameras: (..., T, 2, 3).
+            weights: (..., T, N), 0 where unseen.
+            start: (..., T, N, 3), a network's output, say; the back-projected tracks if None.
+
+        Returns:
+            (..., T, N, 3).
+
+        Raises:
+            ShapeError: the shapes do not fit.
+        """
+        threshold, step = self._values("threshold", tracks), self._values("step", tracks)
+        scale = self._scale(tracks, cameras, weights)
+        return iterate(
+            lambda shape, k: shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k]),
+            start_shape(tracks, cameras, weights) if start is None else start,
+            num_steps=self.num_steps,
+            grad_steps=self.grad_steps,
+        ).value
+
+    def _scale(self, tracks: Tensor, cameras: Tensor, weights: Tensor | None) -> Tensor:
+        if tracks.ndim < 3 or tracks.shape[-1] != 2 or cameras.shape[-3:] != (tracks.shape[-3], 2, 3):
+            raise ShapeError(
+                f"{type(self).__name__}: expected tracks (..., T, N, 2) and cameras (..., T, 2, 3), "
+                f"got {tuple(tracks.shape)} and {tuple(cameras.shape)}"
+            )
+        return data_scale(tracks, cameras, weights)
+
+    def _positive(self, name: str, values: list[float]) -> None:
+        """Hold positive numbers, in double precision until the module is cast, as softplus of what is learned."""
+        raw = inverse_softplus(torch.tensor(values, dtype=torch.float64))
+        if self.learnable:
+            setattr(self, f"raw_{name}", nn.Parameter(raw))
+        else:
+            self.register_buffer(f"raw_{name}", raw)
+
+    def _values(self, name: str, like: Tensor) -> Tensor:
+        return nn.functional.softplus(getattr(self, f"raw_{name}")).to(like)
+
+
+class UnrolledSfAM(UnrolledFPC):
+    """``num_steps`` steps of SfAM: FPC with the articulated term in the last of them.
+
+    Args:
+        skeleton: a :class:`Skeleton`, a built-in name or a file.
+        num_steps: steps; each has its own step size, threshold and stiffness.
+        mu: first threshold, a share of the data's largest singular value.
+        final: last threshold.
+        tau: step size of the articulated steps, below 1; the others take twice that.
+        beta: stiffness of the bones.
+        articulate_from: share of the steps after which the articulated term joins; 0 is all of them, as printed.
+        learnable: as in :class:`UnrolledFPC`.
+        grad_steps: as in :class:`UnrolledFPC`.
+
+    Raises:
+        OptionError: a number is out of range.
+        SkeletonError: the skeleton is unknown.
+
+    Kovalenko et al. 2019, Algorithm 1.
+    """
+
+    bones: Tensor
+    rigid: Tensor
+
+    def __init__(
+        self,
+        skeleton: str | Path | Skeleton,
+        num_steps: int = 10,
+        *,
+        mu: float = 0.5,
+        final: float = 3e-5,
+        tau: float = 0.5,
+        beta: float = 1.5,
+        articulate_from: float = 0.75,
+        learnable: bool = True,
+        grad_steps: int | None = None,
+    ) -> None:
+        super().__init__(num_steps, mu=mu, final=final, tau=tau, learnable=learnable, grad_steps=grad_steps)
+        if not beta > 0 or not 0 <= articulate_from <= 1:
+            raise OptionError(f"UnrolledSfAM: expected beta > 0 and articulate_from in 0..1, got {beta} and {articulate_from}")
+        self.skeleton = get_skeleton(skeleton)
+        rigid = list(self.skeleton.rigid)
+        self.register_buffer("bones", self.skeleton.bone_index()[rigid], persistent=False)
+        self.first = round(articulate_from * num_steps) if rigid else num_steps
+        self._positive("step", [2 * tau] * self.first + [tau] * (num_steps - self.first))
+        self._positive("stiffness", [beta] * num_steps)
+
+    def forward(
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        *,
+        weights: Tensor | None = None,
+        start: Tensor | None = None,
+        lengths: Tensor | None = None,
+    ) -> Tensor:
+        """Return the shape in the world frame of the cameras.
+
+        Args:
+            tracks: (..., T, N, 2).
+            cameras: (..., T, 2, 3).
+            weights: (..., T, N), 0 where unseen.
+            start: (..., T, N, 3); the back-projected tracks if None.
+            lengths: (..., B) bone lengths in the unit of the tracks; estimated at every step if None.
+
+        Returns:
+            (..., T, N, 3).
+
+        Raises:
+            ShapeError: the shapes do not fit.
+        """
+        threshold, step = self._values("threshold", tracks), self._values("step", tracks)
+        stiffness = self._values("stiffness", tracks)
+        scale = self._scale(tracks, cameras, weights)
+        fixed = None if lengths is None else lengths[..., list(self.skeleton.rigid)]
+        graded = not self.skeleton.tree
+
+        def advance(shape: Tensor, k: int) -> Tensor:
+            if k < self.first:
+                return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k])
+            target, rigidity = estimate_lengths(shape, self.bones, weights, graded=graded)
+            return shape_step(
+                shape, tracks, cameras, weights, threshold[k] * scale, step[k],
+                bones=self.bones, lengths=target if fixed is None else fixed, stiffness=stiffness[k] * rigidity,
+            )  # fmt: skip
+
+        first = start_shape(tracks, cameras, weights) if start is None else start
+        return iterate(advance, first, num_steps=self.num_steps, grad_steps=self.grad_steps).value
+
+
+def start_shape(tracks: Tensor, cameras: Tensor, weights: Tensor | None) -> Tensor:
+    """The back-projected, centred tracks (..., T, N, 3); unseen joints at the centre of the seen ones."""
+    centred = -centred_residual(torch.zeros_like(tracks), tracks, weights)
+    if weights is not None:
+        centred = torch.where((weights > 0)[..., None], centred, torch.zeros_like(centred))
+    return back_project(centred, cameras)

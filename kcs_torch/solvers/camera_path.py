@@ -1,0 +1,60 @@
+"""Cameras that move simply: a path of constant angular velocity fitted to noisy rotations."""
+
+from __future__ import annotations
+
+import roma
+import torch
+from torch import Tensor
+
+__all__ = ["constant_path"]
+
+
+def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Tensor]:
+    """Fit R_t = exp(t w) R_0 to rotations: six numbers, robustly.
+
+    Rotations that come from aligning poses also carry the body's own turning; a camera that moves evenly does
+    not. Speeds around the median turn from frame to frame are tried, then iteratively reweighted Gauss-Newton
+    (Cauchy weights) refines the best.
+
+    Args:
+        rotations: (T, 3, 3), T >= 2.
+        num_steps: Gauss-Newton steps.
+
+    Returns:
+        The path (T, 3, 3), and its angle to each rotation (T,), in radians.
+    """
+    frames = rotations.shape[0]
+    time = torch.arange(frames, dtype=rotations.dtype, device=rotations.device) - (frames - 1) / 2
+    turn = roma.rotmat_to_rotvec(rotations[1:] @ rotations[:-1].mT).median(0).values
+    speeds = turn * torch.linspace(0.8, 1.2, 161, dtype=turn.dtype, device=turn.device)[:, None]
+    spun = roma.rotvec_to_rotmat(speeds[:, None] * time[:, None])  # (S, T, 3, 3)
+    starts = roma.special_procrustes((spun.mT @ rotations).mean(1))
+    best = ((spun @ starts[:, None]) * rotations).sum((-2, -1)).mean(-1).argmax()
+    speed, start = speeds[best], starts[best]
+    eye = torch.eye(6, dtype=turn.dtype, device=turn.device)
+    for _ in range(num_steps):
+        spin = roma.rotvec_to_rotmat(time[:, None] * speed)
+        error = roma.rotmat_to_rotvec(rotations @ (spin @ start).mT)
+        angle = error.norm(dim=-1)
+        spread = angle.median().clamp_min(1e-9)
+        weight = 1 / (1 + (angle / spread).square())
+        jacobian = torch.cat([_left_jacobian(time[:, None] * speed) * time[:, None, None], spin], -1)
+        normal = (jacobian.mT * weight[:, None, None] @ jacobian).sum(0)
+        target = (jacobian.mT @ (error * weight[:, None])[..., None]).sum(0)[:, 0]
+        move = torch.linalg.solve(normal + 1e-12 * normal.diagonal().mean() * eye, target)
+        speed, start = speed + move[:3], roma.rotvec_to_rotmat(move[3:]) @ start
+    path = roma.rotvec_to_rotmat(time[:, None] * speed) @ start
+    return path, roma.rotmat_geodesic_distance(path, rotations)
+
+
+def _left_jacobian(vectors: Tensor) -> Tensor:
+    """Left Jacobian of the exponential map at rotation vectors (T, 3), (T, 3, 3)."""
+    angle = vectors.norm(dim=-1)[:, None, None]
+    small = angle < 1e-6
+    safe = torch.where(small, torch.ones_like(angle), angle)
+    first = torch.where(small, 0.5 - angle.square() / 24, (1 - safe.cos()) / safe.square())
+    second = torch.where(small, 1 / 6 - angle.square() / 120, (safe - safe.sin()) / safe**3)
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    hat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+    return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + first * hat + second * (hat @ hat)

@@ -1,0 +1,143 @@
+"""The metric upgrade of a factorisation: which 3 columns of the motion space are a camera's rows."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ShapeError
+from kcs_torch.functional.camera import orthonormality_defect
+from kcs_torch.functional.spectral import psd_shrink
+from kcs_torch.solvers.iterate import iterate
+
+__all__ = ["ist", "metric_upgrade"]
+
+
+def ist(motion: Tensor, *, weight: float = 1e-3, num_steps: int = 60) -> Tensor:
+    """Return Q of the convex relaxation: min_F 1/2 |A(F) - b|^2 + weight tr F over F = Q Q^T >= 0, cut to rank 3.
+
+    A(F) holds m1 F m1 - m2 F m2, 2 m1 F m2 and m1 F m1 + m2 F m2 of each frame's two motion rows, b is (0, 0, 2):
+    rows of equal length at a right angle. Solved by accelerated iterative shrinkage (FISTA on the PSD cone).
+
+    Args:
+        motion: (..., T, 2, R) from :func:`kcs_torch.functional.factorize`, R >= 3.
+        weight: of the trace, relative to the first gradient.
+        num_steps: shrinkage steps.
+
+    Returns:
+        Q (..., R, 3), so that ``motion @ Q`` are roughly camera rows; unique up to a rotation or reflection.
+
+    Raises:
+        ShapeError: R is below 3.
+
+    Kovalenko et al. 2019, eq. 4-7; Dai, Li, He 2012; Beck, Teboulle 2009.
+    """
+    _check(motion, "ist")
+    a, b = motion[..., 0, :], motion[..., 1, :]
+    frames = motion.shape[-3]
+
+    def forward(f: Tensor) -> Tensor:
+        af, bf = a @ f, b @ f
+        aa, bb, ab = (af * a).sum(-1), (bf * b).sum(-1), (af * b).sum(-1)
+        return torch.stack([aa - bb, 2 * ab, aa + bb], -1) / frames**0.5
+
+    def adjoint(y: Tensor) -> Tensor:
+        y = y / frames**0.5
+        wa, wb, wab = y[..., 0] + y[..., 2], y[..., 2] - y[..., 0], y[..., 1]
+        cross = (a * wab[..., None]).mT @ b
+        return (a * wa[..., None]).mT @ a + (b * wb[..., None]).mT @ b + cross + cross.mT
+
+    goal = torch.zeros(*motion.shape[:-2], 3, dtype=motion.dtype, device=motion.device)
+    goal[..., 2] = 2 / frames**0.5
+    first = adjoint(goal)
+    probe = first  # power iteration for the step size
+    for _ in range(8):
+        size = torch.linalg.matrix_norm(probe, keepdim=True)
+        probe = adjoint(forward(probe / torch.where(size > 0, size, torch.ones_like(size))))
+    bound = torch.linalg.matrix_norm(probe, keepdim=True).clamp_min(torch.finfo(motion.dtype).tiny) * 1.1
+    level = weight * torch.linalg.matrix_norm(first) / bound[..., 0, 0]
+
+    def step(state: tuple[Tensor, Tensor], k: int) -> tuple[Tensor, Tensor]:
+        f, ahead = state
+        new = psd_shrink(ahead - adjoint(forward(ahead) - goal) / bound, level)
+        return new, new + k / (k + 3) * (new - f)
+
+    f = iterate(step, (torch.zeros_like(first), torch.zeros_like(first)), num_steps=num_steps).value[0]
+    value, vector = torch.linalg.eigh(f)
+    return vector[..., -3:] * value[..., None, -3:].clamp_min(0).sqrt()
+
+
+def metric_upgrade(motion: Tensor, start: Tensor, *, num_steps: int = 150) -> tuple[Tensor, Tensor]:
+    """Refine Q by Levenberg-Marquardt on the orthonormality defect of ``motion @ Q``.
+
+    Minimises mean_t [((a.a - b.b)/2)^2 + (a.b)^2] over (mean squared row length)^2, which is free of scale.
+
+    Args:
+        motion: (..., T, 2, R).
+        start: Q (..., R, 3) to start from; further batch dimensions try several starts at once.
+        num_steps: steps; each is kept only where it lowers the defect.
+
+    Returns:
+        Q (..., R, 3), scaled so that rows have mean squared length 1, and the defect (...).
+
+    Raises:
+        ShapeError: R is below 3, or the shapes do not fit.
+    """
+    _check(motion, "metric_upgrade")
+    if start.shape[-2:] != (motion.shape[-1], 3):
+        raise ShapeError(f"metric_upgrade: expected start (..., {motion.shape[-1]}, 3), got {tuple(start.shape)}")
+    a, b = motion[..., 0, :], motion[..., 1, :]
+    gram = (a.mT @ a + b.mT @ b) / (2 * motion.shape[-3])  # mean squared row length is tr(Q^T gram Q)
+    rank = motion.shape[-1]
+    eye = torch.eye(3 * rank, dtype=motion.dtype, device=motion.device)
+
+    def normalise(q: Tensor) -> Tensor:
+        size = (q * (gram @ q)).sum((-2, -1))
+        return q / torch.where(size > 0, size, torch.ones_like(size)).sqrt()[..., None, None]
+
+    def defect(q: Tensor) -> Tensor:
+        return orthonormality_defect(motion @ q[..., None, :, :]).mean(-1)
+
+    def step(state: tuple[Tensor, ...], _: int) -> tuple[Tensor, ...]:
+        q, cost, damping, progress = state
+        aq, bq = a @ q, b @ q
+        residual = torch.cat([(aq.square().sum(-1) - bq.square().sum(-1)) / 2, (aq * bq).sum(-1)], -1)
+        first = a[..., :, None] * aq[..., None, :] - b[..., :, None] * bq[..., None, :]
+        second = a[..., :, None] * bq[..., None, :] + b[..., :, None] * aq[..., None, :]
+        jacobian = torch.cat([first, second], -3).flatten(-2)
+        normal = jacobian.mT @ jacobian
+        gradient = (jacobian.mT @ residual[..., None]).squeeze(-1)
+        size = normal.diagonal(dim1=-2, dim2=-1).mean(-1)
+        # The residuals are homogeneous, so the undamped step would only shrink Q: hold its scale.
+        radial = (gram @ q).flatten(-2)
+        radial = radial / torch.linalg.vector_norm(radial, dim=-1, keepdim=True).clamp_min(torch.finfo(q.dtype).tiny)
+        normal = normal + 1e3 * size[..., None, None] * rank * radial[..., :, None] * radial[..., None, :]
+        ridge = (damping * size + torch.finfo(q.dtype).tiny)[..., None, None] * eye
+        factor, _ = torch.linalg.cholesky_ex(normal + ridge)
+        move = torch.cholesky_solve(gradient[..., None], factor).squeeze(-1)
+        trial = normalise(q - move.unflatten(-1, (rank, 3)))
+        new = defect(trial)
+        better = new < cost  # False for NaN, too: a failed factorisation only raises the damping
+        keep = better[..., None, None]
+        return (
+            torch.where(keep, trial, q),
+            torch.where(better, new, cost),
+            torch.where(better, damping / 4, damping * 3).clamp(1e-9, 1e6),
+            progress / 2 + torch.where(better, 1 - new / cost, 0),  # halved, not zeroed, by a refused step
+        )
+
+    q = normalise(start.expand(*torch.broadcast_shapes(start.shape[:-2], motion.shape[:-3]), rank, 3))
+    cost = defect(q)
+    final = iterate(
+        step,
+        (q, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost)),
+        num_steps=num_steps,
+        change=lambda _, new: new[3].amax(),
+        tolerance=1e-4,
+    ).value
+    return final[0], final[1]
+
+
+def _check(motion: Tensor, name: str) -> None:
+    if motion.ndim < 3 or motion.shape[-2] != 2 or motion.shape[-1] < 3:
+        raise ShapeError(f"{name}: expected motion (..., T, 2, R) with R >= 3, got {tuple(motion.shape)}")

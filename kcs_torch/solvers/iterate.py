@@ -1,0 +1,195 @@
+"""The loop that every iterative solver here shares, and its two textbook uses."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ConvergenceWarning, OptionError
+from kcs_torch.functional.spectral import svt as shrink
+
+__all__ = ["Solution", "fpc", "iterate", "svt"]
+
+State = TypeVar("State")
+
+
+@dataclass(frozen=True)
+class Solution(Generic[State]):
+    """Where an iteration ended.
+
+    Attributes:
+        value: the last state.
+        converged: whether the stopping rule was met (True where there was none).
+        iterations: steps made.
+    """
+
+    value: State
+    converged: bool
+    iterations: int
+
+
+def iterate(
+    step: Callable[[State, int], State],
+    start: State,
+    *,
+    num_steps: int,
+    change: Callable[[State, State], Tensor] | None = None,
+    tolerance: float = 0.0,
+    check_every: int = 5,
+    grad_steps: int | None = None,
+    warn: str | None = None,
+) -> Solution[State]:
+    """Apply ``state = step(state, k)`` for k = 0, 1, ... until it settles.
+
+    Args:
+        step: one step; gets the state and the step's number.
+        start: first state: a tensor or a tuple of tensors.
+        num_steps: at most so many steps.
+        change: how much a step changed the state, a 0-dimensional tensor; None makes every step.
+        tolerance: stop where ``change`` is at or below it.
+        check_every: measure the change at every so-manyth step only (each check waits for the device).
+        grad_steps: record only the last so many steps for autograd; None records all, 0 none.
+        warn: what to call the iteration in a :class:`ConvergenceWarning` if it does not settle; None is quiet.
+
+    Returns:
+        A :class:`Solution`.
+
+    Raises:
+        OptionError: a count is negative.
+
+    >>> iterate(lambda x, k: x / 2, torch.tensor(8.0), num_steps=3).value.item()
+    1.0
+    """
+    if num_steps < 0 or check_every < 1 or (grad_steps is not None and grad_steps < 0):
+        raise OptionError(f"iterate: expected num_steps, grad_steps >= 0, got {num_steps} and {grad_steps}")
+    state, recorded = start, torch.is_grad_enabled()
+    converged = change is None
+    count = 0
+    for k in range(num_steps):
+        record = recorded and (grad_steps is None or k >= num_steps - grad_steps)
+        with torch.set_grad_enabled(record):
+            new = step(state, k)
+        count = k + 1
+        if change is not None and count % check_every == 0:
+            with torch.no_grad():
+                converged = bool(change(state, new) <= tolerance)
+        state = new
+        if converged and change is not None:
+            break
+    if not converged and warn is not None:
+        warnings.warn(f"{warn} did not settle within {num_steps} steps; the result says converged=False", ConvergenceWarning, stacklevel=2)
+    return Solution(state, converged, count)
+
+
+def fpc(
+    start: Tensor,
+    grad: Callable[[Tensor], Tensor],
+    prox: Callable[[Tensor, Tensor | float], Tensor] = shrink,
+    *,
+    step: Tensor | float,
+    weights: Tensor | list[float],
+    steps_per_weight: int = 10,
+    tolerance: float = 0.0,
+    grad_steps: int | None = None,
+) -> Solution[Tensor]:
+    """Fixed-point continuation: X <- prox(X - step grad(X), step weight), for a falling run of weights.
+
+    Minimises ``f(X) + weight g(X)`` at the last weight, by proximal gradient steps warm-started from the larger ones.
+
+    Args:
+        start: first X, any shape that ``prox`` takes (for the nuclear norm (..., M, N)).
+        grad: gradient of the smooth term f.
+        prox: proximal map ``prox(X, t)`` of g; singular value shrinkage by default.
+        step: step size, below 2 over the Lipschitz constant of ``grad``.
+        weights: (L,) or (L, ...) weights mu in falling order; each row broadcasts against the batch of X.
+        steps_per_weight: steps at each weight, at most.
+        tolerance: go on to the next weight where a step changes X by less than this share of X.
+        grad_steps: as in :func:`iterate`, counted over all steps.
+
+    Returns:
+        A :class:`Solution`; converged tells of the last weight.
+
+    Ma, Goldfarb, Chen 2011; Kovalenko et al. 2019, Algorithm 1, lines 8-11.
+
+    >>> Y = torch.diag(torch.tensor([3.0, 1.0]))
+    >>> fpc(torch.zeros(2, 2), lambda X: X - Y, step=1.0, weights=[2.0]).value.round(decimals=4).tolist()
+    [[1.0, 0.0], [0.0, 0.0]]
+    """
+    total, done, value, converged = len(weights) * steps_per_weight, 0, start, False
+    for weight in weights:
+        last = None if grad_steps is None else max(0, min(steps_per_weight, grad_steps - (total - done - steps_per_weight)))
+        solution = iterate(
+            lambda x, _, w=weight: prox(x - step * grad(x), step * w),  # type: ignore[misc]
+            value,
+            num_steps=steps_per_weight,
+            change=relative_change if tolerance > 0 else None,
+            tolerance=tolerance,
+            grad_steps=last,
+        )
+        value, converged = solution.value, solution.converged
+        done += steps_per_weight
+    return Solution(value, converged, done)
+
+
+def svt(
+    forward: Callable[[Tensor], Tensor],
+    adjoint: Callable[[Tensor], Tensor],
+    target: Tensor,
+    *,
+    threshold: Tensor | float,
+    step: float = 1.2,
+    num_steps: int = 200,
+    tolerance: float = 1e-4,
+    grad_steps: int | None = None,
+) -> Solution[Tensor]:
+    """Singular value thresholding: min ||X||_* + 1/(2 threshold) |X|^2 subject to forward(X) = target.
+
+    The dual ascent X = shrink(forward^*(Y), threshold), Y <- Y + step (target - forward(X)).
+
+    Args:
+        forward: linear map from X (..., M, N) to the shape of ``target``.
+        adjoint: its adjoint.
+        target: data.
+        threshold: the larger, the nearer the solution is to that of the nuclear norm alone.
+        step: below 2 over the squared norm of ``forward``.
+        num_steps: at most so many steps.
+        tolerance: stop where the residual is this share of the target.
+        grad_steps: as in :func:`iterate`.
+
+    Returns:
+        A :class:`Solution` whose value is X.
+
+    Cai, Candes, Shen 2010, Algorithm 1; Wandt et al. 2018, eq. 21.
+
+    >>> Y = torch.diag(torch.tensor([3.0, 1.0]))
+    >>> svt(lambda X: X, lambda Y: Y, Y, threshold=0.5).value.round(decimals=2).tolist()
+    [[3.0, 0.0], [0.0, 1.0]]
+    """
+    goal = torch.linalg.vector_norm(target.detach()) * tolerance
+
+    def ascend(state: tuple[Tensor, Tensor], _: int) -> tuple[Tensor, Tensor]:
+        dual, _ = state
+        value = shrink(adjoint(dual), threshold)
+        return dual + step * (target - forward(value)), value
+
+    solution = iterate(
+        ascend,
+        (step * target, adjoint(torch.zeros_like(target))),
+        num_steps=num_steps,
+        change=lambda old, new: torch.linalg.vector_norm(new[0] - old[0]) / step - goal,
+        tolerance=0.0,
+        grad_steps=grad_steps,
+    )
+    return Solution(solution.value[1], solution.converged, solution.iterations)
+
+
+def relative_change(old: Tensor, new: Tensor) -> Tensor:
+    """Largest change over the batch, as a share of the new value's size; a batch of matrices (..., M, N)."""
+    size = torch.linalg.vector_norm(new, dim=(-2, -1))
+    moved = torch.linalg.vector_norm(new - old, dim=(-2, -1))
+    return (moved / torch.where(size > 0, size, torch.ones_like(size))).amax()
