@@ -19,10 +19,11 @@ from kcs_torch.functional.chain import (
     points_from_bones,
 )
 from kcs_torch.functional.spectral import dct_basis, log_det, nuclear_norm, psd_shrink, singular_values, svt
-from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
+from kcs_torch.functional.temporal import best_path, blend_windows, interpolate, window_starts
 
 __all__ = [
     "back_project",
+    "best_path",
     "blend_windows",
     "bone_lengths",
     "bone_vectors",

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError
 
-__all__ = ["blend_windows", "interpolate", "window_starts"]
+__all__ = ["best_path", "blend_windows", "interpolate", "window_starts"]
 
 
 def interpolate(values: Tensor, seen: Tensor) -> Tensor:
@@ -78,3 +78,39 @@ def blend_windows(parts: Tensor, starts: list[int], length: int) -> Tensor:
     weight = torch.zeros(length, dtype=parts.dtype, device=parts.device)
     weight = weight.index_add(0, index.flatten(), ramp.repeat(len(starts)))
     return total / weight.reshape(-1, *[1] * (parts.ndim - 2))
+
+
+def best_path(cost: Tensor, transition: Tensor) -> Tensor:
+    """Return the states of least total cost, sum_t cost[t, s_t] + transition[t, s_t, s_t+1] (Viterbi).
+
+    Solved by doubling: spans of 1, 2, 4, ... frames are joined by min-plus products of all spans at once, so that no
+    loop runs over frames.
+
+    Args:
+        cost: (T, S).
+        transition: (T - 1, S, S).
+
+    Returns:
+        (T,) states. Where several paths cost the same, the result may mix them.
+
+    >>> best_path(torch.tensor([[0.0, 1], [1, 0], [0, 1]]), torch.ones(2, 2, 2) - torch.eye(2)).tolist()
+    [0, 0, 0]
+    """
+    if len(cost) == 1:
+        return cost.argmin(-1)
+    forward = _prefix_minima(transition + cost[:-1, :, None])  # costs of frames 0..t-1 and the step into t
+    backward = _prefix_minima((transition + cost[1:, None, :]).flip(0).mT).flip(0)  # of frames t+1.. and the step out
+    start, end = torch.zeros_like(cost[:1]), torch.zeros_like(cost[:1])
+    before = torch.cat([start, forward.amin(-2)])
+    after = torch.cat([backward.amin(-2), end])
+    return (cost + before + after).argmin(-1)  # the least cost of any path through each state
+
+
+def _prefix_minima(steps: Tensor) -> Tensor:
+    """Min-plus products of the first 1, 2, ... of (T, S, S) matrices, by doubling."""
+    span = 1
+    while span < len(steps):
+        joined = (steps[:-span, :, :, None] + steps[span:, None, :, :]).amin(-2)
+        steps = torch.cat([steps[:span], joined])
+        span *= 2
+    return steps

@@ -1,0 +1,253 @@
+"""KCS: kinematic chain space (Wandt, Ackermann, Rosenhahn, ECCV workshops 2018)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ShapeError
+from kcs_torch.functional.camera import back_project, factorize, project
+from kcs_torch.functional.chain import bone_lengths, bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.spectral import singular_values, svt
+from kcs_torch.functional.temporal import best_path, interpolate
+from kcs_torch.methods.base import Estimate, Method
+from kcs_torch.nn.energies import centred_residual
+from kcs_torch.nn.unrolled import continuation
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.solvers.ist import ist, metric_upgrade
+from kcs_torch.solvers.iterate import iterate, relative_change
+from kcs_torch.solvers.pose import fit_cameras
+from kcs_torch.types import Tracks
+
+__all__ = ["KCS"]
+
+
+@dataclass(frozen=True)
+class KCS(Method):
+    """A template's bones plus a deviation of least nuclear norm, alternating with weak-perspective cameras.
+
+    Pose = B0 + A S in bone space: B0 is the template, A S the deviation with min ||A||_* subject to the tracks.
+
+    Args:
+        template: rest pose, N positions (x right, y down, z away), any unit; the skeleton's if None; where that has
+            none, the rigid shape that best explains the tracks.
+        links: extra rigid links as pairs of joint names (two hands on one sword); they may close chains.
+        arrangement: how the deviations of all frames form one matrix: "stacked", 3T x B as printed, or "frames",
+            T x 3B, in which a deviation that recurs under another viewpoint gains depth.
+        rounds: alternations of cameras and shape, at most.
+        tolerance: stop where the cameras change by less than this in a round (radians, root mean square).
+        mu: first weight of the nuclear norm, a share of the data's largest singular value.
+        rho: factor from one weight to the next.
+        num_weights: how many weights.
+        steps_per_weight: singular value thresholding steps at each weight, at most.
+        scale_range: factor by which a frame's weak-perspective scale may leave the clip's, which is told by
+            the longest projections of the bones; inf leaves each frame free, as printed.
+        robust: residuals of this share of the body's size count half in the cameras; None is least squares, as printed.
+        continuity: weight of the turn between frames (radians squared) in choosing among a frame's possible
+            cameras; 0 takes each frame's best, as printed.
+
+    Raises:
+        OptionError: a value is out of range.
+    """
+
+    name: ClassVar[str] = "kcs"
+    template: Sequence[Sequence[float]] | None = None
+    links: tuple[tuple[str, str], ...] = ()
+    arrangement: Literal["stacked", "frames"] = "stacked"
+    rounds: int = 3
+    tolerance: float = 1e-3
+    mu: float = 0.5
+    rho: float = 0.25
+    num_weights: int = 8
+    steps_per_weight: int = 15
+    scale_range: float = 1.1
+    robust: float | None = 0.4
+    continuity: float = 1.0
+
+    def __post_init__(self) -> None:
+        self._expect(self.arrangement in ("stacked", "frames"), "arrangement", "'stacked' or 'frames'")
+        self._expect(self.rounds >= 1, "rounds", "at least 1")
+        self._expect(self.mu > 0, "mu", "a positive number")
+        self._expect(0 < self.rho < 1, "rho", "a number between 0 and 1")
+        self._expect(self.num_weights >= 1, "num_weights", "at least 1")
+        self._expect(self.steps_per_weight >= 1, "steps_per_weight", "at least 1")
+        self._expect(self.scale_range >= 1, "scale_range", "a factor >= 1")
+        self._expect(self.robust is None or self.robust > 0, "robust", "None or a positive share")
+        self._expect(self.continuity >= 0, "continuity", "a number >= 0")
+
+    def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
+        """Alternate cameras and shape until the cameras stand still."""
+        body = tracks.skeleton.with_links(self.links) if self.links else tracks.skeleton
+        body = body.connected()
+        bones = body.bone_index(device=tracks.points.device)
+        matrix = incidence(bones, body.num_joints, dtype=tracks.points.dtype)
+        inverse = chain_inverse(matrix)
+        rest, notes = self._template(tracks)
+        rest = rest - rest.mean(0)
+        scale = clip_scale(tracks, rest)
+        low, high = scale / self.scale_range, scale * self.scale_range
+        if math.isinf(self.scale_range):
+            low, high = torch.zeros_like(scale), torch.full_like(scale, math.inf)
+        shape = rest.expand(tracks.num_frames, -1, 3)
+        rotations: Tensor | None = None
+        deviation = torch.zeros(tracks.num_frames, len(bones), 3, dtype=rest.dtype, device=rest.device)
+        converged, made = False, 0
+        for _ in range(self.rounds):
+            last = rotations
+            rotations, scales = self._cameras(tracks, shape, low, high, last, cameras)
+            deviation, settled, steps = self._deviation(tracks, rest, deviation, rotations[:, :2], scales, matrix, inverse)
+            shape, made = rest + inverse @ deviation, made + steps
+            if last is not None:
+                moved = ((rotations - last).square().sum((-2, -1)).mean() / 2).sqrt()
+                converged = bool(moved <= self.tolerance)
+            if converged or cameras is not None or not bool(tracks.seen.any()):
+                converged = settled
+                break
+        assert rotations is not None
+        size = scales.mean()
+        points = size * shape @ rotations.mT
+        points = points - points.mean(-2, keepdim=True)
+        return Estimate(points, rotations[:, :2], scales / size, converged, made, notes)
+
+    def _template(self, tracks: Tracks) -> tuple[Tensor, tuple[str, ...]]:
+        like = tracks.points
+        joints = tracks.num_joints
+        if self.template is not None:
+            rest = torch.as_tensor(self.template, dtype=like.dtype, device=like.device)
+            if rest.shape != (joints, 3) or not torch.isfinite(rest).all():
+                raise ShapeError(f"kcs: template: expected {joints} finite positions (x, y, z), got shape {tuple(rest.shape)}")
+            return rest, ()
+        if tracks.skeleton.template is not None:
+            return tracks.skeleton.template_points(dtype=like.dtype, device=like.device), ()
+        note = f"skeleton '{tracks.skeleton.name}' has no template: the rigid shape that best explains the tracks stands in"
+        return rigid_shape(tracks), (note,)
+
+    def _cameras(
+        self, tracks: Tracks, shape: Tensor, low: Tensor, high: Tensor, last: Tensor | None, known: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Rotations (T, 3, 3) and scales (T,) of the camera step (eq. 22-25), consistent over time."""
+        fit = fit_cameras(tracks.points, shape, tracks.weights, low, high, robust=self.robust, start=last)
+        rotations, scales, cost = fit.rotations, fit.scales, fit.cost.mT  # cost (T, C)
+        if known is not None:
+            from kcs_torch.functional.camera import complete_rotation
+
+            rotations = complete_rotation(known)
+            flat = project(shape, known)
+            match = (flat * tracks.points * tracks.weights[..., None]).sum((-2, -1))
+            size = (flat.square() * tracks.weights[..., None]).sum((-2, -1))
+            free = match / torch.where(size > 0, size, torch.ones_like(size))
+            return rotations, torch.minimum(torch.maximum(free, low), high)
+        trace = torch.einsum("atij,btij->tab", rotations[:, :-1], rotations[:, 1:])
+        turn = torch.arccos(((trace - 1) / 2).clamp(-1, 1)).square()
+        choice = best_path(cost, self.continuity * turn) if self.continuity > 0 else cost.argmin(-1)
+        frame = torch.arange(tracks.num_frames, device=choice.device)
+        return rotations[choice, frame], scales[choice, frame]
+
+    def _deviation(
+        self, tracks: Tracks, rest: Tensor, start: Tensor, cameras: Tensor, scales: Tensor, matrix: Tensor, inverse: Tensor
+    ) -> tuple[Tensor, bool, int]:
+        """Shape step (eq. 21): deviations (T, B, 3) of least nuclear norm that meet the tracks, by SVT continuation.
+
+        Unseen joints take their current projection, and joints seen with low confidence go part of the way:
+        the majorisation of the weighted data term.
+        """
+        goal = tracks.points / scales[:, None, None]
+        folded = _stack if self.arrangement == "stacked" else _frames
+        first = -centred_residual(project(rest, cameras), goal, tracks.weights) * tracks.weights[..., None]
+        top = singular_values(folded(back_project(matrix.mT @ first, cameras))[0])[0]
+
+        def step(state: Tensor, threshold: Tensor) -> Tensor:
+            residual = centred_residual(project(rest + inverse @ state, cameras), goal, tracks.weights)
+            move = back_project(matrix.mT @ (residual * tracks.weights[..., None]), cameras)
+            folded_state, unfold = folded(state - move)
+            return unfold(svt(folded_state, threshold))
+
+        state, settled, made = start, False, 0
+        for mu in continuation(self.num_weights, self.mu, self.mu * self.rho ** (self.num_weights - 1)):
+            solution = iterate(
+                lambda x, _, mu=mu: step(x, mu * top),  # type: ignore[misc]
+                state,
+                num_steps=self.steps_per_weight,
+                change=lambda old, new: relative_change(old.flatten(0, 1), new.flatten(0, 1)),
+                tolerance=1e-4,
+            )
+            state, settled, made = solution.value, solution.converged, made + solution.iterations
+        return state, settled, made
+
+
+def clip_scale(tracks: Tracks, rest: Tensor, *, span: int = 60, quantile: float = 0.95) -> Tensor:
+    """Weak-perspective scale of each frame, from the longest projections of the bones around it.
+
+    A bone's projection is at most scale times its length, and reaches it where the bone lies in the image plane. In
+    spans of frames, each bone's high quantile of |projection| / length votes, and the median bone wins: an arm held out
+    does not enlarge the body.
+
+    Args:
+        tracks: the tracks.
+        rest: (N, 3) template.
+        span: frames of a span; scales between spans are interpolated.
+        quantile: of a bone's projections within a span.
+
+    Returns:
+        (T,), positive.
+    """
+    body = tracks.skeleton
+    frames, device = tracks.num_frames, tracks.points.device
+    index = body.bone_index(device=device)[list(body.rigid)]
+    fallback = tracks.points.square().sum(-1).mean().sqrt() / rest.square().sum(-1).mean().sqrt().clamp_min(1e-12)
+    if len(index) == 0:
+        return fallback.clamp_min(1e-12).expand(frames)
+    length = bone_lengths(rest, index)
+    seen = (tracks.weights[:, index[:, 0]] > 0) & (tracks.weights[:, index[:, 1]] > 0) & (length > 0)
+    ratio = bone_vectors(tracks.points, index).norm(dim=-1) / torch.where(length > 0, length, torch.ones_like(length))
+    ratio = torch.where(seen, ratio, torch.nan)
+    count = max(1, round(frames / span))
+    edges = [round(i * frames / count) for i in range(count + 1)]
+    votes = torch.stack([ratio[a:b].nanquantile(quantile, 0).nanmedian() for a, b in zip(edges, edges[1:], strict=False)])
+    overall = ratio.nanquantile(quantile, 0).nanmedian()
+    overall = torch.where(torch.isfinite(overall) & (overall > 0), overall, fallback.clamp_min(1e-12))
+    votes = torch.where(torch.isfinite(votes) & (votes > 0), votes, overall)
+    at = torch.tensor([(a + b - 1) / 2 for a, b in zip(edges, edges[1:], strict=False)], dtype=votes.dtype, device=device)
+    time = torch.arange(frames, dtype=votes.dtype, device=device)
+    right = torch.bucketize(time, at).clamp(1, max(count - 1, 1)).clamp_max(count - 1)
+    left = (right - 1).clamp_min(0)
+    gap = (at[right] - at[left]).clamp_min(1e-12)
+    share = ((time - at[left]) / gap).clamp(0, 1)
+    return votes[left] * (1 - share) + votes[right] * share
+
+
+def rigid_shape(tracks: Tracks) -> Tensor:
+    """The one rigid shape (N, 3) that best explains the tracks (Tomasi, Kanade 1992): a template for want of any.
+
+    Where the viewpoint does not turn its depth is nearly zero.
+    """
+    filled = interpolate(tracks.points, tracks.seen)
+    filled = filled - filled.mean(-2, keepdim=True)
+    frames, joints = filled.shape[:2]
+    if min(2 * frames, joints) < 3:
+        return torch.nn.functional.pad(filled.mean(0), (0, 1))
+    motion, _ = factorize(filled, 3)
+    size = motion[..., 0].square().mean().sqrt()
+    motion = motion / torch.where(size > 0, size, torch.ones_like(size))
+    q, _ = metric_upgrade(motion, ist(motion))
+    from kcs_torch.functional.camera import rows_to_cameras
+
+    cameras, _ = rows_to_cameras(motion @ q)
+    normal = (cameras.mT @ cameras).mean(0) + 1e-3 * torch.eye(3, dtype=filled.dtype, device=filled.device)
+    return torch.linalg.solve(normal, back_project(filled, cameras).mean(0).mT).mT
+
+
+def _stack(deviation: Tensor):  # type: ignore[no-untyped-def]
+    """(T, B, 3) as 3T x B, and the way back."""
+    frames = len(deviation)
+    return deviation.mT.flatten(0, 1), lambda m: m.unflatten(0, (frames, 3)).mT
+
+
+def _frames(deviation: Tensor):  # type: ignore[no-untyped-def]
+    """(T, B, 3) as T x 3B, and the way back."""
+    return deviation.flatten(1), lambda m: m.unflatten(1, (-1, 3))

@@ -1,0 +1,90 @@
+"""The entry call: :func:`reconstruct`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from kcs_torch.errors import OptionError, unknown
+from kcs_torch.methods import METHODS
+from kcs_torch.methods.base import Method
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.types import Reconstruction, Tracks
+
+__all__ = ["choose_method", "reconstruct"]
+
+ENOUGH_TURN = 60.0
+"""Degrees of viewpoint turn from which low-rank shapes beat a template."""
+
+
+def reconstruct(
+    tracks: Any,
+    *,
+    method: str | Method = "auto",
+    skeleton: str | Path | Skeleton | None = None,
+    confidence: Any = None,
+    fps: float | None = None,
+    units: str = "px",
+    cameras: Any = None,
+    **fields: Any,
+) -> Reconstruction:
+    """Turn 2D joint tracks of one body into 3D motion with bones of constant length; no training data.
+
+    Args:
+        tracks: a :class:`Tracks`, or an array (T, N, 2) with NaN where unseen.
+        method: "auto", a name in :data:`kcs_torch.METHODS`, or a :class:`Method`. "auto" looks how far the viewpoint
+            turns about the body: SfAM where it turns enough or the skeleton has no template, else KCS.
+        skeleton: for arrays: a :class:`Skeleton`, a built-in name, or a YAML/JSON file.
+        confidence: for arrays: (T, N) in 0..1.
+        fps: for arrays: frames per second.
+        units: for arrays.
+        cameras: (T, 2, 3) camera rows, world to camera, where they are known.
+        **fields: of the method, such as ``beta=2.0``.
+
+    Returns:
+        A :class:`Reconstruction`: points (T, N, 3) in the camera frame, cameras, lengths, diagnostics.
+
+    Raises:
+        OptionError: the method or a field is unknown, or its value is out of range; or array options come with Tracks.
+        ShapeError: an array has the wrong shape or values.
+        SkeletonError: the skeleton is unknown or does not fit.
+
+    >>> from kcs_torch.data.synthetic import walking_person
+    >>> result = reconstruct(walking_person(60).tracks, method="sfam", beta=2.0)
+    >>> result.points.shape, result.method
+    (torch.Size([60, 17, 3]), 'sfam')
+    """
+    if isinstance(tracks, Tracks):
+        if skeleton is not None or confidence is not None or fps is not None:
+            raise OptionError("reconstruct: skeleton, confidence and fps belong to arrays; these tracks already have them")
+    else:
+        tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units)
+    if isinstance(method, Method):
+        if fields:
+            raise OptionError(f"reconstruct: fields ({', '.join(fields)}) go with a method's name; set them on the method itself")
+        return method(tracks, cameras)
+    if method == "auto":
+        name = choose_method(tracks)
+    elif method in METHODS:
+        name = method
+    else:
+        raise unknown("method", method, ["auto", *METHODS])
+    return METHODS[name].from_options(**fields)(tracks, cameras)
+
+
+def choose_method(tracks: Tracks) -> str:
+    """Return the name of the method that suits the tracks.
+
+    Low-rank shapes need a viewpoint that turns; a template needs a skeleton that has one. The turn is that of the body
+    against the camera, told by fitting the template to each frame.
+    """
+    if tracks.skeleton.template is None:
+        return "sfam"
+    import warnings
+
+    from kcs_torch.methods.kcs import KCS
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        probe = KCS(rounds=1, num_weights=1, steps_per_weight=1)(tracks)
+    return "sfam" if probe.diagnostics.viewpoint_turn >= ENOUGH_TURN else "kcs"

@@ -1,0 +1,133 @@
+"""Cameras from a known pose: weak-perspective resection of every frame at once."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import roma
+import torch
+from torch import Tensor
+
+__all__ = ["CameraFit", "fit_cameras"]
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """Weak-perspective cameras of every frame, for each of C starts.
+
+    Attributes:
+        rotations: (C, T, 3, 3), world to camera.
+        scales: (C, T).
+        cost: (C, T), mean robust loss over joints, in 0..1.
+    """
+
+    rotations: Tensor
+    scales: Tensor
+    cost: Tensor
+
+
+def fit_cameras(
+    tracks: Tensor,
+    points: Tensor,
+    weights: Tensor,
+    low: Tensor,
+    high: Tensor,
+    *,
+    num_yaws: int = 8,
+    robust: float | None = 0.4,
+    num_steps: int = 8,
+    start: Tensor | None = None,
+) -> CameraFit:
+    """Fit min_P sum_n w_n rho(|y_n - P x_n - t|) with P = s R_2x3 per frame, from several headings at once.
+
+    The two rows of P are orthogonal and equally long (KCS eq. 22-25). Levenberg-Marquardt over the rotation with the
+    scale at its optimum within its bounds; iteratively reweighted, so that limbs that are away from the template do not
+    tilt the body.
+
+    Args:
+        tracks: y (T, N, 2).
+        points: x (T, N, 3).
+        weights: w (T, N).
+        low: (T,) least scale.
+        high: (T,) greatest scale.
+        num_yaws: headings tried, evenly about the vertical axis.
+        robust: residuals of this share of the body's size count half; None is least squares.
+        num_steps: Levenberg-Marquardt steps of each reweighting.
+        start: (T, 3, 3) a further start.
+
+    Returns:
+        The fit of each start. Frames without a seen joint have cost 0.
+    """
+    frames = len(tracks)
+    rotations = _headings(num_yaws, tracks)[:, None].expand(-1, frames, 3, 3)
+    if start is not None:
+        rotations = torch.cat([start[None], rotations])
+    share = weights.expand(len(rotations), *weights.shape)
+    size = (points - points.mean(-2, keepdim=True)).square().sum(-1).mean(-1).sqrt()
+    reach = (0.5 * (low + high) * size).clamp_min(torch.finfo(size.dtype).tiny) * (robust or 1.0)
+    for _ in range(1 if robust is None else 4):
+        rotations, scales, residual = _refine(rotations, tracks, points, share, low, high, num_steps)
+        square = (residual / reach[:, None]).square()
+        if robust is not None:
+            share = weights / (1 + square).square()
+    loss = square if robust is None else square / (1 + square)
+    total = weights.sum(-1)
+    cost = (loss * weights).sum(-1) / torch.where(total > 0, total, torch.ones_like(total))
+    return CameraFit(rotations, scales, cost)
+
+
+def _refine(
+    rotations: Tensor, tracks: Tensor, points: Tensor, weights: Tensor, low: Tensor, high: Tensor, num_steps: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Weighted least-squares rotations (C, T, 3, 3), scales (C, T) and residual lengths (C, T, N)."""
+    total = weights.sum(-1, keepdim=True)
+    unit = (weights / torch.where(total > 0, total, torch.ones_like(total)))[..., None]
+    y, x = tracks - (tracks * unit).sum(-2, keepdim=True), points - (points * unit).sum(-2, keepdim=True)
+    moment = y.mT @ (x * unit)  # (C, T, 2, 3)
+    gram = x.mT @ (x * unit)  # (C, T, 3, 3)
+    power = (y.square() * unit).sum((-2, -1))
+    axes = _GENERATORS.to(tracks)
+    eye = torch.eye(3, dtype=tracks.dtype, device=tracks.device)
+    tiny = torch.finfo(tracks.dtype).tiny
+
+    def evaluate(r: Tensor) -> tuple[Tensor, Tensor]:
+        rows = r[..., :2, :]
+        match = (rows * moment).sum((-2, -1))
+        size = ((rows @ gram) * rows).sum((-2, -1))
+        s = torch.minimum(torch.maximum(match / size.clamp_min(tiny), low), high)
+        return power - 2 * s * match + s * s * size, s
+
+    cost, scales = evaluate(rotations)
+    damping = torch.full_like(cost, 1e-3)
+    for _ in range(num_steps):
+        rows = rotations[..., :2, :]
+        jacobian = (axes[:, :2] @ rotations[..., None, :, :]) * scales[..., None, None, None]  # (C, T, 3, 2, 3)
+        spread = jacobian @ gram[..., None, :, :]
+        normal = spread.flatten(-2) @ jacobian.flatten(-2).mT
+        misfit = moment - scales[..., None, None] * (rows @ gram)
+        target = (jacobian * misfit[..., None, :, :]).sum((-2, -1))
+        ridge = (damping + 1e-9) * normal.diagonal(dim1=-2, dim2=-1).amax(-1) + tiny
+        move = torch.linalg.solve(normal + ridge[..., None, None] * eye, target)
+        trial = roma.rotvec_to_rotmat(move) @ rotations
+        new, trial_scales = evaluate(trial)
+        better = new < cost
+        rotations = torch.where(better[..., None, None], trial, rotations)
+        scales, cost = torch.where(better, trial_scales, scales), torch.where(better, new, cost)
+        damping = torch.where(better, damping * 0.3, damping * 5)
+    residual = torch.linalg.vector_norm(y - scales[..., None, None] * (x @ rotations[..., :2, :].mT), dim=-1)
+    return rotations, scales, residual
+
+
+def _headings(count: int, like: Tensor) -> Tensor:
+    """(count, 3, 3) rotations about the vertical (y) axis."""
+    angle = torch.arange(count, dtype=like.dtype, device=like.device) * (2 * math.pi / count)
+    axis = torch.tensor([0.0, 1.0, 0.0], dtype=like.dtype, device=like.device)
+    return roma.rotvec_to_rotmat(angle[:, None] * axis)
+
+
+_GENERATORS = torch.tensor(
+    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]],
+    dtype=torch.float64,
+)
+"""Generators of rotations about x, y and z: exp(w) = I + sum_k w_k G_k + ..."""
