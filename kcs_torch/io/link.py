@@ -17,16 +17,16 @@ __all__ = ["link_people"]
 
 Array = NDArray[np.float64]
 
-_REACH = 0.5  # distance, in sizes of the person, beyond which a detection is somebody else ...
-_REACH_GROWTH = 0.05  # ... and by how much that grows with each frame of a gap ...
-_REACH_MOST = 1.0  # ... up to this
-_MISSING = 0.3  # cost of a detection that shows none of the joints last seen; keeps partial doubles from winning
-_YOUNG = 0.1  # cost of a person seen in fewer frames than ...
-_YOUNG_FRAMES = 5  # ... this, so that a ghost does not take over from somebody known
+# Costs are in sizes of the person, as distances are.
+_REACH = 0.5  # farther off than this is somebody else
+_NOBODY = 0.4  # cost of leaving somebody without a detection
+_FARTHEST = 0.7  # a joint counts as no farther off: left and right confused do not make somebody else of a person
+_RANK = 0.5  # gain where somebody well seen so far gets a well seen detection: keeps ghosts from taking over
+_MEMORY = 0.95  # how slowly it fades how well somebody was seen
 _SIZE = 0.2  # cost of a size that differs by a factor of e
 _VELOCITY = 0.4  # share of the newest displacement in the running velocity
+_SPEED_UP = 0.1  # sizes of the person by which the running velocity changes in a frame, at most
 _COAST = 0.9  # the velocity fades by this factor with each frame of a gap
-_BIG = 1e6
 
 
 @dataclass
@@ -37,6 +37,7 @@ class _Person:
     size: float
     frame: int  # when last seen
     velocity: Array  # (2,) of the whole body, per frame
+    strength: float  # running mean of the confidence of all joints, 0 in frames without a sight
     seen: list[tuple[int, int]]  # (frame, index among its detections)
 
 
@@ -67,7 +68,8 @@ def link_people(detections: Sequence[Array], *, max_gap: int = 30) -> list[Array
         for k, index in enumerate(visible):
             person = taken.get(k)
             if person is None:
-                person = _Person(found[index].copy(), _sizes(found[index][None])[0], t, np.zeros(2), [(t, int(index))])
+                size, strength = float(_sizes(found[index][None])[0]), float(found[index, :, 2].mean())
+                person = _Person(found[index], size, t, np.zeros(2), strength, [(t, int(index))])
                 people.append(person)
                 open_people.append(person)
             else:
@@ -94,28 +96,24 @@ def _assign(people: list[_Person], found: Array, frame: int) -> dict[int, _Perso
     size = np.array([p.size for p in people])
     own = _sizes(found)
     scale = np.maximum(size[:, None], own[None])  # (K, P)
-    reach = np.minimum(_REACH + _REACH_GROWTH * (gap - 1), _REACH_MOST)[:, None]
 
     joint = np.linalg.norm(where[:, None] - found[None, ..., :2], axis=-1) / scale[..., None]  # (K, P, N)
     weight = np.minimum(poses[:, None, :, 2], found[None, ..., 2])
     total = weight.sum(-1)
-    # A joint may be far off (left and right confused, say) without making somebody else of the person.
-    distance = (np.minimum(joint, 2 * reach[..., None]) * weight).sum(-1) / np.maximum(total, 1e-9)
+    distance = (np.minimum(joint, _FARTHEST) * weight).sum(-1) / np.maximum(total, 1e-9)
     apart = np.linalg.norm(_centres(poses)[:, None] + drift[:, None] - _centres(found)[None], axis=-1) / scale
     distance = np.where(total > 0, distance, apart)
-    covered = total / np.maximum(poses[..., 2].sum(-1), 1e-9)[:, None]
-    cost = distance + _MISSING * (1 - np.minimum(covered, 1))
-    cost += _SIZE * np.abs(np.log(size[:, None] / own[None]))
-    cost += _YOUNG * np.array([len(p.seen) < _YOUNG_FRAMES for p in people])[:, None]
-
-    cost = np.where(distance < reach, cost, _BIG)
+    cost = distance + _SIZE * np.minimum(np.abs(np.log(size[:, None] / own[None])), 1)
+    strength = np.array([p.strength for p in people]) * _MEMORY ** (gap - 1)
+    gain = _RANK * strength[:, None] * found[None, ..., 2].mean(-1)
+    cost = np.where(cost < _REACH, np.minimum(cost - gain, _NOBODY), _NOBODY)
     if cost.shape == (1, 1):
         pairs = [(0, 0)]
     else:
         from scipy.optimize import linear_sum_assignment
 
         pairs = list(zip(*linear_sum_assignment(cost), strict=True))
-    return {int(p): people[int(k)] for k, p in pairs if cost[k, p] < _BIG}
+    return {int(p): people[int(k)] for k, p in pairs if cost[k, p] < _NOBODY}
 
 
 def _update(person: _Person, found: Array, frame: int) -> None:
@@ -125,11 +123,13 @@ def _update(person: _Person, found: Array, frame: int) -> None:
     both = np.minimum(person.pose[:, 2], found[:, 2])
     if both.sum() > 0:
         step = ((found[:, :2] - person.pose[:, :2]) * both[:, None]).sum(0) / both.sum() / gap
-        person.velocity = step if len(person.seen) == 1 else (1 - _VELOCITY) * person.velocity + _VELOCITY * step
+        most = _SPEED_UP * person.size  # so that one wrong detection does not send the prediction away
+        person.velocity = person.velocity + np.clip(_VELOCITY * (step - person.velocity), -most, most)
     moved = person.pose[:, :2] + person.velocity * gap  # a joint that is unseen now moves with the body ...
     faded = person.pose[:, 2] * 0.9**gap  # ... and counts less and less
     person.pose = np.where(seen[:, None], found, np.column_stack([moved, faded]))
     person.size = 0.8 * person.size + 0.2 * _sizes(found[None])[0] if seen.sum() > 1 else person.size
+    person.strength = _MEMORY**gap * person.strength + (1 - _MEMORY) * float(found[:, 2].mean())
     person.frame = frame
 
 

@@ -107,9 +107,9 @@ def _box(points: NDArray[np.float64]) -> dict[str, Any]:
     least = 0.25 * size
     grow = np.maximum(least - (high - low), 0) / 2
     grow[2] = 0
+    ground = float(low[2])  # where the lowest joint comes
     low, high = low - grow - 0.05 * size, high + grow + 0.05 * size
-    low[2] += 0.05 * size - 1e-3 * size  # the ground is where the lowest joint comes
-    return {"low": low.tolist(), "high": high.tolist(), "grid": _nice(size / GRID_LINES)}
+    return {"low": low.tolist(), "high": high.tolist(), "ground": ground, "grid": _nice(size / GRID_LINES)}
 
 
 def _nice(step: float) -> float:

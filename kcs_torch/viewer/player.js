@@ -25,14 +25,14 @@
   // The traces that move, in the order in which they are drawn: shadow, bones by side, joints.
   const moving = () => {
     const joints = Array.from({ length: count }, (_, k) => place(k));
-    const ground = box().low[2];
+    const ground = box().ground;
     const flat = joints.map(([x, y]) => [x, y, ground]);
     const every = sides.flatMap(s => scene.bones[s]);
     return [lines(every, flat), ...sides.map(s => lines(scene.bones[s], joints)), columns(joints)];
   };
 
   const grid = () => {
-    const { low, high, grid: step } = box(), rows = [], z = low[2];
+    const { low, high, ground, grid: step } = box(), rows = [], z = ground - 0.005 * (high[2] - low[2]);
     for (let x = Math.ceil(low[0] / step) * step; x <= high[0]; x += step) rows.push([x, low[1], z], [x, high[1], z], GAP);
     for (let y = Math.ceil(low[1] / step) * step; y <= high[1]; y += step) rows.push([low[0], y, z], [high[0], y, z], GAP);
     return columns(rows);
