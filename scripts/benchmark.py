@@ -16,6 +16,7 @@ import importlib.util
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Iterator
 from fnmatch import fnmatch
 from pathlib import Path
@@ -131,6 +132,7 @@ def main(config: DictConfig) -> None:
     """Run every chosen case and write results.csv."""
     global failed
     torch.set_num_threads(config.threads)
+    warnings.simplefilter("ignore", kt.KcsWarning)  # the column "converged" says it
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
     shared = Path(config.shared)

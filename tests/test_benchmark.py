@@ -1,6 +1,7 @@
 """scripts/benchmark.py, on a small protocol made here and on a case of the real one."""
 
 import csv
+import importlib.util
 import subprocess
 import sys
 
@@ -81,15 +82,33 @@ def test_a_failing_case_is_a_row_and_an_exit_code(root, folder):
     assert good["options"] == "beta=0.5"
 
 
-@pytest.mark.parametrize(
-    ("word", "hint"),
-    [("suite=walks", "turn, broken"), ("shared=nowhere", "protocol/protocol.py"), ("case=x*", "matches no case")],
-)
-def test_wrong_choices(root, folder, word, hint):
-    words = ["suite=turn", *([] if word.startswith("shared") else ["shared=../shared"]), word]
-    done = benchmark(root, folder, *words)
-    assert done.returncode == 1
-    assert hint in done.stderr + done.stdout
+@pytest.fixture(scope="module")
+def script(root):
+    spec = importlib.util.spec_from_file_location("benchmark", root / "scripts" / "benchmark.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_suites_and_cases_are_chosen_by_name_and_pattern(script, folder):
+    protocol = script.load_protocol(folder.parent / "shared")
+    names = lambda *choice: [(s, c["src"]) for s, c in script.chosen(protocol, *choice)]  # noqa: E731
+    assert names("turn", "*") == [("turn", "a"), ("turn", "b")]
+    assert names(["broken", "turn"], "*_a") == [("broken", "a"), ("turn", "a")]
+    assert len(names("all", "*")) == 4
+
+
+def test_wrong_choices(script, folder):
+    with pytest.raises(SystemExit, match="expected a folder with protocol"):
+        script.load_protocol(folder / "nowhere")
+    protocol = script.load_protocol(folder.parent / "shared")
+    with pytest.raises(SystemExit, match="turn, broken"):
+        list(script.chosen(protocol, ["turn", "walks"], "*"))
+
+
+def test_no_case_is_an_error(root, folder):
+    done = benchmark(root, folder, "suite=turn", "case=x*")
+    assert done.returncode == 1 and "matches no case" in done.stderr
 
 
 def test_real_case_with_true_cameras(root, shared, tmp_path):
