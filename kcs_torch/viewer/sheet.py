@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,8 +72,10 @@ def _draw(result: Reconstruction, chosen: NDArray[Any], rows: list[Any], figure_
     figure = figure_type(figsize=size, dpi=130, layout="constrained")
     canvas_type(figure)
     axes = figure.subplots(len(rows), len(chosen), squeeze=False)
-    name = f"{result.method}: {Path(result.tracks.source).name}"
-    figure.suptitle(f"{name}\n{summarise(result)}", fontsize=9, parse_math=False, wrap=True)
+    title = [f"{result.method}: {Path(result.tracks.source).name}", summarise(result)]
+    lines = [line for text in title for line in textwrap.wrap(text, int(14 * size[0]))]
+    text = "\n".join(lines).encode("utf-8", "replace").decode()  # names of files may hold bytes that are no letters
+    figure.suptitle(text, fontsize=9, parse_math=False)
     for (label, places, depths), half, line in zip(rows, halves, axes, strict=True):
         for i, axis in enumerate(line):
             _body(axis, result, places[i], None if depths is None else depths[i])

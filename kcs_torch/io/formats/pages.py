@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 from kcs_torch.io.registry import Writer
@@ -14,14 +15,16 @@ def write_html(result: Reconstruction, path: Path) -> None:
     """Write the page of :func:`kcs_torch.viewer.player`."""
     from kcs_torch.viewer import player
 
-    path.write_text(player(result), encoding="utf-8")
+    path.write_text(player(result), encoding="utf-8", errors="replace")
 
 
 def write_png(result: Reconstruction, path: Path) -> None:
     """Write the figure of :func:`kcs_torch.viewer.sheet`."""
     from kcs_torch.viewer import sheet
 
-    sheet(result).savefig(path, format="png")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph")  # a file's name may hold letters that the font has not
+        sheet(result).savefig(path, format="png")
 
 
 WRITERS = (

@@ -27,7 +27,7 @@ def write_csv(result: Reconstruction, path: Path) -> None:
     points = plain(result.points)
     header = ["frame", "time [s]"]
     header += [f"{_cell(joint)}_{axis} [{result.units}]" for joint in result.skeleton.joints for axis in "xyz"]
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with path.open("w", newline="", encoding="utf-8", errors="replace") as file:
         writer = csv.writer(file)
         writer.writerow(header)
         for frame, row in enumerate(points.reshape(len(points), -1).tolist()):

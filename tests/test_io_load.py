@@ -1,0 +1,162 @@
+"""Formats by content, the lists of formats, and choosing people."""
+
+import sys
+
+import numpy as np
+import pytest
+from samples import person, write_openpose
+
+import kcs_torch as kt
+from kcs_torch.errors import FormatError, OptionError, SkeletonError
+from kcs_torch.io import READERS, WRITERS, Reader, Writer, detect_format, load_people, load_tracks
+from kcs_torch.io.registry import Probe, need
+
+
+@pytest.fixture
+def samples(tmp_path):
+    """One path of every format."""
+    from scipy.io import savemat
+
+    points = person()[..., :2]
+    np.savez(tmp_path / "a.npz", points2d=points)
+    savemat(tmp_path / "a.mat", {"points2d": points})
+    write_openpose(tmp_path / "json", [p[None] for p in person()])
+    return {"npz": tmp_path / "a.npz", "mat": tmp_path / "a.mat", "openpose": tmp_path / "json"}
+
+
+def test_there_is_a_sample_of_every_format(samples):
+    assert set(samples) == set(READERS)
+
+
+def test_exactly_one_reader_recognises_each_sample(samples):
+    for name, path in samples.items():
+        assert [r.name for r in READERS.values() if r.recognises(Probe(path))] == [name]
+
+
+def test_content_decides_and_not_the_name(samples, tmp_path):
+    for name, path in samples.items():
+        other = path.rename(tmp_path / f"{name}.csv")
+        assert detect_format(other) == name
+        assert load_tracks(other).num_frames == 4
+
+
+def test_lists_of_formats():
+    assert all(isinstance(r, Reader) and r.name == name for name, r in READERS.items())
+    assert all(isinstance(w, Writer) and w.suffix == suffix for suffix, w in WRITERS.items())
+    for entry in [*READERS.values(), *WRITERS.values()]:
+        assert entry.summary
+        assert "\n" not in entry.summary
+
+
+def test_a_new_format_is_one_new_file(tmp_path, monkeypatch):
+    from kcs_torch.io import formats
+    from kcs_torch.io.registry import discover
+
+    (tmp_path / "morse.py").write_text(
+        "from kcs_torch.io.registry import Reader\n"
+        "READERS = (Reader('morse', 'dots and dashes', lambda probe: False, lambda path, options: []),)\n"
+    )
+    monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path)])
+    readers, writers = discover()
+    sys.modules.pop("kcs_torch.io.formats.morse")
+    assert set(readers) == {*READERS, "morse"}
+    assert set(writers) == set(WRITERS)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.json", b"{", "got text that is not JSON"),
+        ("a.json", b"{}", "got JSON with other content"),
+        ("a.json", b"[" * 100_000, "nested too deeply"),
+        ("a.csv", b"x,y\n1,2\n", "a file that begins with b'x,y"),
+        ("a.h5", b"\x89HDF\r\n\x1a\n" + bytes(50), "a binary file with other content"),
+        ("a.zip", b"PK\x03\x04" + bytes(50), "a binary file with other content"),
+        ("a.txt", b"", "an empty file"),
+    ],
+)
+def test_what_nobody_recognises_is_described(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(FormatError, match=message) as caught:
+        load_tracks(tmp_path / name)
+    assert name in str(caught.value)
+
+
+def test_nothing_there(tmp_path):
+    with pytest.raises(FormatError, match="there is no such file or folder"):
+        load_tracks(tmp_path / "absent.npz")
+    with pytest.raises(FormatError, match="there is no such file or folder"):
+        load_tracks(tmp_path / "absent" / "deeper.npz")
+    with pytest.raises(FormatError, match="there is no such file or folder"):
+        load_tracks("a\0b")
+    with pytest.raises(FormatError, match="neither"):
+        load_tracks("/dev/null")
+
+
+def test_a_file_that_the_system_refuses(tmp_path, monkeypatch):
+    from pathlib import Path
+
+    (tmp_path / "a.npz").write_bytes(b"PK")
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(FormatError, match=r"a\.npz: cannot be read: Permission denied"):
+        load_tracks(tmp_path / "a.npz")
+
+
+def test_a_wrong_format_name_is_answered_with_the_right_ones(samples):
+    with pytest.raises(OptionError, match="unknown format 'opnpose': did you mean 'openpose'"):
+        load_tracks(samples["openpose"], format="opnpose")
+
+
+def test_a_format_that_the_file_is_not(samples):
+    with pytest.raises(FormatError, match=r"a\.mat: expected an \.npz archive"):
+        load_tracks(samples["mat"], format="npz")
+    with pytest.raises(FormatError, match=r"a\.npz: expected JSON"):
+        load_tracks(samples["npz"], format="openpose")
+    for name in ("npz", "mat"):
+        with pytest.raises(FormatError, match="json"):
+            load_tracks(samples["openpose"], format=name)
+
+
+@pytest.mark.parametrize("person_", [-1, 1.0, "0", True])
+def test_a_wrong_person_is_told(samples, person_):
+    with pytest.raises(OptionError, match="person: expected None or a number from 0"):
+        load_tracks(samples["npz"], person=person_)
+
+
+def test_a_person_too_many_is_told(samples):
+    assert load_tracks(samples["npz"], person=0).num_frames == 4
+    with pytest.raises(FormatError, match=r"expected a person number 1 .*got 1 person"):
+        load_tracks(samples["npz"], person=1)
+
+
+@pytest.mark.parametrize("options", [{"threshold": -0.1}, {"threshold": 1.5}, {"threshold": float("nan")}])
+def test_a_wrong_threshold_is_told(samples, options):
+    with pytest.raises(OptionError, match="threshold: expected a number from 0 to 1"):
+        load_people(samples["npz"], **options)
+
+
+@pytest.mark.parametrize("fps", [0, -25, float("inf"), float("nan")])
+def test_a_wrong_rate_is_told(samples, fps):
+    with pytest.raises(OptionError, match="fps: expected a positive number"):
+        load_people(samples["npz"], fps=fps)
+
+
+def test_a_wrong_skeleton_is_told(samples):
+    with pytest.raises(SkeletonError, match="did you mean 'coco17'"):
+        load_tracks(samples["npz"], skeleton="coc17")
+    with pytest.raises(SkeletonError, match="25 joints fit body25"):
+        load_tracks(samples["npz"], skeleton="coco17")
+
+
+def test_the_public_name_is_the_same_function():
+    assert kt.load_tracks is load_tracks
+
+
+def test_a_missing_package_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(FormatError, match=r"a\.mat: needs the package h5py .*: pip install h5py"):
+        need("h5py", "a.mat", FormatError)

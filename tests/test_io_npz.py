@@ -1,0 +1,343 @@
+"""The native .npz: what it takes, what it refuses, and exact round trips."""
+
+import io
+import json
+import pickle
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from samples import walk_result
+
+from kcs_torch.errors import FormatError, KcsError, SkeletonError
+from kcs_torch.io import archive, load_people, load_reconstruction, load_tracks, save
+from kcs_torch.skeleton import SKELETONS, Skeleton
+
+quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def arrays(num_frames=5, **changes):
+    rng = np.random.default_rng(1)
+    given_ = {
+        "points2d": rng.uniform(0, 100, (num_frames, 3, 2)),
+        "confidence": rng.uniform(0.5, 1, (num_frames, 3)),
+        "edges": np.array([[0, 1], [1, 2]]),
+        "joint_names": np.array(["hip", "knee", "ankle"]),
+        "fps": np.float64(50),
+        "units": np.array("mm"),
+    } | changes
+    return {k: v for k, v in given_.items() if v is not None}
+
+
+def written(path, **changes):
+    np.savez(path, **arrays(**changes))
+    return path
+
+
+# ---------------------------------------------------------------------- tracks
+
+
+def test_reads_everything(tmp_path):
+    tracks = load_tracks(written(tmp_path / "leg.npz"))
+    assert tracks.skeleton.joints == ("hip", "knee", "ankle")
+    assert tracks.skeleton.bones == ((0, 1), (1, 2))
+    assert (tracks.fps, tracks.units, tracks.num_frames) == (50.0, "mm", 5)
+    assert torch.equal(tracks.points, torch.from_numpy(arrays()["points2d"]))
+    assert torch.equal(tracks.weights, torch.from_numpy(arrays()["confidence"]))
+
+
+def test_points_alone_are_enough(tmp_path):
+    np.savez(tmp_path / "p.npz", points2d=arrays()["points2d"].astype(np.float32))
+    tracks = load_tracks(tmp_path / "p.npz")
+    assert (tracks.fps, tracks.units, tracks.skeleton.num_bones) == (None, "px", 0)
+    assert (tracks.weights == 1).all()
+
+
+def test_names_may_be_bytes_and_rate_unknown(tmp_path):
+    tracks = load_tracks(written(tmp_path / "b.npz", joint_names=np.array([b"a", b"b", b"c"]), fps=np.float32("nan")))
+    assert tracks.skeleton.joints == ("a", "b", "c")
+    assert tracks.fps is None
+
+
+def test_nan_is_unseen_and_threshold_counts(tmp_path):
+    points, confidence = arrays()["points2d"], arrays()["confidence"]
+    points[2, 1] = np.nan
+    confidence[3, 0] = 0.2
+    path = written(tmp_path / "n.npz", points2d=points, confidence=confidence)
+    assert (~load_tracks(path).seen).nonzero().tolist() == [[2, 1], [3, 0]]
+    assert (~load_tracks(path, threshold=0.1).seen).nonzero().tolist() == [[2, 1]]
+
+
+def test_options_go_before_the_file(tmp_path):
+    body = Skeleton.from_names(["ankle", "knee"], [("knee", "ankle")], name="shank")
+    tracks = load_tracks(written(tmp_path / "o.npz"), skeleton=body, fps=10)
+    assert tracks.fps == 10
+    assert torch.equal(tracks.points, torch.from_numpy(arrays()["points2d"][:, [2, 1]]))  # matched by name
+    assert torch.equal(tracks.weights, torch.from_numpy(arrays()["confidence"][:, [2, 1]]))
+    assert "matched by name" in tracks.notes[0]
+
+
+def test_other_names_are_taken_in_their_order(tmp_path):
+    body = Skeleton.from_names(["a", "b", "c"], [("a", "b"), ("b", "c")])
+    tracks = load_tracks(written(tmp_path / "o.npz"), skeleton=body)
+    assert torch.equal(tracks.points, torch.from_numpy(arrays()["points2d"]))
+    assert any("order" in n for n in tracks.notes)
+
+
+def test_names_that_do_not_fit_are_told(tmp_path):
+    body = Skeleton.from_names(["hip", "knee", "heel", "toe"], [("hip", "knee"), ("knee", "heel"), ("heel", "toe")])
+    with pytest.raises(SkeletonError, match=r"got 3 joints, none of them named heel, toe; they are hip, knee, ankle"):
+        load_tracks(written(tmp_path / "o.npz"), skeleton=body)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"points2d": None}, "'points2d', got confidence, edges"),
+        ({"points2d": np.zeros((5, 3))}, r"'points2d': expected 3 dimensions, got shape \(5, 3\)"),
+        ({"points2d": np.zeros((5, 3, 3))}, "points: expected shape"),
+        ({"points2d": np.zeros((0, 3, 2))}, "at least 1 frame"),
+        ({"points2d": np.zeros((5, 3, 2), complex)}, "'points2d': expected floating-point numbers"),
+        ({"points2d": np.full((5, 3, 2), "x")}, "'points2d': expected floating-point numbers"),
+        ({"points2d": np.full((5, 3, 2), np.inf)}, "frame 0, joint 'hip' is infinite"),
+        ({"points2d": np.full((5, 3, 2), np.nan)}, "no joint is seen"),
+        ({"confidence": np.ones((5, 4))}, "confidence: expected shape"),
+        ({"confidence": np.full((5, 3), -0.1)}, "is negative"),
+        ({"confidence": np.full((5, 3), np.inf)}, "is infinite"),
+        ({"confidence": np.ones(5)}, "'confidence': expected 2 dimensions"),
+        ({"edges": np.array([[0, 7]])}, "edges"),
+        ({"edges": np.array([0, 1, 2])}, "edges: expected shape"),
+        ({"edges": np.array([[0.0, np.nan]])}, "'edges': expected integers"),
+        ({"joint_names": np.array(["a", "b"])}, "joint_names: expected 3 names, got 2"),
+        ({"joint_names": np.array([1, 2, 3])}, "'joint_names': expected text"),
+        ({"joint_names": np.array(["a", "a", "b"])}, "given twice: a"),
+        ({"fps": np.array([1.0, 2.0])}, "'fps': expected one value"),
+        ({"fps": np.float64(-5)}, "fps: expected a positive number"),
+        ({"units": np.float64(1)}, "'units': expected text"),
+    ],
+)
+def test_wrong_content_names_file_and_key(tmp_path, changes, message):
+    with pytest.raises(KcsError, match=message) as caught:
+        load_tracks(written(tmp_path / "bad.npz", **changes))
+    assert "bad.npz" in str(caught.value)
+
+
+def test_motion_without_tracks_says_so(tmp_path):
+    np.savez(tmp_path / "m.npz", points3d=np.zeros((4, 3, 3)))
+    with pytest.raises(FormatError, match="3D motion only"):
+        load_tracks(tmp_path / "m.npz")
+
+
+# ---------------------------------------------------------------------- files that mean harm
+
+
+class Burglar:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return (open, (self.path, "w"))
+
+
+@pytest.mark.parametrize("key", ["points2d", "confidence", "edges", "joint_names", "units"])
+def test_pickles_are_refused_and_not_run(tmp_path, key):
+    loot = tmp_path / "loot"
+    evil = np.array([Burglar(str(loot))], object)
+    path = written(tmp_path / "evil.npz", **{key: evil})
+    loot.unlink(missing_ok=True)
+    with pytest.raises(FormatError, match=f"'{key}' holds pickled objects"):
+        load_tracks(path)
+    assert not loot.exists()
+
+
+def test_a_bare_pickle_is_no_format(tmp_path):
+    loot = tmp_path / "loot"
+    (tmp_path / "evil.npz").write_bytes(pickle.dumps(Burglar(str(loot))))
+    loot.unlink(missing_ok=True)
+    with pytest.raises(FormatError):
+        load_tracks(tmp_path / "evil.npz")
+    with pytest.raises(FormatError):
+        load_tracks(tmp_path / "evil.npz", format="npz")
+    assert not loot.exists()
+
+
+def test_zip_bombs_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(archive, "LARGE", 2**20)
+    np.savez_compressed(tmp_path / "bomb.npz", points2d=np.zeros((100_000, 3, 2)))
+    with pytest.raises(FormatError, match=r"'points2d' unpacks from .* refused as a zip bomb"):
+        load_tracks(tmp_path / "bomb.npz")
+
+
+def test_too_much_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(archive, "LIMIT", 400)
+    with pytest.raises(FormatError, match="unpack"):
+        load_tracks(written(tmp_path / "big.npz"))
+
+
+def test_a_header_that_claims_too_much_reserves_nothing(tmp_path):
+    npy = io.BytesIO()
+    np.lib.format.write_array_header_1_0(npy, {"descr": "<f8", "fortran_order": False, "shape": (10**13, 3, 2)})
+    with zipfile.ZipFile(tmp_path / "claim.npz", "w") as file:
+        file.writestr("points2d.npy", npy.getvalue() + bytes(48))
+    with pytest.raises(FormatError, match="'points2d': its size does not fit its shape"):
+        load_tracks(tmp_path / "claim.npz")
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
+def test_truncated_files_say_so(tmp_path, share):
+    path = written(tmp_path / "cut.npz")
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(FormatError, match=r"cut.npz.*(damaged|truncated)"):
+        load_tracks(path)
+
+
+@quick
+@given(data=st.data())
+def test_flipped_bytes_give_tracks_or_our_errors(tmp_path, data):
+    raw = bytearray(written(tmp_path / "good.npz").read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    (tmp_path / "flipped.npz").write_bytes(raw[: data.draw(st.integers(1, len(raw)))])
+    try:
+        people = load_people(tmp_path / "flipped.npz", format=data.draw(st.sampled_from([None, "npz"])))
+    except KcsError:
+        return
+    assert all(torch.isfinite(p.points).all() for p in people)
+
+
+@quick
+@given(data=st.data())
+def test_flipped_arrays_give_tracks_or_our_errors(tmp_path, data):
+    """As above, but behind the zip archive's check sums, which would catch the change."""
+    key = data.draw(st.sampled_from(sorted(arrays())))
+    good = written(tmp_path / "good.npz")
+    with zipfile.ZipFile(good) as old, zipfile.ZipFile(tmp_path / "flipped.npz", "w") as new:
+        for member in old.infolist():
+            raw = bytearray(old.read(member))
+            if member.filename == f"{key}.npy":
+                for _ in range(data.draw(st.integers(1, 3))):
+                    raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+            new.writestr(member.filename, bytes(raw))
+    try:
+        tracks = load_tracks(tmp_path / "flipped.npz")
+    except KcsError:
+        return
+    assert torch.isfinite(tracks.points).all()
+
+
+# ---------------------------------------------------------------------- results
+
+
+def same(a, b):
+    return a is b is None or (a.dtype == b.dtype and torch.equal(a, b))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("skeleton", ["coco17", "body25", "h36m17"])
+def test_results_come_back_exactly(tmp_path, skeleton, dtype):
+    result = walk_result(skeleton=skeleton, dtype=dtype, fps=None if skeleton == "body25" else 29.97)
+    back = load_reconstruction(save(result, tmp_path / "r.npz"))
+    for name in ("points", "cameras", "scales", "lengths", "uncertainty"):
+        assert same(getattr(back, name), getattr(result, name)), name
+    for name in ("points", "weights"):
+        assert same(getattr(back.tracks, name), getattr(result.tracks, name)), name
+    assert back.skeleton == result.skeleton
+    for name in ("fps", "units", "source", "notes"):
+        assert getattr(back.tracks, name) == getattr(result.tracks, name)
+    assert (back.method, back.units) == (result.method, result.units)
+    assert repr(back.diagnostics) == repr(result.diagnostics)  # repr: NaN is not NaN
+
+
+def test_results_without_uncertainty_come_back(tmp_path):
+    back = load_reconstruction(save(walk_result(uncertain=False), tmp_path / "r.npz"))
+    assert back.uncertainty is None
+
+
+@pytest.mark.parametrize("name", list(SKELETONS))
+def test_every_skeleton_comes_back(tmp_path, name):
+    body = SKELETONS[name]
+    assert Skeleton.from_dict(json.loads(json.dumps(body.to_dict()))) == body
+
+
+def test_half_precision_comes_back_as_the_same_numbers(tmp_path):
+    result = walk_result()
+    half = replace(result, points=result.points.to(torch.bfloat16))
+    assert torch.equal(load_reconstruction(save(half, tmp_path / "h.npz")).points, half.points.float())
+
+
+def test_results_hold_what_the_measuring_protocol_reads(tmp_path):
+    result = walk_result()
+    with np.load(save(result, tmp_path / "r.npz"), allow_pickle=False) as file:
+        assert file["points3d"].shape == (12, result.skeleton.num_observed, 3)
+        assert np.array_equal(file["points3d"], result.observed.numpy())
+        assert np.array_equal(file["points3d_all"], result.points.numpy())
+        assert file["cameras"].shape == (12, 2, 3)
+        assert list(file["joint_names_all"]) == list(result.skeleton.joints)
+        assert np.array_equal(file["bones"], result.skeleton.bone_index().numpy())
+        unseen = file["confidence"] == 0
+        assert unseen.any()
+        assert np.array_equal(np.isnan(file["points2d"]).all(-1), unseen)
+        assert (file["edges"] < len(file["joint_names"])).all()
+
+
+def test_results_are_tracks_again(tmp_path):
+    result = walk_result()
+    tracks = load_tracks(save(result, tmp_path / "r.npz"), threshold=0)
+    assert torch.equal(tracks.points, result.tracks.points)
+    assert torch.equal(tracks.weights, result.tracks.weights)
+    assert tracks.skeleton == result.skeleton
+    assert tracks.units == result.tracks.units
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("points3d_all", None, "without points3d_all"),
+        ("points3d_all", np.zeros((12, 3, 3)), "'points3d_all': expected"),
+        ("cameras", np.zeros((12, 2, 3), int), "'cameras': expected floating-point"),
+        ("confidence", np.full((12, 17), np.nan), "'points2d': expected finite"),
+        ("skeleton", np.array("{"), "'skeleton': expected JSON"),
+        ("skeleton", np.array("[]"), "'skeleton': expected a JSON dict"),
+        ("skeleton", np.array('{"joints": ["a", "a"], "bones": []}'), "given twice"),
+        ("diagnostics", np.array("{}"), "'diagnostics'"),
+        ("notes", np.array("7"), "'notes': expected a JSON list"),
+    ],
+)
+def test_damaged_results_are_told(tmp_path, key, value, message):
+    path = save(walk_result(), tmp_path / "r.npz")
+    with np.load(path) as file:
+        content = dict(file)
+    del content[key]
+    np.savez(path, **content, **({} if value is None else {key: value}))
+    with pytest.raises(FormatError, match=message) as caught:
+        load_reconstruction(path)
+    assert "r.npz" in str(caught.value)
+
+
+def test_tracks_are_no_result(tmp_path):
+    with pytest.raises(FormatError, match="load_tracks"):
+        load_reconstruction(written(tmp_path / "t.npz"))
+    (tmp_path / "t.txt").write_text("hello")
+    with pytest.raises(FormatError, match=r"expected an \.npz file"):
+        load_reconstruction(tmp_path / "t.txt")
+
+
+# ---------------------------------------------------------------------- real files
+
+
+def test_every_file_of_the_data_folder_loads_or_says_why(shared):
+    files = sorted((shared / "data").rglob("*.npz"))
+    assert files
+    for path in files:
+        with np.load(path, allow_pickle=False) as file:
+            keys = set(file.files)
+        if "points2d" in keys:
+            assert load_tracks(path).num_frames > 1
+        else:
+            with pytest.raises(FormatError, match="3D motion only"):
+                load_tracks(path)
