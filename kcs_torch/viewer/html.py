@@ -67,7 +67,7 @@ def _scene(result: Reconstruction) -> dict[str, Any]:
     points = np.stack([points[..., 0], points[..., 2], -points[..., 1]], -1)
     if not np.isfinite(points).all(-1).any():
         raise OutputError("an HTML page needs at least one joint at a finite place")
-    middle = np.nanmean(np.where(np.isfinite(points), points, np.nan), axis=(0, 1))
+    middle = np.median(points[np.isfinite(points).all(-1)], axis=0)
     points = points - middle  # so that float32 does not lose small motion far from the origin
     centres = _centres(points)
     fixed = _box(points)
