@@ -24,7 +24,7 @@ def demo(
     method: MethodName = "auto",
     as_json: AsJson = False,
 ) -> None:
-    """Reconstruct a synthetic walking person, seen by an orbiting camera with noise and gaps, and compare with truth."""
+    """Reconstruct a synthetic walking person, seen with noise and gaps, and compare with the truth."""
     with answer(as_json):
         import torch
 
