@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-PROTOCOL = '''
+PROTOCOL = """
 import numpy as np
 FIGURES = ("rigid", "bone_cv")
 EDGES = np.array([(0, 1), (1, 2), (2, 3), (1, 4)])
@@ -37,7 +37,7 @@ def build(data, case):
 def score(pred, truth, edges, cameras=None, world=None):
     assert pred.shape == truth.shape and cameras.shape == (30, 2, 3)
     return dict(rigid=float(abs(pred - truth).mean()), bone_cv=1.0)
-'''
+"""
 
 
 def benchmark(root, folder, *words):
@@ -62,9 +62,7 @@ def test_multirun_writes_predictions_and_one_table(root, folder):
     done = benchmark(root, folder, "-m", "method=kcs,sfam", "suite=turn", "hydra.sweep.dir=out")
     assert done.returncode == 0, done.stderr
     table = rows(folder / "out" / "results.csv")
-    assert [(r["method"], r["case"]) for r in table] == [
-        (m, c) for m in ("kcs", "sfam") for c in ("case_a", "case_b")
-    ]
+    assert [(r["method"], r["case"]) for r in table] == [(m, c) for m in ("kcs", "sfam") for c in ("case_a", "case_b")]
     for row in table:
         assert row["suite"] == "turn" and row["frames"] == "30" and row["joints"] == "5" and not row["error"]
         assert float(row["ms_per_frame"]) == pytest.approx(1000 * float(row["seconds"]) / 30, rel=0.05, abs=0.01)
