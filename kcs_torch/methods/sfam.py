@@ -41,7 +41,7 @@ class SfAM(Method):
             is large the shapes are shrunk, and lengths taken from them would be too short.
         lengths: where the bone lengths come from: "shape" (re-estimated from the shape at each weight), or "skeleton"
             (its proportions, at the scale of the shape; fixed, as printed).
-        rank: K shapes of the camera factorisation, or "auto": the least K whose camera rows are orthonormal.
+        rank: K shapes of the camera factorisation, or "auto": chosen by how evenly the camera moves.
         camera_path: "free" cameras; "constant" angular velocity; "auto" takes the latter where it explains the former.
             It concerns the cameras that are reported, not the shape.
         trajectories: number of cosines that the tracks' paths are smoothed to, or None.
@@ -173,31 +173,39 @@ class SfAM(Method):
         if self.camera_path == "free" or len(rotations) < 10:
             return rotations[:, :2], ()
         path, angle = constant_path(rotations)
-        relative = rotations[1:] @ rotations[:-1].mT
-        trace = relative.diagonal(dim1=-2, dim2=-1).sum(-1)
-        total = torch.arccos(((trace - 1) / 2).clamp(-1, 1)).sum()
-        if self.camera_path == "auto" and not bool(angle.median() < EVEN * total):
+        first = path[1] @ path[0].mT
+        turn = torch.arccos(((first.trace() - 1) / 2).clamp(-1, 1)) * (len(path) - 1)
+        if self.camera_path == "auto" and not bool(angle.median() < EVEN * turn):
             return rotations[:, :2], ()
         degrees = float(torch.rad2deg(angle.median()))
         return path[:, :2], (f"cameras follow a path of constant angular velocity (median deviation {degrees:.1f} degrees)",)
 
 
 EVEN = 0.05
-"""A constant angular velocity explains the cameras where their median deviation is below this share of the turn."""
-
-ORTHONORMAL = 2e-5
-"""Defect of camera rows (relative, squared) below which a larger K is not needed: about half a per cent."""
+"""A constant angular velocity explains the cameras where their median deviation is below this share of its turn."""
 
 
-def orthographic_cameras(tracks: Tensor, rank: int | Literal["auto"] = "auto") -> Tensor:
+def orthographic_cameras(
+    tracks: Tensor,
+    rank: int | Literal["auto"] = "auto",
+    *,
+    num_starts: int = 5,
+    smoothness: float = 0.1,
+    seed: int = 0,
+) -> Tensor:
     """Estimate orthographic cameras by rank-3K factorisation and metric upgrade.
 
-    For each K the convex relaxation (:func:`ist`) gives a start and :func:`metric_upgrade` the optimum; "auto" takes the
-    least K up to 6 whose rows are orthonormal, or whose defect is within twice the best.
+    Many subspaces have nearly orthonormal rows; the wrong ones make the camera jump. So for every K the upgrade
+    runs from the convex relaxation (:func:`ist`) and some random starts, with a weak pull to smooth rows, and the
+    candidate with the least product of both faults wins: the rows' root mean square defect, and the unevenness of
+    the camera's motion.
 
     Args:
-        tracks: (W, T, N, 2), centred, complete.
-        rank: K or "auto".
+        tracks: (W, T, N, 2), complete.
+        rank: K, or "auto" to try 1..6.
+        num_starts: random starts beside the relaxation's.
+        smoothness: weight of the rows' second differences.
+        seed: of the random starts.
 
     Returns:
         (W, T, 2, 3) orthonormal rows; each window has a world frame and a mirror of its own. Windows too short or with
@@ -212,18 +220,21 @@ def orthographic_cameras(tracks: Tensor, rank: int | Literal["auto"] = "auto") -
     motion, _ = factorize(tracks - tracks.mean(-2, keepdim=True), min(limit, 18 if rank == "auto" else 3 * rank))
     size = motion[..., 0].square().mean((-2, -1)).sqrt()
     motion = motion / torch.where(size > 0, size, torch.ones_like(size))[..., None, None, None]
-    ranks = [r for r in range(3, motion.shape[-1] + 1, 3)] if rank == "auto" else [motion.shape[-1]]
-    rows, defects = [], []
-    for r in ranks:
+    generator = torch.Generator().manual_seed(seed)
+    cameras, defects = [], []
+    for r in range(3, motion.shape[-1] + 1, 3) if rank == "auto" else [motion.shape[-1]]:
         part = motion[..., :r]
-        q, defect = metric_upgrade(part, ist(part))
-        rows.append(part @ q[:, None])
+        random = torch.randn(num_starts, 1, r, 3, generator=generator, dtype=torch.float64).to(motion)
+        starts = torch.cat([ist(part)[None], random.expand(-1, windows, -1, -1)])
+        q, defect = metric_upgrade(part, starts, smoothness=smoothness, tolerance=1e-3)
+        cameras.append(rows_to_cameras(part @ q[:, :, None])[0])
         defects.append(defect)
-    defect = torch.stack(defects)  # (K, W)
-    enough = defect <= torch.maximum(2 * defect.amin(0), torch.full_like(defect[0], ORTHONORMAL))
-    choice = enough.to(torch.int8).argmax(0)
-    chosen = torch.stack(rows)[choice, torch.arange(windows, device=choice.device)]
-    return rows_to_cameras(chosen)[0]
+    candidates, defect = torch.cat(cameras), torch.cat(defects)  # (C, W, T, 2, 3), (C, W)
+    turn = complete_rotation(candidates)
+    turn = turn[:, :, 1:] @ turn[:, :, :-1].mT
+    uneven = torch.linalg.matrix_norm(turn.diff(dim=2)).mean(-1) if frames > 2 else torch.ones_like(defect)
+    choice = (uneven * defect.sqrt()).argmin(0)
+    return candidates[choice, torch.arange(windows, device=choice.device)]
 
 
 def _mirror_signs(parts: Tensor, starts: list[int]) -> Tensor:

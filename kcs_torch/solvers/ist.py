@@ -67,15 +67,21 @@ def ist(motion: Tensor, *, weight: float = 1e-3, num_steps: int = 60) -> Tensor:
     return vector[..., -3:] * value[..., None, -3:].clamp_min(0).sqrt()
 
 
-def metric_upgrade(motion: Tensor, start: Tensor, *, num_steps: int = 150) -> tuple[Tensor, Tensor]:
-    """Refine Q by Levenberg-Marquardt on the orthonormality defect of ``motion @ Q``.
+def metric_upgrade(
+    motion: Tensor, start: Tensor, *, smoothness: float = 0.0, num_steps: int = 150, tolerance: float = 1e-4
+) -> tuple[Tensor, Tensor]:
+    """Refine Q by Levenberg-Marquardt on the orthonormality defect of the rows ``motion @ Q``.
 
-    Minimises mean_t [((a.a - b.b)/2)^2 + (a.b)^2] over (mean squared row length)^2, which is free of scale.
+    Minimises mean_t [((a.a - b.b)/2)^2 + (a.b)^2] + smoothness mean_t |second difference of the rows|^2 over Q of
+    mean squared row length 1. Where the viewpoint turns little many Q have small defects; the one whose camera moves
+    smoothly is the right one.
 
     Args:
         motion: (..., T, 2, R).
         start: Q (..., R, 3) to start from; further batch dimensions try several starts at once.
-        num_steps: steps; each is kept only where it lowers the defect.
+        smoothness: weight of the second differences.
+        num_steps: steps, at most; each is kept only where it lowers the cost.
+        tolerance: stop where steps lower the cost by less than this share.
 
     Returns:
         Q (..., R, 3), scaled so that rows have mean squared length 1, and the defect (...).
@@ -87,9 +93,14 @@ def metric_upgrade(motion: Tensor, start: Tensor, *, num_steps: int = 150) -> tu
     if start.shape[-2:] != (motion.shape[-1], 3):
         raise ShapeError(f"metric_upgrade: expected start (..., {motion.shape[-1]}, 3), got {tuple(start.shape)}")
     a, b = motion[..., 0, :], motion[..., 1, :]
-    gram = (a.mT @ a + b.mT @ b) / (2 * motion.shape[-3])  # mean squared row length is tr(Q^T gram Q)
-    rank = motion.shape[-1]
+    frames, rank = motion.shape[-3], motion.shape[-1]
+    gram = (a.mT @ a + b.mT @ b) / (2 * frames)  # mean squared row length is tr(Q^T gram Q)
+    bend = motion.diff(n=2, dim=-3).flatten(-3, -2) if smoothness > 0 and frames > 2 else motion[..., :0, 0, :]
+    bending = smoothness / frames * (bend.mT @ bend)  # (..., R, R)
     eye = torch.eye(3 * rank, dtype=motion.dtype, device=motion.device)
+    three = torch.eye(3, dtype=motion.dtype, device=motion.device)
+    stiff = torch.einsum("...ij,kl->...ikjl", bending, three).reshape(*bending.shape[:-2], 3 * rank, 3 * rank)
+    tiny = torch.finfo(motion.dtype).tiny
 
     def normalise(q: Tensor) -> Tensor:
         size = (q * (gram @ q)).sum((-2, -1))
@@ -98,6 +109,9 @@ def metric_upgrade(motion: Tensor, start: Tensor, *, num_steps: int = 150) -> tu
     def defect(q: Tensor) -> Tensor:
         return orthonormality_defect(motion @ q[..., None, :, :]).mean(-1)
 
+    def total(q: Tensor) -> Tensor:
+        return defect(q) + (q * (bending @ q)).sum((-2, -1))
+
     def step(state: tuple[Tensor, ...], _: int) -> tuple[Tensor, ...]:
         q, cost, damping, progress = state
         aq, bq = a @ q, b @ q
@@ -105,37 +119,36 @@ def metric_upgrade(motion: Tensor, start: Tensor, *, num_steps: int = 150) -> tu
         first = a[..., :, None] * aq[..., None, :] - b[..., :, None] * bq[..., None, :]
         second = a[..., :, None] * bq[..., None, :] + b[..., :, None] * aq[..., None, :]
         jacobian = torch.cat([first, second], -3).flatten(-2)
-        normal = jacobian.mT @ jacobian
-        gradient = (jacobian.mT @ residual[..., None]).squeeze(-1)
+        normal = jacobian.mT @ jacobian / frames + stiff
+        gradient = (jacobian.mT @ residual[..., None]).squeeze(-1) / frames + (bending @ q).flatten(-2)
         size = normal.diagonal(dim1=-2, dim2=-1).mean(-1)
-        # The residuals are homogeneous, so the undamped step would only shrink Q: hold its scale.
+        # The residuals are homogeneous, so the plain step would only shrink Q: hold its scale.
         radial = (gram @ q).flatten(-2)
-        radial = radial / torch.linalg.vector_norm(radial, dim=-1, keepdim=True).clamp_min(torch.finfo(q.dtype).tiny)
+        radial = radial / torch.linalg.vector_norm(radial, dim=-1, keepdim=True).clamp_min(tiny)
+        gradient = gradient - (gradient * radial).sum(-1, keepdim=True) * radial
         normal = normal + 1e3 * size[..., None, None] * rank * radial[..., :, None] * radial[..., None, :]
-        ridge = (damping * size + torch.finfo(q.dtype).tiny)[..., None, None] * eye
-        factor, _ = torch.linalg.cholesky_ex(normal + ridge)
+        factor, _ = torch.linalg.cholesky_ex(normal + (damping * size + tiny)[..., None, None] * eye)
         move = torch.cholesky_solve(gradient[..., None], factor).squeeze(-1)
         trial = normalise(q - move.unflatten(-1, (rank, 3)))
-        new = defect(trial)
+        new = total(trial)
         better = new < cost  # False for NaN, too: a failed factorisation only raises the damping
-        keep = better[..., None, None]
         return (
-            torch.where(keep, trial, q),
+            torch.where(better[..., None, None], trial, q),
             torch.where(better, new, cost),
             torch.where(better, damping / 4, damping * 3).clamp(1e-9, 1e6),
             progress / 2 + torch.where(better, 1 - new / cost, 0),  # halved, not zeroed, by a refused step
         )
 
     q = normalise(start.expand(*torch.broadcast_shapes(start.shape[:-2], motion.shape[:-3]), rank, 3))
-    cost = defect(q)
-    final = iterate(
+    cost = total(q)
+    q = iterate(
         step,
         (q, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost)),
         num_steps=num_steps,
         change=lambda _, new: new[3].amax(),
-        tolerance=1e-4,
-    ).value
-    return final[0], final[1]
+        tolerance=tolerance,
+    ).value[0]
+    return q, defect(q)
 
 
 def _check(motion: Tensor, name: str) -> None:
