@@ -2,8 +2,10 @@
 
 import ast
 import json
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -111,6 +113,16 @@ def test_functional_needs_torch_only():
         assert outside <= {"torch", "roma", "kcs_torch"}, path
 
 
+def test_every_outside_package_is_declared():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needs = [*project["dependencies"], *(n for extra in project["optional-dependencies"].values() for n in extra)]
+    declared = {re.match(r"[\w-]+", need).group(0).lower() for need in needs}
+    named = {"yaml": "pyyaml", "hydra": "hydra-core", "mpl_toolkits": "matplotlib"}
+    for path in FILES:
+        outside = {name.split(".")[0] for name, _, _ in imports(path)} - sys.stdlib_module_names - {"kcs_torch"}
+        assert {named.get(n, n) for n in outside} <= declared, path
+
+
 def loaded(code: str) -> set[str]:
     """Names of the top-level modules that a fresh interpreter has after running ``code``."""
     code += "\nimport json, sys; print(json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
@@ -170,8 +182,6 @@ def test_importing_a_submodule_does_not_hide_a_function():
 
 
 def test_version_is_that_of_the_project():
-    import tomllib
-
     import kcs_torch as kt
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
