@@ -292,6 +292,7 @@ def test_results_are_tracks_again(tmp_path):
     assert torch.equal(tracks.weights, result.tracks.weights)
     assert tracks.skeleton == result.skeleton
     assert tracks.units == result.tracks.units
+    assert tracks.notes == result.tracks.notes
 
 
 @pytest.mark.parametrize(

@@ -109,6 +109,16 @@ def test_confidences_a_little_above_one_are_one(tmp_path):
         load_tracks(write_openpose(tmp_path / "percent", alone(confidence=90.0)))
 
 
+def test_a_byte_order_mark_is_no_error(tmp_path):
+    folder = write_openpose(tmp_path / "json", alone(1), name="f{}.json")
+    (folder / "f0.json").write_bytes(b"\xef\xbb\xbf" + (folder / "f0.json").read_bytes())
+    assert load_tracks(folder).num_frames == load_tracks(folder / "f0.json").num_frames == 1
+
+
+def test_a_slow_clip_is_linked(tmp_path):
+    assert len(load_people(write_openpose(tmp_path / "json", alone()), fps=0.1)) == 1
+
+
 # ---------------------------------------------------------------------- several people
 
 

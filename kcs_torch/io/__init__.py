@@ -4,7 +4,7 @@ from kcs_torch.io.formats.npz import load_reconstruction
 from kcs_torch.io.link import link_people
 from kcs_torch.io.load import READERS, WRITERS, detect_format, load_people, load_tracks
 from kcs_torch.io.registry import Reader, Writer
-from kcs_torch.io.write import save
+from kcs_torch.io.write import save, writer_for
 
 __all__ = [
     "READERS",
@@ -17,4 +17,5 @@ __all__ = [
     "load_reconstruction",
     "load_tracks",
     "save",
+    "writer_for",
 ]

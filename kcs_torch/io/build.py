@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,7 @@ def build_tracks(
                 points = points[:, order]
                 confidence = None if confidence is None or confidence.ndim != 2 else confidence[:, order]
         chosen, names, edges = body, None, None
-    return Tracks.from_arrays(
+    tracks = Tracks.from_arrays(
         points,
         confidence,
         skeleton=chosen,
@@ -72,6 +73,7 @@ def build_tracks(
         source=source,
         notes=remarks,
     )
+    return replace(tracks, notes=tuple(dict.fromkeys(tracks.notes)))  # a result read again already has some
 
 
 def _order(names: Sequence[str], body: Skeleton, source: str, notes: list[str]) -> NDArray[np.int64] | None:

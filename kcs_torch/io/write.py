@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 from kcs_torch.errors import OutputError
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.load import WRITERS
+from kcs_torch.io.registry import Writer
 
 if TYPE_CHECKING:
     from kcs_torch.types import Reconstruction
 
-__all__ = ["save"]
+__all__ = ["save", "writer_for"]
 
 
 def save(result: Reconstruction, path: str | Path) -> Path:
@@ -30,11 +31,20 @@ def save(result: Reconstruction, path: str | Path) -> Path:
     Raises:
         OutputError: the suffix is unknown, or the file cannot be written; nothing is left half-written.
     """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in WRITERS:
-        has = f"'{suffix}'" if suffix else "none"
-        raise OutputError(f"{path}: expected a file with one of the suffixes {', '.join(WRITERS)}, got {has}")
+    writer = writer_for(path)
     with atomic_path(path) as temporary:
-        WRITERS[suffix].write(result, temporary)
-    return path
+        writer.write(result, temporary)
+    return Path(path)
+
+
+def writer_for(path: str | Path) -> Writer:
+    """Return the writer that the suffix of a path chooses.
+
+    Raises:
+        OutputError: there is none; the message lists the suffixes.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in WRITERS:
+        got = f"'{suffix}'" if suffix else "none"
+        raise OutputError(f"{path}: expected a file with one of the suffixes {', '.join(WRITERS)}, got {got}")
+    return WRITERS[suffix]

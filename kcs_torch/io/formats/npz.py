@@ -20,17 +20,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io.archive import Archive
 from kcs_torch.io.build import build_tracks
+from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import Options, Probe, Reader, Writer
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Reconstruction, Tracks
 
-__all__ = ["READERS", "WRITERS", "load_reconstruction", "plain"]
+__all__ = ["READERS", "WRITERS", "load_reconstruction"]
 
 
 def recognises(probe: Probe) -> bool:
@@ -155,12 +155,6 @@ def load_reconstruction(path: str | Path) -> Reconstruction:
         uncertainty=tensor("uncertainty", t, m) if "uncertainty" in file else None,
         units=file.text("units3d") if "units3d" in file else "",
     )
-
-
-def plain(tensor: Tensor) -> NDArray[Any]:
-    """A tensor of any device and dtype as an array; half precision becomes float32, which holds it exactly."""
-    tensor = tensor.detach().cpu()
-    return (tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()).numpy()
 
 
 def _skeleton(file: Archive) -> Skeleton:

@@ -28,6 +28,7 @@ LAYOUTS = {25: ("body25", "body25b"), 18: ("coco18",), 15: ("mpi15",), 21: ("han
 _BODY = "pose_keypoints_2d"
 _OTHERS = ("face_keypoints_2d", "hand_left_keypoints_2d", "hand_right_keypoints_2d")
 _NAME = re.compile(r"(?P<prefix>.*?)(?P<number>[0-9]+)?(?:_keypoints)?\Z", re.DOTALL)
+_BLANK = b"\xef\xbb\xbf \t\r\n"  # what may stand before the JSON, a byte order mark included
 _FARTHEST = 1e9  # pixels
 _CLEARLY = 0.7  # bones this much shorter, by another layout's order of joints, tell that it is the right one
 _OVERSHOOT = 1.5  # some networks' confidences pass 1; above this they are on another scale
@@ -39,11 +40,16 @@ Person = NDArray[np.float64]  # (..., N, 3): x, y, confidence
 def recognises(probe: Probe) -> bool:
     """Tell by the word "people" in the JSON of the path, or of some files of the folder."""
     if probe.is_file:
-        return probe.head.lstrip().startswith(b"{") and b'"people"' in probe.head
+        return probe.head.lstrip(_BLANK).startswith(b"{") and b'"people"' in probe.head
     files = probe.like(".json")
-    return any(f.stem.endswith("_keypoints") for f in files[:5]) or any(
-        f.stat().st_size and recognises(Probe(f)) for f in {*files[:3], *files[-1:]}
-    )
+    return any(f.stem.endswith("_keypoints") or _is_frame(f) for f in (*files[:3], *files[-1:]))
+
+
+def _is_frame(file: Path) -> bool:
+    try:
+        return recognises(Probe(file))
+    except FormatError:  # an empty file, say, which is told by name once the folder is read
+        return False
 
 
 def read(path: Path, options: Options) -> list[Tracks]:
@@ -60,7 +66,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
         if people:
             detections[frame] = np.stack(people)
     layout = _layout(joints, detections, options, path, notes)
-    linked = link_people(detections, max_gap=round(options.fps or _FPS))
+    linked = link_people(detections, max_gap=max(round(options.fps or _FPS), 1))
     visible = [t for t in linked if (t[..., 2] >= max(options.threshold, 1e-12)).any()]
     if not visible:
         raise ShapeError(f"{path}: no joint has a confidence of {options.threshold:g} or more: lower the threshold")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from kcs_torch.io.formats.npz import plain
+from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import Writer
 from kcs_torch.types import Reconstruction
 
@@ -22,7 +22,7 @@ __all__ = ["WRITERS"]
 def write_csv(result: Reconstruction, path: Path) -> None:
     """Write one row a frame: ``frame, time [s], nose_x [px], nose_y [px], nose_z [px], ...``.
 
-    ``time [s]`` is empty where the frame rate is unknown.
+    ``time [s]`` is empty where the frame rate is unknown. Numbers have 9 significant digits.
     """
     points = plain(result.points)
     header = ["frame", "time [s]"]
