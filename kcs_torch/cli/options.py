@@ -46,13 +46,11 @@ def check_outputs(outputs: Sequence[Path], source: str | None = None) -> None:
         OutputError: a suffix is unknown, a place cannot be written to, or an output would replace the input.
     """
     from kcs_torch.errors import OutputError
-    from kcs_torch.io import WRITERS
+    from kcs_torch.io import writer_for
     from kcs_torch.io.atomic import atomic_path
 
     for path in outputs:
-        if path.suffix.lower() not in WRITERS:
-            got = f"'{path.suffix}'" if path.suffix else "none"
-            raise OutputError(f"{path}: expected a file with one of the suffixes {', '.join(WRITERS)}, got {got}")
+        writer_for(path)
         if source is not None and path.exists() and path.resolve() == Path(source).resolve():
             raise OutputError(f"{path}: expected another file than the tracks, which it would replace")
         try:
