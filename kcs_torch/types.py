@@ -97,26 +97,39 @@ class Tracks:
         label = lambda t, n: f"frame {int(t)}, joint '{body.joints[int(n)]}'"  # noqa: E731
         infinite = torch.isinf(xy).any(-1)
         if infinite.any():
-            raise ShapeError(f"{source}: points: {label(*infinite.nonzero()[0])} is infinite; write NaN where a joint is unseen")
+            raise ShapeError(
+                f"{source}: points: {label(*infinite.nonzero()[0])} is infinite; write NaN where a joint is unseen"
+            )
         seen = torch.isfinite(xy).all(-1)
         if confidence is None:
             weights = seen.to(xy.dtype)
         else:
             weights = _array(confidence, f"{source}: confidence", 2).to(xy)
             if weights.shape != seen.shape:
-                raise ShapeError(f"{source}: confidence: expected shape {tuple(seen.shape)}, got {tuple(weights.shape)}")
+                raise ShapeError(
+                    f"{source}: confidence: expected shape {tuple(seen.shape)}, got {tuple(weights.shape)}"
+                )
             if torch.isinf(weights).any():
-                raise ShapeError(f"{source}: confidence: {label(*torch.isinf(weights).nonzero()[0])} is infinite; expected 0..1")
+                raise ShapeError(
+                    f"{source}: confidence: {label(*torch.isinf(weights).nonzero()[0])} is infinite; expected 0..1"
+                )
             weights = torch.nan_to_num(weights, nan=0.0)
             if (weights < 0).any():
-                raise ShapeError(f"{source}: confidence: {label(*(weights < 0).nonzero()[0])} is negative; expected 0..1")
+                raise ShapeError(
+                    f"{source}: confidence: {label(*(weights < 0).nonzero()[0])} is negative; expected 0..1"
+                )
             if (weights > 1).any():
                 where = label(*(weights > 1).nonzero()[0])
-                raise ShapeError(f"{source}: confidence: {where} is {float(weights.max()):g} at most; expected 0..1: divide by the largest")
+                raise ShapeError(
+                    f"{source}: confidence: {where} is {float(weights.max()):g} at most; expected 0..1: "
+                    "divide by the largest"
+                )
             weights = torch.where(seen & (weights >= threshold), weights, torch.zeros_like(weights))
         seen = weights > 0
         if not seen.any():
-            raise ShapeError(f"{source}: no joint is seen in any frame (confidence threshold {threshold:g}): nothing to reconstruct")
+            raise ShapeError(
+                f"{source}: no joint is seen in any frame (confidence threshold {threshold:g}): nothing to reconstruct"
+            )
         xy = torch.where(seen[..., None], xy, torch.zeros_like(xy))
         xy, weights = body.complete(xy, weights)
         never = [body.joints[n] for n in (weights == 0).all(0).nonzero().flatten().tolist()]
@@ -253,7 +266,10 @@ class Reconstruction:
             elif name in self.skeleton.bone_names:
                 own = float(self.lengths[self.skeleton.bone_names.index(name)])
             else:
-                raise OptionError(f"scaled: unknown size {name!r}: expected 'height' or a bone, one of {', '.join(self.skeleton.bone_names)}")
+                raise OptionError(
+                    f"scaled: unknown size {name!r}: expected 'height' or a bone, "
+                    f"one of {', '.join(self.skeleton.bone_names)}"
+                )
             if not own > 0:
                 raise OptionError(f"scaled: {name} is zero in this reconstruction")
             factor = size / own
@@ -289,7 +305,10 @@ class Reconstruction:
         tops = [i for i, n in enumerate(names) if "head" in n.lower() or "nose" in n.lower()]
         feet = [i for i, n in enumerate(names) if any(w in n.lower() for w in ("ankle", "heel", "foot"))]
         if not tops or not feet:
-            raise OptionError(f"scaled: height needs a head and a foot among the joints; skeleton '{self.skeleton.name}' has none: give a bone")
+            raise OptionError(
+                "scaled: height needs a head and a foot among the joints; "
+                f"skeleton '{self.skeleton.name}' has none: give a bone"
+            )
         best = 0.0
         for top in tops:
             reach = {top: 0.0}
@@ -330,7 +349,9 @@ def _choose_skeleton(
         if body.num_observed != num_joints:
             fits = [s.name for s in SKELETONS.values() if s.num_observed == num_joints]
             hint = f"; {num_joints} joints fit {', '.join(fits)}" if fits else ""
-            raise SkeletonError(f"{source}: expected the {body.num_observed} joints of skeleton '{body.name}', got {num_joints}{hint}")
+            raise SkeletonError(
+                f"{source}: expected the {body.num_observed} joints of skeleton '{body.name}', got {num_joints}{hint}"
+            )
         return body
     known = guess_skeleton(names) if names is not None else None
     if edges is None:
@@ -342,14 +363,18 @@ def _choose_skeleton(
         if pairs.size == 0:
             pairs = pairs.reshape(0, 2)
         if pairs.ndim != 2 or pairs.shape[1] != 2 or not np.issubdtype(pairs.dtype, np.number):
-            raise ShapeError(f"{source}: edges: expected shape (bones, 2) of joint indices, got {pairs.shape} of {pairs.dtype}")
+            raise ShapeError(
+                f"{source}: edges: expected shape (bones, 2) of joint indices, got {pairs.shape} of {pairs.dtype}"
+            )
         graph = Skeleton.from_edges(pairs.tolist(), names or num_joints, name=Path(source).stem, tree=False)
     except SkeletonError as error:
         raise SkeletonError(f"{source}: edges: {error}") from None
     if graph.is_tree:
         return replace(graph, tree=True)
     if known is not None:
-        notes.append(f"the file's edges are not a tree; used the built-in skeleton '{known.name}', whose joint names it has")
+        notes.append(
+            f"the file's edges are not a tree; used the built-in skeleton '{known.name}', whose joint names it has"
+        )
         return known
     reason = "close a chain" if graph.cycle() else f"fall into {len(graph.pieces())} pieces"
     notes.append(f"the edges {reason}: used as a graph of rigid links, not as a tree")
