@@ -3,6 +3,7 @@
 from kcs_torch.functional.align import centre, nearest_rotation, procrustes, similarity
 from kcs_torch.functional.camera import (
     back_project,
+    camera_disagreement,
     complete_rotation,
     factorize,
     orthonormality_defect,
@@ -18,7 +19,15 @@ from kcs_torch.functional.chain import (
     kcs_matrix,
     points_from_bones,
 )
-from kcs_torch.functional.spectral import dct_basis, log_det, nuclear_norm, psd_shrink, singular_values, svt
+from kcs_torch.functional.spectral import (
+    dct_basis,
+    log_det,
+    nuclear_norm,
+    psd_shrink,
+    singular_values,
+    spectral_norm,
+    svt,
+)
 from kcs_torch.functional.temporal import best_path, blend_windows, interpolate, window_starts
 
 __all__ = [
@@ -26,6 +35,7 @@ __all__ = [
     "best_path",
     "blend_windows",
     "bone_lengths",
+    "camera_disagreement",
     "bone_vectors",
     "centre",
     "chain_inverse",
@@ -46,6 +56,7 @@ __all__ = [
     "rows_to_cameras",
     "similarity",
     "singular_values",
+    "spectral_norm",
     "svt",
     "viewpoint_turn",
     "window_starts",

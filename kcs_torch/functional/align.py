@@ -24,7 +24,8 @@ def centre(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tenso
         mean = points.mean(-2, keepdim=True)
     else:
         total = weights.sum(-1)[..., None, None]
-        mean = (points * weights[..., None]).sum(-2, keepdim=True) / torch.where(total > 0, total, torch.ones_like(total))
+        total = torch.where(total > 0, total, torch.ones_like(total))
+        mean = (points * weights[..., None]).sum(-2, keepdim=True) / total
     return points - mean, mean
 
 
@@ -76,7 +77,9 @@ def procrustes(
     return rotation, overlap / torch.where(size > 0, size, torch.ones_like(size))
 
 
-def similarity(source: Tensor, target: Tensor, *, sequence: bool = False, scale: bool = True, reflect: bool = False) -> Tensor:
+def similarity(
+    source: Tensor, target: Tensor, *, sequence: bool = False, scale: bool = True, reflect: bool = False
+) -> Tensor:
     """Return ``source`` moved onto ``target`` by rotation, translation and optionally scale.
 
     Args:

@@ -10,6 +10,7 @@ from kcs_torch.functional.align import nearest_rotation
 
 __all__ = [
     "back_project",
+    "camera_disagreement",
     "complete_rotation",
     "factorize",
     "orthonormality_defect",
@@ -107,7 +108,8 @@ def viewpoint_turn(cameras: Tensor) -> Tensor:
         cameras: (..., T, 2, 3), orthonormal rows.
 
     Returns:
-        (...). Turning about the optical axis does not count: it tells nothing of depth.
+        (...). Turning about the optical axis does not count: it tells nothing of depth. Found in three sweeps, which is
+        exact for a path; of directions scattered at random it may miss a fifth.
     """
     view = complete_rotation(cameras)[..., 2, :]  # (..., T, 3)
     far = (view @ view.mean(-2, keepdim=True).mT).squeeze(-1).argmin(-1, keepdim=True)
@@ -116,3 +118,24 @@ def viewpoint_turn(cameras: Tensor) -> Tensor:
         cosine = (view @ anchor.mT).squeeze(-1)
         far = cosine.argmin(-1, keepdim=True)
     return torch.rad2deg(torch.arccos(cosine.amin(-1).clamp(-1, 1)))
+
+
+def camera_disagreement(first: Tensor, second: Tensor) -> Tensor:
+    """Return the median angle in degrees between two camera paths, after the best turn and mirror of the world.
+
+    Args:
+        first: (..., T, 2, 3), orthonormal rows.
+        second: (..., T, 2, 3).
+
+    Returns:
+        (...).
+    """
+    target = complete_rotation(second)
+    angles = []
+    for depth in (1.0, -1.0):
+        mirror = torch.tensor([1.0, 1.0, depth], dtype=first.dtype, device=first.device)
+        source = complete_rotation(first * mirror)
+        gauge = nearest_rotation((source.mT @ target).sum(-3))
+        trace = ((source @ gauge[..., None, :, :]) * target).sum((-2, -1))
+        angles.append(torch.rad2deg(torch.arccos(((trace - 1) / 2).clamp(-1, 1))).median(-1).values)
+    return torch.minimum(*angles)

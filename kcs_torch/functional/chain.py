@@ -30,8 +30,9 @@ def incidence(bones: Tensor | Sequence[Sequence[int]], num_joints: int, *, dtype
     [[-1.0, 0.0], [1.0, -1.0], [0.0, 1.0]]
     """
     index = _pairs(bones)
-    if index.numel() and (int(index.min()) < 0 or int(index.max()) >= num_joints):
-        raise ShapeError(f"bones: expected joint indices 0..{num_joints - 1}, got {int(index.min())}..{int(index.max())}")
+    low, high = (int(index.min()), int(index.max())) if index.numel() else (0, -1)
+    if low < 0 or high >= num_joints:
+        raise ShapeError(f"bones: expected joint indices 0..{num_joints - 1}, got {low}..{high}")
     matrix = torch.zeros(num_joints, len(index), dtype=dtype or torch.get_default_dtype(), device=index.device)
     column = torch.arange(len(index), device=index.device)
     matrix[index[:, 0], column] = -1
@@ -137,7 +138,11 @@ def safe_norm(vectors: Tensor) -> Tensor:
 
 
 def _pairs(bones: Tensor | Sequence[Sequence[int]]) -> Tensor:
-    index = bones if isinstance(bones, Tensor) else torch.tensor([tuple(b) for b in bones], dtype=torch.long).reshape(-1, 2)
-    if index.ndim != 2 or index.shape[-1] != 2:
-        raise ShapeError(f"bones: expected shape (B, 2) of (parent, child), got {tuple(index.shape)}")
-    return index
+    if not isinstance(bones, Tensor):
+        pairs = [tuple(b) for b in bones]
+        if any(len(p) != 2 for p in pairs):
+            raise ShapeError(f"bones: expected (parent, child) pairs, got {next(p for p in pairs if len(p) != 2)}")
+        return torch.tensor(pairs, dtype=torch.long).reshape(-1, 2)
+    if bones.ndim != 2 or bones.shape[-1] != 2:
+        raise ShapeError(f"bones: expected shape (B, 2) of (parent, child), got {tuple(bones.shape)}")
+    return bones

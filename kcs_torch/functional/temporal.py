@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import torch
@@ -17,12 +18,13 @@ def interpolate(values: Tensor, seen: Tensor) -> Tensor:
 
     Args:
         values: (..., T, N, D), finite.
-        seen: (..., T, N), True where ``values`` hold.
+        seen: (..., T, N), or what broadcasts to it, True where ``values`` hold.
 
     Returns:
         (..., T, N, D). A joint never seen takes the mean of the seen joints of each frame (0 where there is none).
     """
     frames = values.shape[-3]
+    seen = seen.expand(values.shape[:-1])
     time = torch.arange(frames, device=values.device)[:, None].expand(seen.shape)
     before = torch.where(seen, time, -1).cummax(-2).values
     after = torch.where(seen, time, frames).flip(-2).cummin(-2).values.flip(-2)
@@ -69,7 +71,7 @@ def blend_windows(parts: Tensor, starts: list[int], length: int) -> Tensor:
     window = parts.shape[1]
     ramp = torch.arange(1, window + 1, dtype=parts.dtype, device=parts.device)
     ramp = torch.minimum(ramp, ramp.flip(0))
-    overlap = max([a + window - b for a, b in zip(starts, starts[1:], strict=False)], default=1)
+    overlap = max([a + window - b for a, b in itertools.pairwise(starts)], default=1)
     ramp = ramp.clamp_max(max(overlap, 1))
     index = torch.tensor(starts, device=parts.device)[:, None] + torch.arange(window, device=parts.device)
     shaped = ramp.reshape(1, -1, *[1] * (parts.ndim - 2))

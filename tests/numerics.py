@@ -1,0 +1,98 @@
+"""What the tests of the mathematics share: seeded numbers, small bodies, and the checks that every function gets."""
+
+import math
+
+import torch
+from torch.testing import assert_close
+
+from kcs_torch.skeleton import Skeleton
+
+BATCHES = [(), (2,), (2, 3)]
+FLOATS = [torch.float32, torch.float64]
+HALVES = [torch.float16, torch.bfloat16]
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+# Seven joints and mirror pairs; one spine bone may change its length.
+BODY = Skeleton.from_names(
+    ["hip", "neck", "head", "left_hand", "right_hand", "left_foot", "right_foot"],
+    [
+        ("hip", "neck"),
+        ("neck", "head"),
+        ("neck", "left_hand"),
+        ("neck", "right_hand"),
+        ("hip", "left_foot"),
+        ("hip", "right_foot"),
+    ],
+    name="body7",
+    flexible=[("hip", "neck")],
+)
+# A chain without twins, and one that is closed.
+CHAIN = Skeleton.from_names(list("abcd"), [("a", "b"), ("b", "c"), ("c", "d")], name="chain4")
+RING = Skeleton.from_names(list("abcd"), [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a")], name="ring4", tree=False)
+
+
+def normal(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64, device: str = "cpu") -> torch.Tensor:
+    """Standard normal numbers, the same in every dtype and on every device."""
+    numbers = torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return numbers.to(device, dtype)
+
+
+def rotations(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    """Random rotations (..., 3, 3)."""
+    q, r = torch.linalg.qr(normal(*shape, 3, 3, seed=seed))
+    q = q * r.diagonal(dim1=-2, dim2=-1).sign()[..., None, :]
+    return (q * torch.linalg.det(q)[..., None, None]).to(dtype)
+
+
+def turning(frames: int, degrees: float = 120.0, *, tilt: float = 0.2, dtype: torch.dtype = torch.float64):
+    """Rotations (T, 3, 3) that turn evenly about the vertical axis, seen from a tilted camera."""
+    angle = torch.linspace(0, math.radians(degrees), frames, dtype=torch.float64)
+    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
+    yaw = torch.stack([angle.cos(), zero, angle.sin(), zero, one, zero, -angle.sin(), zero, angle.cos()], -1)
+    nod = torch.tensor(
+        [[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]], dtype=torch.float64
+    )
+    return (nod @ yaw.reshape(-1, 3, 3)).to(dtype)
+
+
+def same_as_loop(function, *shapes, make=None):
+    """Check that a function of tensors gives for a batch what it gives one by one."""
+    for batch in BATCHES:
+        arguments = [normal(*batch, *s, seed=i) for i, s in enumerate(shapes)]
+        if make is not None:
+            arguments = make(*arguments)
+        singles = zip(*[a.reshape(-1, *a.shape[len(batch) :]) for a in arguments], strict=True)
+        alone = [function(*single) for single in singles]
+        together = function(*arguments)
+        if not isinstance(together, tuple):
+            together, alone = (together,), [(a,) for a in alone]
+        for k, whole in enumerate(together):
+            parts = torch.stack([a[k] for a in alone])
+            assert_close(whole, parts.reshape((*batch, *parts.shape[1:])), rtol=1e-7, atol=1e-9)
+
+
+def leaves_arguments_alone(function, *arguments):
+    """Check that a function changes none of its arguments, and return its value."""
+    before = [a.clone() for a in arguments]
+    value = function(*arguments)
+    for a, b in zip(arguments, before, strict=True):
+        assert torch.equal(a, b)
+    return value
+
+
+def finite(function, *arguments, seed: int = 9):
+    """Check that value and gradients hold neither NaN nor inf, and return the gradients."""
+    leaves = [a.detach().clone().requires_grad_() for a in arguments]
+    value = function(*leaves)
+    assert torch.isfinite(value).all()
+    cotangent = normal(*value.shape, seed=seed, dtype=value.dtype, device=value.device.type)
+    grads = torch.autograd.grad(value, leaves, cotangent, allow_unused=True)
+    for grad in grads:
+        assert grad is None or torch.isfinite(grad).all()
+    return grads
+
+
+def gradcheck(function, *arguments, fast: bool = False, **options):
+    """Compare gradients with finite differences, in double precision."""
+    leaves = [a.detach().clone().requires_grad_() for a in arguments]
+    return torch.autograd.gradcheck(function, leaves, fast_mode=fast, **options)

@@ -1,0 +1,148 @@
+"""Time: gaps, windows, seams, and the best path."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numerics import DEVICES, FLOATS, finite, gradcheck, leaves_arguments_alone, normal
+from torch.testing import assert_close
+
+from kcs_torch.errors import OptionError
+from kcs_torch.functional import best_path, blend_windows, interpolate, window_starts
+
+# ---------------------------------------------------------------------- gaps
+
+
+@given(st.integers(1, 12), st.integers(0, 10**6))
+@settings(max_examples=40, deadline=None)
+def test_interpolate_is_that_of_numpy(frames, seed):
+    values = normal(frames, 3, 2, seed=seed)
+    seen = normal(frames, 3, seed=seed + 1) > 0
+    seen[seed % frames] = True  # each joint somewhere
+    filled = leaves_arguments_alone(interpolate, values, seen)
+    time = np.arange(frames)
+    for joint, axis in itertools.product(range(3), range(2)):
+        known = seen[:, joint].numpy()
+        expected = np.interp(time, time[known], values[known, joint, axis].numpy())
+        assert_close(filled[:, joint, axis], torch.from_numpy(expected))
+
+
+def test_interpolate_keeps_what_is_seen():
+    values, seen = normal(6, 4, 2), normal(6, 4, seed=1) > 0
+    assert torch.equal(interpolate(values, seen)[seen], values[seen])
+    assert torch.equal(interpolate(values, torch.ones(6, 4, dtype=torch.bool)), values)
+
+
+def test_joint_never_seen_takes_the_mean_of_the_others():
+    values, seen = normal(5, 4, 2), torch.ones(5, 4, dtype=torch.bool)
+    seen[:, 2] = False
+    assert_close(interpolate(values, seen)[:, 2], values[:, [0, 1, 3]].mean(1))
+
+
+def test_nothing_seen_gives_zero():
+    assert torch.equal(interpolate(normal(5, 4, 2), torch.zeros(5, 4, dtype=torch.bool)), torch.zeros(5, 4, 2).double())
+
+
+def test_interpolate_takes_batches_and_frames():
+    values, seen = normal(2, 3, 6, 4, 2), normal(2, 3, 6, 4, seed=1) > 0
+    parts = [interpolate(v, s) for v, s in zip(values.flatten(0, 1), seen.flatten(0, 1), strict=True)]
+    assert_close(interpolate(values, seen), torch.stack(parts).reshape(values.shape))
+    frame = torch.tensor([True, False, True, True, False, True])[:, None]  # the same for all joints
+    assert_close(interpolate(values, frame), interpolate(values, frame.expand(2, 3, 6, 4)))
+
+
+def test_interpolate_gradient():
+    seen = normal(6, 4, seed=1) > 0
+    seen[:, 2] = False
+    assert gradcheck(lambda x: interpolate(x, seen), normal(6, 4, 2))
+    (grad,) = finite(lambda x: interpolate(x, seen), normal(6, 4, 2))
+    assert torch.equal(grad[~seen], torch.zeros_like(grad[~seen]))
+
+
+# ---------------------------------------------------------------------- windows
+
+
+@given(st.integers(1, 400), st.integers(1, 60), st.integers(0, 59))
+@settings(max_examples=100, deadline=None)
+def test_windows_cover_all_frames_and_overlap(length, window, overlap):
+    if overlap >= window:
+        with pytest.raises(OptionError, match="overlap"):
+            window_starts(length, window, overlap)
+        return
+    starts = window_starts(length, window, overlap)
+    size = min(window, length)
+    assert starts[0] == 0 and starts[-1] == length - size
+    for a, b in itertools.pairwise(starts):
+        assert a < b and a + size - b >= overlap
+    if length > window:  # no more windows than it takes
+        assert (len(starts) - 1) * (window - overlap) + overlap < length
+
+
+def test_negative_overlap_is_refused():
+    with pytest.raises(OptionError, match=r"0\.\.3"):
+        window_starts(10, 4, -1)
+
+
+@given(st.integers(1, 60), st.integers(1, 20), st.integers(0, 19))
+@settings(max_examples=40, deadline=None)
+def test_blending_windows_of_one_signal_gives_it_back(length, window, overlap):
+    starts = window_starts(length, window, min(overlap, window - 1))
+    size = min(window, length)
+    signal = normal(length, 3, 2)
+    parts = torch.stack([signal[s : s + size] for s in starts])
+    assert_close(leaves_arguments_alone(lambda p: blend_windows(p, starts, length), parts), signal)
+
+
+def test_blending_fades_evenly():
+    parts = torch.stack([torch.zeros(6), torch.ones(6)]).double()
+    blended = blend_windows(parts, [0, 4], 10)
+    assert_close(blended, torch.tensor([0, 0, 0, 0, 1 / 3, 2 / 3, 1, 1, 1, 1], dtype=torch.float64))
+    assert gradcheck(lambda p: blend_windows(p, [0, 4], 10), parts)
+
+
+# ---------------------------------------------------------------------- paths
+
+
+def path_cost(cost, transition, path):
+    steps = range(len(cost) - 1)
+    return sum(cost[t, s] for t, s in enumerate(path)) + sum(transition[t, path[t], path[t + 1]] for t in steps)
+
+
+@given(st.integers(1, 6), st.integers(1, 3), st.integers(0, 10**6))
+@settings(max_examples=60, deadline=None)
+def test_best_path_is_the_best(frames, states, seed):
+    cost, transition = normal(frames, states, seed=seed), normal(frames - 1, states, states, seed=seed + 1)
+    path = leaves_arguments_alone(best_path, cost, transition)
+    brute = min(itertools.product(range(states), repeat=frames), key=lambda p: path_cost(cost, transition, p))
+    assert tuple(path.tolist()) == brute
+
+
+def test_best_path_of_many_frames_is_that_of_viterbi():
+    cost, transition = normal(300, 4), normal(299, 4, 4, seed=1)
+    total, back = cost[0], []
+    for t in range(1, 300):
+        best = (total[:, None] + transition[t - 1]).min(0)
+        back.append(best.indices)
+        total = best.values + cost[t]
+    path = [int(total.argmin())]
+    for b in reversed(back):
+        path.append(int(b[path[-1]]))
+    assert best_path(cost, transition).tolist() == path[::-1]
+
+
+# ---------------------------------------------------------------------- all of them
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_results_follow_dtype_and_device(dtype, device):
+    values = normal(6, 4, 2, dtype=dtype, device=device)
+    results = [
+        interpolate(values, torch.ones(6, 4, dtype=torch.bool, device=device)),
+        blend_windows(torch.stack([values, values]), [0, 4], 10),
+    ]
+    assert {(v.dtype, v.device.type) for v in results} == {(dtype, device)}
+    assert best_path(values[:, :, 0], values.new_zeros(5, 4, 4)).device.type == device
