@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 from kcs_torch.errors import OptionError, unknown
-from kcs_torch.methods import METHODS
+from kcs_torch.functional.camera import camera_disagreement
+from kcs_torch.methods import KCS, METHODS, SfAM
 from kcs_torch.methods.base import Method
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks
 
-__all__ = ["choose_method", "reconstruct"]
+__all__ = ["reconstruct"]
 
 ENOUGH_TURN = 60.0
 """Degrees of viewpoint turn from which low-rank shapes beat a template."""
+
+TRUSTED = 25.0
+"""Degrees within which SfAM's cameras must agree with those that the template gives: wrong ones are far off."""
 
 
 def reconstruct(
@@ -32,8 +37,9 @@ def reconstruct(
 
     Args:
         tracks: a :class:`Tracks`, or an array (T, N, 2) with NaN where unseen.
-        method: "auto", a name in :data:`kcs_torch.METHODS`, or a :class:`Method`. "auto" looks how far the viewpoint
-            turns about the body: SfAM where it turns enough or the skeleton has no template, else KCS.
+        method: "auto", a name in :data:`kcs_torch.METHODS`, or a :class:`Method`. "auto" takes SfAM
+            where the skeleton has no template, or the viewpoint turns enough and SfAM's cameras agree with those that
+            the template gives; else KCS.
         skeleton: for arrays: a :class:`Skeleton`, a built-in name, or a YAML/JSON file.
         confidence: for arrays: (T, N) in 0..1.
         fps: for arrays: frames per second.
@@ -56,35 +62,44 @@ def reconstruct(
     """
     if isinstance(tracks, Tracks):
         if skeleton is not None or confidence is not None or fps is not None:
-            raise OptionError("reconstruct: skeleton, confidence and fps belong to arrays; these tracks already have them")
+            raise OptionError(
+                "reconstruct: skeleton, confidence and fps belong to arrays; these tracks already have them"
+            )
     else:
         tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units)
     if isinstance(method, Method):
         if fields:
-            raise OptionError(f"reconstruct: fields ({', '.join(fields)}) go with a method's name; set them on the method itself")
+            raise OptionError(
+                f"reconstruct: fields ({', '.join(fields)}) go with a method's name; set them on the method itself"
+            )
         return method(tracks, cameras)
     if method == "auto":
-        name = choose_method(tracks)
-    elif method in METHODS:
-        name = method
-    else:
+        if fields:
+            raise OptionError(f"reconstruct: fields ({', '.join(fields)}) need a method's name: {', '.join(METHODS)}")
+        return _automatic(tracks, cameras)
+    if method not in METHODS:
         raise unknown("method", method, ["auto", *METHODS])
-    return METHODS[name].from_options(**fields)(tracks, cameras)
+    return METHODS[method].from_options(**fields)(tracks, cameras)
 
 
-def choose_method(tracks: Tracks) -> str:
-    """Return the name of the method that suits the tracks.
+def _automatic(tracks: Tracks, cameras: Any) -> Reconstruction:
+    """The result of the method that suits the tracks.
 
-    Low-rank shapes need a viewpoint that turns; a template needs a skeleton that has one. The turn is that of the body
-    against the camera, told by fitting the template to each frame.
+    Low-rank shapes need a viewpoint that turns, a template needs a skeleton that has one. Where the turn is too small,
+    SfAM may take the body's motion for the camera's; the template's cameras, rough as they are, give it away.
     """
     if tracks.skeleton.template is None:
-        return "sfam"
-    import warnings
-
-    from kcs_torch.methods.kcs import KCS
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        probe = KCS(rounds=1, num_weights=1, steps_per_weight=1)(tracks)
-    return "sfam" if probe.diagnostics.viewpoint_turn >= ENOUGH_TURN else "kcs"
+        return SfAM()(tracks, cameras)
+    by_template = KCS()(tracks, cameras)
+    if by_template.diagnostics.viewpoint_turn < ENOUGH_TURN / 2:
+        return by_template
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        low_rank = SfAM()(tracks, cameras)
+    if low_rank.diagnostics.viewpoint_turn < ENOUGH_TURN:
+        return by_template
+    if cameras is None and float(camera_disagreement(low_rank.cameras, by_template.cameras)) > TRUSTED:
+        return by_template
+    for warning in told:
+        warnings.warn(warning.message, warning.category, stacklevel=3)
+    return low_rank

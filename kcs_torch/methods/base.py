@@ -14,8 +14,10 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ConvergenceWarning, KcsWarning, OptionError, ShapeError, unknown
+from kcs_torch.functional.align import centre
 from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.temporal import interpolate
 from kcs_torch.types import Diagnostics, Reconstruction, Tracks
 
 __all__ = ["Estimate", "Method"]
@@ -81,18 +83,15 @@ class Method(ABC):
             if cameras.shape != (tracks.num_frames, 2, 3) or not torch.isfinite(cameras).all():
                 raise ShapeError(f"cameras: expected finite ({tracks.num_frames}, 2, 3), got {tuple(cameras.shape)}")
         with torch.no_grad():
-            weights = tracks.weights
-            total = weights.sum(-1)[:, None, None]
-            middle = (tracks.points * weights[..., None]).sum(-2, keepdim=True) / torch.where(total > 0, total, torch.ones_like(total))
-            middle = _carry(middle, total[:, 0, 0] > 0)
-            centred = (tracks.points - middle) * (weights > 0)[..., None]
-            size = (centred.square() * weights[..., None]).sum() / weights.sum()
+            known = tracks.seen.any(-1)
+            middle = interpolate(_mean(tracks.points, tracks.weights), known[:, None])
+            centred = (tracks.points - middle) * tracks.seen[..., None]
+            size = (centred.square() * tracks.weights[..., None]).sum() / tracks.weights.sum()
             size = torch.where(size > 0, size, torch.ones_like(size)).sqrt()
             found = self.solve(dataclasses.replace(tracks, points=centred / size), cameras)
             points = found.points * size
             seen = points[..., :2] * found.scales[:, None, None]
-            shift = ((tracks.points - seen) * weights[..., None]).sum(-2, keepdim=True) / torch.where(total > 0, total, torch.ones_like(total))
-            shift = _carry(shift, total[:, 0, 0] > 0)
+            shift = interpolate(_mean(tracks.points - seen, tracks.weights), known[:, None])
             points = points + torch.nn.functional.pad(shift, (0, 1))
             return self._finish(tracks, points, seen + shift, found, time.perf_counter() - begin)
 
@@ -108,13 +107,19 @@ class Method(ABC):
         turn = float(viewpoint_turn(found.cameras))
         notes = list(found.notes)
         if turn < WEAK_TURN:
-            notes.append(f"the viewpoint turned by {turn:.0f} degrees only: depth rests on the skeleton's template and lengths")
+            notes.append(
+                f"the viewpoint turned by {turn:.0f} degrees only: depth rests on the skeleton's template and lengths"
+            )
         if not found.converged:
             notes.append(f"{self.name} did not settle within {found.iterations} steps")
             warnings.warn(f"{tracks.source}: {notes[-1]}", ConvergenceWarning, stacklevel=3)
         never = [body.joints[n] for n in (tracks.weights == 0).all(0).nonzero().flatten().tolist()]
         if never:
-            warnings.warn(f"{tracks.source}: never seen, so placed by the skeleton alone: {', '.join(never)}", KcsWarning, stacklevel=3)
+            warnings.warn(
+                f"{tracks.source}: never seen, so placed by the skeleton alone: {', '.join(never)}",
+                KcsWarning,
+                stacklevel=3,
+            )
         diagnostics = Diagnostics(
             viewpoint_turn=turn,
             unseen_share=tracks.unseen_share,
@@ -146,8 +151,6 @@ class Method(ABC):
             raise OptionError(f"{self.name}: {field}: expected {expected}, got {getattr(self, field)!r}")
 
 
-def _carry(values: Tensor, known: Tensor) -> Tensor:
-    """Fill the rows of unknown frames (T, ...) linearly from their neighbours."""
-    from kcs_torch.functional.temporal import interpolate
-
-    return interpolate(values, known[:, None])
+def _mean(points: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean over joints, (T, 1, D); 0 in frames without a seen joint."""
+    return centre(points, weights)[1]

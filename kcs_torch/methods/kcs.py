@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -11,15 +11,14 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.functional.camera import back_project, factorize, project
-from kcs_torch.functional.chain import bone_lengths, bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.camera import back_project, complete_rotation, project
+from kcs_torch.functional.chain import chain_inverse, incidence
 from kcs_torch.functional.spectral import singular_values, svt
-from kcs_torch.functional.temporal import best_path, interpolate
+from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.base import Estimate, Method
+from kcs_torch.methods.template import clip_scale, rigid_shape
 from kcs_torch.nn.energies import centred_residual
 from kcs_torch.nn.unrolled import continuation
-from kcs_torch.skeleton import Skeleton
-from kcs_torch.solvers.ist import ist, metric_upgrade
 from kcs_torch.solvers.iterate import iterate, relative_change
 from kcs_torch.solvers.pose import fit_cameras
 from kcs_torch.types import Tracks
@@ -60,7 +59,7 @@ class KCS(Method):
     links: tuple[tuple[str, str], ...] = ()
     arrangement: Literal["stacked", "frames"] = "stacked"
     rounds: int = 3
-    tolerance: float = 1e-3
+    tolerance: float = 1e-2
     mu: float = 0.5
     rho: float = 0.25
     num_weights: int = 8
@@ -100,7 +99,9 @@ class KCS(Method):
         for _ in range(self.rounds):
             last = rotations
             rotations, scales = self._cameras(tracks, shape, low, high, last, cameras)
-            deviation, settled, steps = self._deviation(tracks, rest, deviation, rotations[:, :2], scales, matrix, inverse)
+            deviation, settled, steps = self._deviation(
+                tracks, rest, deviation, rotations[:, :2], scales, matrix, inverse
+            )
             shape, made = rest + inverse @ deviation, made + steps
             if last is not None:
                 moved = ((rotations - last).square().sum((-2, -1)).mean() / 2).sqrt()
@@ -120,11 +121,13 @@ class KCS(Method):
         if self.template is not None:
             rest = torch.as_tensor(self.template, dtype=like.dtype, device=like.device)
             if rest.shape != (joints, 3) or not torch.isfinite(rest).all():
-                raise ShapeError(f"kcs: template: expected {joints} finite positions (x, y, z), got shape {tuple(rest.shape)}")
+                raise ShapeError(
+                    f"kcs: template: expected {joints} finite positions (x, y, z), got shape {tuple(rest.shape)}"
+                )
             return rest, ()
         if tracks.skeleton.template is not None:
             return tracks.skeleton.template_points(dtype=like.dtype, device=like.device), ()
-        note = f"skeleton '{tracks.skeleton.name}' has no template: the rigid shape that best explains the tracks stands in"
+        note = f"skeleton '{tracks.skeleton.name}' has no template: the tracks' best rigid shape serves"
         return rigid_shape(tracks), (note,)
 
     def _cameras(
@@ -134,8 +137,6 @@ class KCS(Method):
         fit = fit_cameras(tracks.points, shape, tracks.weights, low, high, robust=self.robust, start=last)
         rotations, scales, cost = fit.rotations, fit.scales, fit.cost.mT  # cost (T, C)
         if known is not None:
-            from kcs_torch.functional.camera import complete_rotation
-
             rotations = complete_rotation(known)
             flat = project(shape, known)
             match = (flat * tracks.points * tracks.weights[..., None]).sum((-2, -1))
@@ -149,7 +150,14 @@ class KCS(Method):
         return rotations[choice, frame], scales[choice, frame]
 
     def _deviation(
-        self, tracks: Tracks, rest: Tensor, start: Tensor, cameras: Tensor, scales: Tensor, matrix: Tensor, inverse: Tensor
+        self,
+        tracks: Tracks,
+        rest: Tensor,
+        start: Tensor,
+        cameras: Tensor,
+        scales: Tensor,
+        matrix: Tensor,
+        inverse: Tensor,
     ) -> tuple[Tensor, bool, int]:
         """Shape step (eq. 21): deviations (T, B, 3) of least nuclear norm that meet the tracks, by SVT continuation.
 
@@ -180,74 +188,15 @@ class KCS(Method):
         return state, settled, made
 
 
-def clip_scale(tracks: Tracks, rest: Tensor, *, span: int = 60, quantile: float = 0.95) -> Tensor:
-    """Weak-perspective scale of each frame, from the longest projections of the bones around it.
-
-    A bone's projection is at most scale times its length, and reaches it where the bone lies in the image plane. In
-    spans of frames, each bone's high quantile of |projection| / length votes, and the median bone wins: an arm held out
-    does not enlarge the body.
-
-    Args:
-        tracks: the tracks.
-        rest: (N, 3) template.
-        span: frames of a span; scales between spans are interpolated.
-        quantile: of a bone's projections within a span.
-
-    Returns:
-        (T,), positive.
-    """
-    body = tracks.skeleton
-    frames, device = tracks.num_frames, tracks.points.device
-    index = body.bone_index(device=device)[list(body.rigid)]
-    fallback = tracks.points.square().sum(-1).mean().sqrt() / rest.square().sum(-1).mean().sqrt().clamp_min(1e-12)
-    if len(index) == 0:
-        return fallback.clamp_min(1e-12).expand(frames)
-    length = bone_lengths(rest, index)
-    seen = (tracks.weights[:, index[:, 0]] > 0) & (tracks.weights[:, index[:, 1]] > 0) & (length > 0)
-    ratio = bone_vectors(tracks.points, index).norm(dim=-1) / torch.where(length > 0, length, torch.ones_like(length))
-    ratio = torch.where(seen, ratio, torch.nan)
-    count = max(1, round(frames / span))
-    edges = [round(i * frames / count) for i in range(count + 1)]
-    votes = torch.stack([ratio[a:b].nanquantile(quantile, 0).nanmedian() for a, b in zip(edges, edges[1:], strict=False)])
-    overall = ratio.nanquantile(quantile, 0).nanmedian()
-    overall = torch.where(torch.isfinite(overall) & (overall > 0), overall, fallback.clamp_min(1e-12))
-    votes = torch.where(torch.isfinite(votes) & (votes > 0), votes, overall)
-    at = torch.tensor([(a + b - 1) / 2 for a, b in zip(edges, edges[1:], strict=False)], dtype=votes.dtype, device=device)
-    time = torch.arange(frames, dtype=votes.dtype, device=device)
-    right = torch.bucketize(time, at).clamp(1, max(count - 1, 1)).clamp_max(count - 1)
-    left = (right - 1).clamp_min(0)
-    gap = (at[right] - at[left]).clamp_min(1e-12)
-    share = ((time - at[left]) / gap).clamp(0, 1)
-    return votes[left] * (1 - share) + votes[right] * share
+Folded = tuple[Tensor, Callable[[Tensor], Tensor]]
 
 
-def rigid_shape(tracks: Tracks) -> Tensor:
-    """The one rigid shape (N, 3) that best explains the tracks (Tomasi, Kanade 1992): a template for want of any.
-
-    Where the viewpoint does not turn its depth is nearly zero.
-    """
-    filled = interpolate(tracks.points, tracks.seen)
-    filled = filled - filled.mean(-2, keepdim=True)
-    frames, joints = filled.shape[:2]
-    if min(2 * frames, joints) < 3:
-        return torch.nn.functional.pad(filled.mean(0), (0, 1))
-    motion, _ = factorize(filled, 3)
-    size = motion[..., 0].square().mean().sqrt()
-    motion = motion / torch.where(size > 0, size, torch.ones_like(size))
-    q, _ = metric_upgrade(motion, ist(motion))
-    from kcs_torch.functional.camera import rows_to_cameras
-
-    cameras, _ = rows_to_cameras(motion @ q)
-    normal = (cameras.mT @ cameras).mean(0) + 1e-3 * torch.eye(3, dtype=filled.dtype, device=filled.device)
-    return torch.linalg.solve(normal, back_project(filled, cameras).mean(0).mT).mT
-
-
-def _stack(deviation: Tensor):  # type: ignore[no-untyped-def]
+def _stack(deviation: Tensor) -> Folded:
     """(T, B, 3) as 3T x B, and the way back."""
     frames = len(deviation)
     return deviation.mT.flatten(0, 1), lambda m: m.unflatten(0, (frames, 3)).mT
 
 
-def _frames(deviation: Tensor):  # type: ignore[no-untyped-def]
+def _frames(deviation: Tensor) -> Folded:
     """(T, B, 3) as T x 3B, and the way back."""
     return deviation.flatten(1), lambda m: m.unflatten(1, (-1, 3))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -13,13 +13,15 @@ from kcs_torch.errors import OptionError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import complete_rotation, factorize, rows_to_cameras
 from kcs_torch.functional.spectral import dct_basis
-from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
+from kcs_torch.functional.temporal import blend_windows, window_starts
 from kcs_torch.methods.base import Estimate, Method
-from kcs_torch.nn.unrolled import continuation, data_scale, estimate_lengths, shape_step, start_shape
+from kcs_torch.methods.unseen import place_unseen
+from kcs_torch.nn.unrolled import UnrolledSfAM
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.camera_path import constant_path
+from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.ist import ist, metric_upgrade
-from kcs_torch.solvers.iterate import iterate, relative_change
+from kcs_torch.solvers.iterate import Solution
 from kcs_torch.types import Tracks
 
 __all__ = ["SfAM"]
@@ -31,20 +33,19 @@ class SfAM(Method):
 
     Args:
         beta: stiffness of the bones (the paper's beta); 0 is plain low-rank structure from motion.
-        mu: first weight of the nuclear norm, a share of the data's largest singular value.
-        rho: factor from one weight to the next.
-        num_weights: how many weights.
-        steps_per_weight: shrinkage steps at each weight, at most.
-        tolerance: go on to the next weight where a step changes the shape by less than this share.
+        num_steps: shrinkage steps; the weight of the nuclear norm falls with each.
+        mu: first weight, a share of the data's largest singular value.
+        final: last weight. The factor from step to step (the paper's rho) follows from the three.
         tau: step size of the articulated steps, below 1; the others take twice that.
-        articulate_from: share of the weights after which the bones' term joins; 0 is all of them, as printed. While mu
+        momentum: share of the last change that the next step starts ahead by; 0 is the printed iteration.
+        articulate_from: share of the steps after which the bones' term joins; 0 is all of them, as printed. While mu
             is large the shapes are shrunk, and lengths taken from them would be too short.
-        lengths: where the bone lengths come from: "shape" (re-estimated from the shape at each weight), or "skeleton"
-            (its proportions, at the scale of the shape; fixed, as printed).
+        lengths: where the bone lengths come from: "shape" (re-estimated at each step), or "skeleton" (its
+            proportions, at the scale of the shape), or one relative length per bone (fixed, as printed).
         rank: K shapes of the camera factorisation, or "auto": chosen by how evenly the camera moves.
         camera_path: "free" cameras; "constant" angular velocity; "auto" takes the latter where it explains the former.
             It concerns the cameras that are reported, not the shape.
-        trajectories: number of cosines that the tracks' paths are smoothed to, or None.
+        trajectories: number of cosines that the tracks' paths are smoothed to within a window, or None.
         window: frames that are solved together, or None for all.
         overlap: frames that neighbouring windows share.
 
@@ -54,14 +55,13 @@ class SfAM(Method):
 
     name: ClassVar[str] = "sfam"
     beta: float = 1.5
+    num_steps: int = 60
     mu: float = 0.5
-    rho: float = 0.25
-    num_weights: int = 8
-    steps_per_weight: int = 30
-    tolerance: float = 1e-5
+    final: float = 1e-5
     tau: float = 0.5
-    articulate_from: float = 0.75
-    lengths: Literal["shape", "skeleton"] = "shape"
+    momentum: float = 0.8
+    articulate_from: float = 0.6
+    lengths: Literal["shape", "skeleton"] | Sequence[float] = "shape"
     rank: int | Literal["auto"] = "auto"
     camera_path: Literal["auto", "free", "constant"] = "auto"
     trajectories: int | None = None
@@ -70,18 +70,21 @@ class SfAM(Method):
 
     def __post_init__(self) -> None:
         self._expect(self.beta >= 0, "beta", "a number >= 0")
+        self._expect(self.num_steps >= 1, "num_steps", "at least 1")
         self._expect(self.mu > 0, "mu", "a positive number")
-        self._expect(0 < self.rho < 1, "rho", "a number between 0 and 1")
-        self._expect(self.num_weights >= 1, "num_weights", "at least 1")
-        self._expect(self.steps_per_weight >= 1, "steps_per_weight", "at least 1")
+        self._expect(0 < self.final <= self.mu, "final", f"a positive number up to mu = {self.mu}")
         self._expect(0 < self.tau < 1, "tau", "a number between 0 and 1")
+        self._expect(0 <= self.momentum < 1, "momentum", "a share within [0, 1)")
         self._expect(0 <= self.articulate_from <= 1, "articulate_from", "a share within 0..1")
-        self._expect(self.lengths in ("shape", "skeleton"), "lengths", "'shape' or 'skeleton'")
+        if isinstance(self.lengths, str):
+            self._expect(self.lengths in ("shape", "skeleton"), "lengths", "'shape', 'skeleton' or numbers")
+        else:
+            self._expect(min(self.lengths, default=0.0) > 0, "lengths", "positive numbers")
         self._expect(self.rank == "auto" or (isinstance(self.rank, int) and self.rank >= 1), "rank", "'auto' or K >= 1")
         self._expect(self.camera_path in ("auto", "free", "constant"), "camera_path", "'auto', 'free' or 'constant'")
         self._expect(self.trajectories is None or self.trajectories >= 1, "trajectories", "None or at least 1")
         self._expect(self.window is None or self.window >= 2, "window", "None or at least 2 frames")
-        self._expect(0 <= self.overlap, "overlap", "at least 0 frames")
+        self._expect(self.overlap >= 0, "overlap", "at least 0 frames")
         if self.window is not None and self.overlap >= self.window:
             raise OptionError(f"sfam: overlap: expected below the window of {self.window} frames, got {self.overlap}")
 
@@ -91,30 +94,27 @@ class SfAM(Method):
         window = min(self.window or frames, frames)
         starts = window_starts(frames, window, min(self.overlap, window - 1))
         cut = lambda x: torch.stack([x[s : s + window] for s in starts])  # noqa: E731
-        filled = interpolate(tracks.points, tracks.seen)
-        if self.trajectories is not None:
-            basis = dct_basis(frames, min(self.trajectories, frames), dtype=filled.dtype, device=filled.device)
-            filled = torch.einsum("tk,sk,snd->tnd", basis, basis, filled)
-            tracks = Tracks(filled * tracks.seen[..., None], tracks.weights, tracks.skeleton, source=tracks.source)
+        filled = complete_tracks(cut(tracks.points), cut(tracks.seen))
         points, weights = cut(tracks.points), cut(tracks.weights)
-        rows = cut(cameras) if cameras is not None else orthographic_cameras(cut(filled), self.rank)
-        shape, converged, iterations = self.shape(points, rows, weights, tracks.skeleton)
-        turned = complete_rotation(rows)  # (W, T, 3, 3)
-        local = shape @ turned.mT
-        sign = _mirror_signs(local, starts)
+        if self.trajectories is not None:
+            basis = dct_basis(window, min(self.trajectories, window), dtype=filled.dtype, device=filled.device)
+            filled = torch.einsum("tk,sk,wsnd->wtnd", basis, basis, filled)
+            points = filled * (weights > 0)[..., None]
+        rows = cut(cameras) if cameras is not None else orthographic_cameras(filled, self.rank)
+        solution = self.shape(points, rows, weights, tracks.skeleton)
+        local = solution.value @ complete_rotation(rows).mT  # (W, T, N, 3) in each frame's camera
         flip = torch.ones(len(starts), 3, dtype=local.dtype, device=local.device)
-        flip[:, 2] = sign
-        depth = blend_windows(local * flip[:, None, None], starts, frames)
-        if cameras is not None:
-            path, notes = cameras, ()
-        else:
-            free = _join_rotations(complete_rotation(rows * flip[:, None, None]), starts, frames)
-            path, notes = self._path(free)
-        return Estimate(depth, path, torch.ones_like(depth[:, 0, 0]), converged, iterations, notes)
+        if cameras is None:  # known cameras know their mirror
+            flip[:, 2] = _mirror_signs(local, starts)
+        joined = blend_windows(local * flip[:, None, None], starts, frames)
+        joined = place_unseen(joined, tracks.seen.any(0), tracks.skeleton)
+        path = cameras
+        notes: tuple[str, ...] = ()
+        if path is None:
+            path, notes = self._path(_join_rotations(complete_rotation(rows * flip[:, None, None]), starts, frames))
+        return Estimate(joined, path, torch.ones_like(joined[:, 0, 0]), solution.converged, solution.iterations, notes)
 
-    def shape(
-        self, tracks: Tensor, cameras: Tensor, weights: Tensor, skeleton: Skeleton
-    ) -> tuple[Tensor, bool, int]:
+    def shape(self, tracks: Tensor, cameras: Tensor, weights: Tensor, skeleton: Skeleton) -> Solution[Tensor]:
         """Algorithm 1 with known cameras, for a batch of windows of one body.
 
         Args:
@@ -124,49 +124,30 @@ class SfAM(Method):
             skeleton: of the N joints.
 
         Returns:
-            Shapes (W, T, N, 3) in the windows' world frames, whether all settled, and steps made.
-        """
-        rigid = list(skeleton.rigid)
-        bones = skeleton.bone_index(device=tracks.device)[rigid]
-        scale = data_scale(tracks, cameras, weights)
-        first = round(self.articulate_from * self.num_weights) if rigid and self.beta > 0 else self.num_weights
-        mus = continuation(self.num_weights, self.mu, self.mu * self.rho ** (self.num_weights - 1))
-        shape, converged, made = start_shape(tracks, cameras, weights), False, 0
-        for k, mu in enumerate(mus):
-            step = self._step(shape, tracks, cameras, weights, mu * scale, bones if k >= first else None, skeleton)
-            solution = iterate(
-                step,
-                shape,
-                num_steps=self.steps_per_weight,
-                change=lambda old, new: relative_change(old.flatten(-2), new.flatten(-2)),
-                tolerance=self.tolerance,
-            )
-            shape, converged, made = solution.value, solution.converged, made + solution.iterations
-        return shape, converged, made
+            The shapes (W, T, N, 3) in the windows' world frames.
 
-    def _step(
-        self,
-        shape: Tensor,
-        tracks: Tensor,
-        cameras: Tensor,
-        weights: Tensor,
-        threshold: Tensor,
-        bones: Tensor | None,
-        skeleton: Skeleton,
-    ) -> Callable[[Tensor, int], Tensor]:
-        """The step at one weight; bone lengths are taken from the shape that it starts from."""
-        if bones is None:
-            return lambda x, _: shape_step(x, tracks, cameras, weights, threshold, 2 * self.tau)
-        # one body, one set of lengths: all windows' frames together
-        length, rigidity = estimate_lengths(shape.flatten(0, 1), bones, weights.flatten(0, 1), graded=not skeleton.tree)
-        known = skeleton.relative_lengths(dtype=shape.dtype, device=shape.device) if self.lengths == "skeleton" else None
-        if known is not None:
-            known = known[list(skeleton.rigid)]
-            length = known * (length / known).median()
-        stiffness = self.beta * rigidity
-        return lambda x, _: shape_step(
-            x, tracks, cameras, weights, threshold, self.tau, bones=bones, lengths=length, stiffness=stiffness
-        )
+        Raises:
+            OptionError: ``lengths`` are not one per bone.
+        """
+        lengths = None
+        if self.lengths == "skeleton":
+            lengths = skeleton.relative_lengths(dtype=tracks.dtype, device=tracks.device)
+        elif not isinstance(self.lengths, str):
+            lengths = torch.tensor(tuple(self.lengths), dtype=tracks.dtype, device=tracks.device)
+            if len(lengths) != skeleton.num_bones:
+                raise OptionError(f"sfam: lengths: expected {skeleton.num_bones}, one per bone, got {len(lengths)}")
+        solver = UnrolledSfAM(
+            skeleton,
+            self.num_steps,
+            mu=self.mu,
+            final=self.final,
+            tau=self.tau,
+            momentum=self.momentum,
+            beta=self.beta or 1.0,
+            articulate_from=self.articulate_from if self.beta > 0 else 1.0,
+            learnable=False,
+        ).to(tracks.device)
+        return solver.solve(tracks, cameras, weights=weights, lengths=lengths, one_body=True)
 
     def _path(self, rotations: Tensor) -> tuple[Tensor, tuple[str, ...]]:
         """Reported cameras (T, 2, 3): free, or of constant angular velocity where that explains them."""
@@ -178,7 +159,9 @@ class SfAM(Method):
         if self.camera_path == "auto" and not bool(angle.median() < EVEN * turn):
             return rotations[:, :2], ()
         degrees = float(torch.rad2deg(angle.median()))
-        return path[:, :2], (f"cameras follow a path of constant angular velocity (median deviation {degrees:.1f} degrees)",)
+        return path[:, :2], (
+            f"cameras follow a path of constant angular velocity (median deviation {degrees:.1f} degrees)",
+        )
 
 
 EVEN = 0.05
@@ -249,7 +232,7 @@ def _mirror_signs(parts: Tensor, starts: list[int]) -> Tensor:
 
 
 def _join_rotations(parts: Tensor, starts: list[int], frames: int) -> Tensor:
-    """Rotations (W, T, 3, 3), each window in a world frame of its own, as one run (frames, 3, 3) in the first's frame."""
+    """Rotations (W, T, 3, 3), each window in a world frame of its own, as one run (frames, 3, 3) in the first's."""
     window = parts.shape[1]
     turned = [parts[0]]
     for i in range(1, len(starts)):

@@ -52,8 +52,14 @@ class BoneLengthEnergy(SkeletonModule):
 
         Returns:
             (..., T), in squared units.
+
+        Raises:
+            ShapeError: the shapes do not fit.
         """
-        self.check(points)
+        self.check(points, clip=True)
+        check_weights(weights, points, self)
+        if lengths is not None and lengths.shape[-1:] != (len(self.bones),):
+            raise ShapeError(f"BoneLengthEnergy: expected lengths (..., {len(self.bones)}), got {tuple(lengths.shape)}")
         size = bone_lengths(points, self.bones)  # (..., T, B)
         share = self.rigid.to(size.dtype).expand_as(size)
         if weights is not None:
@@ -77,13 +83,13 @@ class BoneLengthEnergy(SkeletonModule):
         Returns:
             (..., T, N, 3).
         """
-        self.check(points)
+        self.check(points, clip=True)
         beta = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device) * self.rigid.to(points.dtype)
         return fit_bones(points, lengths[..., None, :], self.bones, stiffness=beta, num_steps=num_steps)
 
 
 class ReprojectionEnergy(nn.Module):
-    """1/2 sum_n w_n |R x_n + t - y_n|^2 of each frame, the translation t at its optimum.
+    """1/2 sum_n w_n |R x_n + t - y_n|^2 of each frame, the translation t at its least-squares optimum.
 
     Args:
         translation: False leaves t at 0 (points and tracks already share an origin).
@@ -99,7 +105,9 @@ class ReprojectionEnergy(nn.Module):
             raise OptionError(f"ReprojectionEnergy: expected a positive huber length or None, got {huber}")
         self.translation, self.huber = translation, huber
 
-    def forward(self, points: Tensor, tracks: Tensor, cameras: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
+    def forward(
+        self, points: Tensor, tracks: Tensor, cameras: Tensor | None = None, weights: Tensor | None = None
+    ) -> Tensor:
         """Return the energy of each frame.
 
         Args:
@@ -110,6 +118,9 @@ class ReprojectionEnergy(nn.Module):
 
         Returns:
             (..., T), in squared units of the tracks.
+
+        Raises:
+            ShapeError: the shapes do not fit.
         """
         square = self.residual(points, tracks, cameras, weights).square().sum(-1)
         if self.huber is not None:
@@ -118,11 +129,19 @@ class ReprojectionEnergy(nn.Module):
             square = torch.where(far, 2 * self.huber * root - self.huber**2, square)
         return 0.5 * (square if weights is None else square * weights).sum(-1)
 
-    def residual(self, points: Tensor, tracks: Tensor, cameras: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
+    def residual(
+        self, points: Tensor, tracks: Tensor, cameras: Tensor | None = None, weights: Tensor | None = None
+    ) -> Tensor:
         """R x + t - y, (..., T, N, 2)."""
+        check_clip(points, self)
+        if tracks.shape[-3:] != (*points.shape[-3:-1], 2):
+            expected = f"(..., {points.shape[-3]}, {points.shape[-2]}, 2)"
+            raise ShapeError(f"ReprojectionEnergy: expected tracks {expected}, got {tuple(tracks.shape)}")
+        if cameras is not None and cameras.shape[-3:] != (points.shape[-3], 2, 3):
+            expected = f"(..., {points.shape[-3]}, 2, 3)"
+            raise ShapeError(f"ReprojectionEnergy: expected cameras {expected}, got {tuple(cameras.shape)}")
+        check_weights(weights, points, self)
         seen = points[..., :2] if cameras is None else project(points, cameras)
-        if seen.shape[-2:] != tracks.shape[-2:]:
-            raise ShapeError(f"ReprojectionEnergy: expected tracks (..., {seen.shape[-2]}, 2), got {tuple(tracks.shape)}")
         return centred_residual(seen, tracks, weights) if self.translation else seen - tracks
 
     def grad(self, points: Tensor, tracks: Tensor, cameras: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -146,18 +165,21 @@ class LowRankEnergy(nn.Module):
     def __init__(self, kind: str = "nuclear", *, eps: float = 1e-3) -> None:
         super().__init__()
         if kind not in ("nuclear", "log_det") or not eps > 0:
-            raise OptionError(f"LowRankEnergy: expected kind 'nuclear' or 'log_det' and eps > 0, got {kind!r} and {eps}")
+            raise OptionError(
+                f"LowRankEnergy: expected kind 'nuclear' or 'log_det' and eps > 0, got {kind!r} and {eps}"
+            )
         self.kind, self.eps = kind, eps
 
     def forward(self, points: Tensor) -> Tensor:
         """Return the energy (...) of clips (..., T, N, D)."""
+        check_clip(points, self)
         matrix = points.flatten(-2)
         if self.kind == "nuclear":
             return nuclear_norm(matrix)
         frames = matrix.shape[-2]
         centred = matrix - matrix.mean(-2, keepdim=True)
         covariance = centred.mT @ centred / frames
-        scale = covariance.diagonal(dim1=-2, dim2=-1).mean(-1).detach()
+        scale = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
         level = self.eps * torch.where(scale > 0, scale, torch.ones_like(scale))
         return frames / 2 * log_det(covariance, level)
 
@@ -184,6 +206,8 @@ class SmoothnessEnergy(nn.Module):
 
     def forward(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return (..., T) of points (..., T, N, D); a difference weighs as much as the least of its frames."""
+        check_clip(points, self)
+        check_weights(weights, points, self)
         frames = points.shape[-3]
         if frames <= self.order:
             return points.new_zeros(points.shape[:-2]) + 0 * points.sum((-2, -1))
@@ -209,9 +233,22 @@ class SymmetryEnergy(SkeletonModule):
 
     def forward(self, points: Tensor) -> Tensor:
         """Return (..., T) of points (..., T, N, 3)."""
-        self.check(points)
+        self.check(points, clip=True)
         size = bone_lengths(points, self.bones)
         return 0.5 * (size[..., self.pairs[:, 0]] - size[..., self.pairs[:, 1]]).square().sum(-1)
+
+
+def check_clip(points: Tensor, module: nn.Module) -> None:
+    """Raise a ShapeError unless ``points`` are (..., T, N, D)."""
+    if points.ndim < 3:
+        raise ShapeError(f"{type(module).__name__}: expected points (..., T, N, D), got {tuple(points.shape)}")
+
+
+def check_weights(weights: Tensor | None, points: Tensor, module: nn.Module) -> None:
+    """Raise a ShapeError unless ``weights`` are (..., T, N) for points (..., T, N, D)."""
+    if weights is not None and weights.shape[-2:] != points.shape[-3:-1]:
+        expected = f"(..., {points.shape[-3]}, {points.shape[-2]})"
+        raise ShapeError(f"{type(module).__name__}: expected weights {expected}, got {tuple(weights.shape)}")
 
 
 def centred_residual(seen: Tensor, tracks: Tensor, weights: Tensor | None) -> Tensor:

@@ -26,11 +26,12 @@ class SkeletonModule(nn.Module):
         self.skeleton = get_skeleton(skeleton)
         self.register_buffer("bones", self.skeleton.bone_index(), persistent=False)
 
-    def check(self, points: Tensor) -> None:
-        """Raise a ShapeError unless ``points`` are (..., N, D) with this skeleton's N."""
-        if points.ndim < 2 or points.shape[-2] != self.skeleton.num_joints:
+    def check(self, points: Tensor, *, clip: bool = False) -> None:
+        """Raise a ShapeError unless ``points`` are (..., N, D), or a clip (..., T, N, D), with this skeleton's N."""
+        joints = self.skeleton.num_joints
+        if points.ndim < 2 + clip or points.shape[-2] != joints:
             raise ShapeError(
-                f"{type(self).__name__}: expected points (..., {self.skeleton.num_joints}, 3) for skeleton "
+                f"{type(self).__name__}: expected points (..., {'T, ' if clip else ''}{joints}, 3) for skeleton "
                 f"'{self.skeleton.name}', got {tuple(points.shape)}"
             )
 
@@ -97,7 +98,8 @@ class SVT(nn.Module):
     def __init__(self, threshold: float, *, learnable: bool = False, relative: bool = False) -> None:
         super().__init__()
         if not (threshold >= 0 and math.isfinite(threshold)) or (learnable and threshold == 0):
-            raise OptionError(f"SVT: expected a {'positive' if learnable else 'non-negative'} threshold, got {threshold}")
+            kind = "positive" if learnable else "non-negative"
+            raise OptionError(f"SVT: expected a {kind}, finite threshold, got {threshold}")
         self.relative = relative
         self.raw = nn.Parameter(inverse_softplus(torch.tensor(float(threshold)))) if learnable else None
         self.fixed = float(threshold)
@@ -109,10 +111,10 @@ class SVT(nn.Module):
     def forward(self, matrix: Tensor) -> Tensor:
         level = self.threshold
         if self.relative:
-            level = level * torch.linalg.matrix_norm(matrix.detach())
+            level = level * torch.linalg.matrix_norm(matrix)
         return svt(matrix, level)
 
 
 def inverse_softplus(value: Tensor) -> Tensor:
-    """x with softplus(x) = value, for positive values, without overflow."""
+    """Return x with softplus(x) = value, for positive values, without overflow."""
     return value + torch.log(-torch.expm1(-value))

@@ -1,10 +1,11 @@
 """Unrolled solvers: a fixed number of steps of FPC and SfAM as layers, with learnable step sizes and weights.
 
-Untrained they are the method: :class:`kcs_torch.SfAM` runs the same steps through :func:`shape_step`.
+Untrained they are the method: :class:`kcs_torch.SfAM` runs :class:`UnrolledSfAM` over its windows.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -12,25 +13,32 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import back_project, project
-from kcs_torch.functional.chain import bone_lengths
-from kcs_torch.functional.spectral import singular_values, svt
-from kcs_torch.nn.energies import centred_residual
+from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.spectral import spectral_norm, svt
+from kcs_torch.functional.temporal import interpolate
+from kcs_torch.nn.energies import centred_residual, check_weights
 from kcs_torch.nn.layers import inverse_softplus
 from kcs_torch.skeleton import Skeleton, get_skeleton
-from kcs_torch.solvers.iterate import iterate
+from kcs_torch.solvers.iterate import Solution, iterate, relative_change
 from kcs_torch.solvers.lm import fit_bones
 
 __all__ = ["UnrolledFPC", "UnrolledSfAM", "continuation", "data_scale", "estimate_lengths", "shape_step"]
 
 
-def continuation(num_weights: int, mu: float = 0.5, final: float = 3e-5) -> list[float]:
+SETTLED = 5e-3
+"""A shape stands still where a step changes it by no more than this share."""
+
+
+def continuation(num_weights: int, mu: float = 0.5, final: float = 1e-5) -> list[float]:
     """Weights that fall geometrically from ``mu`` to ``final``, shares of the data's largest singular value.
 
     >>> [round(w, 3) for w in continuation(3, 1.0, 0.01)]
     [1.0, 0.1, 0.01]
     """
     if num_weights < 1 or not 0 < final <= mu:
-        raise OptionError(f"continuation: expected num_weights >= 1 and 0 < final <= mu, got {num_weights}, {final}, {mu}")
+        raise OptionError(
+            f"continuation: expected num_weights >= 1 and 0 < final <= mu, got {num_weights}, {final} and {mu}"
+        )
     ratio = (final / mu) ** (1 / max(num_weights - 1, 1))
     return [mu * ratio**k for k in range(num_weights)]
 
@@ -43,14 +51,15 @@ def data_scale(tracks: Tensor, cameras: Tensor, weights: Tensor | None = None) -
         cameras: (..., T, 2, 3).
         weights: (..., T, N).
     """
-    with torch.no_grad():
-        data = -centred_residual(torch.zeros_like(tracks), tracks, weights)
-        if weights is not None:
-            data = data * weights[..., None]
-        return singular_values(back_project(data, cameras).flatten(-2))[..., 0]
+    data = -centred_residual(torch.zeros_like(tracks), tracks, weights)
+    if weights is not None:
+        data = data * weights[..., None]
+    return spectral_norm(back_project(data, cameras).flatten(-2))
 
 
-def estimate_lengths(shape: Tensor, bones: Tensor, weights: Tensor | None = None, *, graded: bool = False) -> tuple[Tensor, Tensor]:
+def estimate_lengths(
+    shape: Tensor, bones: Tensor, weights: Tensor | None = None, *, graded: bool = False
+) -> tuple[Tensor, Tensor]:
     """Return each bone's median length over time, and how rigid it is.
 
     Args:
@@ -61,7 +70,8 @@ def estimate_lengths(shape: Tensor, bones: Tensor, weights: Tensor | None = None
             links that nobody has declared rigid; False trusts all.
 
     Returns:
-        lengths (..., B) and rigidity (..., B) in [0, 1].
+        lengths (..., B) and rigidity (..., B) in [0, 1], a constant for autograd: among bones that all keep their
+        length, rounding alone grades them.
     """
     size = bone_lengths(shape, bones)
     if weights is not None:
@@ -112,7 +122,10 @@ def shape_step(
     residual = centred_residual(project(shape, cameras), tracks, weights)
     gradient = back_project(residual if weights is None else residual * weights[..., None], cameras)
     if bones is not None and lengths is not None and stiffness is not None:
-        articulated = fit_bones(shape, lengths[..., None, :], bones, stiffness=stiffness[..., None, :], num_steps=1)
+        # A bone of no length has no direction either: it stays, and no derivative piles up step by step.
+        directed = bone_vectors(shape.detach(), bones).any(-1).to(shape.dtype)
+        beta = stiffness[..., None, :] * directed
+        articulated = fit_bones(shape, lengths[..., None, :], bones, stiffness=beta, num_steps=1)
         gradient = gradient + (shape - articulated)
     return svt((shape - step * gradient).flatten(-2), step * threshold).unflatten(-1, shape.shape[-2:])
 
@@ -125,6 +138,7 @@ class UnrolledFPC(nn.Module):
         mu: first threshold, a share of the data's largest singular value.
         final: last threshold; between them they fall geometrically.
         tau: step size.
+        momentum: share of the last change that the next step starts ahead by.
         learnable: step sizes and thresholds are parameters (positive through a softplus); else constants.
         grad_steps: record only the last so many steps for autograd; None all.
 
@@ -144,19 +158,25 @@ class UnrolledFPC(nn.Module):
         num_steps: int = 10,
         *,
         mu: float = 0.5,
-        final: float = 3e-5,
+        final: float = 1e-5,
         tau: float = 1.0,
+        momentum: float = 0.8,
         learnable: bool = True,
         grad_steps: int | None = None,
     ) -> None:
         super().__init__()
-        if num_steps < 1 or not tau > 0:
-            raise OptionError(f"{type(self).__name__}: expected num_steps >= 1 and tau > 0, got {num_steps} and {tau}")
-        self.num_steps, self.learnable, self.grad_steps = num_steps, learnable, grad_steps
+        if num_steps < 1 or not tau > 0 or not 0 <= momentum < 1:
+            raise OptionError(
+                f"{type(self).__name__}: expected num_steps >= 1, tau > 0 and momentum within [0, 1), "
+                f"got {num_steps}, {tau} and {momentum}"
+            )
+        self.num_steps, self.learnable, self.grad_steps, self.momentum = num_steps, learnable, grad_steps, momentum
         self._positive("threshold", continuation(num_steps, mu, final))
         self._positive("step", [tau] * num_steps)
 
-    def forward(self, tracks: Tensor, cameras: Tensor, *, weights: Tensor | None = None, start: Tensor | None = None) -> Tensor:
+    def forward(
+        self, tracks: Tensor, cameras: Tensor, *, weights: Tensor | None = None, start: Tensor | None = None
+    ) -> Tensor:
         """Return the shape in the world frame of the cameras.
 
         Args:
@@ -171,22 +191,48 @@ class UnrolledFPC(nn.Module):
         Raises:
             ShapeError: the shapes do not fit.
         """
+        return self.solve(tracks, cameras, weights=weights, start=start).value
+
+    def solve(
+        self, tracks: Tensor, cameras: Tensor, *, weights: Tensor | None = None, start: Tensor | None = None
+    ) -> Solution[Tensor]:
+        """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still."""
+        self._check(tracks, cameras, weights, start)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
-        scale = self._scale(tracks, cameras, weights)
-        return iterate(
+        scale = data_scale(tracks, cameras, weights)
+        return self._run(
             lambda shape, k: shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k]),
             start_shape(tracks, cameras, weights) if start is None else start,
-            num_steps=self.num_steps,
-            grad_steps=self.grad_steps,
-        ).value
+        )
 
-    def _scale(self, tracks: Tensor, cameras: Tensor, weights: Tensor | None) -> Tensor:
+    def _run(self, step: Callable[[Tensor, int], Tensor], start: Tensor) -> Solution[Tensor]:
+        """Make all steps, each from a point ahead of the last shape; the state is (shape, point ahead)."""
+
+        def advance(state: tuple[Tensor, Tensor], k: int) -> tuple[Tensor, Tensor]:
+            shape = step(state[1], k)
+            return shape, shape + self.momentum * (shape - state[0])
+
+        solution = iterate(
+            advance,
+            (start, start),
+            num_steps=self.num_steps,
+            change=lambda old, new: relative_change(old[0].flatten(-2), new[0].flatten(-2)),
+            tolerance=SETTLED,
+            check_every=self.num_steps,
+            grad_steps=self.grad_steps,
+        )
+        return Solution(solution.value[0], solution.converged, solution.iterations)
+
+    def _check(self, tracks: Tensor, cameras: Tensor, weights: Tensor | None, start: Tensor | None) -> None:
         if tracks.ndim < 3 or tracks.shape[-1] != 2 or cameras.shape[-3:] != (tracks.shape[-3], 2, 3):
             raise ShapeError(
                 f"{type(self).__name__}: expected tracks (..., T, N, 2) and cameras (..., T, 2, 3), "
                 f"got {tuple(tracks.shape)} and {tuple(cameras.shape)}"
             )
-        return data_scale(tracks, cameras, weights)
+        check_weights(weights, tracks, self)
+        if start is not None and start.shape[-3:] != (*tracks.shape[-3:-1], 3):
+            expected = f"(..., {tracks.shape[-3]}, {tracks.shape[-2]}, 3)"
+            raise ShapeError(f"{type(self).__name__}: expected start {expected}, got {tuple(start.shape)}")
 
     def _positive(self, name: str, values: list[float]) -> None:
         """Hold positive numbers, in double precision until the module is cast, as softplus of what is learned."""
@@ -209,6 +255,7 @@ class UnrolledSfAM(UnrolledFPC):
         mu: first threshold, a share of the data's largest singular value.
         final: last threshold.
         tau: step size of the articulated steps, below 1; the others take twice that.
+        momentum: as in :class:`UnrolledFPC`.
         beta: stiffness of the bones.
         articulate_from: share of the steps after which the articulated term joins; 0 is all of them, as printed.
         learnable: as in :class:`UnrolledFPC`.
@@ -230,16 +277,21 @@ class UnrolledSfAM(UnrolledFPC):
         num_steps: int = 10,
         *,
         mu: float = 0.5,
-        final: float = 3e-5,
+        final: float = 1e-5,
         tau: float = 0.5,
+        momentum: float = 0.8,
         beta: float = 1.5,
-        articulate_from: float = 0.75,
+        articulate_from: float = 0.6,
         learnable: bool = True,
         grad_steps: int | None = None,
     ) -> None:
-        super().__init__(num_steps, mu=mu, final=final, tau=tau, learnable=learnable, grad_steps=grad_steps)
+        super().__init__(
+            num_steps, mu=mu, final=final, tau=tau, momentum=momentum, learnable=learnable, grad_steps=grad_steps
+        )
         if not beta > 0 or not 0 <= articulate_from <= 1:
-            raise OptionError(f"UnrolledSfAM: expected beta > 0 and articulate_from in 0..1, got {beta} and {articulate_from}")
+            raise OptionError(
+                f"UnrolledSfAM: expected beta > 0 and articulate_from in 0..1, got {beta} and {articulate_from}"
+            )
         self.skeleton = get_skeleton(skeleton)
         rigid = list(self.skeleton.rigid)
         self.register_buffer("bones", self.skeleton.bone_index()[rigid], persistent=False)
@@ -271,28 +323,63 @@ class UnrolledSfAM(UnrolledFPC):
         Raises:
             ShapeError: the shapes do not fit.
         """
+        return self.solve(tracks, cameras, weights=weights, start=start, lengths=lengths).value
+
+    def solve(
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        *,
+        weights: Tensor | None = None,
+        start: Tensor | None = None,
+        lengths: Tensor | None = None,
+        one_body: bool = False,
+    ) -> Solution[Tensor]:
+        """As :meth:`forward`, with a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still.
+
+        ``one_body`` takes the batch (W, T, N, ...) for windows of one body, which share their bone lengths;
+        ``lengths`` are then proportions (B,), brought to the scale of the shape.
+        """
+        self._check(tracks, cameras, weights, start)
+        joints, count = self.skeleton.num_joints, self.skeleton.num_bones
+        given = None if lengths is None else tuple(lengths.shape)
+        if tracks.shape[-2] != joints or (given is not None and given[-1:] != (count,)):
+            raise ShapeError(
+                f"UnrolledSfAM: expected tracks (..., T, {joints}, 2) and lengths (..., {count}) for skeleton "
+                f"'{self.skeleton.name}', got {tuple(tracks.shape)} and {given}"
+            )
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         stiffness = self._values("stiffness", tracks)
-        scale = self._scale(tracks, cameras, weights)
+        scale = data_scale(tracks, cameras, weights)
         fixed = None if lengths is None else lengths[..., list(self.skeleton.rigid)]
+        pooled = weights.flatten(0, 1) if weights is not None and one_body else weights
         graded = not self.skeleton.tree
 
         def advance(shape: Tensor, k: int) -> Tensor:
             if k < self.first:
                 return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k])
-            target, rigidity = estimate_lengths(shape, self.bones, weights, graded=graded)
+            target, rigidity = estimate_lengths(
+                shape.flatten(0, 1) if one_body else shape, self.bones, pooled, graded=graded
+            )
+            if fixed is not None:
+                target = fixed * (target / fixed).median(-1, keepdim=True).values if one_body else fixed
             return shape_step(
                 shape, tracks, cameras, weights, threshold[k] * scale, step[k],
-                bones=self.bones, lengths=target if fixed is None else fixed, stiffness=stiffness[k] * rigidity,
+                bones=self.bones, lengths=target, stiffness=stiffness[k] * rigidity,
             )  # fmt: skip
 
-        first = start_shape(tracks, cameras, weights) if start is None else start
-        return iterate(advance, first, num_steps=self.num_steps, grad_steps=self.grad_steps).value
+        return self._run(advance, start_shape(tracks, cameras, weights) if start is None else start)
 
 
 def start_shape(tracks: Tensor, cameras: Tensor, weights: Tensor | None) -> Tensor:
-    """The back-projected, centred tracks (..., T, N, 3); unseen joints at the centre of the seen ones."""
+    """The back-projected, centred tracks (..., T, N, 3).
+
+    Unseen joints are put at the centre of the seen ones, and frames in which nothing is seen between their neighbours:
+    started at a single point they would stay there, as no term moves them.
+    """
     centred = -centred_residual(torch.zeros_like(tracks), tracks, weights)
-    if weights is not None:
-        centred = torch.where((weights > 0)[..., None], centred, torch.zeros_like(centred))
-    return back_project(centred, cameras)
+    if weights is None:
+        return back_project(centred, cameras)
+    seen = weights > 0
+    shape = back_project(torch.where(seen[..., None], centred, torch.zeros_like(centred)), cameras)
+    return interpolate(shape, seen.any(-1, keepdim=True))

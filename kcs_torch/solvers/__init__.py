@@ -1,8 +1,19 @@
 """Iterations over callables: they know no camera, prior or skeleton."""
 
 from kcs_torch.solvers.camera_path import constant_path
+from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.ist import ist, metric_upgrade
 from kcs_torch.solvers.iterate import Solution, fpc, iterate, svt
 from kcs_torch.solvers.lm import fit_bones
 
-__all__ = ["Solution", "constant_path", "fit_bones", "fpc", "ist", "iterate", "metric_upgrade", "svt"]
+__all__ = [
+    "Solution",
+    "complete_tracks",
+    "constant_path",
+    "fit_bones",
+    "fpc",
+    "ist",
+    "iterate",
+    "metric_upgrade",
+    "svt",
+]

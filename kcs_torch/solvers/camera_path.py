@@ -6,6 +6,8 @@ import roma
 import torch
 from torch import Tensor
 
+from kcs_torch.errors import ShapeError
+
 __all__ = ["constant_path"]
 
 
@@ -22,8 +24,15 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Te
 
     Returns:
         The path (T, 3, 3), and its angle to each rotation (T,), in radians.
+
+    Raises:
+        ShapeError: ``rotations`` is not (T, 3, 3) with T >= 2.
     """
     frames = rotations.shape[0]
+    if rotations.ndim != 3 or rotations.shape[-2:] != (3, 3) or frames < 2:
+        raise ShapeError(
+            f"constant_path: expected rotations (T, 3, 3) of 2 frames or more, got {tuple(rotations.shape)}"
+        )
     time = torch.arange(frames, dtype=rotations.dtype, device=rotations.device) - (frames - 1) / 2
     turn = roma.rotmat_to_rotvec(rotations[1:] @ rotations[:-1].mT).median(0).values
     speeds = turn * torch.linspace(0.8, 1.2, 161, dtype=turn.dtype, device=turn.device)[:, None]

@@ -141,9 +141,10 @@ def metric_upgrade(
 
     q = normalise(start.expand(*torch.broadcast_shapes(start.shape[:-2], motion.shape[:-3]), rank, 3))
     cost = total(q)
+    first_state: tuple[Tensor, ...] = (q, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost))
     q = iterate(
         step,
-        (q, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost)),
+        first_state,
         num_steps=num_steps,
         change=lambda _, new: new[3].amax(),
         tolerance=tolerance,

@@ -52,8 +52,9 @@ def iterate(
         num_steps: at most so many steps.
         change: how much a step changed the state, a 0-dimensional tensor; None makes every step.
         tolerance: stop where ``change`` is at or below it.
-        check_every: measure the change at every so-manyth step only (each check waits for the device).
-        grad_steps: record only the last so many steps for autograd; None records all, 0 none.
+        check_every: measure the change at every so-manyth step and at the last (each check waits for the device).
+        grad_steps: record only the last so many steps for autograd; None records all, 0 none. An iteration that
+            settles before it has recorded them goes on for so many steps.
         warn: what to call the iteration in a :class:`ConvergenceWarning` if it does not settle; None is quiet.
 
     Returns:
@@ -66,23 +67,27 @@ def iterate(
     1.0
     """
     if num_steps < 0 or check_every < 1 or (grad_steps is not None and grad_steps < 0):
-        raise OptionError(f"iterate: expected num_steps, grad_steps >= 0, got {num_steps} and {grad_steps}")
-    state, recorded = start, torch.is_grad_enabled()
-    converged = change is None
-    count = 0
-    for k in range(num_steps):
-        record = recorded and (grad_steps is None or k >= num_steps - grad_steps)
-        with torch.set_grad_enabled(record):
-            new = step(state, k)
-        count = k + 1
-        if change is not None and count % check_every == 0:
+        raise OptionError(
+            f"iterate: expected num_steps, grad_steps >= 0 and check_every >= 1, "
+            f"got {num_steps}, {grad_steps} and {check_every}"
+        )
+    state, recorded, converged = start, torch.is_grad_enabled(), change is None
+    partial = recorded and grad_steps is not None and grad_steps < num_steps
+    tail = (grad_steps or 0) if partial else 0  # steps to be recorded after others that are not
+    count, end = 0, num_steps
+    while count < end:
+        with torch.set_grad_enabled(recorded and (not partial or end - count <= tail)):
+            new = step(state, count)
+        count += 1
+        if change is not None and not converged and (count % check_every == 0 or count == end):
             with torch.no_grad():
                 converged = bool(change(state, new) <= tolerance)
+            if converged:
+                end = min(end, count + tail)
         state = new
-        if converged and change is not None:
-            break
     if not converged and warn is not None:
-        warnings.warn(f"{warn} did not settle within {num_steps} steps; the result says converged=False", ConvergenceWarning, stacklevel=2)
+        message = f"{warn} did not settle within {num_steps} steps; the result says converged=False"
+        warnings.warn(message, ConvergenceWarning, stacklevel=2)
     return Solution(state, converged, count)
 
 
@@ -105,14 +110,14 @@ def fpc(
         start: first X, any shape that ``prox`` takes (for the nuclear norm (..., M, N)).
         grad: gradient of the smooth term f.
         prox: proximal map ``prox(X, t)`` of g; singular value shrinkage by default.
-        step: step size, below 2 over the Lipschitz constant of ``grad``.
+        step: step size, a number or a tensor of one element, below 2 over the Lipschitz constant of ``grad``.
         weights: (L,) or (L, ...) weights mu in falling order; each row broadcasts against the batch of X.
         steps_per_weight: steps at each weight, at most.
         tolerance: go on to the next weight where a step changes X by less than this share of X.
         grad_steps: as in :func:`iterate`, counted over all steps.
 
     Returns:
-        A :class:`Solution`; converged tells of the last weight.
+        A :class:`Solution`; converged tells of the last weight (True where ``tolerance`` is 0: nothing is measured).
 
     Ma, Goldfarb, Chen 2011; Kovalenko et al. 2019, Algorithm 1, lines 8-11.
 
@@ -120,9 +125,10 @@ def fpc(
     >>> fpc(torch.zeros(2, 2), lambda X: X - Y, step=1.0, weights=[2.0]).value.round(decimals=4).tolist()
     [[1.0, 0.0], [0.0, 0.0]]
     """
-    total, done, value, converged = len(weights) * steps_per_weight, 0, start, False
-    for weight in weights:
-        last = None if grad_steps is None else max(0, min(steps_per_weight, grad_steps - (total - done - steps_per_weight)))
+    value, converged, made = start, False, 0
+    for k, weight in enumerate(weights):
+        after = (len(weights) - 1 - k) * steps_per_weight  # steps at the weights to come
+        last = None if grad_steps is None else max(0, min(steps_per_weight, grad_steps - after))
         solution = iterate(
             lambda x, _, w=weight: prox(x - step * grad(x), step * w),  # type: ignore[misc]
             value,
@@ -131,9 +137,8 @@ def fpc(
             tolerance=tolerance,
             grad_steps=last,
         )
-        value, converged = solution.value, solution.converged
-        done += steps_per_weight
-    return Solution(value, converged, done)
+        value, converged, made = solution.value, solution.converged, made + solution.iterations
+    return Solution(value, converged, made)
 
 
 def svt(
@@ -173,7 +178,7 @@ def svt(
     goal = torch.linalg.vector_norm(target.detach()) * tolerance
 
     def ascend(state: tuple[Tensor, Tensor], _: int) -> tuple[Tensor, Tensor]:
-        dual, _ = state
+        dual = state[0]
         value = shrink(adjoint(dual), threshold)
         return dual + step * (target - forward(value)), value
 

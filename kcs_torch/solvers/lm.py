@@ -34,8 +34,10 @@ def fit_bones(
         points: (..., N, D), what A stays near.
         lengths: (..., B) target lengths L, in the unit of the points; 0 asks for a zero-length bone.
         bones: (B, 2) integer (parent, child) pairs.
-        stiffness: the paper's beta: a number, or a tensor that broadcasts against (..., B); 0 frees a bone.
-        num_steps: Levenberg-Marquardt steps; 2 or 3 reach rounding where bones are near their length.
+        stiffness: the paper's beta, non-negative: a number, or a tensor that broadcasts against (..., B); 0 frees a
+            bone. Above 1 / (B eps) it is as good as infinite and is cut there (5e5 for 16 bones in single precision).
+        num_steps: Levenberg-Marquardt steps; each gains about a digit where bones are within a few per cent of their
+            length, less where they are far off.
         damping: non-negative; shortens the steps without moving the solution.
         start: (..., N, D), A to start from; ``points`` if None.
 
@@ -45,7 +47,7 @@ def fit_bones(
 
     Raises:
         ShapeError: the shapes do not fit.
-        OptionError: ``num_steps`` or ``damping`` is negative.
+        OptionError: ``num_steps``, ``damping`` or a number for ``stiffness`` is negative.
 
     Note:
         |b| is sqrt(|b|^2 + e^2), e being 1e-4 times the mean target length: 5e-9 relative at the target.
@@ -62,14 +64,19 @@ def fit_bones(
             f"fit_bones: expected points (..., N, D) and lengths (..., {len(bones)}), "
             f"got {tuple(points.shape)} and {tuple(lengths.shape)}"
         )
-    if num_steps < 0 or damping < 0:
-        raise OptionError(f"fit_bones: expected num_steps and damping >= 0, got {num_steps} and {damping}")
+    if num_steps < 0 or damping < 0 or (isinstance(stiffness, float | int) and not stiffness >= 0):
+        raise OptionError(
+            f"fit_bones: expected num_steps, damping and stiffness >= 0, got {num_steps}, {damping} and {stiffness}"
+        )
+    limits = torch.finfo(points.dtype)
     matrix = incidence(bones, points.shape[-2], dtype=points.dtype)  # (N, B)
     overlap = matrix.mT @ matrix  # (B, B)
-    root = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device).sqrt()
+    beta = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device)
+    beta = beta.clamp_max(1 / (max(len(bones), 1) * limits.eps))  # beyond it the system loses its unit diagonal
+    root = (beta + limits.tiny).sqrt()  # a derivative at 0, too
     root = root.expand(torch.broadcast_shapes(root.shape, lengths.shape[-1:]))
     floor = 1e-4 * lengths.detach().abs().mean(-1, keepdim=True)
-    tiny = torch.finfo(points.dtype).tiny ** 0.5
+    tiny = limits.tiny**0.5
     eye = torch.eye(len(bones), dtype=points.dtype, device=points.device)
     anchor_bones = bone_vectors(points, bones)
     current = points if start is None else start

@@ -9,6 +9,8 @@ import roma
 import torch
 from torch import Tensor
 
+from kcs_torch.functional.align import centre
+
 __all__ = ["CameraFit", "fit_cameras"]
 
 
@@ -50,7 +52,7 @@ def fit_cameras(
         points: x (T, N, 3).
         weights: w (T, N).
         low: (T,) least scale.
-        high: (T,) greatest scale.
+        high: (T,) greatest scale; inf where it is free.
         num_yaws: headings tried, evenly about the vertical axis.
         robust: residuals of this share of the body's size count half; None is least squares.
         num_steps: Levenberg-Marquardt steps of each reweighting.
@@ -65,7 +67,11 @@ def fit_cameras(
         rotations = torch.cat([start[None], rotations])
     share = weights.expand(len(rotations), *weights.shape)
     size = (points - points.mean(-2, keepdim=True)).square().sum(-1).mean(-1).sqrt()
-    reach = (0.5 * (low + high) * size).clamp_min(torch.finfo(size.dtype).tiny) * (robust or 1.0)
+    seen = (centre(tracks, weights)[0].square().sum(-1) * weights).sum(-1) / weights.sum(-1).clamp_min(1e-12)
+    # In the image the body is as large as the scale tells or, where the scale is free, as the tracks are: a sphere's
+    # shadow has 2/3 of its mean square.
+    extent = torch.where(high.isinf(), (1.5 * seen).sqrt(), 0.5 * (low + high) * size)
+    reach = extent.clamp_min(torch.finfo(size.dtype).tiny) * (robust or 1.0)
     for _ in range(1 if robust is None else 4):
         rotations, scales, residual = _refine(rotations, tracks, points, share, low, high, num_steps)
         square = (residual / reach[:, None]).square()

@@ -1,0 +1,47 @@
+"""Unseen joints from the rest of the clip: low-rank completion of 2D tracks."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.spectral import singular_values
+from kcs_torch.functional.temporal import interpolate
+from kcs_torch.solvers.iterate import fpc
+
+__all__ = ["complete_tracks"]
+
+
+def complete_tracks(
+    tracks: Tensor, seen: Tensor, *, num_steps: int = 60, first: float = 0.3, last: float = 2e-3
+) -> Tensor:
+    """Fill unseen joints so that a clip's poses, as a T x 2N matrix about their mean, have low rank.
+
+    Starts from linear interpolation in time; nuclear-norm completion then makes what is filled consistent with
+    how the joints move together elsewhere in the clip, where interpolation alone breaks the rank that a camera
+    factorisation builds on.
+
+    Args:
+        tracks: (..., T, N, 2), finite.
+        seen: (..., T, N), True where the tracks hold.
+        num_steps: shrinkage steps; the weight falls geometrically.
+        first: first weight, a share of the largest singular value.
+        last: last weight.
+
+    Returns:
+        (..., T, N, 2), equal to the tracks where they are seen.
+
+    Mazumder, Hastie, Tibshirani 2010 (soft-impute).
+    """
+    filled = interpolate(tracks, seen)
+    if bool(seen.all()):
+        return filled
+    mean = filled.mean(-3, keepdim=True)
+    kept = seen[..., None].to(tracks.dtype).expand_as(tracks).flatten(-2)
+    goal = ((tracks - mean).flatten(-2)) * kept
+    start = (filled - mean).flatten(-2)
+    ratio = (last / first) ** (1 / max(num_steps - 1, 1))
+    top = singular_values(start)[..., 0]
+    weights = [first * ratio**k * top for k in range(num_steps)]
+    found = fpc(start, lambda x: x * kept - goal, step=1.0, weights=weights, steps_per_weight=1).value
+    return torch.where(seen[..., None], tracks, found.unflatten(-1, tracks.shape[-2:]) + mean)
