@@ -71,7 +71,7 @@ def fit_cameras(
     # In the image the body is as large as the scale tells or, where the scale is free, as the tracks are: a sphere's
     # shadow has 2/3 of its mean square.
     extent = torch.where(high.isinf(), (1.5 * seen).sqrt(), 0.5 * (low + high) * size)
-    reach = extent.clamp_min(torch.finfo(size.dtype).tiny) * (robust or 1.0)
+    reach = torch.where(extent > 0, extent, torch.ones_like(extent)) * (robust or 1.0)
     for _ in range(1 if robust is None else 4):
         rotations, scales, residual = _refine(rotations, tracks, points, share, low, high, num_steps)
         square = (residual / reach[:, None]).square()
@@ -111,7 +111,15 @@ def _refine(
         jacobian = (axes[:, :2] @ rotations[..., None, :, :]) * scales[..., None, None, None]  # (C, T, 3, 2, 3)
         spread = jacobian @ gram[..., None, :, :]
         normal = spread.flatten(-2) @ jacobian.flatten(-2).mT
-        misfit = moment - scales[..., None, None] * (rows @ gram)
+        flat = rows @ gram
+        # Where the scale is free it follows the turn: take its share out of the normal matrix (variable projection).
+        # A frontal body that nods shrinks as one that recedes does: without this the two would creep along together.
+        cross = (jacobian * flat[..., None, :, :]).sum((-2, -1)) / (flat * rows).sum((-2, -1)).clamp_min(tiny).sqrt()[
+            ..., None
+        ]
+        cross = cross * ((scales > low) & (scales < high))[..., None]
+        normal = normal - cross[..., :, None] * cross[..., None, :]
+        misfit = moment - scales[..., None, None] * flat
         target = (jacobian * misfit[..., None, :, :]).sum((-2, -1))
         ridge = (damping + 1e-9) * normal.diagonal(dim1=-2, dim2=-1).amax(-1) + tiny
         move = torch.linalg.solve(normal + ridge[..., None, None] * eye, target)

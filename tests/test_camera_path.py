@@ -1,0 +1,106 @@
+"""Paths of constant angular velocity: recovered from exact, noisy and spoiled rotations."""
+
+import math
+
+import pytest
+import roma
+import torch
+from numerics import DEVICES, FLOATS, leaves_arguments_alone, normal, rotations
+from torch.testing import assert_close
+
+from kcs_torch.errors import ShapeError
+from kcs_torch.solvers import constant_path
+from kcs_torch.solvers.camera_path import _left_jacobian
+
+
+def path(frames, degrees, axis=(0.2, 1.0, -0.1), seed=0):
+    """R_t = exp(t w) R_0 that turns by so many degrees in all."""
+    axis = torch.tensor(axis, dtype=torch.float64)
+    angle = torch.linspace(0, math.radians(degrees), frames, dtype=torch.float64)
+    return roma.rotvec_to_rotmat(angle[:, None] * axis / axis.norm()) @ rotations(seed=seed)
+
+
+def error(found, true):
+    return torch.rad2deg(roma.rotmat_geodesic_distance(found, true)).max().item()
+
+
+@pytest.mark.parametrize("frames", [2, 3, 10, 120])
+@pytest.mark.parametrize("degrees", [0.0, 1.0, 90.0, 170.0])
+def test_exact_paths(frames, degrees):
+    true = path(frames, degrees)
+    found, angle = constant_path(true)
+    assert error(found, true) < 1e-4
+    assert angle.shape == (frames,) and angle.max() < 1e-5
+
+
+@pytest.mark.parametrize("degrees", [400.0, 1500.0])
+def test_several_turns(degrees):
+    true = path(200, degrees)
+    assert error(constant_path(true)[0], true) < 1e-4
+
+
+def test_noise_averages_out():
+    true = path(150, 120)
+    noisy = roma.rotvec_to_rotmat(0.02 * normal(150, 3)) @ true  # about 2 degrees
+    found, angle = constant_path(noisy)
+    assert error(found, true) < 0.8
+    assert_close(angle, roma.rotmat_geodesic_distance(found, noisy))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 150.0])
+def test_outliers_do_not_count(degrees):
+    true = path(150, degrees)
+    spoiled = roma.rotvec_to_rotmat(0.01 * normal(150, 3)) @ true
+    wrong = torch.arange(150) % 5 == 0
+    spoiled[wrong] = rotations(30, seed=4)  # a fifth of the frames, anywhere
+    found, _ = constant_path(spoiled)
+    assert error(found, true) < 1.0
+
+
+def test_noisy_static_cameras_stay():
+    true = path(100, 0.0)
+    noisy = roma.rotvec_to_rotmat(0.01 * normal(100, 3)) @ true
+    assert error(constant_path(noisy)[0], true) < 0.5
+
+
+def test_found_paths_have_constant_angular_velocity():
+    found, _ = constant_path(roma.rotvec_to_rotmat(0.3 * normal(40, 3)) @ path(40, 200))
+    step = found[1:] @ found[:-1].mT
+    assert_close(step, step[:1].expand_as(step))
+    assert_close(found @ found.mT, torch.eye(3).double().expand(40, 3, 3))
+
+
+def test_single_precision():
+    true = path(60, 100)
+    found, _ = constant_path(true.float())
+    assert error(found.double(), true) < 0.05
+
+
+def test_world_frame_is_free():
+    """Another world frame turns the path along."""
+    noisy, world = roma.rotvec_to_rotmat(0.05 * normal(50, 3)) @ path(50, 100), rotations(seed=5)
+    assert error(constant_path(noisy @ world)[0], constant_path(noisy)[0] @ world) < 1e-4
+
+
+def test_left_jacobian_is_the_derivative_of_the_exponential():
+    vectors = torch.cat([normal(4, 3), torch.zeros(1, 3).double(), 1e-8 * normal(1, 3)])
+    jacobian = _left_jacobian(vectors)
+    for vector, matrix in zip(vectors, jacobian, strict=True):
+        base = roma.rotvec_to_rotmat(vector)
+        for axis in range(3):
+            moved = vector + 1e-6 * torch.eye(3).double()[axis]
+            difference = roma.rotmat_to_rotvec(roma.rotvec_to_rotmat(moved) @ base.mT) / 1e-6
+            assert_close(matrix[:, axis], difference, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 3), (5, 2, 3), (3, 3), (2, 5, 3, 3)])
+def test_shapes_that_do_not_fit(shape):
+    with pytest.raises(ShapeError, match="constant_path: expected"):
+        constant_path(torch.zeros(shape))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_results_follow_dtype_and_device(dtype, device):
+    values = leaves_arguments_alone(constant_path, path(10, 50).to(device, dtype))
+    assert {(v.dtype, v.device.type) for v in values} == {(dtype, device)}
