@@ -1,0 +1,57 @@
+"""Unseen joints from the rest of the clip."""
+
+import pytest
+import torch
+from numerics import BATCHES, DEVICES, FLOATS, leaves_arguments_alone, normal
+from torch.testing import assert_close
+
+from kcs_torch.functional import interpolate
+from kcs_torch.solvers import complete_tracks
+
+
+def clip(*batch, frames=60, joints=15, rank=3):
+    """Tracks (..., T, N, 2) of low rank about their mean, and which are seen: each joint vanishes for a while."""
+    time = torch.linspace(0, 12, frames, dtype=torch.float64)
+    waves = torch.stack([(time * (k + 1) / 2 + k).sin() for k in range(rank)], -1)
+    tracks = (waves @ normal(*batch, rank, joints * 2)).unflatten(-1, (joints, 2)) + normal(joints, 2, seed=1)
+    start = torch.arange(joints) * 3
+    frame = torch.arange(frames)[:, None]
+    return tracks, ((frame < start) | (frame >= start + 12)).expand(tracks.shape[:-1])
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_low_rank_tracks_are_found(batch):
+    tracks, seen = clip(*batch)
+    spoiled = torch.where(seen[..., None], tracks, torch.full_like(tracks, 1e3))
+    found = leaves_arguments_alone(complete_tracks, spoiled, seen)
+    assert torch.equal(found[seen], tracks[seen])
+    error = (found - tracks)[~seen].square().mean().sqrt()
+    linear = (interpolate(spoiled, seen) - tracks)[~seen].square().mean().sqrt()
+    assert error < 0.5 * linear
+
+
+def test_batches_equal_loops():
+    tracks, seen = clip(2, 3)
+    parts = [complete_tracks(t, s) for t, s in zip(tracks.flatten(0, 1), seen.flatten(0, 1), strict=True)]
+    assert_close(complete_tracks(tracks, seen), torch.stack(parts).reshape(tracks.shape))
+
+
+def test_nothing_to_do():
+    tracks, seen = clip()
+    assert torch.equal(complete_tracks(tracks, torch.ones_like(seen)), tracks)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5])
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_degenerate_clips_are_finite(frames, dtype):
+    for tracks in (normal(frames, 4, 2, dtype=dtype), torch.zeros(frames, 4, 2, dtype=dtype)):
+        for seen in (torch.zeros(frames, 4, dtype=torch.bool), normal(frames, 4) > 0):
+            assert torch.isfinite(complete_tracks(tracks, seen)).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_results_follow_dtype_and_device(dtype, device):
+    tracks, seen = clip()
+    found = complete_tracks(tracks.to(device, dtype), seen.to(device))
+    assert (found.dtype, found.device.type) == (dtype, device)
