@@ -1,0 +1,454 @@
+"""Energies: values by hand, gradients with degenerate inputs, and the prox and gradient that solvers use."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numerics import (
+    BODY,
+    CHAIN,
+    DEVICES,
+    FLOATS,
+    RING,
+    finite,
+    gradcheck,
+    leaves_arguments_alone,
+    normal,
+    rotations,
+    same_as_loop,
+)
+from torch.testing import assert_close
+
+from kcs_torch.errors import OptionError, ShapeError, SkeletonError
+from kcs_torch.functional import bone_lengths, project
+from kcs_torch.nn import BoneLengthEnergy, LowRankEnergy, ReprojectionEnergy, SmoothnessEnergy, SymmetryEnergy
+
+BONES = BODY.bone_index()
+RIGID = torch.tensor([0.0, 1, 1, 1, 1, 1]).double()  # the spine is flexible
+
+
+def clip(kind: str = "any", *batch, dtype=torch.float64, joints: int = 7):
+    """Points (..., T, N, 3), ordinary or degenerate."""
+    points = {
+        "any": lambda: normal(*batch, 5, joints, 3),
+        "static": lambda: normal(*batch, 1, joints, 3).expand(*batch, 5, joints, 3).clone(),
+        "one frame": lambda: normal(*batch, 1, joints, 3),
+        "two frames": lambda: normal(*batch, 2, joints, 3),
+        "zero": lambda: torch.zeros(*batch, 5, joints, 3),
+        "short bones": lambda: torch.cat([normal(*batch, 5, 2, 3), torch.ones(*batch, 5, joints - 2, 3)], -2),
+    }[kind]()
+    return points.to(dtype)
+
+
+KINDS = ["any", "static", "one frame", "two frames", "zero", "short bones"]
+SMOOTH = ["any", "static", "one frame", "two frames"]  # no bone of length zero
+
+
+def confidences(points, seed=3):
+    """Weights (..., T, N): some joints unseen, one never, one frame empty where there are several."""
+    weights = normal(*points.shape[:-1], seed=seed).abs().clamp_max(1).to(points.dtype)
+    weights = weights * (normal(*points.shape[:-1], seed=seed + 1) > -1)
+    weights[..., 4] = 0
+    if points.shape[-3] > 1:
+        weights[..., 1, :] = 0
+    return weights
+
+
+# ---------------------------------------------------------------------- bone lengths
+
+
+def test_bone_length_energy_by_hand():
+    points, lengths = clip(), normal(6, seed=1).abs()
+    size = bone_lengths(points, BONES)
+    energy = BoneLengthEnergy(BODY)
+    assert_close(energy(points, lengths), 0.5 * (RIGID * (size - lengths).square()).sum(-1))
+    variance = size.var(0, unbiased=False)
+    assert_close(energy(points).mean(), 0.5 * (RIGID * variance).sum())
+
+
+def test_bone_length_energy_is_free_of_motion():
+    points = clip("static")
+    moved = points @ rotations(5) + normal(5, 1, 3, seed=2)
+    assert_close(BoneLengthEnergy(BODY)(moved), torch.zeros(5).double(), atol=1e-25, rtol=0)
+
+
+def test_bones_weigh_as_their_lesser_end():
+    points, lengths, weights = clip(), normal(6, seed=1).abs(), confidences(clip())
+    share = torch.minimum(weights[:, BONES[:, 0]], weights[:, BONES[:, 1]]) * RIGID
+    size = bone_lengths(points, BONES)
+    energy = BoneLengthEnergy(BODY)
+    assert_close(energy(points, lengths, weights), 0.5 * (share * (size - lengths).square()).sum(-1))
+    mean = (size * share).sum(0) / share.sum(0).clamp_min(1e-30)
+    assert_close(energy(points, None, weights), 0.5 * (share * (size - mean).square()).sum(-1))
+    elsewhere = torch.where(weights[..., None] > 0, points, 100 + points)  # where nothing is seen, anything may stand
+    assert_close(energy(elsewhere, lengths, weights), energy(points, lengths, weights))
+    assert_close(energy(elsewhere, None, weights), energy(points, None, weights))
+
+
+@pytest.mark.parametrize("kind", SMOOTH)
+@pytest.mark.parametrize("weighted", [False, True])
+def test_bone_length_energy_gradient(kind, weighted):
+    points = clip(kind)
+    weights = confidences(points) if weighted else None
+    energy = BoneLengthEnergy(BODY)
+    assert gradcheck(lambda x, ell: energy(x, ell, weights), points, normal(6, seed=1).abs(), fast=True)
+    assert gradcheck(lambda x: energy(x, None, weights), points, fast=True)
+
+
+def test_bone_length_energy_gradient_in_the_weights():
+    points = clip()
+    energy = BoneLengthEnergy(BODY)
+    assert gradcheck(lambda w: energy(points, normal(6, seed=1).abs(), w), normal(5, 7, seed=2).abs() + 0.1, fast=True)
+    assert gradcheck(lambda w: energy(points, None, w), normal(5, 7, seed=2).abs() + 0.1, fast=True)
+
+
+def test_bone_length_prox_is_optimal():
+    points, lengths = clip(), bone_lengths(clip(), BONES).mean(0) * 1.1
+    energy = BoneLengthEnergy(BODY)
+    best = energy.prox(points, lengths, 2.0, num_steps=100)
+
+    def objective(x):
+        return 2.0 * energy(x, lengths) + 0.5 * (x - points).square().sum((-2, -1))
+
+    assert (objective(best + 0.01 * normal(100, 5, 7, 3, seed=2)) > objective(best)).all()
+    leaf = best.clone().requires_grad_()
+    (grad,) = torch.autograd.grad(objective(leaf).sum(), leaf)
+    assert grad.abs().max() < 1e-3
+    spine = energy.prox(points, lengths * torch.tensor([50.0, 1, 1, 1, 1, 1]), 2.0, num_steps=100)
+    assert_close(spine, best, rtol=0, atol=1e-2)  # the flexible bone's length does not matter
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_bone_length_prox_has_a_derivative_in_the_stiffness(dtype):
+    """With a flexible bone, whose stiffness is 0, this was NaN."""
+    points, lengths = clip(dtype=dtype), normal(6, seed=1, dtype=dtype).abs()
+    energy = BoneLengthEnergy(BODY)
+    grads = finite(lambda x, ell, k: energy.prox(x, ell, k), points, lengths, torch.tensor(1.5, dtype=dtype))
+    assert grads[2] != 0
+    if dtype == torch.float64:
+        assert gradcheck(energy.prox, points, lengths, torch.tensor(1.5).double(), fast=True)
+
+
+# ---------------------------------------------------------------------- reprojection
+
+
+def scene(kind="any", *batch, dtype=torch.float64):
+    points = clip(kind, *batch, dtype=dtype)
+    frames = points.shape[-3]
+    return points, normal(*points.shape[:-1], 2, seed=5, dtype=dtype), normal(*batch, frames, 2, 3, seed=6, dtype=dtype)
+
+
+def test_reprojection_energy_by_hand():
+    points, tracks, cameras = scene()
+    weights = confidences(points)
+    residual = project(points, cameras) - tracks
+    assert_close(ReprojectionEnergy(translation=False)(points, tracks, cameras), 0.5 * residual.square().sum((-2, -1)))
+    plain = ReprojectionEnergy(translation=False)(points, tracks, cameras, weights)
+    assert_close(plain, 0.5 * (weights[..., None] * residual.square()).sum((-2, -1)))
+    front = ReprojectionEnergy(translation=False)(points, tracks)
+    assert_close(front, 0.5 * (points[..., :2] - tracks).square().sum((-2, -1)))
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_translation_is_at_its_optimum(weighted):
+    points, tracks, cameras = scene()
+    weights = confidences(points) if weighted else None
+    best = ReprojectionEnergy()(points, tracks, cameras, weights)
+    fixed = ReprojectionEnergy(translation=False)
+    for k in range(30):
+        moved = tracks + normal(5, 1, 2, seed=k)
+        assert (fixed(points, moved, cameras, weights) >= best - 1e-12).all()
+    shifted = ReprojectionEnergy()(points, tracks + normal(5, 1, 2), cameras, weights)
+    assert_close(shifted, best)
+
+
+@pytest.mark.parametrize("translation", [False, True])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_reprojection_grad_is_the_gradient(translation, weighted):
+    points, tracks, cameras = scene()
+    weights = confidences(points) if weighted else None
+    energy = ReprojectionEnergy(translation=translation)
+    leaf = points.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(energy(leaf, tracks, cameras, weights).sum(), leaf)
+    assert_close(energy.grad(points, tracks, cameras, weights), expected)
+
+
+def test_huber_is_quadratic_near_and_linear_far():
+    points, tracks, cameras = scene()
+    near = ReprojectionEnergy(huber=1e3)(points, tracks, cameras)
+    assert_close(near, ReprojectionEnergy()(points, tracks, cameras))
+    one = torch.zeros(1, 1, 3).double()
+    energy = ReprojectionEnergy(huber=0.5, translation=False)
+    far = [energy(one, torch.tensor([[[x, 0.0]]]).double()).item() for x in (0.5, 10.0, 11.0)]
+    assert far == pytest.approx([0.125, 0.5 * 10 - 0.125, 0.5 * 11 - 0.125])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("huber", [None, 0.7])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_reprojection_gradient(kind, huber, weighted):
+    points, tracks, cameras = scene(kind)
+    weights = confidences(points) if weighted else None
+    energy = ReprojectionEnergy(huber=huber)
+    assert gradcheck(lambda x, y, r: energy(x, y, r, weights), points, tracks, cameras, fast=True)
+    if weighted:
+        assert gradcheck(
+            lambda w: energy(points, tracks, cameras, w), normal(*points.shape[:-1]).abs() + 0.1, fast=True
+        )
+
+
+@pytest.mark.parametrize("huber", [0.0, -1.0, float("nan")])
+def test_huber_out_of_range(huber):
+    with pytest.raises(OptionError, match="huber"):
+        ReprojectionEnergy(huber=huber)
+
+
+# ---------------------------------------------------------------------- low rank
+
+
+def test_low_rank_energies_by_hand():
+    points = clip()
+    matrix = points.flatten(-2)
+    assert_close(LowRankEnergy()(points), torch.linalg.svdvals(matrix).sum())
+    covariance = torch.cov(matrix.mT, correction=0)
+    level = 0.01 * covariance.diagonal().mean() * torch.eye(21).double()
+    expected = 5 / 2 * torch.linalg.slogdet(covariance + level).logabsdet
+    assert_close(LowRankEnergy("log_det", eps=0.01)(points), expected)
+
+
+@pytest.mark.parametrize("kind", ["nuclear", "log_det"])
+def test_low_rank_energies_tell_few_shapes_from_many(kind):
+    few = (normal(30, 2) @ normal(2, 21)).unflatten(-1, (7, 3))
+    many = normal(30, 7, 3)
+    many = many * few.norm() / many.norm()
+    energy = LowRankEnergy(kind)
+    assert energy(few) < energy(many)
+    assert_close(energy(few @ rotations()), energy(few))
+
+
+@pytest.mark.parametrize("kind", ["any", "one frame", "two frames"])
+def test_nuclear_energy_gradient(kind):
+    assert gradcheck(LowRankEnergy(), clip(kind))
+
+
+@pytest.mark.parametrize("kind", ["any", "two frames", "short bones"])
+def test_log_det_energy_gradient(kind):
+    """Also of the level, which is a share of the variance."""
+    assert gradcheck(LowRankEnergy("log_det"), clip(kind))
+
+
+def test_low_rank_prox_is_optimal():
+    points = clip()
+    energy = LowRankEnergy()
+    best = energy.prox(points, 0.8)
+    others = best + 0.1 * normal(100, *best.shape, seed=2)
+    objective = lambda x: 0.8 * energy(x) + 0.5 * (x - points).square().sum((-3, -2, -1))  # noqa: E731
+    assert (objective(others) > objective(best)).all()
+    assert gradcheck(energy.prox, points, torch.tensor(0.8).double(), fast=True)
+
+
+@pytest.mark.parametrize("options", [{"kind": "rank"}, {"kind": "log_det", "eps": 0.0}])
+def test_low_rank_options_out_of_range(options):
+    with pytest.raises(OptionError, match="'nuclear' or 'log_det'"):
+        LowRankEnergy(**options)
+
+
+# ---------------------------------------------------------------------- smoothness
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_smoothness_energy_by_hand(order):
+    points = clip()
+    energy = SmoothnessEnergy(order)(points)
+    assert_close(energy[order:], 0.5 * points.diff(n=order, dim=0).square().sum((-2, -1)))
+    assert torch.equal(energy[:order], torch.zeros(order).double())
+    time = torch.arange(5.0).double()[:, None, None]
+    polynomial = sum(time**k * normal(7, 3, seed=k) for k in range(order))
+    assert SmoothnessEnergy(order)(polynomial).abs().max() < 1e-20
+
+
+def test_smoothness_weighs_as_its_least_frame():
+    points, weights = clip(), confidences(clip())
+    least = torch.stack([weights[k : k + 3] for k in range(3)]).amin(1)
+    expected = 0.5 * (points.diff(n=2, dim=0).square().sum(-1) * least).sum(-1)
+    assert_close(SmoothnessEnergy()(points, weights)[2:], expected)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("order", [1, 2])
+def test_smoothness_gradient(kind, order):
+    points = clip(kind)
+    energy = SmoothnessEnergy(order)
+    assert gradcheck(energy, points, fast=True)
+    assert gradcheck(lambda x: energy(x, confidences(points)), points, fast=True)
+
+
+def test_smoothness_of_too_few_frames_is_zero_with_a_gradient():
+    (grad,) = finite(SmoothnessEnergy(3), clip("two frames"))
+    assert torch.equal(grad, torch.zeros_like(grad))
+
+
+def test_smoothness_order_out_of_range():
+    with pytest.raises(OptionError, match="order"):
+        SmoothnessEnergy(0)
+
+
+# ---------------------------------------------------------------------- symmetry
+
+
+def test_symmetry_energy_by_hand():
+    points = clip()
+    size = bone_lengths(points, BONES)
+    expected = 0.5 * ((size[:, 2] - size[:, 3]).square() + (size[:, 4] - size[:, 5]).square())
+    assert_close(SymmetryEnergy(BODY)(points), expected)
+    even = points.clone()  # each right joint the mirror image of the left one, about a plane through the spine
+    even[:, :3, 0] = 0
+    even[:, 4], even[:, 6] = (even[:, k] * torch.tensor([-1.0, 1, 1]) for k in (3, 5))
+    assert SymmetryEnergy(BODY)(even).abs().max() < 1e-20
+
+
+@pytest.mark.parametrize("body", [CHAIN, RING])
+def test_skeleton_without_twins_has_no_asymmetry(body):
+    points = normal(5, 4, 3)
+    (grad,) = finite(SymmetryEnergy(body), points)
+    assert torch.equal(SymmetryEnergy(body)(points), torch.zeros(5).double())
+    assert torch.equal(grad, torch.zeros_like(grad))
+    assert gradcheck(SymmetryEnergy(body), points)
+
+
+@pytest.mark.parametrize("kind", SMOOTH)
+def test_symmetry_gradient(kind):
+    assert gradcheck(SymmetryEnergy(BODY), clip(kind), fast=True)
+
+
+# ---------------------------------------------------------------------- all of them
+
+ENERGIES = {
+    "bone length": BoneLengthEnergy(BODY),
+    "nuclear": LowRankEnergy(),
+    "log_det": LowRankEnergy("log_det"),
+    "smoothness": SmoothnessEnergy(),
+    "symmetry": SymmetryEnergy(BODY),
+}
+each_energy = pytest.mark.parametrize("energy", ENERGIES.values(), ids=ENERGIES.keys())
+
+
+@each_energy
+def test_batches_equal_loops(energy):
+    same_as_loop(energy, (5, 7, 3))
+
+
+def test_batches_of_several_arguments_equal_loops():
+    energy = ReprojectionEnergy()
+    same_as_loop(energy, (5, 7, 3), (5, 7, 2), (5, 2, 3))
+    same_as_loop(lambda x, y, r, w: energy(x, y, r, w.abs()), (5, 7, 3), (5, 7, 2), (5, 2, 3), (5, 7))
+    same_as_loop(energy.grad, (5, 7, 3), (5, 7, 2), (5, 2, 3))
+    bone = BoneLengthEnergy(BODY)
+    same_as_loop(lambda x, ell, w: bone(x, ell.abs(), w.abs()), (5, 7, 3), (6,), (5, 7))
+    same_as_loop(lambda x, ell: bone.prox(x, ell.abs()), (5, 7, 3), (6,))
+    same_as_loop(lambda x: LowRankEnergy().prox(x, 0.5), (5, 7, 3))
+    same_as_loop(lambda x, w: SmoothnessEnergy()(x, w.abs()), (5, 7, 3), (5, 7))
+
+
+@each_energy
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_results_follow_dtype_and_device(energy, dtype, device):
+    value = leaves_arguments_alone(energy.to(device), clip(dtype=dtype).to(device))
+    energy.to("cpu")
+    assert (value.dtype, value.device.type) == (dtype, device)
+
+
+@each_energy
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_degenerate_clips_are_finite(energy, kind, dtype):
+    finite(energy, clip(kind, dtype=dtype))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_nothing_seen_is_no_energy(kind, dtype):
+    points, tracks, cameras = scene(kind, dtype=dtype)
+    none = torch.zeros(points.shape[:-1], dtype=dtype)
+    for run in (
+        lambda x: BoneLengthEnergy(BODY)(x, None, none),
+        lambda x: BoneLengthEnergy(BODY)(x, torch.ones(6, dtype=dtype), none),
+        lambda x: ReprojectionEnergy()(x, tracks, cameras, none),
+        lambda x: ReprojectionEnergy(huber=1.0)(x, tracks, cameras, none),
+        lambda x: SmoothnessEnergy()(x, none),
+    ):
+        (grad,) = finite(run, points)
+        assert torch.equal(run(points), torch.zeros_like(run(points)))
+        assert torch.equal(grad, torch.zeros_like(grad))
+
+
+@given(st.integers(0, 10**6), st.floats(-6, 6), st.sampled_from(FLOATS), st.sampled_from(KINDS))
+@settings(max_examples=60, deadline=None)
+def test_nothing_is_nan_at_any_scale(seed, power, dtype, kind):
+    scale = 10.0**power
+    points = scale * (clip(kind, dtype=dtype) + 0.1 * normal(7, 3, seed=seed, dtype=dtype))
+    weights = confidences(points, seed=seed)
+    for energy in ENERGIES.values():
+        finite(energy, points)
+    finite(lambda x, ell: BoneLengthEnergy(BODY)(x, ell, weights), points, scale * normal(6, dtype=dtype).abs())
+    finite(lambda x, ell: BoneLengthEnergy(BODY).prox(x, ell), points, scale * normal(6, dtype=dtype).abs())
+    tracks, cameras = scale * scene(kind, dtype=dtype)[1], scene(kind, dtype=dtype)[2]
+    for huber in (None, 0.1 * scale):
+        energy = ReprojectionEnergy(huber=huber)
+        finite(lambda x, y, r, e=energy: e(x, y, r, weights), points, tracks, cameras)
+
+
+@each_energy
+def test_energies_are_losses(energy):
+    """A few steps of gradient descent lower them."""
+    points = clip().requires_grad_()
+    before = energy(points).sum()
+    for _ in range(20):
+        (grad,) = torch.autograd.grad(energy(points).sum(), points)
+        points = (points - 1e-3 * grad).detach().requires_grad_()
+    assert energy(points).sum() < before
+
+
+def test_modules_move_their_buffers_and_save_no_state():
+    energy = BoneLengthEnergy(BODY).to(torch.float32)
+    assert energy(clip(dtype=torch.float32)).dtype == torch.float32
+    assert energy.bones.dtype == torch.long
+    assert not energy.state_dict() and not list(energy.parameters())
+    assert "body7" in repr(energy)
+
+
+@pytest.mark.parametrize("energy", [BoneLengthEnergy(BODY), SymmetryEnergy(BODY)])
+@pytest.mark.parametrize("shape", [(5, 6, 3), (7, 3), (7,), (5, 8, 3)])
+def test_wrong_points_are_refused_with_the_skeletons_name(energy, shape):
+    with pytest.raises(ShapeError, match=r"\(\.\.\., T, 7, 3\) for skeleton 'body7'"):
+        energy(torch.zeros(shape))
+
+
+@pytest.mark.parametrize("energy", [LowRankEnergy(), LowRankEnergy("log_det"), SmoothnessEnergy()])
+def test_a_single_pose_is_no_clip(energy):
+    with pytest.raises(ShapeError, match=r"\(\.\.\., T, N, D\), got \(7, 3\)"):
+        energy(torch.zeros(7, 3))
+
+
+def test_other_shapes_that_do_not_fit():
+    points, tracks, cameras = scene()
+    with pytest.raises(ShapeError, match=r"lengths \(\.\.\., 6\)"):
+        BoneLengthEnergy(BODY)(points, torch.ones(5))
+    for run in (
+        lambda w: BoneLengthEnergy(BODY)(points, None, w),
+        lambda w: SmoothnessEnergy()(points, w),
+        lambda w: ReprojectionEnergy()(points, tracks, cameras, w),
+    ):
+        with pytest.raises(ShapeError, match=r"weights \(\.\.\., 5, 7\), got \(5, 6\)"):
+            run(torch.ones(5, 6))
+    for wrong in (tracks[:1], tracks[:, :6], points):
+        with pytest.raises(ShapeError, match=r"tracks \(\.\.\., 5, 7, 2\)"):
+            ReprojectionEnergy()(points, wrong, cameras)
+    with pytest.raises(ShapeError, match=r"cameras \(\.\.\., 5, 2, 3\)"):
+        ReprojectionEnergy()(points, tracks, cameras[:1])
+
+
+def test_unknown_skeletons_are_named():
+    with pytest.raises(SkeletonError, match="h36m17"):
+        BoneLengthEnergy("h36m18")
