@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import torch
@@ -13,7 +13,7 @@ from kcs_torch.errors import OptionError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import complete_rotation, factorize, rows_to_cameras
 from kcs_torch.functional.spectral import dct_basis
-from kcs_torch.functional.temporal import blend_windows, window_starts
+from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.nn.unrolled import UnrolledSfAM
@@ -42,7 +42,7 @@ class SfAM(Method):
             is large the shapes are shrunk, and lengths taken from them would be too short.
         lengths: where the bone lengths come from: "shape" (re-estimated at each step), or "skeleton" (its
             proportions, at the scale of the shape), or one relative length per bone (fixed, as printed).
-        rank: K shapes of the camera factorisation, or "auto": chosen by how evenly the camera moves.
+        rank: K shapes of the camera factorisation, or "auto": chosen by how evenly and how orthonormal the rows come.
         camera_path: "free" cameras; "constant" angular velocity; "auto" takes the latter where it explains the former.
             It concerns the cameras that are reported, not the shape.
         trajectories: number of cosines that the tracks' paths are smoothed to within a window, or None.
@@ -94,6 +94,7 @@ class SfAM(Method):
         window = min(self.window or frames, frames)
         starts = window_starts(frames, window, min(self.overlap, window - 1))
         cut = lambda x: torch.stack([x[s : s + window] for s in starts])  # noqa: E731
+        tracks = _fill_blank_frames(tracks)
         filled = complete_tracks(cut(tracks.points), cut(tracks.seen))
         points, weights = cut(tracks.points), cut(tracks.weights)
         if self.trajectories is not None:
@@ -164,6 +165,21 @@ class SfAM(Method):
         )
 
 
+def _fill_blank_frames(tracks: Tracks) -> Tracks:
+    """Tracks whose frames without any seen joint are seen halfway between their neighbours.
+
+    No term holds the shape of such a frame: the nuclear norm would shrink it.
+    """
+    blank = ~tracks.seen.any(-1, keepdim=True)
+    made = blank & tracks.seen.any(0)
+    filled = interpolate(tracks.points, tracks.seen)
+    return replace(
+        tracks,
+        points=torch.where(made[..., None], filled, tracks.points),
+        weights=torch.where(made, torch.ones_like(tracks.weights), tracks.weights),
+    )
+
+
 EVEN = 0.05
 """A constant angular velocity explains the cameras where their median deviation is below this share of its turn."""
 
@@ -172,20 +188,20 @@ def orthographic_cameras(
     tracks: Tensor,
     rank: int | Literal["auto"] = "auto",
     *,
-    num_starts: int = 5,
+    num_starts: int = 7,
     smoothness: float = 0.1,
     seed: int = 0,
 ) -> Tensor:
     """Estimate orthographic cameras by rank-3K factorisation and metric upgrade.
 
     Many subspaces have nearly orthonormal rows; the wrong ones make the camera jump. So for every K the upgrade
-    runs from the convex relaxation (:func:`ist`) and some random starts, with a weak pull to smooth rows, and the
-    candidate with the least product of both faults wins: the rows' root mean square defect, and the unevenness of
-    the camera's motion.
+    runs from the convex relaxation (:func:`ist`) and some random starts, with a weak pull to smooth rows; the two best
+    are refined, and of all candidates the one with the least product of both faults wins: the rows' root mean square
+    defect, and the unevenness of the camera's motion.
 
     Args:
         tracks: (W, T, N, 2), complete.
-        rank: K, or "auto" to try 1..6.
+        rank: K, or "auto" to try 2..5 (1 where there are too few joints or frames for more).
         num_starts: random starts beside the relaxation's.
         smoothness: weight of the rows' second differences.
         seed: of the random starts.
@@ -197,27 +213,32 @@ def orthographic_cameras(
     Kovalenko et al. 2019, section 3.2.
     """
     windows, frames, joints, _ = tracks.shape
-    limit = min(2 * frames, joints - 1)
-    if limit < 3:
+    most = min(2 * frames, joints - 1) // 3  # the largest K that the factorisation can hold
+    if most < 1:
         return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(windows, frames, 2, 3)
-    motion, _ = factorize(tracks - tracks.mean(-2, keepdim=True), min(limit, 18 if rank == "auto" else 3 * rank))
+    ranks = range(min(2, most), min(5, most) + 1) if rank == "auto" else [min(rank, most)]
+    motion, _ = factorize(tracks - tracks.mean(-2, keepdim=True), 3 * ranks[-1])
     size = motion[..., 0].square().mean((-2, -1)).sqrt()
     motion = motion / torch.where(size > 0, size, torch.ones_like(size))[..., None, None, None]
+    relaxed = ist(motion[..., : 3 * ranks[0]], num_steps=30)
     generator = torch.Generator().manual_seed(seed)
+    window = torch.arange(windows, device=tracks.device)
     cameras, defects = [], []
-    for r in range(3, motion.shape[-1] + 1, 3) if rank == "auto" else [motion.shape[-1]]:
-        part = motion[..., :r]
-        random = torch.randn(num_starts, 1, r, 3, generator=generator, dtype=torch.float64).to(motion)
-        starts = torch.cat([ist(part)[None], random.expand(-1, windows, -1, -1)])
-        q, defect = metric_upgrade(part, starts, smoothness=smoothness, tolerance=1e-3)
+    for k in ranks:
+        part = motion[..., : 3 * k]
+        random = torch.randn(num_starts, 1, 3 * k, 3, generator=generator, dtype=torch.float64).to(motion)
+        starts = torch.nn.functional.pad(relaxed, (0, 0, 0, 3 * k - relaxed.shape[-2]))
+        starts = torch.cat([starts[None], random.expand(-1, windows, -1, -1)])
+        q, defect = metric_upgrade(part, starts, smoothness=smoothness, tolerance=0, num_steps=12)
+        best = defect.topk(min(2, len(defect)), dim=0, largest=False).indices
+        q, defect = metric_upgrade(part, q[best, window], smoothness=smoothness, tolerance=1e-2, num_steps=60)
         cameras.append(rows_to_cameras(part @ q[:, :, None])[0])
         defects.append(defect)
     candidates, defect = torch.cat(cameras), torch.cat(defects)  # (C, W, T, 2, 3), (C, W)
     turn = complete_rotation(candidates)
     turn = turn[:, :, 1:] @ turn[:, :, :-1].mT
     uneven = torch.linalg.matrix_norm(turn.diff(dim=2)).mean(-1) if frames > 2 else torch.ones_like(defect)
-    choice = (uneven * defect.sqrt()).argmin(0)
-    return candidates[choice, torch.arange(windows, device=choice.device)]
+    return candidates[(uneven * defect.sqrt()).argmin(0), window]
 
 
 def _mirror_signs(parts: Tensor, starts: list[int]) -> Tensor:
