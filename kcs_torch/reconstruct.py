@@ -39,7 +39,7 @@ def reconstruct(
         tracks: a :class:`Tracks`, or an array (T, N, 2) with NaN where unseen.
         method: "auto", a name in :data:`kcs_torch.METHODS`, or a :class:`Method`. "auto" takes SfAM
             where the skeleton has no template, or the viewpoint turns enough and SfAM's cameras agree with those that
-            the template gives; else KCS.
+            the template gives; else KCS, with its frames in one row each and constant bones.
         skeleton: for arrays: a :class:`Skeleton`, a built-in name, or a YAML/JSON file.
         confidence: for arrays: (T, N) in 0..1.
         fps: for arrays: frames per second.
@@ -77,7 +77,7 @@ def reconstruct(
         if fields:
             raise OptionError(f"reconstruct: fields ({', '.join(fields)}) need a method's name: {', '.join(METHODS)}")
         return _automatic(tracks, cameras)
-    if method not in METHODS:
+    if not isinstance(method, str) or method not in METHODS:
         raise unknown("method", method, ["auto", *METHODS])
     return METHODS[method].from_options(**fields)(tracks, cameras)
 
@@ -90,7 +90,7 @@ def _automatic(tracks: Tracks, cameras: Any) -> Reconstruction:
     """
     if tracks.skeleton.template is None:
         return SfAM()(tracks, cameras)
-    by_template = KCS()(tracks, cameras)
+    by_template = KCS(arrangement="frames", bone_steps=20)(tracks, cameras)
     if by_template.diagnostics.viewpoint_turn < ENOUGH_TURN / 2:
         return by_template
     with warnings.catch_warnings(record=True) as told:

@@ -12,16 +12,18 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.camera import back_project, complete_rotation, project
-from kcs_torch.functional.chain import chain_inverse, incidence
+from kcs_torch.functional.chain import bone_lengths, chain_inverse, incidence
 from kcs_torch.functional.spectral import singular_values, svt
 from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.template import clip_scale, rigid_shape
 from kcs_torch.nn.energies import centred_residual
 from kcs_torch.nn.unrolled import continuation
+from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.iterate import iterate, relative_change
+from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.pose import fit_cameras
-from kcs_torch.types import Tracks
+from kcs_torch.types import Tracks, as_floats
 
 __all__ = ["KCS"]
 
@@ -49,6 +51,8 @@ class KCS(Method):
         robust: residuals of this share of the body's size count half in the cameras; None is least squares, as printed.
         continuity: weight of the turn between frames (radians squared) in choosing among a frame's possible
             cameras; 0 takes each frame's best, as printed.
+        bone_steps: steps that then bring the bones to their median lengths, image positions of seen joints held; 0 is
+            none, as printed: the nuclear norm alone does not make lengths constant.
 
     Raises:
         OptionError: a value is out of range.
@@ -67,17 +71,20 @@ class KCS(Method):
     scale_range: float = 1.1
     robust: float | None = 0.4
     continuity: float = 1.0
+    bone_steps: int = 0
 
     def __post_init__(self) -> None:
-        self._expect(self.arrangement in ("stacked", "frames"), "arrangement", "'stacked' or 'frames'")
+        super().__post_init__()
         self._expect(self.rounds >= 1, "rounds", "at least 1")
-        self._expect(self.mu > 0, "mu", "a positive number")
+        self._expect(self.tolerance >= 0, "tolerance", "a number >= 0")
+        self._expect(0 < self.mu < math.inf, "mu", "a positive number")
         self._expect(0 < self.rho < 1, "rho", "a number between 0 and 1")
         self._expect(self.num_weights >= 1, "num_weights", "at least 1")
         self._expect(self.steps_per_weight >= 1, "steps_per_weight", "at least 1")
         self._expect(self.scale_range >= 1, "scale_range", "a factor >= 1")
         self._expect(self.robust is None or self.robust > 0, "robust", "None or a positive share")
         self._expect(self.continuity >= 0, "continuity", "a number >= 0")
+        self._expect(self.bone_steps >= 0, "bone_steps", "at least 0")
 
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Alternate cameras and shape until the cameras stand still."""
@@ -112,6 +119,8 @@ class KCS(Method):
         assert rotations is not None
         size = scales.mean()
         points = size * shape @ rotations.mT
+        if self.bone_steps:
+            points = self._constant_bones(points, body, tracks.seen)
         points = points - points.mean(-2, keepdim=True)
         return Estimate(points, rotations[:, :2], scales / size, converged, made, notes)
 
@@ -119,7 +128,7 @@ class KCS(Method):
         like = tracks.points
         joints = tracks.num_joints
         if self.template is not None:
-            rest = torch.as_tensor(self.template, dtype=like.dtype, device=like.device)
+            rest = as_floats(self.template, "kcs: template", 2).to(like)
             if rest.shape != (joints, 3) or not torch.isfinite(rest).all():
                 raise ShapeError(
                     f"kcs: template: expected {joints} finite positions (x, y, z), got shape {tuple(rest.shape)}"
@@ -148,6 +157,16 @@ class KCS(Method):
         choice = best_path(cost, self.continuity * turn) if self.continuity > 0 else cost.argmin(-1)
         frame = torch.arange(tracks.num_frames, device=choice.device)
         return rotations[choice, frame], scales[choice, frame]
+
+    def _constant_bones(self, points: Tensor, body: Skeleton, seen: Tensor) -> Tensor:
+        """Alternate the bone-length step with the image positions of seen joints."""
+        bones = body.bone_index(device=points.device)[list(body.rigid)]
+        lengths = bone_lengths(points, bones).median(0).values
+        image = points[..., :2]
+        for _ in range(self.bone_steps):
+            points = fit_bones(points, lengths, bones, num_steps=1)
+            points = torch.cat([torch.where(seen[..., None], image, points[..., :2]), points[..., 2:]], -1)
+        return points
 
     def _deviation(
         self,
