@@ -5,6 +5,7 @@ import math
 import torch
 from torch.testing import assert_close
 
+from kcs_torch.functional import bone_lengths
 from kcs_torch.skeleton import Skeleton
 
 BATCHES = [(), (2,), (2, 3)]
@@ -96,3 +97,19 @@ def gradcheck(function, *arguments, fast: bool = False, **options):
     """Compare gradients with finite differences, in double precision."""
     leaves = [a.detach().clone().requires_grad_() for a in arguments]
     return torch.autograd.gradcheck(function, leaves, fast_mode=fast, **options)
+
+
+def dense_fit_bones(points, lengths, bones, stiffness, num_steps, damping=0.0, start=None):
+    """The textbook: Levenberg-Marquardt with the 3N x 3N normal equations of one frame."""
+
+    def residuals(flat):
+        shape = flat.reshape(points.shape)
+        bone = (bone_lengths(shape, bones) - lengths) * torch.as_tensor(stiffness, dtype=points.dtype).sqrt()
+        return torch.cat([bone, (shape - points).flatten()])
+
+    current = (points if start is None else start).flatten()
+    for _ in range(num_steps):
+        jacobian = torch.autograd.functional.jacobian(residuals, current)
+        normal_matrix = jacobian.mT @ jacobian + damping * torch.eye(len(current), dtype=points.dtype)
+        current = current - torch.linalg.solve(normal_matrix, jacobian.mT @ residuals(current))
+    return current.reshape(points.shape)

@@ -7,7 +7,20 @@ import scipy.optimize
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numerics import BODY, CHAIN, DEVICES, FLOATS, RING, finite, gradcheck, leaves_arguments_alone, normal, same_as_loop
+from numerics import (
+    BODY,
+    CHAIN,
+    DEVICES,
+    FLOATS,
+    HALVES,
+    RING,
+    dense_fit_bones,
+    finite,
+    gradcheck,
+    leaves_arguments_alone,
+    normal,
+    same_as_loop,
+)
 from torch.testing import assert_close
 
 from kcs_torch.errors import OptionError, ShapeError
@@ -27,22 +40,6 @@ def problem(body, *batch, share=0.3):
     return points, size * (1 + share * normal(*size.shape, seed=1)).abs()
 
 
-def dense(points, lengths, bones, stiffness, num_steps, damping=0.0, start=None):
-    """The textbook: Levenberg-Marquardt with the 3N x 3N normal equations of one frame."""
-
-    def residuals(flat):
-        shape = flat.reshape(points.shape)
-        bone = (bone_lengths(shape, bones) - lengths) * torch.as_tensor(stiffness, dtype=points.dtype).sqrt()
-        return torch.cat([bone, (shape - points).flatten()])
-
-    current = (points if start is None else start).flatten()
-    for _ in range(num_steps):
-        jacobian = torch.autograd.functional.jacobian(residuals, current)
-        normal_matrix = jacobian.mT @ jacobian + damping * torch.eye(len(current), dtype=points.dtype)
-        current = current - torch.linalg.solve(normal_matrix, jacobian.mT @ residuals(current))
-    return current.reshape(points.shape)
-
-
 def energy(shape, points, lengths, bones, stiffness):
     bone = (stiffness * (bone_lengths(shape, bones) - lengths).square()).sum(-1)
     return 0.5 * (bone + (shape - points).square().sum((-2, -1)))
@@ -55,7 +52,9 @@ def test_every_step_is_that_of_the_dense_system(body, damping, num_steps):
     points, lengths = problem(body)
     stiffness = normal(len(lengths), seed=2).abs()
     got = fit_bones(points, lengths, BONES[body], stiffness=stiffness, num_steps=num_steps, damping=damping)
-    assert_close(got, dense(points, lengths, BONES[body], stiffness, num_steps, damping), rtol=1e-6, atol=1e-6)
+    assert_close(
+        got, dense_fit_bones(points, lengths, BONES[body], stiffness, num_steps, damping), rtol=1e-6, atol=1e-6
+    )
 
 
 def test_start():
@@ -63,7 +62,7 @@ def test_start():
     start = points + 0.2 * normal(7, 3, seed=5)
     for damping in (0.0, 0.5):
         got = fit_bones(points, lengths, BONES["tree"], num_steps=2, damping=damping, start=start)
-        assert_close(got, dense(points, lengths, BONES["tree"], 1.5, 2, damping, start), rtol=1e-6, atol=1e-6)
+        assert_close(got, dense_fit_bones(points, lengths, BONES["tree"], 1.5, 2, damping, start), rtol=1e-6, atol=1e-6)
     assert torch.equal(fit_bones(points, lengths, BONES["tree"], num_steps=0, start=start), start)
     assert torch.equal(fit_bones(points, lengths, BONES["tree"], num_steps=0), points)
 
@@ -270,12 +269,15 @@ def test_no_bones():
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize("dtype", FLOATS + HALVES)
 def test_results_follow_dtype_and_device(dtype, device):
     points, lengths = (x.to(device, dtype) for x in problem("tree", 2))
     bones = BONES["tree"].to(device)
     got = leaves_arguments_alone(lambda p, ell: fit_bones(p, ell, bones), points, lengths)
     assert (got.dtype, got.device.type) == (dtype, device)
+    expected = fit_bones(points.double(), lengths.double(), bones)
+    assert_close(got.double(), expected, rtol=0, atol=100 * torch.finfo(dtype).eps)
+    assert fit_bones(points, lengths, bones, start=points).dtype == dtype
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.spectral import log_det, nuclear_norm, svt
-from kcs_torch.nn.layers import SkeletonModule
+from kcs_torch.nn.layers import SkeletonModule, full_precision
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lm import fit_bones
 
@@ -85,7 +85,8 @@ class BoneLengthEnergy(SkeletonModule):
         """
         self.check(points, clip=True)
         beta = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device) * self.rigid.to(points.dtype)
-        return fit_bones(points, lengths[..., None, :], self.bones, stiffness=beta, num_steps=num_steps)
+        with full_precision(points):
+            return fit_bones(points, lengths[..., None, :], self.bones, stiffness=beta, num_steps=num_steps)
 
 
 class ReprojectionEnergy(nn.Module):
@@ -141,7 +142,9 @@ class ReprojectionEnergy(nn.Module):
             expected = f"(..., {points.shape[-3]}, 2, 3)"
             raise ShapeError(f"ReprojectionEnergy: expected cameras {expected}, got {tuple(cameras.shape)}")
         check_weights(weights, points, self)
-        seen = points[..., :2] if cameras is None else project(points, cameras)
+        with full_precision(points):
+            dtype = torch.promote_types(points.dtype, tracks.dtype)
+            seen = points[..., :2] if cameras is None else project(points.to(dtype), cameras.to(dtype))
         return centred_residual(seen, tracks, weights) if self.translation else seen - tracks
 
     def grad(self, points: Tensor, tracks: Tensor, cameras: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -177,11 +180,15 @@ class LowRankEnergy(nn.Module):
         if self.kind == "nuclear":
             return nuclear_norm(matrix)
         frames = matrix.shape[-2]
-        centred = matrix - matrix.mean(-2, keepdim=True)
-        covariance = centred.mT @ centred / frames
-        scale = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
-        level = self.eps * torch.where(scale > 0, scale, torch.ones_like(scale))
-        return frames / 2 * log_det(covariance, level)
+        with full_precision(points):
+            wide = matrix.to(
+                torch.promote_types(matrix.dtype, torch.float32)
+            )  # in half precision a covariance is not definite
+            centred = wide - wide.mean(-2, keepdim=True)
+            covariance = centred.mT @ centred / frames
+            scale = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
+            level = self.eps * torch.where(scale > 0, scale, torch.ones_like(scale))
+            return (frames / 2 * log_det(covariance, level)).to(matrix.dtype)
 
     def prox(self, points: Tensor, threshold: Tensor | float) -> Tensor:
         """Singular value shrinkage of S#, the nuclear norm's proximal map: (..., T, N, D)."""

@@ -115,6 +115,11 @@ class SVT(nn.Module):
         return svt(matrix, level)
 
 
+def full_precision(tensor: Tensor) -> torch.autocast:
+    """Suspend autocast on the tensor's device: pixels and factorisations need more than three digits."""
+    return torch.autocast(tensor.device.type, enabled=False)
+
+
 def inverse_softplus(value: Tensor) -> Tensor:
     """Return x with softplus(x) = value, for positive values, without overflow."""
     return value + torch.log(-torch.expm1(-value))

@@ -17,7 +17,7 @@ from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.spectral import spectral_norm, svt
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.nn.energies import centred_residual, check_weights
-from kcs_torch.nn.layers import inverse_softplus
+from kcs_torch.nn.layers import full_precision, inverse_softplus
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution, iterate, relative_change
 from kcs_torch.solvers.lm import fit_bones
@@ -83,7 +83,10 @@ def estimate_lengths(
     if not graded or size.shape[-1] == 0:
         return lengths, torch.ones_like(lengths)
     with torch.no_grad():
-        variation = (size - lengths[..., None, :]).abs().mean(-2) / lengths.clamp_min(torch.finfo(size.dtype).tiny)
+        whole = torch.maximum(lengths, 1e-6 * size.amax(-2))  # a bone that has no length in most frames is not rigid
+        variation = (size - lengths[..., None, :]).abs().mean(-2) / torch.where(
+            whole > 0, whole, torch.ones_like(whole)
+        )
         steady = variation.quantile(0.25, -1, keepdim=True)
         ratio = variation / torch.where(steady > 0, steady, torch.ones_like(steady))
         return lengths, 1 / (1 + ratio.square()).square()
@@ -183,7 +186,7 @@ class UnrolledFPC(nn.Module):
             tracks: (..., T, N, 2).
             cameras: (..., T, 2, 3).
             weights: (..., T, N), 0 where unseen.
-            start: (..., T, N, 3), a network's output, say; the back-projected tracks if None.
+            start: (..., T, N, 3), a network's output, say, in any precision; the back-projected tracks if None.
 
         Returns:
             (..., T, N, 3).
@@ -199,11 +202,12 @@ class UnrolledFPC(nn.Module):
         """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still."""
         self._check(tracks, cameras, weights, start)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
-        scale = data_scale(tracks, cameras, weights)
-        return self._run(
-            lambda shape, k: shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k]),
-            start_shape(tracks, cameras, weights) if start is None else start,
-        )
+        with full_precision(tracks):
+            scale = data_scale(tracks, cameras, weights)
+            return self._run(
+                lambda shape, k: shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k]),
+                start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype),
+            )
 
     def _run(self, step: Callable[[Tensor, int], Tensor], start: Tensor) -> Solution[Tensor]:
         """Make all steps, each from a point ahead of the last shape; the state is (shape, point ahead)."""
@@ -350,7 +354,6 @@ class UnrolledSfAM(UnrolledFPC):
             )
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         stiffness = self._values("stiffness", tracks)
-        scale = data_scale(tracks, cameras, weights)
         fixed = None if lengths is None else lengths[..., list(self.skeleton.rigid)]
         pooled = weights.flatten(0, 1) if weights is not None and one_body else weights
         graded = not self.skeleton.tree
@@ -368,18 +371,22 @@ class UnrolledSfAM(UnrolledFPC):
                 bones=self.bones, lengths=target, stiffness=stiffness[k] * rigidity,
             )  # fmt: skip
 
-        return self._run(advance, start_shape(tracks, cameras, weights) if start is None else start)
+        with full_precision(tracks):
+            scale = data_scale(tracks, cameras, weights)
+            return self._run(
+                advance, start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype)
+            )
 
 
 def start_shape(tracks: Tensor, cameras: Tensor, weights: Tensor | None) -> Tensor:
     """The back-projected, centred tracks (..., T, N, 3).
 
-    Unseen joints are put at the centre of the seen ones, and frames in which nothing is seen between their neighbours:
-    started at a single point they would stay there, as no term moves them.
+    Unseen joints are put at the centre of the seen ones, and frames that show fewer than two joints between their
+    neighbours: started at a single point they would stay there, or grow out of rounding.
     """
     centred = -centred_residual(torch.zeros_like(tracks), tracks, weights)
     if weights is None:
         return back_project(centred, cameras)
     seen = weights > 0
     shape = back_project(torch.where(seen[..., None], centred, torch.zeros_like(centred)), cameras)
-    return interpolate(shape, seen.any(-1, keepdim=True))
+    return interpolate(shape, seen.sum(-1, keepdim=True) > 1)
