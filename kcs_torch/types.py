@@ -5,8 +5,10 @@ Everything that a user passes is checked here, once; past this point all numbers
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -75,9 +77,10 @@ class Tracks:
 
         Raises:
             ShapeError: wrong shapes, infinite values, negative confidences, nothing seen at all.
+            OptionError: the threshold is no confidence.
             SkeletonError: the joint count does not fit the skeleton (the message says which one it fits).
         """
-        xy = _array(points, f"{source}: points", 3)
+        xy = as_floats(points, f"{source}: points", 3)
         if xy.shape[-1] != 2:
             raise ShapeError(f"{source}: points: expected shape (frames, joints, 2), got {tuple(xy.shape)}")
         num_frames, num_joints = xy.shape[:2]
@@ -85,10 +88,14 @@ class Tracks:
             raise ShapeError(f"{source}: expected at least 1 frame, got none")
         if num_joints < 2:
             raise ShapeError(f"{source}: expected at least 2 joints, got {num_joints}")
-        if fps is not None and not np.isfinite(fps):
-            fps = None
-        if fps is not None and fps <= 0:
-            raise ShapeError(f"{source}: fps: expected a positive number or None, got {fps}")
+        rate = _number(fps)
+        if fps is not None and (rate is None or rate <= 0):
+            raise ShapeError(f"{source}: fps: expected a positive number or None, got {fps!r}")
+        if rate is not None and not math.isfinite(rate):
+            rate = None
+        least = _number(threshold)
+        if least is None or not 0 <= least <= 1:
+            raise OptionError(f"{source}: threshold: expected a confidence within 0..1, got {threshold!r}")
         names = None if joint_names is None else [str(n) for n in joint_names]
         if names is not None and len(names) != num_joints:
             raise ShapeError(f"{source}: joint_names: expected {num_joints} names, got {len(names)}")
@@ -104,7 +111,7 @@ class Tracks:
         if confidence is None:
             weights = seen.to(xy.dtype)
         else:
-            weights = _array(confidence, f"{source}: confidence", 2).to(xy)
+            weights = as_floats(confidence, f"{source}: confidence", 2).to(xy)
             if weights.shape != seen.shape:
                 raise ShapeError(
                     f"{source}: confidence: expected shape {tuple(seen.shape)}, got {tuple(weights.shape)}"
@@ -139,7 +146,7 @@ class Tracks:
         if blank:
             shown = ", ".join(map(str, blank[:8])) + (", ..." if len(blank) > 8 else "")
             remarks.append(f"{len(blank)} frames without any seen joint (frame {shown}): filled from their neighbours")
-        return cls(xy, weights, body, fps, units, source, tuple(remarks))
+        return cls(xy, weights, body, rate, units, source, tuple(remarks))
 
     @property
     def num_frames(self) -> int:
@@ -204,7 +211,7 @@ class Reconstruction:
     Attributes:
         points: (T, N, 3) joint positions in ``units``.
         cameras: (T, 2, 3) first two rows of each frame's world-to-camera rotation.
-        scales: (T,) weak-perspective scale of each frame; image = scale * points.
+        scales: (T,) weak-perspective scale of each frame; image = scale * points up to a shift.
         lengths: (B,) bone lengths, in ``units``.
         tracks: what it was made from.
         method: the method's name.
@@ -323,16 +330,29 @@ class Reconstruction:
         return best
 
 
-def _array(value: Any, what: str, ndim: int) -> Tensor:
-    """An array-like as a floating tensor of ``ndim`` dimensions; tensors keep dtype and device."""
+def as_floats(value: Any, what: str, ndim: int) -> Tensor:
+    """An array-like as a floating tensor of ``ndim`` dimensions; tensors keep their device and single precision.
+
+    Raises:
+        ShapeError: it is no array of real numbers, or has another number of dimensions.
+    """
     if not isinstance(value, Tensor):
         try:
-            value = torch.as_tensor(np.asarray(value, dtype=np.float64))
+            array = np.asarray(value)
+            value = torch.as_tensor(array if np.iscomplexobj(array) else array.astype(np.float64))
         except (TypeError, ValueError):
             raise ShapeError(f"{what}: expected an array of numbers, got {type(value).__name__}") from None
+    if value.is_complex():
+        raise ShapeError(f"{what}: expected real numbers, got {str(value.dtype).removeprefix('torch.')}")
     if value.ndim != ndim:
         raise ShapeError(f"{what}: expected {ndim} dimensions, got shape {tuple(value.shape)}")
+    if value.dtype in (torch.float16, torch.bfloat16):
+        return value.float()  # no factorisation takes half precision
     return value if value.is_floating_point() else value.double()
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if isinstance(value, Real) else None
 
 
 def _choose_skeleton(
@@ -359,7 +379,10 @@ def _choose_skeleton(
             return known
         return Skeleton.from_edges([], names or num_joints, name="points", tree=False)
     try:
-        pairs = np.asarray(edges)
+        try:
+            pairs = np.asarray(edges)
+        except ValueError:
+            raise ShapeError(f"{source}: edges: expected pairs of joint indices, got rows of unequal length") from None
         if pairs.size == 0:
             pairs = pairs.reshape(0, 2)
         if pairs.ndim != 2 or pairs.shape[1] != 2 or not np.issubdtype(pairs.dtype, np.number):

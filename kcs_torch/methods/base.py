@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
 import time
+import types
+import typing
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -18,7 +22,7 @@ from kcs_torch.functional.align import centre
 from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.types import Diagnostics, Reconstruction, Tracks
+from kcs_torch.types import Diagnostics, Reconstruction, Tracks, as_floats
 
 __all__ = ["Estimate", "Method"]
 
@@ -56,6 +60,11 @@ class Method(ABC):
 
     name: ClassVar[str] = ""
 
+    def __post_init__(self) -> None:
+        hints = typing.get_type_hints(type(self))
+        for field in dataclasses.fields(self):
+            self._expect(_is_a(getattr(self, field.name), hints[field.name]), field.name, str(field.type))
+
     @abstractmethod
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Reconstruct normalised tracks; ``cameras`` (T, 2, 3) are given or to be found."""
@@ -79,15 +88,16 @@ class Method(ABC):
         """
         begin = time.perf_counter()
         if cameras is not None:
-            cameras = torch.as_tensor(cameras).to(tracks.points)
-            if cameras.shape != (tracks.num_frames, 2, 3) or not torch.isfinite(cameras).all():
-                raise ShapeError(f"cameras: expected finite ({tracks.num_frames}, 2, 3), got {tuple(cameras.shape)}")
+            cameras = _check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         with torch.no_grad():
             known = tracks.seen.any(-1)
             middle = interpolate(_mean(tracks.points, tracks.weights), known[:, None])
             centred = (tracks.points - middle) * tracks.seen[..., None]
-            size = (centred.square() * tracks.weights[..., None]).sum() / tracks.weights.sum()
-            size = torch.where(size > 0, size, torch.ones_like(size)).sqrt()
+            size = centred.abs().amax()
+            size = torch.where(size > 0, size, torch.ones_like(size))  # first, so that no square overflows
+            square = (centred / size).square() * tracks.weights[..., None]
+            size = size * (square.sum() / tracks.weights.sum()).sqrt()
+            size = torch.where(size > 0, size, torch.ones_like(size))
             found = self.solve(dataclasses.replace(tracks, points=centred / size), cameras)
             points = found.points * size
             seen = points[..., :2] * found.scales[:, None, None]
@@ -149,6 +159,41 @@ class Method(ABC):
         """Raise an OptionError for ``field`` unless the rule holds."""
         if not rule:
             raise OptionError(f"{self.name}: {field}: expected {expected}, got {getattr(self, field)!r}")
+
+
+def _check_cameras(cameras: Tensor, frames: int) -> Tensor:
+    """The cameras themselves, if they are (T, 2, 3) with orthonormal rows."""
+    if cameras.shape != (frames, 2, 3) or not torch.isfinite(cameras).all():
+        raise ShapeError(f"cameras: expected finite ({frames}, 2, 3), got {tuple(cameras.shape)}")
+    off = (cameras @ cameras.mT - torch.eye(2).to(cameras)).abs().amax((-2, -1))
+    if bool((off > 0.01).any()):
+        raise ShapeError(
+            f"cameras: expected the first two rows of rotations, got rows that are not orthonormal in frame "
+            f"{int(off.argmax())}; a scale belongs to the tracks"
+        )
+    return cameras
+
+
+def _is_a(value: Any, hint: Any) -> bool:
+    """Whether a value is what a field's annotation says; whole numbers pass for numbers, NaN does not."""
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return any(_is_a(value, h) for h in inner)
+    if origin is typing.Literal:
+        return isinstance(value, str) and value in inner
+    if origin in (Sequence, tuple):  # or a tensor or array that stands for one
+        listed = value.tolist() if hasattr(value, "tolist") else value
+        if not isinstance(listed, Sequence) or isinstance(listed, str):
+            return False
+        fixed = origin is tuple and Ellipsis not in inner
+        if fixed and len(listed) != len(inner):
+            return False
+        return all(_is_a(v, h) for v, h in zip(listed, inner if fixed else [inner[0]] * len(listed), strict=True))
+    if hint in (int, float):
+        if isinstance(value, bool) or not isinstance(value, numbers.Integral if hint is int else numbers.Real):
+            return False
+        return not math.isnan(value)
+    return isinstance(value, hint) if isinstance(hint, type) else True
 
 
 def _mean(points: Tensor, weights: Tensor) -> Tensor:

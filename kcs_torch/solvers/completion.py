@@ -19,7 +19,7 @@ def complete_tracks(
 
     Starts from linear interpolation in time; nuclear-norm completion then makes what is filled consistent with
     how the joints move together elsewhere in the clip, where interpolation alone breaks the rank that a camera
-    factorisation builds on.
+    factorisation builds on. Frames without any seen joint stay interpolated between their completed neighbours.
 
     Args:
         tracks: (..., T, N, 2), finite.
@@ -44,4 +44,6 @@ def complete_tracks(
     top = singular_values(start)[..., 0]
     weights = [first * ratio**k * top for k in range(num_steps)]
     found = fpc(start, lambda x: x * kept - goal, step=1.0, weights=weights, steps_per_weight=1).value
-    return torch.where(seen[..., None], tracks, found.unflatten(-1, tracks.shape[-2:]) + mean)
+    found = torch.where(seen[..., None], tracks, found.unflatten(-1, tracks.shape[-2:]) + mean)
+    # The least nuclear norm puts a frame without any seen joint at the mean pose: a jump that no camera makes.
+    return interpolate(found, seen.any(-1, keepdim=True))
