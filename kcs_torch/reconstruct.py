@@ -90,16 +90,19 @@ def _automatic(tracks: Tracks, cameras: Any) -> Reconstruction:
     """
     if tracks.skeleton.template is None:
         return SfAM()(tracks, cameras)
-    by_template = KCS(arrangement="frames", bone_steps=20)(tracks, cameras)
-    if by_template.diagnostics.viewpoint_turn < ENOUGH_TURN / 2:
-        return by_template
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        low_rank = SfAM()(tracks, cameras)
-    if low_rank.diagnostics.viewpoint_turn < ENOUGH_TURN:
-        return by_template
-    if cameras is None and float(camera_disagreement(low_rank.cameras, by_template.cameras)) > TRUSTED:
-        return by_template
+    chosen, told = _aside(KCS(arrangement="frames", bone_steps=20), tracks, cameras)
+    if chosen.diagnostics.viewpoint_turn >= ENOUGH_TURN / 2:
+        low_rank, more = _aside(SfAM(), tracks, cameras)
+        turned = low_rank.diagnostics.viewpoint_turn >= ENOUGH_TURN
+        if turned and (cameras is not None or float(camera_disagreement(low_rank.cameras, chosen.cameras)) <= TRUSTED):
+            chosen, told = low_rank, more
     for warning in told:
         warnings.warn(warning.message, warning.category, stacklevel=3)
-    return low_rank
+    return chosen
+
+
+def _aside(method: Method, tracks: Tracks, cameras: Any) -> tuple[Reconstruction, list[warnings.WarningMessage]]:
+    """A method's result, and its warnings for the case that it is chosen."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        return method(tracks, cameras), told
