@@ -1,0 +1,386 @@
+"""What goes in and what comes out: every bad input is refused in words, and results change as they should."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+import yaml
+from samples import walk_result
+from torch.testing import assert_close
+
+from kcs_torch import OptionError, ShapeError, SkeletonError, Tracks
+from kcs_torch.errors import FormatError
+from kcs_torch.functional import bone_lengths
+from kcs_torch.skeleton import SKELETONS, Skeleton
+
+NAN, INF = math.nan, math.inf
+
+
+def grid(frames=4, joints=17, dtype=torch.float64):
+    """Tracks of different numbers everywhere."""
+    return torch.arange(frames * joints * 2, dtype=dtype).reshape(frames, joints, 2)
+
+
+def with_value(array, index, value):
+    array = array.clone()
+    array[index] = value
+    return array
+
+
+# ---------------------------------------------------------------------- Tracks: what is accepted
+
+
+@pytest.mark.parametrize("kind", [torch.Tensor.numpy, torch.Tensor.clone, torch.Tensor.tolist])
+def test_arrays_of_any_kind(kind):
+    points = kind(grid())
+    tracks = Tracks.from_arrays(points, skeleton="h36m17", fps=25, units="mm", source="walk.csv", notes=["hello"])
+    assert_close(tracks.points, grid())
+    assert (tracks.num_frames, tracks.num_joints, tracks.unseen_share) == (4, 17, 0.0)
+    assert tracks.seen.all() and torch.equal(tracks.weights, torch.ones(4, 17, dtype=torch.float64))
+    assert (tracks.fps, tracks.units, tracks.source, tracks.notes) == (25, "mm", "walk.csv", ("hello",))
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        (torch.float32, torch.float32),
+        (torch.float64, torch.float64),
+        (torch.float16, torch.float32),  # no factorisation takes half precision
+        (torch.bfloat16, torch.float32),
+        (torch.int64, torch.float64),
+    ],
+)
+def test_dtypes(given, kept):
+    tracks = Tracks.from_arrays(grid(dtype=given), torch.ones(4, 17, dtype=torch.float64))
+    assert (tracks.points.dtype, tracks.weights.dtype) == (kept, kept)
+    assert tracks.to(torch.float32).points.dtype == tracks.to(torch.float32).weights.dtype == torch.float32
+
+
+def test_arguments_are_left_alone():
+    points, confidence = with_value(grid(), (1, 2), NAN), torch.full((4, 17), 0.2, dtype=torch.float64)
+    confidence[0] = 1
+    before = points.clone(), confidence.clone()
+    Tracks.from_arrays(points, confidence)
+    assert_close(points, before[0], equal_nan=True, rtol=0, atol=0)
+    assert torch.equal(confidence, before[1])
+
+
+@pytest.mark.parametrize("half", [(1, 2), (1, 2, 0), (1, 2, 1)])
+def test_nan_in_either_coordinate_means_unseen(half):
+    tracks = Tracks.from_arrays(with_value(grid(), half, NAN))
+    assert tracks.weights[1, 2] == 0 and (tracks.points[1, 2] == 0).all()
+    assert int(tracks.seen.sum()) == 4 * 17 - 1
+    assert tracks.unseen_share == pytest.approx(1 / 68)
+
+
+def test_confidence_is_a_weight_above_the_threshold():
+    confidence = torch.linspace(0, 1, 17, dtype=torch.float64).expand(4, 17)
+    tracks = Tracks.from_arrays(grid(), confidence, threshold=0.5)
+    assert_close(tracks.weights, torch.where(confidence >= 0.5, confidence, torch.zeros_like(confidence)))
+    assert (tracks.points[:, :8] == 0).all()
+    assert_close(tracks.points[:, 8:], grid()[:, 8:])
+
+
+def test_confidence_zero_and_nan_are_the_same_as_nan_points():
+    hidden = torch.rand(4, 17, generator=torch.Generator().manual_seed(1)) < 0.4
+    by_points = Tracks.from_arrays(torch.where(hidden[..., None], NAN, grid()))
+    for nothing in (0.0, NAN):
+        by_weight = Tracks.from_arrays(grid(), torch.where(hidden, nothing, 1.0))
+        assert torch.equal(by_weight.points, by_points.points)
+        assert torch.equal(by_weight.weights, by_points.weights)
+
+
+@pytest.mark.parametrize("fps", [None, NAN, INF])
+def test_unknown_fps(fps):
+    assert Tracks.from_arrays(grid(), fps=fps).fps is None
+
+
+def test_frames_cuts_a_run():
+    part = Tracks.from_arrays(grid(), fps=5, skeleton="h36m17").frames(1, 3)
+    assert_close(part.points, grid()[1:3])
+    assert (part.num_frames, part.weights.shape, part.fps) == (2, (2, 17), 5)
+
+
+def test_virtual_joints_are_appended():
+    tracks = Tracks.from_arrays(with_value(grid(), (0, 5), NAN), skeleton="coco17")  # its left shoulder
+    body = tracks.skeleton
+    assert (body.num_observed, tracks.num_joints) == (17, body.num_joints)
+    for joint, sources in body.virtual:
+        assert_close(tracks.points[1:, joint], tracks.points[1:, list(sources)].mean(1))
+        assert (tracks.weights[0, joint] == 0) == (5 in sources)
+    assert tracks.unseen_share == pytest.approx(1 / 68)  # of the joints that were given
+
+
+def test_never_seen_joints_and_blank_frames_are_noted():
+    points = with_value(with_value(grid(12), (slice(None), 3), NAN), (slice(2, 12), slice(None)), NAN)
+    notes = " ".join(Tracks.from_arrays(points, skeleton="h36m17").notes)
+    assert f"never seen, so placed by the skeleton alone: {SKELETONS['h36m17'].joints[3]}" in notes
+    assert "10 frames without any seen joint (frame 2, 3, 4, 5, 6, 7, 8, 9, ...)" in notes
+
+
+# ---------------------------------------------------------------------- Tracks: which skeleton
+
+
+def test_skeleton_by_name_object_and_file(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text(yaml.safe_dump(SKELETONS["h36m17"].to_dict()), encoding="utf-8")
+    for given in ("h36m17", SKELETONS["h36m17"], file, str(file)):
+        assert Tracks.from_arrays(grid(), skeleton=given).skeleton == SKELETONS["h36m17"]
+
+
+def test_names_of_a_built_in_skeleton_select_it():
+    names = SKELETONS["coco17"].joints[:17]
+    assert Tracks.from_arrays(grid(), joint_names=names).skeleton is SKELETONS["coco17"]
+    assert Tracks.from_arrays(grid(), joint_names=names[::-1]).skeleton.name == "points"
+
+
+def test_points_without_any_skeleton():
+    body = Tracks.from_arrays(grid()).skeleton
+    assert (body.name, body.num_bones, body.num_joints) == ("points", 0, 17)
+
+
+def test_edges_that_are_a_tree():
+    tracks = Tracks.from_arrays(grid(joints=3), edges=[[0, 1], [1, 2]], joint_names=["a", "b", "c"], source="x/arm.npz")
+    assert tracks.skeleton.tree and tracks.skeleton.bone_names == ("a-b", "b-c")
+    assert (tracks.skeleton.name, tracks.notes) == ("arm", ())
+
+
+@pytest.mark.parametrize(
+    ("edges", "words"),
+    [([[0, 1], [1, 2], [2, 0]], "close a chain"), ([[0, 1]], "fall into 2 pieces"), ([], "fall into 3 pieces")],
+)
+def test_edges_that_are_no_tree_become_a_graph_and_are_noted(edges, words):
+    tracks = Tracks.from_arrays(grid(joints=3), edges=edges)
+    assert not tracks.skeleton.tree and tracks.skeleton.num_bones == len(edges)
+    assert words in tracks.notes[0]
+
+
+def test_edges_that_are_no_tree_yield_to_known_names():
+    names = SKELETONS["h36m17"].joints
+    tracks = Tracks.from_arrays(grid(), edges=[[0, 1]], joint_names=names, source="walk.npz")
+    assert tracks.skeleton is SKELETONS["h36m17"]
+    assert "not a tree" in tracks.notes[0] and "h36m17" in tracks.notes[0]
+
+
+# ---------------------------------------------------------------------- Tracks: what is refused
+
+
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        (grid()[0], "3 dimensions"),
+        (grid()[None], "3 dimensions"),
+        (torch.zeros(4, 17, 3), "(frames, joints, 2)"),
+        (torch.zeros(4, 2, 17), "(frames, joints, 2)"),
+        (torch.zeros(0, 17, 2), "at least 1 frame"),
+        (torch.zeros(4, 1, 2), "at least 2 joints"),
+        (torch.zeros(4, 0, 2), "at least 2 joints"),
+        ([[[1, 2], [3]]], "array of numbers"),
+        ("walk.npz", "array of numbers"),
+        ({}, "array of numbers"),
+        (None, "dimensions"),
+        (grid() * 1j, "real numbers"),
+        (grid().numpy() * 1j, "real numbers"),
+        (torch.full((4, 17, 2), NAN), "no joint is seen"),
+        (with_value(grid(), (2, 3, 1), INF), "frame 2, joint 'joint3' is infinite"),
+        (with_value(grid(), (0, 16, 0), -INF), "frame 0, joint 'joint16' is infinite"),
+    ],
+)
+def test_bad_points(points, words):
+    with pytest.raises(ShapeError, match="(?s)clip") as caught:
+        Tracks.from_arrays(points, source="clip")
+    assert words in str(caught.value)
+
+
+ONES = torch.ones(4, 17)
+
+
+@pytest.mark.parametrize(
+    ("confidence", "words"),
+    [
+        (ONES[:, :5], "confidence: expected shape (4, 17), got (4, 5)"),
+        (ONES[..., None], "2 dimensions"),
+        (with_value(ONES, (1, 2), -0.5), "frame 1, joint 'joint2' is negative"),
+        (with_value(ONES, (1, 2), INF), "frame 1, joint 'joint2' is infinite"),
+        (
+            with_value(ONES, (3, 0), 100.0),
+            "frame 3, joint 'joint0' is 100 at most; expected 0..1: divide by the largest",
+        ),
+        (ONES * 0.2, "no joint is seen in any frame (confidence threshold 0.3)"),
+        (ONES * NAN, "no joint is seen"),
+        ("high", "array of numbers"),
+    ],
+)
+def test_bad_confidence(confidence, words):
+    with pytest.raises(ShapeError) as caught:
+        Tracks.from_arrays(grid(), confidence, source="clip")
+    assert str(caught.value).startswith("clip") and words in str(caught.value)
+
+
+def test_confidence_of_what_is_nan_does_not_count():
+    with pytest.raises(ShapeError, match="no joint is seen"):
+        seen = torch.eye(4, 17)
+        Tracks.from_arrays(torch.where(seen[..., None] > 0, grid(), NAN), 1 - seen)
+
+
+@pytest.mark.parametrize("fps", [0, -25.0, -INF, "25", [25]])
+def test_bad_fps(fps):
+    with pytest.raises(ShapeError, match="fps: expected a positive number or None"):
+        Tracks.from_arrays(grid(), fps=fps)
+
+
+@pytest.mark.parametrize("threshold", [-0.1, 1.5, NAN, "low", None])
+def test_bad_threshold(threshold):
+    with pytest.raises(OptionError, match="threshold: expected a confidence within 0..1"):
+        Tracks.from_arrays(grid(), ONES, threshold=threshold)
+
+
+def test_joint_count_that_fits_another_skeleton_says_which():
+    with pytest.raises(SkeletonError) as caught:
+        Tracks.from_arrays(grid(), skeleton="body25", source="clip")
+    message = str(caught.value)
+    assert "clip: expected the 25 joints of skeleton 'body25', got 17; 17 joints fit" in message
+    assert all(name in message for name in ("h36m17", "coco17", "ap10k"))
+
+
+def test_joint_count_that_fits_none():
+    with pytest.raises(SkeletonError, match="got 3$"):
+        Tracks.from_arrays(grid(joints=3), skeleton="body25")
+
+
+def test_unknown_skeletons():
+    with pytest.raises(SkeletonError, match="unknown skeleton 'coco': did you mean 'coco1"):
+        Tracks.from_arrays(grid(), skeleton="coco")
+    with pytest.raises(SkeletonError, match="unknown skeleton 17"):
+        Tracks.from_arrays(grid(), skeleton=17)
+    with pytest.raises(FormatError, match="nowhere.yaml: cannot be read"):
+        Tracks.from_arrays(grid(), skeleton="nowhere.yaml")
+
+
+def test_bad_joint_names():
+    with pytest.raises(ShapeError, match="joint_names: expected 17 names, got 2"):
+        Tracks.from_arrays(grid(), joint_names=["a", "b"])
+    with pytest.raises(SkeletonError, match="given twice: a"):
+        Tracks.from_arrays(grid(joints=3), joint_names=["a", "a", "b"])
+
+
+@pytest.mark.parametrize(
+    ("edges", "error", "words"),
+    [
+        ([[0, 3]], SkeletonError, "expected joint indices 0..2"),
+        ([[-1, 2]], SkeletonError, "expected joint indices 0..2"),
+        ([[1, 1]], SkeletonError, "joins a joint to itself"),
+        ([[0, 1], [1, 0]], SkeletonError, "given twice"),
+        ([[0.5, 1]], SkeletonError, "pairs of joint indices"),
+        ([[NAN, 1]], SkeletonError, "pairs of joint indices"),
+        ([[0, 1, 2]], ShapeError, "shape (bones, 2)"),
+        ([0, 1], ShapeError, "shape (bones, 2)"),
+        ([["a", "b"]], ShapeError, "shape (bones, 2)"),
+        ([[0, 1], [2]], ShapeError, "rows of unequal length"),
+        ("0-1", ShapeError, "shape (bones, 2)"),
+    ],
+)
+def test_bad_edges(edges, error, words):
+    with pytest.raises(error) as caught:
+        Tracks.from_arrays(grid(joints=3), edges=edges, source="clip")
+    assert str(caught.value).startswith("clip: edges") and words in str(caught.value)
+
+
+# ---------------------------------------------------------------------- Reconstruction
+
+
+def test_mirrored_twice_is_itself_and_projects_equally():
+    result = walk_result()
+    other = result.mirrored()
+    assert_close(other.points[..., :2], result.points[..., :2], rtol=0, atol=0)
+    assert_close(other.points[..., 2], -result.points[..., 2], rtol=0, atol=0)
+    bones = result.skeleton.bone_index()
+    assert_close(bone_lengths(other.points, bones), bone_lengths(result.points, bones))
+    # its world is mirrored, too: seen by its cameras it is the mirrored pose
+    world = result.points @ full(result.cameras)
+    mirrored_world = other.points @ full(other.cameras)
+    assert_close(mirrored_world, world * torch.tensor([1.0, 1.0, -1.0]).double())
+    assert_close(mirrored_world @ other.cameras.mT, other.points[..., :2])
+    again = other.mirrored()
+    assert torch.equal(again.points, result.points) and torch.equal(again.cameras, result.cameras)
+    assert again.diagnostics == result.diagnostics
+
+
+def full(cameras):
+    return torch.cat([cameras, torch.linalg.cross(cameras[:, :1], cameras[:, 1:])], 1)
+
+
+def test_scaled_by_factor():
+    result = walk_result()
+    big = result.scaled(units="cm", factor=100.0)
+    assert (big.units, result.units) == ("cm", "m")
+    assert_close(big.points, 100 * result.points)
+    assert_close(big.lengths, 100 * result.lengths)
+    assert_close(big.uncertainty, 100 * result.uncertainty)
+    assert_close(big.scales[:, None, None] * big.points, result.scales[:, None, None] * result.points)
+    assert big.tracks is result.tracks and torch.equal(big.cameras, result.cameras)
+    assert walk_result(uncertain=False).scaled(units="cm", factor=2).uncertainty is None
+
+
+def test_scaled_by_a_bone():
+    result = walk_result()
+    name = "left_knee-left_ankle"
+    scaled = result.scaled(units="m", **{name: 0.43})
+    index = result.skeleton.bone_names.index(name)
+    assert scaled.lengths[index].item() == pytest.approx(0.43)
+    assert_close(scaled.points * (result.lengths[index] / 0.43), result.points)
+
+
+def test_scaled_by_height():
+    chain = Skeleton.from_names(
+        ["head_top", "hip", "left_ankle", "right_foot"],
+        [("hip", "head_top"), ("hip", "left_ankle"), ("hip", "right_foot")],
+    )
+    result = walk_result()
+    points = torch.tensor([[0.0, -3, 0], [0, 0, 0], [0, 2, 0], [0, 1, 0]]).double().expand(12, 4, 3)
+    tracks = Tracks.from_arrays(points[..., :2], skeleton=chain)
+    body = replace(result, points=points, lengths=torch.tensor([3.0, 2, 1]).double(), tracks=tracks)
+    tall = body.scaled(units="m", height=1.75)  # head to the farther foot: 5 units
+    assert_close(tall.points, points * 0.35)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "exactly one size"),
+        ({"factor": 2.0, "height": 1.7}, "exactly one size"),
+        ({"height": 1.7, "left_knee-left_ankle": 0.4}, "exactly one size"),
+        ({"factor": 0.0}, "positive factor"),
+        ({"factor": -1.0}, "positive factor"),
+        ({"factor": INF}, "positive factor"),
+        ({"factor": NAN}, "positive factor"),
+        ({"height": -1.75}, "positive factor"),
+        ({"width": 1.0}, "unknown size 'width': expected 'height' or a bone"),
+    ],
+)
+def test_scaled_refuses(options, words):
+    with pytest.raises(OptionError) as caught:
+        walk_result().scaled(units="m", **options)
+    assert words in str(caught.value)
+
+
+def test_scaled_by_what_is_not_there():
+    result = walk_result()
+    with pytest.raises(OptionError, match="is zero in this reconstruction"):
+        replace(result, lengths=0 * result.lengths).scaled(units="m", height=1.75)
+    arm = Skeleton.from_names(["a", "b"], [("a", "b")])
+    tracks = Tracks.from_arrays(grid(12, 2), skeleton=arm)
+    with pytest.raises(OptionError, match="height needs a head and a foot"):
+        replace(result, tracks=tracks, lengths=torch.ones(1)).scaled(units="m", height=1.75)
+
+
+def test_observed_leaves_the_virtual_joints_out():
+    result = walk_result()
+    assert result.observed.shape == (12, 17, 3) and result.points.shape == (12, 19, 3)
+    assert torch.equal(result.observed, result.points[:, :17])
+    assert (result.fps, result.skeleton.name) == (25.0, "coco17")
+
+
+def test_units_are_those_of_the_tracks():
+    assert replace(walk_result(), units="").units == "mm"
