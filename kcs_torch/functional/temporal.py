@@ -109,10 +109,15 @@ def best_path(cost: Tensor, transition: Tensor) -> Tensor:
 
 
 def _prefix_minima(steps: Tensor) -> Tensor:
-    """Min-plus products of the first 1, 2, ... of (T, S, S) matrices, by doubling."""
+    """Min-plus products of the first 1, 2, ... of (T, S, S) matrices, by doubling.
+
+    Runs of frames at a time, as one product needs S times the memory of its result.
+    """
+    run = max(1, 2**20 // max(1, steps.shape[-1] ** 3))
     span = 1
     while span < len(steps):
-        joined = (steps[:-span, :, :, None] + steps[span:, None, :, :]).amin(-2)
-        steps = torch.cat([steps[:span], joined])
+        pairs = zip(steps[:-span].split(run), steps[span:].split(run), strict=True)
+        joined = [(left[:, :, :, None] + right[:, None, :, :]).amin(-2) for left, right in pairs]
+        steps = torch.cat([steps[:span], *joined])
         span *= 2
     return steps

@@ -93,41 +93,43 @@ def _refine(
     moment = y.mT @ (x * unit)  # (C, T, 2, 3)
     gram = x.mT @ (x * unit)  # (C, T, 3, 3)
     power = (y.square() * unit).sum((-2, -1))
-    axes = _GENERATORS.to(tracks)
     eye = torch.eye(3, dtype=tracks.dtype, device=tracks.device)
     tiny = torch.finfo(tracks.dtype).tiny
 
-    def evaluate(r: Tensor) -> tuple[Tensor, Tensor]:
-        rows = r[..., :2, :]
-        match = (rows * moment).sum((-2, -1))
-        size = ((rows @ gram) * rows).sum((-2, -1))
+    def evaluate(r: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Cost and best scale (C, T); the body's spread G = R gram R^T and M = R moment^T, in the camera's axes."""
+        g, m = r @ gram @ r.mT, r @ moment.mT  # (C, T, 3, 3) and (C, T, 3, 2)
+        match, size = m[..., 0, 0] + m[..., 1, 1], g[..., 0, 0] + g[..., 1, 1]
         s = torch.minimum(torch.maximum(match / size.clamp_min(tiny), low), high)
-        return power - 2 * s * match + s * s * size, s
+        return power - 2 * s * match + s * s * size, s, g, m
 
-    cost, scales = evaluate(rotations)
+    cost, scales, g, m = evaluate(rotations)
     damping = torch.full_like(cost, 1e-3)
     for _ in range(num_steps):
-        rows = rotations[..., :2, :]
-        jacobian = (axes[:, :2] @ rotations[..., None, :, :]) * scales[..., None, None, None]  # (C, T, 3, 2, 3)
-        spread = jacobian @ gram[..., None, :, :]
-        normal = spread.flatten(-2) @ jacobian.flatten(-2).mT
-        flat = rows @ gram
+        # A turn w takes the rows r0, r1 to r0 + w_y r2 - w_z r1 and r1 + w_z r0 - w_x r2: the normal matrix and the
+        # gradient are sums of entries of G and of the misfit R (moment - scale rows gram)^T = M - scale G.
+        square = scales.square()
+        flat = square * (g[..., 0, 0] + g[..., 1, 1])
+        deep, zero = square * g[..., 2, 2], torch.zeros_like(square)
+        zx, zy = -square * g[..., 0, 2], -square * g[..., 1, 2]
+        normal = torch.stack([deep, zero, zx, zero, deep, zy, zx, zy, flat], -1).unflatten(-1, (3, 3))
+        misfit = m - scales[..., None, None] * g[..., :2]
+        target = torch.stack([-misfit[..., 2, 1], misfit[..., 2, 0], misfit[..., 0, 1] - misfit[..., 1, 0]], -1)
         # Where the scale is free it follows the turn: take its share out of the normal matrix (variable projection).
         # A frontal body that nods shrinks as one that recedes does: without this the two would creep along together.
-        cross = (jacobian * flat[..., None, :, :]).sum((-2, -1)) / (flat * rows).sum((-2, -1)).clamp_min(tiny).sqrt()[
-            ..., None
-        ]
-        cross = cross * ((scales > low) & (scales < high))[..., None]
+        free = ((scales > low) & (scales < high)) / flat.clamp_min(tiny).sqrt()
+        cross = torch.stack([zy, -zx, zero], -1) * free[..., None]
         normal = normal - cross[..., :, None] * cross[..., None, :]
-        misfit = moment - scales[..., None, None] * flat
-        target = (jacobian * misfit[..., None, :, :]).sum((-2, -1))
         ridge = (damping + 1e-9) * normal.diagonal(dim1=-2, dim2=-1).amax(-1) + tiny
-        move = torch.linalg.solve(normal + ridge[..., None, None] * eye, target)
+        move = torch.linalg.solve(normal + ridge[..., None, None] * eye, scales[..., None] * target)
         trial = roma.rotvec_to_rotmat(move) @ rotations
-        new, trial_scales = evaluate(trial)
+        new, *others = evaluate(trial)
         better = new < cost
-        rotations = torch.where(better[..., None, None], trial, rotations)
-        scales, cost = torch.where(better, trial_scales, scales), torch.where(better, new, cost)
+        pick = better[..., None, None]
+        rotations, g, m = (
+            torch.where(pick, n, o) for n, o in zip((trial, *others[1:]), (rotations, g, m), strict=True)
+        )
+        scales, cost = torch.where(better, others[0], scales), torch.where(better, new, cost)
         damping = torch.where(better, damping * 0.3, damping * 5)
     residual = torch.linalg.vector_norm(y - scales[..., None, None] * (x @ rotations[..., :2, :].mT), dim=-1)
     return rotations, scales, residual
@@ -138,10 +140,3 @@ def _headings(count: int, like: Tensor) -> Tensor:
     angle = torch.arange(count, dtype=like.dtype, device=like.device) * (2 * math.pi / count)
     axis = torch.tensor([0.0, 1.0, 0.0], dtype=like.dtype, device=like.device)
     return roma.rotvec_to_rotmat(angle[:, None] * axis)
-
-
-_GENERATORS = torch.tensor(
-    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]],
-    dtype=torch.float64,
-)
-"""Generators of rotations about x, y and z: exp(w) = I + sum_k w_k G_k + ..."""
