@@ -30,7 +30,7 @@ from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths, rows_to_cameras
 from kcs_torch.methods import SfAM
 from kcs_torch.nn import UnrolledFPC, UnrolledSfAM
-from kcs_torch.nn.unrolled import continuation, data_scale, estimate_lengths, shape_step, start_shape
+from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape
 
 BODIES = {"body": BODY, "chain": CHAIN, "ring": RING}
 each_body = pytest.mark.parametrize("body", BODIES.values(), ids=BODIES.keys())

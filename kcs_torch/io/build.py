@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from kcs_torch.errors import SkeletonError
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
@@ -55,12 +53,9 @@ def build_tracks(
         if names is None and skeleton is not None:
             own = get_skeleton(skeleton)
             names = own.joints[: own.num_observed]
-        if names is not None and len(names) == points.shape[1]:
-            order = _order(names, body, source, remarks)
-            if order is not None:
-                points = points[:, order]
-                confidence = None if confidence is None or confidence.ndim != 2 else confidence[:, order]
-        chosen, names, edges = body, None, None
+        if names is not None and len(names) != points.shape[1]:
+            names = None
+        chosen, edges = body, None
     tracks = Tracks.from_arrays(
         points,
         confidence,
@@ -74,22 +69,3 @@ def build_tracks(
         notes=remarks,
     )
     return replace(tracks, notes=tuple(dict.fromkeys(tracks.notes)))  # a result read again already has some
-
-
-def _order(names: Sequence[str], body: Skeleton, source: str, notes: list[str]) -> NDArray[np.int64] | None:
-    """Where each joint of ``body`` stands among ``names``; None: take the joints in their order."""
-    wanted = body.joints[: body.num_observed]
-    if tuple(names) == wanted:
-        return None
-    where = {n: i for i, n in enumerate(names)}
-    missing = [n for n in wanted if n not in where]
-    if not missing:
-        notes.append(f"joints matched by name with skeleton '{body.name}'; {len(names) - len(wanted)} left out")
-        return np.array([where[n] for n in wanted])
-    if len(names) == len(wanted):
-        notes.append(f"joints taken in their order as those of skeleton '{body.name}': their names differ")
-        return None
-    raise SkeletonError(
-        f"{source}: expected the {len(wanted)} joints of skeleton '{body.name}', got {len(names)} joints, none of them "
-        f"named {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''}; they are {', '.join(names)}"
-    )

@@ -18,7 +18,7 @@ from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.template import clip_scale, rigid_shape
 from kcs_torch.nn.energies import centred_residual
-from kcs_torch.nn.unrolled import continuation
+from kcs_torch.nn.steps import continuation
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.iterate import iterate, relative_change
 from kcs_torch.solvers.lm import fit_bones

@@ -12,125 +12,16 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.functional.camera import back_project, project
-from kcs_torch.functional.chain import bone_lengths, bone_vectors
-from kcs_torch.functional.spectral import spectral_norm, svt
-from kcs_torch.functional.temporal import interpolate
-from kcs_torch.nn.energies import centred_residual, check_weights
+from kcs_torch.nn.energies import check_weights
 from kcs_torch.nn.layers import full_precision, inverse_softplus
+from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution, iterate, relative_change
-from kcs_torch.solvers.lm import fit_bones
 
-__all__ = ["UnrolledFPC", "UnrolledSfAM", "continuation", "data_scale", "estimate_lengths", "shape_step"]
-
+__all__ = ["UnrolledFPC", "UnrolledSfAM"]
 
 SETTLED = 5e-3
 """A shape stands still where a step changes it by no more than this share."""
-
-
-def continuation(num_weights: int, mu: float = 0.5, final: float = 1e-5) -> list[float]:
-    """Weights that fall geometrically from ``mu`` to ``final``, shares of the data's largest singular value.
-
-    >>> [round(w, 3) for w in continuation(3, 1.0, 0.01)]
-    [1.0, 0.1, 0.01]
-    """
-    if num_weights < 1 or not 0 < final <= mu:
-        raise OptionError(
-            f"continuation: expected num_weights >= 1 and 0 < final <= mu, got {num_weights}, {final} and {mu}"
-        )
-    ratio = (final / mu) ** (1 / max(num_weights - 1, 1))
-    return [mu * ratio**k for k in range(num_weights)]
-
-
-def data_scale(tracks: Tensor, cameras: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Largest singular value of the back-projected, centred tracks as S# (T x 3N): the unit of the shrinkage, (...).
-
-    Args:
-        tracks: (..., T, N, 2).
-        cameras: (..., T, 2, 3).
-        weights: (..., T, N).
-    """
-    data = -centred_residual(torch.zeros_like(tracks), tracks, weights)
-    if weights is not None:
-        data = data * weights[..., None]
-    return spectral_norm(back_project(data, cameras).flatten(-2))
-
-
-def estimate_lengths(
-    shape: Tensor, bones: Tensor, weights: Tensor | None = None, *, graded: bool = False
-) -> tuple[Tensor, Tensor]:
-    """Return each bone's median length over time, and how rigid it is.
-
-    Args:
-        shape: (..., T, N, 3).
-        bones: (B, 2).
-        weights: (..., T, N); lengths are taken from frames in which both ends are seen, if there are any.
-        graded: True grades bones by how little their length varies beside the steadiest quarter of all bones, for
-            links that nobody has declared rigid; False trusts all.
-
-    Returns:
-        lengths (..., B) and rigidity (..., B) in [0, 1], a constant for autograd: among bones that all keep their
-        length, rounding alone grades them.
-    """
-    size = bone_lengths(shape, bones)
-    if weights is not None:
-        seen = torch.minimum(weights[..., bones[:, 0]], weights[..., bones[:, 1]]) > 0
-        seen = seen | ~seen.any(-2, keepdim=True)
-        lengths = torch.where(seen, size, torch.nan).nanmedian(-2).values
-    else:
-        lengths = size.median(-2).values
-    if not graded or size.shape[-1] == 0:
-        return lengths, torch.ones_like(lengths)
-    with torch.no_grad():
-        whole = torch.maximum(lengths, 1e-6 * size.amax(-2))  # a bone that has no length in most frames is not rigid
-        variation = (size - lengths[..., None, :]).abs().mean(-2) / torch.where(
-            whole > 0, whole, torch.ones_like(whole)
-        )
-        steady = variation.quantile(0.25, -1, keepdim=True)
-        ratio = variation / torch.where(steady > 0, steady, torch.ones_like(steady))
-        return lengths, 1 / (1 + ratio.square()).square()
-
-
-def shape_step(
-    shape: Tensor,
-    tracks: Tensor,
-    cameras: Tensor,
-    weights: Tensor | None,
-    threshold: Tensor,
-    step: Tensor | float,
-    *,
-    bones: Tensor | None = None,
-    lengths: Tensor | None = None,
-    stiffness: Tensor | None = None,
-) -> Tensor:
-    """One step of SfAM: S <- shrink(S - tau (R^T w (R S + t - W) + (S - A)), tau mu), A the bone-length step.
-
-    Args:
-        shape: S (..., T, N, 3) in the world frame.
-        tracks: W (..., T, N, 2).
-        cameras: R (..., T, 2, 3).
-        weights: w (..., T, N) or None.
-        threshold: mu (...), in the unit of S#'s singular values.
-        step: tau.
-        bones: (B, 2), or None for plain FPC without A.
-        lengths: (..., B) target lengths.
-        stiffness: (..., B), the paper's beta of each bone.
-
-    Returns:
-        (..., T, N, 3).
-
-    Kovalenko et al. 2019, Algorithm 1, lines 5-10. With points as rows ``S.flatten(-2)`` is the reshuffled S#.
-    """
-    residual = centred_residual(project(shape, cameras), tracks, weights)
-    gradient = back_project(residual if weights is None else residual * weights[..., None], cameras)
-    if bones is not None and lengths is not None and stiffness is not None:
-        # A bone of no length has no direction either: it stays, and no derivative piles up step by step.
-        directed = bone_vectors(shape.detach(), bones).any(-1).to(shape.dtype)
-        beta = stiffness[..., None, :] * directed
-        articulated = fit_bones(shape, lengths[..., None, :], bones, stiffness=beta, num_steps=1)
-        gradient = gradient + (shape - articulated)
-    return svt((shape - step * gradient).flatten(-2), step * threshold).unflatten(-1, shape.shape[-2:])
 
 
 class UnrolledFPC(nn.Module):
@@ -376,17 +267,3 @@ class UnrolledSfAM(UnrolledFPC):
             return self._run(
                 advance, start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype)
             )
-
-
-def start_shape(tracks: Tensor, cameras: Tensor, weights: Tensor | None) -> Tensor:
-    """The back-projected, centred tracks (..., T, N, 3).
-
-    Unseen joints are put at the centre of the seen ones, and frames that show fewer than two joints between their
-    neighbours: started at a single point they would stay there, or grow out of rounding.
-    """
-    centred = -centred_residual(torch.zeros_like(tracks), tracks, weights)
-    if weights is None:
-        return back_project(centred, cameras)
-    seen = weights > 0
-    shape = back_project(torch.where(seen[..., None], centred, torch.zeros_like(centred)), cameras)
-    return interpolate(shape, seen.sum(-1, keepdim=True) > 1)

@@ -33,6 +33,9 @@ def ist(motion: Tensor, *, weight: float = 1e-3, num_steps: int = 60) -> Tensor:
     Kovalenko et al. 2019, eq. 4-7; Dai, Li, He 2012; Beck, Teboulle 2009.
     """
     _check(motion, "ist")
+    unit = motion.abs().amax((-3, -2, -1), keepdim=True)  # first, so that no product overflows
+    unit = torch.where(unit > 0, unit, torch.ones_like(unit))
+    motion = motion / unit
     a, b = motion[..., 0, :], motion[..., 1, :]
     frames = motion.shape[-3]
 
@@ -64,7 +67,7 @@ def ist(motion: Tensor, *, weight: float = 1e-3, num_steps: int = 60) -> Tensor:
 
     f = iterate(step, (torch.zeros_like(first), torch.zeros_like(first)), num_steps=num_steps).value[0]
     value, vector = torch.linalg.eigh(f)
-    return vector[..., -3:] * value[..., None, -3:].clamp_min(0).sqrt()
+    return vector[..., -3:] * value[..., None, -3:].clamp_min(0).sqrt() / unit[..., 0]
 
 
 def metric_upgrade(

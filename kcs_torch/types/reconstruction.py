@@ -1,0 +1,171 @@
+"""What comes out: :class:`Reconstruction` with its :class:`Diagnostics`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import OptionError
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.types.tracks import Tracks
+
+__all__ = ["Diagnostics", "Reconstruction"]
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """What the tracks could tell, and how the iteration ended.
+
+    Attributes:
+        viewpoint_turn: degrees by which the camera turned about the body, largest angle between two frames.
+            Depth is weakly determined below about 30 degrees.
+        unseen_share: share of joints without a measurement.
+        bone_variation: median over rigid bones of the length's standard deviation over its mean, per cent.
+        reprojection_rms: root mean square of seen joints' reprojection error, in the tracks' units.
+        converged: whether the stopping rule was met.
+        iterations: how many steps were made.
+        seconds: wall-clock time of the method.
+        notes: sentences for the user.
+    """
+
+    viewpoint_turn: float
+    unseen_share: float
+    bone_variation: float
+    reprojection_rms: float
+    converged: bool
+    iterations: int
+    seconds: float = float("nan")
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """3D motion of one body, in the camera frame: x right, y down, z away from the camera.
+
+    The sign of depth cannot be told from parallel rays (:meth:`mirrored` gives the other one), nor can
+    the scale (:meth:`scaled`). Depth is relative to the body; x and y follow the image.
+
+    Attributes:
+        points: (T, N, 3) joint positions in ``units``.
+        cameras: (T, 2, 3) first two rows of each frame's world-to-camera rotation.
+        scales: (T,) weak-perspective scale of each frame; image = scale * points up to a shift.
+        lengths: (B,) bone lengths, in ``units``.
+        tracks: what it was made from.
+        method: the method's name.
+        diagnostics: see :class:`Diagnostics`.
+        uncertainty: (T, N) standard deviation of depth, or None where the method has none.
+        units: of the 3D.
+    """
+
+    points: Tensor
+    cameras: Tensor
+    scales: Tensor
+    lengths: Tensor
+    tracks: Tracks
+    method: str
+    diagnostics: Diagnostics
+    uncertainty: Tensor | None = None
+    units: str = field(default="")
+
+    def __post_init__(self) -> None:
+        if not self.units:
+            object.__setattr__(self, "units", self.tracks.units)
+
+    @property
+    def skeleton(self) -> Skeleton:
+        return self.tracks.skeleton
+
+    @property
+    def fps(self) -> float | None:
+        return self.tracks.fps
+
+    @property
+    def observed(self) -> Tensor:
+        """(T, num_observed, 3): the joints of the tracks as they were given, without the virtual ones."""
+        return self.points[:, : self.skeleton.num_observed]
+
+    def mirrored(self) -> Reconstruction:
+        """The other solution that parallel rays admit: depth with the opposite sign."""
+        flip = torch.tensor([1.0, 1.0, -1.0]).to(self.points)
+        return replace(self, points=self.points * flip, cameras=self.cameras * flip)
+
+    def scaled(self, *, units: str, factor: float | None = None, **sizes: float) -> Reconstruction:
+        """The same motion in another unit.
+
+        Args:
+            units: name of the new unit.
+            factor: new units per old unit; or instead one size by name:
+            **sizes: ``height=1.75`` (head to foot of the straightened body, along the bones) or
+                ``length=0.43, `` given as ``{"left_knee-left_ankle": 0.43}`` through ``**``.
+
+        Raises:
+            OptionError: not exactly one of ``factor`` and a size is given, or it is not positive.
+        """
+        if (factor is None) == (len(sizes) != 1):
+            raise OptionError("scaled: expected either factor=... or exactly one size, such as height=1.75")
+        if factor is None:
+            (name, size), *_ = sizes.items()
+            if name == "height":
+                own = self._height()
+            elif name in self.skeleton.bone_names:
+                own = float(self.lengths[self.skeleton.bone_names.index(name)])
+            else:
+                raise OptionError(
+                    f"scaled: unknown size {name!r}: expected 'height' or a bone, "
+                    f"one of {', '.join(self.skeleton.bone_names)}"
+                )
+            if not own > 0:
+                raise OptionError(f"scaled: {name} is zero in this reconstruction")
+            factor = size / own
+        if not (factor > 0 and np.isfinite(factor)):
+            raise OptionError(f"scaled: expected a positive factor, got {factor}")
+        spread = None if self.uncertainty is None else self.uncertainty * factor
+        return replace(
+            self,
+            points=self.points * factor,
+            scales=self.scales / factor,
+            lengths=self.lengths * factor,
+            uncertainty=spread,
+            units=units,
+        )
+
+    def save(self, path: str | Path) -> Path:
+        """Write to a file; its suffix chooses the format (.npz, .csv, .html, .png).
+
+        Raises:
+            OutputError: the suffix is unknown or the file cannot be written; nothing is left half-written.
+        """
+        from kcs_torch.io import save
+
+        return save(self, path)
+
+    def _height(self) -> float:
+        """Longest path through the bones: head to foot of the straightened body."""
+        neighbours: dict[int, list[tuple[int, float]]] = {i: [] for i in range(self.skeleton.num_joints)}
+        for (a, b), length in zip(self.skeleton.bones, self.lengths.tolist(), strict=True):
+            neighbours[a].append((b, length))
+            neighbours[b].append((a, length))
+        names = list(self.skeleton.joints)
+        tops = [i for i, n in enumerate(names) if "head" in n.lower() or "nose" in n.lower()]
+        feet = [i for i, n in enumerate(names) if any(w in n.lower() for w in ("ankle", "heel", "foot"))]
+        if not tops or not feet:
+            raise OptionError(
+                "scaled: height needs a head and a foot among the joints; "
+                f"skeleton '{self.skeleton.name}' has none: give a bone"
+            )
+        best = 0.0
+        for top in tops:
+            reach = {top: 0.0}
+            stack = [top]
+            while stack:
+                i = stack.pop()
+                for j, length in neighbours[i]:
+                    if j not in reach:
+                        reach[j] = reach[i] + length
+                        stack.append(j)
+            best = max([best, *(reach[f] for f in feet if f in reach)])
+        return best
