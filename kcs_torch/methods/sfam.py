@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
@@ -69,22 +70,21 @@ class SfAM(Method):
     overlap: int = 50
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self._expect(self.beta >= 0, "beta", "a number >= 0")
         self._expect(self.num_steps >= 1, "num_steps", "at least 1")
-        self._expect(self.mu > 0, "mu", "a positive number")
+        self._expect(0 < self.mu < math.inf, "mu", "a positive number")
         self._expect(0 < self.final <= self.mu, "final", f"a positive number up to mu = {self.mu}")
         self._expect(0 < self.tau < 1, "tau", "a number between 0 and 1")
         self._expect(0 <= self.momentum < 1, "momentum", "a share within [0, 1)")
         self._expect(0 <= self.articulate_from <= 1, "articulate_from", "a share within 0..1")
-        if isinstance(self.lengths, str):
-            self._expect(self.lengths in ("shape", "skeleton"), "lengths", "'shape', 'skeleton' or numbers")
-        else:
-            self._expect(min(self.lengths, default=0.0) > 0, "lengths", "positive numbers")
-        self._expect(self.rank == "auto" or (isinstance(self.rank, int) and self.rank >= 1), "rank", "'auto' or K >= 1")
-        self._expect(self.camera_path in ("auto", "free", "constant"), "camera_path", "'auto', 'free' or 'constant'")
+        if not isinstance(self.lengths, str):
+            positive = len(self.lengths) > 0 and all(0 < x < math.inf for x in self.lengths)
+            self._expect(positive, "lengths", "'shape', 'skeleton' or positive numbers")
+        self._expect(isinstance(self.rank, str) or self.rank >= 1, "rank", "'auto' or K >= 1")
         self._expect(self.trajectories is None or self.trajectories >= 1, "trajectories", "None or at least 1")
         self._expect(self.window is None or self.window >= 2, "window", "None or at least 2 frames")
-        self._expect(self.overlap >= 0, "overlap", "at least 0 frames")
+        self._expect(self.overlap >= 1, "overlap", "at least 1 frame, by which windows are joined")
         if self.window is not None and self.overlap >= self.window:
             raise OptionError(f"sfam: overlap: expected below the window of {self.window} frames, got {self.overlap}")
 
@@ -101,7 +101,10 @@ class SfAM(Method):
             basis = dct_basis(window, min(self.trajectories, window), dtype=filled.dtype, device=filled.device)
             filled = torch.einsum("tk,sk,wsnd->wtnd", basis, basis, filled)
             points = filled * (weights > 0)[..., None]
-        rows = cut(cameras) if cameras is not None else orthographic_cameras(filled, self.rank)
+        if cameras is not None:
+            rows = cut(cameras)
+        else:  # some windows at a time: the search tries several starts for each
+            rows = torch.cat([orthographic_cameras(part, self.rank) for part in filled.split(CHUNK)])
         solution = self.shape(points, rows, weights, tracks.skeleton)
         local = solution.value @ complete_rotation(rows).mT  # (W, T, N, 3) in each frame's camera
         flip = torch.ones(len(starts), 3, dtype=local.dtype, device=local.device)
@@ -128,11 +131,16 @@ class SfAM(Method):
             The shapes (W, T, N, 3) in the windows' world frames.
 
         Raises:
-            OptionError: ``lengths`` are not one per bone.
+            OptionError: ``lengths`` are not one per bone, or the skeleton knows none.
         """
         lengths = None
         if self.lengths == "skeleton":
             lengths = skeleton.relative_lengths(dtype=tracks.dtype, device=tracks.device)
+            if lengths is None:
+                raise OptionError(
+                    f"sfam: lengths: skeleton '{skeleton.name}' has neither proportions nor a template: "
+                    "expected 'shape' or one relative length per bone"
+                )
         elif not isinstance(self.lengths, str):
             lengths = torch.tensor(tuple(self.lengths), dtype=tracks.dtype, device=tracks.device)
             if len(lengths) != skeleton.num_bones:
@@ -165,20 +173,8 @@ class SfAM(Method):
         )
 
 
-def _fill_blank_frames(tracks: Tracks) -> Tracks:
-    """Tracks whose frames without any seen joint are seen halfway between their neighbours.
-
-    No term holds the shape of such a frame: the nuclear norm would shrink it.
-    """
-    blank = ~tracks.seen.any(-1, keepdim=True)
-    made = blank & tracks.seen.any(0)
-    filled = interpolate(tracks.points, tracks.seen)
-    return replace(
-        tracks,
-        points=torch.where(made[..., None], filled, tracks.points),
-        weights=torch.where(made, torch.ones_like(tracks.weights), tracks.weights),
-    )
-
+CHUNK = 32
+"""Windows whose cameras are searched together: more would only take memory."""
 
 EVEN = 0.05
 """A constant angular velocity explains the cameras where their median deviation is below this share of its turn."""
@@ -239,6 +235,21 @@ def orthographic_cameras(
     turn = turn[:, :, 1:] @ turn[:, :, :-1].mT
     uneven = torch.linalg.matrix_norm(turn.diff(dim=2)).mean(-1) if frames > 2 else torch.ones_like(defect)
     return candidates[(uneven * defect.sqrt()).argmin(0), window]
+
+
+def _fill_blank_frames(tracks: Tracks) -> Tracks:
+    """Fill frames without any seen joint between their neighbours, and count them as seen.
+
+    No term would hold the shape of such a frame, and the nuclear norm would shrink it.
+    """
+    blank = ~tracks.seen.any(-1, keepdim=True)
+    made = blank & tracks.seen.any(0)
+    filled = interpolate(tracks.points, tracks.seen)
+    return replace(
+        tracks,
+        points=torch.where(made[..., None], filled, tracks.points),
+        weights=torch.where(made, torch.ones_like(tracks.weights), tracks.weights),
+    )
 
 
 def _mirror_signs(parts: Tensor, starts: list[int]) -> Tensor:
