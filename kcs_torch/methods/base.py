@@ -93,10 +93,7 @@ class Method(ABC):
             known = tracks.seen.any(-1)
             middle = interpolate(_mean(tracks.points, tracks.weights), known[:, None])
             centred = (tracks.points - middle) * tracks.seen[..., None]
-            size = centred.abs().amax()
-            size = torch.where(size > 0, size, torch.ones_like(size))  # first, so that no square overflows
-            square = (centred / size).square() * tracks.weights[..., None]
-            size = size * (square.sum() / tracks.weights.sum()).sqrt()
+            size = _rms(centred, tracks.weights)
             size = torch.where(size > 0, size, torch.ones_like(size))
             found = self.solve(dataclasses.replace(tracks, points=centred / size), cameras)
             points = found.points * size
@@ -111,9 +108,8 @@ class Method(ABC):
         lengths = size.median(0).values
         rigid = list(body.rigid)
         mean = size.mean(0)
-        variation = size.std(0, unbiased=False) / torch.where(mean > 0, mean, torch.ones_like(mean))
-        error = (seen - tracks.points).square().sum(-1)
-        count = tracks.seen.sum()
+        ratio = torch.where(mean > 0, size / torch.where(mean > 0, mean, torch.ones_like(mean)), torch.ones_like(size))
+        variation = (ratio - 1).square().mean(0).sqrt()
         turn = float(viewpoint_turn(found.cameras))
         notes = list(found.notes)
         if turn < WEAK_TURN:
@@ -134,7 +130,7 @@ class Method(ABC):
             viewpoint_turn=turn,
             unseen_share=tracks.unseen_share,
             bone_variation=float(100 * variation[rigid].median()) if rigid else math.nan,
-            reprojection_rms=float((error * tracks.seen).sum().div(count).sqrt()),
+            reprojection_rms=float(_rms(seen - tracks.points, tracks.seen.to(points.dtype))),
             converged=found.converged,
             iterations=found.iterations,
             seconds=seconds,
@@ -199,3 +195,11 @@ def _is_a(value: Any, hint: Any) -> bool:
 def _mean(points: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean over joints, (T, 1, D); 0 in frames without a seen joint."""
     return centre(points, weights)[1]
+
+
+def _rms(vectors: Tensor, weights: Tensor) -> Tensor:
+    """Weighted root mean square length of (..., D) vectors, scaled first, so that no square overflows."""
+    top = torch.where(weights > 0, vectors.abs().amax(-1), torch.zeros_like(weights)).amax()
+    top = torch.where(top > 0, top, torch.ones_like(top))
+    square = (vectors / top).square().sum(-1) * weights
+    return top * (square.sum() / weights.sum()).sqrt()
