@@ -216,6 +216,10 @@ def orthographic_cameras(
     motion, _ = factorize(tracks - tracks.mean(-2, keepdim=True), 3 * ranks[-1])
     size = motion[..., 0].square().mean((-2, -1)).sqrt()
     motion = motion / torch.where(size > 0, size, torch.ones_like(size))[..., None, None, None]
+    # Eigenvectors come with either sign: fix it, so that starts, and the mirror found, depend on no order of joints.
+    flat = motion.flatten(-3, -2)
+    peak = flat.gather(-2, flat.abs().argmax(-2, keepdim=True))[..., None, :]
+    motion = motion * torch.where(peak < 0, -torch.ones_like(peak), torch.ones_like(peak))
     relaxed = ist(motion[..., : 3 * ranks[0]], num_steps=30)
     generator = torch.Generator().manual_seed(seed)
     window = torch.arange(windows, device=tracks.device)

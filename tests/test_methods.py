@@ -1,0 +1,426 @@
+"""What every method keeps to, on ordinary clips and at the edges: finite numbers, invariances, no side effects."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from kcs_torch import (
+    METHODS,
+    ConvergenceWarning,
+    KcsWarning,
+    OptionError,
+    ShapeError,
+    Skeleton,
+    Tracks,
+    reconstruct,
+)
+from kcs_torch.data import random_motion, walking_person
+from kcs_torch.functional import bone_lengths, viewpoint_turn
+
+NAN = math.nan
+NAMES = [*METHODS, "auto"]
+quiet = pytest.mark.filterwarnings("ignore::kcs_torch.errors.KcsWarning")
+
+CLIP = walking_person(12, turn=100.0)
+WALK = CLIP.tracks.points
+BODY = CLIP.tracks.skeleton
+
+
+def tracks_of(points, **options):
+    return Tracks.from_arrays(points, **({"skeleton": BODY} | options))
+
+
+def hidden(*index):
+    points = WALK.clone()
+    points[index] = NAN
+    return tracks_of(points)
+
+
+def half():
+    points = WALK.clone()
+    points[torch.rand(12, 17, generator=torch.Generator().manual_seed(0)) < 0.5] = NAN
+    return tracks_of(points)
+
+
+def one_place(joint, other):
+    points = WALK.clone()
+    points[:, joint] = points[:, other]
+    return tracks_of(points)
+
+
+ONE_POINT = torch.zeros(12, 17, dtype=torch.bool)
+ONE_POINT[3, 5] = True
+
+# The pelvis (0) and the left leg hang together as 0-4-5-6; 7 and 8 are the spine.
+CASES = {
+    "ordinary": lambda: CLIP.tracks,
+    "virtual joints": lambda: walking_person(12, skeleton="coco17").tracks,
+    "one frame": lambda: tracks_of(WALK[:1]),
+    "two frames": lambda: tracks_of(WALK[:2]),
+    "three frames": lambda: tracks_of(WALK[:3]),
+    "five frames": lambda: tracks_of(WALK[:5]),
+    "two joints": lambda: tracks_of(WALK[:, 4:6], skeleton=None, edges=[[0, 1]]),
+    "three joints": lambda: tracks_of(WALK[:, 4:7], skeleton=None, edges=[[0, 1], [1, 2]]),
+    "two joints, one frame": lambda: tracks_of(WALK[:1, 4:6], skeleton=None, edges=[[0, 1]]),
+    "static": lambda: tracks_of(WALK[:1].expand(12, 17, 2)),
+    "at one point": lambda: tracks_of(torch.full((12, 17, 2), 300.0).double()),
+    "at the origin": lambda: tracks_of(torch.zeros(12, 17, 2).double()),
+    "a joint never seen": lambda: hidden(slice(None), 5),
+    "a leaf never seen": lambda: hidden(slice(None), 6),
+    "a limb never seen": lambda: hidden(slice(None), [4, 5, 6]),
+    "one joint ever seen": lambda: hidden(slice(None), slice(1, 17)),
+    "a blank frame": lambda: hidden(4),
+    "blank frames": lambda: hidden([2, 3, 4, 9]),
+    "first frame blank": lambda: hidden(0),
+    "last frame blank": lambda: hidden(11),
+    "all frames but one blank": lambda: hidden([*range(5), *range(6, 12)]),
+    "half unseen": half,
+    "one point seen": lambda: tracks_of(torch.where(ONE_POINT[..., None], WALK, NAN)),
+    "zero-length bone": lambda: one_place(5, 4),
+    "no bones": lambda: tracks_of(WALK, skeleton=None),
+    "closed chain": lambda: tracks_of(WALK[:, :4], skeleton=None, edges=[[0, 1], [1, 2], [2, 3], [3, 0]]),
+    "separate pieces": lambda: tracks_of(WALK[:, :7], skeleton=None, edges=[[0, 1], [1, 2], [3, 4], [4, 5]]),
+    "no template": lambda: tracks_of(WALK, skeleton=replace(BODY, template=None)),
+    "single precision": lambda: tracks_of(WALK.float()),
+    "single precision, far off": lambda: tracks_of(WALK.float() + 3e4),
+    "very large": lambda: tracks_of(WALK.float() * 1e20),
+    "very small": lambda: tracks_of(WALK * 1e-200),
+}  # fmt: skip
+
+
+def image_of(result):
+    """Where the camera sees the result: (T, N, 2)."""
+    middle = result.points[..., :2].mean(1, keepdim=True)
+    return middle + result.scales[:, None, None] * (result.points[..., :2] - middle)
+
+
+def check(result, tracks):
+    """Check all that holds for every result."""
+    frames, joints, bones = tracks.num_frames, tracks.num_joints, tracks.skeleton.num_bones
+    fields = {
+        "points": (frames, joints, 3),
+        "cameras": (frames, 2, 3),
+        "scales": (frames,),
+        "lengths": (bones,),
+    }
+    for field, shape in fields.items():
+        value = getattr(result, field)
+        assert value.shape == shape, field
+        assert value.dtype == tracks.points.dtype, field
+        assert torch.isfinite(value).all(), field
+    assert result.tracks is tracks and result.units == tracks.units and result.method in METHODS
+    fine = 1e-9 if tracks.points.dtype == torch.float64 else 1e-5
+    eye = torch.eye(2).expand(frames, 2, 2).to(result.cameras)
+    assert_close(result.cameras @ result.cameras.mT, eye, rtol=0, atol=fine)
+    assert (result.scales > 0).all() and result.scales.mean().item() == pytest.approx(1, abs=fine)
+    told = result.diagnostics
+    size = bone_lengths(result.points, tracks.skeleton.bone_index())
+    assert_close(result.lengths, size.median(0).values)
+    assert told.viewpoint_turn == pytest.approx(float(viewpoint_turn(result.cameras)), abs=1e-6)
+    assert 0 <= told.viewpoint_turn <= 180
+    assert any("the viewpoint turned by" in n for n in told.notes) == (told.viewpoint_turn < 30)
+    assert told.unseen_share == tracks.unseen_share
+    if tracks.skeleton.rigid:
+        share = (size / torch.where(size > 0, size.mean(0), 1)).std(0, unbiased=False)
+        share = 100 * float(share[list(tracks.skeleton.rigid)].median())
+        assert told.bone_variation == pytest.approx(share, rel=1e-3, abs=1e-3 if fine > 1e-6 else 1e-9)
+    else:
+        assert math.isnan(told.bone_variation)
+    extent = tracks.points.abs().max().item() or 1.0
+    error = ((image_of(result) - tracks.points) / extent).norm(dim=-1)[tracks.seen].square().mean().sqrt()
+    assert told.reprojection_rms / extent == pytest.approx(float(error), rel=1e-3, abs=max(fine, 1e-7))
+    assert told.converged in (True, False) and told.iterations >= 1 and told.seconds > 0
+    assert told.converged != any("did not settle" in n for n in told.notes)
+
+
+@quiet
+@pytest.mark.parametrize("method", NAMES)
+@pytest.mark.parametrize("case", CASES)
+def test_every_case(case, method):
+    tracks = CASES[case]()
+    before = tracks.points.clone(), tracks.weights.clone()
+    result = reconstruct(tracks, method=method)
+    check(result, tracks)
+    assert torch.equal(tracks.points, before[0]) and torch.equal(tracks.weights, before[1])
+    assert method in ("auto", result.method)
+
+
+@quiet
+@pytest.mark.parametrize("method", NAMES)
+def test_known_cameras_hold_at_the_edges(method):
+    for tracks in (CLIP.tracks, hidden(0), hidden([2, 3]), half(), tracks_of(WALK.float())):
+        cameras = CLIP.cameras.to(tracks.points)
+        result = reconstruct(tracks, method=method, cameras=cameras.tolist())
+        check(result, tracks)
+        assert_close(result.cameras, cameras)
+
+
+# ---------------------------------------------------------------------- side effects
+
+
+@quiet
+@pytest.mark.parametrize("method", NAMES)
+def test_no_global_is_changed_and_numbers_repeat(method):
+    tracks = hidden([2, 3], [4, 5])
+    torch.manual_seed(5)
+    np.random.seed(5)  # noqa: NPY002
+    state = lambda: (  # noqa: E731
+        torch.get_num_threads(),
+        torch.get_default_dtype(),
+        torch.is_grad_enabled(),
+        torch.get_rng_state().tolist(),
+        np.random.get_state()[1].tolist(),  # noqa: NPY002
+        torch.get_default_device(),
+    )
+    before = state()
+    first = reconstruct(tracks, method=method)
+    assert state() == before
+    torch.manual_seed(6)
+    second = reconstruct(tracks, method=method)
+    for field in ("points", "cameras", "scales", "lengths"):
+        assert torch.equal(getattr(first, field), getattr(second, field)), field
+
+
+def test_gradients_are_neither_needed_nor_kept():
+    tracks = replace(CLIP.tracks, points=WALK.clone().requires_grad_())
+    for method in NAMES:
+        with torch.enable_grad():
+            assert not reconstruct(tracks, method=method).points.requires_grad
+        with torch.inference_mode():
+            check(reconstruct(CLIP.tracks, method=method), CLIP.tracks)
+
+
+# ---------------------------------------------------------------------- invariances
+
+
+def relative(a, b):
+    return float((a - b).abs().max() / b.std())
+
+
+@pytest.mark.parametrize("method", NAMES)
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_scaled_tracks_scale_the_result(method, factor):
+    plain = reconstruct(CLIP.tracks, method=method)
+    scaled = reconstruct(tracks_of(WALK * factor), method=method)
+    assert relative(scaled.points / factor, plain.points) < 1e-3
+    assert_close(scaled.cameras, plain.cameras, rtol=0, atol=1e-3)
+    assert_close(scaled.lengths, factor * plain.lengths, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("method", NAMES)
+def test_shifted_tracks_shift_the_result(method):
+    shift = torch.tensor([2000.0, -700.0, 0.0]).double()
+    plain = reconstruct(CLIP.tracks, method=method)
+    shifted = reconstruct(tracks_of(WALK + shift[:2]), method=method)
+    assert relative(shifted.points - shift, plain.points) < 1e-3
+    drift = torch.linspace(0, 900, 12)[:, None, None] * shift.double() / 2000  # another shift in each frame
+    moving = reconstruct(tracks_of(WALK + drift[..., :2]), method=method)
+    assert relative(moving.points - drift, plain.points) < 1e-3
+
+
+ORDER = torch.randperm(17, generator=torch.Generator().manual_seed(3)).tolist()
+
+
+def reordered(body):
+    """The same body with its joints in ORDER."""
+    where = {old: new for new, old in enumerate(ORDER)}
+    return replace(
+        body,
+        joints=tuple(body.joints[i] for i in ORDER),
+        bones=tuple((where[a], where[b]) for a, b in body.bones),
+        mirror=tuple((where[a], where[b]) for a, b in body.mirror),
+        template=tuple(body.template[i] for i in ORDER),
+    )
+
+
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("method", NAMES)
+def test_the_order_of_joints_does_not_matter(method, known):
+    clip = walking_person(60, turn=120.0, yaw=0.0)
+    cameras = clip.cameras if known else None
+    plain = reconstruct(clip.tracks, method=method, cameras=cameras)
+    other = reconstruct(
+        tracks_of(clip.tracks.points[:, ORDER], skeleton=reordered(BODY)), method=method, cameras=cameras
+    )
+    assert other.method == plain.method
+    assert relative(other.points, plain.points[:, ORDER]) < 1e-3
+
+
+@quiet
+@pytest.mark.parametrize("method", NAMES)
+def test_confidence_zero_is_the_same_as_nan(method):
+    gone = torch.rand(12, 17, generator=torch.Generator().manual_seed(2)) < 0.3
+    by_nan = reconstruct(torch.where(gone[..., None], NAN, WALK), method=method, skeleton=BODY)
+    spoiled = torch.where(gone[..., None], WALK + 1e4, WALK)
+    by_zero = reconstruct(spoiled, method=method, skeleton=BODY, confidence=(~gone).double())
+    assert torch.equal(by_nan.points, by_zero.points)
+    assert torch.equal(by_nan.cameras, by_zero.cameras)
+
+
+@quiet
+@pytest.mark.parametrize("method", METHODS)
+def test_weights_are_soft(method):
+    """The image follows a wrong joint the more, the more it is trusted."""
+    spoiled = WALK.clone()
+    spoiled[:, 16] += 400.0
+    away = []
+    for trust in (0.0, 0.35, 1.0):
+        confidence = torch.ones(12, 17, dtype=torch.float64)
+        confidence[:, 16] = trust
+        found = reconstruct(spoiled, method=method, skeleton=BODY, confidence=confidence, cameras=CLIP.cameras)
+        away.append(float((image_of(found)[:, 16] - spoiled[:, 16]).norm(dim=-1).mean()))
+    assert away[0] > 300 and away[0] > away[1] > away[2]
+
+
+# ---------------------------------------------------------------------- unseen joints and frames
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_blank_frames_lie_between_their_neighbours(method):
+    clip = random_motion("h36m17", 60, turn=120.0, generator=torch.Generator().manual_seed(0))
+    points = clip.tracks.points.clone()
+    points[25:35] = NAN
+    plain, gap = (reconstruct(tracks_of(p), method=method).points for p in (clip.tracks.points, points))
+    size = (gap - gap.mean(1, keepdim=True)).norm(dim=(1, 2))
+    assert size[25:35].min() > 0.85 * size.median()  # the body does not shrink
+    step = (gap[1:] - gap[:-1]).norm(dim=-1).mean(-1)
+    assert step.max() < 3 * (plain[1:] - plain[:-1]).norm(dim=-1).mean(-1).max()  # nor does it jump
+
+
+@pytest.mark.parametrize("method", NAMES)
+def test_a_joint_never_seen_is_placed_and_told_of(method):
+    tracks = hidden(slice(None), 6)  # the left ankle
+    with pytest.warns(KcsWarning, match=f"never seen.*{BODY.joints[6]}") as told:
+        result = reconstruct(tracks, method=method)
+    assert sum("never seen" in str(w.message) for w in told) == 1
+    left = BODY.bone_names.index(f"{BODY.joints[5]}-{BODY.joints[6]}")
+    right = BODY.bone_names.index(f"{BODY.joints[2]}-{BODY.joints[3]}")
+    assert result.lengths[left] / result.lengths[right] == pytest.approx(1, abs=0.35)
+    # below the knee, as the template has it
+    assert (result.points[:, 6, 1] > result.points[:, 5, 1]).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_half_of_the_joints_suffice(method):
+    clip = walking_person(80, turn=180.0, yaw=0.0, generator=torch.Generator().manual_seed(1))
+    gone = torch.rand(80, 17, generator=torch.Generator().manual_seed(4)) < 0.5
+    tracks = tracks_of(torch.where(gone[..., None], NAN, clip.tracks.points))
+    found = reconstruct(tracks, method=method, cameras=clip.cameras).points
+    centre = lambda x: x - x.mean(1, keepdim=True)  # noqa: E731
+    error = (centre(found) - centre(clip.points)).norm(dim=-1).mean()
+    flat = centre(clip.points)[..., 2].abs().mean()
+    assert error < 0.7 * flat
+
+
+# ---------------------------------------------------------------------- warnings and errors
+
+
+@pytest.mark.parametrize(
+    ("method", "fields"),
+    [("kcs", {"num_weights": 1, "steps_per_weight": 1, "rounds": 2, "tolerance": 0.0}), ("sfam", {"num_steps": 2})],
+)
+def test_not_converging_is_a_result_and_one_warning(method, fields):
+    with pytest.warns(ConvergenceWarning, match="did not settle within") as told:
+        result = reconstruct(CLIP.tracks, method=method, **fields)
+    assert len(told) == 1
+    assert not result.diagnostics.converged
+    assert any("did not settle" in n for n in result.diagnostics.notes)
+    check(result, CLIP.tracks)
+
+
+@pytest.mark.parametrize("method", NAMES)
+@pytest.mark.parametrize(
+    ("cameras", "words"),
+    [
+        (torch.eye(3)[:2], "3 dimensions"),
+        (torch.eye(3).expand(12, 3, 3), "expected finite (12, 2, 3), got (12, 3, 3)"),
+        (torch.eye(3)[:2].expand(11, 2, 3), "expected finite (12, 2, 3), got (11, 2, 3)"),
+        (torch.eye(3)[:2].expand(12, 2, 3) * NAN, "finite"),
+        (torch.eye(3)[:2].expand(12, 2, 3) * 2, "not orthonormal in frame 0"),
+        (torch.zeros(12, 2, 3), "not orthonormal"),
+        ("turning", "array of numbers"),
+        ([[[1, 0, 0], [0, 1]]], "array of numbers"),
+    ],
+)
+def test_bad_cameras(method, cameras, words):
+    with pytest.raises(ShapeError) as caught:
+        reconstruct(CLIP.tracks, method=method, cameras=cameras)
+    assert str(caught.value).startswith("cameras") and words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("method", "field", "value"),
+    [
+        ("kcs", "rounds", 0),
+        ("kcs", "rounds", 2.5),
+        ("kcs", "rounds", "three"),
+        ("kcs", "rounds", True),
+        ("kcs", "rounds", None),
+        ("kcs", "tolerance", -1.0),
+        ("kcs", "tolerance", NAN),
+        ("kcs", "mu", 0.0),
+        ("kcs", "mu", NAN),
+        ("kcs", "mu", math.inf),
+        ("kcs", "rho", 1.0),
+        ("kcs", "rho", 0),
+        ("kcs", "num_weights", 0),
+        ("kcs", "steps_per_weight", 0),
+        ("kcs", "scale_range", 0.9),
+        ("kcs", "robust", 0.0),
+        ("kcs", "continuity", -1),
+        ("kcs", "bone_steps", -1),
+        ("kcs", "arrangement", "columns"),
+        ("kcs", "arrangement", 3),
+        ("kcs", "links", "left_wrist"),
+        ("kcs", "links", [("left_wrist",)]),
+        ("kcs", "template", "human"),
+        ("sfam", "beta", -0.1),
+        ("sfam", "beta", "stiff"),
+        ("sfam", "num_steps", 0),
+        ("sfam", "num_steps", 10.5),
+        ("sfam", "mu", math.inf),
+        ("sfam", "final", 0.0),
+        ("sfam", "final", 0.6),
+        ("sfam", "tau", 1.0),
+        ("sfam", "momentum", 1.0),
+        ("sfam", "articulate_from", 1.1),
+        ("sfam", "lengths", "template"),
+        ("sfam", "lengths", 3.0),
+        ("sfam", "lengths", ()),
+        ("sfam", "lengths", [1.0, -1.0]),
+        ("sfam", "lengths", [1.0, math.inf]),
+        ("sfam", "lengths", ["a"]),
+        ("sfam", "rank", 0),
+        ("sfam", "rank", 1.5),
+        ("sfam", "rank", "all"),
+        ("sfam", "camera_path", "wild"),
+        ("sfam", "trajectories", 0),
+        ("sfam", "trajectories", 2.5),
+        ("sfam", "window", 1),
+        ("sfam", "window", 20.5),
+        ("sfam", "overlap", 0),
+        ("sfam", "overlap", 200),
+    ],
+)
+def test_fields_out_of_range(method, field, value):
+    with pytest.raises(OptionError, match=f"{method}: {field}: expected"):
+        METHODS[method](**{field: value})
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_methods_are_values(method):
+    kind = METHODS[method]
+    assert kind() == kind() and hash(kind()) == hash(kind()) and kind.name == method
+    assert kind.from_options() == kind()
+    with pytest.raises(OptionError, match="unknown option of method"):
+        kind.from_options(nothing=1)
+
+
+def test_skeleton_without_template_or_bones_still_names_itself():
+    body = Skeleton.from_edges([], 17, name="dots", tree=False)
+    result = reconstruct(tracks_of(WALK, skeleton=body), method="kcs")
+    assert any("'dots' has no template" in n for n in result.diagnostics.notes)
