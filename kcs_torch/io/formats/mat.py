@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,9 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.build import build_tracks
-from kcs_torch.io.registry import Options, Probe, Reader, need
+from kcs_torch.io.hdf5 import read_hdf5
+from kcs_torch.io.matlab import read_matlab
+from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.types import Tracks
 
 __all__ = ["READERS"]
@@ -31,7 +31,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
     """Read the one body's tracks."""
     notes: list[str] = []
     hdf5 = b"\x89HDF" in Probe(path).head[:520]  # version 7.3, after its own header of 512 bytes
-    shapes, values = (_read_hdf5 if hdf5 else _read_matlab)(path)
+    shapes, values = (read_hdf5 if hdf5 else read_matlab)(path, _WANTED, LIMIT)
     found = ", ".join(f"{k} {v}" for k, v in sorted(shapes.items())) or "nothing"
     if "W" in values:
         points = _unfold(_real(values["W"], "W", path), path, found, notes)
@@ -91,40 +91,6 @@ def _real(value: Any, name: str, path: Path) -> NDArray[np.float64]:
     if array.dtype.kind not in "fiub":
         raise FormatError(f"{path}: '{name}': expected real numbers, got {array.dtype}")
     return array.astype(np.float64)
-
-
-def _read_matlab(path: Path) -> tuple[Mapping[str, tuple[int, ...]], Mapping[str, Any]]:
-    """Shapes of all variables, and those that matter, of a file up to version 7."""
-    io = need("scipy.io", str(path), FormatError)
-    try:
-        shapes = {name: tuple(shape) for name, shape, _ in io.whosmat(str(path))}
-        _check(shapes, path)
-        return shapes, io.loadmat(str(path), variable_names=[k for k in _WANTED if k in shapes])
-    except FormatError:
-        raise
-    except Exception as error:  # scipy raises many kinds on damaged files
-        raise FormatError(f"{path}: expected a MATLAB .mat file, got a damaged or truncated one: {error}") from None
-
-
-def _read_hdf5(path: Path) -> tuple[Mapping[str, tuple[int, ...]], Mapping[str, Any]]:
-    """As :func:`_read_matlab`, of version 7.3, which is HDF5 with its dimensions reversed."""
-    h5py = need("h5py", f"{path}: MATLAB 7.3", FormatError)
-    try:
-        with h5py.File(path, "r") as file:
-            shapes = {k: tuple(v.shape[::-1]) for k, v in file.items() if isinstance(v, h5py.Dataset)}
-            _check(shapes, path)
-            return shapes, {k: np.asarray(file[k]).T for k in _WANTED if k in shapes}
-    except FormatError:
-        raise
-    except Exception as error:  # h5py raises many kinds on damaged files
-        raise FormatError(f"{path}: expected a MATLAB 7.3 .mat file, got a damaged or truncated one: {error}") from None
-
-
-def _check(shapes: Mapping[str, tuple[int, ...]], path: Path) -> None:
-    """Refuse what a damaged header claims before room is made for it."""
-    for name in _WANTED:
-        if math.prod(shapes.get(name, ())) > LIMIT:
-            raise FormatError(f"{path}: '{name}': {shapes[name]} are more numbers than a file of tracks holds")
 
 
 READERS = (Reader("mat", "MATLAB .mat of the NRSfM benchmarks: W (2T, N), or points2d (T, N, 2)", recognises, read),)
