@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional.align import centre, procrustes
 from kcs_torch.functional.camera import back_project, complete_rotation, project
 from kcs_torch.functional.chain import bone_lengths, chain_inverse, incidence
 from kcs_torch.functional.spectral import singular_values, svt
@@ -93,8 +94,7 @@ class KCS(Method):
         bones = body.bone_index(device=tracks.points.device)
         matrix = incidence(bones, body.num_joints, dtype=tracks.points.dtype)
         inverse = chain_inverse(matrix)
-        rest, notes = self._template(tracks)
-        rest = rest - rest.mean(0)
+        rest, notes = self._template(tracks, cameras)
         scale = clip_scale(tracks, rest)
         low, high = scale / self.scale_range, scale * self.scale_range
         if math.isinf(self.scale_range):
@@ -124,20 +124,26 @@ class KCS(Method):
         points = points - points.mean(-2, keepdim=True)
         return Estimate(points, rotations[:, :2], scales / size, converged, made, notes)
 
-    def _template(self, tracks: Tracks) -> tuple[Tensor, tuple[str, ...]]:
+    def _template(self, tracks: Tracks, cameras: Tensor | None) -> tuple[Tensor, tuple[str, ...]]:
+        """The rest pose (N, 3), centred; turned into the world of the cameras where they are known."""
         like = tracks.points
         joints = tracks.num_joints
+        rest = None
         if self.template is not None:
             rest = as_floats(self.template, "kcs: template", 2).to(like)
             if rest.shape != (joints, 3) or not torch.isfinite(rest).all():
                 raise ShapeError(
                     f"kcs: template: expected {joints} finite positions (x, y, z), got shape {tuple(rest.shape)}"
                 )
-            return rest, ()
-        if tracks.skeleton.template is not None:
-            return tracks.skeleton.template_points(dtype=like.dtype, device=like.device), ()
-        note = f"skeleton '{tracks.skeleton.name}' has no template: the tracks' best rigid shape serves"
-        return rigid_shape(tracks), (note,)
+        elif tracks.skeleton.template is not None:
+            rest = tracks.skeleton.template_points(dtype=like.dtype, device=like.device)
+        if rest is None:
+            note = f"skeleton '{tracks.skeleton.name}' has no template: the tracks' best rigid shape serves"
+            return centre(rigid_shape(tracks, cameras))[0], (note,)
+        rest, _ = centre(rest)
+        if cameras is not None:
+            rest = rest @ procrustes(rest, centre(rigid_shape(tracks, cameras))[0])[0]
+        return rest, ()
 
     def _cameras(
         self, tracks: Tracks, shape: Tensor, low: Tensor, high: Tensor, last: Tensor | None, known: Tensor | None

@@ -7,10 +7,10 @@ import itertools
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.camera import back_project, factorize, rows_to_cameras
+from kcs_torch.functional.camera import back_project
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.solvers.ist import ist, metric_upgrade
+from kcs_torch.methods.cameras import orthographic_cameras
 from kcs_torch.types import Tracks
 
 __all__ = ["clip_scale", "rigid_shape"]
@@ -58,20 +58,19 @@ def clip_scale(tracks: Tracks, rest: Tensor, *, span: int = 60, quantile: float 
     return votes[left] * (1 - share) + votes[right] * share
 
 
-def rigid_shape(tracks: Tracks) -> Tensor:
-    """The one rigid shape (N, 3) that best explains the tracks (Tomasi, Kanade 1992): a template for want of any.
+def rigid_shape(tracks: Tracks, cameras: Tensor | None = None) -> Tensor:
+    """The one rigid shape that best explains the tracks: a template for want of any.
 
-    Where the viewpoint does not turn its depth is nearly zero.
+    Args:
+        tracks: the tracks.
+        cameras: (T, 2, 3) where they are known; else those of :func:`orthographic_cameras`.
+
+    Returns:
+        (N, 3), in the world frame of the cameras. Where the viewpoint does not turn its depth is nearly zero.
     """
     filled = interpolate(tracks.points, tracks.seen)
     filled = filled - filled.mean(-2, keepdim=True)
-    frames, joints = filled.shape[:2]
-    if min(2 * frames, joints) < 3:
-        return torch.nn.functional.pad(filled.mean(0), (0, 1))
-    motion, _ = factorize(filled, 3)
-    size = motion[..., 0].square().mean().sqrt()
-    motion = motion / torch.where(size > 0, size, torch.ones_like(size))
-    q, _ = metric_upgrade(motion, ist(motion))
-    cameras, _ = rows_to_cameras(motion @ q)
+    if cameras is None:
+        cameras = orthographic_cameras(filled[None])[0]
     normal = (cameras.mT @ cameras).mean(0) + 1e-3 * torch.eye(3, dtype=filled.dtype, device=filled.device)
     return torch.linalg.solve(normal, back_project(filled, cameras).mean(0).mT).mT

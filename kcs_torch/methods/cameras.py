@@ -1,0 +1,74 @@
+"""Orthographic cameras from the tracks alone: factorisation and metric upgrade."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.camera import complete_rotation, factorize, rows_to_cameras
+from kcs_torch.solvers.ist import ist, metric_upgrade
+
+__all__ = ["orthographic_cameras"]
+
+
+def orthographic_cameras(
+    tracks: Tensor,
+    rank: int | Literal["auto"] = "auto",
+    *,
+    num_starts: int = 7,
+    smoothness: float = 0.1,
+    seed: int = 0,
+) -> Tensor:
+    """Estimate orthographic cameras by rank-3K factorisation and metric upgrade.
+
+    Many subspaces have nearly orthonormal rows; the wrong ones make the camera jump. So for every K the upgrade
+    runs from the convex relaxation (:func:`ist`) and some random starts, with a weak pull to smooth rows; the two best
+    are refined, and of all candidates the one with the least product of both faults wins: the rows' root mean square
+    defect, and the unevenness of the camera's motion.
+
+    Args:
+        tracks: (W, T, N, 2), complete.
+        rank: K, or "auto" to try 2..5 (1 where there are too few joints or frames for more).
+        num_starts: random starts beside the relaxation's.
+        smoothness: weight of the rows' second differences.
+        seed: of the random starts.
+
+    Returns:
+        (W, T, 2, 3) orthonormal rows; each window has a world frame and a mirror of its own. Windows too short or with
+        too few joints to tell (2T < 3 or N < 4) get the identity.
+
+    Kovalenko et al. 2019, section 3.2.
+    """
+    windows, frames, joints, _ = tracks.shape
+    most = min(2 * frames, joints - 1) // 3  # the largest K that the factorisation can hold
+    if most < 1:
+        return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(windows, frames, 2, 3)
+    ranks = range(min(2, most), min(5, most) + 1) if rank == "auto" else [min(rank, most)]
+    motion, _ = factorize(tracks - tracks.mean(-2, keepdim=True), 3 * ranks[-1])
+    size = motion[..., 0].square().mean((-2, -1)).sqrt()
+    motion = motion / torch.where(size > 0, size, torch.ones_like(size))[..., None, None, None]
+    # Eigenvectors come with either sign: fix it, so that starts, and the mirror found, depend on no order of joints.
+    flat = motion.flatten(-3, -2)
+    peak = flat.gather(-2, flat.abs().argmax(-2, keepdim=True))[..., None, :]
+    motion = motion * torch.where(peak < 0, -torch.ones_like(peak), torch.ones_like(peak))
+    relaxed = ist(motion[..., : 3 * ranks[0]], num_steps=30)
+    generator = torch.Generator().manual_seed(seed)
+    window = torch.arange(windows, device=tracks.device)
+    cameras, defects = [], []
+    for k in ranks:
+        part = motion[..., : 3 * k]
+        random = torch.randn(num_starts, 1, 3 * k, 3, generator=generator, dtype=torch.float64).to(motion)
+        starts = torch.nn.functional.pad(relaxed, (0, 0, 0, 3 * k - relaxed.shape[-2]))
+        starts = torch.cat([starts[None], random.expand(-1, windows, -1, -1)])
+        q, defect = metric_upgrade(part, starts, smoothness=smoothness, tolerance=0, num_steps=12)
+        best = defect.topk(min(2, len(defect)), dim=0, largest=False).indices
+        q, defect = metric_upgrade(part, q[best, window], smoothness=smoothness, tolerance=1e-2, num_steps=60)
+        cameras.append(rows_to_cameras(part @ q[:, :, None])[0])
+        defects.append(defect)
+    candidates, defect = torch.cat(cameras), torch.cat(defects)  # (C, W, T, 2, 3), (C, W)
+    turn = complete_rotation(candidates)
+    turn = turn[:, :, 1:] @ turn[:, :, :-1].mT
+    uneven = torch.linalg.matrix_norm(turn.diff(dim=2)).mean(-1) if frames > 2 else torch.ones_like(defect)
+    return candidates[(uneven * defect.sqrt()).argmin(0), window]
