@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import torch
@@ -14,7 +14,7 @@ from kcs_torch.errors import OptionError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.spectral import dct_basis
-from kcs_torch.functional.temporal import blend_windows, window_starts
+from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.cameras import orthographic_cameras
 from kcs_torch.methods.unseen import place_unseen
