@@ -98,6 +98,7 @@ def metric_upgrade(
     a, b = motion[..., 0, :], motion[..., 1, :]
     frames, rank = motion.shape[-3], motion.shape[-1]
     gram = (a.mT @ a + b.mT @ b) / (2 * frames)  # mean squared row length is tr(Q^T gram Q)
+    forms = _quadratic_forms(a, b) / frames**0.5  # (..., M, R, R): residuals are <form, Q Q^T>
     bend = motion.diff(n=2, dim=-3).flatten(-3, -2) if smoothness > 0 and frames > 2 else motion[..., :0, 0, :]
     bending = smoothness / frames * (bend.mT @ bend)  # (..., R, R)
     eye = torch.eye(3 * rank, dtype=motion.dtype, device=motion.device)
@@ -109,21 +110,16 @@ def metric_upgrade(
         size = (q * (gram @ q)).sum((-2, -1))
         return q / torch.where(size > 0, size, torch.ones_like(size)).sqrt()[..., None, None]
 
-    def defect(q: Tensor) -> Tensor:
-        return orthonormality_defect(motion @ q[..., None, :, :]).mean(-1)
-
-    def total(q: Tensor) -> Tensor:
-        return defect(q) + (q * (bending @ q)).sum((-2, -1))
+    def evaluate(q: Tensor) -> tuple[Tensor, Tensor]:
+        """Residuals (..., M) of the defect, and the cost (...)."""
+        residual = torch.einsum("...mij,...ij->...m", forms, q @ q.mT)
+        return residual, residual.square().sum(-1) + (q * (bending @ q)).sum((-2, -1))
 
     def step(state: tuple[Tensor, ...], _: int) -> tuple[Tensor, ...]:
-        q, cost, damping, progress = state
-        aq, bq = a @ q, b @ q
-        residual = torch.cat([(aq.square().sum(-1) - bq.square().sum(-1)) / 2, (aq * bq).sum(-1)], -1)
-        first = a[..., :, None] * aq[..., None, :] - b[..., :, None] * bq[..., None, :]
-        second = a[..., :, None] * bq[..., None, :] + b[..., :, None] * aq[..., None, :]
-        jacobian = torch.cat([first, second], -3).flatten(-2)
-        normal = jacobian.mT @ jacobian / frames + stiff
-        gradient = (jacobian.mT @ residual[..., None]).squeeze(-1) / frames + (bending @ q).flatten(-2)
+        q, residual, cost, damping, progress = state
+        jacobian = 2 * torch.einsum("...mij,...jk->...mik", forms, q).flatten(-2)
+        normal = jacobian.mT @ jacobian + stiff
+        gradient = (jacobian.mT @ residual[..., None]).squeeze(-1) + (bending @ q).flatten(-2)
         size = normal.diagonal(dim1=-2, dim2=-1).mean(-1)
         # The residuals are homogeneous, so the plain step would only shrink Q: hold its scale.
         radial = (gram @ q).flatten(-2)
@@ -133,26 +129,49 @@ def metric_upgrade(
         factor, _ = torch.linalg.cholesky_ex(normal + (damping * size + tiny)[..., None, None] * eye)
         move = torch.cholesky_solve(gradient[..., None], factor).squeeze(-1)
         trial = normalise(q - move.unflatten(-1, (rank, 3)))
-        new = total(trial)
+        moved, new = evaluate(trial)
         better = new < cost  # False for NaN, too: a failed factorisation only raises the damping
         return (
             torch.where(better[..., None, None], trial, q),
+            torch.where(better[..., None], moved, residual),
             torch.where(better, new, cost),
             torch.where(better, damping / 4, damping * 3).clamp(1e-9, 1e6),
             progress / 2 + torch.where(better, 1 - new / cost, 0),  # halved, not zeroed, by a refused step
         )
 
     q = normalise(start.expand(*torch.broadcast_shapes(start.shape[:-2], motion.shape[:-3]), rank, 3))
-    cost = total(q)
-    first_state: tuple[Tensor, ...] = (q, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost))
+    residual, cost = evaluate(q)
+    first_state: tuple[Tensor, ...] = (q, residual, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost))
     q = iterate(
         step,
         first_state,
         num_steps=num_steps,
-        change=lambda _, new: new[3].amax(),
+        change=lambda _, new: new[4].amax(),
         tolerance=tolerance,
     ).value[0]
-    return q, defect(q)
+    return q, orthonormality_defect(motion @ q[..., None, :, :]).mean(-1)
+
+
+def _quadratic_forms(a: Tensor, b: Tensor) -> Tensor:
+    """Symmetric forms P (..., M, R, R) with sum_m <P_m, F>^2 = sum_t ((a.Fa - b.Fb)/2)^2 + (a.Fb)^2 for symmetric F.
+
+    A clip has two a frame, but no more than R (R + 1) / 2 of them are independent: the triangle of their QR
+    decomposition stands for all, so that the work of an iteration does not grow with the number of frames.
+
+    Args:
+        a: (..., T, R) first motion rows.
+        b: (..., T, R) second motion rows.
+    """
+    rank = a.shape[-1]
+    row, column = torch.triu_indices(rank, rank, device=a.device)
+    along = (a[..., row] * a[..., column] - b[..., row] * b[..., column]) / 2
+    across = (a[..., row] * b[..., column] + b[..., row] * a[..., column]) / 2
+    forms = torch.cat([along, across], -2)  # (..., 2T, R (R + 1) / 2)
+    if forms.shape[-2] > forms.shape[-1] and not forms.requires_grad:  # QR without its Q has no derivative
+        forms = torch.linalg.qr(forms, mode="r").R
+    place = torch.zeros(rank, rank, dtype=torch.long, device=a.device)
+    place[row, column] = place[column, row] = torch.arange(len(row), device=a.device)
+    return forms[..., place]
 
 
 def _check(motion: Tensor, name: str) -> None:
