@@ -35,10 +35,11 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Te
         )
     time = torch.arange(frames, dtype=rotations.dtype, device=rotations.device) - (frames - 1) / 2
     turn = roma.rotmat_to_rotvec(rotations[1:] @ rotations[:-1].mT).median(0).values
-    speeds = turn * torch.linspace(0.8, 1.2, 161, dtype=turn.dtype, device=turn.device)[:, None]
-    spun = roma.rotvec_to_rotmat(speeds[:, None] * time[:, None])  # (S, T, 3, 3)
-    starts = roma.special_procrustes((spun.mT @ rotations).mean(1))
-    best = ((spun @ starts[:, None]) * rotations).sum((-2, -1)).mean(-1).argmax()
+    factors = torch.linspace(0.8, 1.2, 161, dtype=turn.dtype, device=turn.device)
+    speeds = turn * factors[:, None]
+    means = _mean_unturned(rotations, factors[:, None] * time, turn)
+    starts = roma.special_procrustes(means)
+    best = (starts * means).sum((-2, -1)).argmax()  # the mean agreement of path and rotations
     speed, start = speeds[best], starts[best]
     eye = torch.eye(6, dtype=turn.dtype, device=turn.device)
     for _ in range(num_steps):
@@ -54,6 +55,21 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Te
         speed, start = speed + move[:3], roma.rotvec_to_rotmat(move[3:]) @ start
     path = roma.rotvec_to_rotmat(time[:, None] * speed) @ start
     return path, roma.rotmat_geodesic_distance(path, rotations)
+
+
+def _mean_unturned(rotations: Tensor, times: Tensor, turn: Tensor) -> Tensor:
+    """Means over t of exp(-times_st turn) R_t (S, 3, 3), for rotations R (T, 3, 3), times (S, T) and one turn (3,).
+
+    By Rodrigues' formula exp(-a n) = cos(a) (I - n n^T) + n n^T - sin(a) [n]: sums of R under S x T cosines and sines.
+    """
+    size = turn.norm()
+    x, y, z = axis = turn / torch.where(size > 0, size, torch.ones_like(size))
+    zero = torch.zeros_like(x)
+    hat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    along = axis[:, None] * axis
+    flat = rotations.flatten(-2) / len(rotations)
+    cosine, sine = ((wave(times * size) @ flat).unflatten(-1, (3, 3)) for wave in (torch.cos, torch.sin))
+    return cosine + along @ (flat.sum(0).unflatten(-1, (3, 3)) - cosine) - hat @ sine
 
 
 def _left_jacobian(vectors: Tensor) -> Tensor:
