@@ -91,9 +91,9 @@ def fit_bones(
         unit = vectors / size[..., None]
         goal = anchor_bones if damping == 0 else (anchor_bones + damping * vectors) * share
         residual = size - lengths + (unit * (goal - vectors)).sum(-1)
-        system = eye + share * root[..., :, None] * root[..., None, :] * overlap * kcs_matrix(unit)
-        factor, _ = torch.linalg.cholesky_ex(system)
-        pull = root * torch.cholesky_solve((root * residual)[..., None], factor).squeeze(-1)
+        weighted = root[..., None] * unit
+        factor, _ = torch.linalg.cholesky_ex(eye + share * overlap * kcs_matrix(weighted))
+        pull = torch.cholesky_solve((root * residual)[..., None], factor)
         base = points if damping == 0 else (points + damping * current) * share
-        current = base - share * (matrix @ (pull[..., None] * unit))
+        current = base - share * (matrix @ (pull * weighted))
     return current
