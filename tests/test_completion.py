@@ -55,3 +55,31 @@ def test_results_follow_dtype_and_device(dtype, device):
     tracks, seen = clip()
     found = complete_tracks(tracks.to(device, dtype), seen.to(device))
     assert (found.dtype, found.device.type) == (dtype, device)
+
+
+@pytest.mark.parametrize("blank", [[30], [0], [59], [10, 11, 12, 13], list(range(20, 50))])
+def test_frames_without_any_joint_lie_between_their_neighbours(blank):
+    """The least nuclear norm alone would put them at the mean pose."""
+    tracks, seen = clip()
+    full = torch.ones_like(seen)
+    full[blank] = False
+    found = complete_tracks(tracks, full)
+    assert_close(found, interpolate(tracks, full))
+    gaps = seen & full
+    found = complete_tracks(tracks, gaps)
+    assert_close(found, interpolate(found, full))
+    if blank[0] > 0 and blank[-1] < 59:
+        low, high = found[blank[0] - 1], found[blank[-1] + 1]
+        share = torch.arange(1.0, len(blank) + 1, dtype=torch.float64)[:, None, None] / (len(blank) + 1)
+        assert_close(found[blank], low + share * (high - low))
+
+
+def test_joints_never_seen_stay_with_the_others():
+    tracks, seen = clip()
+    never = seen.clone()
+    never[:, 4] = False
+    found = complete_tracks(tracks, never)
+    others = [i for i in range(15) if i != 4]
+    assert_close(found[:, others], complete_tracks(tracks[:, others], seen[:, others]), rtol=0.2, atol=0.2)
+    low, high = tracks.amin((0, 1)), tracks.amax((0, 1))
+    assert ((low <= found[:, 4]) & (found[:, 4] <= high)).all()
