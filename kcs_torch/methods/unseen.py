@@ -49,4 +49,4 @@ def place_unseen(points: Tensor, known: Tensor, skeleton: Skeleton) -> Tensor:
             placed = placed.index_copy(-2, torch.tensor([joint], device=points.device),
                                        (placed[:, near] + offsets[:, joint] - offsets[:, near])[:, None])  # fmt: skip
             done[joint] = True
-    return placed + middle
+    return torch.where(known[:, None], points, placed + middle)
