@@ -1,0 +1,255 @@
+"""Measure speed, memory and growth on one thread, beside a naive twin of each method in the same run.
+
+    python scripts/speed.py                      # everything; some minutes
+    python scripts/speed.py --parts methods --csv speed.csv
+
+Parts: ``memory`` (peak of a run above what importing takes, in a process of its own), ``methods`` (each method beside
+its twin), ``kernels`` (the same for single steps), ``growth`` (with the number of frames), ``joints`` (with their
+number). Times are in double precision; variants take turns, so that a busy machine slows all of them, and the best run
+is told beside the median. The twins are those of tests/naive.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import importlib.util
+import json
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import torch
+
+import kcs_torch as kt
+from kcs_torch.data import SyntheticClip, random_motion, walking_person
+
+TESTS = Path(__file__).resolve().parents[1] / "tests"
+FRAMES, TURN = 300, 180.0
+KERNELS = (
+    ("17 joints", (200, 51)),
+    ("41 joints", (370, 123)),
+    ("5 windows", (5, 200, 51)),
+    ("no windows", (10000, 51)),
+    ("KCS", (900, 16)),
+)
+Row = dict[str, Any]
+Variants = dict[str, Callable[[], object]]
+
+
+def load_naive() -> ModuleType:
+    """Import tests/naive.py by its path."""
+    path = TESTS / "naive.py"
+    spec = importlib.util.spec_from_file_location("naive", path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise SystemExit(f"{path}: expected the naive twins, found none; run from a clone of the repository")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def measure(variants: Variants, runs: int, *, per: float = 1.0, repeat: int = 1) -> Iterator[Row]:
+    """Median and least milliseconds of each variant, and its ratio to the first one's median.
+
+    Variants take turns, after one turn that does not count. ``per`` divides the times (by frames, say), and each run
+    is ``repeat`` calls.
+    """
+    times: dict[str, list[float]] = {name: [] for name in variants}
+    for turn in range(runs + 1):
+        for name, run in variants.items():
+            start = time.perf_counter()
+            for _ in range(repeat):
+                run()
+            if turn:
+                times[name].append(1000 * (time.perf_counter() - start) / (per * repeat))
+    medians = {name: statistics.median(values) for name, values in times.items()}
+    first = next(iter(medians.values()))
+    for name, values in times.items():
+        yield {"variant": name, "median": medians[name], "best": min(values), "ratio": medians[name] / first}
+
+
+def tree(num_joints: int) -> kt.Skeleton:
+    """A binary tree of joints, which random_motion brings to life."""
+    return kt.Skeleton.from_edges(
+        [((i - 1) // 2, i) for i in range(1, num_joints)], num_joints, name=f"tree{num_joints}"
+    )
+
+
+def clip_of(frames: int) -> SyntheticClip:
+    """A walking person, orbited by half a turn in 300 frames, however long the clip is."""
+    return walking_person(frames, turn=TURN * frames / FRAMES)
+
+
+def compare_methods(frames: int, runs: int) -> Iterator[Row]:
+    """Milliseconds a frame of each method and its twins."""
+    twins = load_naive()
+    clip = walking_person(frames, turn=TURN)
+
+    def within(run: Callable[[], object], frame_by_frame: bool) -> None:
+        with twins.naive(frame_by_frame=frame_by_frame):
+            run()
+
+    for name, method in kt.METHODS.items():
+        for cameras in (None, clip.cameras):
+            run = partial(method(), clip.tracks, cameras)
+            variants: Variants = {
+                "ours": run,
+                "naive": partial(within, run, False),
+                "naive, frame by frame": partial(within, run, True),
+            }
+            what = name if cameras is None else f"{name}, cameras given"
+            for row in measure(variants, runs, per=frames):
+                yield {"ms a frame": what} | row
+
+
+def compare_kernels(frames: int, runs: int) -> Iterator[Row]:
+    """Milliseconds of shrinkage and of the bone-length step, and of their twins."""
+    twins = load_naive()
+    generator = torch.Generator().manual_seed(0)
+    for what, shape in KERNELS:
+        matrix = torch.randn(shape, generator=generator, dtype=torch.float64)
+        level = torch.linalg.svdvals(matrix).median()
+        variants: Variants = {
+            "ours": partial(kt.functional.svt, matrix, level),
+            "naive": partial(twins.svt, matrix, level),
+        }
+        for row in measure(variants, runs, repeat=20):
+            yield {"ms": f"svt {' x '.join(map(str, shape))}, {what}"} | row
+    for joints in (17, 41):
+        body = tree(joints)
+        points = random_motion(body, frames, generator=generator).points
+        bones = body.bone_index()
+        lengths = kt.functional.bone_lengths(points, bones)[0]
+        points = points + 0.01 * lengths.mean() * torch.randn(points.shape, generator=generator, dtype=torch.float64)
+        variants = {
+            "ours": partial(kt.solvers.fit_bones, points, lengths, bones, num_steps=1),
+            "naive": partial(twins.fit_bones, points, lengths, bones, num_steps=1),
+            "naive, frame by frame": partial(twins.fit_bones_frame_by_frame, points, lengths, bones, num_steps=1),
+        }
+        for row in measure(variants, runs):
+            yield {"ms": f"bone-length step, {frames} frames of {joints} joints"} | row
+
+
+def grow_frames(counts: list[int], runs: int) -> Iterator[Row]:
+    """Milliseconds a frame as clips get longer, and their ratio to those at 1000 frames."""
+    for name, method in kt.METHODS.items():
+        reference = None
+        for frames in counts:
+            run = partial(method(), clip_of(frames).tracks)
+            (row,) = measure({"ours": run}, max(1, min(runs, runs * 1000 // frames)), per=frames)
+            reference = row["median"] if frames == 1000 else reference
+            ratio = row["median"] / reference if reference else None
+            yield {"ms a frame": name, "frames": frames} | row | {"ratio": ratio}
+
+
+def grow_joints(counts: list[int], frames: int, runs: int) -> Iterator[Row]:
+    """Milliseconds a frame, and frames a second, as bodies get more joints."""
+    for name, method in kt.METHODS.items():
+        for joints in counts:
+            clip = random_motion(tree(joints), frames, turn=TURN, generator=torch.Generator().manual_seed(0))
+            (row,) = measure({"ours": partial(method(), clip.tracks)}, runs, per=frames)
+            del row["ratio"]
+            yield {"ms a frame": name, "joints": joints} | row | {"frames a second": 1000 / row["median"]}
+
+
+def peak_memory(counts: list[int]) -> Iterator[Row]:
+    """Peak memory of a run, each in a process of its own."""
+    for name in kt.METHODS:
+        for frames in counts:
+            command = [sys.executable, __file__, "--peak", name, str(frames)]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode:
+                raise SystemExit(f"{' '.join(command)}: {done.stderr.strip()}")
+            yield {"peak of": name, "frames": frames} | json.loads(done.stdout)
+
+
+def resident_mb() -> float:
+    """The most memory that this process held so far, in MB."""
+    status = Path("/proc/self/status")
+    if status.is_file():  # Linux lets a child inherit its parent's ru_maxrss, but not this
+        return next(float(line.split()[1]) for line in status.read_text().splitlines() if "VmHWM" in line) / 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024**2 if sys.platform == "darwin" else 1024)
+
+
+def measure_peak(name: str, frames: int) -> Row:
+    """Run a method in this process; memory in MB, and KB a frame above what a short run takes."""
+    method = kt.METHODS[name]()
+    method(walking_person(30, turn=TURN).tracks)  # loads what is loaded late
+    before = resident_mb()
+    method(clip_of(frames).tracks)
+    above = resident_mb() - before
+    return {"import MB": before, "above MB": above, "KB a frame": 1024 * above / frames}
+
+
+def show(rows: list[Row]) -> str:
+    """Rows of one part as a table."""
+    names = list(dict.fromkeys(key for row in rows for key in row))
+    cells = [names] + [[text(row.get(name)) for name in names] for row in rows]
+    widths = [max(len(line[i]) for line in cells) for i in range(len(names))]
+    left = [isinstance(rows[0].get(name), str) for name in names]
+    align = lambda cell, width, by: cell.ljust(width) if by else cell.rjust(width)  # noqa: E731
+    return "\n".join("  ".join(map(align, line, widths, left)).rstrip() for line in cells)
+
+
+def text(value: Any) -> str:
+    """A number at three digits; nothing for None."""
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return "" if value is None else str(value)
+
+
+def arguments(words: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parts = ("memory", "methods", "kernels", "growth", "joints")
+    parser.add_argument("--parts", nargs="+", choices=parts, default=parts, metavar="PART", help=", ".join(parts))
+    parser.add_argument("--frames", type=int, default=FRAMES, help="of methods, kernels and joints")
+    parser.add_argument("--growth", type=int, nargs="+", default=[100, 300, 1000, 3000, 10000], metavar="FRAMES")
+    parser.add_argument("--memory", type=int, nargs="+", default=[1000, 10000], metavar="FRAMES")
+    parser.add_argument("--joints", type=int, nargs="+", default=[17, 41, 133], metavar="JOINTS")
+    parser.add_argument("--runs", type=int, default=5, help="of which the median is taken")
+    parser.add_argument("--csv", type=Path, help="also write all rows here")
+    parser.add_argument("--peak", nargs=2, metavar=("METHOD", "FRAMES"), help=argparse.SUPPRESS)
+    return parser.parse_args(words)
+
+
+def main(words: list[str] | None = None) -> None:
+    """Measure what is asked for and print one table a part."""
+    options = arguments(words)
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore", kt.KcsWarning)  # of short clips that do not settle
+    if options.peak:
+        print(json.dumps(measure_peak(options.peak[0], int(options.peak[1]))))
+        return
+    parts: dict[str, Callable[[], Iterator[Row]]] = {
+        "memory": lambda: peak_memory(options.memory),
+        "methods": lambda: compare_methods(options.frames, options.runs),
+        "kernels": lambda: compare_kernels(options.frames, options.runs),
+        "growth": lambda: grow_frames(options.growth, options.runs),
+        "joints": lambda: grow_joints(options.joints, options.frames, options.runs),
+    }
+    print(f"torch {torch.__version__}, {platform.machine()}, 1 thread, float64, median of {options.runs} runs")
+    everything: list[Row] = []
+    for part in parts:
+        if part in options.parts:
+            rows = list(parts[part]())
+            print(f"\n{part}\n{show(rows)}", flush=True)
+            everything += [{"part": part} | row for row in rows]
+    if options.csv:
+        with options.csv.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(dict.fromkeys(key for row in everything for key in row)))
+            writer.writeheader()
+            writer.writerows(everything)
+
+
+if __name__ == "__main__":
+    main()

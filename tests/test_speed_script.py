@@ -1,0 +1,71 @@
+"""scripts/speed.py, and that the naive twins it measures do the same as the methods."""
+
+import csv
+import runpy
+
+import naive
+import pytest
+import torch
+from numerics import BODY, normal
+from torch.testing import assert_close
+
+import kcs_torch as kt
+from kcs_torch.data import walking_person
+from kcs_torch.functional import bone_lengths
+from kcs_torch.nn import steps
+
+
+@pytest.mark.parametrize("shape", [(40, 9), (9, 40), (3, 20, 6), (2, 2, 5, 5)])
+def test_shrinkage_twin(shape):
+    matrix = normal(*shape)
+    level = normal(*shape[:-2]).abs()
+    assert_close(kt.functional.svt(matrix, level), naive.svt(matrix, level))
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.5])
+def test_bone_step_twins(damping):
+    points = normal(2, 5, 7, 3)
+    bones = BODY.bone_index()
+    lengths = bone_lengths(points, bones) * (1 + 0.2 * normal(2, 5, 6, seed=1)).abs()
+    options = {"stiffness": normal(6, seed=2).abs(), "num_steps": 3, "damping": damping}
+    got = kt.solvers.fit_bones(points, lengths, bones, **options)
+    for twin in (naive.fit_bones, naive.fit_bones_frame_by_frame):
+        assert_close(got, twin(points, lengths, bones, **options), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["cameras found", "cameras given"])
+@pytest.mark.parametrize("method", [kt.KCS(rounds=2), kt.SfAM(num_steps=12, window=20, overlap=5)], ids=["kcs", "sfam"])
+def test_method_twins(method, known):
+    clip = walking_person(36, turn=120, noise=3, missing=0.05, generator=torch.Generator().manual_seed(0))
+    cameras = clip.cameras if known else None
+    with pytest.warns() if method.name == "sfam" else torch.no_grad():  # twelve steps do not settle
+        ours = method(clip.tracks, cameras).points
+        for frame_by_frame in (False, True):
+            with naive.naive(frame_by_frame=frame_by_frame):
+                twin = method(clip.tracks, cameras).points
+            assert not torch.equal(ours, twin)  # else it was not the twin that ran
+            assert (ours - twin).abs().max() < 1e-2  # of a body of 1750 mm
+
+
+def test_after_the_context_the_fast_parts_are_back():
+    before = steps.svt, steps.fit_bones
+    with pytest.raises(KeyError), naive.naive():
+        assert (steps.svt, steps.fit_bones) == (naive.svt, naive.fit_bones)
+        raise KeyError
+    assert (steps.svt, steps.fit_bones) == before
+
+
+@pytest.mark.parametrize("part", ["memory", "methods", "kernels", "growth", "joints"])
+def test_script(root, tmp_path, capsys, part):
+    script = runpy.run_path(str(root / "scripts" / "speed.py"))
+    table = tmp_path / "speed.csv"
+    sizes = ["--frames", "12", "--growth", "12", "--memory", "12", "--joints", "5", "--runs", "1"]
+    script["main"](["--parts", part, *sizes, "--csv", str(table)])
+    shown = capsys.readouterr().out
+    with table.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) >= 2 and {row["part"] for row in rows} == {part}
+    for row in rows:
+        what = row.get("ms a frame") or row.get("ms") or row["peak of"]
+        assert what in shown  # the table on the terminal has what the file has
+        assert float(row.get("median") or row["import MB"]) > 0
