@@ -384,3 +384,19 @@ def test_observed_leaves_the_virtual_joints_out():
 
 def test_units_are_those_of_the_tracks():
     assert replace(walk_result(), units="").units == "mm"
+
+
+def test_joints_are_matched_by_name_with_a_given_skeleton():
+    body = SKELETONS["h36m17"]
+    points = torch.randn(4, 17, 2, dtype=torch.float64)
+    shuffled = [5, 3, 16, 0, 1, 2, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15]
+    names = [body.joints[i] for i in shuffled]
+    confidence = torch.rand(4, 17, dtype=torch.float64) * 0.5 + 0.5
+    plain = Tracks.from_arrays(points, confidence, skeleton=body)
+    by_name = Tracks.from_arrays(points[:, shuffled], confidence[:, shuffled], skeleton=body, joint_names=names)
+    assert torch.equal(by_name.points, plain.points)
+    assert torch.equal(by_name.weights, plain.weights)
+    assert any("matched by name" in note for note in by_name.notes)
+    more = torch.cat([points, torch.zeros(4, 1, 2, dtype=torch.float64)], 1)
+    wider = Tracks.from_arrays(more, skeleton=body, joint_names=[*body.joints, "hat"])
+    assert torch.equal(wider.points, points)
