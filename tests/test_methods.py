@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from kcs_torch import (
@@ -157,6 +159,32 @@ def test_known_cameras_hold_at_the_edges(method):
         result = reconstruct(tracks, method=method, cameras=cameras.tolist())
         check(result, tracks)
         assert_close(result.cameras, cameras)
+
+
+@st.composite
+def wild_tracks(draw):
+    """Few frames and joints, values that repeat or lie far apart, gaps, weights, and any graph of bones."""
+    frames, joints = draw(st.integers(1, 6)), draw(st.integers(2, 6))
+    numbers = st.one_of(st.sampled_from([0.0, 1.0, 100.0]), st.floats(-1e4, 1e4), st.floats(-1e-3, 1e-3))
+    shape = (frames, joints, 2)
+    points = np.array(draw(st.lists(numbers, min_size=frames * joints * 2, max_size=frames * joints * 2))).reshape(
+        shape
+    )
+    weights = st.sampled_from([0.0, 0.31, 0.7, 1.0, 1.0])
+    confidence = np.array(draw(st.lists(weights, min_size=frames * joints, max_size=frames * joints)))
+    confidence[draw(st.integers(0, frames * joints - 1))] = 1.0
+    pairs = [(a, b) for b in range(joints) for a in range(b)]
+    edges = draw(st.lists(st.sampled_from(pairs), unique=True, max_size=joints))
+    dtype = draw(st.sampled_from([torch.float32, torch.float64]))
+    return Tracks.from_arrays(torch.tensor(points, dtype=dtype), confidence.reshape(frames, joints), edges=edges)
+
+
+@quiet
+@pytest.mark.parametrize("method", METHODS)
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(tracks=wild_tracks())
+def test_wild_tracks(method, tracks):
+    check(reconstruct(tracks, method=method), tracks)
 
 
 # ---------------------------------------------------------------------- side effects

@@ -6,10 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from samples import walk_result
 from torch.testing import assert_close
 
-from kcs_torch import OptionError, ShapeError, SkeletonError, Tracks
+from kcs_torch import KcsError, OptionError, ShapeError, SkeletonError, Tracks
 from kcs_torch.errors import FormatError
 from kcs_torch.functional import bone_lengths
 from kcs_torch.skeleton import SKELETONS, Skeleton
@@ -125,8 +127,8 @@ def test_never_seen_joints_and_blank_frames_are_noted():
 def test_skeleton_by_name_object_and_file(tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text(yaml.safe_dump(SKELETONS["h36m17"].to_dict()), encoding="utf-8")
-    for given in ("h36m17", SKELETONS["h36m17"], file, str(file)):
-        assert Tracks.from_arrays(grid(), skeleton=given).skeleton == SKELETONS["h36m17"]
+    for form in ("h36m17", SKELETONS["h36m17"], file, str(file)):
+        assert Tracks.from_arrays(grid(), skeleton=form).skeleton == SKELETONS["h36m17"]
 
 
 def test_names_of_a_built_in_skeleton_select_it():
@@ -400,3 +402,40 @@ def test_joints_are_matched_by_name_with_a_given_skeleton():
     more = torch.cat([points, torch.zeros(4, 1, 2, dtype=torch.float64)], 1)
     wider = Tracks.from_arrays(more, skeleton=body, joint_names=[*body.joints, "hat"])
     assert torch.equal(wider.points, points)
+
+
+# ---------------------------------------------------------------------- whatever comes in
+
+anything = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(-3, 300), st.floats(), st.text(max_size=3)),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3), st.tuples(inner, inner), st.dictionaries(st.text(max_size=2), inner, max_size=2)
+    ),
+    max_leaves=8,
+)
+numbers = st.lists(
+    st.lists(st.lists(st.floats(width=32), min_size=2, max_size=2), min_size=3, max_size=3), min_size=1, max_size=3
+)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(
+    points=st.one_of(numbers, anything),
+    confidence=st.one_of(st.none(), st.just([[1.0, 0.5, 0.0]] * 2), anything),
+    edges=st.one_of(st.none(), st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), max_size=3), anything),
+    skeleton=st.one_of(st.none(), st.sampled_from(["h36m17", "none"]), st.integers()),
+    fps=st.one_of(st.none(), st.floats(), anything),
+    threshold=st.one_of(st.just(0.3), st.floats(), st.text(max_size=2)),
+)
+def test_anything_gives_tracks_or_an_error_of_our_own(points, confidence, edges, skeleton, fps, threshold):
+    try:
+        tracks = Tracks.from_arrays(
+            points, confidence, edges=edges, skeleton=skeleton, fps=fps, threshold=threshold, source="clip"
+        )
+    except KcsError:
+        return
+    assert torch.isfinite(tracks.points).all() and torch.isfinite(tracks.weights).all()
+    assert tracks.points.shape == (*tracks.weights.shape, 2) and tracks.seen.any()
+    assert ((tracks.weights >= 0) & (tracks.weights <= 1)).all()
+    assert (tracks.points[~tracks.seen] == 0).all()
+    assert tracks.fps is None or tracks.fps > 0

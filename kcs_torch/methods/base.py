@@ -199,7 +199,8 @@ def _mean(points: Tensor, weights: Tensor) -> Tensor:
 
 def _rms(vectors: Tensor, weights: Tensor) -> Tensor:
     """Weighted root mean square length of (..., D) vectors, scaled first, so that no square overflows."""
-    top = torch.where(weights > 0, vectors.abs().amax(-1), torch.zeros_like(weights)).amax()
+    vectors = torch.where(weights[..., None] > 0, vectors, torch.zeros_like(vectors))
+    top = vectors.abs().amax()
     top = torch.where(top > 0, top, torch.ones_like(top))
     square = (vectors / top).square().sum(-1) * weights
     return top * (square.sum() / weights.sum()).sqrt()
