@@ -1,0 +1,80 @@
+"""scripts/robustness.py: what it disturbs, by how much, and a run on a few frames."""
+
+import csv
+import math
+import sys
+from importlib import import_module
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from kcs_torch.data import walking_person
+from kcs_torch.functional import bone_lengths, bone_vectors, project
+from kcs_torch.functional.align import centre
+from kcs_torch.skeleton import SKELETONS
+
+
+@pytest.fixture(scope="module")
+def script(root):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(root / "scripts"))
+        yield import_module("robustness")
+        for name in ("robustness", "benchmark"):
+            sys.modules.pop(name)
+
+
+@pytest.mark.parametrize(("share", "degrees"), [(0.0, 0.0), (0.3, 0.0), (0.0, 20.0), (0.1, 10.0)])
+def test_templates_are_off_by_what_is_asked(script, share, degrees):
+    body = SKELETONS["h36m17"]
+    true = bone_vectors(body.template_points(dtype=torch.float64), body.bones)
+    got = bone_vectors(script.perturbed(body, share, math.radians(degrees), script.generator(1)), body.bones)
+    ratio = got.norm(dim=-1) / true.norm(dim=-1)
+    assert (ratio - 1).abs().max() <= share + 1e-9 and (share == 0 or ratio.std() > 0.3 * share)
+    cosine = (got * true).sum(-1) / (got.norm(dim=-1) * true.norm(dim=-1))
+    assert_close(cosine, torch.full_like(cosine, math.cos(math.radians(degrees))))
+
+
+def test_tracks_at_other_places_keep_everything_else(script):
+    tracks = walking_person(9, skeleton="coco17", missing=0.2, generator=script.generator(0)).tracks
+    moved = script.replace_points(tracks, tracks.points + 3)
+    assert moved.skeleton == tracks.skeleton and moved.fps == tracks.fps and moved.units == tracks.units
+    assert torch.equal(moved.weights, tracks.weights)
+    assert_close(moved.points[tracks.seen], tracks.points[tracks.seen] + 3)
+
+
+def test_without_the_data_it_says_what_it_needs(script, tmp_path):
+    with pytest.raises(SystemExit, match="expected a folder with protocol"):
+        script.main(["--shared", str(tmp_path)])
+
+
+def test_true_lengths_and_cameras_are_those_of_the_case(script, shared):
+    bench = script.Bench(shared, frames=30, sequences=1)
+    ((label, tracks, truth),) = bench.orbits()
+    assert label == "cmu_02_01_yaw45_orbit180" and tracks.num_frames == 30
+    points = torch.from_numpy(truth["points3d"])
+    size = bone_lengths(points, tracks.skeleton.bones)
+    rigid = size.std(0) < 1e-2 * size.mean(0)
+    assert rigid.sum() > 10
+    assert_close(script.true_lengths(tracks, truth)[rigid], size[0][rigid], rtol=1e-2, atol=0)
+    source = bench.protocol.load(bench.data, "cmu/cmu_02_01")["points3d"].astype(float)
+    world = torch.from_numpy(source[::4][:30, bench.protocol.CMU17])
+    seen = project(world, bench.orbit_cameras(30))
+    assert_close(centre(seen)[0], centre(tracks.points)[0], rtol=0, atol=1e-3)
+
+
+def test_script(script, shared, tmp_path, capsys):
+    table = tmp_path / "runs.csv"
+    script.main(["--sequences", "1", "--frames", "40", "--seeds", "2", "--shared", str(shared), "--csv", str(table)])
+    shown = capsys.readouterr().out
+    with table.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert list(dict.fromkeys(row["part"] for row in rows)) == list(script.PARTS)
+    assert all(row["setting"] in shown and float(row["rigid"]) > 0 for row in rows)
+    counts = {part: sum(row["part"] == part for row in rows) for part in script.PARTS}
+    assert counts == {"lengths": 2 + 4 * 2, "variation": 2, "noise": 4 * (1 + 4 * 2), "template": 4 * (2 + 5 * 2)}
+    own, free = (row for row in rows if row["part"] == "variation")
+    bones = [key for key in own if key.startswith("variation of ")]
+    middle = [np.median([float(row[bone]) for bone in bones]) for row in (own, free)]
+    assert middle[0] < middle[1]  # the articulated term keeps lengths more constant
