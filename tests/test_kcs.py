@@ -245,11 +245,13 @@ def test_static_walk(shared):
     assert error < 50 and error < 0.5 * guess_error
 
 
-def test_known_cameras_tell_where_the_template_stands():
+@pytest.mark.parametrize("turn", [0.0, 90.0])
+def test_known_cameras_tell_where_the_template_stands(turn):
     """Known cameras give the template its place in their world; the pose is no worse than with own cameras."""
-    clip = walking_person(60, turn=90.0)
+    clip = walking_person(60, turn=turn)
     own, known = (KCS()(clip.tracks, c) for c in (None, clip.cameras))
     assert_close(known.cameras, clip.cameras, rtol=0, atol=0)
     assert rigid_error(known.points, clip.points) < 1.1 * rigid_error(own.points, clip.points)
-    turn, _ = procrustes(centred(known.points[30]), centred(clip.points[30]))
-    assert (turn.trace() - 1) / 2 > math.cos(math.radians(12))  # and it faces the right way
+    if turn:
+        rotation, _ = procrustes(centred(known.points[30]), centred(clip.points[30]))
+        assert (rotation.trace() - 1) / 2 > math.cos(math.radians(12))  # and it faces the right way
