@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.functional.align import centre, procrustes
+from kcs_torch.functional.align import centre, nearest_rotation
 from kcs_torch.functional.camera import back_project, complete_rotation, project
 from kcs_torch.functional.chain import bone_lengths, chain_inverse, incidence
 from kcs_torch.functional.spectral import singular_values, svt
@@ -36,8 +36,9 @@ class KCS(Method):
     Pose = B0 + A S in bone space: B0 is the template, A S the deviation with min ||A||_* subject to the tracks.
 
     Args:
-        template: rest pose, N positions (x right, y down, z away), any unit; the skeleton's if None; where that has
-            none, the rigid shape that best explains the tracks.
+        template: rest pose, N positions (x right, y down, z away), any unit, limbs symmetric (a stride of one frame
+            looks like a body turned about in the next); the skeleton's if None; where that has none, the rigid shape
+            that best explains the tracks.
         links: extra rigid links as pairs of joint names (two hands on one sword); they may close chains.
         arrangement: how the deviations of all frames form one matrix: "stacked", 3T x B as printed, or "frames",
             T x 3B, in which a deviation that recurs under another viewpoint gains depth.
@@ -99,6 +100,10 @@ class KCS(Method):
         low, high = scale / self.scale_range, scale * self.scale_range
         if math.isinf(self.scale_range):
             low, high = torch.zeros_like(scale), torch.full_like(scale, math.inf)
+        if cameras is not None and not (self.template is None and tracks.skeleton.template is None):
+            # A template has a frame of its own: turn it into the world, as it is seen over the whole clip.
+            seen_from, _ = self._cameras(tracks, rest.expand(tracks.num_frames, -1, 3), low, high, None, None)
+            rest = rest @ nearest_rotation((complete_rotation(cameras).mT @ seen_from).sum(0)).mT
         shape = rest.expand(tracks.num_frames, -1, 3)
         rotations: Tensor | None = None
         deviation = torch.zeros(tracks.num_frames, len(bones), 3, dtype=rest.dtype, device=rest.device)
@@ -125,7 +130,7 @@ class KCS(Method):
         return Estimate(points, rotations[:, :2], scales / size, converged, made, notes)
 
     def _template(self, tracks: Tracks, cameras: Tensor | None) -> tuple[Tensor, tuple[str, ...]]:
-        """The rest pose (N, 3), centred; turned into the world of the cameras where they are known."""
+        """The rest pose (N, 3), centred; a stand-in is in the world of the cameras where they are known."""
         like = tracks.points
         joints = tracks.num_joints
         rest = None
@@ -140,24 +145,20 @@ class KCS(Method):
         if rest is None:
             note = f"skeleton '{tracks.skeleton.name}' has no template: the tracks' best rigid shape serves"
             return centre(rigid_shape(tracks, cameras))[0], (note,)
-        rest, _ = centre(rest)
-        if cameras is not None:
-            rest = rest @ procrustes(rest, centre(rigid_shape(tracks, cameras))[0])[0]
-        return rest, ()
+        return centre(rest)[0], ()
 
     def _cameras(
         self, tracks: Tracks, shape: Tensor, low: Tensor, high: Tensor, last: Tensor | None, known: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Rotations (T, 3, 3) and scales (T,) of the camera step (eq. 22-25), consistent over time."""
-        fit = fit_cameras(tracks.points, shape, tracks.weights, low, high, robust=self.robust, start=last)
-        rotations, scales, cost = fit.rotations, fit.scales, fit.cost.mT  # cost (T, C)
         if known is not None:
-            rotations = complete_rotation(known)
             flat = project(shape, known)
             match = (flat * tracks.points * tracks.weights[..., None]).sum((-2, -1))
             size = (flat.square() * tracks.weights[..., None]).sum((-2, -1))
             free = match / torch.where(size > 0, size, torch.ones_like(size))
-            return rotations, torch.minimum(torch.maximum(free, low), high)
+            return complete_rotation(known), torch.minimum(torch.maximum(free, low), high)
+        fit = fit_cameras(tracks.points, shape, tracks.weights, low, high, robust=self.robust, start=last)
+        rotations, scales, cost = fit.rotations, fit.scales, fit.cost.mT  # cost (T, C)
         trace = torch.einsum("atij,btij->tab", rotations[:, :-1], rotations[:, 1:])
         turn = torch.arccos(((trace - 1) / 2).clamp(-1, 1)).square()
         choice = best_path(cost, self.continuity * turn) if self.continuity > 0 else cost.argmin(-1)
