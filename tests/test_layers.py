@@ -180,3 +180,13 @@ def test_a_learned_threshold_starts_above_zero():
 def test_inverse_softplus(value, dtype):
     raw = inverse_softplus(torch.tensor(value, dtype=dtype))
     assert_close(torch.nn.functional.softplus(raw), torch.tensor(value, dtype=dtype), rtol=1e-5, atol=0)
+
+
+def test_points_without_the_virtual_joints_are_told_how_to_get_them():
+    body = SKELETONS["coco17"]
+    points = torch.randn(2, 17, 3)
+    with pytest.raises(ShapeError, match=r"without its virtual joints pelvis, neck, which skeleton\.complete"):
+        KCSMatrix(body)(points)
+    assert KCSMatrix(body)(body.complete(points)[0]).shape == (2, body.num_bones, body.num_bones)
+    with pytest.raises(ShapeError, match="expected a tensor of points, got ndarray"):
+        KCSMatrix(body)(points.numpy())

@@ -47,7 +47,8 @@ class BoneLengthEnergy(SkeletonModule):
         Args:
             points: (..., T, N, 3).
             lengths: (..., B) target lengths; None takes each bone's own (weighted) mean over the T frames, which
-                makes this half the bone's variance.
+                makes this half the bone's variance: 0 for clips of one frame. A batch of single poses is (..., 1, N, 3)
+                and needs lengths; as (T, N, 3) it would pass for one clip of one body.
             weights: (..., T, N) of the joints; a bone weighs as much as the lesser of its two ends.
 
         Returns:

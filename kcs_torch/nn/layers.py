@@ -29,11 +29,17 @@ class SkeletonModule(nn.Module):
     def check(self, points: Tensor, *, clip: bool = False) -> None:
         """Raise a ShapeError unless ``points`` are (..., N, D), or a clip (..., T, N, D), with this skeleton's N."""
         joints = self.skeleton.num_joints
+        if not isinstance(points, Tensor):
+            raise ShapeError(f"{type(self).__name__}: expected a tensor of points, got {type(points).__name__}")
         if points.ndim < 2 + clip or points.shape[-2] != joints:
-            raise ShapeError(
+            message = (
                 f"{type(self).__name__}: expected points (..., {'T, ' if clip else ''}{joints}, 3) for skeleton "
                 f"'{self.skeleton.name}', got {tuple(points.shape)}"
             )
+            if points.ndim >= 2 and points.shape[-2] == self.skeleton.num_observed:
+                virtual = ", ".join(self.skeleton.joints[self.skeleton.num_observed :])
+                message += f": without its virtual joints {virtual}, which skeleton.complete(points) appends"
+            raise ShapeError(message)
 
     def extra_repr(self) -> str:
         return f"skeleton='{self.skeleton.name}'"

@@ -124,6 +124,11 @@ class UnrolledFPC(nn.Module):
                 f"{type(self).__name__}: expected tracks (..., T, N, 2) and cameras (..., T, 2, 3), "
                 f"got {tuple(tracks.shape)} and {tuple(cameras.shape)}"
             )
+        if cameras.dtype != tracks.dtype or cameras.device != tracks.device:
+            raise ShapeError(
+                f"{type(self).__name__}: expected cameras of the tracks' dtype and device, got {cameras.dtype} on "
+                f"{cameras.device} for {tracks.dtype} on {tracks.device}: use cameras.to(tracks)"
+            )
         check_weights(weights, tracks, self)
         if start is not None and start.shape[-3:] != (*tracks.shape[-3:-1], 3):
             expected = f"(..., {tracks.shape[-3]}, {tracks.shape[-2]}, 3)"

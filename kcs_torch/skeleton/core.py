@@ -342,16 +342,18 @@ class Skeleton:
         flexible = self.flexible + tuple(range(first, first + len(extra)))
         return replace(self, bones=self.bones + extra, flexible=flexible, proportions=None, tree=False)
 
-    def complete(self, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    def complete(self, points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Append the virtual joints to observed tracks.
 
         Args:
             points: (..., num_observed, D), finite.
-            weights: (..., num_observed), 0 where unseen.
+            weights: (..., num_observed), 0 where unseen; all 1 if None.
 
         Returns:
             points (..., N, D) and weights (..., N). A virtual joint is seen where all its sources are.
         """
+        if weights is None:
+            weights = torch.ones_like(points[..., 0])
         for _, sources in self.virtual:
             index = torch.tensor(sources, device=points.device)
             points = torch.cat([points, points.index_select(-2, index).mean(-2, keepdim=True)], -2)

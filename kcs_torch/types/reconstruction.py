@@ -75,6 +75,14 @@ class Reconstruction:
         if not self.units:
             object.__setattr__(self, "units", self.tracks.units)
 
+    def __repr__(self) -> str:
+        found = self.diagnostics
+        return (
+            f"Reconstruction({self.method} of {self.tracks.source!r}: points {tuple(self.points.shape)}, {self.units}, "
+            f"viewpoint turn {found.viewpoint_turn:.0f} degrees, bone variation {found.bone_variation:.2f} %, "
+            f"{'converged' if found.converged else 'not converged'})"
+        )
+
     @property
     def skeleton(self) -> Skeleton:
         return self.tracks.skeleton

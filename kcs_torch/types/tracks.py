@@ -152,6 +152,12 @@ class Tracks:
             remarks.append(f"{len(blank)} frames without any seen joint (frame {shown}): filled from their neighbours")
         return cls(xy, weights, body, rate, units, source, tuple(remarks))
 
+    def __repr__(self) -> str:
+        return (
+            f"Tracks({self.source!r}: {self.num_frames} frames, {self.num_joints} joints of skeleton "
+            f"'{self.skeleton.name}', fps {self.fps}, {self.units}, {100 * self.unseen_share:.1f} % unseen)"
+        )
+
     @property
     def num_frames(self) -> int:
         return self.points.shape[0]
