@@ -171,3 +171,15 @@ def test_results_follow_dtype_and_device(dtype, device):
 
     values = leaves_arguments_alone(run, tracks, points, weights, 0.5 * scales, 2 * scales, turn)
     assert {(v.dtype, v.device.type) for v in values} == {(dtype, device)}
+
+
+def test_frames_are_fitted_by_themselves(monkeypatch):
+    """Long clips are fitted some frames at a time."""
+    tracks, points, turn, scales = scene(noise=0.2)
+    weights = normal(FRAMES, 17, seed=3).abs()
+    whole = fit_cameras(tracks, points, weights, 0.5 * scales, 2 * scales, start=turn)
+    monkeypatch.setattr("kcs_torch.solvers.pose.RUN", 5)
+    runs = fit_cameras(tracks, points, weights, 0.5 * scales, 2 * scales, start=turn)
+    assert_close(runs.rotations, whole.rotations)
+    assert_close(runs.scales, whole.scales)
+    assert_close(runs.cost, whole.cost)

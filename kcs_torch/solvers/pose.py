@@ -61,10 +61,30 @@ def fit_cameras(
     Returns:
         The fit of each start. Frames without a seen joint have cost 0.
     """
-    frames = len(tracks)
-    rotations = _headings(num_yaws, tracks)[:, None].expand(-1, frames, 3, 3)
+    starts = _headings(num_yaws, tracks)[:, None].expand(-1, len(tracks), 3, 3)
     if start is not None:
-        rotations = torch.cat([start[None], rotations])
+        starts = torch.cat([start[None], starts])
+    runs = zip(starts.split(RUN, 1), *(x.split(RUN) for x in (tracks, points, weights, low, high)), strict=True)
+    fits = [_fit(*run, robust=robust, num_steps=num_steps) for run in runs]
+    return CameraFit(*(torch.cat(parts, 1) for parts in zip(*fits, strict=True)))
+
+
+RUN = 2000
+"""Frames that are fitted together: each is a problem of its own, and more would only take memory."""
+
+
+def _fit(
+    rotations: Tensor,
+    tracks: Tensor,
+    points: Tensor,
+    weights: Tensor,
+    low: Tensor,
+    high: Tensor,
+    *,
+    robust: float | None,
+    num_steps: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotations (C, T, 3, 3), scales (C, T) and cost (C, T) from starts (C, T, 3, 3)."""
     share = weights.expand(len(rotations), *weights.shape)
     size = (points - points.mean(-2, keepdim=True)).square().sum(-1).mean(-1).sqrt()
     seen = (centre(tracks, weights)[0].square().sum(-1) * weights).sum(-1) / weights.sum(-1).clamp_min(1e-12)
@@ -79,8 +99,7 @@ def fit_cameras(
             share = weights / (1 + square).square()
     loss = square if robust is None else square / (1 + square)
     total = weights.sum(-1)
-    cost = (loss * weights).sum(-1) / torch.where(total > 0, total, torch.ones_like(total))
-    return CameraFit(rotations, scales, cost)
+    return rotations, scales, (loss * weights).sum(-1) / torch.where(total > 0, total, torch.ones_like(total))
 
 
 def _refine(
