@@ -92,7 +92,7 @@ def fit_bones(
         goal = anchor_bones if damping == 0 else (anchor_bones + damping * vectors) * share
         residual = size - lengths + (unit * (goal - vectors)).sum(-1)
         weighted = root[..., None] * unit
-        factor, _ = torch.linalg.cholesky_ex(eye + share * overlap * kcs_matrix(weighted))
+        factor, _ = torch.linalg.cholesky_ex(torch.addcmul(eye, share * overlap, kcs_matrix(weighted)))
         pull = torch.cholesky_solve((root * residual)[..., None], factor)
         base = points if damping == 0 else (points + damping * current) * share
         current = base - share * (matrix @ (pull * weighted))
