@@ -1,0 +1,114 @@
+"""Limited-memory BFGS for many problems at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from kcs_torch.solvers.iterate import Solution
+
+__all__ = ["lbfgs"]
+
+
+def lbfgs(
+    energy: Callable[[Tensor], Tensor],
+    start: Tensor,
+    *,
+    num_steps: int = 100,
+    memory: int = 10,
+    tolerance: float = 1e-6,
+    max_trials: int = 12,
+    first_step: float = 1e-2,
+) -> Solution[Tensor]:
+    """Minimise ``energy`` of each row of ``start`` by L-BFGS with a backtracking line search (Nocedal 1980).
+
+    All problems move in lockstep, each with its own history and step length, so that many starts of one problem cost
+    little more than one. A step is taken only where it lowers the energy enough (Armijo) and is finite.
+
+    Args:
+        energy: maps (H, D) to (H,), differentiable; row h depends on row h alone.
+        start: (H, D).
+        num_steps: steps, at most.
+        memory: pairs of differences kept.
+        tolerance: stop where ten steps lower every energy by less than this share of its size.
+        max_trials: halvings of a step; a problem whose step fails restarts from steepest descent, then rests.
+        first_step: length of the first step, a share of the start's root mean square (of 1 where that is 0).
+
+    Returns:
+        The minimisers (H, D) and whether all settled within ``num_steps``.
+
+    >>> goal = torch.tensor([[1.0, 2.0], [3.0, -1.0]], dtype=torch.float64)
+    >>> lbfgs(lambda x: ((x - goal) ** 2).sum(-1), torch.zeros_like(goal)).value.round(decimals=4).tolist()
+    [[1.0, 2.0], [3.0, -1.0]]
+    """
+
+    def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
+        with torch.enable_grad():
+            x = x.detach().requires_grad_()
+            value = energy(x)
+            (gradient,) = torch.autograd.grad(value.sum(), x)
+        return value.detach(), gradient
+
+    dot = lambda a, b: (a * b).sum(-1, keepdim=True)  # noqa: E731
+    x = start.detach()
+    value, gradient = evaluate(x)
+    tiny = torch.finfo(x.dtype).tiny**0.5
+    size = x.square().mean(-1, keepdim=True).sqrt()
+    size = torch.where(size > 0, size, torch.ones_like(size))
+    steepest = first_step * size / gradient.square().mean(-1, keepdim=True).sqrt().clamp_min(tiny)
+    moves: list[Tensor] = []
+    turns: list[Tensor] = []
+    inverses: list[Tensor] = []
+    scale = steepest
+    resting = torch.zeros_like(value, dtype=torch.bool)
+    failed = torch.zeros_like(resting)
+    past = [value]
+    settled, made = False, 0
+    for made in range(1, num_steps + 1):  # noqa: B007
+        q = gradient
+        shares = []
+        for s, y, r in zip(reversed(moves), reversed(turns), reversed(inverses), strict=True):
+            shares.append(r * dot(s, q))
+            q = q - shares[-1] * y
+        q = q * scale
+        for (s, y, r), a in zip(zip(moves, turns, inverses, strict=True), reversed(shares), strict=True):
+            q = q + s * (a - r * dot(y, q))
+        downhill = dot(q, gradient) > 0
+        direction = -torch.where(downhill & ~failed[:, None], q, steepest * gradient)
+        slope = dot(direction, gradient)[:, 0]
+        length = torch.ones_like(value)
+        done = resting
+        new_x, new_value, new_gradient = x, value, gradient
+        for _ in range(max_trials):
+            trial = x + length[:, None] * direction
+            v, g = evaluate(torch.where(done[:, None], new_x, trial))
+            good = ~done & (v <= value + 1e-4 * length * slope) & torch.isfinite(g).all(-1)
+            new_x = torch.where(good[:, None], trial, new_x)
+            new_value = torch.where(good, v, new_value)
+            new_gradient = torch.where(good[:, None], g, new_gradient)
+            done = done | good
+            if bool(done.all()):
+                break
+            # the parabola through value, slope and trial, kept within a tenth and a half
+            bend = 2 * (v - value - length * slope)
+            guess = torch.where(torch.isfinite(v) & (bend > 0), -slope * length.square() / bend, 0.1 * length)
+            length = torch.where(done, length, torch.maximum(torch.minimum(guess, 0.5 * length), 0.1 * length))
+        resting = resting | (failed & ~done)
+        failed = ~done
+        s, y = new_x - x, new_gradient - gradient
+        curve = dot(s, y)
+        kept = curve > 1e-10 * dot(y, y) * scale.clamp_min(tiny)
+        moves.append(torch.where(kept, s, torch.zeros_like(s)))
+        turns.append(torch.where(kept, y, torch.zeros_like(y)))
+        inverses.append(torch.where(kept, 1 / torch.where(kept, curve, torch.ones_like(curve)), torch.zeros_like(curve)))
+        del moves[:-memory], turns[:-memory], inverses[:-memory]
+        scale = torch.where(kept, curve / dot(y, y).clamp_min(tiny), scale)
+        x, value, gradient = new_x, new_value, new_gradient
+        past.append(value)
+        drop = past[-11:][0] - value
+        if bool(resting.all()) or (made >= 10 and bool((drop <= tolerance * value.abs().clamp_min(tiny)).all())):
+            settled = True
+            break
+    return Solution(x, settled, made)
