@@ -1,6 +1,17 @@
-"""What the names of joints mean, and where a human's joints are."""
+"""What the names of joints mean, where a human's joints are, and how they move."""
 
+from kcs_torch.anatomy.limbs import BENDS, Hinge, contacts_by_names, hinges_by_names
 from kcs_torch.anatomy.names import canonical_name, mirror_name, side_of
 from kcs_torch.anatomy.template import places_by_names, template_by_names
 
-__all__ = ["canonical_name", "mirror_name", "places_by_names", "side_of", "template_by_names"]
+__all__ = [
+    "BENDS",
+    "Hinge",
+    "canonical_name",
+    "contacts_by_names",
+    "hinges_by_names",
+    "mirror_name",
+    "places_by_names",
+    "side_of",
+    "template_by_names",
+]

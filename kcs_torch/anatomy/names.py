@@ -76,6 +76,17 @@ _SIDED_NAMES = _spellings(
         "mouth": "mouth",
     }
 )
+# What has its own name in the limbs of animals.
+_ANIMAL_NAMES = _spellings(
+    {
+        "hock": "hock tarsus",
+        "knee": "stifle",
+        "wrist": "carpus",
+        "forepaw": "forepaw frontpaw forehoof fronthoof forefoot frontfoot",
+        "hindpaw": "hindpaw backpaw rearpaw hindhoof backhoof rearhoof hindfoot backfoot rearfoot",
+        "paw": "paw hoof",
+    }
+)
 
 
 def _hand_names() -> dict[str, str]:
@@ -139,7 +150,7 @@ def canonical_name(name: str) -> tuple[str, str] | None:
 
 
 def part_of(name: str, kind: str) -> str | None:
-    """Return the part that a name means, before its neighbours are looked at."""
+    """Return the part of a "human", a "hand" or an "animal" that a name means, before its neighbours are looked at."""
     name = name.rsplit(":", 1)[-1]  # "mixamorig:LeftArm"
     found = _side_span(name)
     rest = name if found is None else name[: found[1]] + " " + name[found[2] :]
@@ -147,6 +158,8 @@ def part_of(name: str, kind: str) -> str | None:
     keys = [key, key.removesuffix("joint")]
     if kind == "hand":
         table = {**_HAND_NAMES, "wrist": "wrist"}
+    elif kind == "animal":
+        table = _ANIMAL_NAMES
     else:
         table = _CENTRE_NAMES if found is None else _SIDED_NAMES
     return next((table[k] for k in keys if k in table), None)

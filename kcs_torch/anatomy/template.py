@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from kcs_torch.anatomy.names import FINGER_JOINTS, part_of, side_of
 from kcs_torch.errors import SkeletonError, unknown
 
-__all__ = ["places_by_names", "template_by_names"]
+__all__ = ["places_by_names", "places_of_known", "template_by_names"]
 
 Point = tuple[float, float, float]
 
@@ -140,6 +140,18 @@ def places_by_names(names: Sequence[str]) -> list[tuple[str, str]]:
     if not any(side != "centre" and part not in _FACE for side, part in parts):
         raise SkeletonError("template 'human': expected a joint of an arm or a leg; a head alone may be any animal's")
     return [(side, _resolve(part, side, present)) for side, part in parts]
+
+
+def places_of_known(names: Sequence[str]) -> list[tuple[str, str] | None]:
+    """Return (side, place) of each joint as :func:`places_by_names`, None where a name is no part of a person.
+
+    >>> places_of_known(["LKnee", "club"])
+    [('left', 'knee'), None]
+    """
+    parts = [part_of(n, "human") for n in names]
+    present = {part for part in parts if part is not None}
+    sides = [side_of(n) for n in names]
+    return [None if p is None else (s, _resolve(p, s, present)) for s, p in zip(sides, parts, strict=True)]
 
 
 def _known_parts(kind: str, names: Sequence[str]) -> list[tuple[str, str]]:

@@ -1,6 +1,7 @@
 """Skeletons: named joints, the rigid bones between them, and what is known of their shape."""
 
+from kcs_torch.anatomy import Hinge
 from kcs_torch.skeleton.builtin import SKELETONS, get_skeleton, guess_skeleton
 from kcs_torch.skeleton.core import Skeleton
 
-__all__ = ["SKELETONS", "Skeleton", "get_skeleton", "guess_skeleton"]
+__all__ = ["SKELETONS", "Hinge", "Skeleton", "get_skeleton", "guess_skeleton"]

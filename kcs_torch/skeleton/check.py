@@ -41,6 +41,26 @@ def check_facts(body: Skeleton) -> None:
     for i in body.flexible:
         if not 0 <= i < body.num_bones:
             raise SkeletonError(f"{where}: flexible {i}: expected bone indices 0..{body.num_bones - 1}")
+    joined = {frozenset(b) for b in body.bones}
+    for hinge in body.hinges:
+        used = (hinge.parent, hinge.joint, hinge.child, hinge.left, hinge.right)
+        if not all(0 <= i < n for i in used) or hinge.left == hinge.right:
+            raise SkeletonError(f"{where}: {hinge}: expected joint indices in 0..{n - 1}, left and right different")
+        what = f"{where}: hinge at '{body.joints[hinge.joint]}'"
+        for a, b in hinge.bones:
+            if frozenset((a, b)) not in joined or hinge.parent == hinge.child:
+                raise SkeletonError(
+                    f"{what}: expected the joint between two bones, got '{body.joints[hinge.parent]}' - "
+                    f"'{body.joints[hinge.joint]}' - '{body.joints[hinge.child]}'. Add the bone "
+                    f"{body.joints[a]}-{body.joints[b]}, or choose other ends (parent, child)."
+                )
+        if hinge.sign not in (1, -1):
+            raise SkeletonError(f"{what}: sign: expected 1 (backward) or -1 (forward), got {hinge.sign}")
+        if not 0 <= hinge.firm <= 1:
+            raise SkeletonError(f"{what}: weight: expected a number within 0..1, got {hinge.firm}")
+    for i in body.contacts:
+        if not 0 <= i < n:
+            raise SkeletonError(f"{where}: contact {i}: expected joint indices 0..{n - 1}")
     if body.template is not None:
         if len(body.template) != n:
             raise SkeletonError(f"{where}: template: expected {n} positions, got {len(body.template)}")

@@ -13,14 +13,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.anatomy import template_by_names
+from kcs_torch.anatomy import Hinge, contacts_by_names, hinges_by_names, template_by_names
 from kcs_torch.errors import FormatError, SkeletonError, unknown
 from kcs_torch.skeleton.check import check_facts, check_tree
 from kcs_torch.skeleton.graph import find_cycle, find_pieces
-from kcs_torch.skeleton.parse import arguments, find_mirror
+from kcs_torch.skeleton.parse import arguments, find_mirror, hinge_to_dict
 
 __all__ = ["Skeleton"]
 
+KEYS = (
+    *("name", "joints", "bones", "mirror", "virtual", "template", "proportions", "flexible", "tree"),
+    *("hinges", "contacts"),
+)
 Pair = tuple[int, int]
 Point = tuple[float, float, float]
 
@@ -42,6 +46,8 @@ class Skeleton:
         template: a rest pose, one (x right, y down, z away from the viewer) per joint, any unit; or None.
         proportions: relative bone lengths, one per bone, any unit; taken from the template if None.
         flexible: indices of bones that may change their length (a spine drawn as one stick, say).
+        hinges: joints that bend one way only (:class:`Hinge`).
+        contacts: indices of the joints that touch the ground: heels and toes, paws, or ankles.
         tree: False admits cycles and separate pieces.
 
     Raises:
@@ -62,6 +68,8 @@ class Skeleton:
     proportions: tuple[float, ...] | None = None
     flexible: tuple[int, ...] = ()
     tree: bool = True
+    hinges: tuple[Hinge, ...] = ()
+    contacts: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         settle = object.__setattr__  # lists become tuples, so that a skeleton can be hashed
@@ -70,6 +78,8 @@ class Skeleton:
         settle(self, "mirror", tuple((int(a), int(b)) for a, b in self.mirror))
         settle(self, "virtual", tuple((int(v), tuple(sources)) for v, sources in self.virtual))
         settle(self, "flexible", tuple(self.flexible))
+        settle(self, "hinges", tuple(self.hinges))
+        settle(self, "contacts", tuple(self.contacts))
         if self.template is not None:
             settle(self, "template", tuple(tuple(float(c) for c in p) for p in self.template))
         if self.proportions is not None:
@@ -93,6 +103,8 @@ class Skeleton:
         proportions: Mapping[str, float] | None = None,
         flexible: Iterable[tuple[str, str]] = (),
         tree: bool = True,
+        hinges: Iterable[Mapping[str, Any]] | None = None,
+        contacts: Iterable[str] | None = None,
     ) -> Skeleton:
         """Build a skeleton from joint names and pairs of names.
 
@@ -106,6 +118,11 @@ class Skeleton:
             proportions: ``{"parent-child": relative length}`` for every bone.
             flexible: bones that may change their length.
             tree: False admits cycles and separate pieces.
+            hinges: ``{"joint": "left_knee", "bends": "backward"}`` for each joint that bends one way only. More keys,
+                where needed: ``axis`` (left, right), by default the mirror pair of the joint above; ``weight``, how
+                far it can be relied on, 0 to 1, by default 1; ``parent`` and ``child``, where the bones do not tell
+                them. Found from the names if None.
+            contacts: joints that touch the ground; found from the names if None.
 
         Raises:
             SkeletonError: a name is unknown, or the skeleton is inconsistent.
@@ -121,6 +138,8 @@ class Skeleton:
                 proportions=proportions,
                 flexible=flexible,
                 tree=tree,
+                hinges=hinges,
+                contacts=contacts,
             )
         )
 
@@ -133,7 +152,7 @@ class Skeleton:
         name: str = "custom",
         tree: bool = True,
     ) -> Skeleton:
-        """Build a skeleton from index pairs; mirror pairs and a template are found from the names.
+        """Build a skeleton from index pairs; what names tell is found: mirror pairs, template, hinges, contacts.
 
         Args:
             edges: (B, 2) pairs (parent, child).
@@ -163,7 +182,12 @@ class Skeleton:
                     continue
         if template is not None and any(math.dist(template[a], template[b]) < 1e-6 for a, b in pairs):
             template = None  # two names for one place: this body is built otherwise
-        return replace(plain, mirror=find_mirror(names), template=template)
+        joined = {frozenset(p) for p in pairs}
+        hinges, contacts = hinges_by_names(names, pairs), contacts_by_names(names)
+        if known is not None:
+            hinges = tuple(h for h in known.hinges if {frozenset(b) for b in h.bones} <= joined)
+            contacts = known.contacts
+        return replace(plain, mirror=find_mirror(names), template=template, hinges=hinges, contacts=contacts)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], *, source: str = "skeleton") -> Skeleton:
@@ -174,10 +198,9 @@ class Skeleton:
         """
         if not isinstance(data, Mapping):
             raise FormatError(f"{source}: expected a mapping with 'joints' and 'bones', got {type(data).__name__}")
-        known = ("name", "joints", "bones", "mirror", "virtual", "template", "proportions", "flexible", "tree")
         for key in data:
-            if key not in known:
-                raise unknown(f"key in {source}", key, known, FormatError)
+            if key not in KEYS:
+                raise unknown(f"key in {source}", key, KEYS, FormatError)
         for key in ("joints", "bones"):
             if not isinstance(data.get(key), (list, tuple)):
                 raise FormatError(f"{source}: expected a list under '{key}', got {type(data.get(key)).__name__}")
@@ -375,4 +398,6 @@ class Skeleton:
             out["proportions"] = dict(zip(self.bone_names, self.proportions, strict=True))
         if not self.tree:
             out["tree"] = False
+        out["hinges"] = [hinge_to_dict(h, self.joints) for h in self.hinges]
+        out["contacts"] = [self.joints[i] for i in self.contacts]
         return out

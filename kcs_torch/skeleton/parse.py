@@ -5,10 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from kcs_torch.anatomy import mirror_name, side_of, template_by_names
+from kcs_torch.anatomy import (
+    BENDS,
+    Hinge,
+    contacts_by_names,
+    hinges_by_names,
+    mirror_name,
+    side_of,
+    template_by_names,
+)
 from kcs_torch.errors import SkeletonError, unknown
 
-__all__ = ["arguments", "find_mirror"]
+__all__ = ["arguments", "find_mirror", "hinge_to_dict"]
 
 Pair = tuple[int, int]
 Point = tuple[float, float, float]
@@ -25,6 +33,8 @@ def arguments(
     proportions: Mapping[str, float] | None,
     flexible: Iterable[tuple[str, str]],
     tree: bool,
+    hinges: Iterable[Mapping[str, Any]] | None,
+    contacts: Iterable[str] | None,
 ) -> dict[str, Any]:
     """Return the arguments of ``Skeleton`` from those of ``Skeleton.from_names``."""
     virtual = {str(v): tuple(sources) for v, sources in (virtual or {}).items()}
@@ -53,16 +63,25 @@ def arguments(
     if proportions is not None:
         _check_keys(f"proportions of skeleton '{name}'", proportions, bone_names, bone_names)
         lengths = tuple(float(proportions[b]) for b in bone_names)
+    twins = find_mirror(names) if mirror is None else pairs(mirror, "mirror")
+    if hinges is None:
+        bends = hinges_by_names(names, bone_pairs)
+    else:
+        bends = tuple(_read_hinge(h, names, bone_pairs, twins, f"hinges of skeleton '{name}'") for h in hinges)
+    if isinstance(contacts, str):
+        raise SkeletonError(f"contacts of skeleton '{name}': expected a list of joint names, got {contacts!r}")
     return {
         "joints": names,
         "bones": bone_pairs,
         "name": name,
-        "mirror": find_mirror(names) if mirror is None else pairs(mirror, "mirror"),
+        "mirror": twins,
         "virtual": tuple((position[v], tuple(at(s, "virtual") for s in sources)) for v, sources in virtual.items()),
         "template": None if template is None else _read_template(template, names, virtual, name),
         "proportions": lengths,
         "flexible": tuple(i for i, b in enumerate(bone_pairs) if frozenset(b) in soft),
         "tree": tree,
+        "hinges": bends,
+        "contacts": contacts_by_names(names) if contacts is None else tuple(at(c, "contacts") for c in contacts),
     }
 
 
@@ -71,6 +90,65 @@ def find_mirror(names: Sequence[str]) -> tuple[Pair, ...]:
     position = {n: i for i, n in enumerate(names)}
     twins = ((n, mirror_name(n)) for n in names if side_of(n) == "left")
     return tuple((position[a], position[b]) for a, b in twins if b in position)
+
+
+def hinge_to_dict(hinge: Hinge, names: Sequence[str]) -> dict[str, Any]:
+    """The keys that ``Skeleton.from_names`` takes for a hinge, all of them."""
+    return {
+        "joint": names[hinge.joint],
+        "bends": hinge.bends,
+        "axis": [names[hinge.left], names[hinge.right]],
+        "weight": hinge.firm,
+        "parent": names[hinge.parent],
+        "child": names[hinge.child],
+    }
+
+
+def _read_hinge(
+    data: Mapping[str, Any], names: Sequence[str], bones: Sequence[Pair], mirror: Sequence[Pair], what: str
+) -> Hinge:
+    """A hinge from names; ends not given follow from the bones, an axis not given from the mirror pairs."""
+    keys = ("joint", "bends", "axis", "weight", "parent", "child")
+    if not isinstance(data, Mapping):
+        raise SkeletonError(f"{what}: expected mappings such as {{joint: left_knee, bends: backward}}, got {data!r}")
+    for key in data:
+        if key not in keys:
+            raise unknown(f"key in {what}", key, keys, SkeletonError)
+
+    def at(joint: object) -> int:
+        if joint not in names:
+            raise unknown(f"joint in {what}", joint, names, SkeletonError)
+        return list(names).index(str(joint))
+
+    if "joint" not in data or data.get("bends") not in list(BENDS):
+        raise SkeletonError(f"{what}: expected 'joint' and 'bends: {' or '.join(BENDS)}', got {dict(data)}")
+    joint, ends = at(data["joint"]), {}
+    for key, around in (
+        ("parent", [a for a, b in bones if b == joint]),
+        ("child", [b for a, b in bones if a == joint]),
+    ):
+        if data.get(key) is not None:
+            ends[key] = at(data[key])
+        elif len(around) == 1:
+            ends[key] = around[0]
+        else:
+            choices = ", ".join(names[i] for i in around) or "no joint"
+            raise SkeletonError(f"{what}: '{names[joint]}': the bones give {choices} as {key}: write '{key}: NAME'")
+    axis = data.get("axis")
+    if axis is None:
+        pair = next((p for p in mirror if ends["parent"] in p), None)
+        if pair is None:
+            raise SkeletonError(
+                f"{what}: '{names[joint]}': '{names[ends['parent']]}' has no mirror twin to make an axis: "
+                "write 'axis: [LEFT, RIGHT]'"
+            )
+    elif isinstance(axis, (list, tuple)) and len(axis) == 2:
+        pair = (at(axis[0]), at(axis[1]))
+    else:
+        raise SkeletonError(f"{what}: '{names[joint]}': axis: expected two joint names, left and right, got {axis!r}")
+    weight = data.get("weight")
+    firm = 1.0 if weight is None else float(weight)
+    return Hinge(ends["parent"], joint, ends["child"], *pair, sign=BENDS[data["bends"]], firm=firm)
 
 
 def _read_template(
