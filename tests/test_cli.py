@@ -278,8 +278,13 @@ def test_skeletons_list_as_json():
 @pytest.mark.parametrize("name", kt.SKELETONS)
 def test_skeletons_show_every_joint(name):
     text = run("skeletons", "show", name).stdout
-    for joint in kt.SKELETONS[name].joints:
+    body = kt.SKELETONS[name]
+    for joint in body.joints:
         assert joint in text
+    for hinge in body.hinges:
+        assert f"{body.joints[hinge.joint]} {hinge.bends}" in text
+    ground = text.split("touch the ground: ")[1].splitlines()[0]
+    assert ground == (", ".join(body.joints[i] for i in body.contacts) or "none known")
 
 
 def test_skeletons_show_is_a_skeleton_file(tmp_path):

@@ -256,12 +256,15 @@ ORDER = torch.randperm(17, generator=torch.Generator().manual_seed(3)).tolist()
 def reordered(body):
     """The same body with its joints in ORDER."""
     where = {old: new for new, old in enumerate(ORDER)}
+    ends = ("parent", "joint", "child", "left", "right")
     return replace(
         body,
         joints=tuple(body.joints[i] for i in ORDER),
         bones=tuple((where[a], where[b]) for a, b in body.bones),
         mirror=tuple((where[a], where[b]) for a, b in body.mirror),
         template=tuple(body.template[i] for i in ORDER),
+        hinges=tuple(replace(h, **{end: where[getattr(h, end)] for end in ends}) for h in body.hinges),
+        contacts=tuple(where[i] for i in body.contacts),
     )
 
 

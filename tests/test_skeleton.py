@@ -14,11 +14,19 @@ from hypothesis import strategies as st
 
 from kcs_torch.anatomy import mirror_name, side_of
 from kcs_torch.errors import FormatError, KcsError, SkeletonError
-from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton
+from kcs_torch.skeleton import SKELETONS, Hinge, Skeleton, get_skeleton, guess_skeleton
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 BUILT_IN = sorted(SKELETONS)
+KNEE = {"joint": "left_knee", "bends": "backward"}
 ARM = Skeleton.from_names(["shoulder", "elbow", "wrist"], [("shoulder", "elbow"), ("elbow", "wrist")], name="arm")
+
+
+def leg(*, names=("left_hip", "right_hip", "left_knee", "left_ankle", "left_heel"), **options):
+    """A leg, its hips and its heel."""
+    bones = [(names[0], names[1]), (names[0], names[2]), (names[2], names[3]), (names[3], names[4])]
+    return Skeleton.from_names(names, bones, **options)
+
 
 # As published by each detector or data set, sides as l and r.
 COCO = (
@@ -110,7 +118,46 @@ def test_from_edges_finds_what_names_tell():
     assert Skeleton.from_edges([[0, 1]], ["left_toe", "left_ball"]).template is None
 
 
+def test_from_edges_takes_what_the_built_in_skeleton_of_that_name_says():
+    for body in SKELETONS.values():
+        names = body.joints[: body.num_observed]
+        bones = [b for b in body.bones if max(b) < body.num_observed]
+        other = Skeleton.from_edges(bones, names, tree=False)
+        assert (other.hinges, other.contacts) == (body.hinges, body.contacts)
+        told = dict(zip(body.bones, body.spread, strict=True))
+        assert other.spread == tuple(told[b] for b in bones)
+    # a hinge needs its bones
+    coco = SKELETONS["coco17"]
+    few = Skeleton.from_edges([[11, 12], [11, 13], [13, 15]], coco.joints[:17], tree=False)
+    assert [coco.joints[h.joint] for h in few.hinges] == ["left_knee"]
+    assert few.spread == (12, 30, 35)
+    assert Skeleton.from_edges([[0, 1]], ["tail1", "tail2"]).spread is None
+
+
+def test_hinges():
+    expected = Hinge(parent=0, joint=2, child=3, left=0, right=1, sign=1.0, firm=1.0)
+    assert leg().hinges == leg(hinges=[KNEE]).hinges == (expected,)
+    assert leg(hinges=[]).hinges == ()
+    told = KNEE | {"axis": ["right_hip", "left_hip"], "weight": 0.5, "bends": "forward", "child": None}
+    assert leg(hinges=[told]).hinges == (Hinge(0, 2, 3, left=1, right=0, sign=-1.0, firm=0.5),)
+    # the ends may be given, also against the direction of the bones
+    bend = {"joint": "b", "bends": "backward", "parent": "a", "child": "c", "axis": ["a", "d"]}
+    turned = Skeleton.from_names("abcd", [("b", "a"), ("c", "b"), ("c", "d")], hinges=[bend])
+    assert turned.hinges == (Hinge(0, 1, 2, left=0, right=3, sign=1.0),)
+
+
+def test_contacts_and_spread():
+    assert leg().contacts == (4,) and leg(contacts=["left_ankle", "left_heel"]).contacts == (3, 4)
+    assert leg(contacts=[]).contacts == ()
+    assert leg().spread is None and leg(template="human").spread == (12, 30, 35, 35)
+    assert leg(template="human", spread={}).spread is None
+    degrees = dict(zip(leg().bone_names, (1, 2, 3, 4), strict=True))
+    assert leg(spread=degrees).spread == (1, 2, 3, 4)
+
+
 def test_lists_become_tuples():
+    body = Skeleton(("a", "b"), ((0, 1),), hinges=[], contacts=[1], spread=[30])
+    assert hash(body) == hash(Skeleton(("a", "b"), ((0, 1),), contacts=(1,), spread=(30.0,)))
     body = Skeleton(joints=["a", "b"], bones=[[0, 1]], template=[[0, 0, 0], [0, 1, 0]])
     assert hash(body) == hash(Skeleton(("a", "b"), ((0, 1),), template=((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))))
     assert pickle.loads(pickle.dumps(body)) == body
@@ -169,6 +216,38 @@ def test_graphs_are_admitted_when_asked_for():
             lambda: Skeleton.from_names(["a", "b", "c"], [("a", "b"), ("b", "c")], flexible=[("a", "c")]),
             "expected bones",
         ),
+        (lambda: Skeleton("abc", ((0, 1), (1, 2)), hinges=[Hinge(0, 1, 3, 0, 2, 1.0)]), "joint indices in 0..2"),
+        (lambda: Skeleton("abc", ((0, 1), (1, 2)), hinges=[Hinge(0, 1, 2, 1, 1, 1.0)]), "left and right different"),
+        (lambda: Skeleton("abc", ((0, 1), (1, 2)), hinges=[Hinge(1, 0, 2, 1, 2, 1.0)]), "Add the bone a-c"),
+        (lambda: Skeleton("abc", ((0, 1), (1, 2)), hinges=[Hinge(0, 1, 0, 0, 2, 1.0)]), "the joint between two bones"),
+        (
+            lambda: Skeleton("abc", ((0, 1), (1, 2)), hinges=[Hinge(0, 1, 2, 0, 2, 2.0)]),
+            "hinge at 'b': sign: expected 1",
+        ),
+        (lambda: Skeleton("abc", ((0, 1), (1, 2)), hinges=[Hinge(0, 1, 2, 0, 2, 1.0, 1.5)]), "within 0..1, got 1.5"),
+        (lambda: Skeleton("abc", ((0, 1), (1, 2)), hinges=[Hinge(0, 1, 2, 0, 2, 1.0, math.nan)]), "within 0..1"),
+        (lambda: Skeleton("ab", ((0, 1),), contacts=(2,)), "contact 2: expected joint indices 0..1"),
+        (lambda: Skeleton("ab", ((0, 1),), contacts=(1, 1)), "contact 'b' is given twice"),
+        (lambda: Skeleton("ab", ((0, 1),), spread=(1, 2)), "spread: expected 1 angles, got 2"),
+        (lambda: Skeleton("ab", ((0, 1),), spread=(0,)), "bone a-b: expected degrees above 0"),
+        (lambda: Skeleton("ab", ((0, 1),), spread=(math.nan,)), "bone a-b: expected degrees above 0"),
+        (lambda: leg(hinges=["left_knee"]), "expected mappings such as {joint: left_knee, bends: backward}"),
+        (lambda: leg(hinges=[{"joint": "left_knee"}]), "'joint' and 'bends: backward or forward'"),
+        (lambda: leg(hinges=[KNEE | {"bends": "up"}]), "'joint' and 'bends: backward or forward'"),
+        (lambda: leg(hinges=[KNEE | {"weigth": 1}]), "did you mean 'weight'"),
+        (lambda: leg(hinges=[KNEE | {"joint": "left_kne"}]), "did you mean 'left_knee'"),
+        (lambda: leg(hinges=[KNEE | {"axis": "left_hip"}]), "expected two joint names, left and right"),
+        (lambda: leg(hinges=[KNEE | {"axis": ["left_hip", "hip"]}]), "unknown joint in hinges"),
+        (lambda: leg(hinges=[KNEE | {"joint": "left_ankle"}]), "'left_knee' has no mirror twin.*axis: "),
+        (lambda: leg(hinges=[KNEE | {"joint": "left_heel"}]), "give no joint as child: write 'child: NAME'"),
+        (lambda: leg(hinges=[KNEE | {"joint": "left_hip"}]), "give no joint as parent: write 'parent: NAME'"),
+        (
+            lambda: leg(hinges=[KNEE | {"parent": "left_heel", "axis": ["left_hip", "right_hip"]}]),
+            "Add the bone left_heel-left_knee",
+        ),
+        (lambda: leg(contacts=["left_hel"]), "did you mean 'left_heel'"),
+        (lambda: leg(contacts="left_heel"), "expected a list of joint names"),
+        (lambda: leg(spread={"left_hip-left_knee": 3}), "none for left_hip-right_hip"),
         (lambda: Skeleton.from_edges([[0, math.nan]], 3), "expected pairs of joint indices"),
         (lambda: Skeleton.from_edges([[0, 1.5]], 3), "expected pairs of joint indices"),
         (lambda: Skeleton.from_edges([[0, 1, 2]], 3), "expected pairs of joint indices"),
@@ -305,6 +384,17 @@ def trees(draw):
         extras["proportions"] = [draw(st.floats(1e-6, 1e6)) for _ in bones]
     if draw(st.booleans()):
         extras["flexible"] = sorted(draw(st.sets(st.integers(0, len(bones) - 1))))
+    if draw(st.booleans()):
+        extras["spread"] = [draw(st.floats(1e-6, 180)) for _ in bones]
+    if draw(st.booleans()):
+        extras["contacts"] = sorted(draw(st.sets(st.integers(0, len(names) - 1))))
+    chains = [(a, b, c) for a, b in bones for d, c in bones if b == d]
+    if chains:
+        ends = [draw(st.tuples(st.sampled_from(chains), st.permutations(range(len(names))))) for _ in range(2)]
+        extras["hinges"] = [
+            Hinge(*chain, *order[:2], draw(st.sampled_from([1.0, -1.0])), draw(st.floats(0, 1)))
+            for chain, order in ends
+        ]
     return Skeleton(joints=names, bones=draw(st.permutations(bones)), name=draw(st.text(max_size=5)), **extras)
 
 
@@ -313,7 +403,9 @@ def test_round_trip_of_random_trees(body):
     assert body.is_tree and body.cycle() is None and len(body.pieces()) == 1
     data = body.to_dict()
     keys = {f"{a}-{b}" for a, b in ((body.joints[a], body.joints[b]) for a, b in body.bones)}
-    if body.proportions is None or len(keys) == body.num_bones:  # "a-" + "b" and "a" + "-b" may collide
+    if (body.proportions is None and body.spread is None) or len(
+        keys
+    ) == body.num_bones:  # "a-" + "b" and "a" + "-b" may collide
         assert Skeleton.from_dict(json.loads(json.dumps(data))) == body
 
 
@@ -369,7 +461,7 @@ VALUES = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["a", "b", "a-b"]), inner, max_size=3),
     max_leaves=8,
 )
-OPTIONAL = ("name", "mirror", "virtual", "template", "proportions", "flexible", "tree")
+OPTIONAL = ("name", "mirror", "virtual", "template", "proportions", "flexible", "tree", "hinges", "contacts", "spread")
 
 
 @given(
@@ -412,6 +504,7 @@ def test_with_links():
     held = body.with_links([("left_wrist", "right_wrist")])
     assert held.num_bones == body.num_bones + 1 and not held.is_tree and held.flexible == body.flexible
     assert {held.joints[i] for i in held.cycle()} >= {"left_wrist", "right_wrist", "neck"}
+    assert (held.hinges, held.contacts) == (body.hinges, body.contacts) and held.spread == (*body.spread, 45)
     with pytest.raises(SkeletonError, match="given twice"):
         body.with_links([("left_knee", "left_hip")])
     with pytest.raises(SkeletonError, match="did you mean 'left_wrist'"):
@@ -424,6 +517,11 @@ def test_connected():
     whole = body.connected()
     assert len(whole.pieces()) == 1 and whole.bones[: body.num_bones] == body.bones
     assert [whole.bones[i] for i in whole.flexible] == [(2, 0), (2, 5)]
+    names = ("left_hip", "left_knee", "left_ankle", "right_hip")
+    apart = Skeleton.from_edges([[0, 1], [1, 2]], names, tree=False)
+    joined = apart.connected()
+    assert joined.hinges == apart.hinges == (Hinge(0, 1, 2, 0, 3, 1.0),)
+    assert joined.contacts == (2,) and joined.spread == (30, 35, 45)
 
 
 @pytest.mark.parametrize("batch", [(), (2,), (2, 3)])

@@ -2,10 +2,12 @@
 
 from kcs_torch.anatomy.limbs import BENDS, Hinge, contacts_by_names, hinges_by_names
 from kcs_torch.anatomy.names import canonical_name, mirror_name, side_of
+from kcs_torch.anatomy.spread import UNKNOWN_SPREAD, spread_by_names
 from kcs_torch.anatomy.template import places_by_names, template_by_names
 
 __all__ = [
     "BENDS",
+    "UNKNOWN_SPREAD",
     "Hinge",
     "canonical_name",
     "contacts_by_names",
@@ -13,5 +15,6 @@ __all__ = [
     "mirror_name",
     "places_by_names",
     "side_of",
+    "spread_by_names",
     "template_by_names",
 ]

@@ -62,7 +62,7 @@ def show_skeleton(
     ] = [],  # noqa: B006 (typer reads it and never changes it)
     as_json: AsJson = False,
 ) -> None:
-    """Show a skeleton's joints, bones, mirror pairs and virtual joints; a file is checked."""
+    """Show a skeleton's joints, bones, mirror pairs, hinges and contacts; a file is checked."""
     with answer(as_json):
         from kcs_torch.skeleton import get_skeleton
 
@@ -94,6 +94,11 @@ def _print(body: Skeleton) -> None:
             typer.echo(f"  {bone}")
     pairs = ", ".join(f"{body.joints[a]} = {body.joints[b]}" for a, b in body.mirror)
     typer.echo(f"mirror pairs: {pairs or 'none'}")
+    hinges = ", ".join(f"{body.joints[h.joint]} {h.bends}" for h in body.hinges)
+    typer.echo(f"bend one way: {hinges or 'none known'}")
+    typer.echo(f"touch the ground: {', '.join(body.joints[i] for i in body.contacts) or 'none known'}")
+    if body.spread is not None:
+        typer.echo(f"bones stray from the template by {min(body.spread):g} to {max(body.spread):g} degrees")
 
 
 def _tree(body: Skeleton) -> Tree:

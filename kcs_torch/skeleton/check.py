@@ -41,6 +41,24 @@ def check_facts(body: Skeleton) -> None:
     for i in body.flexible:
         if not 0 <= i < body.num_bones:
             raise SkeletonError(f"{where}: flexible {i}: expected bone indices 0..{body.num_bones - 1}")
+    _check_motion(body, where)
+    if body.template is not None:
+        if len(body.template) != n:
+            raise SkeletonError(f"{where}: template: expected {n} positions, got {len(body.template)}")
+        for joint, p in zip(body.joints, body.template, strict=True):
+            if len(p) != 3 or not all(map(math.isfinite, p)):
+                raise SkeletonError(f"{where}: template: '{joint}': expected 3 finite numbers, got {p}")
+    if body.proportions is not None:
+        if len(body.proportions) != body.num_bones:
+            raise SkeletonError(f"{where}: proportions: expected {body.num_bones} lengths, got {len(body.proportions)}")
+        for bone, length in zip(body.bone_names, body.proportions, strict=True):
+            if not 0 < length < math.inf:
+                raise SkeletonError(f"{where}: proportions: bone {bone}: expected a positive number, got {length}")
+
+
+def _check_motion(body: Skeleton, where: str) -> None:
+    """What is said of hinges, contacts and spread."""
+    n = body.num_joints
     joined = {frozenset(b) for b in body.bones}
     for hinge in body.hinges:
         used = (hinge.parent, hinge.joint, hinge.child, hinge.left, hinge.right)
@@ -61,18 +79,14 @@ def check_facts(body: Skeleton) -> None:
     for i in body.contacts:
         if not 0 <= i < n:
             raise SkeletonError(f"{where}: contact {i}: expected joint indices 0..{n - 1}")
-    if body.template is not None:
-        if len(body.template) != n:
-            raise SkeletonError(f"{where}: template: expected {n} positions, got {len(body.template)}")
-        for joint, p in zip(body.joints, body.template, strict=True):
-            if len(p) != 3 or not all(map(math.isfinite, p)):
-                raise SkeletonError(f"{where}: template: '{joint}': expected 3 finite numbers, got {p}")
-    if body.proportions is not None:
-        if len(body.proportions) != body.num_bones:
-            raise SkeletonError(f"{where}: proportions: expected {body.num_bones} lengths, got {len(body.proportions)}")
-        for bone, length in zip(body.bone_names, body.proportions, strict=True):
-            if not 0 < length < math.inf:
-                raise SkeletonError(f"{where}: proportions: bone {bone}: expected a positive number, got {length}")
+        if body.contacts.count(i) > 1:
+            raise SkeletonError(f"{where}: contact '{body.joints[i]}' is given twice")
+    if body.spread is not None:
+        if len(body.spread) != body.num_bones:
+            raise SkeletonError(f"{where}: spread: expected {body.num_bones} angles, got {len(body.spread)}")
+        for bone, angle in zip(body.bone_names, body.spread, strict=True):
+            if not 0 < angle <= 180:
+                raise SkeletonError(f"{where}: spread: bone {bone}: expected degrees above 0, up to 180, got {angle}")
 
 
 def check_tree(body: Skeleton) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,17 +12,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.anatomy import Hinge, contacts_by_names, hinges_by_names, template_by_names
+from kcs_torch.anatomy import UNKNOWN_SPREAD, Hinge
 from kcs_torch.errors import FormatError, SkeletonError, unknown
 from kcs_torch.skeleton.check import check_facts, check_tree
 from kcs_torch.skeleton.graph import find_cycle, find_pieces
-from kcs_torch.skeleton.parse import arguments, find_mirror, hinge_to_dict
+from kcs_torch.skeleton.parse import arguments, facts_by_names, hinge_to_dict
 
 __all__ = ["Skeleton"]
 
 KEYS = (
     *("name", "joints", "bones", "mirror", "virtual", "template", "proportions", "flexible", "tree"),
-    *("hinges", "contacts"),
+    *("hinges", "contacts", "spread"),
 )
 Pair = tuple[int, int]
 Point = tuple[float, float, float]
@@ -48,6 +47,8 @@ class Skeleton:
         flexible: indices of bones that may change their length (a spine drawn as one stick, say).
         hinges: joints that bend one way only (:class:`Hinge`).
         contacts: indices of the joints that touch the ground: heels and toes, paws, or ankles.
+        spread: how far each bone strays from the template, root mean square in degrees once the trunk is turned onto
+            the template's; or None where nothing is known.
         tree: False admits cycles and separate pieces.
 
     Raises:
@@ -70,6 +71,7 @@ class Skeleton:
     tree: bool = True
     hinges: tuple[Hinge, ...] = ()
     contacts: tuple[int, ...] = ()
+    spread: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         settle = object.__setattr__  # lists become tuples, so that a skeleton can be hashed
@@ -84,6 +86,8 @@ class Skeleton:
             settle(self, "template", tuple(tuple(float(c) for c in p) for p in self.template))
         if self.proportions is not None:
             settle(self, "proportions", tuple(float(p) for p in self.proportions))
+        if self.spread is not None:
+            settle(self, "spread", tuple(float(s) for s in self.spread))
         check_facts(self)
         if self.tree:
             self.validate()
@@ -105,6 +109,7 @@ class Skeleton:
         tree: bool = True,
         hinges: Iterable[Mapping[str, Any]] | None = None,
         contacts: Iterable[str] | None = None,
+        spread: Mapping[str, float] | None = None,
     ) -> Skeleton:
         """Build a skeleton from joint names and pairs of names.
 
@@ -123,6 +128,8 @@ class Skeleton:
                 far it can be relied on, 0 to 1, by default 1; ``parent`` and ``child``, where the bones do not tell
                 them. Found from the names if None.
             contacts: joints that touch the ground; found from the names if None.
+            spread: ``{"parent-child": degrees}`` for every bone, how far it strays from the template, or an empty
+                mapping where nothing is known; found from the names if None and there is a template.
 
         Raises:
             SkeletonError: a name is unknown, or the skeleton is inconsistent.
@@ -140,6 +147,7 @@ class Skeleton:
                 tree=tree,
                 hinges=hinges,
                 contacts=contacts,
+                spread=spread,
             )
         )
 
@@ -152,7 +160,7 @@ class Skeleton:
         name: str = "custom",
         tree: bool = True,
     ) -> Skeleton:
-        """Build a skeleton from index pairs; what names tell is found: mirror pairs, template, hinges, contacts.
+        """Build a skeleton from index pairs; all else is found from the names, as far as they tell.
 
         Args:
             edges: (B, 2) pairs (parent, child).
@@ -172,22 +180,7 @@ class Skeleton:
                 raise SkeletonError(f"edges of skeleton '{name}': expected pairs of joint indices, got {edge!r}")
             pairs.append((int(edge[0]), int(edge[1])))
         plain = cls(joints=names, bones=tuple(pairs), name=name, tree=tree)
-        known = guess_skeleton(names)
-        template = None if known is None or known.template is None else known.template[: len(names)]
-        for kind in ("human", "hand"):
-            if template is None:
-                try:
-                    template = template_by_names(kind, names)
-                except SkeletonError:
-                    continue
-        if template is not None and any(math.dist(template[a], template[b]) < 1e-6 for a, b in pairs):
-            template = None  # two names for one place: this body is built otherwise
-        joined = {frozenset(p) for p in pairs}
-        hinges, contacts = hinges_by_names(names, pairs), contacts_by_names(names)
-        if known is not None:
-            hinges = tuple(h for h in known.hinges if {frozenset(b) for b in h.bones} <= joined)
-            contacts = known.contacts
-        return replace(plain, mirror=find_mirror(names), template=template, hinges=hinges, contacts=contacts)
+        return replace(plain, **facts_by_names(names, pairs, guess_skeleton(names)))
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], *, source: str = "skeleton") -> Skeleton:
@@ -352,7 +345,7 @@ class Skeleton:
         (False, 'left_wrist-right_wrist')
         """
         extra = tuple((self.index(a), self.index(b)) for a, b in links)
-        return replace(self, bones=self.bones + extra, proportions=None, tree=False)
+        return self._with_bones(extra)
 
     def connected(self) -> Skeleton:
         """Join separate pieces by flexible bones, so that bone vectors determine the whole pose."""
@@ -363,7 +356,12 @@ class Skeleton:
         extra = tuple((main[0], p[0]) for p in pieces if p is not main)
         first = self.num_bones
         flexible = self.flexible + tuple(range(first, first + len(extra)))
-        return replace(self, bones=self.bones + extra, flexible=flexible, proportions=None, tree=False)
+        return self._with_bones(extra, flexible=flexible)
+
+    def _with_bones(self, extra: tuple[Pair, ...], **changes: Any) -> Skeleton:
+        """More bones, of which neither length nor spread is known."""
+        spread = None if self.spread is None else self.spread + (UNKNOWN_SPREAD,) * len(extra)
+        return replace(self, bones=self.bones + extra, proportions=None, spread=spread, tree=False, **changes)
 
     def complete(self, points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Append the virtual joints to observed tracks.
@@ -400,4 +398,6 @@ class Skeleton:
             out["tree"] = False
         out["hinges"] = [hinge_to_dict(h, self.joints) for h in self.hinges]
         out["contacts"] = [self.joints[i] for i in self.contacts]
+        if self.template is not None or self.spread is not None:
+            out["spread"] = dict(zip(self.bone_names, self.spread or (), strict=False))
         return out

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kcs_torch.anatomy import (
     BENDS,
@@ -12,11 +13,15 @@ from kcs_torch.anatomy import (
     hinges_by_names,
     mirror_name,
     side_of,
+    spread_by_names,
     template_by_names,
 )
 from kcs_torch.errors import SkeletonError, unknown
 
-__all__ = ["arguments", "find_mirror", "hinge_to_dict"]
+if TYPE_CHECKING:
+    from kcs_torch.skeleton.core import Skeleton
+
+__all__ = ["arguments", "facts_by_names", "find_mirror", "hinge_to_dict"]
 
 Pair = tuple[int, int]
 Point = tuple[float, float, float]
@@ -35,6 +40,7 @@ def arguments(
     tree: bool,
     hinges: Iterable[Mapping[str, Any]] | None,
     contacts: Iterable[str] | None,
+    spread: Mapping[str, float] | None,
 ) -> dict[str, Any]:
     """Return the arguments of ``Skeleton`` from those of ``Skeleton.from_names``."""
     virtual = {str(v): tuple(sources) for v, sources in (virtual or {}).items()}
@@ -59,10 +65,16 @@ def arguments(
     soft = {frozenset(p) for p in pairs(flexible, "flexible")}
     if soft - {frozenset(p) for p in bone_pairs}:
         raise SkeletonError(f"flexible of skeleton '{name}': expected bones, one of {', '.join(bone_names)}")
-    lengths = None
-    if proportions is not None:
-        _check_keys(f"proportions of skeleton '{name}'", proportions, bone_names, bone_names)
-        lengths = tuple(float(proportions[b]) for b in bone_names)
+
+    def per_bone(given: Mapping[str, float] | None, what: str) -> tuple[float, ...] | None:
+        if given is None:
+            return None
+        _check_keys(f"{what} of skeleton '{name}'", given, bone_names, bone_names)
+        return tuple(float(given[b]) for b in bone_names)
+
+    spreads = None if spread is None or len(spread) == 0 else per_bone(spread, "spread")
+    if spread is None and template is not None:
+        spreads = spread_by_names(names, bone_pairs)
     twins = find_mirror(names) if mirror is None else pairs(mirror, "mirror")
     if hinges is None:
         bends = hinges_by_names(names, bone_pairs)
@@ -77,11 +89,48 @@ def arguments(
         "mirror": twins,
         "virtual": tuple((position[v], tuple(at(s, "virtual") for s in sources)) for v, sources in virtual.items()),
         "template": None if template is None else _read_template(template, names, virtual, name),
-        "proportions": lengths,
+        "proportions": per_bone(proportions, "proportions"),
         "flexible": tuple(i for i, b in enumerate(bone_pairs) if frozenset(b) in soft),
         "tree": tree,
         "hinges": bends,
         "contacts": contacts_by_names(names) if contacts is None else tuple(at(c, "contacts") for c in contacts),
+        "spread": spreads,
+    }
+
+
+def facts_by_names(names: Sequence[str], bones: Sequence[Pair], known: Skeleton | None) -> dict[str, Any]:
+    """Return what names tell of a skeleton of these bones: mirror, template, hinges, contacts, spread.
+
+    Args:
+        names: N joint names.
+        bones: pairs of joint indices.
+        known: a skeleton whose observed joints have these names; what it says goes before what the names say.
+    """
+    template = None if known is None or known.template is None else known.template[: len(names)]
+    for kind in ("human", "hand"):
+        if template is None:
+            try:
+                template = template_by_names(kind, names)
+            except SkeletonError:
+                continue
+    if template is not None and any(math.dist(template[a], template[b]) < 1e-6 for a, b in bones):
+        template = None  # two names for one place: this body is built otherwise
+    hinges, contacts, spread = hinges_by_names(names, bones), contacts_by_names(names), spread_by_names(names, bones)
+    if known is not None:
+        joined = {frozenset(b) for b in bones}
+        hinges = tuple(h for h in known.hinges if {frozenset(b) for b in h.bones} <= joined)
+        contacts = known.contacts
+        if known.spread is not None:
+            told = dict(zip(map(frozenset, known.bones), known.spread, strict=True))
+            # A bone that the known skeleton has not, such as the links of hips and shoulders to a neck that is virtual
+            # there, is as its names say.
+            spread = tuple(told.get(frozenset(b), s) for b, s in zip(bones, spread, strict=True))
+    return {
+        "mirror": find_mirror(names),
+        "template": template,
+        "hinges": hinges,
+        "contacts": contacts,
+        "spread": None if template is None else spread,
     }
 
 
