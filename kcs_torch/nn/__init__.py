@@ -1,5 +1,6 @@
 """Modules: layers, energies that are losses and solver terms at once, and unrolled solvers."""
 
+from kcs_torch.nn.anatomy import HingeEnergy
 from kcs_torch.nn.energies import (
     BoneLengthEnergy,
     LowRankEnergy,
@@ -15,6 +16,7 @@ __all__ = [
     "BoneLengthEnergy",
     "BoneLengths",
     "BoneVectors",
+    "HingeEnergy",
     "KCSMatrix",
     "LowRankEnergy",
     "ReprojectionEnergy",

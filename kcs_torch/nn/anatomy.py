@@ -1,0 +1,98 @@
+"""Energies of what the skeleton knows about a body's joints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ShapeError
+from kcs_torch.nn.layers import SkeletonModule
+from kcs_torch.skeleton import Skeleton
+
+__all__ = ["HingeEnergy"]
+
+
+class HingeEnergy(SkeletonModule):
+    """1/2 sum_h f_h max(0, -s_h)^2 of each frame: no joint bends the wrong way.
+
+    s_h = sign_h (u x v) . a / (|u| |v| |a|), where u and v are the bones above and below hinge h and a is its axis from
+    right to left: the sine of the bend where the axis is square to both. f_h is how firm the hinge is. The lengths are
+    the clip's, not each frame's, so that energy and gradient are smooth where a bone shrinks to nothing in a frame.
+
+    Args:
+        skeleton: a :class:`Skeleton`, a built-in name or a file; without hinges the energy is 0.
+
+    >>> energy = HingeEnergy("h36m17")
+    >>> energy(torch.randn(4, 30, 17, 3)).shape
+    torch.Size([4, 30])
+    """
+
+    joints: Tensor
+    limbs: Tensor
+    sign: Tensor
+    firm: Tensor
+
+    def __init__(self, skeleton: str | Path | Skeleton) -> None:
+        super().__init__(skeleton)
+        hinges = self.skeleton.hinges
+        where = {frozenset(bone): i for i, bone in enumerate(self.skeleton.bones)}
+        joints = [(h.parent, h.joint, h.child, h.left, h.right) for h in hinges]
+        limbs = [[where[frozenset(bone)] for bone in h.bones] for h in hinges]
+        self.register_buffer("joints", torch.tensor(joints, dtype=torch.long).reshape(-1, 5), persistent=False)
+        self.register_buffer("limbs", torch.tensor(limbs, dtype=torch.long).reshape(-1, 2), persistent=False)
+        self.register_buffer("sign", torch.tensor([h.sign for h in hinges]), persistent=False)
+        self.register_buffer("firm", torch.tensor([h.firm for h in hinges]), persistent=False)
+
+    def forward(self, points: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Return the energy of each frame.
+
+        Args:
+            points: (..., T, N, 3).
+            lengths: (..., B) of the bones; None takes each bone's root mean square over the T frames, as is always done
+                for the axes.
+
+        Returns:
+            (..., T), without unit.
+
+        Raises:
+            ShapeError: the shapes do not fit.
+        """
+        wrong = (-self.bend(points, lengths)).clamp_min(0)
+        return 0.5 * (self.firm.to(wrong.dtype) * wrong.square()).sum(-1)
+
+    def bend(self, points: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """The sine s of each hinge, (..., T, H), positive where it bends its way; arguments as in :meth:`forward`."""
+        self.check(points, clip=True)
+        if points.shape[-1] != 3:
+            raise ShapeError(f"HingeEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
+        if lengths is not None and lengths.shape[-1:] != (len(self.bones),):
+            raise ShapeError(f"HingeEnergy: expected lengths (..., {len(self.bones)}), got {tuple(lengths.shape)}")
+        wide = points.to(torch.promote_types(points.dtype, torch.float32))  # squares in mm leave half precision's range
+        ends = wide.index_select(-2, self.joints.mT.reshape(-1)).unflatten(-2, (5, len(self.joints)))
+        parent, joint, child, left, right = ends.unbind(-3)  # each (..., T, H, 3)
+        upper, lower, axis = joint - parent, child - joint, left - right
+        if lengths is None:
+            upper, lower = _to_size(upper), _to_size(lower)
+        else:
+            above, below = lengths.to(wide.dtype)[..., None, self.limbs].unbind(-1)  # each (..., 1, H)
+            upper, lower = _divide(upper, above[..., None]), _divide(lower, below[..., None])
+        return (self.sign.to(wide.dtype) * _triple(upper, lower, _to_size(axis))).to(points.dtype)
+
+
+def _triple(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """(a x b) . c of vectors (..., 3)."""
+    return (torch.linalg.cross(a, b) * c).sum(-1)
+
+
+def _to_size(vectors: Tensor) -> Tensor:
+    """Vectors (..., T, H, 3) over their root mean square length in the clip; 0 where they all are."""
+    square = vectors.square().sum(-1, keepdim=True).mean(-3, keepdim=True)
+    return _divide(vectors, torch.where(square > 0, square, torch.ones_like(square)).sqrt())
+
+
+def _divide(vectors: Tensor, lengths: Tensor) -> Tensor:
+    """Vectors over lengths; 0 where a length is."""
+    known = lengths > 0
+    return vectors * torch.where(known, 1 / torch.where(known, lengths, torch.ones_like(lengths)), 0)
