@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -37,13 +39,11 @@ def nearest_rotation(matrix: Tensor, *, reflect: bool = False) -> Tensor:
         reflect: True also admits reflections.
 
     Returns:
-        (..., D, D), orthogonal. Not meant to be differentiated where singular values coincide.
+        (..., D, D), orthogonal. Differentiable once, by the sums of singular values, not their gaps: repeated singular
+        values are safe, and directions in which the rotation is arbitrary have the derivative 0.
     """
-    u, _, vt = torch.linalg.svd(matrix)
-    if not reflect:
-        sign = torch.linalg.det(u @ vt).sign()
-        u = torch.cat([u[..., :-1], u[..., -1:] * sign[..., None, None]], -1)
-    return u @ vt
+    out: Tensor = _Polar.apply(matrix, reflect)
+    return out
 
 
 def procrustes(
@@ -101,3 +101,25 @@ def similarity(
         rotation, factor = rotation[..., None, :, :], factor[..., None]
     moved = a @ rotation
     return (moved * factor[..., None, None] if scale else moved) + mean
+
+
+class _Polar(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, matrix: Tensor, reflect: bool) -> Tensor:
+        u, size, vt = torch.linalg.svd(matrix)
+        if not reflect:
+            sign = torch.linalg.det(u @ vt).sign()[..., None]
+            u = torch.cat([u[..., :-1], u[..., -1:] * sign[..., None]], -1)
+            size = torch.cat([size[..., :-1], size[..., -1:] * sign], -1)
+        ctx.save_for_backward(u, size, vt)
+        return u @ vt
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        u, size, vt = ctx.saved_tensors
+        inner = u.mT @ grad @ vt.mT
+        total = size[..., :, None] + size[..., None, :]
+        firm = total > 1e-6 * size.abs().amax(-1)[..., None, None]  # else any turn in this plane would do
+        spin = torch.where(firm, (inner - inner.mT) / torch.where(firm, total, torch.ones_like(total)), 0)
+        return u @ spin @ vt, None

@@ -1,14 +1,26 @@
-"""Cameras that move simply: a path of constant angular velocity fitted to noisy rotations."""
+"""Cameras that move simply: paths of constant angular velocity or smooth ones, from rotations that align poses."""
 
 from __future__ import annotations
+
+import math
+from typing import Literal
 
 import roma
 import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional.align import nearest_rotation
+from kcs_torch.functional.scatter import scatter_log_det
+from kcs_torch.functional.spectral import dct_basis
+from kcs_torch.solvers.lbfgs import lbfgs
 
-__all__ = ["constant_path"]
+__all__ = ["CameraPath", "choose_path", "constant_path", "settle_path", "smooth_path"]
+
+CameraPath = Literal["auto", "free", "smooth", "constant"]
+
+EVEN = 0.05
+"""A path explains rotations where their median deviation from it is below this share of its length."""
 
 
 def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Tensor]:
@@ -55,6 +67,116 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Te
         speed, start = speed + move[:3], roma.rotvec_to_rotmat(move[3:]) @ start
     path = roma.rotvec_to_rotmat(time[:, None] * speed) @ start
     return path, roma.rotmat_geodesic_distance(path, rotations)
+
+
+def smooth_path(rotations: Tensor, *, waves: int = 6, num_steps: int = 20) -> tuple[Tensor, Tensor]:
+    """Fit a path whose deviation from a constant angular velocity is a sum of ``waves`` slow cosines, robustly.
+
+    Args:
+        rotations: (T, 3, 3), T >= 2.
+        waves: cosines, the constant included; no more than T.
+        num_steps: rounds of Cauchy weights.
+
+    Returns:
+        The path (T, 3, 3), and its angle to each rotation (T,), in radians.
+
+    Raises:
+        ShapeError: ``rotations`` is not (T, 3, 3) with T >= 2.
+    """
+    base, angle = constant_path(rotations)
+    frames = len(rotations)
+    basis = dct_basis(frames, min(waves, frames), dtype=base.dtype, device=base.device)  # (T, K)
+    deviation = (rotations @ base.mT).flatten(-2)
+    path = base
+    for _ in range(num_steps):
+        weight = 1 / (1 + (angle / angle.median().clamp_min(1e-9)).square())
+        normal = basis.mT @ (weight[:, None] * basis)
+        ridge = 1e-9 * normal.diagonal().mean() * torch.eye(len(normal), dtype=base.dtype, device=base.device)
+        share = torch.linalg.solve(normal + ridge, basis.mT @ (weight[:, None] * deviation))
+        path = nearest_rotation((basis @ share).unflatten(-1, (3, 3))) @ base
+        angle = roma.rotmat_geodesic_distance(path, rotations)
+    return path, angle
+
+
+def choose_path(rotations: Tensor, kind: CameraPath = "auto") -> tuple[Tensor, CameraPath, Tensor]:
+    """Return the simplest camera path that explains the rotations: constant angular velocity, smooth, or free.
+
+    Args:
+        rotations: (T, 3, 3).
+        kind: "auto" chooses, by the median deviation as a share of the path's length; else the path to fit.
+
+    Returns:
+        The path (T, 3, 3), its kind, and its angle to each rotation (T,), in radians. Clips below 10 frames are free.
+    """
+    zero = rotations.new_zeros(len(rotations))
+    if kind == "free" or len(rotations) < 10:
+        return rotations, "free", zero
+    if kind != "smooth":
+        path, angle = constant_path(rotations)
+        if kind == "constant" or _explains(path, angle):
+            return path, "constant", angle
+    path, angle = smooth_path(rotations)
+    if kind == "smooth" or _explains(path, angle):
+        return path, "smooth", angle
+    return rotations, "free", zero
+
+
+def _explains(path: Tensor, angle: Tensor) -> bool:
+    length = roma.rotmat_geodesic_distance(path[1:], path[:-1]).sum()
+    return bool(angle.median() < EVEN * length)
+
+
+def settle_path(
+    vectors: Tensor, path: Tensor, *, waves: int = 0, eps: tuple[float, ...] = (1e-3, 1e-4, 1e-5), num_steps: int = 40
+) -> Tensor:
+    """Refine a camera path so that the world poses vary least: T/2 log det of the scatter of the turned bones.
+
+    A path fitted to rotations that align poses inherits the body's own turning. What a camera must explain is only
+    that poses seen from it vary little: the axis and speed of the path (three numbers), and ``waves`` slow cosines
+    of deviation, are moved to where the log-determinant is least.
+
+    Args:
+        vectors: (T, B, 3) bones in the camera frame, of size near 1.
+        path: (T, 3, 3) world to camera, of constant angular velocity if ``waves`` is 0.
+        waves: cosines of deviation beside axis and speed.
+        eps: of the log-determinant, in order.
+        num_steps: L-BFGS steps for each.
+
+    Returns:
+        (T, 3, 3), turned as a whole nearest to ``path``.
+    """
+    frames = len(path)
+    if frames < 3:
+        return path
+    time = torch.arange(frames, dtype=path.dtype, device=path.device) - (frames - 1) / 2
+    turn = roma.rotmat_to_rotvec(path[1:] @ path[:-1].mT).median(0).values
+    spin = roma.rotvec_to_rotmat(time[:, None] * turn)
+    rest = spin.mT @ path  # one rotation, if the path is of constant angular velocity
+    # a radian of tilt moves the axis, a radian of speed the path's ends
+    size = turn.norm()
+    axis = turn / size.clamp_min(1e-9)
+    lean = size * (torch.eye(3, dtype=path.dtype, device=path.device) - axis[:, None] * axis)
+    lean = lean + axis[:, None] * axis / frames
+    if bool(size * frames < 1e-2):
+        lean = torch.eye(3, dtype=path.dtype, device=path.device) / frames
+    basis = dct_basis(frames, waves + 1, dtype=path.dtype, device=path.device)[:, 1:] * math.sqrt(frames)
+
+    def turned(u: Tensor) -> Tensor:
+        speed = turn + u[:, :3] @ lean  # (1, 3)
+        out = roma.rotvec_to_rotmat(time[:, None] * speed) @ rest
+        if waves:
+            out = roma.rotvec_to_rotmat(basis @ u[0, 3:].view(waves, 3)) @ out
+        return out
+
+    def energy(u: Tensor) -> Tensor:
+        aligned = (vectors @ turned(u)).flatten(-2)
+        return scatter_log_det(aligned - aligned.mean(-2, keepdim=True), level)[None] / frames
+
+    u = path.new_zeros(1, 3 + 3 * waves)
+    for level in eps:  # noqa: B007
+        u = lbfgs(energy, u, num_steps=num_steps, first_step=1e-2).value
+    found = turned(u)
+    return found @ nearest_rotation((found.mT @ path).sum(0))
 
 
 def _mean_unturned(rotations: Tensor, times: Tensor, turn: Tensor) -> Tensor:

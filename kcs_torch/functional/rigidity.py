@@ -1,0 +1,64 @@
+"""Which joints belong to one rigid part: pairs whose distance hardly varies, and their spanning tree."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ShapeError
+
+__all__ = ["distance_spread", "rigid_tree"]
+
+
+def distance_spread(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Return the mean and the standard deviation over time of the distances between all joints.
+
+    Args:
+        points: (..., T, N, 3).
+        weights: (..., T, N); a pair counts in a frame as much as the lesser of its joints. All 1 where None.
+
+    Returns:
+        mean (..., N, N) and standard deviation (..., N, N), both 0 for pairs never seen together.
+    """
+    offset = points[..., :, None, :] - points[..., None, :, :]
+    distance = offset.square().sum(-1).sqrt()  # (..., T, N, N)
+    if weights is None:
+        mean = distance.mean(-3)
+        return mean, (distance - mean[..., None, :, :]).square().mean(-3).sqrt()
+    share = torch.minimum(weights[..., :, None], weights[..., None, :])
+    total = share.sum(-3)
+    total = torch.where(total > 0, total, torch.ones_like(total))
+    mean = (share * distance).sum(-3) / total
+    return mean, ((share * (distance - mean[..., None, :, :]).square()).sum(-3) / total).sqrt()
+
+
+def rigid_tree(cost: Tensor) -> Tensor:
+    """Return the minimum spanning tree of joints under a cost of each pair (Prim 1957).
+
+    Args:
+        cost: (N, N), symmetric; how much a pair's distance varies, say.
+
+    Returns:
+        (N - 1, 2) integer (parent, child) pairs, parents first, from joint 0.
+
+    Raises:
+        ShapeError: ``cost`` is not square.
+
+    >>> rigid_tree(torch.tensor([[0.0, 1, 9], [1, 0, 2], [9, 2, 0]])).tolist()
+    [[0, 1], [1, 2]]
+    """
+    joints = len(cost)
+    if cost.ndim != 2 or cost.shape[0] != cost.shape[1]:
+        raise ShapeError(f"rigid_tree: expected a cost of each pair (N, N), got {tuple(cost.shape)}")
+    cost = torch.nan_to_num(cost, nan=torch.finfo(cost.dtype).max)
+    inside = torch.zeros(joints, dtype=torch.bool, device=cost.device)
+    inside[:1] = True
+    pairs = []
+    for _ in range(joints - 1):
+        open_pairs = cost.masked_fill(~inside[:, None] | inside, math.inf)
+        parent, child = divmod(int(open_pairs.argmin()), joints)
+        pairs.append((parent, child))
+        inside[child] = True
+    return torch.tensor(pairs, dtype=torch.long, device=cost.device).reshape(-1, 2)

@@ -1,0 +1,103 @@
+"""Curvature of the Procrustean objective, frame by frame: what its descent is preconditioned with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.chain import bone_vectors, incidence, safe_norm
+from kcs_torch.functional.scatter import inverse_scatter
+
+__all__ = ["Curvature", "Levels", "block_roots", "frame_curvature"]
+
+Levels = list[tuple[float, Tensor, float, int]]
+"""(weight, rows (H, T, 3B), eps, frames that a row links) of each log-determinant."""
+
+
+@dataclass
+class Curvature:
+    """Blocks of the Hessian: the joints' free coordinates (the last ``free`` of x, y, z), then the rotation.
+
+    Attributes:
+        matrix: (H, T, free N + 3, free N + 3); coordinates come in blocks of N, all x first.
+        free: 1 (depths) or 3.
+        joints: N.
+    """
+
+    matrix: Tensor
+    free: int
+    joints: int
+
+    def add_lengths(self, points: Tensor, rigid: Tensor, stiffness: Tensor, slack: float, reach: float) -> None:
+        """Add the Gauss-Newton term of the lengths (P, 2)."""
+        vectors = bone_vectors(points, rigid)
+        size = safe_norm(vectors)
+        spread = size.var(-2, unbiased=False)
+        pull = stiffness * (1 / (spread + slack**2) - 1 / (spread + (reach * slack) ** 2))
+        along = vectors / size.clamp_min(torch.finfo(size.dtype).tiny)[..., None]
+        along = along[..., 3 - self.free :] * pull.sqrt()[..., None, :, None]  # (H, T, P, free)
+        ends = incidence(rigid, self.joints, dtype=points.dtype)
+        rows = (along.mT[..., None, :] * ends).flatten(-3, -2)  # (H, T, free N, P)
+        count = self.free * self.joints
+        self.matrix[..., :count, :count] += rows @ rows.mT
+
+    def add_tracks(self, precision: Tensor) -> None:
+        """Add the curvature (H, T, N) of the residuals of x and of y."""
+        count = 2 * self.joints
+        self.matrix.diagonal(dim1=-2, dim2=-1)[..., :count] += torch.cat([precision, precision], -1)
+
+
+def frame_curvature(points: Tensor, rotations: Tensor, bones: Tensor, levels: Levels, free: int) -> Curvature:
+    """Return each frame's Hessian of the log-determinants, their covariances held (the majoriser's).
+
+    With S the precision of the aligned bones, the block of joints n, m and coordinates i, j is
+    sum_kl R_ik R_jl (C S_kl C^T)_nm: nine N x N matrices serve all frames.
+
+    Args:
+        points: (H, T, N, 3).
+        rotations: (H, T, 3, 3).
+        bones: (B, 2).
+        levels: the log-determinants; links between frames count on the diagonal only.
+        free: coordinates of a joint that are free, 1 (depth) or 3.
+    """
+    hypotheses, frames, joints, _ = points.shape
+    count = len(bones)
+    ends = incidence(bones, joints, dtype=points.dtype)
+    vectors = bone_vectors(points, bones)
+    precision = points.new_zeros(hypotheses, 3 * count, 3 * count)
+    for weight, rows, eps, linked in levels:
+        precision = precision + linked * weight * inverse_scatter(rows, eps)
+    nine = precision.view(hypotheses, count, 3, count, 3).permute(0, 2, 4, 1, 3)
+    nine = (ends @ nine @ ends.mT).flatten(1, 2).flatten(-2)  # (H, 9, N N)
+    rows = rotations[:, :, 3 - free :]  # (H, T, free, 3)
+    pairs = (rows[:, :, :, None, :, None] * rows[:, :, None, :, None, :]).flatten(-2)  # (H, T, free, free, 9)
+    joint = (pairs.flatten(1, 3) @ nine).view(hypotheses, frames, free, free, joints, joints)
+    joint = joint.transpose(3, 4).flatten(4, 5).flatten(2, 3)
+    # A turn by w moves a bone b by b x w, before the rotation.
+    eye = torch.eye(3, dtype=points.dtype, device=points.device)
+    turned = torch.linalg.cross(vectors[..., None, :].expand(*vectors.shape, 3), eye.expand(*vectors.shape, 3), dim=-1)
+    turned = (turned.flatten(-3, -2) @ rotations).unflatten(-2, (count, 3)).mT.flatten(-3, -2)  # (H, T, 3B, 3)
+    weighed = (turned.mT.flatten(1, 2) @ precision).unflatten(1, (frames, 3)).mT  # (H, T, 3B, 3)
+    cross = torch.einsum("htik,htbkw->htibw", rows, weighed.unflatten(-2, (count, 3)))
+    cross = (ends @ cross).flatten(2, 3)  # (H, T, free N, 3)
+    matrix = torch.cat([torch.cat([joint, cross], -1), torch.cat([cross.mT, turned.mT @ weighed], -1)], -2)
+    return Curvature(matrix, free, joints)
+
+
+def block_roots(curvature: Curvature, *, ridge: float = 1e-6) -> Tensor:
+    """Return P (H, T, D, D) with P P^T the inverse of each block, shifts along the depth held in place.
+
+    A common depth of all joints moves no bone: its curvature, zero, becomes the mean one.
+    """
+    matrix = curvature.matrix.clone()
+    joints, free = curvature.joints, curvature.free
+    depth = slice((free - 1) * joints, free * joints)
+    typical = matrix.diagonal(dim1=-2, dim2=-1)[..., depth].mean(-1)
+    matrix[..., depth, depth] += (typical / joints)[..., None, None]
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    diagonal.mul_(1 + ridge).add_(ridge * typical[..., None] + torch.finfo(matrix.dtype).tiny)
+    factor = torch.linalg.cholesky_ex(matrix)[0]
+    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    return torch.linalg.solve_triangular(factor, eye, upper=False).mT.contiguous()

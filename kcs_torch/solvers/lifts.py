@@ -1,0 +1,54 @@
+"""Starts for a descent with many valleys: depths from bone lengths with random slow signs, and turning cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import roma
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence, safe_norm
+
+__all__ = ["random_lifts", "turning_cameras"]
+
+
+def turning_cameras(
+    degrees: Sequence[float] | Tensor, frames: int, *, dtype: torch.dtype, device: torch.device | None = None
+) -> Tensor:
+    """Return rotations (H, T, 3, 3) of cameras that turn evenly about the image's vertical by ``degrees`` in all."""
+    angle = torch.deg2rad(torch.as_tensor(degrees, dtype=dtype, device=device))
+    time = torch.linspace(-0.5, 0.5, frames, dtype=dtype, device=device) if frames > 1 else angle.new_zeros(1)
+    return roma.rotvec_to_rotmat(torch.nn.functional.pad((angle[:, None] * time)[..., None], (1, 1)))
+
+
+def random_lifts(
+    tracks: Tensor, bones: Tensor, count: int, *, waves: int = 3, generator: torch.Generator | None = None
+) -> Tensor:
+    """Lift tracks by the lengths of their bones, dz = s sqrt(L^2 - |b|^2), with random slow signs s in (-1, 1).
+
+    A bone is about as long as it ever looks. Signs are tanh of a few random cosines in time: a bone that keeps to one
+    side, or passes through the image plane now and then.
+
+    Args:
+        tracks: (T, N, 2).
+        bones: (B, 2) pairs; each separate piece is centred by itself.
+        count: starts to make.
+        waves: highest cosine.
+        generator: of the random numbers.
+
+    Returns:
+        (count, T, N, 3).
+    """
+    frames, joints, _ = tracks.shape
+    size = safe_norm(bone_vectors(tracks, bones))  # (T, B)
+    length = 1.02 * size.amax(-2)
+    depth = (length.square() - size.square()).clamp_min(0).sqrt()
+    time = torch.linspace(0, 1, frames, dtype=tracks.dtype, device=tracks.device)
+    order = torch.arange(waves + 1, dtype=tracks.dtype, device=tracks.device)
+    basis = (math.pi * order * time[:, None]).cos()  # (T, waves + 1)
+    draw = torch.randn(count, waves + 1, len(bones), generator=generator, dtype=torch.float64).to(tracks)
+    signed = depth * (3 * (basis @ draw)).tanh()  # (count, T, B)
+    inverse = chain_inverse(incidence(bones, joints, dtype=tracks.dtype))
+    return torch.cat([tracks.expand(count, -1, -1, -1), (signed @ inverse.mT)[..., None]], -1)

@@ -1,0 +1,241 @@
+"""Structure from motion by Procrustes alignment in bone space: the moving viewpoint.
+
+The bones of each frame, turned back by a rotation of that frame, follow one Gaussian, and so do their changes from
+frame to frame; rigid bones keep their length. With the covariances at their maximum likelihood this is
+
+    F = sum_m w_m T/2 log det(A_m^T A_m / T + eps_m I)              A_0: aligned bones, A_1: their changes in time
+      + sum_b s_b T/2 log((v_b + d^2) / (v_b + 9 d^2))              v_b: variance over time of a bone's length
+      + sum_tn u_tn c^2/2 log(1 + |x_tn - y_tn|^2 / (c noise)^2)    where the tracks are noisy or incomplete
+
+over depths (and x, y), and rotations. A log-determinant is the tighter surrogate of rank; the term in the lengths stops
+pulling on bones that vary by more than three times the slack d. All scales fall from stage to stage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import roma
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ShapeError
+from kcs_torch.functional.align import nearest_rotation
+from kcs_torch.functional.chain import bone_vectors, safe_norm
+from kcs_torch.functional.scatter import scatter_log_det
+from kcs_torch.solvers.curvature import Levels, block_roots, frame_curvature
+from kcs_torch.solvers.lbfgs import lbfgs
+
+__all__ = [
+    "COARSE",
+    "FINE",
+    "Pose",
+    "Stage",
+    "align_rotations",
+    "length_energy",
+    "motion_energy",
+    "procrustean",
+    "track_energy",
+]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Weights and scales of one stage of the descent, relative to tracks of root mean square 1.
+
+    Attributes:
+        eps: variance that the log-determinants do not look below; a tenth of it for the changes.
+        num_steps: L-BFGS steps.
+        still: weight of the aligned bones' log-determinant.
+        moving: weight of that of their changes from frame to frame.
+        slack: standard deviation of a rigid bone's length.
+    """
+
+    eps: float
+    num_steps: int
+    still: float
+    moving: float
+    slack: float
+
+
+COARSE = (Stage(1e-2, 15, 1.0, 0.0, 0.1), Stage(1e-3, 25, 1.0, 0.0, 0.03), Stage(1e-4, 30, 1.0, 0.0, 0.01))
+"""Stages that find the basin: frames in any order, so that far starts travel."""
+
+FINE = (Stage(1e-4, 30, 0.01, 1.0, 0.01), Stage(1e-5, 40, 0.01, 1.0, 0.01), Stage(1e-5, 40, 0.01, 1.0, 0.003))
+"""Stages that refine: the changes in time tell more than the poses, but slow modes move little."""
+
+CHANGE = 0.1
+"""The eps of the changes, a share of the poses'."""
+
+REACH = 3.0
+"""Residuals beyond this many standard deviations, and lengths beyond this many slacks, stop pulling."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """What :func:`procrustean` finds for H hypotheses.
+
+    Attributes:
+        points: (H, T, N, 3) in the camera frame.
+        rotations: (H, T, 3, 3), world to camera: ``points @ rotations`` are the aligned poses.
+        objective: (H,) at the last stage's scales; the lowest is best.
+        deviation: (H, T, N) standard deviation of the depths, from the objective's curvature in each frame.
+    """
+
+    points: Tensor
+    rotations: Tensor
+    objective: Tensor
+    deviation: Tensor
+
+    def __getitem__(self, index: Tensor | slice) -> Pose:
+        """Some of the hypotheses."""
+        return Pose(self.points[index], self.rotations[index], self.objective[index], self.deviation[index])
+
+
+def procrustean(
+    tracks: Tensor,
+    points: Tensor,
+    rotations: Tensor,
+    bones: Tensor,
+    *,
+    weights: Tensor | None = None,
+    rigid: Tensor | None = None,
+    stiffness: Tensor | float = 1.0,
+    noise: float = 0.0,
+    stages: Sequence[Stage] = COARSE + FINE,
+    extra: Callable[[Tensor], Tensor] | None = None,
+) -> Pose:
+    """Descend F from H starts at once, by L-BFGS in coordinates that whiten each frame's curvature.
+
+    Args:
+        tracks: (T, N, 2), centred, of root mean square near 1; where unseen, any value.
+        points: (H, T, N, 3) starts in the camera frame; x and y stay as they are unless ``noise`` is positive.
+        rotations: (H, T, 3, 3) starts, world to camera.
+        bones: (B, 2) joint pairs that span the joints.
+        weights: (T, N) confidences, 0 where unseen; needed only with ``noise``. All 1 where None.
+        rigid: (P, 2) joint pairs that keep their distance; ``bones`` where None.
+        stiffness: (P,) or a number, weight of each pair's length.
+        noise: standard deviation of the tracks, as a share of their size. 0 takes them as exact and complete, which
+            leaves one unknown a joint; else there are three.
+        stages: scales and weights, in order.
+        extra: further energy (H,) of points (H, T, N, 3), differentiable.
+
+    Returns:
+        The :class:`Pose` of each start.
+
+    Raises:
+        ShapeError: the shapes do not fit.
+    """
+    _check(tracks, points, rotations, bones)
+    hypotheses, frames, joints, _ = points.shape
+    rigid = bones if rigid is None else rigid
+    stiff = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device).expand(len(rigid))
+    free = 3 if noise > 0 else 1
+    share = tracks.new_ones(frames, joints) if weights is None else weights
+    value, roots = points.new_zeros(hypotheses), points.new_ones(hypotheses, frames, free * joints, 1)
+    for stage in stages:
+        precision = _precision(points, tracks, share, noise)
+        levels = aligned_levels(points, rotations, bones, stage)
+        curvature = frame_curvature(points, rotations, bones, levels, free)
+        curvature.add_lengths(points, rigid, stiff, stage.slack, REACH)
+        if noise > 0:
+            curvature.add_tracks(precision)
+        roots = block_roots(curvature)
+        base, turn = points, rotations
+
+        def move(u: Tensor) -> tuple[Tensor, Tensor]:
+            step = (roots @ u.view(hypotheses, frames, -1, 1)).squeeze(-1)  # noqa: B023
+            shift = step[..., :-3].unflatten(-1, (free, joints)).mT
+            if free == 1:
+                shift = torch.nn.functional.pad(shift, (2, 0))
+            return base + shift, roma.rotvec_to_rotmat(step[..., -3:]) @ turn  # noqa: B023
+
+        def energy(u: Tensor) -> Tensor:
+            x, r = move(u)
+            total = motion_energy(x, r, bones, stage) + length_energy(x, rigid, stiff, stage.slack)  # noqa: B023
+            if noise > 0:
+                total = total + track_energy(x, tracks, share, noise)
+            return total if extra is None else total + extra(x)
+
+        start = points.new_zeros(hypotheses, frames * (free * joints + 3))
+        found = lbfgs(energy, start, num_steps=stage.num_steps, first_step=1.0, tolerance=1e-8).value
+        points, rotations = move(found)
+        rotations = nearest_rotation(rotations)  # rounding would add up
+        with torch.no_grad():
+            value = energy(found)
+    depth = roots[..., (free - 1) * joints : free * joints, :]
+    return Pose(points, rotations, value, depth.square().sum(-1).sqrt())
+
+
+def aligned_levels(points: Tensor, rotations: Tensor, bones: Tensor, stage: Stage) -> Levels:
+    """The rows whose scatter counts: (weight, rows (H, T', 3B), eps, frames that a row links)."""
+    aligned = (bone_vectors(points, bones) @ rotations).flatten(-2)
+    aligned = aligned - aligned.mean(-2, keepdim=True)
+    levels: Levels = []
+    if stage.still > 0:
+        levels.append((stage.still, aligned, stage.eps, 1))
+    if stage.moving > 0 and aligned.shape[-2] > 2:
+        levels.append((stage.moving, aligned.diff(dim=-2), CHANGE * stage.eps, 2))
+    return levels
+
+
+def motion_energy(points: Tensor, rotations: Tensor, bones: Tensor, stage: Stage) -> Tensor:
+    """sum_m w_m T/2 log det of the scatter of aligned bones and of their changes, (...)."""
+    total = points.new_zeros(points.shape[:-3])
+    for weight, rows, eps, _ in aligned_levels(points, rotations, bones, stage):
+        total = total + weight * scatter_log_det(rows, eps)
+    return total
+
+
+def length_energy(points: Tensor, rigid: Tensor, stiffness: Tensor, slack: float, reach: float = REACH) -> Tensor:
+    """sum_p s_p T/2 log((v_p + d^2) / (v_p + (reach d)^2)), v_p the variance of a length over time, (...)."""
+    size = safe_norm(bone_vectors(points, rigid))
+    spread = size.var(-2, unbiased=False)
+    ratio = (spread + slack**2) / (spread + (reach * slack) ** 2)
+    return points.shape[-3] / 2 * (stiffness * ratio.log()).sum(-1)
+
+
+def track_energy(points: Tensor, tracks: Tensor, weights: Tensor, noise: float, reach: float = REACH) -> Tensor:
+    """sum_tn u_tn c^2/2 log(1 + |x_tn - y_tn|^2 / (c noise)^2): Cauchy's, so that outliers do not pull, (...)."""
+    square = (points[..., :2] - tracks).square().sum(-1) / (reach * noise) ** 2
+    return reach**2 / 2 * (weights * square.log1p()).sum((-2, -1))
+
+
+def align_rotations(points: Tensor, rotations: Tensor, bones: Tensor, *, num_steps: int = 10) -> Tensor:
+    """Turn each frame's bones onto their common mean (generalised Procrustes, without scale).
+
+    Args:
+        points: (..., T, N, 3) in the camera frame.
+        rotations: (..., T, 3, 3) to start from, world to camera.
+        bones: (B, 2).
+        num_steps: rounds of mean and alignment.
+
+    Returns:
+        (..., T, 3, 3).
+    """
+    vectors = bone_vectors(points, bones)
+    for _ in range(num_steps):
+        rotations = nearest_rotation(vectors.mT @ (vectors @ rotations).mean(-3, keepdim=True))
+    return rotations
+
+
+def _precision(points: Tensor, tracks: Tensor, weights: Tensor, noise: float) -> Tensor:
+    """Curvature (H, T, N) of :func:`track_energy`, its robust weights held."""
+    if noise <= 0:
+        return weights
+    square = (points[..., :2] - tracks).square().sum(-1) / (REACH * noise) ** 2
+    return weights / noise**2 / (1 + square)
+
+
+def _check(tracks: Tensor, points: Tensor, rotations: Tensor, bones: Tensor) -> None:
+    if points.ndim != 4 or points.shape[-1] != 3 or tracks.shape != (*points.shape[1:3], 2):
+        raise ShapeError(
+            "procrustean: expected points (H, T, N, 3) and tracks (T, N, 2), "
+            f"got {tuple(points.shape)} and {tuple(tracks.shape)}"
+        )
+    if rotations.shape != (*points.shape[:2], 3, 3):
+        expected = f"{tuple(points.shape[:2])} + (3, 3)"
+        raise ShapeError(f"procrustean: expected rotations {expected}, got {tuple(rotations.shape)}")
+    if bones.ndim != 2 or bones.shape[-1] != 2 or len(bones) == 0:
+        raise ShapeError(f"procrustean: expected bones (B, 2), at least one, got {tuple(bones.shape)}")
