@@ -1,0 +1,252 @@
+"""A body before a camera that hardly turns: bones of constant length, their signs of depth, several hypotheses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.temporal import best_path
+from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limb_path, limbs_of
+from kcs_torch.methods.pkc.objective import Objective, Weights
+from kcs_torch.methods.pkc.trunk import TURN, Trunk, mirror, trunk_paths, trunk_turns
+from kcs_torch.nn.posture import free_bones
+from kcs_torch.skeleton import Skeleton
+
+__all__ = ["Hypotheses", "fixed_view"]
+
+COARSE = (1.0, 1.01, 1.03, 1.07, 1.14, 1.25)
+FINE = (1.0, 1.004, 1.01, 1.02, 1.035, 1.055, 1.08, 1.12, 1.17, 1.25)
+"""Lengths tried for a bone, over its longest image (or 0.8 of its usual length, where that is more)."""
+
+TRUST = 0.1
+"""Weight of the limbs' votes for the trunk's sign: each frame's vote already speaks for its neighbours."""
+
+SWITCH = 8.0
+"""Largest cost of the trunk's change of sign from one frame to the next."""
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Solutions of one clip, best first.
+
+    Attributes:
+        depth: (H, T, N), centred per frame, in units of the template.
+        lengths: (H, B).
+        energy: (H,) of the objective.
+    """
+
+    depth: Tensor
+    lengths: Tensor
+    energy: Tensor
+
+    def __getitem__(self, index: slice | Tensor) -> Hypotheses:
+        return Hypotheses(self.depth[index], self.lengths[index], self.energy[index])
+
+
+def fixed_view(
+    skeleton: Skeleton,
+    image: Tensor,
+    *,
+    rate: float = 30.0,
+    rounds: int = 2,
+    steps: int = 50,
+    weights: Weights | None = None,
+    anchor: Tensor | None = None,
+) -> Hypotheses:
+    """Lift one clip by lengths, signs and posture, without any turn of the viewpoint.
+
+    1. The trunk, as a rigid template, gives a path of rotations and its mirror image; once with the template's lengths
+       and once with central bones no longer than their longest image.
+    2. Each limb's lengths and signs follow by second-order Viterbi for both paths at once; how much dearer a frame is
+       with one path than with the other is the limb's vote on the trunk's sign.
+    3. With the trunk's signs settled, limbs are placed again on a finer grid of lengths; the mirror image and other
+       sign paths stay as further hypotheses.
+    4. All are refined together on :class:`Objective`. Rounds of discrete moves from the best follow: limbs placed
+       again about the refined trunk, each limb's bones flipped.
+
+    Args:
+        skeleton: with a template, spreads and a trunk.
+        image: (T, N, 2), complete, in units of the template (a standing person being about 1.75).
+        rate: frames a second.
+        rounds: of discrete moves.
+        steps: L-BFGS steps of each refinement.
+        weights: of the objective.
+        anchor: (B,) lengths known from elsewhere, or None.
+
+    Returns:
+        The hypotheses, best first.
+    """
+    slow = 30.0 / rate
+    base = weights or Weights()
+    weights = replace(
+        base,
+        acceleration=base.acceleration * slow**2,
+        posture=base.posture / slow,
+        foreshortening=base.foreshortening / slow,
+        hinge=base.hinge * slow,
+    )
+    costs = SignCosts()
+    costs = replace(
+        costs,
+        acceleration=costs.acceleration * slow**2,
+        posture=costs.posture / slow,
+        foreshortening=costs.foreshortening / slow,
+        hinge=costs.hinge * slow,
+    )
+    image = image - image.mean(-2, keepdim=True)
+    search = _Search(skeleton, image, Objective(skeleton, image, weights, anchor), costs, TURN * slow)
+    found = search.start(anchor)
+    found = search.refine(found, steps)
+    for _ in range(rounds):
+        best = found.energy[0]
+        found = search.refine(search.moves(found), steps)
+        if not bool(found.energy[0] < best - 0.5):
+            break
+    return found
+
+
+@dataclass(frozen=True)
+class _Search:
+    skeleton: Skeleton
+    image: Tensor
+    objective: Objective
+    costs: SignCosts
+    turn: float
+
+    @property
+    def limbs(self) -> list[Limb]:
+        return limbs_of(self.skeleton, self.objective.posture.trunk.tolist())
+
+    def start(self, anchor: Tensor | None) -> Hypotheses:
+        """Hypotheses from both templates of the trunk."""
+        depths, lengths = [], []
+        for trunk in self._trunks(anchor):
+            paths = trunk_paths(self.image, trunk, self.objective.posture, self.costs.posture, self.turn)
+            settled = self._settle(paths, anchor)
+            frame = torch.arange(len(self.image), device=self.image.device)
+            tried: list[Tensor] = []
+            for path in (paths[settled, frame], paths[1 - settled, frame], paths[0]):
+                if not any(bool((path - other).abs().amax() < 1e-6) for other in tried):
+                    tried.append(path)
+                    z, length = self._place(path, trunk, anchor)
+                    depths.append(z)
+                    lengths.append(length)
+        z, length = torch.stack(depths), torch.stack(lengths)
+        return Hypotheses(z, length, z.new_full((len(z),), torch.inf))
+
+    def refine(self, found: Hypotheses, steps: int) -> Hypotheses:
+        """All a little, then the best few well."""
+        obj = self.objective
+        few = max(steps // 3, 1)
+        z, length, energy, _ = obj.minimise(found.depth, found.lengths, few)
+        rest = Hypotheses(z, length, energy)
+        keep = min(4, len(z))
+        z, length, energy, _ = obj.minimise(z[:keep], length[:keep], steps)
+        joined = Hypotheses(
+            torch.cat([z, rest.depth[keep:]]), torch.cat([length, rest.lengths[keep:]]), torch.cat([energy, rest.energy[keep:]])
+        )
+        return joined[joined.energy.argsort()]
+
+    def moves(self, found: Hypotheses) -> Hypotheses:
+        """The best, the next ones, and what discrete moves make of the best."""
+        z, length = found.depth[0], found.lengths[0]
+        points = torch.cat([self.image, z[..., None]], -1)
+        path = self.objective.posture.frame(points)
+        paths = torch.stack([path, mirror(path)])
+        frame = torch.arange(len(z), device=z.device)
+        path = paths[self._settle(paths, length), frame]
+        trunk = Trunk(self.objective.posture.rest, length)
+        new = [self._place(path, trunk, length, z), self._place(path, trunk, None, z)]
+        new += [(flipped, length) for flipped in self._flips(z)]
+        return Hypotheses(
+            torch.cat([found.depth[:2], torch.stack([n[0] for n in new])]),
+            torch.cat([found.lengths[:2], torch.stack([n[1] for n in new])]),
+            torch.cat([found.energy[:2], found.energy.new_full((len(new),), torch.inf)]),
+        )
+
+    def _trunks(self, anchor: Tensor | None) -> list[Trunk]:
+        """The template, and one whose central bones are as long as their longest image."""
+        posture = self.objective.posture
+        usual = posture.rest_lengths if anchor is None else anchor
+        seen = torch.quantile(bone_vectors(self.image, posture.bones).norm(dim=-1), 0.98, dim=0)
+        twins = {b for pair in self.skeleton.mirror_bones for b in pair}
+        central = torch.tensor([i not in twins for i in range(self.skeleton.num_bones)], device=seen.device)
+        short = torch.where(central, torch.minimum(torch.maximum(seen, 0.3 * usual), 1.3 * usual), usual)
+        out = []
+        for length in (usual, short) if anchor is None else (usual,):
+            scale = length / posture.rest_lengths.clamp_min(1e-9)
+            rest = self._chain(bone_vectors(posture.rest, posture.bones) * scale[:, None])
+            out.append(Trunk(rest, length))
+        return out
+
+    def _settle(self, paths: Tensor, lengths: Tensor | None) -> Tensor:
+        """Which of two trunk paths each frame takes by the limbs' votes, (T,)."""
+        posture, free = self.objective.posture, free_bones(self.skeleton)
+        flat = bone_vectors(self.image, posture.bones)
+        moves = trunk_turns(paths, self.turn, SWITCH)
+        votes = self.image.new_zeros(len(self.image), 2)
+        for limb in self.limbs:
+            if limb.inner is None:
+                continue
+            candidates = self._candidates(flat, limb, COARSE) if lengths is None else lengths[None, list(limb.bones)]
+            _, _, _, margins = limb_path(
+                flat, limb, paths, posture, free, self.costs, candidates=candidates, transition=moves, margins=True
+            )
+            assert margins is not None
+            votes = votes + (margins - margins.amin(-1, keepdim=True)).clamp_max(20)
+        return best_path(TRUST * votes, trunk_turns(paths, self.turn))
+
+    def _place(
+        self, path: Tensor, trunk: Trunk, lengths: Tensor | None, keep: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Depths (T, N) and lengths (B,) of a body whose trunk follows a path; ``keep`` gives the trunk's own depths."""
+        posture, free = self.objective.posture, free_bones(self.skeleton)
+        flat = bone_vectors(self.image, posture.bones)
+        if keep is None:
+            dz = (bone_vectors(trunk.rest, posture.bones) @ path.mT)[..., 2]  # (T, B)
+        else:
+            dz = bone_vectors(keep[..., None], posture.bones)[..., 0]
+        dz = dz.clone()
+        length = trunk.lengths.clone()
+        for limb in self.limbs:
+            chain = list(limb.bones)
+            candidates = self._candidates(flat, limb, FINE) if lengths is None else lengths[None, chain]
+            before = None
+            if limb.entry is not None:
+                near = torch.cat([flat[:, limb.before], dz[:, limb.before, None]], -1)
+                before = near / length[limb.before].clamp_min(1e-9)
+            found, depth, _, _ = limb_path(
+                flat, limb, path[None], posture, free, self.costs, candidates=candidates, before=before
+            )
+            dz[:, chain], length[chain] = depth, found
+        z = self._chain(dz.mT).mT
+        return z - z.mean(-1, keepdim=True), length
+
+    def _candidates(self, flat: Tensor, limb: Limb, grid: tuple[float, ...]) -> Tensor:
+        """All combinations of a limb's lengths, (K, M)."""
+        chain = list(limb.bones)
+        longest = torch.quantile(flat[:, chain].norm(dim=-1), 0.99, dim=0)
+        least = torch.maximum(longest, 0.8 * self.objective.posture.rest_lengths[chain])
+        steps = torch.tensor(grid, dtype=flat.dtype, device=flat.device)
+        return torch.cartesian_prod(*(b * steps for b in least)).view(-1, len(chain))
+
+    def _flips(self, z: Tensor) -> list[Tensor]:
+        """The pose with one bone, or both, of each two-bone limb mirrored in depth."""
+        dz = bone_vectors(z[..., None], self.objective.posture.bones)[..., 0]
+        out = []
+        for limb in self.limbs:
+            if limb.inner is None:
+                continue
+            for part in ((limb.bones[0],), (limb.bones[1],), limb.bones):
+                flipped = dz.clone()
+                flipped[:, list(part)] *= -1
+                depth = self._chain(flipped.mT).mT
+                out.append(depth - depth.mean(-1, keepdim=True))
+        return out
+
+    def _chain(self, vectors: Tensor) -> Tensor:
+        """Joints (N, ...) from bone vectors (B, ...), the root at 0."""
+        return torch.tensordot(self.objective.tree.to(vectors), vectors, dims=1)

@@ -1,0 +1,90 @@
+"""The trunk's orientation: a rigid template seen under weak perspective, and its two-fold ambiguity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.temporal import best_path
+from kcs_torch.nn.posture import PostureEnergy
+from kcs_torch.solvers.pose import fit_cameras
+
+__all__ = ["Trunk", "image_scale", "mirror", "trunk_paths", "trunk_turns"]
+
+FIT = 0.03
+"""Standard deviation of the trunk's joints about its template, a standing person being about 1.75 tall."""
+
+TURN = 0.15
+"""Standard deviation of the trunk's turn from frame to frame, in radians, at 30 frames a second."""
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """A trunk's joints in rest and the bones that they make.
+
+    Attributes:
+        rest: (N, 3), the template, perhaps with central bones of another length.
+        lengths: (B,) of the bones of ``rest``.
+    """
+
+    rest: Tensor
+    lengths: Tensor
+
+
+def image_scale(image: Tensor, lengths: Tensor, bones: Tensor, rigid: Tensor) -> Tensor:
+    """Scale of a clip: image units per unit of length, a 0-dimensional tensor.
+
+    Each bone's longest image over its usual length is about the scale, if the bone ever lies in the image plane; the
+    0.6 quantile over bones lets those that never do, and those of unusual length, pass.
+
+    Args:
+        image: (T, N, 2).
+        lengths: (B,) usual lengths.
+        bones: (B, 2).
+        rigid: (B,) bool, bones that count.
+    """
+    use = rigid & (lengths > 0)
+    seen = bone_vectors(image, bones[use]).norm(dim=-1)
+    ratio = torch.quantile(seen, 0.98, dim=0) / lengths[use]
+    return torch.quantile(ratio, 0.6) if len(ratio) else image.new_ones(())
+
+
+def mirror(rotations: Tensor) -> Tensor:
+    """Rotations (..., 3, 3) of the mirror image in depth, S R S: the same image of a flat body."""
+    flip = torch.tensor([1.0, 1.0, -1.0], dtype=rotations.dtype, device=rotations.device)
+    return rotations * flip[:, None] * flip
+
+
+def trunk_paths(image: Tensor, trunk: Trunk, posture: PostureEnergy, correlation: float, turn: float) -> Tensor:
+    """A smooth path of the trunk's rotation and its mirror image, (2, T, 3, 3), template to camera.
+
+    Args:
+        image: (T, N, 2), in units of the template.
+        trunk: what to fit.
+        posture: says which joints are the trunk's.
+        correlation: frames that count as one.
+        turn: standard deviation of the turn from frame to frame, in radians.
+    """
+    frames = len(image)
+    joints = posture.trunk
+    rest = trunk.rest[joints] - trunk.rest[joints].mean(0)
+    goal = image[:, joints] - image[:, joints].mean(1, keepdim=True)
+    one = image.new_ones(frames)
+    fit = fit_cameras(goal, rest.expand(frames, -1, 3), image.new_ones(goal.shape[:2]), 0.9 * one, 1.1 * one, robust=None)
+    rotations = torch.cat([fit.rotations, mirror(fit.rotations)])  # (16, T, 3, 3)
+    scales = fit.scales.repeat(2, 1)[..., None, None]
+    off = (scales * (rest @ rotations[..., :2, :].mT) - goal).square().sum((-2, -1))
+    cost = off.mT / (2 * FIT**2 * correlation)
+    choice = best_path(cost, trunk_turns(rotations, turn))
+    path = rotations[choice, torch.arange(frames, device=image.device)]
+    return torch.stack([path, mirror(path)])
+
+
+def trunk_turns(rotations: Tensor, turn: float, cap: float | None = None) -> Tensor:
+    """Cost of turning from each of C rotations to each of the next frame's, (T - 1, C, C), from (C, T, 3, 3)."""
+    trace = torch.einsum("atij,btij->tab", rotations[:, :-1], rotations[:, 1:])
+    cost = torch.arccos(((trace - 1) / 2).clamp(-1, 1)).square() / (2 * turn**2)
+    return cost if cap is None else cost.clamp_max(cap)

@@ -1,0 +1,303 @@
+"""What a body usually does: energies of posture, lengths, foreshortening and contact."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ShapeError, SkeletonError
+from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.nn.layers import SkeletonModule
+from kcs_torch.skeleton import Skeleton
+
+__all__ = ["ContactEnergy", "ForeshorteningEnergy", "PostureEnergy", "ProportionEnergy"]
+
+TRUNK_SPREAD = 18.0
+"""Bones that stray from the template by less than this, in degrees, are of the trunk."""
+
+BEND = (0.15, 0.3)
+"""How far a hinge's upper and lower bone hang from the template on average, as a share of their length."""
+
+
+class PostureEnergy(SkeletonModule):
+    """-log marginal likelihood of a clip's bone directions, seen from the trunk, under one Gaussian of unknown moments.
+
+    y_tb = (R_t^T b_t / L_b - m_b) / d_b, with the trunk's rotation R_t, the directions m that the template and the
+    hinges suggest and the spreads d of the skeleton. Of n independent frames with scatter S = sum_t (y - mean)(y -
+    mean)^T and mean y', a normal - inverse-Wishart prior of strength nu leaves
+
+        (n + nu)/2 log det(I + (S + n kappa/(n + kappa) y' y'^T) / nu):
+
+    the log-det of Procrustes-aligned bones for long clips, a pull to the template for short ones.
+
+    Args:
+        skeleton: with a template and spreads, and a trunk of at least three joints.
+        strength: nu, in frames.
+        kappa: strength of the prior on the mean, in frames.
+        correlation: frames that tell as much as one independent frame.
+
+    Raises:
+        SkeletonError: the skeleton has no template, no spreads or no trunk.
+
+    >>> energy = PostureEnergy("h36m17")
+    >>> energy(torch.randn(4, 30, 17, 3)).shape
+    torch.Size([4])
+    """
+
+    trunk: Tensor
+    affine: Tensor
+    axes: Tensor
+    mean: Tensor
+    deviation: Tensor
+    rest: Tensor
+    rest_lengths: Tensor
+
+    def __init__(
+        self, skeleton: str | Path | Skeleton, *, strength: float = 10.0, kappa: float = 1.0, correlation: float = 15.0
+    ) -> None:
+        super().__init__(skeleton)
+        body = self.skeleton
+        self.strength, self.kappa, self.correlation = strength, kappa, correlation
+        trunk = trunk_joints(body)
+        if len(trunk) < 3:
+            raise SkeletonError(
+                f"skeleton '{body.name}' has no trunk: expected a template and spreads, with at least three joints "
+                f"joined by bones that stray by less than {TRUNK_SPREAD:g} degrees"
+            )
+        rest = body.template_points(dtype=torch.float64)
+        rest = rest - rest.mean(0)
+        rest = rest * (0.5 / rest.square().sum(-1).mean().sqrt())  # a standing person of about 1.75
+        vectors = bone_vectors(rest, body.bone_index())
+        length = vectors.norm(dim=-1)
+        flat = rest[trunk] - rest[trunk].mean(0)
+        axes = torch.linalg.svd(flat)[2].mT  # columns: the trunk's two long axes and its normal
+        axes = torch.cat([axes[:, :2], axes[:, 2:] * torch.linalg.det(axes).sign()], -1)  # right-handed
+        along = torch.sin(torch.deg2rad(torch.tensor(body.spread, dtype=torch.float64))).clamp_max(0.6)
+        side, mean = 0.7 * along, vectors / length.clamp_min(1e-9)[:, None]
+        lateral, hang = _hinge_facts(body, rest)
+        firm = torch.tensor([i in hang for i in range(body.num_bones)])
+        side = torch.where(firm, along / 3, side)
+        mean = 0.95 * (mean + lateral)
+        self.register_buffer("trunk", torch.tensor(trunk), persistent=False)
+        self.register_buffer("affine", torch.linalg.pinv(flat @ axes[:, :2]), persistent=False)
+        self.register_buffer("axes", axes, persistent=False)
+        self.register_buffer("mean", mean, persistent=False)
+        self.register_buffer("deviation", torch.stack([side, along, along], -1), persistent=False)
+        self.register_buffer("rest", rest, persistent=False)
+        self.register_buffer("rest_lengths", length, persistent=False)
+
+    def frame(self, points: Tensor) -> Tensor:
+        """The trunk's rotation R_t, template to camera, (..., T, 3, 3): the best affine fit, made square.
+
+        Args:
+            points: (..., T, N, 3).
+        """
+        part = points.index_select(-2, self.trunk)
+        part = part - part.mean(-2, keepdim=True)
+        first, second = (self.affine.to(part) @ part).unbind(-2)  # images of the trunk's two long axes
+        first = _unit(first)
+        second = _unit(second - (second * first).sum(-1, keepdim=True) * first)
+        turned = torch.stack([first, second, torch.linalg.cross(first, second)], -1)
+        return turned @ self.axes.to(part).mT
+
+    def directions(self, points: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Bones seen from the trunk over their lengths, (..., T, B, 3); arguments as in :meth:`forward`."""
+        self.check(points, clip=True)
+        vectors = bone_vectors(points, self.bones)
+        if lengths is None:
+            lengths = vectors.square().sum(-1).mean(-2).clamp_min(torch.finfo(points.dtype).tiny).sqrt()
+        return vectors @ self.frame(points) / lengths[..., None, :, None]
+
+    def forward(self, points: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Return the energy of each clip.
+
+        Args:
+            points: (..., T, N, 3).
+            lengths: (..., B); None takes each bone's root mean square over the T frames.
+
+        Returns:
+            (...).
+
+        Raises:
+            ShapeError: the shapes do not fit.
+        """
+        local = self.directions(points, lengths)
+        wide = local.to(torch.promote_types(local.dtype, torch.float32))
+        y = ((wide - self.mean.to(wide)) / self.deviation.to(wide)).flatten(-2)
+        frames = y.shape[-2]
+        count = frames / self.correlation
+        mean = y.mean(-2, keepdim=True)
+        scatter = (y - mean).mT @ (y - mean) / self.correlation
+        scatter = scatter + count * self.kappa / (count + self.kappa) * (mean.mT @ mean)
+        eye = torch.eye(scatter.shape[-1], dtype=wide.dtype, device=wide.device)
+        factor, _ = torch.linalg.cholesky_ex(eye + scatter / self.strength)
+        log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        return ((count + self.strength) / 2 * log_det).to(points.dtype)
+
+
+class ForeshorteningEnergy(SkeletonModule):
+    """sum_tb w_b/tau [log L_b + 1/2 log(dz_tb^2 + (eps L_b)^2)]: bones point anywhere, and are as often seen long.
+
+    A direction drawn evenly from the sphere has an image of density 1 / (L |dz|): a bone that is longer than any of its
+    images would have to avoid the image plane all the time. This keeps lengths down where smoothness, which prefers
+    long bones that hardly turn, would let them grow.
+
+    Args:
+        skeleton: bones of its trunk, where it has one, do not count.
+        correlation: tau, frames that tell as much as one independent frame.
+        eps: share of the length below which depths are not told apart.
+    """
+
+    free: Tensor
+
+    def __init__(self, skeleton: str | Path | Skeleton, *, correlation: float = 10.0, eps: float = 0.1) -> None:
+        super().__init__(skeleton)
+        self.correlation, self.eps = correlation, eps
+        self.register_buffer("free", free_bones(self.skeleton), persistent=False)
+
+    def forward(self, points: Tensor, lengths: Tensor) -> Tensor:
+        """Return (...) of points (..., T, N, 3) and lengths (..., B)."""
+        self.check(points, clip=True)
+        depth = bone_vectors(points, self.bones)[..., 2]
+        each = foreshortening(depth, lengths[..., None, :], self.eps)
+        return (self.free.to(each) * each).sum((-2, -1)) / self.correlation
+
+
+class ProportionEnergy(SkeletonModule):
+    """How unusual bone lengths are: sum_b log(1 + (l_b/s)^2/2) + 1/2 sum of twins (l_left - l_right)^2/p^2.
+
+    l_b is the log of a length over the skeleton's, less the mean over bones: the size of the body does not count. The
+    heavy tail is for joints that a data set defines in its own way.
+
+    Args:
+        skeleton: with a template or proportions.
+        spread: s, usual deviation of a length, as a share.
+        twins: p, usual difference of left and right, as a share.
+
+    Raises:
+        SkeletonError: the skeleton knows no lengths.
+    """
+
+    usual: Tensor
+    pairs: Tensor
+
+    def __init__(self, skeleton: str | Path | Skeleton, *, spread: float = 0.08, twins: float = 0.03) -> None:
+        super().__init__(skeleton)
+        usual = self.skeleton.relative_lengths(dtype=torch.float64)
+        if usual is None:
+            raise SkeletonError(f"skeleton '{self.skeleton.name}' has neither proportions nor a template")
+        self.spread, self.twins = spread, twins
+        self.register_buffer("usual", usual, persistent=False)
+        pairs = torch.tensor(self.skeleton.mirror_bones, dtype=torch.long).reshape(-1, 2)
+        self.register_buffer("pairs", pairs, persistent=False)
+
+    def forward(self, lengths: Tensor) -> Tensor:
+        """Return (...) of lengths (..., B), positive, in any unit."""
+        if lengths.shape[-1] != len(self.usual):
+            raise ShapeError(f"ProportionEnergy: expected lengths (..., {len(self.usual)}), got {tuple(lengths.shape)}")
+        tiny = torch.finfo(lengths.dtype).tiny
+        log = (lengths.clamp_min(tiny) / self.usual.to(lengths).clamp_min(tiny)).log()
+        off = log - log.mean(-1, keepdim=True)
+        apart = (log[..., self.pairs[:, 0]] - log[..., self.pairs[:, 1]]) / self.twins
+        return torch.log1p((off / self.spread).square() / 2).sum(-1) + apart.square().sum(-1) / 2
+
+
+class ContactEnergy(SkeletonModule):
+    """Feet that stand still in the image stand still in space: the root's depth has to move against them.
+
+    1/2 sum_tc c_tc log(1 + ((z_c,t - z_c,t-1 + v_t)/s)^2) + 1/2 sum_t ((v_t - v_t-1)/a)^2, with the root's depth
+    velocity v and the weights c of :meth:`standing`. It holds for a camera that does not move.
+
+    Args:
+        skeleton: with contacts; without them the energy is 0.
+        slip: s, in units of the points per frame.
+        change: a, of the root's velocity from frame to frame.
+    """
+
+    contacts: Tensor
+
+    def __init__(self, skeleton: str | Path | Skeleton, *, slip: float = 0.006, change: float = 0.004) -> None:
+        super().__init__(skeleton)
+        self.slip, self.change = slip, change
+        contacts = torch.tensor(self.skeleton.contacts, dtype=torch.long)
+        self.register_buffer("contacts", contacts, persistent=False)
+
+    def standing(self, image: Tensor) -> Tensor:
+        """How surely each contact point stands still, (..., T, C) in 0..1, from tracks (..., T, N, 2) not centred.
+
+        A point stands where its image moves at less than about an eighth of the points' top speed.
+        """
+        feet = image[..., self.contacts, :]
+        if feet.shape[-3] < 3 or not len(self.contacts):
+            return torch.ones_like(feet[..., 0])
+        speed = (feet[..., 2:, :, :] - feet[..., :-2, :, :]).norm(dim=-1) / 2
+        speed = torch.cat([speed[..., :1, :], speed, speed[..., -1:, :]], -2)
+        top = speed.flatten(-2).quantile(0.95, -1)[..., None, None]
+        floor = 2e-3 * (feet - feet.mean((-3, -2), keepdim=True)).square().mean((-3, -2, -1), keepdim=True)[..., 0].sqrt()
+        return torch.exp(-0.5 * (speed / (0.12 * top + floor).clamp_min(torch.finfo(feet.dtype).tiny)).square())
+
+    def forward(self, points: Tensor, velocity: Tensor, standing: Tensor) -> Tensor:
+        """Return (...).
+
+        Args:
+            points: (..., T, N, 3), depth relative to the root or the body's middle.
+            velocity: v (..., T), the first frame's does not count.
+            standing: c (..., T, C).
+        """
+        self.check(points, clip=True)
+        depth = points[..., self.contacts, 2]
+        move = depth[..., 1:, :] - depth[..., :-1, :] + velocity[..., 1:, None]
+        both = torch.minimum(standing[..., 1:, :], standing[..., :-1, :])
+        slip = (both * torch.log1p((move / self.slip).square())).sum((-2, -1)) / 2
+        steady = ((velocity[..., 2:] - velocity[..., 1:-1]) / self.change).square().sum(-1) / 2
+        return slip + steady + 5e-4 * (velocity / self.slip).square().sum(-1)
+
+
+def foreshortening(depth: Tensor, length: Tensor, eps: float) -> Tensor:
+    """log L + 1/2 log(dz^2 + (eps L)^2), elementwise: -log density of an image of an evenly drawn direction."""
+    tiny = torch.finfo(depth.dtype).tiny
+    return length.clamp_min(tiny).log() + 0.5 * (depth.square() + (eps * length).square()).clamp_min(tiny).log()
+
+
+def trunk_joints(skeleton: Skeleton) -> list[int]:
+    """Joints that bones of little spread connect to the root; none without a template or spreads."""
+    if skeleton.template is None or skeleton.spread is None or not skeleton.is_tree:
+        return []
+    children = {b for _, b in skeleton.bones}
+    trunk = {next(a for a, _ in skeleton.bones if a not in children)}
+    for _ in skeleton.bones:
+        trunk |= {b for (a, b), s in zip(skeleton.bones, skeleton.spread, strict=True) if a in trunk and s < TRUNK_SPREAD}
+    return sorted(trunk)
+
+
+def free_bones(skeleton: Skeleton) -> Tensor:
+    """1 for bones of the limbs, which point anywhere, 0 for those of trunk and head, (B,)."""
+    if skeleton.spread is None:
+        return torch.ones(skeleton.num_bones)
+    return torch.tensor([float(s > 26.0) for s in skeleton.spread])
+
+
+def _hinge_facts(body: Skeleton, rest: Tensor) -> tuple[Tensor, set[int]]:
+    """How hinges shift the mean directions (B, 3), and which bones swing in the plane of a firm hinge."""
+    where = {frozenset(bone): i for i, bone in enumerate(body.bones)}
+    shift = torch.zeros(body.num_bones, 3, dtype=rest.dtype)
+    firm: set[int] = set()
+    for hinge in body.hinges:
+        upper, lower = (where[frozenset(bone)] for bone in hinge.bones)
+        axis = _unit(rest[hinge.left] - rest[hinge.right])
+        along = _unit(rest[hinge.joint] - rest[hinge.parent])
+        towards = hinge.sign * torch.linalg.cross(axis, along)  # the side that the lower bone bends to
+        bends_first = not any(h.joint == hinge.parent for h in body.hinges)
+        if bends_first:  # an ankle's rest is the template's
+            shift[upper] = -BEND[0] * towards
+            shift[lower] = BEND[1] * towards
+        if hinge.firm >= 0.5:
+            firm |= {upper, lower}
+    return shift, firm
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    size = (vectors.square().sum(-1, keepdim=True) + 1e-18).sqrt()
+    return vectors / size
