@@ -2,14 +2,17 @@
 
 from kcs_torch.solvers.camera_path import constant_path
 from kcs_torch.solvers.completion import complete_tracks
+from kcs_torch.solvers.denoise import Denoised, denoise_tracks
 from kcs_torch.solvers.ist import ist, metric_upgrade
 from kcs_torch.solvers.iterate import Solution, fpc, iterate, svt
 from kcs_torch.solvers.lm import fit_bones
 
 __all__ = [
+    "Denoised",
     "Solution",
     "complete_tracks",
     "constant_path",
+    "denoise_tracks",
     "fit_bones",
     "fpc",
     "ist",

@@ -1,0 +1,273 @@
+"""2D tracks without noise, gaps and outliers: an empirical Bayes smoother over time and joints together."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
+
+__all__ = ["Denoised", "denoise_tracks"]
+
+# Bands of temporal modes, each with its own covariance between joints: how joints sway together differs from how
+# they twitch together. Modes 0..2 are the parabola of a window, mode i has about i/2 periods in it.
+_BANDS = (0, 3, 6, 12, 24, 48)
+_NEIGHBOUR = 0.3  # what the modes of the next band count in a band's covariance
+_PRIOR_SAMPLES = 10.0  # modes' worth of belief that joints move independently
+_TINY = 1e-30
+
+
+class Denoised(NamedTuple):
+    """What :func:`denoise_tracks` finds.
+
+    Attributes:
+        points: (..., T, N, 2) smoothed and filled tracks, in the tracks' units.
+        weights: (..., T, N) as given, 0 at outliers.
+        noise: (..., N) standard deviation of the measurement noise of a coordinate, in the tracks' units.
+        outliers: (..., T, N), True where a seen joint was rejected and its place filled.
+    """
+
+    points: Tensor
+    weights: Tensor
+    noise: Tensor
+    outliers: Tensor
+
+
+def denoise_tracks(
+    tracks: Tensor, weights: Tensor, *, window: int = 64, threshold: float = 6.0, floor: float = 0.04
+) -> Denoised:
+    r"""Smooth 2D tracks, fill what is unseen and reject outliers; all parameters come from the clip itself.
+
+    In windows of L frames, with temporal modes u_i (eigenvectors of the third-difference penalty, polynomials first),
+    the tracks' coordinates x_i = u_i^T X about their mean follow a Gaussian, and measurements add white noise:
+
+        x_i ~ N(0, g_i Q_b(i)),    y_tn = x_tn + e_tn,    e_tn ~ N(0, s^2 / w_tn I_2)
+
+    g_i is the clip's spectrum and Q_b its covariance between the 2N coordinates, for every octave b of modes, both
+    estimated from the clip (moments, with shrinkage to independent joints). s^2 is the level at which the spectrum
+    stops falling, so that clean tracks come back as they are but for their own jitter. Given these, x is the minimum
+    of sum w_tn |y_tn - x_tn|^2 / s^2 + sum_i x_i^T (g_i Q_b)^-1 x_i, by conjugate gradients with the solution for even
+    weights as preconditioner. Cost is linear in T.
+
+    A joint is an outlier where it is further from what the rest of the clip predicts than ``threshold`` times the
+    usual distance (the median of the joint's clip or surroundings, whichever is larger) plus ``floor`` of the body's
+    size: first from the nearest frames of the joint, then, twice, from the model without the joint itself.
+
+    Args:
+        tracks: (..., T, N, 2), finite.
+        weights: (..., T, N) in [0, 1], 0 where unseen.
+        window: L, frames solved together; windows overlap by half.
+        threshold: of outliers, in medians of the prediction error.
+        floor: of outliers, a share of the body's size (median distance of its joints from their centre).
+
+    Returns:
+        :class:`Denoised`. Clips of fewer than 12 frames are only filled and cleared of outliers.
+
+    >>> time = torch.linspace(0, 6, 100, dtype=torch.float64)[:, None, None]
+    >>> truth = torch.sin(time + torch.arange(8).reshape(4, 2)) * 100
+    >>> noisy = truth + 5 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    >>> noisy[50, 2] += 200
+    >>> found = denoise_tracks(noisy, torch.ones(100, 4))
+    >>> found.outliers.nonzero().tolist(), bool((found.points - truth).square().mean().sqrt() < 2)
+    ([[50, 2]], True)
+
+    Garcia 2010 smooths gappy data by one spectrum in the same way; here the joints' covariance is added.
+    """
+    shape = tracks.shape
+    values = tracks.detach().reshape(-1, *shape[-3:]).double()  # (K, T, N, 2): the spectra span more than float32
+    given = weights.detach().reshape(values.shape[:-1]).double()
+    size = _body_size(values, given > 0)
+    unit = torch.where(size > _TINY, size, torch.ones_like(size))[:, None, None, None]
+    values = values / unit
+    frames, joints = values.shape[1], values.shape[2]
+    length = min(window, frames)
+    starts = window_starts(frames, length, length // 2)
+    index = torch.tensor(starts, device=tracks.device)[:, None] + torch.arange(length, device=tracks.device)
+    model = _Model(length, values)
+
+    outliers = _stray_from_neighbours(values, given > 0, threshold, floor)
+    points = values
+    for rounds, steps in ((4, 15), (1, 30), (1, 60)):
+        live = torch.where(outliers, torch.zeros_like(given), given)
+        if points is values:
+            points = interpolate(values, live > 0)
+        mean = points.mean(1, keepdim=True)
+        y, x = ((a - mean)[:, index].flatten(-2) for a in (values, points))  # (K, H, L, M), M = 2N
+        w = live[:, index].repeat_interleave(2, -1)
+        for _ in range(rounds):
+            model.fit(y, x, w)
+            x = model.solve(y, x, w, steps)
+        points = blend_windows(x.unflatten(-1, (joints, 2)).movedim(0, 2), starts, frames).movedim(1, 0) + mean
+        if steps == 60:
+            break
+        error = (values - points).norm(dim=-1) / (1 - model.leverage()[:, None] * live).clamp_min(1e-3)
+        outliers = _far(error, given > 0, threshold, floor)
+    noise = (model.noise.sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints)
+    return Denoised(
+        (points * unit).reshape(shape).to(tracks.dtype),
+        torch.where(outliers.reshape(weights.shape), torch.zeros_like(weights), weights),
+        noise.reshape(*shape[:-3], joints).to(tracks.dtype),
+        outliers.reshape(weights.shape),
+    )
+
+
+class _Model:
+    """The Gaussian of a clip's windows, (K, H, L, M) about the mean: K clips, H windows, L frames, M coordinates."""
+
+    def __init__(self, length: int, like: Tensor) -> None:
+        self.basis = _temporal_modes(length).to(like)
+        edges = [*(b for b in _BANDS if b < length), length]
+        self.bands = list(itertools.pairwise(edges))
+
+    def fit(self, y: Tensor, x: Tensor, w: Tensor) -> None:
+        """Estimate noise, spectrum and covariances from the measurements, filled by ``x`` where unseen."""
+        windows, length, size = y.shape[1:]
+        self.share = w.mean((1, 2, 3)).clamp_min(1e-3)[:, None, None, None]
+        z = self.basis.mT @ (x + w * (y - x))
+        total = z.square().mean((1, 2, 3))
+        typical = z.square().movedim(2, 1).flatten(2).median(-1).values / 0.4549  # of chi-square: blind to impacts
+        self.noise = (_spectrum_floor(typical) / self.share.flatten()).clamp_min(1e-12 * total + _TINY)
+        left = (self.noise * self.share.flatten())[:, None]  # noise power in a mode: what is filled has none
+        order = torch.arange(1, length + 1, dtype=y.dtype, device=y.device)
+        near = torch.exp(-0.5 * ((order.log()[:, None] - order.log()) / 0.15) ** 2)
+        near = near / near.sum(1, keepdim=True)
+        # Smoothed over neighbouring modes, relative to the i^-4 by which motion falls off.
+        spectrum = (((z.square().mean((1, 3)) - left) * order**4) @ near.mT) / order**4
+        spectrum = spectrum.clamp_min(1e-9 * left)
+        trust = spectrum / (spectrum + left)  # (K, L)
+        scaled = z * (trust / (spectrum + left)).sqrt()[:, None, :, None]
+        scatter, count = [], []
+        for a, b in self.bands:
+            rows = scaled[:, :, a:b].flatten(1, 2)
+            noise = windows * (trust * (1 - trust))[:, a:b].sum(1)
+            scatter.append(rows.mT @ rows - noise[:, None, None] * torch.eye(size, dtype=y.dtype, device=y.device))
+            count.append(windows * trust[:, a:b].square().sum(1)[:, None, None])
+        self.axes, variances = [], []
+        for j, (a, b) in enumerate(self.bands):
+            share = [_NEIGHBOUR ** abs(k - j) for k in range(len(self.bands))]
+            samples = sum((s * c for s, c in zip(share, count, strict=True)), torch.zeros_like(count[0]))
+            both = sum((s * c for s, c in zip(share, scatter, strict=True)), torch.zeros_like(scatter[0]))
+            alone = (both / samples.clamp_min(1e-9)).diagonal(dim1=-2, dim2=-1).clamp_min(0)
+            alone = 0.9 * alone + 0.1 * alone.mean(-1, keepdim=True) + 1e-9
+            both = (both + _PRIOR_SAMPLES * torch.diag_embed(alone)) / (samples + _PRIOR_SAMPLES)
+            variance, axes = torch.linalg.eigh(both)
+            variance = variance.clamp_min(1e-4 * alone.mean(-1, keepdim=True))
+            variance = variance / variance.mean(-1, keepdim=True)
+            self.axes.append(axes[:, None])
+            variances.append(spectrum[:, a:b, None] * variance[:, None])
+        self.ratio = (self.noise[:, None, None] / torch.cat(variances, 1).clamp_min(_TINY))[:, None]  # (K, 1, L, M)
+
+    def solve(self, y: Tensor, x: Tensor, w: Tensor, steps: int, tolerance: float = 1e-10) -> Tensor:
+        """Minimise over x by preconditioned conjugate gradients, every window for itself, from the given x."""
+        dot = lambda a, b: (a * b).sum((-1, -2), keepdim=True)  # noqa: E731
+        apply = lambda v: w * v + self._from_modes(self.ratio * self._to_modes(v))  # noqa: E731
+        even = lambda r: self._from_modes(self._to_modes(r) / (self.share + self.ratio))  # noqa: E731
+        small = tolerance * dot(w * y, even(w * y)) + _TINY
+        rest = w * y - apply(x)
+        towards = step = even(rest)
+        energy = dot(rest, towards)
+        for _ in range(steps):
+            if bool((energy <= small).all()):
+                break
+            image = apply(step)
+            far = energy / dot(step, image).clamp_min(_TINY**2)
+            x, rest = x + far * step, rest - far * image
+            towards = even(rest)
+            before, energy = energy, dot(rest, towards)
+            step = towards + energy / before.clamp_min(_TINY**2) * step
+        return x
+
+    def leverage(self) -> Tensor:
+        """(K, N) mean weight of a joint's measurement in its own estimate."""
+        gain = (1 / (1 + self.ratio))[:, 0]
+        own = sum(
+            (
+                gain[:, a:b].sum(1, keepdim=True) @ v[:, 0].mT.square()
+                for (a, b), v in zip(self.bands, self.axes, strict=True)
+            ),
+            torch.zeros_like(gain[:, :1]),
+        )
+        return own[:, 0].unflatten(-1, (-1, 2)).mean(-1) / gain.shape[1]
+
+    def _to_modes(self, x: Tensor) -> Tensor:
+        z = self.basis.mT @ x
+        return torch.cat([z[:, :, a:b] @ v for (a, b), v in zip(self.bands, self.axes, strict=True)], 2)
+
+    def _from_modes(self, z: Tensor) -> Tensor:
+        x = torch.cat([z[:, :, a:b] @ v.mT for (a, b), v in zip(self.bands, self.axes, strict=True)], 2)
+        return self.basis @ x
+
+
+def _temporal_modes(length: int) -> Tensor:
+    """(L, L) orthonormal columns: polynomials up to the second degree, then eigenvectors of the third difference."""
+    time = torch.linspace(-1, 1, length, dtype=torch.float64)
+    smooth = torch.linalg.qr(torch.stack([time**k for k in range(min(3, length))], -1)).Q
+    if length <= 3:
+        return smooth
+    third = torch.eye(length, dtype=torch.float64).diff(n=3, dim=0)
+    rough = torch.linalg.eigh(third.mT @ third).eigenvectors[:, 3:]
+    return torch.linalg.qr(torch.cat([smooth, rough], -1)).Q
+
+
+def _spectrum_floor(power: Tensor) -> Tensor:
+    """Level (K,) at which a spectrum (K, L) stops falling: power_i ~ c ((1 - r) i^-b + r), maximum likelihood."""
+    length = power.shape[1]
+    if length < 12:
+        return torch.zeros_like(power[:, 0])
+    first = max(3, length // 8)
+    order = torch.arange(first, length, dtype=power.dtype, device=power.device) / first
+    slope = torch.tensor([2.0, 3, 4, 5, 6, 8], dtype=power.dtype, device=power.device)[:, None, None]
+    level = torch.cat([torch.zeros(1), torch.logspace(-8, 0, 49)]).to(power)[:, None]
+    shape = (1 - level) * order**-slope + level  # (6, 50, I)
+    power = power[:, None, None, first:].clamp_min(_TINY)
+    scale = (power / shape).mean(-1)
+    misfit = scale.log() * len(order) + shape.log().sum(-1)
+    best = misfit.flatten(1).argmin(1, keepdim=True)
+    return (scale * level[:, 0]).flatten(1).gather(1, best)[:, 0]
+
+
+def _stray_from_neighbours(values: Tensor, seen: Tensor, threshold: float, floor: float) -> Tensor:
+    """(K, T, N) outliers against the median of straight lines through a joint's nearest seen frames."""
+    frames = values.shape[1]
+    if frames < 5:
+        return torch.zeros_like(seen)
+    time = torch.arange(frames, device=values.device)[:, None].expand(seen.shape)
+    order = torch.where(seen, time, time + frames).argsort(1)
+    rank, count = seen.cumsum(1) - 1, seen.sum(1, keepdim=True)
+
+    def neighbour(k: int) -> tuple[Tensor, Tensor]:
+        at = order.gather(1, (rank + k).clamp(0, frames - 1))
+        held = values.gather(1, at[..., None].expand(values.shape))
+        there = (rank + k >= 0) & (rank + k < count)
+        return at.to(values.dtype), torch.where(there[..., None], held, torch.full_like(held, math.nan))
+
+    near = {k: neighbour(k) for k in (-3, -2, -1, 1, 2, 3)}
+    lines = []
+    for a, b in ((-1, 1), (-2, 1), (-1, 2), (-2, 2), (-3, 3), (-2, -1), (1, 2)):
+        (start, first), (stop, last) = near[a], near[b]
+        gap = torch.where(stop == start, torch.ones_like(stop), stop - start)
+        lines.append(first + ((time - start) / gap)[..., None] * (last - first))
+    error = (values - torch.stack(lines).nanmedian(0).values).norm(dim=-1)
+    return _far(error, seen & error.isfinite(), threshold, floor)
+
+
+def _far(error: Tensor, seen: Tensor, threshold: float, floor: float, spread: int = 8) -> Tensor:
+    """(K, T, N), True where a seen joint's error, in body sizes, is far above what is usual for it."""
+    known = torch.where(seen, error, torch.full_like(error, math.nan))
+    clip = known.nanmedian(1, keepdim=True).values
+    around = torch.nn.functional.pad(known.mT, (spread, spread), value=math.nan).unfold(-1, 2 * spread + 1, 1)
+    usual = torch.maximum(clip, around.nanmedian(-1).values.mT).nan_to_num(0.0)
+    return seen & (error > threshold * usual + floor)
+
+
+def _body_size(values: Tensor, seen: Tensor) -> Tensor:
+    """(K,) median distance of the seen joints from the mean of their frame's seen joints."""
+    kept = seen[..., None].to(values.dtype)
+    centre = (values * kept).sum(2, keepdim=True) / kept.sum(2, keepdim=True).clamp_min(1)
+    distance = (values - centre).norm(dim=-1)
+    distance = torch.where(seen, distance, torch.full_like(distance, math.nan))
+    return distance.flatten(1).nanmedian(1).values.nan_to_num(0.0)
