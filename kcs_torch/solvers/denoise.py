@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
+from kcs_torch.solvers.completion import complete_tracks
 
 __all__ = ["Denoised", "denoise_tracks"]
 
@@ -18,6 +19,11 @@ __all__ = ["Denoised", "denoise_tracks"]
 _BANDS = (0, 3, 6, 12, 24, 48)
 _NEIGHBOUR = 0.3  # what the modes of the next band count in a band's covariance
 _PRIOR_SAMPLES = 10.0  # modes' worth of belief that joints move independently
+# Estimates and conjugate gradient steps before outliers are judged, and again after: most by the last.
+_ROUNDS = ((2, 40), (1, 40), (1, 60))
+_CHUNK = 256  # windows solved at once: bounds memory
+# Of the body's size: below it nothing is gained, and gaps would converge more slowly.
+_LEAST_NOISE = 1e-3
 _TINY = 1e-30
 
 
@@ -54,8 +60,9 @@ def denoise_tracks(
     weights as preconditioner. Cost is linear in T.
 
     A joint is an outlier where it is further from what the rest of the clip predicts than ``threshold`` times the
-    usual distance (the median of the joint's clip or surroundings, whichever is larger) plus ``floor`` of the body's
-    size: first from the nearest frames of the joint, then, twice, from the model without the joint itself.
+    usual distance (the median of the joint's clip, or up to four times that where its surroundings have more) plus
+    ``floor`` of the body's size: first from the nearest frames of the joint, then, twice, from the model without the
+    joint itself.
 
     Args:
         tracks: (..., T, N, 2), finite.
@@ -91,22 +98,23 @@ def denoise_tracks(
 
     outliers = _stray_from_neighbours(values, given > 0, threshold, floor)
     points = values
-    for rounds, steps in ((4, 15), (1, 30), (1, 60)):
+    for last, (rounds, steps) in enumerate(_ROUNDS, start=1 - len(_ROUNDS)):
         live = torch.where(outliers, torch.zeros_like(given), given)
         if points is values:
-            points = interpolate(values, live > 0)
+            points = _fill(values, live > 0)
         mean = points.mean(1, keepdim=True)
         y, x = ((a - mean)[:, index].flatten(-2) for a in (values, points))  # (K, H, L, M), M = 2N
         w = live[:, index].repeat_interleave(2, -1)
         for _ in range(rounds):
             model.fit(y, x, w)
-            x = model.solve(y, x, w, steps)
+            parts = zip(y.split(_CHUNK, 1), x.split(_CHUNK, 1), w.split(_CHUNK, 1), strict=True)
+            x = torch.cat([model.solve(*part, steps) for part in parts], 1)
         points = blend_windows(x.unflatten(-1, (joints, 2)).movedim(0, 2), starts, frames).movedim(1, 0) + mean
-        if steps == 60:
+        if last == 0:
             break
         error = (values - points).norm(dim=-1) / (1 - model.leverage()[:, None] * live).clamp_min(1e-3)
         outliers = _far(error, given > 0, threshold, floor)
-    noise = (model.noise.sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints)
+    noise = (model.measured.sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints)
     return Denoised(
         (points * unit).reshape(shape).to(tracks.dtype),
         torch.where(outliers.reshape(weights.shape), torch.zeros_like(weights), weights),
@@ -128,9 +136,9 @@ class _Model:
         windows, length, size = y.shape[1:]
         self.share = w.mean((1, 2, 3)).clamp_min(1e-3)[:, None, None, None]
         z = self.basis.mT @ (x + w * (y - x))
-        total = z.square().mean((1, 2, 3))
         typical = z.square().movedim(2, 1).flatten(2).median(-1).values / 0.4549  # of chi-square: blind to impacts
-        self.noise = (_spectrum_floor(typical) / self.share.flatten()).clamp_min(1e-12 * total + _TINY)
+        self.measured = _spectrum_floor(typical) / self.share.flatten()
+        self.noise = self.measured.clamp_min(_LEAST_NOISE**2)
         left = (self.noise * self.share.flatten())[:, None]  # noise power in a mode: what is filled has none
         order = torch.arange(1, length + 1, dtype=y.dtype, device=y.device)
         near = torch.exp(-0.5 * ((order.log()[:, None] - order.log()) / 0.15) ** 2)
@@ -174,7 +182,8 @@ class _Model:
             if bool((energy <= small).all()):
                 break
             image = apply(step)
-            far = energy / dot(step, image).clamp_min(_TINY**2)
+            # A window that has converged rests, so that what is beside it in the batch makes no difference.
+            far = torch.where(energy > small, energy / dot(step, image).clamp_min(_TINY**2), torch.zeros_like(energy))
             x, rest = x + far * step, rest - far * image
             towards = even(rest)
             before, energy = energy, dot(rest, towards)
@@ -230,6 +239,18 @@ def _spectrum_floor(power: Tensor) -> Tensor:
     return (scale * level[:, 0]).flatten(1).gather(1, best)[:, 0]
 
 
+def _fill(values: Tensor, seen: Tensor) -> Tensor:
+    """(K, T, N, 2) where to start in the gaps: joints go with the body, and about its centre with each other."""
+    points = interpolate(values, seen)
+    if bool(seen.all()):
+        return points
+    for _ in range(6):  # the centre is that of the filled joints
+        centre = points.mean(2, keepdim=True)
+        points = centre + interpolate(values - centre, seen)
+    centre = points.mean(2, keepdim=True)
+    return complete_tracks(values - centre, seen, num_steps=20) + centre
+
+
 def _stray_from_neighbours(values: Tensor, seen: Tensor, threshold: float, floor: float) -> Tensor:
     """(K, T, N) outliers against the median of straight lines through a joint's nearest seen frames."""
     frames = values.shape[1]
@@ -260,7 +281,8 @@ def _far(error: Tensor, seen: Tensor, threshold: float, floor: float, spread: in
     known = torch.where(seen, error, torch.full_like(error, math.nan))
     clip = known.nanmedian(1, keepdim=True).values
     around = torch.nn.functional.pad(known.mT, (spread, spread), value=math.nan).unfold(-1, 2 * spread + 1, 1)
-    usual = torch.maximum(clip, around.nanmedian(-1).values.mT).nan_to_num(0.0)
+    # Bounded, as near the ends of a clip one outlier may spoil the prediction of all that is around.
+    usual = torch.maximum(clip, torch.minimum(around.nanmedian(-1).values.mT, 4 * clip)).nan_to_num(0.0)
     return seen & (error > threshold * usual + floor)
 
 

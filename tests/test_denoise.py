@@ -1,0 +1,190 @@
+"""Noise, gaps and outliers of 2D tracks."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numerics import BATCHES, DEVICES, FLOATS, leaves_arguments_alone, normal
+from torch.testing import assert_close
+
+from kcs_torch.data.synthetic import walking_person
+from kcs_torch.functional import interpolate
+from kcs_torch.solvers import complete_tracks, denoise_tracks
+from kcs_torch.solvers.denoise import _Model, _spectrum_floor, _temporal_modes
+
+
+def walk(frames=90, **fields):
+    """Tracks (T, N, 2) of a walk in mm, without noise."""
+    tracks = walking_person(num_frames=frames, fps=30.0, yaw=45.0, **fields).tracks
+    return tracks.points.double()
+
+
+def rms(error):
+    return float(error.square().mean().sqrt())
+
+
+def gaps(*shape, share=0.3, seed=0):
+    """Which are seen (T, N): half of what is not are runs of ten frames."""
+    number = torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    starts = torch.rand(shape, generator=torch.Generator().manual_seed(seed + 1), dtype=torch.float64) < share / 20
+    gone = number < share / 2
+    for k in range(10):
+        gone[k:] |= starts[: shape[0] - k]
+    return ~gone
+
+
+def test_clean_tracks_stay():
+    tracks = walk()
+    weights = torch.ones(tracks.shape[:2], dtype=torch.float64)
+    found = leaves_arguments_alone(denoise_tracks, tracks, weights)
+    size = rms(tracks - tracks.mean(1, keepdim=True))
+    assert rms(found.points - tracks) < 1e-3 * size
+    assert not found.outliers.any()
+    assert torch.equal(found.weights, weights)
+    assert found.noise.shape == (tracks.shape[1],)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.03, 0.1])
+def test_noise_is_measured_and_taken_away(share):
+    tracks = walk()
+    noise = share * rms(tracks - tracks.mean(1, keepdim=True))
+    found = denoise_tracks(tracks + noise * normal(*tracks.shape), torch.ones(tracks.shape[:2]))
+    assert_close(found.noise.mean(), torch.tensor(noise, dtype=torch.float64), rtol=0.1, atol=0)
+    assert rms(found.points - tracks) < 0.6 * noise
+    assert not found.outliers.any()
+
+
+def test_gaps_are_filled_better_than_by_time_or_rank_alone():
+    tracks = walk()
+    seen = gaps(*tracks.shape[:2])
+    spoiled = torch.where(seen[..., None], tracks, torch.full_like(tracks, 1e4))
+    found = denoise_tracks(spoiled, seen.double())
+    error = rms((found.points - tracks)[~seen])
+    assert error < 0.65 * rms((interpolate(spoiled, seen) - tracks)[~seen])
+    assert error < 0.65 * rms((complete_tracks(spoiled, seen) - tracks)[~seen])
+    assert not (found.outliers & ~seen).any()
+    assert torch.equal(found.points, denoise_tracks(torch.where(seen[..., None], tracks, 0), seen.double()).points)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1])
+def test_outliers_are_found(share):
+    tracks = walk()
+    size = rms(tracks - tracks.mean(1, keepdim=True))
+    hit = torch.rand(tracks.shape[:2], generator=torch.Generator().manual_seed(1)) < share
+    off = torch.where(hit[..., None], size * normal(*tracks.shape), torch.zeros_like(tracks))
+    found = denoise_tracks(tracks + off, torch.ones(tracks.shape[:2]))
+    gross = off.norm(dim=-1) > 0.2 * size
+    assert found.outliers[gross].double().mean() > 0.98
+    assert found.outliers[~hit].double().mean() < 0.01
+    assert torch.equal(found.weights == 0, found.outliers)
+    assert rms(found.points - tracks) < 0.05 * rms(off)
+
+
+def test_swapped_sides_are_outliers():
+    tracks = walk()
+    swapped = tracks.clone()
+    distance = (tracks[:, :, None] - tracks[:, None]).norm(dim=-1)[40:42].amin(0)
+    first, second = divmod(int(distance.argmax()), tracks.shape[1])
+    swapped[40:42, [first, second]] = tracks[40:42, [second, first]]
+    found = denoise_tracks(swapped, torch.ones(tracks.shape[:2]))
+    assert found.outliers[40:42, [first, second]].all()
+    assert found.outliers.sum() <= 6
+    assert (found.points - tracks)[40:42].norm(dim=-1).amax() < 0.1 * (swapped - tracks)[40:42].norm(dim=-1).amax()
+
+
+def test_confidence_counts():
+    """What is measured badly, and says so, spoils less."""
+    tracks = walk()
+    size = rms(tracks - tracks.mean(1, keepdim=True))
+    sure = torch.where(normal(*tracks.shape[:2], seed=3) > 0, 1.0, 0.04).double()
+    noisy = tracks + 0.02 * size * normal(*tracks.shape) / sure[..., None].sqrt()
+    with_weights, without = (denoise_tracks(noisy, w).points - tracks for w in (sure, torch.ones_like(sure)))
+    assert rms(with_weights) < 0.8 * rms(without)
+
+
+@pytest.mark.parametrize("frames", [40, 64, 65, 200])
+def test_units_place_and_order_of_joints_do_not_matter(frames):
+    tracks = walk(frames) + 5 * normal(frames, 1, 1)
+    weights = gaps(*tracks.shape[:2], share=0.1).double()
+    found = denoise_tracks(tracks, weights)
+    order = torch.arange(tracks.shape[1]).flip(0)
+    other = denoise_tracks(tracks[:, order] * 1e-3 + 2, weights[:, order])
+    assert_close((other.points - 2) * 1e3, found.points[:, order], rtol=1e-4, atol=1e-1)
+    assert_close(other.noise * 1e3, found.noise, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_batches_equal_loops(batch):
+    clean = walk(70)
+    tracks = clean + 10 * normal(*batch, *clean.shape)
+    weights = gaps(*clean.shape[:2], share=0.1).double().expand(tracks.shape[:-1])
+    found = denoise_tracks(tracks, weights)
+    pairs = zip(tracks.reshape(-1, *clean.shape), weights.reshape(-1, *clean.shape[:2]), strict=True)
+    alone = [denoise_tracks(*pair) for pair in pairs]
+    for k, whole in enumerate(found):
+        parts = torch.stack([a[k] for a in alone]).reshape(whole.shape)
+        # Conjugate gradients stop before they have converged everywhere: rounding shows, far below the noise of 10.
+        assert_close(whole, parts, rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 4, 5, 11, 12, 13, 65])
+@pytest.mark.parametrize("joints", [1, 2, 5])
+def test_degenerate_clips_are_finite(frames, joints):
+    some = normal(frames, joints) > 0
+    for tracks in (normal(frames, joints, 2), torch.zeros(frames, joints, 2), torch.full((frames, joints, 2), 1e4)):
+        for seen in (torch.ones_like(some), torch.zeros_like(some), some, some & (torch.arange(joints) > 0)):
+            found = denoise_tracks(tracks, seen.to(tracks))
+            assert torch.isfinite(found.points).all() and torch.isfinite(found.noise).all()
+            if seen.all() and tracks.std(correction=0) == 0:
+                assert_close(found.points, tracks)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 4), st.integers(0, 2**31), st.sampled_from([1e-12, 1.0, 1e12]))
+def test_wild_tracks_are_finite(frames, joints, seed, scale):
+    heavy = normal(frames, joints, 2, seed=seed).pow(9) * scale
+    weights = normal(frames, joints, seed=seed + 1).clamp(0, 1)
+    found = denoise_tracks(heavy, weights)
+    assert torch.isfinite(found.points).all() and torch.isfinite(found.noise).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_results_follow_dtype_and_device(dtype, device):
+    tracks = walk(30).to(device, dtype)
+    found = denoise_tracks(tracks, torch.ones(tracks.shape[:2], dtype=dtype, device=device))
+    for value in (found.points, found.weights, found.noise):
+        assert (value.dtype, value.device.type) == (dtype, device)
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 4, 12, 64])
+def test_temporal_modes_are_orthonormal_and_begin_with_parabolas(length):
+    modes = _temporal_modes(length)
+    assert_close(modes.mT @ modes, torch.eye(length, dtype=torch.float64))
+    if length > 3:
+        assert_close(modes[:, :3].diff(n=3, dim=0), torch.zeros(length - 3, 3, dtype=torch.float64))
+
+
+def test_spectrum_floor_is_the_level_at_the_end():
+    order = torch.arange(64, dtype=torch.float64).clamp_min(1)
+    power = torch.stack([1e6 * order**-5 + 7, 1e6 * order**-5, torch.full_like(order, 3.0)])
+    floor = _spectrum_floor(power)
+    assert_close(floor[[0, 2]], torch.tensor([7.0, 3.0], dtype=torch.float64), rtol=0.05, atol=0)
+    assert floor[1] < 1e-2 * power[1, -1]
+
+
+def test_solution_is_that_of_the_normal_equations():
+    length, size = 16, 4
+    y, x = normal(1, 2, length, size).cumsum(2), torch.zeros(1, 2, length, size, dtype=torch.float64)
+    w = normal(1, 2, length, size, seed=1).clamp(0, 1)
+    model = _Model(length, y)
+    model.fit(y, x, w)
+    found = model.solve(y, x, w, 500, tolerance=1e-24)
+    rows = torch.eye(length * size, dtype=torch.float64).reshape(1, -1, length, size)
+    prior = model._from_modes(model.ratio * model._to_modes(rows)).reshape(length * size, -1)
+    assert_close(prior, prior.mT)
+    for h in range(2):
+        exact = torch.linalg.solve(torch.diag(w[0, h].flatten()) + prior, (w * y)[0, h].flatten())
+        assert_close(found[0, h].flatten(), exact, rtol=1e-6, atol=1e-6 * math.sqrt(length))
