@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
-from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limb_path, limbs_of
+from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limb_paths, limbs_of, waves
 from kcs_torch.methods.pkc.objective import Objective, Weights
 from kcs_torch.methods.pkc.trunk import TURN, Trunk, mirror, trunk_paths, trunk_turns
 from kcs_torch.nn.posture import free_bones
@@ -18,7 +20,7 @@ from kcs_torch.skeleton import Skeleton
 __all__ = ["Hypotheses", "fixed_view"]
 
 COARSE = (1.0, 1.01, 1.03, 1.07, 1.14, 1.25)
-FINE = (1.0, 1.004, 1.01, 1.02, 1.035, 1.055, 1.08, 1.12, 1.17, 1.25)
+FINE = (1.0, 1.008, 1.02, 1.04, 1.07, 1.12, 1.2)
 """Lengths tried for a bone, over its longest image (or 0.8 of its usual length, where that is more)."""
 
 TRUST = 0.1
@@ -52,7 +54,7 @@ def fixed_view(
     *,
     rate: float = 30.0,
     rounds: int = 2,
-    steps: int = 50,
+    steps: int = 30,
     weights: Weights | None = None,
     anchor: Tensor | None = None,
 ) -> Hypotheses:
@@ -116,7 +118,7 @@ class _Search:
     costs: SignCosts
     turn: float
 
-    @property
+    @cached_property
     def limbs(self) -> list[Limb]:
         return limbs_of(self.skeleton, self.objective.posture.trunk.tolist())
 
@@ -187,16 +189,15 @@ class _Search:
         posture, free = self.objective.posture, free_bones(self.skeleton)
         flat = bone_vectors(self.image, posture.bones)
         moves = trunk_turns(paths, self.turn, SWITCH)
-        votes = self.image.new_zeros(len(self.image), 2)
-        for limb in self.limbs:
-            if limb.inner is None:
-                continue
-            candidates = self._candidates(flat, limb, COARSE) if lengths is None else lengths[None, list(limb.bones)]
-            _, _, _, margins = limb_path(
-                flat, limb, paths, posture, free, self.costs, candidates=candidates, transition=moves, margins=True
-            )
-            assert margins is not None
-            votes = votes + (margins - margins.amin(-1, keepdim=True)).clamp_max(20)
+        limbs = [limb for limb in self.limbs if limb.inner is not None]
+        if not limbs:
+            return torch.zeros(len(self.image), dtype=torch.long, device=self.image.device)
+        candidates = self._candidates(flat, limbs, COARSE if lengths is None else lengths)
+        found = limb_paths(
+            flat, limbs, paths, posture, free, self.costs, candidates=candidates, transition=moves, margins=True
+        )
+        assert found.margins is not None
+        votes = (found.margins - found.margins.amin(-1, keepdim=True)).clamp_max(20).sum(0)
         return best_path(TRUST * votes, trunk_turns(paths, self.turn))
 
     def _place(
@@ -211,27 +212,30 @@ class _Search:
             dz = bone_vectors(keep[..., None], posture.bones)[..., 0]
         dz = dz.clone()
         length = trunk.lengths.clone()
-        for limb in self.limbs:
-            chain = list(limb.bones)
-            candidates = self._candidates(flat, limb, FINE) if lengths is None else lengths[None, chain]
-            before = None
-            if limb.entry is not None:
-                near = torch.cat([flat[:, limb.before], dz[:, limb.before, None]], -1)
-                before = near / length[limb.before].clamp_min(1e-9)
-            found, depth, _, _ = limb_path(
-                flat, limb, path[None], posture, free, self.costs, candidates=candidates, before=before
-            )
-            dz[:, chain], length[chain] = depth, found
+        for wave in waves(self.limbs):
+            chains = [list(limb.bones) for limb in wave]
+            candidates = self._candidates(flat, wave, FINE if lengths is None else lengths)
+            near = [self._direction(flat, dz, length, limb.before) if limb.entry else None for limb in wave]
+            found = limb_paths(flat, wave, path[None], posture, free, self.costs, candidates=candidates, before=near)
+            for chain, depth, size in zip(chains, found.depths, found.lengths, strict=True):
+                dz[:, chain], length[chain] = depth, size
         z = self._chain(dz.mT).mT
         return z - z.mean(-1, keepdim=True), length
 
-    def _candidates(self, flat: Tensor, limb: Limb, grid: tuple[float, ...]) -> Tensor:
-        """All combinations of a limb's lengths, (K, M)."""
-        chain = list(limb.bones)
-        longest = torch.quantile(flat[:, chain].norm(dim=-1), 0.99, dim=0)
-        least = torch.maximum(longest, 0.8 * self.objective.posture.rest_lengths[chain])
+    def _candidates(self, flat: Tensor, limbs: Sequence[Limb], grid: tuple[float, ...] | Tensor) -> Tensor:
+        """Combinations of limbs' lengths (J, K, M): of a grid over their longest images, or the one that is known."""
+        if isinstance(grid, Tensor):
+            return torch.stack([grid[None, list(limb.bones)] for limb in limbs])
         steps = torch.tensor(grid, dtype=flat.dtype, device=flat.device)
-        return torch.cartesian_prod(*(b * steps for b in least)).view(-1, len(chain))
+        longest = torch.quantile(flat.norm(dim=-1), 0.99, dim=0)
+        least = torch.maximum(longest, 0.8 * self.objective.posture.rest_lengths)
+        count = len(limbs[0].bones)
+        return torch.stack([torch.cartesian_prod(*(least[b] * steps for b in limb.bones)).view(-1, count) for limb in limbs])
+
+    @staticmethod
+    def _direction(flat: Tensor, dz: Tensor, length: Tensor, bone: int) -> Tensor:
+        """Direction (T, 3) of a bone that is already placed."""
+        return torch.cat([flat[:, bone], dz[:, bone, None]], -1) / length[bone].clamp_min(1e-9)
 
     def _flips(self, z: Tensor) -> list[Tensor]:
         """The pose with one bone, or both, of each two-bone limb mirrored in depth."""

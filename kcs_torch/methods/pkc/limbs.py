@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +14,7 @@ from kcs_torch.nn.posture import PostureEnergy, foreshortening
 from kcs_torch.skeleton import Hinge, Skeleton
 from kcs_torch.solvers.signs import SignPath, sign_table, smooth_signs
 
-__all__ = ["Limb", "SignCosts", "limb_path", "limbs_of"]
+__all__ = ["Limb", "LimbPaths", "SignCosts", "limb_paths", "limbs_of", "waves"]
 
 WINDOW, OVERLAP = 200, 40
 """Frames whose signs are found together, and by how many neighbouring windows overlap."""
@@ -63,6 +65,31 @@ class SignCosts:
     over: float = 0.004
 
 
+def waves(limbs: Sequence[Limb]) -> list[list[Limb]]:
+    """Limbs of as many bones each whose neighbours towards the trunk are in earlier waves."""
+    level: dict[int, int] = {}
+    out: dict[tuple[int, int], list[Limb]] = {}
+    for limb in limbs:
+        depth = level.get(limb.before, -1) + 1
+        level |= dict.fromkeys(limb.bones, depth)
+        out.setdefault((depth, len(limb.bones)), []).append(limb)
+    return [out[key] for key in sorted(out)]
+
+
+class LimbPaths(NamedTuple):
+    """Lengths and signs of J limbs.
+
+    Attributes:
+        lengths: (J, M).
+        depths: (J, T, M), signed.
+        margins: (J, T, C), or None.
+    """
+
+    lengths: Tensor
+    depths: Tensor
+    margins: Tensor | None
+
+
 def limbs_of(skeleton: Skeleton, trunk: list[int]) -> list[Limb]:
     """Chains of one or two bones that reach every joint beyond the trunk, nearer ones first; hinges join two bones."""
     bones = skeleton.bones
@@ -90,9 +117,9 @@ def limbs_of(skeleton: Skeleton, trunk: list[int]) -> list[Limb]:
     return limbs
 
 
-def limb_path(
+def limb_paths(
     image: Tensor,
-    limb: Limb,
+    limbs: Sequence[Limb],
     rotations: Tensor,
     posture: PostureEnergy,
     free: Tensor,
@@ -100,59 +127,63 @@ def limb_path(
     *,
     candidates: Tensor,
     transition: Tensor | None = None,
-    before: Tensor | None = None,
+    before: Sequence[Tensor | None] | None = None,
     margins: bool = False,
-) -> tuple[Tensor, Tensor, float, Tensor | None]:
-    """Choose a limb's lengths among candidates, and its signs of depth, given one or several paths of the trunk.
+) -> LimbPaths:
+    """Choose limbs' lengths among candidates, and their signs of depth, given one or several paths of the trunk.
 
     Args:
         image: bones' images (T, B, 2), in units of the lengths.
-        limb: which.
+        limbs: J limbs of M bones each.
         rotations: (C, T, 3, 3) of the trunk.
         posture: mean directions and spreads.
         free: (B,) 1 for bones that point anywhere.
         costs: weights.
-        candidates: lengths (K, M) to choose from.
+        candidates: lengths (J, K, M) to choose from.
         transition: (T - 1, C, C) cost of going from one trunk path to the other.
-        before: (T, 3) direction of the bone before, or None.
+        before: (T, 3) direction of the bone before each limb, or None.
         margins: True also returns how much dearer the clip is if a frame takes the other trunk path.
-
-    Returns:
-        lengths (M,), signed depths (T, M), the cost, and margins (T, C) or None.
     """
     frames = len(image)
     size = min(WINDOW, frames)
     starts = window_starts(frames, size, min(OVERLAP, size - 1))
+    count, tried, _ = candidates.shape
+    before = [None] * count if before is None else before
 
     def solve(lengths: Tensor, begin: list[int], margins: bool) -> tuple[SignPath, Tensor]:
-        """The best signs of W windows for K lengths each, as K W problems: window w of length k is problem k W + w."""
+        """Signs in W windows for J limbs of K lengths each: window w of length k of limb j is problem (j K + k) W + w."""
+        parts = [
+            _unary(image, limb, rotations, posture, free, costs, length, near)
+            for limb, length, near in zip(limbs, lengths, before, strict=True)
+        ]
+        unary, depth = (torch.cat(part) for part in zip(*parts, strict=True))  # (J K, T, ...)
         at = torch.tensor(begin, device=image.device)[:, None] + torch.arange(size, device=image.device)  # (W, T_w)
-        unary, depth = _unary(image, limb, rotations, posture, free, costs, lengths, before)
-        moves = None if transition is None else transition[at[:, :-1]].repeat(len(lengths), 1, 1, 1)
+        moves = None if transition is None else transition[at[:, :-1]].repeat(len(unary), 1, 1, 1)
         scaled = depth[:, at].flatten(0, 1) / costs.acceleration
         return smooth_signs(unary[:, at].flatten(0, 1), scaled, cap=costs.cap, transition=moves, margins=margins), depth
 
-    usual = posture.rest_lengths[list(limb.bones)].to(image)
-    prior = 0.5 * ((candidates / usual).log() / costs.proportions).square().sum(-1)
-    sample = starts
-    if len(starts) > SAMPLE:
-        sample = [starts[round(i * (len(starts) - 1) / (SAMPLE - 1))] for i in range(SAMPLE)]
-    if len(candidates) > 1:
+    usual = torch.stack([posture.rest_lengths[list(limb.bones)] for limb in limbs]).to(image)  # (J, M)
+    prior = 0.5 * ((candidates / usual[:, None]).log() / costs.proportions).square().sum(-1)  # (J, K)
+    best = torch.zeros(count, dtype=torch.long, device=image.device)
+    if tried > 1:
+        sample = starts
+        if len(starts) > SAMPLE:
+            sample = [starts[round(i * (len(starts) - 1) / (SAMPLE - 1))] for i in range(SAMPLE)]
         path, _ = solve(candidates, sample, False)
-        best = int((path.cost.view(len(candidates), -1).sum(1) * (len(starts) / len(sample)) + prior).argmin())
-    else:
-        best = 0
-    lengths = candidates[best]
-    path, depth = solve(lengths[None], starts, margins)
-    signs = torch.empty(frames, len(limb.bones), dtype=image.dtype, device=image.device)
-    spread = torch.empty(frames, len(rotations), dtype=image.dtype, device=image.device) if margins else None
+        best = (path.cost.view(count, tried, -1).sum(-1) * (len(starts) / len(sample)) + prior).argmin(-1)
+    limb_index = torch.arange(count, device=image.device)
+    lengths = candidates[limb_index, best]  # (J, M)
+    path, depth = solve(lengths[:, None], starts, margins)
+    signs = torch.empty_like(depth)
+    windows = path.signs.unflatten(0, (count, len(starts)))
+    spread = image.new_empty(count, frames, len(rotations)) if margins else None
     for i, begin in enumerate(starts):
         first = 0 if i == 0 else (starts[i - 1] + size - begin) // 2
-        signs[begin + first : begin + size] = path.signs[i, first:]
+        signs[:, begin + first : begin + size] = windows[:, i, first:]
         if spread is not None and path.margins is not None:
-            spread[begin + first : begin + size] = path.margins[i, first:].amin(-1)
-    cost = float(path.cost.sum() + prior[best])
-    return lengths, signs * depth[0], cost, spread
+            part = path.margins.unflatten(0, (count, len(starts)))[:, i, first:]
+            spread[:, begin + first : begin + size] = part.amin(-1)
+    return LimbPaths(lengths, signs * depth, spread)
 
 
 def _unary(

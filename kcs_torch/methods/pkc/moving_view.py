@@ -1,0 +1,210 @@
+"""A body seen from a viewpoint that turns: many starts, ranked by one objective, the best refined on all frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.align import nearest_rotation
+from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.rigidity import distance_spread, rigid_tree
+from kcs_torch.functional.temporal import interpolate
+from kcs_torch.nn.unrolled import UnrolledSfAM
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.solvers.camera_path import CameraPath, choose_path, settle_path
+from kcs_torch.solvers.lifts import random_lifts, turning_cameras
+from kcs_torch.solvers.procrustean import (
+    COARSE,
+    FINE,
+    Pose,
+    Stage,
+    align_rotations,
+    depth_deviation,
+    length_energy,
+    motion_energy,
+    procrustean,
+)
+
+__all__ = ["MovingView", "moving_view"]
+
+TURNS = (30.0, 60.0, 90.0, 120.0, 180.0, 360.0)
+"""Degrees that the cameras of the starts turn, evenly, about the image's vertical."""
+
+KEPT = (12, 6, 3)
+"""Starts that go on after each of the coarse stages."""
+
+RANKING = Stage(1e-5, 0, 1.0, 1.0, 0.003)
+"""Scales at which finished starts are compared: the poses and their changes count alike."""
+
+LOOSE, LOOSER = 0.3, 0.1
+"""Weight of each length where the links are no tree (markers, say), in the coarse stages and in the fine ones."""
+
+ROBOT = 10
+"""Up to as many joints, eight times the random starts are tried: they are cheap, and little else decides."""
+
+
+@dataclass(frozen=True)
+class MovingView:
+    """Solutions of one clip, best first.
+
+    Attributes:
+        pose: points (H, T, N, 3) in the camera frame, and the rotations that align them.
+        bones: (B, 2) tree that the poses were aligned in.
+        rigid: (P, 2) pairs that keep their distance.
+        stiffness: weight of each length.
+    """
+
+    pose: Pose
+    bones: Tensor
+    rigid: Tensor
+    stiffness: float
+
+    def cameras(self, index: int = 0, kind: CameraPath = "auto") -> tuple[Tensor, CameraPath]:
+        """Rotations (T, 3, 3), world to camera, of one solution, and the kind of path they follow.
+
+        What aligns poses also turns with the body; a camera moves simply. See
+        :func:`kcs_torch.solvers.camera_path.choose_path`.
+        """
+        path, kind, _ = choose_path(self.pose.rotations[index], kind)
+        if kind == "constant":
+            path = settle_path(bone_vectors(self.pose.points[index], self.bones), path)
+        return path, kind
+
+    def deviation(self, cameras: Tensor, index: int = 0) -> Tensor:
+        """Standard deviation (T, N) of the depths of one solution, for camera rotations (T, 3, 3)."""
+        view = cameras[:, 2]
+        travel = torch.rad2deg((view[1:] * view[:-1]).sum(-1).clamp(-1, 1).arccos().sum())
+        pose = self.pose[index : index + 1]
+        return depth_deviation(
+            pose.points, pose.rotations, self.bones, turn=travel, rigid=self.rigid, stiffness=self.stiffness
+        )[0]
+
+
+def moving_view(
+    image: Tensor,
+    skeleton: Skeleton,
+    start: Tensor,
+    rotations: Tensor,
+    *,
+    weights: Tensor | None = None,
+    noise: float = 0.0,
+    turns: Sequence[float] = TURNS,
+    lifts: int = 16,
+    coarse_frames: int = 100,
+    alternatives: int = 1,
+    seed: int = 0,
+) -> MovingView:
+    """Lift one clip by low-rank motion of aligned bones of constant length.
+
+    Args:
+        image: (T, N, 2), complete, centred per frame, of root mean square 1.
+        skeleton: of the N joints. A tree is taken at its word: its rigid bones keep their length, and poses are
+            aligned in it. Else its links are pulled weakly, and poses are aligned in a tree found from them.
+        start: (T, N, 3) a first guess, from :class:`kcs_torch.methods.SfAM`.
+        rotations: (T, 3, 3) world to camera, of that guess.
+        weights: (T, N) confidences, for ``noise``.
+        noise: of the image; 0 holds x and y.
+        turns: degrees of further starts with evenly turning cameras.
+        lifts: number of further starts from bone lengths with random signs.
+        coarse_frames: starts are compared on about as many frames, evenly spread.
+        alternatives: how many of the best (at most the last of KEPT) are refined on all frames.
+        seed: of the random starts.
+
+    Returns:
+        The solutions, ranked.
+    """
+    frames, joints, _ = image.shape
+    rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
+    is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
+    first = torch.cat([image, start[..., 2:] - start[..., 2:].mean(1, keepdim=True)], -1)[None]
+    spread = lambda points: rigid_tree(distance_spread(points)[1])  # noqa: E731
+    bones = skeleton.bone_index(device=image.device) if is_tree else spread(first[0])
+    coarse, fine = (tuple(_soften(s, noise) for s in stages) for stages in (COARSE, FINE))
+    tight = (1.0, 1.0) if is_tree else (LOOSE, LOOSER)
+
+    pick = torch.arange(0, frames, max(1, -(-frames // coarse_frames)), device=image.device)
+    few, few_weights = image[pick], None if weights is None else weights[pick]
+    made = _starts(few, skeleton, bones, turns, lifts if joints > ROBOT else 8 * lifts, frames, pick, seed)
+    points = torch.cat([first[:, pick], made[0]])
+    turned = align_rotations(points, torch.cat([rotations[None, pick], made[1]]), bones)
+    pose = Pose(points, turned, points.new_zeros(len(points)))
+    order = torch.arange(len(points))
+    for stage, kept in zip(coarse, KEPT, strict=True):
+        pose = procrustean(
+            few, pose.points, pose.rotations, bones,
+            weights=few_weights, rigid=rigid, stiffness=tight[0], noise=noise, stages=[stage],
+        )  # fmt: skip
+        best = pose.objective.argsort()[: kept if len(made[0]) < 10 * kept else 3 * kept]
+        pose, order = pose[best], order[best.cpu()]
+    pose = procrustean(
+        few, pose.points, pose.rotations, bones,
+        weights=few_weights, rigid=rigid, stiffness=tight[1], noise=noise, stages=fine,
+    )  # fmt: skip
+    best = _rank(pose, bones, rigid, tight[0], noise)[:alternatives]
+    pose, order = pose[best], order[best.cpu()]
+
+    if len(pick) < frames:
+        points, turned = _spread_out(pose, image, pick)
+        own = (order == 0).to(image.device)  # the first guess has all frames of its own
+        points = torch.where(own[:, None, None, None], first, points)
+        turned = torch.where(own[:, None, None, None], align_rotations(first, rotations[None], bones), turned)
+        stages = coarse if bool(own.any()) else coarse[-1:]
+        pose = procrustean(
+            image, points, turned, bones,
+            weights=weights, rigid=rigid, stiffness=tight[0], noise=noise, stages=stages,
+        )  # fmt: skip
+    if not is_tree:
+        bones = spread(pose.points[0])
+    pose = procrustean(
+        image, pose.points, pose.rotations, bones,
+        weights=weights, rigid=rigid, stiffness=tight[1], noise=noise, stages=fine,
+    )  # fmt: skip
+    return MovingView(pose[_rank(pose, bones, rigid, tight[0], noise)], bones, rigid, tight[0])
+
+
+def _soften(stage: Stage, noise: float) -> Stage:
+    """The stage, with no scale far below the noise."""
+    return replace(stage, eps=max(stage.eps, 0.1 * noise**2), slack=max(stage.slack, 0.3 * noise))
+
+
+def _rank(pose: Pose, bones: Tensor, rigid: Tensor, stiffness: float, noise: float) -> Tensor:
+    """Indices of the hypotheses, best first."""
+    stage = _soften(RANKING, noise)
+    pull = pose.points.new_full((len(rigid),), stiffness)
+    total = motion_energy(pose.points, pose.rotations, bones, stage)
+    return (total + length_energy(pose.points, rigid, pull, stage.slack)).argsort()
+
+
+def _starts(
+    image: Tensor, skeleton: Skeleton, bones: Tensor, turns: Sequence[float], lifts: int, frames: int, pick: Tensor,
+    seed: int,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Points (H, T', N, 3) and rotations (H, T', 3, 3) of further starts, for the frames in ``pick``."""
+    like = {"dtype": image.dtype, "device": image.device}
+    cameras = turning_cameras(turns, frames, **like)[:, pick]
+    seen = image.expand(len(cameras), -1, -1, -1)
+    solver = UnrolledSfAM(skeleton, 30, articulate_from=1.0, learnable=False).to(image.device)
+    lifted = (solver(seen, cameras[:, :, :2]) @ cameras.mT)[..., 2:]
+    generator = torch.Generator().manual_seed(seed)
+    flips = random_lifts(image, bones, lifts, generator=generator)
+    turned = turning_cameras(torch.rand(lifts, generator=generator) * 360, len(image), **like)
+    points = torch.cat([seen, lifted - lifted.mean(-2, keepdim=True)], -1)
+    return torch.cat([points, flips]), torch.cat([cameras, turned])
+
+
+def _spread_out(pose: Pose, image: Tensor, pick: Tensor) -> tuple[Tensor, Tensor]:
+    """Points and rotations of all frames, linear between those in ``pick``."""
+    count, frames = len(pose.points), len(image)
+    known = torch.zeros(frames, 1, dtype=torch.bool, device=image.device)
+    known[pick] = True
+
+    def fill(values: Tensor) -> Tensor:
+        out = values.new_zeros(count, frames, 1, values[0, 0].numel())
+        out[:, pick] = values.flatten(2)[:, :, None]
+        return interpolate(out, known).reshape(count, frames, *values.shape[2:])
+
+    depth = fill(pose.points[..., 2:])
+    return torch.cat([image.expand(count, -1, -1, -1), depth], -1), nearest_rotation(fill(pose.rotations))
