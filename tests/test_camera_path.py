@@ -9,8 +9,9 @@ from numerics import DEVICES, FLOATS, leaves_arguments_alone, normal, rotations
 from torch.testing import assert_close
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional import nearest_rotation
 from kcs_torch.solvers import constant_path
-from kcs_torch.solvers.camera_path import _left_jacobian
+from kcs_torch.solvers.camera_path import _left_jacobian, choose_path, settle_path, smooth_path
 
 
 def path(frames, degrees, axis=(0.2, 1.0, -0.1), seed=0):
@@ -104,3 +105,48 @@ def test_shapes_that_do_not_fit(shape):
 def test_results_follow_dtype_and_device(dtype, device):
     values = leaves_arguments_alone(constant_path, path(10, 50).to(device, dtype))
     assert {(v.dtype, v.device.type) for v in values} == {(dtype, device)}
+
+
+def test_smooth_path_follows_a_swaying_camera_through_noise():
+    time = torch.linspace(0, 1, 200, dtype=torch.float64)
+    vector = torch.zeros(200, 3, dtype=torch.float64)
+    vector[:, 1] = 0.35 * (2 * torch.pi * time).sin()
+    truth = roma.rotvec_to_rotmat(vector)
+    jolt = 0.05 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    path, angle = smooth_path(roma.rotvec_to_rotmat(jolt) @ truth, waves=8)
+    assert roma.rotmat_geodesic_distance(path, truth).median() < 0.03
+    assert angle.shape == (200,)
+    assert torch.allclose(path @ path.mT, torch.eye(3, dtype=torch.float64).expand_as(path), atol=1e-9)
+
+
+def test_choose_path_takes_the_simplest_that_explains():
+    time = torch.linspace(0, 1, 200, dtype=torch.float64)[:, None]
+    axis = torch.tensor([0.1, 1.0, 0.0], dtype=torch.float64)
+    jolt = 0.02 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    even = roma.rotvec_to_rotmat(jolt) @ roma.rotvec_to_rotmat(3 * time * axis)
+    sway = roma.rotvec_to_rotmat(0.6 * (2 * torch.pi * time).sin() * axis)
+    wild = roma.random_rotmat(200, dtype=torch.float64)
+    assert choose_path(even)[1] == "constant"
+    assert choose_path(sway)[1] == "smooth"
+    path, kind, _ = choose_path(wild)
+    assert kind == "free" and torch.equal(path, wild)
+    assert choose_path(even, "free")[1] == "free" and choose_path(even, "smooth")[1] == "smooth"
+    assert choose_path(even[:5])[1] == "free"
+
+
+def test_settle_path_finds_axis_and_speed():
+    """A path off in axis and speed comes back to where the world poses vary least."""
+    frames = 150
+    time = (torch.arange(frames, dtype=torch.float64) - (frames - 1) / 2)[:, None]
+    speed = torch.tensor([0.0, 0.1, 0.0], dtype=torch.float64)
+    truth = roma.rotvec_to_rotmat(time * speed)
+    generator = torch.Generator().manual_seed(0)
+    rest = torch.randn(1, 6, 3, generator=generator, dtype=torch.float64)
+    moves = 0.1 * torch.randn(1, 6, 3, generator=generator, dtype=torch.float64)
+    world = rest + moves * (0.05 * time)[..., None].sin()
+    off = roma.rotvec_to_rotmat(time * (speed + torch.tensor([0.003, 0.0005, 0.0])))
+    found = settle_path(world @ truth.mT, off)
+    gauge = lambda p: roma.rotmat_geodesic_distance(p, truth @ nearest_rotation((truth.mT @ p).sum(0))).max()  # noqa: E731
+    assert gauge(off) > 0.03
+    assert gauge(found) < 0.005
+    assert settle_path(world[:2], off[:2]).shape == (2, 3, 3)

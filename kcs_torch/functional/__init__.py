@@ -19,6 +19,8 @@ from kcs_torch.functional.chain import (
     kcs_matrix,
     points_from_bones,
 )
+from kcs_torch.functional.rigidity import distance_spread, rigid_tree
+from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.functional.spectral import (
     dct_basis,
     log_det,
@@ -28,7 +30,7 @@ from kcs_torch.functional.spectral import (
     spectral_norm,
     svt,
 )
-from kcs_torch.functional.temporal import best_path, blend_windows, interpolate, window_starts
+from kcs_torch.functional.temporal import best_path, blend_windows, interpolate, jitter, window_starts
 
 __all__ = [
     "back_project",
@@ -41,9 +43,11 @@ __all__ = [
     "chain_inverse",
     "complete_rotation",
     "dct_basis",
+    "distance_spread",
     "factorize",
     "incidence",
     "interpolate",
+    "jitter",
     "kcs_matrix",
     "log_det",
     "nearest_rotation",
@@ -53,7 +57,9 @@ __all__ = [
     "procrustes",
     "project",
     "psd_shrink",
+    "rigid_tree",
     "rows_to_cameras",
+    "scatter_log_det",
     "similarity",
     "singular_values",
     "spectral_norm",

@@ -115,7 +115,7 @@ class _Polar(torch.autograd.Function):
         return u @ vt
 
     @staticmethod
-    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         u, size, vt = ctx.saved_tensors
         inner = u.mT @ grad @ vt.mT

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError
 
-__all__ = ["best_path", "blend_windows", "interpolate", "window_starts"]
+__all__ = ["best_path", "blend_windows", "interpolate", "jitter", "window_starts"]
 
 
 def interpolate(values: Tensor, seen: Tensor) -> Tensor:
@@ -38,6 +38,28 @@ def interpolate(values: Tensor, seen: Tensor) -> Tensor:
     known = (~never).to(values.dtype)[..., None]
     middle = (filled * known).sum(-2, keepdim=True) / known.sum(-2, keepdim=True).clamp_min(1)
     return torch.where(never[..., None], middle, filled)
+
+
+def jitter(values: Tensor, seen: Tensor, *, order: int = 4) -> Tensor:
+    """Estimate the standard deviation of independent noise in smooth motion, from its ``order``-th differences.
+
+    Motion has little in its fourth difference, noise most of it: binomial(2 n, n) times its variance. The median makes
+    it blind to outliers and to the few frames where motion is abrupt.
+
+    Args:
+        values: (T, N, D).
+        seen: (T, N), True where ``values`` hold; differences across gaps do not count.
+        order: n.
+
+    Returns:
+        A scalar in the unit of the values; 0 for clips with no more than ``order`` frames in a row.
+    """
+    if len(values) <= order:
+        return values.new_zeros(())
+    change = values.diff(n=order, dim=0)[seen.unfold(0, order + 1, 1).all(-1)]
+    if change.numel() == 0:
+        return values.new_zeros(())
+    return change.abs().median() / (0.6745 * math.comb(2 * order, order) ** 0.5)
 
 
 def window_starts(length: int, window: int, overlap: int) -> list[int]:

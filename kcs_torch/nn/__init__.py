@@ -9,6 +9,7 @@ from kcs_torch.nn.energies import (
     SymmetryEnergy,
 )
 from kcs_torch.nn.layers import SVT, BoneLengths, BoneVectors, KCSMatrix
+from kcs_torch.nn.procrustean import ProcrusteanEnergy
 from kcs_torch.nn.unrolled import UnrolledFPC, UnrolledSfAM
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "HingeEnergy",
     "KCSMatrix",
     "LowRankEnergy",
+    "ProcrusteanEnergy",
     "ReprojectionEnergy",
     "SmoothnessEnergy",
     "SymmetryEnergy",

@@ -20,7 +20,10 @@ __all__ = ["CameraPath", "choose_path", "constant_path", "settle_path", "smooth_
 CameraPath = Literal["auto", "free", "smooth", "constant"]
 
 EVEN = 0.05
-"""A path explains rotations where their median deviation from it is below this share of its length."""
+"""A path explains rotations where their median deviation from it is below this share of its length ..."""
+
+NEAR = math.radians(30)
+"""... and below this angle, as a path that races through all directions has length enough for any deviation."""
 
 
 def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Tensor]:
@@ -123,7 +126,7 @@ def choose_path(rotations: Tensor, kind: CameraPath = "auto") -> tuple[Tensor, C
 
 def _explains(path: Tensor, angle: Tensor) -> bool:
     length = roma.rotmat_geodesic_distance(path[1:], path[:-1]).sum()
-    return bool(angle.median() < EVEN * length)
+    return bool(angle.median() < (EVEN * length).clamp_max(NEAR))
 
 
 def settle_path(

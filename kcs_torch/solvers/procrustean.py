@@ -33,6 +33,7 @@ __all__ = [
     "Pose",
     "Stage",
     "align_rotations",
+    "depth_deviation",
     "length_energy",
     "motion_energy",
     "procrustean",
@@ -65,6 +66,9 @@ COARSE = (Stage(1e-2, 15, 1.0, 0.0, 0.1), Stage(1e-3, 25, 1.0, 0.0, 0.03), Stage
 FINE = (Stage(1e-4, 30, 0.01, 1.0, 0.01), Stage(1e-5, 40, 0.01, 1.0, 0.01), Stage(1e-5, 40, 0.01, 1.0, 0.003))
 """Stages that refine: the changes in time tell more than the poses, but slow modes move little."""
 
+TELLING = Stage(1e-4, 0, 1.0, 0.0, 0.03)
+"""Scales at which the curvature tells how sure depths are."""
+
 CHANGE = 0.1
 """The eps of the changes, a share of the poses'."""
 
@@ -80,17 +84,15 @@ class Pose:
         points: (H, T, N, 3) in the camera frame.
         rotations: (H, T, 3, 3), world to camera: ``points @ rotations`` are the aligned poses.
         objective: (H,) at the last stage's scales; the lowest is best.
-        deviation: (H, T, N) standard deviation of the depths, from the objective's curvature in each frame.
     """
 
     points: Tensor
     rotations: Tensor
     objective: Tensor
-    deviation: Tensor
 
     def __getitem__(self, index: Tensor | slice) -> Pose:
         """Some of the hypotheses."""
-        return Pose(self.points[index], self.rotations[index], self.objective[index], self.deviation[index])
+        return Pose(self.points[index], self.rotations[index], self.objective[index])
 
 
 def procrustean(
@@ -133,7 +135,7 @@ def procrustean(
     stiff = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device).expand(len(rigid))
     free = 3 if noise > 0 else 1
     share = tracks.new_ones(frames, joints) if weights is None else weights
-    value, roots = points.new_zeros(hypotheses), points.new_ones(hypotheses, frames, free * joints, 1)
+    value = points.new_zeros(hypotheses)
     for stage in stages:
         precision = _precision(points, tracks, share, noise)
         levels = aligned_levels(points, rotations, bones, stage)
@@ -164,8 +166,44 @@ def procrustean(
         rotations = nearest_rotation(rotations)  # rounding would add up
         with torch.no_grad():
             value = energy(found)
-    depth = roots[..., (free - 1) * joints : free * joints, :]
-    return Pose(points, rotations, value, depth.square().sum(-1).sqrt())
+    return Pose(points, rotations, value)
+
+
+def depth_deviation(
+    points: Tensor,
+    rotations: Tensor,
+    bones: Tensor,
+    *,
+    turn: Tensor | float,
+    rigid: Tensor | None = None,
+    stiffness: Tensor | float = 1.0,
+) -> Tensor:
+    """Estimate the standard deviation of depths from the objective's curvature, and from how far the viewpoint turned.
+
+    The curvature in each frame says which joints the others hold: a tip less than a hip. It does not know of errors
+    that all frames share, a depth stretched as a whole above all, which only a turning viewpoint rules out: their size
+    goes about with the turn's power -0.6. The constants were set on motion capture of people, dogs and hands seen
+    from paths of 40 to 5,000 degrees, so that one standard deviation covers about two thirds.
+
+    Args:
+        points: (H, T, N, 3), of root mean square near 1.
+        rotations: (H, T, 3, 3).
+        bones: (B, 2).
+        turn: (H,) or a number, degrees that the viewing direction travels in all.
+        rigid: (P, 2) pairs that keep their distance; ``bones`` where None.
+        stiffness: as in :func:`procrustean`.
+
+    Returns:
+        (H, T, N), in the unit of the points.
+    """
+    rigid = bones if rigid is None else rigid
+    stiff = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device).expand(len(rigid))
+    levels = aligned_levels(points, rotations, bones, TELLING)
+    curvature = frame_curvature(points, rotations, bones, levels, 1)
+    curvature.add_lengths(points, rigid, stiff, TELLING.slack, REACH)
+    local = block_roots(curvature)[..., :-3, :].square().sum(-1).sqrt()
+    angle = torch.as_tensor(turn, dtype=points.dtype, device=points.device).clamp_min(1.0)
+    return local * (270 / angle).pow(0.6).expand(len(points))[:, None, None]
 
 
 def aligned_levels(points: Tensor, rotations: Tensor, bones: Tensor, stage: Stage) -> Levels:

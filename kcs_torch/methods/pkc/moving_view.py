@@ -183,14 +183,14 @@ def _starts(
     seed: int,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Points (H, T', N, 3) and rotations (H, T', 3, 3) of further starts, for the frames in ``pick``."""
-    like = {"dtype": image.dtype, "device": image.device}
-    cameras = turning_cameras(turns, frames, **like)[:, pick]
+    cameras = turning_cameras(turns, frames, dtype=image.dtype, device=image.device)[:, pick]
     seen = image.expand(len(cameras), -1, -1, -1)
     solver = UnrolledSfAM(skeleton, 30, articulate_from=1.0, learnable=False).to(image.device)
     lifted = (solver(seen, cameras[:, :, :2]) @ cameras.mT)[..., 2:]
     generator = torch.Generator().manual_seed(seed)
     flips = random_lifts(image, bones, lifts, generator=generator)
-    turned = turning_cameras(torch.rand(lifts, generator=generator) * 360, len(image), **like)
+    degrees = 360 * torch.rand(lifts, generator=generator, dtype=torch.float64)
+    turned = turning_cameras(degrees, len(image), dtype=image.dtype, device=image.device)
     points = torch.cat([seen, lifted - lifted.mean(-2, keepdim=True)], -1)
     return torch.cat([points, flips]), torch.cat([cameras, turned])
 

@@ -1,0 +1,83 @@
+"""A skeleton from the data alone: the joint pairs that keep their distance, and their tree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.rigidity import distance_spread, rigid_tree
+from kcs_torch.methods.sfam import SfAM
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.types import Reconstruction, Tracks
+
+__all__ = ["find_skeleton"]
+
+
+def find_skeleton(
+    source: Tracks | Reconstruction | Tensor,
+    *,
+    weights: Tensor | None = None,
+    joints: Sequence[str] | None = None,
+    rigid_below: float = 0.05,
+) -> Skeleton:
+    """Find the bones of a body: the spanning tree over the joint pairs whose distance varies least.
+
+    Markers on one limb keep their distance whatever the pose, markers on different limbs do not. A reconstruction need
+    not be good for that; its mirror image or a wrong turn of the whole changes no distance.
+
+    Args:
+        source: tracks (which are lifted first, by :class:`SfAM`), a reconstruction, or points (T, N, 3).
+        weights: (T, N), 0 where unseen; those of the tracks if None.
+        joints: their names, for points; those of the tracks' skeleton otherwise.
+        rigid_below: a bone whose length varies by more than this share (standard deviation over mean) is flexible.
+
+    Returns:
+        A skeleton named "found" with ``proportions``, the median lengths; its bones run away from the first joint.
+
+    Raises:
+        ShapeError: there are no two joints, or points that are not finite (T, N, 3).
+        OptionError: ``rigid_below`` is negative.
+
+    >>> import kcs_torch as kt
+    >>> points = torch.zeros(20, 3, 3)
+    >>> points[:, 1, 0] = 1
+    >>> points[:, 2, 0] = 1 + torch.linspace(0, 1, 20).cos()
+    >>> points[:, 2, 1] = torch.linspace(0, 1, 20).sin()
+    >>> find_skeleton(points).bones
+    ((0, 1), (1, 2))
+    """
+    if not rigid_below >= 0:
+        raise OptionError(f"find_skeleton: rigid_below: expected a share >= 0, got {rigid_below}")
+    if isinstance(source, Tracks):
+        source = SfAM()(source)
+    if isinstance(source, Reconstruction):
+        weights = source.tracks.weights if weights is None else weights
+        joints = source.tracks.skeleton.joints if joints is None else joints
+        source = source.points
+    if source.ndim != 3 or source.shape[-1] != 3 or source.shape[0] < 1 or source.shape[1] < 2:
+        raise ShapeError(f"find_skeleton: expected points (T, N, 3) of at least 2 joints, got {tuple(source.shape)}")
+    if not torch.isfinite(source).all():
+        raise ShapeError("find_skeleton: expected finite points; give weights 0 where a joint is unseen")
+    if weights is not None and weights.shape != source.shape[:2]:
+        raise ShapeError(f"find_skeleton: expected weights {tuple(source.shape[:2])}, got {tuple(weights.shape)}")
+    mean, spread = distance_spread(source, weights)
+    # Between equally rigid pairs, those of a body at rest say, the shorter is the likelier bone.
+    cost = spread + 1e-3 * mean
+    if weights is not None:  # what was never seen together is joined last
+        together = torch.minimum(weights[:, :, None], weights[:, None, :]).sum(0)
+        cost = torch.where(together > 0, cost, 1e3 * (1 + cost.amax()) + mean)
+    bones = rigid_tree(cost)
+    size = bone_lengths(source, bones)
+    ratio = spread[bones[:, 0], bones[:, 1]] / mean[bones[:, 0], bones[:, 1]].clamp_min(torch.finfo(mean.dtype).tiny)
+    lengths = size.median(0).values
+    return Skeleton(
+        joints=tuple(joints) if joints is not None else tuple(f"joint{i}" for i in range(source.shape[1])),
+        bones=tuple((int(a), int(b)) for a, b in bones.tolist()),
+        name="found",
+        proportions=tuple(lengths.tolist()) if bool((lengths > 0).all()) else None,
+        flexible=tuple((ratio > rigid_below).nonzero().flatten().tolist()),
+    )

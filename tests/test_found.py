@@ -1,0 +1,48 @@
+"""Skeletons found from motion."""
+
+import pytest
+import torch
+from test_procrustean import BONES, swinging_body
+
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.methods.found import find_skeleton
+from kcs_torch.types import Tracks
+
+
+def test_finds_the_bones_of_a_moving_body():
+    points, _ = swinging_body()
+    body = find_skeleton(points)
+    assert {frozenset(b) for b in body.bones} == {frozenset(b) for b in BONES.tolist()}
+    assert body.flexible == () and body.is_tree and body.name == "found"
+    assert body.proportions is not None and len(body.proportions) == 5
+    mirrored = find_skeleton(points * torch.tensor([1.0, 1.0, -1.0]), joints=list("abcdef"))
+    assert mirrored.bones == body.bones and mirrored.joints == tuple("abcdef")
+
+
+def test_unseen_joints_do_not_spoil_it():
+    points, _ = swinging_body()
+    weights = torch.ones(60, 6, dtype=torch.float64)
+    broken = points.clone()
+    broken[10:30, 3] = 100.0
+    weights[10:30, 3] = 0
+    assert find_skeleton(broken, weights=weights).bones == find_skeleton(points).bones
+    weights[:, 5] = 0
+    assert find_skeleton(broken, weights=weights).is_tree
+
+
+def test_takes_tracks_and_results():
+    points, _ = swinging_body()
+    tracks = Tracks.from_arrays(points[..., :2], joint_names=list("abcdef"))
+    body = find_skeleton(tracks)
+    assert body.joints == tuple("abcdef") and body.num_bones == 5
+
+
+def test_bad_input():
+    with pytest.raises(ShapeError, match="at least 2 joints"):
+        find_skeleton(torch.zeros(4, 1, 3))
+    with pytest.raises(ShapeError, match="finite"):
+        find_skeleton(torch.full((4, 3, 3), float("nan")))
+    with pytest.raises(ShapeError, match="weights"):
+        find_skeleton(torch.randn(4, 3, 3), weights=torch.ones(3, 3))
+    with pytest.raises(OptionError, match="rigid_below"):
+        find_skeleton(torch.randn(4, 3, 3), rigid_below=-1.0)
