@@ -2,9 +2,10 @@
 
 from kcs_torch.methods.base import Method
 from kcs_torch.methods.kcs import KCS
+from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.sfam import SfAM
 
-__all__ = ["KCS", "METHODS", "Method", "SfAM"]
+__all__ = ["KCS", "METHODS", "PKC", "Method", "SfAM"]
 
-METHODS: dict[str, type[Method]] = {"kcs": KCS, "sfam": SfAM}
+METHODS: dict[str, type[Method]] = {"pkc": PKC, "sfam": SfAM, "kcs": KCS}
 """The methods by name."""

@@ -22,6 +22,7 @@ from kcs_torch.functional.align import centre
 from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import interpolate
+from kcs_torch.methods.root import root_depth
 from kcs_torch.types import Diagnostics, Reconstruction, Tracks, as_floats
 
 __all__ = ["Estimate", "Method"]
@@ -41,6 +42,10 @@ class Estimate:
         converged: whether the stopping rule was met.
         iterations: steps made.
         notes: sentences for the user.
+        deviation: (T, N) standard deviation of depth, or None.
+        objective: value that ranks the solutions of one method on one clip, lower is better; NaN where it has none.
+        alternatives: further solutions, best first.
+        still: whether the camera may be taken to stand still, so that feet tell the root's depth.
     """
 
     points: Tensor
@@ -49,6 +54,10 @@ class Estimate:
     converged: bool
     iterations: int
     notes: tuple[str, ...] = ()
+    deviation: Tensor | None = None
+    objective: float = math.nan
+    alternatives: tuple[Estimate, ...] = ()
+    still: bool = False
 
 
 @dataclass(frozen=True)
@@ -96,19 +105,37 @@ class Method(ABC):
             size = _rms(centred, tracks.weights)
             size = torch.where(size > 0, size, torch.ones_like(size))
             found = self.solve(dataclasses.replace(tracks, points=centred / size), cameras)
-            points = found.points * size
-            seen = points[..., :2] * found.scales[:, None, None]
-            shift = interpolate(_mean(tracks.points - seen, tracks.weights), known[:, None])
-            points = points + torch.nn.functional.pad(shift, (0, 1))
-            return self._finish(tracks, points, seen + shift, found, time.perf_counter() - begin)
+            result = self._finish(tracks, found, size, known, time.perf_counter() - begin)
+        self._warn(result)
+        return result
 
-    def _finish(self, tracks: Tracks, points: Tensor, seen: Tensor, found: Estimate, seconds: float) -> Reconstruction:
+    def _warn(self, result: Reconstruction) -> None:
+        """Tell what the user should not miss."""
+        tracks, found = result.tracks, result.diagnostics
+        if not found.converged:
+            warnings.warn(f"{tracks.source}: {self._unsettled(found.iterations)}", ConvergenceWarning, stacklevel=3)
+        never = [tracks.skeleton.joints[n] for n in (tracks.weights == 0).all(0).nonzero().flatten().tolist()]
+        if never:
+            warnings.warn(
+                f"{tracks.source}: never seen, so placed by the skeleton alone: {', '.join(never)}",
+                KcsWarning,
+                stacklevel=3,
+            )
+
+    def _unsettled(self, steps: int) -> str:
+        return f"{self.name} did not settle within {steps} steps"
+
+    def _finish(self, tracks: Tracks, found: Estimate, size: Tensor, known: Tensor, seconds: float) -> Reconstruction:
+        """An estimate in the tracks' units and place, with what there is to say about it."""
+        points = found.points * size
+        seen = points[..., :2] * found.scales[:, None, None]
+        shift = interpolate(_mean(tracks.points - seen, tracks.weights), known[:, None])
+        points, seen = points + torch.nn.functional.pad(shift, (0, 1)), seen + shift
         body = tracks.skeleton
-        size = bone_lengths(points, body.bone_index(device=points.device))
-        lengths = size.median(0).values
+        bones = bone_lengths(points, body.bone_index(device=points.device))
         rigid = list(body.rigid)
-        mean = size.mean(0)
-        ratio = torch.where(mean > 0, size / torch.where(mean > 0, mean, torch.ones_like(mean)), torch.ones_like(size))
+        mean = bones.mean(0)
+        ratio = torch.where(mean > 0, bones / torch.where(mean > 0, mean, torch.ones_like(mean)), torch.ones_like(bones))
         variation = (ratio - 1).square().mean(0).sqrt()
         turn = float(viewpoint_turn(found.cameras))
         notes = list(found.notes)
@@ -117,15 +144,11 @@ class Method(ABC):
                 f"the viewpoint turned by {turn:.0f} degrees only: depth rests on the skeleton's template and lengths"
             )
         if not found.converged:
-            notes.append(f"{self.name} did not settle within {found.iterations} steps")
-            warnings.warn(f"{tracks.source}: {notes[-1]}", ConvergenceWarning, stacklevel=3)
-        never = [body.joints[n] for n in (tracks.weights == 0).all(0).nonzero().flatten().tolist()]
-        if never:
-            warnings.warn(
-                f"{tracks.source}: never seen, so placed by the skeleton alone: {', '.join(never)}",
-                KcsWarning,
-                stacklevel=3,
-            )
+            notes.append(self._unsettled(found.iterations))
+        root = None
+        if found.still:
+            root, remark = root_depth(points, tracks)
+            notes.append(remark)
         diagnostics = Diagnostics(
             viewpoint_turn=turn,
             unseen_share=tracks.unseen_share,
@@ -136,7 +159,19 @@ class Method(ABC):
             seconds=seconds,
             notes=tuple(notes),
         )
-        return Reconstruction(points, found.cameras, found.scales, lengths, tracks, self.name, diagnostics)
+        return Reconstruction(
+            points,
+            found.cameras,
+            found.scales,
+            bones.median(0).values,
+            tracks,
+            self.name,
+            diagnostics,
+            uncertainty=None if found.deviation is None else found.deviation * size,
+            objective=found.objective,
+            root_depth=root,
+            alternatives=tuple(self._finish(tracks, other, size, known, seconds) for other in found.alternatives),
+        )
 
     @classmethod
     def from_options(cls, **options: object) -> Method:

@@ -235,7 +235,9 @@ class ContactEnergy(SkeletonModule):
         speed = (feet[..., 2:, :, :] - feet[..., :-2, :, :]).norm(dim=-1) / 2
         speed = torch.cat([speed[..., :1, :], speed, speed[..., -1:, :]], -2)
         top = speed.flatten(-2).quantile(0.95, -1)[..., None, None]
-        floor = 2e-3 * (feet - feet.mean((-3, -2), keepdim=True)).square().mean((-3, -2, -1), keepdim=True)[..., 0].sqrt()
+        floor = (
+            2e-3 * (feet - feet.mean((-3, -2), keepdim=True)).square().mean((-3, -2, -1), keepdim=True)[..., 0].sqrt()
+        )
         return torch.exp(-0.5 * (speed / (0.12 * top + floor).clamp_min(torch.finfo(feet.dtype).tiny)).square())
 
     def forward(self, points: Tensor, velocity: Tensor, standing: Tensor) -> Tensor:
@@ -256,7 +258,7 @@ class ContactEnergy(SkeletonModule):
 
 
 def foreshortening(depth: Tensor, length: Tensor, eps: float) -> Tensor:
-    """log L + 1/2 log(dz^2 + (eps L)^2), elementwise: -log density of an image of an evenly drawn direction."""
+    """Log L + 1/2 log(dz^2 + (eps L)^2), elementwise: -log density of an image of an evenly drawn direction."""
     tiny = torch.finfo(depth.dtype).tiny
     return length.clamp_min(tiny).log() + 0.5 * (depth.square() + (eps * length).square()).clamp_min(tiny).log()
 
@@ -268,7 +270,9 @@ def trunk_joints(skeleton: Skeleton) -> list[int]:
     children = {b for _, b in skeleton.bones}
     trunk = {next(a for a, _ in skeleton.bones if a not in children)}
     for _ in skeleton.bones:
-        trunk |= {b for (a, b), s in zip(skeleton.bones, skeleton.spread, strict=True) if a in trunk and s < TRUNK_SPREAD}
+        trunk |= {
+            b for (a, b), s in zip(skeleton.bones, skeleton.spread, strict=True) if a in trunk and s < TRUNK_SPREAD
+        }
     return sorted(trunk)
 
 

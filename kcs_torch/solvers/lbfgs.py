@@ -66,7 +66,7 @@ def lbfgs(
     failed = torch.zeros_like(resting)
     past = [value]
     settled, made = False, 0
-    for made in range(1, num_steps + 1):  # noqa: B007
+    for made in range(1, num_steps + 1):
         q = gradient
         shares = []
         for s, y, r in zip(reversed(moves), reversed(turns), reversed(inverses), strict=True):

@@ -59,6 +59,9 @@ class Reconstruction:
         diagnostics: see :class:`Diagnostics`.
         uncertainty: (T, N) standard deviation of depth, or None where the method has none.
         units: of the 3D.
+        objective: by which the method ranks solutions of this clip, lower is better; NaN where it has none.
+        root_depth: (T,) depth of the body relative to the first frame, or None where nothing tells it.
+        alternatives: further solutions of the same tracks, best first: the mirror image, limbs flipped in depth.
     """
 
     points: Tensor
@@ -70,6 +73,9 @@ class Reconstruction:
     diagnostics: Diagnostics
     uncertainty: Tensor | None = None
     units: str = field(default="")
+    objective: float = float("nan")
+    root_depth: Tensor | None = None
+    alternatives: tuple[Reconstruction, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.units:
@@ -99,7 +105,21 @@ class Reconstruction:
     def mirrored(self) -> Reconstruction:
         """The other solution that parallel rays admit: depth with the opposite sign."""
         flip = torch.tensor([1.0, 1.0, -1.0]).to(self.points)
-        return replace(self, points=self.points * flip, cameras=self.cameras * flip)
+        root = None if self.root_depth is None else -self.root_depth
+        return replace(self, points=self.points * flip, cameras=self.cameras * flip, root_depth=root)
+
+    def in_space(self) -> Tensor:
+        """(T, N, 3): the points with the root's depth path added, so that a walking body moves through space.
+
+        Raises:
+            OptionError: the root's depth is not known.
+        """
+        if self.root_depth is None:
+            raise OptionError(
+                "in_space: the root's depth is not known: it takes a fixed camera, a skeleton with contact points and "
+                "feet that stand still now and then; see diagnostics.notes"
+            )
+        return self.points + torch.nn.functional.pad(self.root_depth[:, None, None], (2, 0))
 
     def scaled(self, *, units: str, factor: float | None = None, **sizes: float) -> Reconstruction:
         """The same motion in another unit.
@@ -139,6 +159,8 @@ class Reconstruction:
             lengths=self.lengths * factor,
             uncertainty=spread,
             units=units,
+            root_depth=None if self.root_depth is None else self.root_depth * factor,
+            alternatives=tuple(other.scaled(units=units, factor=factor) for other in self.alternatives),
         )
 
     def save(self, path: str | Path) -> Path:

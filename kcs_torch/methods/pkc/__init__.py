@@ -1,1 +1,8 @@
-"""PKC."""
+"""PKC: Procrustean kinematic chains; every stage is a function of its own."""
+
+from kcs_torch.methods.pkc.fixed_view import Hypotheses, fixed_view
+from kcs_torch.methods.pkc.method import PKC
+from kcs_torch.methods.pkc.moving_view import MovingView, moving_view
+from kcs_torch.methods.pkc.objective import Objective, Weights
+
+__all__ = ["PKC", "Hypotheses", "MovingView", "Objective", "Weights", "fixed_view", "moving_view"]

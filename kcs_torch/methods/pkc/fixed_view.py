@@ -12,7 +12,7 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limb_paths, limbs_of, waves
-from kcs_torch.methods.pkc.objective import Objective, Weights
+from kcs_torch.methods.pkc.objective import Objective, Weights, at_rate
 from kcs_torch.methods.pkc.trunk import TURN, Trunk, mirror, trunk_paths, trunk_turns
 from kcs_torch.nn.posture import free_bones
 from kcs_torch.skeleton import Skeleton
@@ -82,14 +82,7 @@ def fixed_view(
         The hypotheses, best first.
     """
     slow = 30.0 / rate
-    base = weights or Weights()
-    weights = replace(
-        base,
-        acceleration=base.acceleration * slow**2,
-        posture=base.posture / slow,
-        foreshortening=base.foreshortening / slow,
-        hinge=base.hinge * slow,
-    )
+    weights = at_rate(weights or Weights(), rate)
     costs = SignCosts()
     costs = replace(
         costs,
@@ -148,7 +141,9 @@ class _Search:
         keep = min(4, len(z))
         z, length, energy, _ = obj.minimise(z[:keep], length[:keep], steps)
         joined = Hypotheses(
-            torch.cat([z, rest.depth[keep:]]), torch.cat([length, rest.lengths[keep:]]), torch.cat([energy, rest.energy[keep:]])
+            torch.cat([z, rest.depth[keep:]]),
+            torch.cat([length, rest.lengths[keep:]]),
+            torch.cat([energy, rest.energy[keep:]]),
         )
         return joined[joined.energy.argsort()]
 
@@ -230,7 +225,9 @@ class _Search:
         longest = torch.quantile(flat.norm(dim=-1), 0.99, dim=0)
         least = torch.maximum(longest, 0.8 * self.objective.posture.rest_lengths)
         count = len(limbs[0].bones)
-        return torch.stack([torch.cartesian_prod(*(least[b] * steps for b in limb.bones)).view(-1, count) for limb in limbs])
+        return torch.stack(
+            [torch.cartesian_prod(*(least[b] * steps for b in limb.bones)).view(-1, count) for limb in limbs]
+        )
 
     @staticmethod
     def _direction(flat: Tensor, dz: Tensor, length: Tensor, bone: int) -> Tensor:

@@ -109,7 +109,9 @@ def limbs_of(skeleton: Skeleton, trunk: list[int]) -> list[Limb]:
         if i in done:
             continue
         a, b = bones[i]
-        inner = next((h for h in skeleton.hinges if (h.parent, h.joint) == (a, b) and arrives[h.child] not in done), None)
+        inner = next(
+            (h for h in skeleton.hinges if (h.parent, h.joint) == (a, b) and arrives[h.child] not in done), None
+        )
         entry = next((h for h in skeleton.hinges if (h.joint, h.child) == (a, b)), None)
         chain = (i,) if inner is None else (i, arrives[inner.child])
         done |= set(chain)

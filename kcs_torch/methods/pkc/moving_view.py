@@ -128,8 +128,8 @@ def moving_view(
     pick = torch.arange(0, frames, max(1, -(-frames // coarse_frames)), device=image.device)
     few, few_weights = image[pick], None if weights is None else weights[pick]
     made = _starts(few, skeleton, bones, turns, lifts if joints > ROBOT else 8 * lifts, frames, pick, seed)
-    points = torch.cat([first[:, pick], made[0]])
-    turned = align_rotations(points, torch.cat([rotations[None, pick], made[1]]), bones)
+    points = torch.cat([first[:, pick], *(p for p, _ in made)])
+    turned = align_rotations(points, torch.cat([rotations[None, pick], *(r for _, r in made)]), bones)
     pose = Pose(points, turned, points.new_zeros(len(points)))
     order = torch.arange(len(points))
     for stage, kept in zip(coarse, KEPT, strict=True):
@@ -137,7 +137,7 @@ def moving_view(
             few, pose.points, pose.rotations, bones,
             weights=few_weights, rigid=rigid, stiffness=tight[0], noise=noise, stages=[stage],
         )  # fmt: skip
-        best = pose.objective.argsort()[: kept if len(made[0]) < 10 * kept else 3 * kept]
+        best = pose.objective.argsort()[: kept if joints > ROBOT else 3 * kept]
         pose, order = pose[best], order[best.cpu()]
     pose = procrustean(
         few, pose.points, pose.rotations, bones,
@@ -181,18 +181,21 @@ def _rank(pose: Pose, bones: Tensor, rigid: Tensor, stiffness: float, noise: flo
 def _starts(
     image: Tensor, skeleton: Skeleton, bones: Tensor, turns: Sequence[float], lifts: int, frames: int, pick: Tensor,
     seed: int,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+) -> list[tuple[Tensor, Tensor]]:  # fmt: skip
     """Points (H, T', N, 3) and rotations (H, T', 3, 3) of further starts, for the frames in ``pick``."""
-    cameras = turning_cameras(turns, frames, dtype=image.dtype, device=image.device)[:, pick]
-    seen = image.expand(len(cameras), -1, -1, -1)
-    solver = UnrolledSfAM(skeleton, 30, articulate_from=1.0, learnable=False).to(image.device)
-    lifted = (solver(seen, cameras[:, :, :2]) @ cameras.mT)[..., 2:]
-    generator = torch.Generator().manual_seed(seed)
-    flips = random_lifts(image, bones, lifts, generator=generator)
-    degrees = 360 * torch.rand(lifts, generator=generator, dtype=torch.float64)
-    turned = turning_cameras(degrees, len(image), dtype=image.dtype, device=image.device)
-    points = torch.cat([seen, lifted - lifted.mean(-2, keepdim=True)], -1)
-    return torch.cat([points, flips]), torch.cat([cameras, turned])
+    starts = []
+    if turns:
+        cameras = turning_cameras(turns, frames, dtype=image.dtype, device=image.device)[:, pick]
+        seen = image.expand(len(cameras), -1, -1, -1)
+        solver = UnrolledSfAM(skeleton, 30, articulate_from=1.0, learnable=False).to(image.device)
+        lifted = (solver(seen, cameras[:, :, :2]) @ cameras.mT)[..., 2:]
+        starts.append((torch.cat([seen, lifted - lifted.mean(-2, keepdim=True)], -1), cameras))
+    if lifts > 0:
+        generator = torch.Generator().manual_seed(seed)
+        flips = random_lifts(image, bones, lifts, generator=generator)
+        degrees = 360 * torch.rand(lifts, generator=generator, dtype=torch.float64)
+        starts.append((flips, turning_cameras(degrees, len(image), dtype=image.dtype, device=image.device)))
+    return starts
 
 
 def _spread_out(pose: Pose, image: Tensor, pick: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.iterate import Solution
 from kcs_torch.solvers.lbfgs import lbfgs
 
-__all__ = ["Objective", "Weights"]
+__all__ = ["Objective", "Weights", "at_rate"]
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,18 @@ class Weights:
     sine: float = 0.05
     proportions: float = 0.08
     twins: float = 0.03
+
+
+def at_rate(weights: Weights, rate: float) -> Weights:
+    """Weights for another frame rate: more frames a second tell no more, and move less from one to the next."""
+    slow = 30.0 / rate
+    return replace(
+        weights,
+        acceleration=weights.acceleration * slow**2,
+        posture=weights.posture / slow,
+        foreshortening=weights.foreshortening / slow,
+        hinge=weights.hinge * slow,
+    )
 
 
 class Objective:
@@ -106,7 +118,9 @@ class Objective:
         """The energy of each hypothesis, (H,)."""
         return torch.stack(list(self.terms(state).values())).sum(0)
 
-    def minimise(self, depth: Tensor, lengths: Tensor, num_steps: int) -> tuple[Tensor, Tensor, Tensor, Solution[Tensor]]:
+    def minimise(
+        self, depth: Tensor, lengths: Tensor, num_steps: int
+    ) -> tuple[Tensor, Tensor, Tensor, Solution[Tensor]]:
         """Refine hypotheses (H, T, N) and (H, B): depths, lengths and energies (H,), best first."""
         solution = lbfgs(self, self.pack(depth, lengths), num_steps=num_steps, tolerance=1e-5)
         with torch.no_grad():

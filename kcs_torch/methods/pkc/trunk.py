@@ -73,7 +73,9 @@ def trunk_paths(image: Tensor, trunk: Trunk, posture: PostureEnergy, correlation
     rest = trunk.rest[joints] - trunk.rest[joints].mean(0)
     goal = image[:, joints] - image[:, joints].mean(1, keepdim=True)
     one = image.new_ones(frames)
-    fit = fit_cameras(goal, rest.expand(frames, -1, 3), image.new_ones(goal.shape[:2]), 0.9 * one, 1.1 * one, robust=None)
+    fit = fit_cameras(
+        goal, rest.expand(frames, -1, 3), image.new_ones(goal.shape[:2]), 0.9 * one, 1.1 * one, robust=None
+    )
     rotations = torch.cat([fit.rotations, mirror(fit.rotations)])  # (16, T, 3, 3)
     scales = fit.scales.repeat(2, 1)[..., None, None]
     off = (scales * (rest @ rotations[..., :2, :].mT) - goal).square().sum((-2, -1))

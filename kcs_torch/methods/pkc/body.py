@@ -1,0 +1,99 @@
+"""A body with a template: the search before a fixed camera, and the ranking of all hypotheses."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
+from kcs_torch.methods.pkc.fixed_view import Hypotheses, fixed_view
+from kcs_torch.methods.pkc.objective import Objective, Weights, at_rate
+from kcs_torch.methods.pkc.trunk import image_scale
+from kcs_torch.nn.posture import PostureEnergy
+from kcs_torch.skeleton import Skeleton
+
+__all__ = ["Body"]
+
+BLOCK, OVERLAP = 400, 40
+"""Frames of a long clip that are searched together, and by how many blocks overlap."""
+
+FAST = 45.0
+"""Frames a second from which on the search leaves frames out."""
+
+
+class Body:
+    """One clip of a body with a template, in the template's units.
+
+    Args:
+        skeleton: with a template, spreads and a trunk.
+        image: (T, N, 2), complete, centred per frame.
+        rate: frames a second.
+
+    Attributes:
+        factor: units of the template per unit of the image.
+        image: (T, N, 2), in units of the template.
+        objective: that ranks hypotheses, over all frames.
+    """
+
+    def __init__(self, skeleton: Skeleton, image: Tensor, rate: float) -> None:
+        posture = PostureEnergy(skeleton).to(image)
+        rigid = torch.zeros(skeleton.num_bones, dtype=torch.bool, device=image.device)
+        rigid[list(skeleton.rigid)] = True
+        scale = image_scale(image, posture.rest_lengths, posture.bones, rigid)
+        scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+        self.skeleton, self.rate, self.factor = skeleton, rate, 1 / scale
+        self.image = image / scale
+        self.objective = Objective(skeleton, self.image, at_rate(Weights(), rate))
+
+    def frames(self, depth: Tensor) -> Tensor:
+        """The trunk's rotations (T, 3, 3), template to camera, of depths (T, N)."""
+        return self.objective.posture.frame(torch.cat([self.image, depth[..., None]], -1))
+
+    def rank(self, depth: Tensor, steps: int) -> Hypotheses:
+        """Depths (H, T, N) from elsewhere, refined on the objective, best first."""
+        points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
+        lengths = bone_lengths(points, self.objective.bones).median(1).values
+        usual = self.objective.posture.rest_lengths
+        lengths = torch.where(lengths > 1e-3 * usual, lengths, usual)
+        z, lengths, energy, _ = self.objective.minimise(depth, lengths, steps)
+        return Hypotheses(z, lengths, energy)
+
+    def search(self, rounds: int, steps: int) -> Hypotheses:
+        """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best."""
+        stride = max(1, round(self.rate / 30)) if self.rate >= FAST else 1
+        image = self.image[::stride]
+        rate = self.rate / stride
+        frames = len(image)
+        size = min(BLOCK, frames)
+        starts = window_starts(frames, size, min(OVERLAP, size - 1))
+        options = {"rate": rate, "rounds": rounds, "steps": steps}
+        if len(starts) == 1:
+            found = fixed_view(self.skeleton, image, **options)  # type: ignore[arg-type]
+        else:
+            blocks = torch.stack([image[s : s + size] for s in starts])
+            moved = bone_vectors(blocks, self.objective.bones).diff(dim=1).square().sum((1, 2, 3))
+            order = moved.argsort(descending=True).tolist()  # lengths come from the liveliest block
+            depths: list[Tensor] = [image.new_zeros(0)] * len(starts)
+            lengths = None
+            for i in order:
+                best = fixed_view(self.skeleton, blocks[i], anchor=lengths, **options)[:1]  # type: ignore[arg-type]
+                lengths = best.lengths[0] if lengths is None else lengths
+                depths[i] = best.depth[0]
+            joined = blend_windows(torch.stack(depths), starts, frames)
+            assert lengths is not None
+            found = Hypotheses(joined[None], lengths[None], joined.new_zeros(1))
+        if stride > 1 or len(starts) > 1:
+            found = self._on_all_frames(found[:4], stride, steps)
+        return found
+
+    def _on_all_frames(self, found: Hypotheses, stride: int, steps: int) -> Hypotheses:
+        """Hypotheses of every ``stride``-th frame on all frames, refined."""
+        frames = len(self.image)
+        known = torch.zeros(frames, 1, dtype=torch.bool, device=self.image.device)
+        known[::stride] = True
+        full = found.depth.new_zeros(len(found.depth), frames, 1, found.depth.shape[-1])
+        full[:, ::stride] = found.depth[:, :, None]
+        depth = interpolate(full, known)[:, :, 0]
+        z, lengths, energy, _ = self.objective.minimise(depth, found.lengths, steps)
+        return Hypotheses(z, lengths, energy)

@@ -1,0 +1,187 @@
+"""PKC: Procrustean kinematic chains, this library's own method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import OptionError
+from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.temporal import interpolate
+from kcs_torch.methods.base import Estimate, Method
+from kcs_torch.methods.pkc.answers import depth_deviation, distinct, told_by_prior
+from kcs_torch.methods.pkc.body import Body
+from kcs_torch.methods.pkc.fixed_view import Hypotheses
+from kcs_torch.methods.pkc.moving_view import MovingView, moving_view
+from kcs_torch.methods.sfam import SfAM
+from kcs_torch.methods.unseen import place_unseen
+from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.solvers.denoise import denoise_tracks
+from kcs_torch.solvers.procrustean import COARSE, FINE, align_rotations, procrustean
+from kcs_torch.types import Tracks
+
+__all__ = ["PKC"]
+
+CLEAN = 0.003
+"""Noise below this share of the body's size is left in the tracks."""
+
+LEAST_FRAMES = 12
+"""Frames from which on the viewpoint may have turned."""
+
+
+@dataclass(frozen=True)
+class PKC(Method):
+    """Both papers' ideas in one statistical model in bone space; the default of :func:`kcs_torch.reconstruct`.
+
+    Bone vectors, aligned frame by frame to a common pose, follow one Gaussian, and so do their changes in time; bones
+    keep their length. Where the viewpoint turns this alone gives depth (:func:`moving_view`). Where it hardly does, the
+    depth of a bone is +-sqrt(L^2 - |xy|^2): lengths and signs come from the skeleton's template, spreads and hinges
+    (:func:`fixed_view`). With a template both are tried, and one objective ranks all hypotheses, mirror images included.
+
+    Args:
+        viewpoint: "auto" tries both solvers, "fixed" and "moving" only one.
+        denoise: smooth noisy tracks, fill gaps and reject outliers first (:func:`kcs_torch.solvers.denoise_tracks`).
+        lifts: random starts of the moving viewpoint's solver.
+        rounds: of discrete moves of the fixed viewpoint's solver.
+        steps: L-BFGS steps of each of its refinements.
+        alternatives: further solutions to return.
+        seed: of the random starts.
+
+    Raises:
+        OptionError: a value is out of range.
+    """
+
+    name: ClassVar[str] = "pkc"
+    viewpoint: Literal["auto", "fixed", "moving"] = "auto"
+    denoise: bool = True
+    lifts: int = 16
+    rounds: int = 2
+    steps: int = 30
+    alternatives: int = 4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for field, least in (("lifts", 1), ("rounds", 0), ("steps", 1), ("alternatives", 0)):
+            self._expect(getattr(self, field) >= least, field, f"at least {least}")
+
+    def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
+        """Clean the tracks, try both viewpoints, rank what they give."""
+        image, notes = self._clean(tracks)
+        skeleton = tracks.skeleton
+        has_trunk = len(trunk_joints(skeleton)) >= 3
+        if self.viewpoint == "fixed" and not has_trunk:
+            raise OptionError(
+                f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
+            )
+        body = Body(skeleton, image, tracks.fps or 30.0) if has_trunk and cameras is None else None
+        moving: MovingView | None = None
+        enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
+        if body is None or (self.viewpoint != "fixed" and enough):
+            moving, first = self._moving(tracks, image, cameras, enough)
+            if moving is None:
+                return replace(first, notes=(*notes, *first.notes))
+        if body is None:
+            assert moving is not None
+            return self._from_moving(moving, image, cameras, notes)
+        found, _ = self._search(body, moving)
+        return self._from_hypotheses(found, body, image, notes)
+
+    def _clean(self, tracks: Tracks) -> tuple[Tensor, tuple[str, ...]]:
+        """Complete tracks (T, N, 2), centred per frame, and what was done."""
+        known = tracks.seen.any(0)
+        points, notes = tracks.points, []
+        if self.denoise:
+            clean = denoise_tracks(points, tracks.weights)
+            noise = float(clean.noise.median())
+            wrong = int(clean.outliers.sum())
+            if wrong:
+                notes.append(f"{wrong} detections ({100 * wrong / int(tracks.seen.sum()):.1f} %) rejected as outliers")
+            keep = tracks.seen & ~clean.outliers
+            if noise > CLEAN:
+                keep = torch.zeros_like(keep)
+                notes.append(f"tracks smoothed: noise of {100 * noise:.1f} % of the body's size")
+            points = torch.where(keep[..., None], points, clean.points)
+        else:
+            points = interpolate(points, tracks.seen)
+        if not bool(known.all()):
+            flat = torch.nn.functional.pad(points, (0, 1))
+            points = place_unseen(flat, known, tracks.skeleton)[..., :2]
+        return points - points.mean(-2, keepdim=True), tuple(notes)
+
+    def _moving(
+        self, tracks: Tracks, image: Tensor, cameras: Tensor | None, enough: bool
+    ) -> tuple[MovingView | None, Estimate]:
+        """Solutions of the moving viewpoint, and SfAM's first guess; the guess alone where there is too little."""
+        seen = replace(tracks, points=image, weights=torch.ones_like(tracks.weights))
+        first = SfAM().solve(seen, cameras)
+        if not enough:
+            return None, first
+        rotations = complete_rotation(first.cameras)
+        if cameras is None:
+            return moving_view(image, tracks.skeleton, first.points, rotations, lifts=self.lifts, seed=self.seed), first
+        bones = tracks.skeleton.bone_index(device=image.device)
+        if not tracks.skeleton.is_tree:
+            return None, first
+        start = torch.cat([image, first.points[..., 2:] - first.points[..., 2:].mean(1, keepdim=True)], -1)[None]
+        turned = align_rotations(start, rotations[None], bones)
+        pose = procrustean(image, start, turned, bones, stages=(*COARSE[-1:], *FINE))
+        return MovingView(pose, bones, bones, 1.0), first
+
+    def _from_moving(
+        self, moving: MovingView, image: Tensor, cameras: Tensor | None, notes: tuple[str, ...]
+    ) -> Estimate:
+        """The estimate and its mirror image, which nothing but known cameras tells apart."""
+        points = moving.pose.points[0]
+        path = moving.cameras()[0] if cameras is None else complete_rotation(cameras)
+        one = torch.ones_like(points[:, 0, 0])
+        value = float(moving.pose.objective[0])
+        main = Estimate(points, path[:, :2], one, True, 0, notes, moving.deviation(path), value)
+        if cameras is not None or not self.alternatives:
+            return main
+        flip = points.new_tensor([1.0, 1.0, -1.0])
+        other = replace(main, points=points * flip, cameras=path[:, :2] * flip, notes=("the mirror image in depth",))
+        return replace(main, alternatives=(other,))
+
+    def _search(self, body: Body, moving: MovingView | None) -> tuple[Hypotheses, Tensor]:
+        """All hypotheses of a body with a template, ranked by the objective, and which came from the moving viewpoint."""
+        found = body.search(self.rounds, self.steps) if self.viewpoint != "moving" else None
+        if moving is None:
+            assert found is not None
+            return found, torch.zeros(len(found.energy), dtype=torch.bool)
+        depths = [moving.pose.points[0, ..., 2] * body.factor]
+        depths.append(-depths[0])
+        if found is not None:  # the fixed viewpoint's solution, where the viewpoint turns after all
+            start = torch.cat([body.image, found.depth[0, ..., None]], -1)[None] / body.factor
+            turned = align_rotations(start, body.frames(found.depth[0])[None], moving.bones)
+            pose = procrustean(start[0, ..., :2], start, turned, moving.bones, rigid=moving.rigid, stages=FINE)
+            depths.append(pose.points[0, ..., 2] * body.factor)
+        ranked = body.rank(torch.stack(depths), steps=self.steps)
+        if found is None:
+            return ranked, torch.ones(len(ranked.energy), dtype=torch.bool)
+        both = Hypotheses(
+            torch.cat([found.depth, ranked.depth]),
+            torch.cat([found.lengths, ranked.lengths]),
+            torch.cat([found.energy, ranked.energy]),
+        )
+        order = both.energy.argsort()
+        return both[order], (order >= len(found.energy)).cpu()
+
+    def _from_hypotheses(self, found: Hypotheses, body: Body, image: Tensor, notes: tuple[str, ...]) -> Estimate:
+        """Estimates of the distinct hypotheses, in the tracks' units."""
+        found = distinct(found, self.alternatives + 1)
+        told = told_by_prior(found, body.skeleton)
+        if told:
+            notes = (*notes, f"the depth's sign was decided by the prior for {', '.join(told)}: see the alternatives")
+        made = []
+        for k, depth in enumerate(found.depth):
+            points = torch.cat([image, depth[..., None] / body.factor], -1)
+            one = torch.ones_like(points[:, 0, 0])
+            spread = depth_deviation(found[k:] if k else found, body.image, body.skeleton) / body.factor
+            value = float(found.energy[k])
+            path = body.frames(depth)[:, :2]
+            made.append(Estimate(points, path, one, True, 0, () if k else notes, spread, value, still=True))
+        return replace(made[0], alternatives=tuple(made[1:]))
