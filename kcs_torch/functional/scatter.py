@@ -46,7 +46,9 @@ def inverse_scatter(values: Tensor, eps: Tensor | float) -> Tensor:
 def _factor(values: Tensor, eps: Tensor) -> Tensor:
     scatter = values.mT @ values / max(values.shape[-2], 1)
     scatter.diagonal(dim1=-2, dim2=-1).add_(eps[..., None])
-    return torch.linalg.cholesky_ex(scatter)[0]
+    factor, info = torch.linalg.cholesky_ex(scatter)
+    # A step so far that nothing is left of eps is answered by NaN, which a line search refuses, not by an exception.
+    return torch.where((info == 0)[..., None, None], factor, torch.full_like(factor, torch.nan))
 
 
 class _ScatterLogDet(torch.autograd.Function):

@@ -98,6 +98,8 @@ def block_roots(curvature: Curvature, *, ridge: float = 1e-6) -> Tensor:
     matrix[..., depth, depth] += (typical / joints)[..., None, None]
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
     diagonal.mul_(1 + ridge).add_(ridge * typical[..., None] + torch.finfo(matrix.dtype).tiny)
-    factor = torch.linalg.cholesky_ex(matrix)[0]
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    plain = diagonal.clamp_min(torch.finfo(matrix.dtype).tiny).sqrt().diag_embed()  # where rounding spoils a block
+    factor = torch.where((info == 0)[..., None, None], factor, plain)
     eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
     return torch.linalg.solve_triangular(factor, eye, upper=False).mT.contiguous()

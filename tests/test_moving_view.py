@@ -1,0 +1,83 @@
+"""PKC's half for viewpoints that turn: from a clip to ranked poses, cameras and uncertainty."""
+
+import pytest
+import torch
+
+from kcs_torch.data.synthetic import walking_person
+from kcs_torch.functional import complete_rotation, viewpoint_turn
+from kcs_torch.methods.pkc.moving_view import moving_view
+from kcs_torch.skeleton import Skeleton
+
+
+@pytest.fixture(scope="module")
+def film():
+    """Points (T, N, 3) of a walk seen from half around, centred, rms of the image 1, and its skeleton."""
+    clip = walking_person(70, turn=180)
+    points = clip.points - clip.points.mean(1, keepdim=True)
+    return points / points[..., :2].square().sum(-1).mean().sqrt(), clip
+
+
+def depth_error(found, points):
+    depth = found[..., 2] - found[..., 2].mean(-1, keepdim=True)
+    return float(min((depth - s * points[..., 2]).abs().mean() for s in (1, -1)))
+
+
+def solve(points, skeleton, **options):
+    """From a flat start that knows nothing of the cameras."""
+    flat = torch.cat([points[..., :2], torch.zeros_like(points[..., :1])], -1)
+    still = torch.eye(3, dtype=points.dtype).expand(len(points), 3, 3)
+    return moving_view(points[..., :2], skeleton, flat, still, turns=(90.0, 180.0), lifts=4, **options)
+
+
+def test_finds_depths_and_the_turning_camera_from_a_flat_start(film):
+    points, clip = film
+    found = solve(points, clip.skeleton, coarse_frames=40, alternatives=2)
+    assert found.pose.points.shape == (2, 70, 17, 3)
+    assert depth_error(found.pose.points[0], points) < 0.05 < depth_error(0 * points, points) / 4
+    path, kind = found.cameras()
+    assert kind == "constant"
+    assert float(viewpoint_turn(path[:, :2])) == pytest.approx(180, abs=25)
+    deviation = found.deviation(path)
+    assert deviation.shape == (70, 17) and bool((deviation > 0).all())
+
+
+def test_same_seed_same_answer(film):
+    points, clip = film
+    first, second = (solve(points[:30], clip.skeleton, seed=3).pose.points for _ in range(2))
+    assert torch.equal(first, second)
+
+
+def test_links_that_are_no_tree_are_aligned_in_a_tree_that_is_found(film):
+    points, clip = film
+    loop = Skeleton.from_edges([*clip.skeleton.bones, (1, 4)], 17, tree=False)
+    found = solve(points[:40], loop)
+    assert found.bones.shape == (16, 2) and found.rigid.shape == (17, 2)
+    assert found.stiffness < 1
+    assert found.pose.points.isfinite().all()
+
+
+def test_noise_frees_the_image(film):
+    points, clip = film
+    noisy = points[:40].clone()
+    noisy[..., :2] += 0.02 * torch.randn(40, 17, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights = torch.ones(40, 17, dtype=torch.float64)
+    found = solve(noisy, clip.skeleton, noise=0.02, weights=weights).pose.points[0]
+    error = lambda x: float(((x - x.mean(1, keepdim=True) - points[:40])[..., :2]).norm(dim=-1).mean())  # noqa: E731
+    assert 0 < error(found) < 0.9 * error(noisy)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 4])
+def test_short_clips_stay_finite(film, frames):
+    points, clip = film
+    found = solve(points[:frames], clip.skeleton)
+    path, kind = found.cameras()
+    assert kind == "free"
+    assert found.pose.points.isfinite().all() and path.isfinite().all()
+    assert found.deviation(path).isfinite().all()
+
+
+def test_needs_no_further_start_where_the_first_is_good(film):
+    points, clip = film
+    cameras = complete_rotation(clip.cameras)
+    found = moving_view(points[..., :2], clip.skeleton, points, cameras, turns=(), lifts=0)
+    assert depth_error(found.pose.points[0], points) < 0.05
