@@ -21,7 +21,7 @@ if TYPE_CHECKING:
         SkeletonError,
     )
     from kcs_torch.io import load_tracks, save
-    from kcs_torch.methods import KCS, METHODS, Method, SfAM
+    from kcs_torch.methods import KCS, METHODS, PKC, Method, SfAM, find_skeleton
     from kcs_torch.reconstruct import reconstruct
     from kcs_torch.skeleton import SKELETONS, Skeleton
     from kcs_torch.types import Diagnostics, Reconstruction, Tracks
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 __all__ = [
     "KCS",
     "METHODS",
+    "PKC",
     "SKELETONS",
     "ConvergenceWarning",
     "Diagnostics",
@@ -46,6 +47,7 @@ __all__ = [
     "Skeleton",
     "SkeletonError",
     "Tracks",
+    "find_skeleton",
     "functional",
     "load_tracks",
     "nn",
@@ -66,7 +68,7 @@ _NAMES = {
         "SkeletonError",
     ),
     "io": ("load_tracks", "save"),
-    "methods": ("KCS", "METHODS", "Method", "SfAM"),
+    "methods": ("KCS", "METHODS", "PKC", "Method", "SfAM", "find_skeleton"),
     "reconstruct": ("reconstruct",),
     "skeleton": ("SKELETONS", "Skeleton"),
     "types": ("Diagnostics", "Reconstruction", "Tracks"),

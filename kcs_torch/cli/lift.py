@@ -90,7 +90,7 @@ def lift(
 
 
 def method_fields(method: str, settings: list[str]) -> dict[str, Any]:
-    """Check the method's name and read ``--set`` by its fields; by those of all methods for ``auto``.
+    """Check the method's name and read ``--set`` by its fields.
 
     Raises:
         OptionError: the method, a field or a value is wrong.
@@ -98,10 +98,12 @@ def method_fields(method: str, settings: list[str]) -> dict[str, Any]:
     from kcs_torch.cli.fields import parse_settings
     from kcs_torch.errors import unknown
     from kcs_torch.methods import METHODS
+    from kcs_torch.reconstruct import DEFAULT
 
-    if method != "auto" and method not in METHODS:
+    method = DEFAULT if method == "auto" else method
+    if method not in METHODS:
         raise unknown("method", method, ["auto", *METHODS])
-    return parse_settings(settings, list(METHODS.values()) if method == "auto" else [METHODS[method]])
+    return parse_settings(settings, [METHODS[method]])
 
 
 def _people(tracks: str, person: str | None, **options: Any) -> list[tuple[int, Tracks]]:

@@ -32,6 +32,8 @@ class Curvature:
 
     def add_lengths(self, points: Tensor, rigid: Tensor, stiffness: Tensor, slack: float, reach: float) -> None:
         """Add the Gauss-Newton term of the lengths (P, 2)."""
+        if len(rigid) == 0:
+            return
         vectors = bone_vectors(points, rigid)
         size = safe_norm(vectors)
         spread = size.var(-2, unbiased=False)

@@ -228,6 +228,8 @@ def motion_energy(points: Tensor, rotations: Tensor, bones: Tensor, stage: Stage
 
 def length_energy(points: Tensor, rigid: Tensor, stiffness: Tensor, slack: float, reach: float = REACH) -> Tensor:
     """sum_p s_p T/2 log((v_p + d^2) / (v_p + (reach d)^2)), v_p the variance of a length over time, (...)."""
+    if len(rigid) == 0:
+        return points.new_zeros(points.shape[:-3])
     size = safe_norm(bone_vectors(points, rigid))
     spread = size.var(-2, unbiased=False)
     ratio = (spread + slack**2) / (spread + (reach * slack) ** 2)
