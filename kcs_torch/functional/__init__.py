@@ -30,7 +30,7 @@ from kcs_torch.functional.spectral import (
     spectral_norm,
     svt,
 )
-from kcs_torch.functional.temporal import best_path, blend_windows, interpolate, jitter, window_starts
+from kcs_torch.functional.temporal import best_path, blend_windows, interpolate, jitter, standing, window_starts
 
 __all__ = [
     "back_project",
@@ -63,6 +63,7 @@ __all__ = [
     "similarity",
     "singular_values",
     "spectral_norm",
+    "standing",
     "svt",
     "viewpoint_turn",
     "window_starts",

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError
 
-__all__ = ["best_path", "blend_windows", "interpolate", "jitter", "window_starts"]
+__all__ = ["best_path", "blend_windows", "interpolate", "jitter", "standing", "window_starts"]
 
 
 def interpolate(values: Tensor, seen: Tensor) -> Tensor:
@@ -60,6 +60,36 @@ def jitter(values: Tensor, seen: Tensor, *, order: int = 4) -> Tensor:
     if change.numel() == 0:
         return values.new_zeros(())
     return change.abs().median() / (0.6745 * math.comb(2 * order, order) ** 0.5)
+
+
+def standing(image: Tensor, weights: Tensor) -> Tensor:
+    """Tell how surely points stand still, exp(-1/2 (speed / 12 % of the top speed)^2).
+
+    Args:
+        image: (..., T, C, 2) of points that touch the ground now and then, not centred.
+        weights: (..., T, C), 0 where unseen.
+
+    Returns:
+        (..., T, C) in 0..1; 0 where a point or its neighbours in time are unseen, and in clips of one or two frames.
+        The top speed is the 0.95 quantile over frames and points.
+
+    >>> x = torch.tensor([0.0, 0, 0, 0, 1, 2, 3])
+    >>> standing(torch.stack([x, 0 * x], -1)[:, None], torch.ones(7, 1)).flatten()
+    tensor([1.0000e+00, 1.0000e+00, 1.0000e+00, 1.7e-04, 8.3e-16, 8.3e-16, 8.3e-16])
+    """
+    if image.shape[-3] < 3 or not image.shape[-2]:
+        return torch.zeros_like(weights)
+    speed = (image[..., 2:, :, :] - image[..., :-2, :, :]).norm(dim=-1) / 2
+    speed = torch.cat([speed[..., :1, :], speed, speed[..., -1:, :]], -2)
+    seen = weights > 0
+    seen = (
+        seen
+        & torch.cat([seen[..., :1, :], seen[..., :-1, :]], -2)
+        & torch.cat([seen[..., 1:, :], seen[..., -1:, :]], -2)
+    )
+    top = torch.nanquantile(torch.where(seen, speed, torch.nan).flatten(-2), 0.95, dim=-1)[..., None, None]
+    still = torch.exp(-0.5 * (speed / (0.12 * top).clamp_min(torch.finfo(speed.dtype).tiny)).square())
+    return torch.where(seen, still, torch.zeros_like(still))
 
 
 def window_starts(length: int, window: int, overlap: int) -> list[int]:

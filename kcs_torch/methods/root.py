@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.temporal import blend_windows, window_starts
+from kcs_torch.functional.temporal import blend_windows, standing, window_starts
 from kcs_torch.types import Tracks
 
-__all__ = ["root_depth", "standing"]
+__all__ = ["root_depth"]
 
 WINDOW, OVERLAP = 400, 80
 """Frames that are solved together, and by how many windows overlap."""
@@ -19,28 +19,6 @@ frame at 30 frames a second."""
 
 ENOUGH = 0.5
 """Share of frames in which some contact point must stand."""
-
-
-def standing(image: Tensor, weights: Tensor) -> Tensor:
-    """How surely contact points stand still, (T, C) in 0..1.
-
-    A point stands where its image moves at less than about an eighth of the points' top speed, and it is seen.
-
-    Args:
-        image: (T, C, 2) of the contact points, not centred.
-        weights: (T, C), 0 where unseen.
-    """
-    if len(image) < 3 or not image.shape[1]:
-        return torch.zeros_like(weights)
-    speed = (image[2:] - image[:-2]).norm(dim=-1) / 2
-    speed = torch.cat([speed[:1], speed, speed[-1:]])
-    seen = weights > 0
-    seen = seen & torch.cat([seen[:1], seen[:-1]]) & torch.cat([seen[1:], seen[-1:]])
-    if not bool(seen.any()):
-        return torch.zeros_like(weights)
-    top = torch.quantile(speed[seen], 0.95)
-    still = torch.exp(-0.5 * (speed / (0.12 * top).clamp_min(torch.finfo(speed.dtype).tiny)).square())
-    return torch.where(seen, still, torch.zeros_like(still))
 
 
 def root_depth(points: Tensor, tracks: Tracks) -> tuple[Tensor | None, str]:

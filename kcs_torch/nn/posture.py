@@ -208,7 +208,8 @@ class ContactEnergy(SkeletonModule):
     """Feet that stand still in the image stand still in space: the root's depth has to move against them.
 
     1/2 sum_tc c_tc log(1 + ((z_c,t - z_c,t-1 + v_t)/s)^2) + 1/2 sum_t ((v_t - v_t-1)/a)^2, with the root's depth
-    velocity v and the weights c of :meth:`standing`. It holds for a camera that does not move.
+    velocity v and the weights c of :func:`kcs_torch.functional.standing`. It holds for a camera that does not move. A
+    small multiple of sum_t (v_t/s)^2 settles what no standing foot tells.
 
     Args:
         skeleton: with contacts; without them the energy is 0.
@@ -224,22 +225,6 @@ class ContactEnergy(SkeletonModule):
         contacts = torch.tensor(self.skeleton.contacts, dtype=torch.long)
         self.register_buffer("contacts", contacts, persistent=False)
 
-    def standing(self, image: Tensor) -> Tensor:
-        """How surely each contact point stands still, (..., T, C) in 0..1, from tracks (..., T, N, 2) not centred.
-
-        A point stands where its image moves at less than about an eighth of the points' top speed.
-        """
-        feet = image[..., self.contacts, :]
-        if feet.shape[-3] < 3 or not len(self.contacts):
-            return torch.ones_like(feet[..., 0])
-        speed = (feet[..., 2:, :, :] - feet[..., :-2, :, :]).norm(dim=-1) / 2
-        speed = torch.cat([speed[..., :1, :], speed, speed[..., -1:, :]], -2)
-        top = speed.flatten(-2).quantile(0.95, -1)[..., None, None]
-        floor = (
-            2e-3 * (feet - feet.mean((-3, -2), keepdim=True)).square().mean((-3, -2, -1), keepdim=True)[..., 0].sqrt()
-        )
-        return torch.exp(-0.5 * (speed / (0.12 * top + floor).clamp_min(torch.finfo(feet.dtype).tiny)).square())
-
     def forward(self, points: Tensor, velocity: Tensor, standing: Tensor) -> Tensor:
         """Return (...).
 
@@ -254,7 +239,7 @@ class ContactEnergy(SkeletonModule):
         both = torch.minimum(standing[..., 1:, :], standing[..., :-1, :])
         slip = (both * torch.log1p((move / self.slip).square())).sum((-2, -1)) / 2
         steady = ((velocity[..., 2:] - velocity[..., 1:-1]) / self.change).square().sum(-1) / 2
-        return slip + steady + 5e-4 * (velocity / self.slip).square().sum(-1)
+        return slip + steady + 5e-4 * (velocity[..., 1:] / self.slip).square().sum(-1)
 
 
 def foreshortening(depth: Tensor, length: Tensor, eps: float) -> Tensor:

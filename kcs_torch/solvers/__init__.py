@@ -5,11 +5,14 @@ from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.denoise import Denoised, denoise_tracks
 from kcs_torch.solvers.ist import ist, metric_upgrade
 from kcs_torch.solvers.iterate import Solution, fpc, iterate, svt
+from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.procrustean import procrustean
+from kcs_torch.solvers.signs import SignPath, sign_table, smooth_signs
 
 __all__ = [
     "Denoised",
+    "SignPath",
     "Solution",
     "choose_path",
     "complete_tracks",
@@ -19,9 +22,12 @@ __all__ = [
     "fpc",
     "ist",
     "iterate",
+    "lbfgs",
     "metric_upgrade",
     "procrustean",
     "settle_path",
+    "sign_table",
     "smooth_path",
+    "smooth_signs",
     "svt",
 ]

@@ -54,7 +54,7 @@ def lbfgs(
     dot = lambda a, b: (a * b).sum(-1, keepdim=True)  # noqa: E731
     x = start.detach()
     value, gradient = evaluate(x)
-    tiny = torch.finfo(x.dtype).tiny**0.5
+    tiny = torch.finfo(x.dtype).tiny ** 0.5
     size = x.square().mean(-1, keepdim=True).sqrt()
     size = torch.where(size > 0, size, torch.ones_like(size))
     steepest = first_step * size / gradient.square().mean(-1, keepdim=True).sqrt().clamp_min(tiny)
@@ -102,7 +102,8 @@ def lbfgs(
         kept = curve > 1e-10 * dot(y, y) * scale.clamp_min(tiny)
         moves.append(torch.where(kept, s, torch.zeros_like(s)))
         turns.append(torch.where(kept, y, torch.zeros_like(y)))
-        inverses.append(torch.where(kept, 1 / torch.where(kept, curve, torch.ones_like(curve)), torch.zeros_like(curve)))
+        inverse = 1 / torch.where(kept, curve, torch.ones_like(curve))
+        inverses.append(torch.where(kept, inverse, torch.zeros_like(curve)))
         del moves[:-memory], turns[:-memory], inverses[:-memory]
         scale = torch.where(kept, curve / dot(y, y).clamp_min(tiny), scale)
         x, value, gradient = new_x, new_value, new_gradient

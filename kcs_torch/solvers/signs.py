@@ -54,7 +54,9 @@ def smooth_signs(
         ShapeError: the shapes do not fit.
 
     >>> d = torch.tensor([[2.0, 1.0, 0.0, 1.0, 2.0]])[..., None]
-    >>> smooth_signs(torch.tensor([[0.0, 1]]).expand(1, 5, 1, 2), d, cap=9.0).signs.flatten().tolist()
+    >>> unary = torch.zeros(1, 5, 1, 2)
+    >>> unary[0, 0, 0, 1] = 1  # the first frame prefers +
+    >>> smooth_signs(unary, d, cap=9.0).signs.flatten().tolist()
     [1.0, 1.0, 1.0, -1.0, -1.0]
     """
     batch, frames, poses, states = unary.shape
