@@ -43,7 +43,7 @@ LOOSE, LOOSER = 0.3, 0.1
 """Weight of each length where the links are no tree (markers, say), in the coarse stages and in the fine ones."""
 
 ROBOT = 10
-"""Up to as many joints, eight times the random starts are tried: they are cheap, and little else decides."""
+"""Up to as many joints, twenty times the random starts are tried: they are cheap, and little else decides."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def moving_view(
     weights: Tensor | None = None,
     noise: float = 0.0,
     turns: Sequence[float] = TURNS,
-    lifts: int = 16,
+    lifts: int = 6,
     coarse_frames: int = 100,
     alternatives: int = 1,
     seed: int = 0,
@@ -127,7 +127,7 @@ def moving_view(
 
     pick = torch.arange(0, frames, max(1, -(-frames // coarse_frames)), device=image.device)
     few, few_weights = image[pick], None if weights is None else weights[pick]
-    made = _starts(few, skeleton, bones, turns, lifts if joints > ROBOT else 8 * lifts, frames, pick, seed)
+    made = _starts(few, skeleton, bones, turns, lifts if joints > ROBOT else 20 * lifts, frames, pick, seed)
     points = torch.cat([first[:, pick], *(p for p, _ in made)])
     turned = align_rotations(points, torch.cat([rotations[None, pick], *(r for _, r in made)]), bones)
     pose = Pose(points, turned, points.new_zeros(len(points)))
