@@ -17,6 +17,7 @@ from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.fixed_view import Hypotheses
 from kcs_torch.methods.pkc.moving_view import MovingView, moving_view
 from kcs_torch.methods.sfam import SfAM
+from kcs_torch.methods.size import weak_perspective
 from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.denoise import denoise_tracks
@@ -71,6 +72,15 @@ class PKC(Method):
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Clean the tracks, try both viewpoints, rank what they give."""
         image, notes = self._clean(tracks)
+        size = weak_perspective(image, tracks.seen, tracks.skeleton, tracks.fps or 30.0)
+        if size is None:
+            return self._solve(tracks, image, cameras, notes)
+        share = float(size.amax() / size.amin())
+        notes = (*notes, f"weak perspective: the body's size in the image varies by a factor of {share:.2f}")
+        return _with_size(self._solve(tracks, image / size[:, None, None], cameras, notes), size)
+
+    def _solve(self, tracks: Tracks, image: Tensor, cameras: Tensor | None, notes: tuple[str, ...]) -> Estimate:
+        """Solve complete tracks (T, N, 2) of a body whose size in the image does not change."""
         skeleton = tracks.skeleton
         has_trunk = len(trunk_joints(skeleton)) >= 3
         if self.viewpoint == "fixed" and not has_trunk:
@@ -185,3 +195,9 @@ class PKC(Method):
             path = body.frames(depth)[:, :2]
             made.append(Estimate(points, path, one, True, 0, () if k else notes, spread, value, still=True))
         return replace(made[0], alternatives=tuple(made[1:]))
+
+
+def _with_size(found: Estimate, size: Tensor) -> Estimate:
+    """An estimate of tracks that were divided by the size (T,)."""
+    others = tuple(_with_size(other, size) for other in found.alternatives)
+    return replace(found, scales=found.scales * size, alternatives=others)

@@ -1,0 +1,91 @@
+"""The apparent size of a body, and PKC on a body that comes nearer."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import kcs_torch as kt
+from kcs_torch.data.synthetic import walking_person
+from kcs_torch.methods.size import size_path, slow_waves, weak_perspective
+
+
+def grown(clip, ratio):
+    """Tracks of a clip whose image grows by a factor, evenly in its log, and the sizes (T,)."""
+    size = torch.linspace(0, math.log(ratio), clip.tracks.num_frames, dtype=torch.float64).exp()
+    return clip.points[..., :2] * size[:, None, None], size
+
+
+def test_finds_how_a_walker_grows():
+    clip = walking_person(90, turn=0, yaw=20)
+    image, size = grown(clip, 1.8)
+    path, gain = size_path(image, torch.ones(image.shape[:2], dtype=torch.bool), clip.skeleton, 30.0)
+    torch.testing.assert_close(path, size / size.log().mean().exp(), rtol=0.02, atol=0)
+    assert float(gain.median()) > 0.6
+
+
+@pytest.mark.parametrize("turn", [0.0, 90.0])
+@pytest.mark.parametrize("yaw", [0.0, 90.0])
+def test_a_distant_camera_keeps_its_scale(yaw, turn):
+    clip = walking_person(100, turn=turn, yaw=yaw, noise=5, generator=torch.Generator().manual_seed(0))
+    assert weak_perspective(clip.tracks.points, clip.tracks.seen, clip.skeleton, 30.0) is None
+
+
+def test_gaps_and_outliers_do_not_change_the_size():
+    clip = walking_person(90, turn=0, yaw=20)
+    image, size = grown(clip, 1.8)
+    random = torch.Generator().manual_seed(0)
+    seen = torch.rand(image.shape[:2], generator=random) > 0.2
+    wrong = torch.rand(image.shape[:2], generator=random) < 0.03
+    image = torch.where(seen[..., None], image, torch.zeros_like(image)) + 200 * wrong[..., None]
+    path = weak_perspective(image, seen, clip.skeleton, 30.0)
+    assert path is not None
+    torch.testing.assert_close(path, size / size.mean(), rtol=0.03, atol=0)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 8])
+def test_few_frames_and_points_in_one_place(frames):
+    body = kt.SKELETONS["h36m17"]
+    seen = torch.ones(frames, 17, dtype=torch.bool)
+    path, gain = size_path(torch.zeros(frames, 17, 2), seen, body, 30.0)
+    assert torch.equal(path, torch.ones(frames)) and bool(torch.isfinite(gain).all())
+    path, gain = size_path(torch.randn(frames, 17, 2), seen & False, body, 30.0)
+    assert torch.equal(path, torch.ones(frames))
+    path, gain = size_path(torch.randn(frames, 17, 2), seen, body, 30.0)
+    assert bool(torch.isfinite(path).all()) and bool(torch.isfinite(gain).all())
+
+
+def test_slow_waves_know_the_frame_rate():
+    like = torch.zeros(1)
+    assert slow_waves(300, 30.0, like).shape == (300, 7)
+    assert slow_waves(300, 120.0, like).shape == (300, 2)
+    assert slow_waves(9000, 30.0, like).shape == (9000, 12)
+    assert slow_waves(1, 30.0, like).shape == (1, 1)
+
+
+def test_pkc_reconstructs_a_body_that_comes_nearer():
+    clip = walking_person(60, turn=0, yaw=45)
+    image, size = grown(clip, 1.6)
+    given = kt.Tracks.from_arrays(image, skeleton=clip.skeleton, fps=30.0, units="mm")
+    method = kt.METHODS["pkc"](viewpoint="fixed", rounds=0, alternatives=1)
+    result, plain = method(given), method(clip.tracks)
+    torch.testing.assert_close(result.scales, size / size.mean(), rtol=0.03, atol=0)
+    assert torch.equal(plain.scales, torch.ones_like(plain.scales))
+    assert all(torch.equal(other.scales, result.scales) for other in result.alternatives)
+    assert any("weak perspective" in note for note in result.diagnostics.notes)
+    assert result.diagnostics.reprojection_rms < 1.0
+
+    def error(points):
+        """Mean distance after the best rotation of each frame and one scale; the better of the two mirror images."""
+        out = []
+        for sign in (1.0, -1.0):
+            a = points * points.new_tensor([1, 1, sign])
+            a, b = a - a.mean(1, keepdim=True), clip.points - clip.points.mean(1, keepdim=True)
+            turn = kt.functional.nearest_rotation((a.mT @ b).mT).mT
+            a = a @ turn
+            out.append(float((a * ((a * b).sum() / (a * a).sum()) - b).norm(dim=-1).mean()))
+        return min(out)
+
+    assert error(result.points) < error(plain.points) + 10
