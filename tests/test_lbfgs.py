@@ -1,0 +1,132 @@
+"""Batched L-BFGS: against scipy and direct solves, row by row, and where energies are flat, infinite or NaN."""
+
+import pytest
+import scipy.optimize
+import torch
+from numerics import FLOATS, leaves_arguments_alone, normal, rotations
+from torch.testing import assert_close
+
+from kcs_torch.solvers import lbfgs
+
+
+def rosenbrock(x):
+    return (100 * (x[..., 1:] - x[..., :-1] ** 2) ** 2 + (1 - x[..., :-1]) ** 2).sum(-1)
+
+
+STARTS = torch.cat([normal(5, 6), torch.zeros(1, 6).double(), torch.ones(1, 6).double(), 3 * normal(1, 6, seed=1)])
+
+
+def test_as_good_as_scipy():
+    found = lbfgs(rosenbrock, STARTS, num_steps=300, tolerance=0.0)
+    leaf = lambda x: torch.from_numpy(x).requires_grad_()  # noqa: E731
+    for start, value in zip(STARTS, found.value, strict=True):
+        other = scipy.optimize.minimize(
+            lambda x: rosenbrock(leaf(x)).item(),
+            start.numpy(),
+            jac=lambda x: torch.autograd.grad(rosenbrock(y := leaf(x)), y)[0].numpy(),
+            method="L-BFGS-B",
+            options={"maxiter": 300, "ftol": 0, "gtol": 1e-9},
+        )
+        assert rosenbrock(value) < other.fun + 1e-8
+        assert_close(value, torch.from_numpy(other.x), rtol=0, atol=1e-4)  # the same of the two minima
+
+
+def test_ill_conditioned_quadratics():
+    """Ten problems of condition 1e4, each with its own matrix."""
+    axes = torch.linalg.qr(normal(10, 12, 12))[0]
+    matrix = axes @ torch.diag(torch.logspace(0, 4, 12, dtype=torch.float64)) @ axes.mT
+    goal = normal(10, 12, seed=1)
+    off = lambda x: ((x - goal)[:, None] @ matrix @ (x - goal)[..., None])[:, 0, 0]  # noqa: E731
+    found = lbfgs(off, torch.zeros_like(goal), num_steps=400, tolerance=1e-8)
+    assert_close(found.value, goal, rtol=0, atol=1e-4)
+    assert found.converged and found.iterations < 400
+    steepest = lbfgs(off, torch.zeros_like(goal), num_steps=found.iterations, memory=1, tolerance=0.0)
+    assert off(steepest.value).sum() > 10 * off(found.value).sum()  # the memory is of use
+
+
+def test_rows_do_not_see_each_other():
+    together = lbfgs(rosenbrock, STARTS, num_steps=40, tolerance=0.0).value
+    alone = torch.cat([lbfgs(rosenbrock, row[None], num_steps=40, tolerance=0.0).value for row in STARTS])
+    assert_close(together, alone, rtol=1e-9, atol=1e-9)
+
+
+def test_more_steps_are_never_worse():
+    before = rosenbrock(STARTS)
+    for steps in (1, 2, 3, 5, 8, 13, 21):
+        energy = rosenbrock(lbfgs(rosenbrock, STARTS, num_steps=steps, tolerance=0.0).value)
+        assert (energy <= before).all()
+        before = energy
+    assert (before[1:6] < 0.5 * rosenbrock(STARTS)[1:6]).all()
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_units_do_not_matter(factor):
+    """Neither the energy's nor the unknowns'."""
+    start = STARTS[:3]
+    plain = lbfgs(rosenbrock, start, num_steps=15, tolerance=0.0).value
+    assert_close(lbfgs(lambda x: factor * rosenbrock(x), start, num_steps=15, tolerance=0.0).value, plain)
+    scaled = lbfgs(lambda x: rosenbrock(x / factor), factor * start, num_steps=15, tolerance=0.0).value
+    assert_close(scaled / factor, plain)
+
+
+def test_turned_unknowns_give_turned_minimisers():
+    turn = rotations(seed=4)
+    start = STARTS[:4, :3]
+    plain = lbfgs(rosenbrock, start, num_steps=10, tolerance=0.0).value
+    assert_close(
+        lbfgs(lambda x: rosenbrock(x @ turn), start @ turn.mT, num_steps=10, tolerance=0.0).value @ turn, plain
+    )
+
+
+def test_stays_within_the_domain():
+    """x - log x is infinite from 0 down: steps that leave the domain are shortened."""
+    start = torch.tensor([[1e-3], [1e3], [1.0]]).double()
+    found = lbfgs(lambda x: (x - x.log()).sum(-1), start, num_steps=100, tolerance=1e-12)
+    assert_close(found.value, torch.ones(3, 1).double(), rtol=0, atol=1e-4)
+
+
+def test_nan_of_one_row_stays_there():
+    def energy(x):
+        return (x - 2).square().sum(-1) * torch.tensor([1.0, torch.nan, 1.0])
+
+    start = normal(3, 4)
+    found = lbfgs(energy, start)
+    assert torch.equal(found.value[1], start[1])
+    assert_close(found.value[[0, 2]], torch.full((2, 4), 2.0).double(), rtol=0, atol=1e-4)
+
+
+def test_start_at_the_optimum_and_flat_energies():
+    goal = normal(2, 3)
+    found = lbfgs(lambda x: (x - goal).square().sum(-1), goal)
+    assert torch.equal(found.value, goal) and found.converged
+    flat = lbfgs(lambda x: 0 * x.sum(-1), goal)
+    assert torch.equal(flat.value, goal) and flat.converged
+    none = lbfgs(rosenbrock, STARTS, num_steps=0)
+    assert torch.equal(none.value, STARTS) and not none.converged and none.iterations == 0
+
+
+def test_says_whether_it_settled():
+    assert not lbfgs(rosenbrock, STARTS, num_steps=12).converged
+    found = lbfgs(rosenbrock, STARTS, num_steps=1000)
+    assert found.converged and 12 < found.iterations < 1000
+    early = lbfgs(rosenbrock, STARTS, num_steps=1000, tolerance=1e-2)
+    assert early.iterations <= found.iterations
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize("grad", [True, False])
+def test_follows_dtype_and_keeps_no_graph(dtype, grad):
+    start = STARTS.to(dtype).requires_grad_()
+    with torch.set_grad_enabled(grad):
+        found = lbfgs(rosenbrock, start, num_steps=200).value
+    assert found.dtype == dtype and not found.requires_grad
+    assert (rosenbrock(found) < 10).all()
+    leaves_arguments_alone(lambda x: lbfgs(rosenbrock, x, num_steps=5).value, STARTS)
+
+
+def test_energies_with_corners():
+    """Where no step helps any more, the problem rests, finite and not above where it came from."""
+    start = normal(6, 4, seed=3)
+    found = lbfgs(lambda x: x.abs().sum(-1), start, num_steps=200)
+    assert torch.isfinite(found.value).all()
+    assert (found.value.abs().sum(-1) < 0.1 * start.abs().sum(-1)).all()
