@@ -65,7 +65,7 @@ def lbfgs(
     resting = torch.zeros_like(value, dtype=torch.bool)
     failed = torch.zeros_like(resting)
     past = [value]
-    least = (torch.finfo(x.dtype).eps * value.abs()).clamp_min(tiny)  # of an energy that falls to 0
+    least = torch.where(value.isfinite(), torch.finfo(x.dtype).eps * value.abs(), 0).clamp_min(tiny)  # if it falls to 0
     settled, made = False, 0
     for made in range(1, num_steps + 1):
         q = gradient
@@ -110,7 +110,7 @@ def lbfgs(
         x, value, gradient = new_x, new_value, new_gradient
         past.append(value)
         drop = past[-11:][0] - value
-        if bool(resting.all()) or (made >= 10 and bool((drop <= tolerance * value.abs().maximum(least)).all())):
+        if bool(resting.all()) or (made >= 10 and bool((drop <= (tolerance * value.abs()).maximum(least)).all())):
             settled = True
             break
     return Solution(x, settled, made)
