@@ -105,6 +105,8 @@ class PostureEnergy(SkeletonModule):
     def directions(self, points: Tensor, lengths: Tensor | None = None) -> Tensor:
         """Bones seen from the trunk over their lengths, (..., T, B, 3); arguments as in :meth:`forward`."""
         self.check(points, clip=True)
+        if points.shape[-1] != 3:
+            raise ShapeError(f"PostureEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
         vectors = bone_vectors(points, self.bones)
         if lengths is None:
             lengths = vectors.square().sum(-1).mean(-2).clamp_min(torch.finfo(points.dtype).tiny).sqrt()
@@ -157,12 +159,12 @@ class ForeshorteningEnergy(SkeletonModule):
         self.correlation, self.eps = correlation, eps
         self.register_buffer("free", free_bones(self.skeleton), persistent=False)
 
-    def forward(self, points: Tensor, lengths: Tensor) -> Tensor:
-        """Return (...) of points (..., T, N, 3) and lengths (..., B)."""
+    def forward(self, points: Tensor, lengths: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return (...) of points (..., T, N, 3), lengths (..., B) and the bones' weights (..., T, B) or None."""
         self.check(points, clip=True)
         depth = bone_vectors(points, self.bones)[..., 2]
-        each = foreshortening(depth, lengths[..., None, :], self.eps)
-        return (self.free.to(each) * each).sum((-2, -1)) / self.correlation
+        each = self.free.to(depth) * foreshortening(depth, lengths[..., None, :], self.eps)
+        return (each if weights is None else each * weights).sum((-2, -1)) / self.correlation
 
 
 class ProportionEnergy(SkeletonModule):
