@@ -7,11 +7,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numerics import DEVICES, FLOATS, finite, gradcheck, leaves_arguments_alone, normal
+from numerics import DEVICES, FLOATS, finite, gradcheck, leaves_arguments_alone, normal, same_as_loop
 from torch.testing import assert_close
 
 from kcs_torch.errors import OptionError
-from kcs_torch.functional import best_path, blend_windows, interpolate, window_starts
+from kcs_torch.functional import best_path, blend_windows, interpolate, standing, window_starts
 
 # ---------------------------------------------------------------------- gaps
 
@@ -134,6 +134,46 @@ def test_best_path_of_many_frames_is_that_of_viterbi():
 
 
 # ---------------------------------------------------------------------- all of them
+
+
+# ---------------------------------------------------------------------- standing
+
+
+def steps(frames=60):
+    """Two feet that stand and move by turns, fifteen frames each: (T, 2, 2) and whether they move (T, 2)."""
+    moves = torch.stack([torch.arange(frames) // 15 % 2 == 0, torch.arange(frames) // 15 % 2 == 1], -1)
+    path = (moves * torch.linspace(0.9, 1.1, frames).double()[:, None]).cumsum(0)
+    return torch.stack([path, 0 * path], -1), moves
+
+
+def test_feet_that_stop_stand():
+    image, moves = steps()
+    sure = leaves_arguments_alone(standing, image, torch.ones(60, 2).double())
+    inside = torch.ones(60, dtype=torch.bool)
+    inside[14::15] = inside[15::15] = False  # where one starts or stops
+    assert (sure[inside & ~moves[:, 0], 0] == 1).all() and (sure[inside & moves[:, 0], 0] < 1e-6).all()
+    assert_close(standing(1e-200 * image + 5, torch.ones(60, 2).double()).amax(), torch.ones(()).double())
+    for factor in (1e-3, 1e200):
+        assert_close(standing(factor * (image + 7), torch.ones(60, 2).double()), sure)
+
+
+def test_unseen_feet_do_not_stand_nor_tell_the_top_speed():
+    image, _ = steps()
+    weights = torch.ones(60, 2).double()
+    weights[20:30, 0] = 0
+    spoiled = image.clone()
+    spoiled[20:30, 0] = 1e6
+    sure = standing(spoiled, weights)
+    assert (sure[19:31, 0] == 0).all() and (sure[32:44, 1] > 0.9).all()
+    for frames in (1, 2):
+        assert (standing(image[:frames], weights[:frames]) == 0).all()
+    assert (standing(image, 0 * weights) == 0).all()
+    assert standing(image[:, :0], weights[:, :0]).shape == (60, 0)
+    assert (standing(torch.full((9, 2, 2), 3.0), torch.ones(9, 2)) == 1).all()
+
+
+def test_standing_takes_batches():
+    same_as_loop(lambda p, w: standing(p, (w > -1).double()), (9, 3, 2), (9, 3))
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -79,7 +79,9 @@ def standing(image: Tensor, weights: Tensor) -> Tensor:
     """
     if image.shape[-3] < 3 or not image.shape[-2]:
         return torch.zeros_like(weights)
-    speed = (image[..., 2:, :, :] - image[..., :-2, :, :]).norm(dim=-1) / 2
+    move = image[..., 2:, :, :] - image[..., :-2, :, :]
+    move = move / move.abs().amax((-3, -2, -1), keepdim=True).clamp_min(torch.finfo(move.dtype).tiny)  # no overflow
+    speed = move.norm(dim=-1) / 2
     speed = torch.cat([speed[..., :1, :], speed, speed[..., -1:, :]], -2)
     seen = weights > 0
     seen = (

@@ -44,7 +44,9 @@ def root_depth(points: Tensor, tracks: Tracks) -> tuple[Tensor | None, str]:
     sure = standing(tracks.points[:, contacts], tracks.weights[:, contacts])
     if float((sure.amax(-1) > 0.5).double().mean()) < ENOUGH:
         return None, "no root depth: the feet hardly ever stand still in the image"
-    radius = (points - points.mean(1, keepdim=True)).square().sum(-1).mean().sqrt().clamp_min(1e-30)
+    body = points - points.mean(1, keepdim=True)
+    top = body.abs().amax().clamp_min(torch.finfo(points.dtype).tiny)  # squares must not overflow
+    radius = (body / top).square().sum(-1).mean().sqrt().clamp_min(1e-3) * top
     move = points[:, contacts, 2].diff(dim=0) / radius  # (T - 1, C), while the root stays
     weight = torch.minimum(sure[1:], sure[:-1])
     frames = len(move)
