@@ -8,7 +8,7 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.pkc.fixed_view import Hypotheses, fixed_view
-from kcs_torch.methods.pkc.objective import Objective, Weights, at_rate
+from kcs_torch.methods.pkc.objective import Objective, Weights, at_rate, bone_noise
 from kcs_torch.methods.pkc.trunk import image_scale
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
@@ -29,6 +29,7 @@ class Body:
         skeleton: with a template, spreads and a trunk.
         image: (T, N, 2), complete, centred per frame.
         rate: frames a second.
+        noise: (T, N) standard deviation of the joints in the image.
 
     Attributes:
         factor: units of the template per unit of the image.
@@ -36,15 +37,16 @@ class Body:
         objective: that ranks hypotheses, over all frames.
     """
 
-    def __init__(self, skeleton: Skeleton, image: Tensor, rate: float) -> None:
+    def __init__(self, skeleton: Skeleton, image: Tensor, rate: float, noise: Tensor) -> None:
         posture = PostureEnergy(skeleton).to(image)
         rigid = torch.zeros(skeleton.num_bones, dtype=torch.bool, device=image.device)
         rigid[list(skeleton.rigid)] = True
-        scale = image_scale(image, posture.rest_lengths, posture.bones, rigid)
+        scale = image_scale(image, posture.rest_lengths, posture.bones, rigid, bone_noise(noise, posture.bones))
         scale = torch.where(scale > 0, scale, torch.ones_like(scale))
         self.skeleton, self.rate, self.factor = skeleton, rate, 1 / scale
         self.image = image / scale
-        self.objective = Objective(skeleton, self.image, at_rate(Weights(), rate))
+        self.noise = noise / scale
+        self.objective = Objective(skeleton, self.image, at_rate(Weights(), rate), self.noise)
 
     def frames(self, depth: Tensor) -> Tensor:
         """The trunk's rotations (T, 3, 3), template to camera, of depths (T, N)."""
@@ -67,9 +69,10 @@ class Body:
         frames = len(image)
         size = min(BLOCK, frames)
         starts = window_starts(frames, size, min(OVERLAP, size - 1))
+        noise = self.noise[::stride]
         options = {"rate": rate, "rounds": rounds, "steps": steps}
         if len(starts) == 1:
-            found = fixed_view(self.skeleton, image, **options)  # type: ignore[arg-type]
+            found = fixed_view(self.skeleton, image, noise=noise, **options)  # type: ignore[arg-type]
         else:
             blocks = torch.stack([image[s : s + size] for s in starts])
             moved = bone_vectors(blocks, self.objective.bones).diff(dim=1).square().sum((1, 2, 3))
@@ -77,7 +80,9 @@ class Body:
             depths: list[Tensor] = [image.new_zeros(0)] * len(starts)
             lengths = None
             for i in order:
-                best = fixed_view(self.skeleton, blocks[i], anchor=lengths, **options)[:1]  # type: ignore[arg-type]
+                best = fixed_view(
+                    self.skeleton, blocks[i], noise=noise[starts[i] : starts[i] + size], anchor=lengths, **options
+                )[:1]  # type: ignore[arg-type]
                 lengths = best.lengths[0] if lengths is None else lengths
                 depths[i] = best.depth[0]
             joined = blend_windows(torch.stack(depths), starts, frames)

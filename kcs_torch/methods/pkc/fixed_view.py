@@ -13,7 +13,7 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limb_paths, limbs_of, waves
 from kcs_torch.methods.pkc.objective import Objective, Weights, at_rate
-from kcs_torch.methods.pkc.trunk import TURN, Trunk, mirror, trunk_paths, trunk_turns
+from kcs_torch.methods.pkc.trunk import TURN, Trunk, longest_image, mirror, trunk_paths, trunk_turns
 from kcs_torch.nn.posture import free_bones
 from kcs_torch.skeleton import Skeleton
 
@@ -53,6 +53,7 @@ def fixed_view(
     image: Tensor,
     *,
     rate: float = 30.0,
+    noise: Tensor | None = None,
     rounds: int = 2,
     steps: int = 30,
     weights: Weights | None = None,
@@ -73,6 +74,7 @@ def fixed_view(
         skeleton: with a template, spreads and a trunk.
         image: (T, N, 2), complete, in units of the template (a standing person being about 1.75).
         rate: frames a second.
+        noise: (T, N) standard deviation of the joints' images, in template units; none if None.
         rounds: of discrete moves.
         steps: L-BFGS steps of each refinement.
         weights: of the objective.
@@ -83,6 +85,7 @@ def fixed_view(
     """
     slow = 30.0 / rate
     weights = at_rate(weights or Weights(), rate)
+    noise = torch.zeros_like(image[..., 0]) if noise is None else noise
     costs = SignCosts()
     costs = replace(
         costs,
@@ -92,7 +95,7 @@ def fixed_view(
         hinge=costs.hinge * slow,
     )
     image = image - image.mean(-2, keepdim=True)
-    search = _Search(skeleton, image, Objective(skeleton, image, weights, anchor), costs, TURN * slow)
+    search = _Search(skeleton, image, Objective(skeleton, image, weights, noise, anchor), costs, TURN * slow)
     found = search.start(anchor)
     found = search.refine(found, steps)
     for _ in range(rounds):
@@ -168,7 +171,7 @@ class _Search:
         """The template, and one whose central bones are as long as their longest image."""
         posture = self.objective.posture
         usual = posture.rest_lengths if anchor is None else anchor
-        seen = torch.quantile(bone_vectors(self.image, posture.bones).norm(dim=-1), 0.98, dim=0)
+        seen = longest_image(bone_vectors(self.image, posture.bones), self.objective.noise)
         twins = {b for pair in self.skeleton.mirror_bones for b in pair}
         central = torch.tensor([i not in twins for i in range(self.skeleton.num_bones)], device=seen.device)
         short = torch.where(central, torch.minimum(torch.maximum(seen, 0.3 * usual), 1.3 * usual), usual)
@@ -189,7 +192,7 @@ class _Search:
             return torch.zeros(len(self.image), dtype=torch.long, device=self.image.device)
         candidates = self._candidates(flat, limbs, COARSE if lengths is None else lengths)
         found = limb_paths(
-            flat, limbs, paths, posture, free, self.costs, candidates=candidates, transition=moves, margins=True
+            flat, limbs, paths, posture, free, self.costs, self.objective.noise, candidates=candidates, transition=moves, margins=True
         )
         assert found.margins is not None
         votes = (found.margins - found.margins.amin(-1, keepdim=True)).clamp_max(20).sum(0)
@@ -198,7 +201,7 @@ class _Search:
     def _place(
         self, path: Tensor, trunk: Trunk, lengths: Tensor | None, keep: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Depths (T, N) and lengths (B,) of a body whose trunk follows a path; ``keep`` gives the trunk's own depths."""
+        """Depths (T, N), lengths (B,) of a body whose trunk follows a path; ``keep`` gives the trunk's own depths."""
         posture, free = self.objective.posture, free_bones(self.skeleton)
         flat = bone_vectors(self.image, posture.bones)
         if keep is None:
@@ -211,7 +214,7 @@ class _Search:
             chains = [list(limb.bones) for limb in wave]
             candidates = self._candidates(flat, wave, FINE if lengths is None else lengths)
             near = [self._direction(flat, dz, length, limb.before) if limb.entry else None for limb in wave]
-            found = limb_paths(flat, wave, path[None], posture, free, self.costs, candidates=candidates, before=near)
+            found = limb_paths(flat, wave, path[None], posture, free, self.costs, self.objective.noise, candidates=candidates, before=near)
             for chain, depth, size in zip(chains, found.depths, found.lengths, strict=True):
                 dz[:, chain], length[chain] = depth, size
         z = self._chain(dz.mT).mT
@@ -222,7 +225,7 @@ class _Search:
         if isinstance(grid, Tensor):
             return torch.stack([grid[None, list(limb.bones)] for limb in limbs])
         steps = torch.tensor(grid, dtype=flat.dtype, device=flat.device)
-        longest = torch.quantile(flat.norm(dim=-1), 0.99, dim=0)
+        longest = longest_image(flat, self.objective.noise)
         least = torch.maximum(longest, 0.8 * self.objective.posture.rest_lengths)
         count = len(limbs[0].bones)
         return torch.stack(

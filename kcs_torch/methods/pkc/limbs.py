@@ -126,6 +126,7 @@ def limb_paths(
     posture: PostureEnergy,
     free: Tensor,
     costs: SignCosts,
+    noise: Tensor,
     *,
     candidates: Tensor,
     transition: Tensor | None = None,
@@ -141,6 +142,7 @@ def limb_paths(
         posture: mean directions and spreads.
         free: (B,) 1 for bones that point anywhere.
         costs: weights.
+        noise: (T, B) standard deviation of bones' images.
         candidates: lengths (J, K, M) to choose from.
         transition: (T - 1, C, C) cost of going from one trunk path to the other.
         before: (T, 3) direction of the bone before each limb, or None.
@@ -153,9 +155,9 @@ def limb_paths(
     before = [None] * count if before is None else before
 
     def solve(lengths: Tensor, begin: list[int], margins: bool) -> tuple[SignPath, Tensor]:
-        """Signs in W windows for J limbs of K lengths each: window w of length k of limb j is problem (j K + k) W + w."""
+        """Signs in W windows for J limbs of K lengths: window w of length k of limb j is problem (j K + k) W + w."""
         parts = [
-            _unary(image, limb, rotations, posture, free, costs, length, near)
+            _unary(image, limb, rotations, posture, free, costs, noise, length, near)
             for limb, length, near in zip(limbs, lengths, before, strict=True)
         ]
         unary, depth = (torch.cat(part) for part in zip(*parts, strict=True))  # (J K, T, ...)
@@ -195,6 +197,7 @@ def _unary(
     posture: PostureEnergy,
     free: Tensor,
     costs: SignCosts,
+    noise: Tensor,
     lengths: Tensor,
     before: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
@@ -204,7 +207,7 @@ def _unary(
     square = lengths[:, None].square() - flat.square().sum(-1)  # (K, T, M)
     depth = square.clamp_min(0).sqrt()
     over = (-square).clamp_min(0) / (2 * lengths[:, None])
-    each = (over / costs.over).square().clamp_max(20) / 2
+    each = (over.square() / (costs.over**2 + noise[:, chain].square())).clamp_max(20) / 2
     density = foreshortening(depth, lengths[:, None], 0.1) - 2 * posture.rest_lengths[chain].to(image).log()
     base = (each + free[chain].to(image) / costs.foreshortening * density).sum(-1)  # (K, T)
     signs = sign_table(len(chain), image)  # (S, M)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -29,6 +30,12 @@ __all__ = ["PKC"]
 CLEAN = 0.003
 """Noise below this share of the body's size is left in the tracks."""
 
+LEFT = 0.45
+"""Share of the noise that smoothing leaves."""
+
+FILLED = 0.015
+"""Standard deviation of a joint that is filled in, a share of the body's size."""
+
 LEAST_FRAMES = 12
 """Frames from which on the viewpoint may have turned."""
 
@@ -40,12 +47,12 @@ class PKC(Method):
     Bone vectors, aligned frame by frame to a common pose, follow one Gaussian, and so do their changes in time; bones
     keep their length. Where the viewpoint turns this alone gives depth (:func:`moving_view`). Where it hardly does, the
     depth of a bone is +-sqrt(L^2 - |xy|^2): lengths and signs come from the skeleton's template, spreads and hinges
-    (:func:`fixed_view`). With a template both are tried, and one objective ranks all hypotheses, mirror images included.
+    (:func:`fixed_view`). With a template both are tried, and one objective ranks all hypotheses and mirror images.
 
     Args:
         viewpoint: "auto" tries both solvers, "fixed" and "moving" only one.
         denoise: smooth noisy tracks, fill gaps and reject outliers first (:func:`kcs_torch.solvers.denoise_tracks`).
-        lifts: random starts of the moving viewpoint's solver.
+        lifts: random starts of the moving viewpoint's solver, for skeletons without a template.
         rounds: of discrete moves of the fixed viewpoint's solver.
         steps: L-BFGS steps of each of its refinements.
         alternatives: further solutions to return.
@@ -58,7 +65,7 @@ class PKC(Method):
     name: ClassVar[str] = "pkc"
     viewpoint: Literal["auto", "fixed", "moving"] = "auto"
     denoise: bool = True
-    lifts: int = 16
+    lifts: int = 6
     rounds: int = 2
     steps: int = 30
     alternatives: int = 4
@@ -71,15 +78,17 @@ class PKC(Method):
 
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Clean the tracks, try both viewpoints, rank what they give."""
-        image, notes = self._clean(tracks)
+        image, noise, notes = self._clean(tracks)
         size = weak_perspective(image, tracks.seen, tracks.skeleton, tracks.fps or 30.0)
         if size is None:
-            return self._solve(tracks, image, cameras, notes)
+            return self._solve(tracks, image, noise, cameras, notes)
         share = float(size.amax() / size.amin())
         notes = (*notes, f"weak perspective: the body's size in the image varies by a factor of {share:.2f}")
-        return _with_size(self._solve(tracks, image / size[:, None, None], cameras, notes), size)
+        return _with_size(self._solve(tracks, image / size[:, None, None], noise, cameras, notes), size)
 
-    def _solve(self, tracks: Tracks, image: Tensor, cameras: Tensor | None, notes: tuple[str, ...]) -> Estimate:
+    def _solve(
+        self, tracks: Tracks, image: Tensor, noise: Tensor, cameras: Tensor | None, notes: tuple[str, ...]
+    ) -> Estimate:
         """Solve complete tracks (T, N, 2) of a body whose size in the image does not change."""
         skeleton = tracks.skeleton
         has_trunk = len(trunk_joints(skeleton)) >= 3
@@ -87,7 +96,7 @@ class PKC(Method):
             raise OptionError(
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
-        body = Body(skeleton, image, tracks.fps or 30.0) if has_trunk and cameras is None else None
+        body = Body(skeleton, image, tracks.fps or 30.0, noise) if has_trunk and cameras is None else None
         moving: MovingView | None = None
         enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
         if body is None or (self.viewpoint != "fixed" and enough):
@@ -100,27 +109,31 @@ class PKC(Method):
         found, _ = self._search(body, moving)
         return self._from_hypotheses(found, body, image, notes)
 
-    def _clean(self, tracks: Tracks) -> tuple[Tensor, tuple[str, ...]]:
-        """Complete tracks (T, N, 2), centred per frame, and what was done."""
+    def _clean(self, tracks: Tracks) -> tuple[Tensor, Tensor, tuple[str, ...]]:
+        """Complete tracks (T, N, 2), centred per frame, the noise (T, N) left in them, and what was done."""
         known = tracks.seen.any(0)
+        level, keep = 0.0, tracks.seen
         points, notes = tracks.points, []
         if self.denoise:
             clean = denoise_tracks(points, tracks.weights)
-            noise = float(clean.noise.median())
+            level = float(clean.noise.median())
             wrong = int(clean.outliers.sum())
             if wrong:
                 notes.append(f"{wrong} detections ({100 * wrong / int(tracks.seen.sum()):.1f} %) rejected as outliers")
-            keep = tracks.seen & ~clean.outliers
-            if noise > CLEAN:
-                keep = torch.zeros_like(keep)
-                notes.append(f"tracks smoothed: noise of {100 * noise:.1f} % of the body's size")
-            points = torch.where(keep[..., None], points, clean.points)
+            keep = keep & ~clean.outliers
+            exact = keep
+            if level > CLEAN:
+                exact = torch.zeros_like(keep)
+                notes.append(f"tracks smoothed: noise of {100 * level:.1f} % of the body's size")
+            points = torch.where(exact[..., None], points, clean.points)
         else:
             points = interpolate(points, tracks.seen)
         if not bool(known.all()):
             flat = torch.nn.functional.pad(points, (0, 1))
             points = place_unseen(flat, known, tracks.skeleton)[..., :2]
-        return points - points.mean(-2, keepdim=True), tuple(notes)
+        left = LEFT * level if level > CLEAN else 0.0
+        noise = torch.where(keep, points.new_full((), left), points.new_full((), math.hypot(left, FILLED)))
+        return points - points.mean(-2, keepdim=True), noise, tuple(notes)
 
     def _moving(
         self, tracks: Tracks, image: Tensor, cameras: Tensor | None, enough: bool
@@ -131,8 +144,10 @@ class PKC(Method):
         if not enough:
             return None, first
         rotations = complete_rotation(first.cameras)
+        # A template gives the moving viewpoint a better start than random signs do: the fixed viewpoint's solution.
+        lifts = 0 if self.viewpoint == "auto" and len(trunk_joints(tracks.skeleton)) >= 3 else self.lifts
         if cameras is None:
-            return moving_view(image, tracks.skeleton, first.points, rotations, lifts=self.lifts, seed=self.seed), first
+            return moving_view(image, tracks.skeleton, first.points, rotations, lifts=lifts, seed=self.seed), first
         bones = tracks.skeleton.bone_index(device=image.device)
         if not tracks.skeleton.is_tree:
             return None, first
@@ -157,7 +172,7 @@ class PKC(Method):
         return replace(main, alternatives=(other,))
 
     def _search(self, body: Body, moving: MovingView | None) -> tuple[Hypotheses, Tensor]:
-        """All hypotheses of a body with a template, ranked by the objective, and which came from the moving viewpoint."""
+        """All hypotheses of a body with a template, best first, and which came from the moving viewpoint."""
         found = body.search(self.rounds, self.steps) if self.viewpoint != "moving" else None
         if moving is None:
             assert found is not None

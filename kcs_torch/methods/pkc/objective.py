@@ -14,7 +14,10 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.iterate import Solution
 from kcs_torch.solvers.lbfgs import lbfgs
 
-__all__ = ["Objective", "Weights", "at_rate"]
+__all__ = ["Objective", "Weights", "at_rate", "bone_noise"]
+
+HEAVY = 4.0
+"""Squared deviations of a length from here on count like an outlier's, in variances."""
 
 
 @dataclass(frozen=True)
@@ -54,21 +57,32 @@ def at_rate(weights: Weights, rate: float) -> Weights:
     )
 
 
-class Objective:
-    """Energy of depths z and lengths L, given the image:
+def bone_noise(noise: Tensor, bones: Tensor) -> Tensor:
+    """Standard deviation (T, B) of bones' images from that of their joints (T, N)."""
+    return (noise[:, bones[:, 0]].square() + noise[:, bones[:, 1]].square()).sqrt()
 
-    sum_tb (|b|^2 - L^2)^2 / (8 L^2 s^2)        bones keep their length
-    + sum_tb |second difference of dz|^2 / (2 a^2)   and move smoothly,
+
+class Objective:
+    """Energy of depths z and lengths L, given the image.
+
+    T/2 sum_b log(1 + v_b)        bones keep their length,
+    + sum_tb |second difference of dz|^2 / (2 a^2)        move smoothly,
     + PostureEnergy + HingeEnergy + ForeshorteningEnergy + ProportionEnergy.
+
+    v_b is the robust mean over time of ((|b|^2 - L^2) / 2L)^2 / s^2: how well a bone keeps its length is for the data to
+    say. Perspective and a detector's habits change lengths by much more than s, all clip long.
 
     Args:
         skeleton: with a template; virtual joints follow their sources.
         image: (T, N, 2), centred, in units of the template.
         weights: of the terms.
+        noise: (T, N) standard deviation of each joint's image: its bones may look longer or shorter than they are.
         anchor: (B,) lengths known from elsewhere in the clip, or None.
     """
 
-    def __init__(self, skeleton: Skeleton, image: Tensor, weights: Weights, anchor: Tensor | None = None) -> None:
+    def __init__(
+        self, skeleton: Skeleton, image: Tensor, weights: Weights, noise: Tensor, anchor: Tensor | None = None
+    ) -> None:
         self.skeleton, self.image, self.weights, self.anchor = skeleton, image, weights, anchor
         make = lambda module: module.to(image)  # noqa: E731
         self.posture = make(PostureEnergy(skeleton, correlation=weights.posture))
@@ -80,6 +94,10 @@ class Objective:
         self.rigid = torch.zeros(skeleton.num_bones, dtype=image.dtype, device=image.device)
         self.rigid[list(skeleton.rigid)] = 1
         self.tree = chain_inverse(incidence(self.bones, skeleton.num_joints, dtype=image.dtype))  # (N, B)
+        self.noise = bone_noise(noise, self.bones)  # (T, B)
+        self.precision = self.rigid / (weights.length**2 + self.noise.square())
+        least = self.noise.amin(0).square() + weights.length**2
+        self.clear = least / (weights.length**2 + self.noise.square())  # a guessed image is no evidence
         observed = torch.eye(skeleton.num_observed, dtype=image.dtype, device=image.device)
         self.complete = skeleton.complete(observed)[0].mT  # (No, N): virtual joints follow their sources
 
@@ -102,17 +120,22 @@ class Objective:
         dz = depth[..., self.bones[:, 1]] - depth[..., self.bones[:, 0]]  # (H, T, B)
         off = (self.flat + dz.square() - lengths[:, None].square()) / (2 * lengths[:, None])
         out = {
-            "length": (self.rigid * off.square()).sum((1, 2)) / (2 * w.length**2),
+            "length": self._length(off),
             "smoothness": dz.diff(n=2, dim=1).square().sum((1, 2)) / (2 * w.acceleration**2),
             "posture": self.posture(points, lengths),
             "hinges": w.hinge / w.sine**2 * self.hinges(points, lengths).sum(-1),
-            "foreshortening": self.foreshortening(points, lengths),
+            "foreshortening": self.foreshortening(points, lengths, self.clear),
             "proportions": self.proportions(lengths),
             "centre": 100 * depth.mean(-1).square().sum(-1),
         }
         if self.anchor is not None:
             out["anchor"] = ((lengths / self.anchor).log() / 0.01).square().sum(-1) / 2
         return out
+
+    def _length(self, off: Tensor) -> Tensor:
+        """T/2 sum_b log(1 + v_b), v_b the mean over time of c log(1 + off^2 / (c s^2)), (H,) from (H, T, B)."""
+        each = HEAVY * torch.log1p(self.precision * off.square() / HEAVY)
+        return len(self.image) / 2 * torch.log1p(each.mean(1)).sum(-1)
 
     def __call__(self, state: Tensor) -> Tensor:
         """The energy of each hypothesis, (H,)."""

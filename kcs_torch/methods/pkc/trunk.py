@@ -12,13 +12,17 @@ from kcs_torch.functional.temporal import best_path
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.solvers.pose import fit_cameras
 
-__all__ = ["Trunk", "image_scale", "mirror", "trunk_paths", "trunk_turns"]
+__all__ = ["Trunk", "image_scale", "longest_image", "mirror", "trunk_paths", "trunk_turns"]
 
 FIT = 0.03
 """Standard deviation of the trunk's joints about its template, a standing person being about 1.75 tall."""
 
 TURN = 0.15
 """Standard deviation of the trunk's turn from frame to frame, in radians, at 30 frames a second."""
+
+
+LONGER = 1.5
+"""By how many standard deviations of its noise the longest image of a bone is too long."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ class Trunk:
     lengths: Tensor
 
 
-def image_scale(image: Tensor, lengths: Tensor, bones: Tensor, rigid: Tensor) -> Tensor:
+def image_scale(image: Tensor, lengths: Tensor, bones: Tensor, rigid: Tensor, noise: Tensor) -> Tensor:
     """Scale of a clip: image units per unit of length, a 0-dimensional tensor.
 
     Each bone's longest image over its usual length is about the scale, if the bone ever lies in the image plane; the
@@ -45,11 +49,25 @@ def image_scale(image: Tensor, lengths: Tensor, bones: Tensor, rigid: Tensor) ->
         lengths: (B,) usual lengths.
         bones: (B, 2).
         rigid: (B,) bool, bones that count.
+        noise: (T, B) standard deviation of the bones' images.
     """
     use = rigid & (lengths > 0)
-    seen = bone_vectors(image, bones[use]).norm(dim=-1)
-    ratio = torch.quantile(seen, 0.98, dim=0) / lengths[use]
-    return torch.quantile(ratio, 0.6) if len(ratio) else image.new_ones(())
+    if not bool(use.any()):
+        return image.new_ones(())
+    ratio = longest_image(bone_vectors(image, bones[use]), noise[:, use]) / lengths[use]
+    return torch.quantile(ratio, 0.6)
+
+
+def longest_image(flat: Tensor, noise: Tensor) -> Tensor:
+    """How long bones look at most, (B,), less what noise adds; filled-in frames count only where there are no others.
+
+    Args:
+        flat: (T, B, 2) images of the bones.
+        noise: (T, B) their standard deviation.
+    """
+    size = flat.norm(dim=-1)
+    sure = noise <= 1.01 * noise.amin(0)
+    return torch.where(sure, size - LONGER * noise, torch.nan).nanquantile(0.985, 0).clamp_min(0)
 
 
 def mirror(rotations: Tensor) -> Tensor:
