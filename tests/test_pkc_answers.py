@@ -1,0 +1,75 @@
+"""What is told beside the best solution: which others differ, which bones the prior decided, how sure depth is."""
+
+import pytest
+import torch
+from numerics import CHAIN, normal
+from torch.testing import assert_close
+
+from kcs_torch.methods.pkc import answers
+from kcs_torch.methods.pkc.answers import depth_deviation, distinct, told_by_prior
+from kcs_torch.methods.pkc.fixed_view import Hypotheses
+
+
+def hypotheses(depths, energy, lengths=None):
+    depths = torch.stack(depths).double()
+    lengths = torch.ones(len(depths), 3).double() if lengths is None else lengths
+    return Hypotheses(depths, lengths, torch.tensor(energy).double())
+
+
+BENT = torch.tensor([[-0.9, -0.3, 0.3, 0.9]]).repeat(5, 1).double()  # a chain of three bones that points away
+
+
+def test_equal_solutions_are_told_once():
+    shapes = [BENT, BENT + 1e-3, -BENT, -BENT + 1e-3 * normal(5, 4), 2 * BENT]
+    found = hypotheses(shapes, [1.0, 2.0, 3.0, 4.0, 5.0])
+    assert distinct(found, 5).energy.tolist() == [1, 3, 5]
+    assert distinct(found, 2).energy.tolist() == [1, 3]
+    assert distinct(found, 1).energy.tolist() == [1]
+    kept = distinct(found, 5).depth
+    for i in range(3):
+        for j in range(i):
+            assert (kept[i] - kept[j]).square().mean().sqrt() > answers.APART
+
+
+def test_solutions_that_failed_are_left_out():
+    found = hypotheses([BENT, -BENT, 2 * BENT], [1.0, torch.nan, torch.inf])
+    assert distinct(found, 3).energy.tolist() == [1]
+    lost = hypotheses([BENT, -BENT], [torch.nan, torch.nan])
+    assert len(distinct(lost, 3).energy) == 1  # something has to be returned
+
+
+def test_bones_that_a_rival_flips():
+    flipped = BENT.clone()
+    flipped[:, 3] = -0.3  # the last bone comes back
+    rival = hypotheses([BENT, flipped], [1.0, 2.0])
+    assert told_by_prior(rival, CHAIN) == ["c-d"]
+    far = hypotheses([BENT, flipped], [1.0, 1.0 + 2 * answers.CLOSE])
+    assert told_by_prior(far, CHAIN) == []
+    brief = BENT.clone()
+    brief[0, 3] = -0.3  # in one frame of five
+    assert told_by_prior(hypotheses([BENT, brief], [1.0, 2.0]), CHAIN) == []
+    shallow = hypotheses([0.1 * BENT, -0.1 * BENT], [1.0, 2.0])  # nearly in the image plane
+    assert told_by_prior(shallow, CHAIN) == []
+    assert told_by_prior(rival[:1], CHAIN) == []
+
+
+def test_deviation_by_hand():
+    """Independent bones, dL L / |dz|, add up from the middle: of the chain a-b-c-d, lengths 1, depths 0.6."""
+    image = torch.zeros(5, 4, 2).double()
+    found = depth_deviation(hypotheses([BENT], [0.0]), image, CHAIN)
+    one = answers.LENGTH / 0.6 * answers.CALIBRATION
+    outer = one * ((3 / 4) ** 2 + (2 / 4) ** 2 + (1 / 4) ** 2) ** 0.5  # how the three bones move the first joint
+    inner = one * ((1 / 4) ** 2 + (2 / 4) ** 2 + (1 / 4) ** 2) ** 0.5
+    assert_close(found, torch.tensor([outer, inner, inner, outer]).double().expand(5, 4))
+
+
+def test_deviation_grows_towards_the_image_plane_and_with_rivals():
+    image = torch.zeros(5, 4, 2).double()
+    steep = depth_deviation(hypotheses([BENT], [0.0]), image, CHAIN)
+    flat = depth_deviation(hypotheses([0.5 * BENT], [0.0]), image, CHAIN)
+    none = depth_deviation(hypotheses([0 * BENT], [0.0]), image, CHAIN)
+    assert (steep < flat).all() and (flat < none).all() and torch.isfinite(none).all()
+    rivals = [depth_deviation(hypotheses([BENT, -BENT], [0.0, e]), image, CHAIN) for e in (0.0, 10.0, 1e4)]
+    assert (rivals[0][:, 0] > rivals[1][:, 0]).all() and (rivals[1][:, 0] > rivals[2][:, 0]).all()
+    assert_close(rivals[2], steep)
+    assert rivals[0][0, 3].item() == pytest.approx((steep[0, 3].item() ** 2 + 0.5 * 1.8**2) ** 0.5, rel=0.02)
