@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
+from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.pkc.fixed_view import Hypotheses, fixed_view
@@ -50,7 +53,7 @@ class Body:
 
     def frames(self, depth: Tensor) -> Tensor:
         """The trunk's rotations (T, 3, 3), template to camera, of depths (T, N)."""
-        return self.objective.posture.frame(torch.cat([self.image, depth[..., None]], -1))
+        return nearest_rotation(self.objective.posture.frame(torch.cat([self.image, depth[..., None]], -1)))
 
     def rank(self, depth: Tensor, steps: int) -> Hypotheses:
         """Depths (H, T, N) from elsewhere, refined on the objective, best first."""
@@ -58,8 +61,8 @@ class Body:
         lengths = bone_lengths(points, self.objective.bones).median(1).values
         usual = self.objective.posture.rest_lengths
         lengths = torch.where(lengths > 1e-3 * usual, lengths, usual)
-        z, lengths, energy, _ = self.objective.minimise(depth, lengths, steps)
-        return Hypotheses(z, lengths, energy)
+        z, lengths, energy, solution = self.objective.minimise(depth, lengths, steps)
+        return Hypotheses(z, lengths, energy, solution.iterations)
 
     def search(self, rounds: int, steps: int) -> Hypotheses:
         """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best."""
@@ -70,24 +73,22 @@ class Body:
         size = min(BLOCK, frames)
         starts = window_starts(frames, size, min(OVERLAP, size - 1))
         noise = self.noise[::stride]
-        options = {"rate": rate, "rounds": rounds, "steps": steps}
+        lift = partial(fixed_view, self.skeleton, rate=rate, rounds=rounds, steps=steps)
         if len(starts) == 1:
-            found = fixed_view(self.skeleton, image, noise=noise, **options)  # type: ignore[arg-type]
+            found = lift(image, noise=noise)
         else:
             blocks = torch.stack([image[s : s + size] for s in starts])
             moved = bone_vectors(blocks, self.objective.bones).diff(dim=1).square().sum((1, 2, 3))
             order = moved.argsort(descending=True).tolist()  # lengths come from the liveliest block
             depths: list[Tensor] = [image.new_zeros(0)] * len(starts)
-            lengths = None
+            lengths, made = None, 0
             for i in order:
-                best = fixed_view(
-                    self.skeleton, blocks[i], noise=noise[starts[i] : starts[i] + size], anchor=lengths, **options
-                )[:1]  # type: ignore[arg-type]
+                best = lift(blocks[i], noise=noise[starts[i] : starts[i] + size], anchor=lengths)[:1]
                 lengths = best.lengths[0] if lengths is None else lengths
-                depths[i] = best.depth[0]
+                depths[i], made = best.depth[0], made + best.steps
             joined = blend_windows(torch.stack(depths), starts, frames)
             assert lengths is not None
-            found = Hypotheses(joined[None], lengths[None], joined.new_zeros(1))
+            found = Hypotheses(joined[None], lengths[None], joined.new_zeros(1), made)
         if stride > 1 or len(starts) > 1:
             found = self._on_all_frames(found[:4], stride, steps)
         return found
@@ -100,5 +101,5 @@ class Body:
         full = found.depth.new_zeros(len(found.depth), frames, 1, found.depth.shape[-1])
         full[:, ::stride] = found.depth[:, :, None]
         depth = interpolate(full, known)[:, :, 0]
-        z, lengths, energy, _ = self.objective.minimise(depth, found.lengths, steps)
-        return Hypotheses(z, lengths, energy)
+        z, lengths, energy, solution = self.objective.minimise(depth, found.lengths, steps)
+        return Hypotheses(z, lengths, energy, found.steps + solution.iterations)

@@ -38,14 +38,16 @@ class Hypotheses:
         depth: (H, T, N), centred per frame, in units of the template.
         lengths: (H, B).
         energy: (H,) of the objective.
+        steps: L-BFGS steps made for them.
     """
 
     depth: Tensor
     lengths: Tensor
     energy: Tensor
+    steps: int = 0
 
     def __getitem__(self, index: slice | Tensor) -> Hypotheses:
-        return Hypotheses(self.depth[index], self.lengths[index], self.energy[index])
+        return Hypotheses(self.depth[index], self.lengths[index], self.energy[index], self.steps)
 
 
 def fixed_view(
@@ -139,14 +141,15 @@ class _Search:
         """All a little, then the best few well."""
         obj = self.objective
         few = max(steps // 3, 1)
-        z, length, energy, _ = obj.minimise(found.depth, found.lengths, few)
+        z, length, energy, first = obj.minimise(found.depth, found.lengths, few)
         rest = Hypotheses(z, length, energy)
         keep = min(4, len(z))
-        z, length, energy, _ = obj.minimise(z[:keep], length[:keep], steps)
+        z, length, energy, second = obj.minimise(z[:keep], length[:keep], steps)
         joined = Hypotheses(
             torch.cat([z, rest.depth[keep:]]),
             torch.cat([length, rest.lengths[keep:]]),
             torch.cat([energy, rest.energy[keep:]]),
+            found.steps + first.iterations + second.iterations,
         )
         return joined[joined.energy.argsort()]
 
@@ -165,6 +168,7 @@ class _Search:
             torch.cat([found.depth[:2], torch.stack([n[0] for n in new])]),
             torch.cat([found.lengths[:2], torch.stack([n[1] for n in new])]),
             torch.cat([found.energy[:2], found.energy.new_full((len(new),), torch.inf)]),
+            found.steps,
         )
 
     def _trunks(self, anchor: Tensor | None) -> list[Trunk]:
@@ -192,7 +196,8 @@ class _Search:
             return torch.zeros(len(self.image), dtype=torch.long, device=self.image.device)
         candidates = self._candidates(flat, limbs, COARSE if lengths is None else lengths)
         found = limb_paths(
-            flat, limbs, paths, posture, free, self.costs, self.objective.noise, candidates=candidates, transition=moves, margins=True
+            flat, limbs, paths, posture, free, self.costs, self.objective.noise,
+            candidates=candidates, transition=moves, margins=True,
         )
         assert found.margins is not None
         votes = (found.margins - found.margins.amin(-1, keepdim=True)).clamp_max(20).sum(0)

@@ -36,6 +36,9 @@ LEFT = 0.45
 FILLED = 0.015
 """Standard deviation of a joint that is filled in, a share of the body's size."""
 
+MOVING_STEPS = sum(stage.num_steps for stage in (*COARSE, *FINE))
+"""L-BFGS steps of the moving viewpoint's solver, at most."""
+
 LEAST_FRAMES = 12
 """Frames from which on the viewpoint may have turned."""
 
@@ -164,7 +167,7 @@ class PKC(Method):
         path = moving.cameras()[0] if cameras is None else complete_rotation(cameras)
         one = torch.ones_like(points[:, 0, 0])
         value = float(moving.pose.objective[0])
-        main = Estimate(points, path[:, :2], one, True, 0, notes, moving.deviation(path), value)
+        main = Estimate(points, path[:, :2], one, True, MOVING_STEPS, notes, moving.deviation(path), value)
         if cameras is not None or not self.alternatives:
             return main
         flip = points.new_tensor([1.0, 1.0, -1.0])
@@ -173,7 +176,8 @@ class PKC(Method):
 
     def _search(self, body: Body, moving: MovingView | None) -> tuple[Hypotheses, Tensor]:
         """All hypotheses of a body with a template, best first, and which came from the moving viewpoint."""
-        found = body.search(self.rounds, self.steps) if self.viewpoint != "moving" else None
+        fixed = self.viewpoint != "moving" or moving is None  # too few frames leave no choice
+        found = body.search(self.rounds, self.steps) if fixed else None
         if moving is None:
             assert found is not None
             return found, torch.zeros(len(found.energy), dtype=torch.bool)
@@ -191,6 +195,7 @@ class PKC(Method):
             torch.cat([found.depth, ranked.depth]),
             torch.cat([found.lengths, ranked.lengths]),
             torch.cat([found.energy, ranked.energy]),
+            found.steps + ranked.steps + MOVING_STEPS,
         )
         order = both.energy.argsort()
         return both[order], (order >= len(found.energy)).cpu()
@@ -208,7 +213,7 @@ class PKC(Method):
             spread = depth_deviation(found[k:] if k else found, body.image, body.skeleton) / body.factor
             value = float(found.energy[k])
             path = body.frames(depth)[:, :2]
-            made.append(Estimate(points, path, one, True, 0, () if k else notes, spread, value, still=True))
+            made.append(Estimate(points, path, one, True, found.steps, () if k else notes, spread, value, still=True))
         return replace(made[0], alternatives=tuple(made[1:]))
 
 

@@ -69,8 +69,8 @@ class Objective:
     + sum_tb |second difference of dz|^2 / (2 a^2)        move smoothly,
     + PostureEnergy + HingeEnergy + ForeshorteningEnergy + ProportionEnergy.
 
-    v_b is the robust mean over time of ((|b|^2 - L^2) / 2L)^2 / s^2: how well a bone keeps its length is for the data to
-    say. Perspective and a detector's habits change lengths by much more than s, all clip long.
+    v_b is the robust mean over time of ((|b|^2 - L^2) / 2L)^2 / s^2: how well a bone keeps its length is for the data
+    to say. Perspective and a detector's habits change lengths by much more than s, all clip long.
 
     Args:
         skeleton: with a template; virtual joints follow their sources.
