@@ -219,7 +219,10 @@ class _Search:
             chains = [list(limb.bones) for limb in wave]
             candidates = self._candidates(flat, wave, FINE if lengths is None else lengths)
             near = [self._direction(flat, dz, length, limb.before) if limb.entry else None for limb in wave]
-            found = limb_paths(flat, wave, path[None], posture, free, self.costs, self.objective.noise, candidates=candidates, before=near)
+            found = limb_paths(
+                flat, wave, path[None], posture, free, self.costs, self.objective.noise,
+                candidates=candidates, before=near,
+            )  # fmt: skip
             for chain, depth, size in zip(chains, found.depths, found.lengths, strict=True):
                 dz[:, chain], length[chain] = depth, size
         z = self._chain(dz.mT).mT
