@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         SkeletonError,
     )
     from kcs_torch.io import load_tracks, save
+    from kcs_torch.live import LivePose, Tracker
     from kcs_torch.methods import KCS, METHODS, PKC, Method, SfAM, find_skeleton
     from kcs_torch.reconstruct import reconstruct
     from kcs_torch.skeleton import SKELETONS, Skeleton
@@ -38,6 +39,7 @@ __all__ = [
     "FormatError",
     "KcsError",
     "KcsWarning",
+    "LivePose",
     "Method",
     "OptionError",
     "OutputError",
@@ -46,6 +48,7 @@ __all__ = [
     "ShapeError",
     "Skeleton",
     "SkeletonError",
+    "Tracker",
     "Tracks",
     "find_skeleton",
     "functional",
@@ -68,13 +71,14 @@ _NAMES = {
         "SkeletonError",
     ),
     "io": ("load_tracks", "save"),
+    "live": ("LivePose", "Tracker"),
     "methods": ("KCS", "METHODS", "PKC", "Method", "SfAM", "find_skeleton"),
     "reconstruct": ("reconstruct",),
     "skeleton": ("SKELETONS", "Skeleton"),
     "types": ("Diagnostics", "Reconstruction", "Tracks"),
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names}
-_MODULES = ("data", "errors", "functional", "io", "methods", "nn", "skeleton", "solvers", "types", "viewer")
+_MODULES = ("data", "errors", "functional", "io", "live", "methods", "nn", "skeleton", "solvers", "types", "viewer")
 
 
 class _Package(ModuleType):

@@ -29,9 +29,10 @@ ALLOWED = {
     "viewer": {"functional"} | BASE,
     "io": {"functional", "viewer"} | BASE,
     "reconstruct": {"functional", "solvers", "nn", "methods"} | BASE,
+    "live": {"functional", "solvers", "nn", "methods"} | BASE,
     "training": {"functional", "solvers", "nn", "methods", "metrics", "data"} | BASE,
     "cli": {"", "functional", "methods", "reconstruct", "io", "data", "viewer", "metrics"} | BASE,
-    "": {"functional", "solvers", "nn", "methods", "reconstruct", "io"} | BASE,
+    "": {"functional", "solvers", "nn", "methods", "reconstruct", "live", "io"} | BASE,
 }
 # Imports made only when called, against the direction: a convenience of the object that the user holds.
 LATE = {("types", "io")}

@@ -8,10 +8,12 @@ from kcs_torch.solvers.iterate import Solution, fpc, iterate, svt
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.procrustean import procrustean
+from kcs_torch.solvers.sign_filter import SignFilter
 from kcs_torch.solvers.signs import SignPath, sign_table, smooth_signs
 
 __all__ = [
     "Denoised",
+    "SignFilter",
     "SignPath",
     "Solution",
     "choose_path",

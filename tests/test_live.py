@@ -1,0 +1,240 @@
+"""The live mode: one frame at a time, causal, of bounded memory, and near the offline method."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import kcs_torch as kt
+from kcs_torch.data import walking_person
+from kcs_torch.functional.align import similarity
+from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.live.turn import follow_rotation
+from kcs_torch.solvers.pose import fit_cameras
+
+FRAMES = 120
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return walking_person(
+        FRAMES, skeleton="coco17", yaw=60, turn=0, noise=3, generator=torch.Generator().manual_seed(1)
+    )
+
+
+def observed(clip):
+    """(T, 17, 2), NaN where unseen."""
+    count = clip.tracks.skeleton.num_observed
+    return torch.where(clip.tracks.seen[..., None], clip.tracks.points, torch.nan)[:, :count]
+
+
+def follow(tracker, frames, confidence=None):
+    return [tracker.update(xy, None if confidence is None else confidence[t]) for t, xy in enumerate(frames)]
+
+
+@pytest.fixture(scope="module")
+def poses(clip):
+    tracker = kt.Tracker("coco17", fps=30, units="mm")
+    return tracker, follow(tracker, observed(clip))
+
+
+def error(points, truth):
+    """Mean distance after one rotation per frame, in mm, of the better of the two mirror images."""
+    flips = (points, points * torch.tensor([1.0, 1.0, -1.0]).to(points))
+    return min(float((similarity(p, truth, scale=False) - truth).norm(dim=-1).mean()) for p in flips)
+
+
+def test_near_the_offline_method(clip, poses):
+    _, found = poses
+    ready = [p.frame for p in found if p.ready]
+    points = torch.stack([p.points for p in found])[ready]
+    truth = clip.points[ready]
+    flat = torch.cat([truth[..., :2], torch.zeros_like(truth[..., :1])], -1)
+    offline = error(kt.reconstruct(clip.tracks, method="pkc", viewpoint="fixed").points[ready], truth)
+    live = error(points, truth)
+    assert live < 1.6 * offline + 5
+    assert live < 0.5 * error(flat, truth)
+
+
+def test_what_a_pose_says(clip, poses):
+    _, found = poses
+    assert [p.frame for p in found] == list(range(FRAMES))
+    ready = [p.ready for p in found]
+    assert not ready[0] and ready[-1] and ready == sorted(ready)
+    assert all((p.delay >= 0) == p.ready for p in found)
+    last = found[-1]
+    assert last.points.shape == (19, 3) and last.uncertainty.shape == last.seen.shape == (19,)
+    assert bool(last.seen.all()) and bool((last.uncertainty > 0).all())
+    assert abs(float(last.points[:, 2].mean())) < 1e-6
+    off = (last.points[:, :2] - clip.tracks.points[-1]).norm(dim=-1)
+    assert float(off.median()) < 10 and float(off.max()) < 80  # mm
+
+
+def test_bones_keep_their_length(poses):
+    tracker, found = poses
+    since = next(p.frame for p in found if p.ready and p.delay >= 15)
+    until = next(p.frame for p in found if p.frame > since and p.delay < found[p.frame - 1].delay)
+    rigid = tracker.skeleton.bone_index()[list(tracker.skeleton.rigid)]
+    lengths = bone_lengths(torch.stack([p.points for p in found[since:until]]), rigid)
+    assert float((lengths.std(0) / lengths.mean(0)).max()) < 1e-9
+
+
+def test_the_same_frames_give_the_same_poses_and_later_ones_change_nothing(clip, poses):
+    again = follow(kt.Tracker("coco17", fps=30), observed(clip)[:60])
+    for a, b in zip(again, poses[1], strict=False):
+        assert torch.equal(a.points, b.points) and torch.equal(a.uncertainty, b.uncertainty)
+
+
+def test_memory_is_bounded_by_the_window(clip):
+    tracker = kt.Tracker("coco17", fps=30, window=20, period=10_000)
+    sizes = []
+    for t, xy in enumerate(torch.cat([observed(clip)] * 2)):
+        tracker.update(xy)
+        if t % 60 == 59:
+            state = [v for v in vars(tracker).values() if hasattr(v, "maxlen")]
+            sizes.append([len(v) for v in state])
+            assert all(len(v) <= 20 for v in state) and len(state) == 4
+    assert sizes[0] == sizes[-1]
+    assert tracker.tracks().num_frames == 20
+
+
+def test_result_is_the_window(clip):
+    tracker = kt.Tracker("coco17", fps=30, window=20, units="mm", method=kt.METHODS["pkc"](viewpoint="fixed", steps=3))
+    frames = observed(clip)[:30]
+    follow(tracker, frames)
+    result = tracker.result()
+    assert result.points.shape == (20, 19, 3) and result.units == "mm" and result.fps == 30
+    assert torch.equal(result.tracks.points[:, :17], frames[10:].double())
+
+
+def test_unseen_joints_are_held_and_doubted(clip, poses):
+    frames = observed(clip)[:70].clone()
+    frames[50:, 9] = torch.nan  # the left wrist
+    found = follow(kt.Tracker("coco17", fps=30), frames)
+    assert all(bool(torch.isfinite(p.points).all()) for p in found)
+    assert bool(found[49].seen[9]) and not bool(found[50].seen[9])
+    more = [float(found[t].uncertainty[9] / poses[1][t].uncertainty[9]) for t in (49, 52, 69)]
+    assert more[0] == 1 and 1 < more[1] < more[2]
+    near = (found[52].points[9, :2] - clip.tracks.points[52, 9]).norm()
+    assert float(near) < 150  # mm; the arm is 600 long
+
+
+def test_frames_without_the_person(clip):
+    frames = observed(clip)[:80].clone()
+    frames[:5] = torch.nan
+    frames[50:60] = torch.nan
+    found = follow(kt.Tracker("coco17", fps=30), frames)
+    assert all(bool(torch.isnan(p.points).all()) and bool(p.uncertainty.isinf().all()) for p in found[:5])
+    assert all(bool(torch.isfinite(p.points).all()) for p in found[5:])
+    assert torch.allclose(found[50].points[:, :2], found[59].points[:, :2])
+    assert not bool(found[55].seen.any()) and bool(found[60].seen.all())
+    assert error(torch.stack([p.points for p in found[62:]]), clip.points[62:80]) < 60
+
+
+def test_starts_anew_after_a_window_without_the_person(clip):
+    tracker = kt.Tracker("coco17", fps=30, window=20)
+    frames = torch.cat([observed(clip)[:40], torch.full((20, 17, 2), torch.nan), observed(clip)[:3]])
+    found = follow(tracker, frames)
+    assert found[39].ready and not found[-1].ready
+    assert tracker.tracks().num_frames == 3
+
+
+def test_low_confidence_is_unseen(clip):
+    frame = observed(clip)[0].clone()
+    sure = torch.ones(17)
+    sure[4] = 0.1
+    frame[4] = 1e6
+    pose = kt.Tracker("coco17", fps=30).update(frame, sure)
+    assert not bool(pose.seen[4]) and float(pose.points.abs().max()) < 1e5
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_dtype_follows_the_input(clip, dtype):
+    pose = kt.Tracker("coco17", fps=30).update(observed(clip)[0].to(dtype))
+    assert pose.points.dtype == pose.uncertainty.dtype == dtype
+
+
+def test_arrays_do_as_well(clip):
+    frame = observed(clip)[0]
+    a, b = (kt.Tracker("coco17", fps=30).update(x) for x in (frame, frame.numpy()))
+    assert torch.equal(a.points, b.points)
+
+
+def test_the_image_may_be_of_any_size_and_place(clip):
+    frames = observed(clip)[:45]
+    a = follow(kt.Tracker("coco17", fps=30), frames)[-1].points
+    b = follow(kt.Tracker("coco17", fps=30), 0.01 * frames + 500)[-1].points
+    assert torch.allclose(100 * (b - torch.tensor([500.0, 500, 0])), a, atol=1.0)
+
+
+def test_without_a_template():
+    body = replace(kt.SKELETONS["coco17"], template=None, spread=None, proportions=None)
+    clip = walking_person(40, skeleton="coco17", turn=200)
+    tracker = kt.Tracker(body, fps=30, window=24, method=kt.METHODS["pkc"](lifts=1))
+    found = follow(tracker, observed(clip))
+    ready = [p.ready for p in found]
+    assert not any(ready[:24]) and ready[-1]
+    assert all(bool(torch.isfinite(p.points).all()) for p in found)
+    lengths = bone_lengths(torch.stack([p.points for p in found[28:]]), tracker.skeleton.bone_index()[:12])
+    assert float((lengths.std(0) / lengths.mean(0)).max()) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda x: x[:16], r"frame 1: xy: expected shape \(17, 2\).*got \(16, 2\)"),
+        (lambda x: x[None], "frame 1: xy: expected 2 dimensions"),
+        (lambda x: x.index_fill(0, torch.tensor([7]), torch.inf), "frame 1: xy: joint 'left_elbow' is infinite"),
+        (lambda x: "a camera", "frame 1: xy: expected an array of numbers"),
+    ],
+)
+def test_bad_frames_are_named_and_not_taken(clip, change, message):
+    tracker = kt.Tracker("coco17", fps=30)
+    tracker.update(observed(clip)[0])
+    with pytest.raises(kt.ShapeError, match=message):
+        tracker.update(change(observed(clip)[1]))
+    assert tracker.update(observed(clip)[1]).frame == 1
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.5, np.inf])
+def test_bad_confidence(clip, value):
+    sure = np.ones(17)
+    sure[3] = value
+    with pytest.raises(kt.ShapeError, match="frame 0: confidence: joint 'left_ear'"):
+        kt.Tracker("coco17", fps=30).update(observed(clip)[0], sure)
+    with pytest.raises(kt.ShapeError, match=r"frame 0: confidence: expected shape \(17,\)"):
+        kt.Tracker("coco17", fps=30).update(observed(clip)[0], np.ones(5))
+
+
+def test_bad_options():
+    for options in ({"fps": 0}, {"fps": "fast"}, {"window": 3}, {"period": 0.5}, {"threshold": 2}):
+        with pytest.raises(kt.OptionError, match=next(iter(options))):
+            kt.Tracker("coco17", **{"fps": 30, **options})
+    loop = kt.SKELETONS["coco17"].with_links([("left_wrist", "right_wrist")])
+    with pytest.raises(kt.SkeletonError, match="one tree"):
+        kt.Tracker(loop)
+    with pytest.raises(kt.ShapeError, match="nothing to reconstruct"):
+        kt.Tracker("coco17").result()
+
+
+def test_follow_rotation_is_the_fit_of_cameras():
+    generator = torch.Generator().manual_seed(0)
+    draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
+    rest = draw(6, 3) * torch.tensor([1.0, 1.0, 0.3])
+    rest = rest - rest.mean(0)
+    truth = torch.linalg.qr(draw(3, 3))[0]
+    truth = truth * torch.linalg.det(truth)
+    start = (
+        torch.matrix_exp(torch.tensor([[0, -0.2, 0.1], [0.2, 0, -0.3], [-0.1, 0.3, 0]], dtype=torch.float64)) @ truth
+    )
+    image = 1.03 * rest @ truth[:2].mT + 0.02 * draw(6, 2)
+    image = image - image.mean(0)
+    one = torch.ones(1, dtype=torch.float64)
+    fit = fit_cameras(
+        image[None], rest[None], torch.ones(1, 6).double(), 0.9 * one, 1.1 * one,
+        robust=None, start=start[None], num_yaws=1, num_steps=8,
+    )  # fmt: skip
+    found = follow_rotation(rest.mT @ rest / 6, image.mT @ rest / 6, start, num_steps=8)
+    assert torch.allclose(found, fit.rotations[0, 0], atol=1e-5)
+    assert torch.allclose(found @ found.mT, torch.eye(3).double(), atol=1e-12)
