@@ -1,4 +1,4 @@
-"""The entry call: what it accepts, what it refuses in words, and which method it chooses."""
+"""The entry call: what it accepts, what it refuses in words, and what its default does."""
 
 import math
 
@@ -8,12 +8,18 @@ import torch
 from torch.testing import assert_close
 
 import kcs_torch as kt
-from kcs_torch import KCS, METHODS, OptionError, SfAM, ShapeError, SkeletonError, Tracks, reconstruct
+from kcs_torch import KCS, METHODS, PKC, OptionError, SfAM, ShapeError, SkeletonError, reconstruct
 from kcs_torch.data import walking_person
 from kcs_torch.skeleton import SKELETONS
 
 CLIP = walking_person(20, turn=90.0)
 TRACKS, POINTS = CLIP.tracks, CLIP.tracks.points
+QUICK = {
+    "kcs": {"rounds": 2, "arrangement": "frames"},
+    "sfam": {"beta": 2.5, "num_steps": 30},
+    "pkc": {"viewpoint": "fixed", "rounds": 0, "steps": 3},
+}
+"""Fields with which each method is fast."""
 
 
 def refused(error, *words, **options):
@@ -47,13 +53,13 @@ def test_arrays_with_nan_and_confidence():
 
 def test_arrays_without_a_skeleton():
     result = reconstruct(POINTS)
-    assert (result.method, result.skeleton.name, result.units) == ("sfam", "points", "px")
+    assert (result.method, result.skeleton.name, result.units) == ("pkc", "points", "px")
     assert result.lengths.shape == (0,)
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_a_methods_name_its_object_and_its_fields_are_one(name):
-    fields = {"kcs": {"rounds": 2, "arrangement": "frames"}, "sfam": {"beta": 2.5, "num_steps": 30}}[name]
+    fields = QUICK[name]
     method = METHODS[name](**fields)
     by_name = reconstruct(TRACKS, method=name, **fields)
     for other in (reconstruct(TRACKS, method=method), method(TRACKS)):
@@ -64,9 +70,12 @@ def test_a_methods_name_its_object_and_its_fields_are_one(name):
 
 def test_results_follow_the_tracks_dtype():
     for dtype in (torch.float32, torch.float64):
-        for method in ("auto", *METHODS):
-            assert reconstruct(TRACKS.to(dtype), method=method).points.dtype == dtype
-    assert reconstruct(POINTS.float().numpy(), skeleton="h36m17").points.dtype == torch.float64  # as readers give it
+        for method, fields in QUICK.items():
+            result = reconstruct(TRACKS.to(dtype), method=method, **fields)
+            given = (result.points, result.cameras, result.lengths, *(a.points for a in result.alternatives))
+            assert {x.dtype for x in given} == {dtype}
+    read = reconstruct(POINTS.float().numpy(), method="sfam", skeleton="h36m17")
+    assert read.points.dtype == torch.float64  # as readers give it
 
 
 def test_the_package_exports_it():
@@ -79,10 +88,10 @@ def test_the_package_exports_it():
 
 
 def test_unknown_methods():
-    refused(OptionError, "unknown method 'sfma': did you mean 'sfam'?", "choices: auto, kcs, sfam", method="sfma")
+    refused(OptionError, "unknown method 'sfma': did you mean 'sfam'?", "choices: auto, kcs, pkc, sfam", method="sfma")
     refused(OptionError, "unknown method 'KCS'", "kcs", method="KCS")
     for nonsense in (None, 3, ["kcs"], KCS):
-        refused(OptionError, "unknown method", "auto, kcs, sfam", method=nonsense)
+        refused(OptionError, "unknown method", "auto, kcs, pkc, sfam", method=nonsense)
 
 
 def test_unknown_fields():
@@ -116,8 +125,9 @@ def test_options_of_arrays_with_tracks():
         refused(OptionError, "belong to arrays; these tracks already have them", **option)
 
 
-def test_fields_with_auto():
-    refused(OptionError, "fields (beta, rounds) need a method's name: kcs, sfam", beta=1.0, rounds=2)
+def test_fields_with_auto_are_the_defaults_own():
+    refused(OptionError, "unknown option of method 'pkc' 'beta'", "rounds", beta=1.0)
+    refused(OptionError, "pkc: steps: expected at least 1, got 0", steps=0)
 
 
 def test_fields_with_a_method_object():
@@ -139,41 +149,50 @@ def test_bad_tracks(tracks):
     refused(ShapeError, "tracks", tracks=tracks)
 
 
-# ---------------------------------------------------------------------- which method auto chooses
+# ---------------------------------------------------------------------- the default
 
 
-@pytest.mark.parametrize(("turn", "method"), [(0.0, "kcs"), (10.0, "kcs"), (180.0, "sfam"), (360.0, "sfam")])
-@pytest.mark.parametrize("yaw", [0.0, 40.0])
-def test_auto_looks_at_the_turn(turn, yaw, method):
-    clip = walking_person(100, turn=turn, yaw=yaw)
-    result = reconstruct(clip.tracks)
-    assert result.method == method
-    if yaw == 0 and method == "kcs":
-        return  # seen from the front and still, legs swing in depth alone: a template cannot tell
-    flat = clip.points * torch.tensor([1.0, 1.0, 0.0]).double()
+def error(points):
+    """Mean distance to the truth of CLIP."""
     centre = lambda x: x - x.mean(1, keepdim=True)  # noqa: E731
-    error = lambda x: (centre(x) - centre(clip.points)).norm(dim=-1).mean()  # noqa: E731
-    assert min(error(result.points), error(result.mirrored().points)) < 0.7 * error(flat)
+    return float((centre(points) - centre(CLIP.points)).norm(dim=-1).mean())
 
 
-def test_auto_needs_no_template():
-    edges = [list(b) for b in SKELETONS["h36m17"].bones]
-    static = walking_person(20, turn=0.0).tracks.points
-    assert reconstruct(Tracks.from_arrays(static, edges=edges)).method == "sfam"
+def test_the_default_is_pkc_and_takes_its_fields():
+    fields = QUICK["pkc"]
+    default = reconstruct(TRACKS, **fields)
+    assert default.method == "pkc"
+    for other in (reconstruct(TRACKS, method="auto", **fields), PKC(**fields)(TRACKS)):
+        assert torch.equal(other.points, default.points)
+    assert error(default.points) < 0.3 * error(CLIP.points * torch.tensor([1.0, 1.0, 0.0]))
 
 
-def test_auto_with_known_cameras():
-    clip = walking_person(60, turn=180.0)
-    result = reconstruct(clip.tracks, cameras=clip.cameras)
-    assert result.method == "sfam" and torch.equal(result.cameras, clip.cameras)
-    still = walking_person(60, turn=0.0)
-    assert reconstruct(still.tracks, cameras=still.cameras.numpy()).method == "kcs"
+def test_without_fields_it_is_pkc_as_it_comes():
+    assert torch.equal(reconstruct(TRACKS).points, PKC()(TRACKS).points)
 
 
-def test_warnings_are_the_chosen_methods_and_point_to_the_caller():
-    points = walking_person(60, turn=180.0).tracks.points.clone()
+def test_known_cameras_are_kept():
+    for cameras in (CLIP.cameras, CLIP.cameras.numpy()):
+        result = reconstruct(TRACKS, cameras=cameras)
+        assert result.method == "pkc" and torch.equal(result.cameras, CLIP.cameras)
+
+
+def test_a_skeleton_is_found_where_that_is_asked_for():
+    plain = walking_person(40, turn=120.0).tracks.points
+    result = reconstruct(plain, skeleton="auto", method="sfam")
+    assert result.skeleton.is_tree and result.skeleton.num_bones == 16
+    assert result.points.shape == (40, 17, 3) and result.lengths.shape == (16,)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_warnings_point_to_the_caller(method):
+    points = POINTS.clone()
     points[:, 6] = math.nan
-    with pytest.warns(kt.KcsWarning) as told:
-        reconstruct(points, skeleton="h36m17")
-    assert len(told) == 1
-    assert told[0].filename == __file__
+    calls = (
+        lambda: reconstruct(points, skeleton="h36m17", method=method, **QUICK[method]),
+        lambda: METHODS[method](**QUICK[method])(kt.Tracks.from_arrays(points, skeleton="h36m17")),
+    )
+    for call in calls:
+        with pytest.warns(kt.KcsWarning, match="never seen") as told:
+            call()
+        assert {w.filename for w in told} == {__file__}

@@ -23,9 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MethodName", "Settings", "lift", "method_fields"]
 
-MethodName = Annotated[
-    str, typer.Option("--method", "-m", metavar="NAME", help="auto, kcs or sfam; auto chooses by the tracks.")
-]
+MethodName = Annotated[str, typer.Option("--method", "-m", metavar="NAME", help="kcs, pkc or sfam; auto is pkc.")]
 Settings = Annotated[
     list[str],
     typer.Option(

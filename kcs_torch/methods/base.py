@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
+import sys
 import time
 import types
 import typing
@@ -113,13 +114,14 @@ class Method(ABC):
         """Tell what the user should not miss."""
         tracks, found = result.tracks, result.diagnostics
         if not found.converged:
-            warnings.warn(f"{tracks.source}: {self._unsettled(found.iterations)}", ConvergenceWarning, stacklevel=3)
+            message = f"{tracks.source}: {self._unsettled(found.iterations)}"
+            warnings.warn(message, ConvergenceWarning, stacklevel=_users_level())
         never = [tracks.skeleton.joints[n] for n in (tracks.weights == 0).all(0).nonzero().flatten().tolist()]
         if never:
             warnings.warn(
                 f"{tracks.source}: never seen, so placed by the skeleton alone: {', '.join(never)}",
                 KcsWarning,
-                stacklevel=3,
+                stacklevel=_users_level(),
             )
 
     def _unsettled(self, steps: int) -> str:
@@ -191,6 +193,14 @@ class Method(ABC):
         """Raise an OptionError for ``field`` unless the rule holds."""
         if not rule:
             raise OptionError(f"{self.name}: {field}: expected {expected}, got {getattr(self, field)!r}")
+
+
+def _users_level() -> int:
+    """The stack level at which a warning names the user's own line, however deep in this package it is given."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "kcs_torch":
+        level, frame = level + 1, frame.f_back
+    return level
 
 
 def _check_cameras(cameras: Tensor, frames: int) -> Tensor:
