@@ -99,13 +99,14 @@ class Method(ABC):
         begin = time.perf_counter()
         if cameras is not None:
             cameras = _check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # solvers differentiate, which inference mode forbids
             known = tracks.seen.any(-1)
             middle = interpolate(_mean(tracks.points, tracks.weights), known[:, None])
             centred = (tracks.points - middle) * tracks.seen[..., None]
             size = _rms(centred, tracks.weights)
             size = torch.where(size > 0, size, torch.ones_like(size))
-            found = self.solve(dataclasses.replace(tracks, points=centred / size), cameras)
+            inner = dataclasses.replace(tracks, points=centred / size, weights=tracks.weights.clone())
+            found = self.solve(inner, None if cameras is None else cameras.clone())
             result = self._finish(tracks, found, size, known, time.perf_counter() - begin)
         self._warn(result)
         return result
