@@ -35,9 +35,11 @@ def test_method_configs_make_the_method_with_its_own_defaults(composed, name):
 
 @pytest.mark.parametrize("name", kt.METHODS)
 def test_fields_can_be_set_on_the_command_line(composed, name):
-    field = next(f for f in dataclasses.fields(kt.METHODS[name]) if isinstance(f.default, float))
-    method = instantiate(composed(f"method={name}", f"+method.{field.name}=0.125").method)
-    assert getattr(method, field.name) == 0.125
+    kind = kt.METHODS[name]
+    field = next(f for f in dataclasses.fields(kind) if type(f.default) in (int, float))
+    value = field.default + 1 if type(field.default) is int else 0.125
+    method = instantiate(composed(f"method={name}", f"+method.{field.name}={value}").method)
+    assert method == kind(**{field.name: value})
 
 
 def test_every_yaml_file_is_reached(root):
