@@ -10,8 +10,9 @@ from kcs_torch.errors import OptionError, unknown
 from kcs_torch.methods import METHODS
 from kcs_torch.methods.base import Method
 from kcs_torch.methods.found import find_skeleton
+from kcs_torch.methods.perspective import reconstruct_perspective
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types import Reconstruction, Tracks
+from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 
 __all__ = ["reconstruct"]
 
@@ -28,6 +29,7 @@ def reconstruct(
     fps: float | None = None,
     units: str = "px",
     cameras: Any = None,
+    intrinsics: Any = None,
     **fields: Any,
 ) -> Reconstruction:
     """Turn 2D joint tracks of one body into 3D motion with bones of constant length; no training data.
@@ -41,6 +43,8 @@ def reconstruct(
         fps: for arrays: frames per second.
         units: for arrays.
         cameras: (T, 2, 3) camera rows, world to camera, where they are known.
+        intrinsics: (fx, fy, cx, cy) or a matrix K (3, 3) in the unit of the tracks, where it is known. Perspective is
+            then taken into account, and ``result.in_space()`` lies before the camera and projects onto the tracks.
         **fields: of the method, such as ``beta=2.0``.
 
     Returns:
@@ -48,7 +52,7 @@ def reconstruct(
 
     Raises:
         OptionError: the method or a field is unknown, or its value is out of range; or array options come with Tracks.
-        ShapeError: an array has the wrong shape or values.
+        ShapeError: an array, or the intrinsics, has the wrong shape or values.
         SkeletonError: the skeleton is unknown or does not fit.
 
     >>> from kcs_torch.data.synthetic import walking_person
@@ -56,6 +60,7 @@ def reconstruct(
     >>> result.points.shape, result.method
     (torch.Size([60, 17, 3]), 'sfam')
     """
+    lens = None if intrinsics is None else Intrinsics.of(intrinsics)
     find = isinstance(skeleton, str) and skeleton == "auto"
     if find:
         skeleton = None
@@ -73,9 +78,12 @@ def reconstruct(
             raise OptionError(
                 f"reconstruct: fields ({', '.join(fields)}) go with a method's name; set them on the method itself"
             )
-        return method(tracks, cameras)
-    if method == "auto":
-        method = DEFAULT
-    if not isinstance(method, str) or method not in METHODS:
-        raise unknown("method", method, ["auto", *METHODS])
-    return METHODS[method].from_options(**fields)(tracks, cameras)
+    else:
+        if method == "auto":
+            method = DEFAULT
+        if not isinstance(method, str) or method not in METHODS:
+            raise unknown("method", method, ["auto", *METHODS])
+        method = METHODS[method].from_options(**fields)
+    if lens is not None:
+        return reconstruct_perspective(method, tracks, lens, cameras)
+    return method(tracks, cameras)

@@ -19,7 +19,7 @@ from kcs_torch.cli.options import (
 from kcs_torch.cli.report import answer, describe, print_json, progress, summary
 
 if TYPE_CHECKING:
-    from kcs_torch.types import Tracks
+    from kcs_torch.types import Intrinsics, Tracks
 
 __all__ = ["MethodName", "Settings", "lift", "method_fields"]
 
@@ -62,6 +62,14 @@ def lift(
         float | None, typer.Option(metavar="NUMBER", help="Frames a second; as TRACKS says if not given.")
     ] = None,
     threshold: Threshold = 0.3,
+    intrinsics: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FX,FY,CX,CY",
+            help="Focal lengths and principal point of the camera in pixels; perspective is then taken into account.",
+            show_default=False,
+        ),
+    ] = None,
     mirror: Annotated[
         bool, typer.Option("--mirror", help="Write the mirror image in depth, which fits the tracks as well.")
     ] = False,
@@ -71,6 +79,8 @@ def lift(
     with answer(as_json):
         check_outputs(output, source=tracks)
         fields = method_fields(method, settings)
+        if intrinsics is not None:
+            fields["intrinsics"] = _lens(intrinsics)
         with progress(f"reading {tracks}"):
             people = _people(tracks, person, format=format, skeleton=skeleton, fps=fps, threshold=threshold)
         use_one_thread()
@@ -102,6 +112,20 @@ def method_fields(method: str, settings: list[str]) -> dict[str, Any]:
     if method not in METHODS:
         raise unknown("method", method, ["auto", *METHODS])
     return parse_settings(settings, [METHODS[method]])
+
+
+def _lens(text: str) -> Intrinsics:
+    """The camera that ``--intrinsics`` names."""
+    from kcs_torch.errors import KcsError, OptionError
+    from kcs_torch.types import Intrinsics
+
+    try:
+        return Intrinsics.of([float(x) for x in text.split(",")])
+    except (ValueError, KcsError):
+        raise OptionError(
+            "--intrinsics: expected FX,FY,CX,CY in pixels, focal lengths positive, such as 1500,1500,960,540, "
+            f"got {text!r}"
+        ) from None
 
 
 def _people(tracks: str, person: str | None, **options: Any) -> list[tuple[int, Tracks]]:

@@ -98,7 +98,7 @@ class Method(ABC):
         """
         begin = time.perf_counter()
         if cameras is not None:
-            cameras = _check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
+            cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         with torch.inference_mode(False), torch.no_grad():  # solvers differentiate, which inference mode forbids
             known = tracks.seen.any(-1)
             middle = interpolate(_mean(tracks.points, tracks.weights), known[:, None])
@@ -116,13 +116,13 @@ class Method(ABC):
         tracks, found = result.tracks, result.diagnostics
         if not found.converged:
             message = f"{tracks.source}: {self._unsettled(found.iterations)}"
-            warnings.warn(message, ConvergenceWarning, stacklevel=_users_level())
+            warnings.warn(message, ConvergenceWarning, stacklevel=users_level())
         never = [tracks.skeleton.joints[n] for n in (tracks.weights == 0).all(0).nonzero().flatten().tolist()]
         if never:
             warnings.warn(
                 f"{tracks.source}: never seen, so placed by the skeleton alone: {', '.join(never)}",
                 KcsWarning,
-                stacklevel=_users_level(),
+                stacklevel=users_level(),
             )
 
     def _unsettled(self, steps: int) -> str:
@@ -196,7 +196,7 @@ class Method(ABC):
             raise OptionError(f"{self.name}: {field}: expected {expected}, got {getattr(self, field)!r}")
 
 
-def _users_level() -> int:
+def users_level() -> int:
     """The stack level at which a warning names the user's own line, however deep in this package it is given."""
     level, frame = 1, sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "kcs_torch":
@@ -204,7 +204,7 @@ def _users_level() -> int:
     return level
 
 
-def _check_cameras(cameras: Tensor, frames: int) -> Tensor:
+def check_cameras(cameras: Tensor, frames: int) -> Tensor:
     """The cameras themselves, if they are (T, 2, 3) with orthonormal rows."""
     if cameras.shape != (frames, 2, 3) or not torch.isfinite(cameras).all():
         raise ShapeError(f"cameras: expected finite ({frames}, 2, 3), got {tuple(cameras.shape)}")

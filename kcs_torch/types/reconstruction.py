@@ -62,6 +62,8 @@ class Reconstruction:
         objective: by which the method ranks solutions of this clip, lower is better; NaN where it has none.
         root_depth: (T,) depth of the body relative to the first frame, or None where nothing tells it.
         alternatives: further solutions of the same tracks, best first: the mirror image, limbs flipped in depth.
+        distance: (T,) depth of the body's middle before a camera of known intrinsics, or None. Then x and y are the
+            camera's, and :meth:`in_space` projects onto the image; the unit is one pixel at the mean distance.
     """
 
     points: Tensor
@@ -76,6 +78,7 @@ class Reconstruction:
     objective: float = float("nan")
     root_depth: Tensor | None = None
     alternatives: tuple[Reconstruction, ...] = ()
+    distance: Tensor | None = None
 
     def __post_init__(self) -> None:
         if not self.units:
@@ -103,23 +106,36 @@ class Reconstruction:
         return self.points[:, : self.skeleton.num_observed]
 
     def mirrored(self) -> Reconstruction:
-        """The other solution that parallel rays admit: depth with the opposite sign."""
+        """The other solution that parallel rays admit: depth with the opposite sign.
+
+        Before a camera of known intrinsics each joint moves along its ray: the mirror image has the same image, but its
+        bones do not keep their length.
+        """
         flip = torch.tensor([1.0, 1.0, -1.0]).to(self.points)
+        if self.distance is not None:
+            far, depth = self.distance[:, None], self.points[..., 2]
+            near = torch.maximum(far - depth, 0.01 * far)
+            points = self.points * (near / (far + depth))[..., None]
+            points = torch.cat([points[..., :2], (near - far)[..., None]], -1)
+            return replace(self, points=points, cameras=self.cameras * flip)
         root = None if self.root_depth is None else -self.root_depth
         return replace(self, points=self.points * flip, cameras=self.cameras * flip, root_depth=root)
 
     def in_space(self) -> Tensor:
         """(T, N, 3): the points with the root's depth path added, so that a walking body moves through space.
 
+        The path begins at depth 0; where intrinsics were given it is the distance, and the camera is the origin.
+
         Raises:
             OptionError: the root's depth is not known.
         """
-        if self.root_depth is None:
+        path = self.root_depth if self.distance is None else self.distance
+        if path is None:
             raise OptionError(
-                "in_space: the root's depth is not known: it takes a fixed camera, a skeleton with contact points and "
-                "feet that stand still now and then; see diagnostics.notes"
+                "in_space: the root's depth is not known: it takes the camera's intrinsics, or a fixed camera, a "
+                "skeleton with contact points and feet that stand still now and then; see diagnostics.notes"
             )
-        return self.points + torch.nn.functional.pad(self.root_depth[:, None, None], (2, 0))
+        return self.points + torch.nn.functional.pad(path[:, None, None], (2, 0))
 
     def scaled(self, *, units: str, factor: float | None = None, **sizes: float) -> Reconstruction:
         """The same motion in another unit.
@@ -160,6 +176,7 @@ class Reconstruction:
             uncertainty=spread,
             units=units,
             root_depth=None if self.root_depth is None else self.root_depth * factor,
+            distance=None if self.distance is None else self.distance * factor,
             alternatives=tuple(other.scaled(units=units, factor=factor) for other in self.alternatives),
         )
 

@@ -6,7 +6,8 @@ Tracks are ``points2d`` (T, N, 2) with NaN where unseen, ``confidence`` (T, N), 
 
 - ``points3d_all`` (T, M, 3) and ``joint_names_all`` (M,): with the virtual joints, which come last; ``bones`` (B, 2)
   are (parent, child) indices into them and ``lengths`` (B,) their lengths;
-- ``cameras`` (T, 2, 3), ``scales`` (T,), ``units3d``, ``method``, and ``uncertainty`` (T, M) where there is one;
+- ``cameras`` (T, 2, 3), ``scales`` (T,), ``units3d``, ``method``, and where they are known ``uncertainty`` (T, M),
+  ``root_depth`` (T,) and ``distance`` (T,);
 - ``skeleton``, ``diagnostics`` and ``notes`` as JSON text.
 """
 
@@ -92,8 +93,8 @@ def write(result: Reconstruction, path: Path) -> None:
     }
     if body.virtual:
         arrays |= {"points2d_virtual": points[:, n:], "confidence_virtual": weights[:, n:]}
-    if result.uncertainty is not None:
-        arrays["uncertainty"] = plain(result.uncertainty)
+    maybe = {"uncertainty": result.uncertainty, "root_depth": result.root_depth, "distance": result.distance}
+    arrays |= {key: plain(value) for key, value in maybe.items() if value is not None}
     with path.open("wb") as file:
         np.savez_compressed(file, **arrays)
 
@@ -153,6 +154,8 @@ def load_reconstruction(path: str | Path) -> Reconstruction:
         method=file.text("method") if "method" in file else "unknown",
         diagnostics=_diagnostics_in(file),
         uncertainty=tensor("uncertainty", t, m) if "uncertainty" in file else None,
+        root_depth=tensor("root_depth", t) if "root_depth" in file else None,
+        distance=tensor("distance", t) if "distance" in file else None,
         units=file.text("units3d") if "units3d" in file else "",
     )
 

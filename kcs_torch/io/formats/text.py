@@ -22,15 +22,20 @@ __all__ = ["WRITERS"]
 def write_csv(result: Reconstruction, path: Path) -> None:
     """Write one row a frame: ``frame, time [s], nose_x [px], nose_y [px], nose_z [px], ...``.
 
-    ``time [s]`` is empty where the frame rate is unknown. Numbers have 9 significant digits.
+    ``time [s]`` is empty where the frame rate is unknown; ``distance [px]`` comes last where it is known. Numbers have
+    9 significant digits.
     """
     points = plain(result.points)
     header = ["frame", "time [s]"]
     header += [f"{_cell(joint)}_{axis} [{result.units}]" for joint in result.skeleton.joints for axis in "xyz"]
+    rows = points.reshape(len(points), -1)
+    if result.distance is not None:
+        header.append(f"distance [{result.units}]")
+        rows = np.concatenate([rows, plain(result.distance)[:, None]], 1)
     with path.open("w", newline="", encoding="utf-8", errors="replace") as file:
         writer = csv.writer(file)
         writer.writerow(header)
-        for frame, row in enumerate(points.reshape(len(points), -1).tolist()):
+        for frame, row in enumerate(rows.tolist()):
             time = f"{frame / result.fps:.6g}" if result.fps else ""
             writer.writerow([frame, time, *(f"{v:.9g}" for v in row)])
 
@@ -53,6 +58,8 @@ def write_json(result: Reconstruction, path: Path) -> None:
         "cameras": _listed(result.cameras),
         "scales": _listed(result.scales),
         "uncertainty": None if result.uncertainty is None else _listed(result.uncertainty),
+        "root_depth": None if result.root_depth is None else _listed(result.root_depth),
+        "distance": None if result.distance is None else _listed(result.distance),
         "skeleton": body.to_dict(),
         "diagnostics": _finite(dataclasses.asdict(result.diagnostics)),
         "notes": list(result.tracks.notes),

@@ -1,0 +1,264 @@
+"""Full perspective for any method: undo it, lift as if the camera were far away, and again until both agree."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import KcsWarning
+from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.temporal import interpolate
+from kcs_torch.methods.base import Method, check_cameras, users_level
+from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
+from kcs_torch.methods.size import slow_waves, weak_perspective
+from kcs_torch.nn.posture import PostureEnergy, trunk_joints
+from kcs_torch.solvers.lbfgs import lbfgs
+from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
+
+__all__ = ["reconstruct_perspective"]
+
+SETTLED = 0.01
+"""Root mean square change of depth, for a body of 1.75, below which no further round is made."""
+
+FLAT = 0.001
+"""Root mean square parallax, for a body of 1.75, below which there is no perspective to speak of."""
+
+APART = 0.04
+"""Root mean square difference in depth, for a body of 1.75, from which on solutions count as two."""
+
+WIDE = 3.0
+"""Tangent of the angle off the optical axis from which on the focal length is hardly true."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Solutions in the virtual camera's frame, best first: points are rays (u, v, 1) times distance + depth.
+
+    Attributes:
+        rays: (T, N, 2), of all joints.
+        distance: (H, T).
+        depth: (H, T, N).
+        energy: (H,).
+        lifted: the method's solutions that they came from, perhaps mirrored.
+        unit: the length that 1 stands for in a body of 1.75, in units of the distance.
+    """
+
+    rays: Tensor
+    distance: Tensor
+    depth: Tensor
+    energy: Tensor
+    lifted: tuple[Reconstruction, ...]
+    unit: float
+
+
+def reconstruct_perspective(
+    method: Method,
+    tracks: Tracks,
+    intrinsics: Intrinsics,
+    cameras: Tensor | None = None,
+    *,
+    rounds: int = 3,
+    steps: int = 100,
+) -> Reconstruction:
+    """Reconstruct a body before a pinhole camera by a method made for parallel rays.
+
+    A virtual camera looks at the body along its line of sight, ray by ray (u, v). At the distance D_t, a joint of
+    relative depth z lies at (u, v) (D_t + z): its image under parallel rays. Starting from z = 0 and D_t from the
+    body's apparent size, each round lifts these tracks by the method, then refines depths, lengths and distances of all
+    its solutions and of a mirror image together under perspective (:class:`PinholeEnergy`); bones' constant lengths
+    tell mirror images apart.
+
+    Args:
+        method: any.
+        tracks: in pixels, or in whatever unit the intrinsics have.
+        intrinsics: of the camera.
+        cameras: (T, 2, 3) known camera rows, world to camera.
+        rounds: of lifting and refining, at most.
+        steps: L-BFGS steps of each refinement.
+
+    Returns:
+        The reconstruction in the camera's frame: ``points + (0, 0, distance)`` projects onto the image. Its unit is one
+        pixel at the mean distance, which is the focal length then; ``scaled`` makes metres of it.
+
+    Warns:
+        KcsWarning: the field of view would be so wide that the focal length is hardly true.
+    """
+    begin = time.perf_counter()
+    rate = tracks.fps or 30.0
+    rays = intrinsics.rays(tracks.points)
+    if bool(tracks.seen.any()) and float(rays[tracks.seen][:, :2].norm(dim=-1).median()) > WIDE:
+        warnings.warn(
+            f"{tracks.source}: half of all joints lie more than {math.degrees(math.atan(WIDE)):.0f} degrees off the "
+            f"optical axis: is the focal length {intrinsics.focal:g} in the tracks' unit ({tracks.units})?",
+            KcsWarning,
+            stacklevel=users_level(),
+        )
+    look = _line_of_sight(rays, tracks.weights, rate)  # (T, 3, 3)
+    rays = rays @ look.mT
+    rays = rays[..., :2] / rays[..., 2:].clamp_min(NEAREST)
+    size = weak_perspective(rays, tracks.seen, tracks.skeleton, rate)
+    distance = torch.full_like(rays[:, 0, 0], intrinsics.focal) / (1 if size is None else size)
+    depth = torch.zeros_like(rays[..., 0])
+    if cameras is not None:
+        known = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
+        cameras = (look @ complete_rotation(known))[:, :2]
+    best: _Found | None = None
+    for _ in range(rounds):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", KcsWarning)
+            lifted = method(_straighten(tracks, rays, distance, depth), cameras)
+        with torch.no_grad():
+            found = _refine(lifted, distance, depth, rate, steps, mirror=cameras is None)
+        moved = float((found.depth[0] - depth).square().mean().sqrt()) / found.unit
+        if best is None or not float(found.energy[0]) > float(best.energy[0]):
+            best = found
+        if moved < SETTLED or not len(found.energy.isfinite().nonzero()):
+            break
+        distance, depth = found.distance[0], found.depth[0]
+    assert best is not None
+    result = _assemble(tracks, intrinsics, look, best)
+    result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
+    method._warn(result)
+    return result
+
+
+def _line_of_sight(rays: Tensor, weights: Tensor, rate: float) -> Tensor:
+    """Rotations (T, 3, 3) from the camera's frame to one that looks at the body, turning slowly."""
+    count = weights.sum(-1, keepdim=True)
+    middle = (rays * weights[..., None]).sum(-2) / torch.where(count > 0, count, torch.ones_like(count))
+    middle = interpolate(middle[:, None], count > 0)[:, 0]
+    smooth = _slow(middle, rate, most=60)
+    ahead = torch.nn.functional.normalize(smooth, dim=-1)
+    right = torch.zeros_like(ahead)
+    right[:, 0] = 1
+    right = torch.nn.functional.normalize(right - ahead[:, :1] * ahead, dim=-1)
+    return torch.stack([right, torch.linalg.cross(ahead, right), ahead], 1)
+
+
+def _slow(values: Tensor, rate: float, *, most: int = 12) -> Tensor:
+    """The slow part of (T, D)."""
+    waves = slow_waves(len(values), rate, values, most=most)
+    basis = torch.cat([torch.ones_like(waves[:, :1]), waves], -1)
+    ridge = 1e-6 * len(values) * torch.eye(basis.shape[1], dtype=values.dtype, device=values.device)
+    mean = values.mean(0)
+    return mean + basis @ torch.linalg.solve(basis.mT @ basis + ridge, basis.mT @ (values - mean))
+
+
+def _straighten(tracks: Tracks, rays: Tensor, distance: Tensor, depth: Tensor) -> Tracks:
+    """The tracks under parallel rays, of a body at distances (T,) with relative depths (T, N)."""
+    n = tracks.skeleton.num_observed
+    own = torch.where(tracks.seen[..., None], rays * _ahead(distance, depth)[..., None], torch.zeros_like(rays))
+    points, weights = tracks.skeleton.complete(own[:, :n], tracks.weights[:, :n])
+    return replace(tracks, points=points, weights=weights)
+
+
+def _ahead(distance: Tensor, depth: Tensor) -> Tensor:
+    """Distance + depth (..., T, N), positive."""
+    return torch.maximum(distance[..., None] + depth, NEAREST * distance[..., None])
+
+
+def _refine(
+    lifted: Reconstruction, distance: Tensor, depth: Tensor, rate: float, steps: int, *, mirror: bool
+) -> _Found:
+    """Refine all solutions of the method under perspective, and the best one's mirror image.
+
+    Args:
+        lifted: the method's solutions, of straightened tracks.
+        distance: (T,) by which they were straightened.
+        depth: (T, N) by which they were straightened.
+        rate: frames a second.
+        steps: of the refinement.
+        mirror: whether depth may have the other sign.
+    """
+    tracks, others = lifted.tracks, (lifted, *lifted.alternatives)
+    flat = lifted.points[..., :2]
+    middle = flat.mean(1, keepdim=True)
+    flat = middle + lifted.scales[:, None, None] * (flat - middle)  # the method's parallel image, clean and complete
+    rays = flat / _ahead(distance, depth)[..., None]
+    start = torch.stack([o.points[..., 2] for o in others])
+    start = start - start.mean(-1, keepdim=True)
+    energy = start.new_tensor([o.objective for o in others])
+    unit = _unit(lifted)
+    exact = distance / lifted.scales
+    parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / unit
+    if parallax < FLAT or not lifted.skeleton.num_bones:
+        return _Found(rays, exact.expand(len(start), -1), start, energy, others, unit)
+    if mirror:
+        others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
+    distance = _slow(exact.log()[:, None], rate)[:, 0].exp()
+    off = (flat - tracks.points).square().sum(-1)[tracks.seen]
+    noise = float((off.mean() / 2).sqrt()) / unit / 2 if len(off) else 0.0
+    pinhole = PinholeEnergy(lifted.skeleton, rays, distance / unit, start / unit, rate, noise)
+    solution = lbfgs(pinhole, pinhole.pack(start / unit), num_steps=steps, tolerance=1e-6)
+    energy = pinhole(solution.value)
+    order = energy.argsort()
+    z, _, shares = pinhole.unpack(solution.value[order])
+    z = z - z.mean(-1, keepdim=True)
+    found = tuple(others[i] for i in order.tolist())
+    return _Found(rays, pinhole.path(shares) * unit, z * unit, energy[order], found, unit)
+
+
+def _unit(lifted: Reconstruction) -> float:
+    """The unit in which the body is about as large as a person of 1.75."""
+    if len(trunk_joints(lifted.skeleton)) >= 3:
+        usual = PostureEnergy(lifted.skeleton).rest_lengths.to(lifted.lengths)
+        unit = float((lifted.lengths / usual).median())
+    else:
+        points = lifted.points - lifted.points.mean(1, keepdim=True)
+        unit = 2 * float(points.square().sum(-1).mean().sqrt())
+    return unit if 0 < unit < math.inf else 1.0
+
+
+def _assemble(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Found) -> Reconstruction:
+    """The best solution in the camera's frame, with those of the others that differ from it."""
+    keep: list[int] = []
+    for k, depth in enumerate(found.depth):
+        apart = [float((depth - found.depth[j]).square().mean().sqrt()) for j in keep]
+        if len(keep) <= max(1, len(found.lifted[0].alternatives)) and all(a > APART * found.unit for a in apart):
+            keep.append(k)
+    made = [_in_camera(tracks, intrinsics, look, found, k) for k in keep]
+    return replace(made[0], alternatives=tuple(made[1:]))
+
+
+def _in_camera(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Found, k: int) -> Reconstruction:
+    """Solution number ``k`` in the camera's frame."""
+    lifted, body = found.lifted[k], tracks.skeleton
+    far = _ahead(found.distance[k], found.depth[k])[..., None]
+    points = torch.cat([found.rays * far, far], -1) @ look
+    points = body.complete(points[:, : body.num_observed])[0]
+    root = points[..., 2].mean(-1)
+    factor = intrinsics.focal / root.log().mean().exp()
+    points, root = points * factor, root * factor
+    off = (intrinsics.project(points) - tracks.points)[tracks.seen]
+    points = torch.cat([points[..., :2], points[..., 2:] - root[:, None, None]], -1)
+    bones = bone_lengths(points, body.bone_index(device=points.device))
+    ratio = bones[:, list(body.rigid)] / bones.mean(0).clamp_min(torch.finfo(bones.dtype).tiny)[list(body.rigid)]
+    spread = (ratio - 1).square().mean(0).sqrt()
+    notes = [n for n in lifted.diagnostics.notes if "root depth" not in n and "weak perspective" not in n]
+    notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
+    facts = replace(
+        lifted.diagnostics,
+        bone_variation=float(100 * spread.median()) if len(spread) else math.nan,
+        reprojection_rms=float(off.square().sum(-1).mean().sqrt()),
+        notes=tuple(notes),
+    )
+    return replace(
+        lifted,
+        points=points,
+        cameras=(look.mT @ complete_rotation(lifted.cameras))[:, :2],
+        scales=intrinsics.focal / root,
+        lengths=bones.median(0).values,
+        tracks=tracks,
+        diagnostics=facts,
+        uncertainty=None if lifted.uncertainty is None else lifted.uncertainty * factor,
+        objective=float(found.energy[k]),
+        root_depth=root - root[0],
+        distance=root,
+        alternatives=(),
+    )

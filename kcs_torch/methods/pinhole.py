@@ -1,0 +1,111 @@
+"""The energy of a body seen through a pinhole: :class:`PinholeEnergy`."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.methods.pkc.objective import Weights, at_rate
+from kcs_torch.methods.size import slow_waves
+from kcs_torch.nn.anatomy import HingeEnergy
+from kcs_torch.nn.posture import ForeshorteningEnergy, PostureEnergy, ProportionEnergy, trunk_joints
+from kcs_torch.skeleton import Skeleton
+
+__all__ = ["NEAREST", "PinholeEnergy"]
+
+NEAREST = 0.15
+"""Joints are kept at least this share of the body's distance before the camera."""
+
+SPEED = 3.0
+"""Usual speed towards the camera a second, for a body of 1.75."""
+
+STRAY = 0.1
+"""Usual deviation of a slow change of distance from what is given, as a share."""
+
+CLOSE = 0.3
+"""Usual deviation of a bone's depth from the method's, for bodies without a template."""
+
+
+class PinholeEnergy:
+    """Energy of depths z, lengths L and distances D of a body seen along rays.
+
+    Points lie at (u, v, 1) (D + z). Bones keep their length and move smoothly; the distance changes slowly. Where the
+    skeleton has a trunk come the anatomical terms of PKC's objective; elsewhere bones stay near the depths that the
+    method found.
+
+    Args:
+        skeleton: of the body.
+        rays: (T, N, 2), complete.
+        distance: (T,) as found so far, in a unit in which the body is about as large as a person of 1.75.
+        near: (H, T, N) the method's depths, in this unit.
+        rate: frames a second.
+        noise: standard deviation of joints in the image, in this unit.
+    """
+
+    def __init__(
+        self, skeleton: Skeleton, rays: Tensor, distance: Tensor, near: Tensor, rate: float, noise: float
+    ) -> None:
+        self.weights = w = at_rate(Weights(), rate)
+        self.skeleton, self.rays, self.distance, self.rate = skeleton, rays, distance, rate
+        self.bones = skeleton.bone_index(device=rays.device)
+        self.near = self._dz(near)
+        self.rigid = list(skeleton.rigid)
+        self.slack = math.hypot(w.length, noise)
+        self.waves = slow_waves(len(rays), rate, rays)
+        self.waves = self.waves - self.waves.mean(0)
+        observed = torch.eye(skeleton.num_observed, dtype=rays.dtype, device=rays.device)
+        self.complete = skeleton.complete(observed)[0].mT  # virtual joints follow their sources
+        self.anatomy = len(trunk_joints(skeleton)) >= 3
+        if self.anatomy:
+            self.posture = PostureEnergy(skeleton, correlation=w.posture).to(rays)
+            self.foreshortening = ForeshorteningEnergy(skeleton, correlation=w.foreshortening).to(rays)
+            self.proportions = ProportionEnergy(skeleton, spread=w.proportions, twins=w.twins).to(rays)
+            self.hinges = HingeEnergy(skeleton).to(rays)
+
+    def points(self, depth: Tensor, distance: Tensor) -> Tensor:
+        """(..., T, N, 3) of depths (..., T, N) and distances (..., T)."""
+        far = torch.maximum(distance[..., None] + depth, NEAREST * distance[..., None])
+        flat = (self.rays * far[..., None])[..., : self.skeleton.num_observed, :]
+        return torch.cat([(flat.mT @ self.complete).mT, depth[..., None]], -1)
+
+    def pack(self, depth: Tensor) -> Tensor:
+        """Unknowns (H, D) of depths (H, T, N), at the distances given."""
+        lengths = bone_lengths(self.points(depth, self.distance), self.bones).median(1).values
+        own = depth[..., : self.skeleton.num_observed].flatten(1)
+        path = depth.new_zeros(len(depth), self.waves.shape[1])
+        return torch.cat([own, lengths.clamp_min(1e-6).log(), path], 1)
+
+    def unpack(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Depths (H, T, N), lengths (H, B) and the slow waves' shares in the distance (H, K)."""
+        count, bones = len(self.rays) * self.skeleton.num_observed, len(self.bones)
+        own = state[:, :count].view(len(state), len(self.rays), -1)
+        return own @ self.complete, state[:, count : count + bones].exp(), state[:, count + bones :]
+
+    def path(self, shares: Tensor) -> Tensor:
+        """Distances (H, T) of the waves' shares (H, K)."""
+        return self.distance * (shares @ self.waves.mT).exp()
+
+    def __call__(self, state: Tensor) -> Tensor:
+        """The energy of each hypothesis, (H,)."""
+        w = self.weights
+        depth, lengths, shares = self.unpack(state)
+        distance = self.path(shares)
+        points = self.points(depth, distance)
+        off = (bone_vectors(points, self.bones).square().sum(-1) - lengths[:, None].square()) / (2 * lengths[:, None])
+        dz = self._dz(depth)
+        total = off[..., self.rigid].square().sum((1, 2)) / (2 * self.slack**2)
+        total = total + dz.diff(n=2, dim=1).square().sum((1, 2)) / (2 * w.acceleration**2)
+        total = total + 100 * depth.mean(-1).square().sum(-1)
+        total = total + (shares / STRAY).square().sum(-1) / 2
+        total = total + (distance.diff(dim=1) * self.rate / SPEED).square().sum(-1) / (2 * w.posture)
+        if not self.anatomy:
+            return total + (dz - self.near).square().sum((1, 2)) / (2 * CLOSE**2)
+        total = total + self.posture(points, lengths) + self.foreshortening(points, lengths)
+        return total + self.proportions(lengths) + w.hinge / w.sine**2 * self.hinges(points, lengths).sum(-1)
+
+    def _dz(self, depth: Tensor) -> Tensor:
+        """Bones' depths (..., B)."""
+        return depth[..., self.bones[:, 1]] - depth[..., self.bones[:, 0]]

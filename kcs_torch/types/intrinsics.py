@@ -1,0 +1,76 @@
+"""What is known of a pinhole camera: :class:`Intrinsics`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import OptionError, ShapeError
+
+__all__ = ["Intrinsics"]
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without distortion: u = fx X/Z + cx, v = fy Y/Z + cy, in the unit of the tracks.
+
+    >>> Intrinsics.of([[1000, 0, 640], [0, 1000, 360], [0, 0, 1]])
+    Intrinsics(fx=1000.0, fy=1000.0, cx=640.0, cy=360.0)
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(x) for x in (self.fx, self.fy, self.cx, self.cy)):
+            raise OptionError(f"intrinsics: expected finite numbers, got {self}")
+        if not (self.fx > 0 and self.fy > 0):
+            raise OptionError(f"intrinsics: expected positive focal lengths, got fx = {self.fx:g}, fy = {self.fy:g}")
+
+    @classmethod
+    def of(cls, value: Any) -> Intrinsics:
+        """Read (fx, fy, cx, cy) or a matrix K (3, 3).
+
+        Raises:
+            ShapeError: it is neither.
+            OptionError: a focal length is not positive, a number is not finite, or K is skewed.
+        """
+        if isinstance(value, Intrinsics):
+            return value
+        what = "intrinsics: expected (fx, fy, cx, cy) or a matrix K (3, 3)"
+        try:
+            matrix = torch.as_tensor(value, dtype=torch.float64).cpu()
+        except (TypeError, ValueError, RuntimeError):
+            raise ShapeError(f"{what}, got {value!r}") from None
+        if matrix.shape not in ((4,), (3, 3)):
+            raise ShapeError(f"{what}, got shape {tuple(matrix.shape)}")
+        if matrix.ndim == 2:
+            (fx, skew, cx), (tilt, fy, cy), last = matrix.tolist()
+            if abs(skew) > 1e-3 * abs(fx) or tilt != 0 or last != [0, 0, 1]:
+                raise OptionError(
+                    "intrinsics: expected K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] without skew, got "
+                    f"{matrix.tolist()}: undistort the tracks first"
+                )
+            return cls(fx, fy, cx, cy)
+        return cls(*matrix.tolist())
+
+    @property
+    def focal(self) -> float:
+        """The geometric mean of the focal lengths."""
+        return math.sqrt(self.fx) * math.sqrt(self.fy)
+
+    def rays(self, image: Tensor) -> Tensor:
+        """(..., 3) directions (X/Z, Y/Z, 1) of image points (..., 2)."""
+        x, y = (image[..., 0] - self.cx) / self.fx, (image[..., 1] - self.cy) / self.fy
+        return torch.stack([x, y, torch.ones_like(x)], -1)
+
+    def project(self, points: Tensor) -> Tensor:
+        """Images (..., 2) of points (..., 3) in the camera frame."""
+        scale = points.new_tensor([self.fx, self.fy])
+        return scale * points[..., :2] / points[..., 2:] + points.new_tensor([self.cx, self.cy])

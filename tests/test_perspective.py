@@ -1,0 +1,260 @@
+"""Full perspective: intrinsics given, for every method."""
+
+import csv
+import json
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+import kcs_torch as kt
+from kcs_torch.cli import app
+from kcs_torch.io import load_reconstruction
+from kcs_torch.types import Intrinsics
+
+LENS = (1500.0, 1480.0, 960.0, 540.0)
+
+
+def filmed(nearest=2500.0, lens=LENS, frames=60, skeleton="h36m17", noise=0.0, **view):
+    """Tracks in px of a walking person whose nearest joint comes as near as that (mm), and the true points (mm)."""
+    clip = kt.data.walking_person(frames, skeleton=skeleton, **{"turn": 0, "yaw": 30, **view})
+    points = clip.points.clone()
+    points[..., 2] += nearest - float(points[..., 2].min())
+    image = Intrinsics.of(lens).project(points)[:, : clip.skeleton.num_observed]
+    image = image + noise * torch.randn(image.shape, generator=torch.Generator().manual_seed(0), dtype=image.dtype)
+    return kt.Tracks.from_arrays(image, skeleton=clip.skeleton, fps=30.0), points
+
+
+def reconstruct(tracks, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", kt.KcsWarning)
+        return kt.reconstruct(tracks, **options)
+
+
+def error(points, truth):
+    """Mean distance (mm) after the best rotation of each frame and one scale for the clip."""
+    a, b = points - points.mean(1, keepdim=True), truth - truth.mean(1, keepdim=True)
+    a = a @ kt.functional.nearest_rotation((a.mT @ b).mT).mT
+    return float((a * ((a * b).sum() / (a * a).sum()) - b).norm(dim=-1).mean())
+
+
+def check_sound(result, before=True):
+    """All numbers are finite, and the points lie before the camera."""
+    for tensor in (result.points, result.cameras, result.scales, result.lengths, result.distance, result.root_depth):
+        assert bool(tensor.isfinite().all())
+    assert bool((result.in_space()[..., 2] > 0).all()) or not before
+    rows = result.cameras @ result.cameras.mT
+    torch.testing.assert_close(rows, torch.eye(2).to(rows).expand_as(rows), rtol=0, atol=1e-4)
+
+
+# ---------------------------------------------------------------------- Intrinsics
+
+
+def test_intrinsics_from_numbers_and_from_a_matrix():
+    matrix = [[1500, 0, 960], [0, 1480, 540], [0, 0, 1]]
+    wanted = Intrinsics(*LENS)
+    for value in (LENS, list(LENS), np.array(LENS), torch.tensor(LENS), matrix, np.array(matrix), wanted):
+        assert Intrinsics.of(value) == wanted
+    assert wanted.focal == pytest.approx(math.sqrt(1500 * 1480))
+
+
+def test_rays_and_projection_are_inverse():
+    lens = Intrinsics(*LENS)
+    points = torch.tensor([[0.3, -0.2, 4.0], [-1.0, 1.0, 2.0]], dtype=torch.float64)
+    image = lens.project(points)
+    assert image[0].tolist() == pytest.approx([1500 * 0.3 / 4 + 960, -1480 * 0.2 / 4 + 540])
+    torch.testing.assert_close(lens.rays(image) * points[:, 2:], points)
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "says"),
+    [
+        ((1500, 1500, 960), kt.ShapeError, r"got shape \(3,\)"),
+        (np.eye(4), kt.ShapeError, r"got shape \(4, 4\)"),
+        ("1500", kt.ShapeError, "got '1500'"),
+        ({"fx": 1}, kt.ShapeError, "fx, fy, cx, cy"),
+        ((-1500, 1500, 0, 0), kt.OptionError, "positive focal lengths, got fx = -1500"),
+        ((0, 1500, 0, 0), kt.OptionError, "positive focal lengths"),
+        ((math.nan, 1500, 0, 0), kt.OptionError, "finite"),
+        ((1500, 1500, math.inf, 0), kt.OptionError, "finite"),
+        ([[1500, 50, 0], [0, 1500, 0], [0, 0, 1]], kt.OptionError, "without skew.*undistort"),
+        ([[1500, 0, 0], [0, 1500, 0], [0, 0, 2]], kt.OptionError, "without skew"),
+    ],
+)
+def test_bad_intrinsics_are_told(value, kind, says):
+    with pytest.raises(kind, match=says):
+        kt.reconstruct(filmed(frames=3)[0], intrinsics=value)
+
+
+def test_cameras_that_do_not_fit_are_told():
+    with pytest.raises(kt.ShapeError, match=r"cameras: expected finite \(3, 2, 3\)"):
+        kt.reconstruct(filmed(frames=3)[0], intrinsics=LENS, cameras=torch.zeros(2, 2, 3))
+
+
+# ---------------------------------------------------------------------- what it brings
+
+
+@pytest.mark.parametrize("method", ["kcs", "sfam", "pkc"])
+def test_every_method_projects_onto_the_image_and_gets_better(method):
+    tracks, truth = filmed(yaw=60)
+    plain, result = reconstruct(tracks, method=method), reconstruct(tracks, method=method, intrinsics=LENS)
+    check_sound(result)
+    image = Intrinsics.of(LENS).project(result.in_space())
+    off = (image - tracks.points)[tracks.seen].square().sum(-1).mean().sqrt()
+    assert result.diagnostics.reprojection_rms == pytest.approx(float(off), rel=1e-3)
+    assert float(off) < 2.0 and result.method == method and result.tracks is tracks
+    assert error(result.points, truth) < 0.8 * error(plain.points, truth)
+
+
+def test_a_person_who_walks_towards_the_camera_comes_nearer_by_the_true_ratio():
+    tracks, truth = filmed(yaw=20, frames=90)
+    result = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    true = truth[..., 2].mean(1)
+    assert float(true[0] / true[-1]) > 1.8  # what there is to find
+    path = result.distance / true
+    assert float((path / path.mean() - 1).abs().max()) < 0.05
+    torch.testing.assert_close(result.root_depth, result.distance - result.distance[0])
+    assert any("full perspective" in note for note in result.diagnostics.notes)
+
+
+def test_in_metres_the_person_is_where_they_are():
+    tracks, truth = filmed(yaw=60, frames=60)
+    result = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    factor = float(kt.functional.bone_lengths(truth, result.skeleton.bones).median(0).values.sum() / 1000)
+    result = result.scaled(units="m", factor=factor / float(result.lengths.sum()))
+    assert float((1000 * result.in_space() - truth).norm(dim=-1).mean()) < 0.06 * float(truth[..., 2].mean())
+    assert float((1000 * result.in_space() - truth).norm(dim=-1).mean()) > 0  # measured, not copied
+
+
+def test_body_off_the_optical_axis():
+    """Seen 30 degrees from the axis the same scene gives the same body."""
+    tracks, truth = filmed(yaw=60, frames=45)
+    turn = torch.tensor(math.radians(30), dtype=torch.float64)
+    c, s, o = turn.cos(), turn.sin(), torch.zeros_like(turn)
+    aside = truth @ torch.stack([torch.stack([c, o, s]), torch.stack([o, o + 1, o]), torch.stack([-s, o, c])]).mT
+    other = kt.Tracks.from_arrays(Intrinsics.of(LENS).project(aside), skeleton=tracks.skeleton, fps=30.0)
+    first, second = (reconstruct(t, method="kcs", intrinsics=LENS) for t in (tracks, other))
+    assert error(second.points, truth) == pytest.approx(error(first.points, truth), rel=0.1)
+    assert error(second.points, truth) < 0.7 * error(reconstruct(other, method="kcs").points, truth)
+
+
+@pytest.mark.parametrize("method", ["kcs", "sfam", "pkc"])
+def test_a_very_long_focal_length_changes_nothing(method):
+    clip = kt.data.walking_person(30, turn=60)
+    lens = (1e8, 1e8, 0.0, 0.0)
+    plain, result = reconstruct(clip.tracks, method=method), reconstruct(clip.tracks, method=method, intrinsics=lens)
+    check_sound(result)
+    middle = lambda x: x - x.mean(1, keepdim=True)  # noqa: E731
+    torch.testing.assert_close(middle(result.points), middle(plain.points), rtol=0, atol=0.1)  # mm
+    assert float(result.distance.log().mean().exp()) == pytest.approx(1e8)
+
+
+def test_known_cameras_are_kept():
+    tracks, truth = filmed(yaw=30, turn=60, frames=90)
+    clip = kt.data.walking_person(90, yaw=30, turn=60)
+    result = reconstruct(tracks, method="sfam", intrinsics=LENS, cameras=clip.cameras)
+    check_sound(result)
+    torch.testing.assert_close(result.cameras, clip.cameras, rtol=0, atol=1e-6)
+    plain = reconstruct(tracks, method="sfam", cameras=clip.cameras)
+    assert error(result.points, truth) < 0.5 * error(plain.points, truth)
+
+
+def test_the_mirror_image_has_the_same_image():
+    tracks, _ = filmed(frames=20)
+    result = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    other = result.mirrored()
+    project = Intrinsics.of(LENS).project
+    torch.testing.assert_close(project(other.in_space()), project(result.in_space()))
+    torch.testing.assert_close(other.points[..., 2], -result.points[..., 2])
+    torch.testing.assert_close(other.mirrored().points, result.points)
+
+
+def test_any_skeleton():
+    """A body without a template, three metres from the camera."""
+    arm = kt.Skeleton.from_names(list("abcd"), [("a", "b"), ("b", "c"), ("c", "d")])
+    clip = kt.data.random_motion(arm, 60, turn=180, generator=torch.Generator().manual_seed(1))
+    truth = clip.points + torch.tensor([0, 0, 3000.0], dtype=torch.float64)
+    tracks = kt.Tracks.from_arrays(Intrinsics.of(LENS).project(truth), skeleton=arm, fps=30.0)
+    for method in ("sfam", "pkc"):
+        result = reconstruct(tracks, method=method, intrinsics=LENS)
+        check_sound(result)
+        assert result.diagnostics.reprojection_rms < 5.0
+    free = kt.Tracks.from_arrays(tracks.points, fps=30.0)  # no bones at all
+    check_sound(reconstruct(free, method="sfam", intrinsics=LENS))
+
+
+# ---------------------------------------------------------------------- degenerate input
+
+
+@pytest.mark.parametrize("method", ["kcs", "sfam", "pkc"])
+def test_no_tracks_give_nan(method):
+    tracks, _ = filmed(frames=20)
+    still = kt.Tracks.from_arrays(tracks.points[:1].expand(20, -1, -1), skeleton=tracks.skeleton)
+    holes = tracks.points.clone()
+    holes[3:7] = math.nan  # frames without a joint
+    holes[:, 5] = math.nan  # a joint that is never seen
+    holes[::2, 12] = math.nan
+    point = torch.full((8, 17, 2), 700.0, dtype=torch.float64)
+    for given in (
+        still,
+        kt.Tracks.from_arrays(holes, skeleton=tracks.skeleton, fps=30.0),
+        kt.Tracks.from_arrays(point, skeleton=tracks.skeleton),
+        tracks.frames(0, 1),
+        tracks.frames(0, 2),
+        tracks.to(torch.float32),
+    ):
+        result = reconstruct(given, method=method, intrinsics=LENS)
+        check_sound(result)
+        assert result.points.dtype == given.points.dtype
+
+
+@pytest.mark.parametrize("focal", [1e-3, 1.0, 50.0, 1e12])
+def test_an_absurd_focal_length_gives_no_nan(focal):
+    tracks, _ = filmed(frames=12)
+    check_sound(reconstruct(tracks, method="kcs", intrinsics=(focal, focal, 0.0, 0.0)), before=focal > 1)
+
+
+def test_a_focal_length_in_another_unit_is_told():
+    with pytest.warns(kt.KcsWarning, match=r"focal length 1.2 in the tracks' unit \(px\)"):
+        kt.reconstruct(filmed(frames=5)[0], method="kcs", intrinsics=(1.2, 1.2, 0.5, 0.5))
+
+
+# ---------------------------------------------------------------------- files and the command line
+
+
+def test_files_keep_the_distance(tmp_path):
+    tracks, _ = filmed(frames=10)
+    result = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    back = load_reconstruction(result.save(tmp_path / "a.npz"))
+    assert torch.equal(back.distance, result.distance) and torch.equal(back.root_depth, result.root_depth)
+    assert torch.equal(back.in_space(), result.in_space())
+    told = json.loads(result.save(tmp_path / "a.json").read_text(encoding="utf-8"))
+    assert told["distance"] == pytest.approx(result.distance.tolist())
+    with result.save(tmp_path / "a.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.reader(file))
+    assert rows[0][-1] == "distance [px]"
+    assert [float(row[-1]) for row in rows[1:]] == pytest.approx(result.distance.tolist())
+
+
+def test_scaled_scales_the_distance():
+    result = reconstruct(filmed(frames=5)[0], method="kcs", intrinsics=LENS)
+    torch.testing.assert_close(result.scaled(units="m", factor=2.0).distance, 2 * result.distance)
+
+
+def test_command_line(tmp_path):
+    tracks, _ = filmed(frames=10)
+    source, output = tmp_path / "tracks.npz", tmp_path / "out.npz"
+    body = tracks.skeleton
+    np.savez(source, points2d=tracks.points.numpy(), joint_names=np.array(body.joints), fps=30.0)
+    words = ["lift", str(source), "-o", str(output), "--method", "kcs", "--skeleton", "h36m17"]
+    done = CliRunner().invoke(app, [*words, "--intrinsics", "1500,1480,960,540"])
+    assert done.exit_code == 0, done.output
+    wanted = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    torch.testing.assert_close(load_reconstruction(output).distance, wanted.distance)
+    for wrong in ("1500", "a,b,c,d", "-1,1,0,0", "nan,1,0,0", ""):
+        done = CliRunner().invoke(app, [*words, "--intrinsics", wrong])
+        assert done.exit_code == 2
+        assert "--intrinsics: expected FX,FY,CX,CY" in done.output
