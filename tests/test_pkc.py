@@ -1,0 +1,298 @@
+"""PKC end to end: walks before fixed and turning cameras, what is told of them, and clips that tell little."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from kcs_torch import PKC, KcsWarning, OptionError, Skeleton, Tracks
+from kcs_torch.data import random_motion, walking_person
+from kcs_torch.methods.pkc import method as module
+
+NAN = math.nan
+FLIP = torch.tensor([1.0, 1.0, -1.0]).double()
+QUICK = {"viewpoint": "fixed", "rounds": 0, "steps": 5}
+
+
+def centred(points):
+    return points - points.mean(1, keepdim=True)
+
+
+def error(points, truth):
+    """Mean distance to the truth, over that of a flat guess."""
+    flat = centred(truth)[..., 2].abs().mean()
+    return float((centred(points) - centred(truth)).norm(dim=-1).mean() / flat)
+
+
+@pytest.fixture(scope="module")
+def still():
+    """A walk before a camera that stands still, and its reconstruction by the default settings."""
+    clip = walking_person(40, turn=0.0, yaw=40.0)
+    return clip, PKC()(clip.tracks)
+
+
+@pytest.fixture(scope="module")
+def turning():
+    """The same before a camera that goes half around."""
+    clip = walking_person(50, turn=180.0, yaw=0.0)
+    return clip, PKC()(clip.tracks)
+
+
+# ---------------------------------------------------------------------- walks
+
+
+def test_fixed_camera(still):
+    clip, result = still
+    assert error(result.points, clip.points) < 0.15
+    assert error(result.points * FLIP, clip.points) > 1  # and the right one of the mirror images
+    assert result.diagnostics.bone_variation < 2
+    assert any("rests on the skeleton's template" in note for note in result.diagnostics.notes)
+
+
+def test_turning_camera(turning):
+    clip, result = turning
+    assert error(result.points, clip.points) < 0.1
+    assert result.diagnostics.viewpoint_turn > 120
+    assert not any("template" in note for note in result.diagnostics.notes)
+
+
+def test_image_is_kept(still, turning):
+    for clip, result in (still, turning):
+        assert_close(result.points[..., :2], clip.points[..., :2], rtol=0, atol=1e-6)
+        assert result.diagnostics.reprojection_rms < 1e-6
+        assert_close(result.scales, torch.ones_like(result.scales))
+
+
+def test_the_walker_walks_through_space(still):
+    clip, result = still
+    path = clip.points[:, 0, 2] - clip.points[0, 0, 2]
+    found = result.in_space()[:, 0, 2]
+    assert path[-1].abs() > 1000  # mm
+    assert (found - found[0] - path).abs().max() < 0.2 * path.abs().max()
+
+
+@pytest.mark.parametrize("case", ["fixed", "turning"])
+def test_most_joints_are_within_two_deviations(case, still, turning):
+    clip, result = still if case == "fixed" else turning
+    off = (centred(result.points) - centred(clip.points))[..., 2].abs()
+    assert result.uncertainty.shape == off.shape and (result.uncertainty > 0).all()
+    assert ((off < 2 * result.uncertainty).double().mean()) > 0.8
+    size = centred(clip.points).square().sum(-1).mean().sqrt()
+    assert result.uncertainty.mean() < 0.5 * size
+
+
+@pytest.mark.parametrize("case", ["fixed", "turning"])
+def test_alternatives_differ_and_are_ranked(case, still, turning):
+    _, result = still if case == "fixed" else turning
+    every = (result, *result.alternatives)
+    assert 2 <= len(every) <= 5
+    values = [found.objective for found in every]
+    assert values == sorted(values) and all(map(math.isfinite, values))
+    size = centred(result.points).square().sum(-1).mean().sqrt()
+    for k, one in enumerate(every):
+        assert one.tracks is result.tracks and (k == 0 or one.alternatives == ())
+        assert torch.isfinite(one.points).all() and torch.isfinite(one.uncertainty).all()
+        for other in every[:k]:
+            assert (one.points - other.points)[..., 2].square().mean().sqrt() > 0.01 * size
+
+
+def test_fewer_alternatives_are_the_first_ones(still):
+    clip, _ = still
+    more, fewer = (PKC(**QUICK, alternatives=n)(clip.tracks) for n in (4, 1))
+    assert torch.equal(more.points, fewer.points) and len(fewer.alternatives) == 1
+    assert torch.equal(more.alternatives[0].points, fewer.alternatives[0].points)
+    assert PKC(**QUICK, alternatives=0)(clip.tracks).alternatives == ()
+
+
+# ---------------------------------------------------------------------- the viewpoint option
+
+
+def test_each_solver_alone(still, turning):
+    (clip, _), (other, _) = still, turning
+    assert error(PKC(viewpoint="fixed", rounds=0)(clip.tracks).points, clip.points) < 0.15
+    assert error(PKC(viewpoint="moving")(other.tracks).points, other.points) < 0.1
+
+
+def test_fixed_needs_a_template_with_a_trunk():
+    clip = walking_person(20)
+    for body in (Skeleton.from_edges(clip.skeleton.bones, 17), replace(clip.skeleton, template=None)):
+        with pytest.raises(OptionError, match="viewpoint: 'fixed' needs a skeleton with a template and a trunk"):
+            PKC(viewpoint="fixed")(replace(clip.tracks, skeleton=body))
+
+
+@pytest.mark.parametrize("frames", [1, module.LEAST_FRAMES - 1])
+def test_too_few_frames_leave_no_choice(frames):
+    clip = walking_person(frames)
+    moving, fixed = (PKC(viewpoint=v, rounds=0, steps=5)(clip.tracks) for v in ("moving", "fixed"))
+    assert torch.equal(moving.points, fixed.points)
+
+
+# ---------------------------------------------------------------------- bodies
+
+
+def robot():
+    arm = Skeleton.from_names(["base", "one", "two", "three", "tip"], [
+        ("base", "one"), ("one", "two"), ("two", "three"), ("three", "tip"),
+    ])  # fmt: skip
+    return random_motion(arm, 60, turn=180.0, generator=torch.Generator().manual_seed(3))
+
+
+def test_a_body_that_nobody_has_described():
+    clip = robot()
+    result = PKC()(clip.tracks)
+    assert min(error(result.points, clip.points), error(result.mirrored().points, clip.points)) < 0.1
+    (mirror,) = result.alternatives  # nothing tells it from the truth
+    assert_close(mirror.points, result.mirrored().points)
+    assert mirror.objective == result.objective and "mirror" in mirror.diagnostics.notes[0]
+    assert result.root_depth is None
+
+
+def test_seeds_of_random_starts():
+    clip = robot()
+    one, same, other = (PKC(lifts=1, seed=seed)(clip.tracks).points for seed in (1, 1, 2))
+    assert torch.equal(one, same) and not torch.equal(one, other)
+
+
+def test_known_cameras_tell_the_mirror_images_apart(turning):
+    clip, _ = turning
+    result = PKC()(clip.tracks, clip.cameras)
+    assert error(result.points, clip.points) < 0.1
+    assert torch.equal(result.cameras, clip.cameras) and result.alternatives == ()
+
+
+# ---------------------------------------------------------------------- units, types
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e4])
+def test_units_scale_the_result(still, factor):
+    clip, _ = still
+    points = clip.tracks.points
+    plain, other = (PKC(**QUICK)(replace(clip.tracks, points=p)) for p in (points, factor * points - 5 * factor))
+    for found, expected in zip((other, *other.alternatives), (plain, *plain.alternatives), strict=True):
+        assert_close(centred(found.points) / factor, centred(expected.points), rtol=0, atol=1.0)  # mm
+        assert_close(found.uncertainty / factor, expected.uncertainty, rtol=0.01, atol=1.0)
+        assert_close(found.lengths / factor, expected.lengths, rtol=0, atol=1.0)
+        assert found.objective == pytest.approx(expected.objective, abs=0.1)
+
+
+def test_single_precision(still):
+    clip, _ = still
+    wide = PKC(**QUICK)(clip.tracks)
+    result = PKC(**QUICK)(clip.tracks.to(torch.float32))
+    assert result.points.dtype == result.uncertainty.dtype == result.root_depth.dtype == torch.float32
+    assert_close(result.points.double(), wide.points, rtol=0, atol=20.0)  # mm, of a person
+
+
+def test_a_body_whose_size_in_the_image_changes(turning):
+    clip, _ = turning
+    size = torch.linspace(0.7, 1.3, 50).double()
+    tracks = replace(clip.tracks, points=centred(clip.tracks.points) * size[:, None, None])
+    result = PKC(viewpoint="moving")(tracks)
+    assert_close(result.scales / result.scales.mean(), size / size.mean(), rtol=0, atol=0.08)
+    assert any("size in the image varies" in note for note in result.diagnostics.notes)
+    true = result.points * (centred(clip.points).std() / centred(result.points).std())
+    assert error(true, clip.points) < 0.2
+
+
+# ---------------------------------------------------------------------- clips that tell little
+
+
+def check(result):
+    frames, joints = result.tracks.num_frames, result.tracks.num_joints
+    for one in (result, *result.alternatives):
+        assert one.points.shape == (frames, joints, 3)
+        assert one.uncertainty is None or one.uncertainty.shape == (frames, joints)
+        for value in (one.points, one.cameras, one.scales, one.lengths, one.uncertainty, one.root_depth):
+            assert value is None or torch.isfinite(value).all()
+
+
+def of(points):
+    return Tracks.from_arrays(points, skeleton="h36m17", fps=30.0)
+
+
+WALK = walking_person(16, turn=60.0).tracks.points
+LITTLE = {
+    "one frame": lambda: WALK[:1],
+    "static": lambda: WALK[:1].expand(16, -1, -1),
+    "one place": lambda: torch.zeros(16, 17, 2),
+    "on a line": lambda: WALK * torch.tensor([0.0, 1.0]),
+    "a frame unseen": lambda: WALK.index_fill(0, torch.tensor([4]), NAN),
+    "a leg unseen": lambda: WALK.index_fill(1, torch.tensor([4, 5, 6]), NAN),
+    "the trunk unseen": lambda: WALK.index_fill(1, torch.tensor([0, 7, 8]), NAN),
+    "all but two joints unseen": lambda: WALK.index_fill(1, torch.arange(2, 17), NAN),
+    "all but one joint unseen": lambda: WALK.index_fill(1, torch.arange(1, 17), NAN),
+}
+
+
+@pytest.mark.parametrize("viewpoint", ["auto", "fixed", "moving"])
+@pytest.mark.parametrize("case", LITTLE)
+@pytest.mark.filterwarnings("ignore:.*never seen")
+def test_clips_that_tell_little(case, viewpoint):
+    check(PKC(viewpoint=viewpoint, rounds=1, steps=3)(of(LITTLE[case]())))
+
+
+def test_one_pose_gives_one_pose():
+    result = PKC(viewpoint="fixed", rounds=0)(of(LITTLE["static"]()))
+    assert (result.points - result.points[:1]).abs().max() < 20  # mm
+    assert result.points[0, :, 2].std() > 30  # and not flat
+
+
+def test_a_leg_never_seen_is_told_and_uncertain():
+    tracks = of(LITTLE["a leg unseen"]())
+    with pytest.warns(KcsWarning, match="never seen.*left_knee"):
+        result = PKC(**QUICK)(tracks)
+    legs = {
+        name: [result.skeleton.joints.index(f"{side}_{name}") for side in ("left", "right")]
+        for name in ("knee", "ankle")
+    }
+    for left, right in legs.values():  # as long as the other one
+        up = lambda joint: (result.points[:, joint] - result.points[:, 0]).norm(dim=-1).mean()  # noqa: E731
+        assert up(left) / up(right) == pytest.approx(1, abs=0.35)
+
+
+# ---------------------------------------------------------------------- noise, gaps, wrong detections
+
+
+def test_noise_gaps_and_wrong_detections_are_cleaned_first():
+    clip = walking_person(60, turn=0.0, noise=20.0, missing=0.1, generator=torch.Generator().manual_seed(1))
+    points = clip.tracks.points.clone()
+    points[::9, 3] += 600.0
+    tracks = of(torch.where(clip.tracks.seen[..., None], points, NAN))
+    result, raw = PKC(rounds=0)(tracks), PKC(rounds=0, denoise=False)(tracks)
+    notes = " ".join(result.diagnostics.notes)
+    assert "rejected as outliers" in notes and "tracks smoothed" in notes
+    assert error(result.points, clip.points) < 0.5
+    assert error(result.points, clip.points) < error(raw.points, clip.points)
+
+
+# ---------------------------------------------------------------------- fields
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("viewpoint", "still"),
+        ("viewpoint", None),
+        ("denoise", "yes"),
+        ("denoise", 1),
+        ("lifts", 0),
+        ("lifts", 2.5),
+        ("rounds", -1),
+        ("rounds", NAN),
+        ("steps", 0),
+        ("alternatives", -1),
+        ("alternatives", True),
+        ("seed", "one"),
+        ("seed", None),
+    ],
+)
+def test_fields_out_of_range(field, value):
+    with pytest.raises(OptionError, match=f"pkc: {field}: expected"):
+        PKC(**{field: value})
+
+
+def test_unknown_fields_are_answered_with_the_right_one():
+    with pytest.raises(OptionError, match="did you mean 'rounds'"):
+        PKC.from_options(round=1)
