@@ -8,6 +8,8 @@ import numpy as np
 import torch
 
 from kcs_torch.data import walking_person
+from kcs_torch.functional import bone_lengths
+from kcs_torch.nn import PostureEnergy
 from kcs_torch.types import Diagnostics, Reconstruction
 
 
@@ -29,6 +31,14 @@ def walk_result(num_frames=12, *, skeleton="coco17", dtype=torch.float64, fps=25
         uncertainty=clip.points[..., 2].abs() + 1 if uncertain else None,
         units="m",
     )
+
+
+def walk_in_template_units(num_frames=40, *, skeleton="h36m17", dtype=torch.float64, **options):
+    """A walk before a fixed camera, centred per frame, as large as the skeleton's template: (T, N, 3)."""
+    points = walking_person(num_frames, skeleton=skeleton, **{"turn": 0.0, "yaw": 40.0, **options}).points
+    posture = PostureEnergy(skeleton)
+    ratio = posture.rest_lengths / bone_lengths(points, posture.bones).mean(0)
+    return ((points - points.mean(1, keepdim=True)) * ratio.median()).to(dtype)
 
 
 def write_openpose(folder: Path, detections, *, name="clip_{:012d}_keypoints.json", frames=None) -> Path:

@@ -2,21 +2,13 @@
 
 import pytest
 import torch
+from samples import walk_in_template_units as walk
 from torch.testing import assert_close
 
-from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths
 from kcs_torch.methods.pkc.fixed_view import Hypotheses, fixed_view
 from kcs_torch.nn import PostureEnergy
 from kcs_torch.skeleton import SKELETONS
-
-
-def walk(frames=40, skeleton="h36m17", dtype=torch.float64, **options):
-    """A walk before a fixed camera, in the template's units, centred per frame: (T, N, 3)."""
-    points = walking_person(frames, skeleton=skeleton, **{"turn": 0.0, "yaw": 40.0, **options}).points
-    posture = PostureEnergy(skeleton)
-    points = points - points.mean(1, keepdim=True)
-    return (points * (posture.rest_lengths / bone_lengths(points, posture.bones).mean(0)).median()).to(dtype)
 
 
 def solve(points, skeleton="h36m17", noise=0.0, **options):
@@ -128,7 +120,7 @@ def test_clips_that_tell_little(kind):
 
 @pytest.mark.parametrize("skeleton", ["coco17", "mediapipe33", "cmu17"])
 def test_any_skeleton_of_a_person(skeleton):
-    points = walk(12, skeleton)
+    points = walk(12, skeleton=skeleton)
     assert error(solve(points, skeleton, steps=8).depth[0], points) < 0.15
 
 

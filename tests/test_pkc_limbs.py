@@ -5,10 +5,10 @@ import itertools
 import pytest
 import torch
 from numerics import CHAIN
+from samples import walk_in_template_units
 from torch.testing import assert_close
 
-from kcs_torch.data import walking_person
-from kcs_torch.functional import bone_lengths, bone_vectors
+from kcs_torch.functional import bone_vectors
 from kcs_torch.methods.pkc.limbs import SignCosts, limb_paths, limbs_of, waves
 from kcs_torch.nn import PostureEnergy
 from kcs_torch.nn.posture import free_bones, trunk_joints
@@ -60,10 +60,8 @@ def test_waves_go_outwards(body):
 
 def walk(frames=60, dtype=torch.float64, **options):
     """A walk in the template's units, (T, 17, 3), and the arguments of limb_paths that follow from it."""
-    points = walking_person(frames, **{"turn": 0.0, "yaw": 40.0, **options}).points
+    points = walk_in_template_units(frames, dtype=dtype, **options)
     posture = PostureEnergy(MAN).to(dtype)
-    points = (points - points.mean(1, keepdim=True)) / 1000
-    points = (points * (posture.rest_lengths / bone_lengths(points, posture.bones).mean(0)).median()).to(dtype)
     vectors = bone_vectors(points, posture.bones)
     return vectors, posture, posture.frame(points)
 
