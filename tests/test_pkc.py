@@ -256,7 +256,7 @@ def test_a_leg_never_seen_is_told_and_uncertain():
 
 
 def test_noise_gaps_and_wrong_detections_are_cleaned_first():
-    clip = walking_person(60, turn=0.0, noise=20.0, missing=0.1, generator=torch.Generator().manual_seed(1))
+    clip = walking_person(60, turn=0.0, noise=6.0, missing=0.05, generator=torch.Generator().manual_seed(1))
     points = clip.tracks.points.clone()
     points[::9, 3] += 600.0
     tracks = of(torch.where(clip.tracks.seen[..., None], points, NAN))
