@@ -10,8 +10,6 @@ import kcs_torch as kt
 from kcs_torch.data import walking_person
 from kcs_torch.functional.align import similarity
 from kcs_torch.functional.chain import bone_lengths
-from kcs_torch.live.turn import follow_rotation
-from kcs_torch.solvers.pose import fit_cameras
 
 FRAMES = 120
 
@@ -74,7 +72,7 @@ def test_what_a_pose_says(clip, poses):
 def test_bones_keep_their_length(poses):
     tracker, found = poses
     since = next(p.frame for p in found if p.ready and p.delay >= 15)
-    until = next(p.frame for p in found if p.frame > since and p.delay < found[p.frame - 1].delay)
+    until = next((p.frame for p in found if p.frame > since and p.delay < found[p.frame - 1].delay), FRAMES)
     rigid = tracker.skeleton.bone_index()[list(tracker.skeleton.rigid)]
     lengths = bone_lengths(torch.stack([p.points for p in found[since:until]]), rigid)
     assert float((lengths.std(0) / lengths.mean(0)).max()) < 1e-9
@@ -94,7 +92,7 @@ def test_memory_is_bounded_by_the_window(clip):
         if t % 60 == 59:
             state = [v for v in vars(tracker).values() if hasattr(v, "maxlen")]
             sizes.append([len(v) for v in state])
-            assert all(len(v) <= 20 for v in state) and len(state) == 4
+            assert all(len(v) <= 20 for v in state) and len(state) == 3
     assert sizes[0] == sizes[-1]
     assert tracker.tracks().num_frames == 20
 
@@ -165,19 +163,58 @@ def test_the_image_may_be_of_any_size_and_place(clip):
     frames = observed(clip)[:45]
     a = follow(kt.Tracker("coco17", fps=30), frames)[-1].points
     b = follow(kt.Tracker("coco17", fps=30), 0.01 * frames + 500)[-1].points
-    assert torch.allclose(100 * (b - torch.tensor([500.0, 500, 0])), a, atol=1.0)
+    assert torch.allclose(100 * (b - torch.tensor([500.0, 500, 0])), a, atol=5.0)
 
 
 def test_without_a_template():
     body = replace(kt.SKELETONS["coco17"], template=None, spread=None, proportions=None)
-    clip = walking_person(40, skeleton="coco17", turn=200)
+    clip = walking_person(60, skeleton="coco17", turn=200)
     tracker = kt.Tracker(body, fps=30, window=24, method=kt.METHODS["pkc"](lifts=1))
     found = follow(tracker, observed(clip))
     ready = [p.ready for p in found]
-    assert not any(ready[:24]) and ready[-1]
+    assert not any(ready[:47]) and all(ready[48:])
     assert all(bool(torch.isfinite(p.points).all()) for p in found)
-    lengths = bone_lengths(torch.stack([p.points for p in found[28:]]), tracker.skeleton.bone_index()[:12])
+    lengths = bone_lengths(torch.stack([p.points for p in found[48:]]), tracker.skeleton.bone_index()[:12])
     assert float((lengths.std(0) / lengths.mean(0)).max()) < 1e-9
+
+
+def test_poses_wait_for_the_solve_and_no_longer(clip):
+    found = follow(kt.Tracker("coco17", fps=30, window=36), observed(clip)[:60])
+    first = next(p.frame for p in found if p.ready)
+    assert first == 11 + 4 + 1  # 12 frames, solved while a third as many come
+    assert [p.delay for p in found[first : first + 3]] == [5, 6, 7]
+    assert found[35 + 12 + 1].delay == 13
+
+
+def test_bodies_that_show_nothing(clip):
+    still = observed(clip)[:1].expand(60, -1, -1)
+    nothing = torch.full((60, 17, 2), 7.0)
+    line = torch.stack([torch.zeros(17), torch.arange(17.0)], -1).expand(60, -1, -1)
+    for frames in (still, nothing, line):
+        found = follow(kt.Tracker("coco17", fps=30, window=24), frames)
+        assert all(bool(torch.isfinite(p.points).all()) for p in found)
+    found = follow(kt.Tracker("coco17", fps=30, window=24), still)
+    assert float((found[-1].points - found[-2].points).abs().max()) < 1e-6
+
+
+def test_a_jump_in_the_image_changes_nothing_and_a_bad_detection_little(clip, poses):
+    frames = observed(clip)[:90].clone()
+    frames[70:] += 5000
+    found = follow(kt.Tracker("coco17", fps=30), frames)
+    moved = found[89].points - torch.tensor([5000.0, 5000.0, 0.0])
+    assert torch.allclose(moved, poses[1][89].points, atol=1e-6)
+    frames[80, 3] += 3000
+    found = follow(kt.Tracker("coco17", fps=30), frames)
+    points = torch.stack([p.points for p in found[82:]])
+    assert error(points, clip.points[82:90]) < 60
+
+
+def test_finds_the_body_again_after_it_turned_unseen(clip):
+    behind = walking_person(60, skeleton="coco17", yaw=-150, turn=0)
+    frames = torch.cat([observed(clip)[:60], torch.full((30, 17, 2), torch.nan), observed(behind)])
+    found = follow(kt.Tracker("coco17", fps=30), frames)
+    assert all(bool(torch.isfinite(p.points).all()) for p in found)
+    assert error(torch.stack([p.points for p in found[-40:]]), behind.points[-40:]) < 40  # flat: 87
 
 
 @pytest.mark.parametrize(
@@ -186,6 +223,7 @@ def test_without_a_template():
         (lambda x: x[:16], r"frame 1: xy: expected shape \(17, 2\).*got \(16, 2\)"),
         (lambda x: x[None], "frame 1: xy: expected 2 dimensions"),
         (lambda x: x.index_fill(0, torch.tensor([7]), torch.inf), "frame 1: xy: joint 'left_elbow' is infinite"),
+        (lambda x: 1e200 * x, "frame 1: xy: joint 'nose' is beyond"),
         (lambda x: "a camera", "frame 1: xy: expected an array of numbers"),
     ],
 )
@@ -216,25 +254,3 @@ def test_bad_options():
         kt.Tracker(loop)
     with pytest.raises(kt.ShapeError, match="nothing to reconstruct"):
         kt.Tracker("coco17").result()
-
-
-def test_follow_rotation_is_the_fit_of_cameras():
-    generator = torch.Generator().manual_seed(0)
-    draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
-    rest = draw(6, 3) * torch.tensor([1.0, 1.0, 0.3])
-    rest = rest - rest.mean(0)
-    truth = torch.linalg.qr(draw(3, 3))[0]
-    truth = truth * torch.linalg.det(truth)
-    start = (
-        torch.matrix_exp(torch.tensor([[0, -0.2, 0.1], [0.2, 0, -0.3], [-0.1, 0.3, 0]], dtype=torch.float64)) @ truth
-    )
-    image = 1.03 * rest @ truth[:2].mT + 0.02 * draw(6, 2)
-    image = image - image.mean(0)
-    one = torch.ones(1, dtype=torch.float64)
-    fit = fit_cameras(
-        image[None], rest[None], torch.ones(1, 6).double(), 0.9 * one, 1.1 * one,
-        robust=None, start=start[None], num_yaws=1, num_steps=8,
-    )  # fmt: skip
-    found = follow_rotation(rest.mT @ rest / 6, image.mT @ rest / 6, start, num_steps=8)
-    assert torch.allclose(found, fit.rotations[0, 0], atol=1e-5)
-    assert torch.allclose(found @ found.mT, torch.eye(3).double(), atol=1e-12)

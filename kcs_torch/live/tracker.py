@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,9 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
-from kcs_torch.live.filter import BodyFilter, ChainFilter, Known, Shape, place
-from kcs_torch.live.solve import Solution, solve_chain, solve_window
+from kcs_torch.live.filter import BodyFilter, ChainFilter, Shape
+from kcs_torch.live.solve import Solution, solve_window
 from kcs_torch.methods.pkc import PKC
-from kcs_torch.methods.pkc.trunk import mirror
 from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton, get_skeleton
@@ -25,20 +24,17 @@ from kcs_torch.types.intake import as_number
 
 __all__ = ["LivePose", "Tracker"]
 
-SOLVED_FRAMES = 30
-"""Frames of a window that are solved, evenly spread: more tell little more, and take longer."""
+LEAST = 12
+"""Frames that a window has at least."""
 
-EARLY = (1 / 3, 1.0)
+LENGTH, AGAIN = 3.0, 10.0
+"""Seconds of a window, and after which it is solved again."""
+
+EARLY: tuple[float, ...] = (1 / 3, 1.0)
 """Shares of the window that are solved as it fills."""
 
-LENGTH = 3.0
-"""Seconds of a window."""
-
-STEPS = 12
-"""L-BFGS steps of a solve, at most."""
-
-AGAIN = 10.0
-"""Seconds after which the window is solved again."""
+DELAY = 1 / 3
+"""Frames that a solve may take, a share of those solved; without a template the whole."""
 
 REMEMBERED = 3
 """Windows that the bones' proportions are averaged over."""
@@ -46,17 +42,20 @@ REMEMBERED = 3
 REPLAYED = 15
 """Solved frames that the filter takes again when a window has been solved, and all frames since."""
 
+LOST = 0.5
+"""Seconds without the body after which the filter starts anew from many headings."""
+
 FOUND, USUAL = 0.02, 0.1
 """Standard deviation of a bone's length as a share: as it is found, and before."""
-
-SCALE = 0.6
-"""Quantile over bones of longest image over usual length that is taken for the scale, before the first solve."""
 
 FLAT = 0.25
 """Share of its length below which a bone's depth is no better known for being small."""
 
 DRIFT, FARTHEST = 1.0, 0.3
 """Speed at which an unseen joint's deviation grows, a second, and how far; a person being 1.75 tall."""
+
+LARGEST = 1e100
+"""Largest coordinate: its square is finite."""
 
 
 @dataclass(frozen=True)
@@ -84,20 +83,18 @@ class LivePose:
 class Tracker:
     """3D poses of one body from 2D joints, frame by frame.
 
-    Each update costs one step of a causal filter: the trunk's rotation from the frame before, the signs of the limbs'
+    Each update is one step of a causal filter: the trunk's rotation from the frame before, the signs of the limbs'
     depths by the forward half of a second-order Viterbi recursion, and bones of constant length. Bone lengths, the
-    trunk's shape and the signs so far come from solving the window as :class:`kcs_torch.PKC` does before a fixed
-    viewpoint: when a third of the window has come, when it is full, and then every ``period`` frames. A solve is spread
-    over the updates that follow, a slice each. On one thread of a CPU a step takes 1 to 2 ms (17 joints), a slice 20 to
-    100 ms, the longest one 0.3 to 0.5 s: a camera's frames wait that long, three times in the first 20 seconds.
+    trunk's shape and the signs so far come from the window of the newest frames, solved by :class:`kcs_torch.PKC` as
+    before a fixed viewpoint: when a third of the window has come, when it is full, then every ``period`` frames. A
+    window is solved in a thread of its own while frames go on. What it finds is taken over a fixed number of frames
+    later, a third of the window's: the same frames give the same poses on every machine. Where frames come faster than
+    that, or the machine is slow, that one update waits for the thread.
 
-    Bone lengths in the tracks' units change when a solve ends, not between: so does the size of a body that comes
-    nearer.
-
-    The camera is taken not to move. Without a template the viewpoint has to turn: depths are 0 and ``ready`` is False
-    until the first full window has been solved, in one piece, which may take seconds. All work is done on the CPU in
-    double precision, whatever the input is; poses come back on the device and in the dtype of the input. The same
-    frames give the same poses. Memory does not grow beyond the window.
+    Bone lengths in the tracks' units change when a window has been solved, not between: so does the size of a body that
+    comes nearer. The camera is taken to move little. Without a template the viewpoint has to turn: depths are 0 and
+    ``ready`` is False until a full window has been solved, which takes seconds. All work is done on the CPU in double
+    precision; poses come back on the device and in the dtype of the input. Memory does not grow beyond the window.
 
     Args:
         skeleton: name, file or :class:`kcs_torch.Skeleton`; its bones form a tree.
@@ -106,7 +103,7 @@ class Tracker:
         period: frames between solves; ten seconds if None.
         units: of the tracks.
         threshold: a joint with less confidence counts as unseen.
-        method: whose fields :meth:`result` takes, and the solves, with fewer ``steps``; ``PKC()`` if None.
+        method: whose fields :meth:`result` takes, and the solves, with fewer steps; ``PKC()`` if None.
 
     Raises:
         SkeletonError: the skeleton is unknown, or its bones are no tree.
@@ -136,27 +133,33 @@ class Tracker:
         if not body.is_tree:
             raise SkeletonError(
                 f"Tracker: expected a skeleton whose bones form one tree, got '{body.name}'; "
-                "kcs_torch.methods.found.find_skeleton finds one from a clip"
+                "kcs_torch.find_skeleton finds one from a clip"
             )
         rate, least = as_number(fps), as_number(threshold)
         if rate is None or not 0 < rate < float("inf"):
             raise OptionError(f"Tracker: fps: expected a positive number, got {fps!r}")
         if least is None or not 0 <= least <= 1:
             raise OptionError(f"Tracker: threshold: expected a confidence within 0..1, got {threshold!r}")
-        window = max(SOLVED_FRAMES, round(LENGTH * rate)) if window is None else window
+        window = max(2 * LEAST, round(LENGTH * rate)) if window is None else window
         period = max(window, round(AGAIN * rate)) if period is None else period
         for name, value in (("window", window), ("period", period)):
-            if not isinstance(value, int) or isinstance(value, bool) or value < 12:
-                raise OptionError(f"Tracker: {name}: expected at least 12 frames, got {value!r}")
+            if not isinstance(value, int) or isinstance(value, bool) or value < LEAST:
+                raise OptionError(f"Tracker: {name}: expected at least {LEAST} frames, got {value!r}")
         self.skeleton, self.fps, self.window, self.period = body, rate, window, period
         self.units, self.threshold = units, least
         self.method = PKC() if method is None else method
-        self._due = [min(max(12, round(share * window)), window) for share in EARLY]
-        self._templated = len(trunk_joints(body)) >= 3
         self._filter: BodyFilter | ChainFilter
-        self._filter = BodyFilter(body, rate) if self._templated else ChainFilter(body, rate)
+        early = EARLY
+        if len(trunk_joints(body)) >= 3:
+            self._filter, self._delay = BodyFilter(body, rate), DELAY
+        else:
+            self._filter, early, self._delay = ChainFilter(body, rate), EARLY[-1:], 1.0
+        self._early = [min(max(LEAST, round(share * window)), window) for share in early]
         self._bones = body.bone_index()
-        self._tree = chain_inverse(incidence(self._bones, body.num_joints, dtype=torch.float64)).square()
+        self._tree = chain_inverse(incidence(self._bones, body.num_joints, dtype=torch.float64))  # (N, B)
+        self._rigid = torch.zeros(body.num_bones, dtype=torch.bool)
+        self._rigid[list(body.rigid)] = True
+        self._thread = ThreadPoolExecutor(1, "kcs_torch.live")
         self._frame = -1
         self.reset()
 
@@ -165,16 +168,16 @@ class Tracker:
         self._filter.reset()
         self._image: deque[Tensor] = deque(maxlen=self.window)  # complete, (N, 2)
         self._weights: deque[Tensor] = deque(maxlen=self.window)
-        self._points: deque[Tensor] = deque(maxlen=self.window)
-        self._path: deque[Tensor] = deque(maxlen=self.window)
         self._shape: Shape | None = None
-        self._age: Tensor = torch.zeros(self.skeleton.num_joints, dtype=torch.float64)
-        self._met: Tensor = torch.zeros(self.skeleton.num_joints, dtype=torch.bool)
-        self._solving: Generator[None, None, Solution] | None = None
-        self._since = self._frame + 1  # the frame that the window began with
-        self._asked = self._solved = -1
-        self._told = 0
-        self._next = self._since + (self._due[0] if self._templated else self.window) - 1
+        self._longest = torch.zeros(self.skeleton.num_bones, dtype=torch.float64)  # of the bones' images
+        self._age = torch.zeros(self.skeleton.num_joints, dtype=torch.float64)  # frames since a joint was seen
+        self._met = torch.zeros(self.skeleton.num_joints, dtype=torch.bool)
+        self._solving: Future[Solution | None] | None = None
+        self._asked = self._ready = -1  # frames at which the running solve began, and at which it is taken over
+        self._solved = -1  # frame at which the last solve began
+        self._told = 0  # frames that the proportions come from
+        self._begun = self._frame + 1  # frame from which the filter follows the body without a break
+        self._due = deque(self._begun + frames - 1 for frames in self._early)
 
     def update(self, xy: Any, confidence: Any = None) -> LivePose:
         """Take the next frame and return its pose.
@@ -191,24 +194,21 @@ class Tracker:
         self._frame += 1
         seen = weights > 0
         if not self._image and not bool(seen.any()):
-            self._since, self._next = self._since + 1, self._next + 1
+            self._due = deque(frame + 1 for frame in self._due)
             blank, unsure = (points.new_full((len(points), 3), x).to(like) for x in (torch.nan, torch.inf))
             return LivePose(self._frame, blank, unsure[:, 0], seen.to(blank.device), False, -1)
+        if float(self._age.amin()) > LOST * self.fps and bool(seen.any()):
+            self._filter.reset()
+            self._begun = self._frame
         image = self._complete(points, seen)
         self._image.append(image)
         self._weights.append(weights)
-        shape = self._shape or self._guess()
-        dz = self._filter.run(image[None], weights[None], shape)[-1]
-        self._path.append(self._filter.path[-1])
-        pose = self._pose(image, dz, seen, shape).to(like)
-        out = LivePose(
-            self._frame,
-            pose[:, :3],
-            pose[:, 3],
-            seen.to(pose.device),
-            self._shape is not None,
-            self._frame - self._solved if self._shape is not None else -1,
-        )
+        self._longest = torch.maximum(self._longest, bone_vectors(image, self._bones).norm(dim=-1))
+        shape = self._shape or self._filter.guess(self._longest)
+        dz = self._filter.step(image, weights, shape)
+        points, unsure = (x.to(like) for x in self._pose(image, dz, shape))
+        delay = self._frame - self._solved if self._shape else -1
+        out = LivePose(self._frame, points, unsure, seen.to(points.device), self._shape is not None, delay)
         if float(self._age.amin()) >= self.window:
             self.reset()
         else:
@@ -252,8 +252,11 @@ class Tracker:
             raise ShapeError(f"{where}: xy: expected shape {expected}, got {tuple(given.shape)}")
         points = given.detach().to("cpu", torch.float64)
         infinite = torch.isinf(points).any(-1)
+        huge = (points.abs() > LARGEST).any(-1)
         if bool(infinite.any()):
             raise ShapeError(f"{where}: xy: {name(infinite)} is infinite; write NaN where a joint is unseen")
+        if bool(huge.any()):
+            raise ShapeError(f"{where}: xy: {name(huge)} is beyond {LARGEST:g}; scale the tracks")
         seen = torch.isfinite(points).all(-1)
         if confidence is None:
             weights = seen.double()
@@ -284,73 +287,54 @@ class Tracker:
             points = place_unseen(flat, self._met, self.skeleton)[0, :, :2]
         return points
 
-    def _guess(self) -> Shape:
-        """The body as far as the frames so far tell: the template, at the scale of its longest images."""
-        image = torch.stack(list(self._image))
-        if isinstance(self._filter, BodyFilter):
-            usual = self._filter.usual
-            ratio = (bone_vectors(image, self._bones).norm(dim=-1).amax(0) / usual.lengths)[list(self.skeleton.rigid)]
-            scale = float(torch.quantile(ratio, SCALE)) if len(ratio) else 1.0
-            return Shape(1 / scale if scale > 0 else 1.0, usual.lengths, usual.trunk)
-        size = float((image - image.mean(1, keepdim=True)).square().sum(-1).mean().sqrt())
-        factor = 0.5 / size if size > 0 else 1.0
-        return Shape(factor, bone_vectors(image, self._bones).norm(dim=-1).amax(0) * factor, image.new_zeros(0, 3))
+    def _pose(self, image: Tensor, dz: Tensor, shape: Shape) -> tuple[Tensor, Tensor]:
+        """Joints (N, 3) whose rigid bones have their length, and the deviation (N,) of their depths, in tracks' units.
 
-    def _pose(self, image: Tensor, dz: Tensor, seen: Tensor, shape: Shape) -> Tensor:
-        """Joints and the deviation of their depths, (N, 4), in the tracks' units."""
-        points, dz = place(self.skeleton, image * shape.factor, dz, shape.lengths, self._filter.body)
-        points[:, 2] -= points[:, 2].mean()
-        length = shape.lengths.clamp_min(1e-9)
+        A bone that looks too long is shortened. Bones of the trunk keep the direction that image and rotation give.
+        """
+        image, length = image * shape.factor, shape.lengths
+        flat = bone_vectors(image, self._bones)
+        size = flat.norm(dim=-1).clamp_min(1e-12)
+        whole = torch.where(self._filter.body, torch.hypot(size, dz), size)
+        share = torch.where(self._filter.body, length / whole, (length / whole).clamp_max(1.0))
+        deep = torch.copysign((length.square() - size.square()).clamp_min(0).sqrt(), dz)
+        depth = torch.where(self._filter.body, dz * share, deep)
+        vectors = torch.cat([flat * share[:, None], depth[:, None]], -1)
+        vectors = torch.where(self._rigid[:, None], vectors, torch.cat([flat, dz[:, None]], -1))
+        points = self._tree @ vectors
+        middle = torch.nn.functional.pad(image.mean(0), (0, 1))
+        points = points - points.mean(0) + middle
         off = length * (USUAL if self._shape is None else FOUND) / (dz.abs() / length).clamp_min(FLAT)
-        variance = self._tree @ (off.square() + self._filter.doubt * (2 * dz).square())
+        variance = self._tree.square() @ (off.square() + self._filter.doubt * (2 * dz).square())
         variance = variance + (self._age * (DRIFT / self.fps)).clamp_max(FARTHEST).square()
-        pose = torch.cat([points, variance.sqrt()[:, None]], -1) / shape.factor
-        self._points.append(pose[:, :3])
-        return pose
+        return points / shape.factor, variance.sqrt() / shape.factor
 
     # ------------------------------------------------------------------ the window
 
     def _advance(self) -> None:
-        """One slice of a window solve, where one is due."""
-        if self._solving is None and self._frame >= self._next:
+        """Begin to solve the window where that is due; take over what was found."""
+        if self._solving is not None and self._frame >= self._ready:
+            found, self._solving = self._solving.result(), None
+            if found is not None:
+                self._adopt(found)
+        if self._solving is None and self._due[0] <= self._frame:
+            self._due.popleft()
+            if not self._due:
+                self._due.append(self._frame + self.period)
             image, weights = torch.stack(list(self._image)), torch.stack(list(self._weights))
-            stride, steps = max(1, -(-len(image) // SOLVED_FRAMES)), min(self.method.steps, STEPS)
-            if self._templated:
-                warm = torch.stack(list(self._points))[..., 2]
-                self._solving = solve_window(
-                    self.skeleton, image, weights, self.fps, stride=stride, steps=steps, warm=warm
-                )
-            else:
-                self._solving = solve_chain(self.skeleton, image, weights, self.fps, stride=stride, method=self.method)
+            self._solving = self._thread.submit(solve_window, self.method, self.skeleton, image, weights, self.fps)
             self._asked = self._frame
-            age = self._frame + 1 - self._since
-            later = [f for f in self._due if f > age]
-            self._next = self._since + later[0] - 1 if later else self._frame + self.period
-        elif self._solving is not None:
-            try:
-                next(self._solving)
-            except StopIteration as end:
-                self._solving, self._solved = None, self._asked
-                self._adopt(end.value)
+            self._ready = self._frame + max(1, round(self._delay * len(image)))
 
     def _adopt(self, found: Solution) -> None:
-        """Take over the body that was found, and let the filter take the frames since then again."""
-        shape, known = found.shape, found.known
-        self._told = min(self._told + found.frames, REMEMBERED * self.window)
-        if self._shape is not None:
-            shape = shape.blended(self._shape, found.frames / self._told)
-        self._shape = shape
+        """Take over the body that was found, and let the filter take the window's last frames again."""
+        count = len(found.told.depths)
+        self._told = min(self._told + count, REMEMBERED * self.window)
+        shape = found.shape if self._shape is None else found.shape.blended(self._shape, count / self._told)
+        self._shape, self._solved = shape, self._asked
+        frames = list(zip(self._image, self._weights, strict=True))
         since = self._frame - self._asked
-        image, weights = torch.stack(list(self._image)), torch.stack(list(self._weights))
-        path = torch.stack(list(self._path))
-        told = len(image) - since  # frames of the window up to the solved window's end
-        begin = max(0, told - REPLAYED)
-        count = told - begin
-        if count > 0:
-            last = Known(known.depths[-count:], known.rotations[-count:])
-            self._filter.run(image[begin:told], weights[begin:told], self._shape, last)
-            own, goal = path[told - 1], last.rotations[-1]
-            if float((mirror(own) * goal).sum()) > float((own * goal).sum()):
-                path = mirror(path)
-        if since and count > 0:
-            self._filter.run(image[told:], weights[told:], self._shape, start=path[told:])
+        again = min(REPLAYED + since, len(frames), self._frame + 1 - self._begun)
+        self._filter.reset()
+        for i, (image, weights) in enumerate(frames[-again:], count + since - again):
+            self._filter.step(image, weights, shape, found.told[i] if i < count else None)
