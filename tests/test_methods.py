@@ -230,7 +230,7 @@ def test_gradients_are_neither_needed_nor_kept():
 
 
 ROUNDING = {"kcs": 1e-3, "sfam": 1e-3, "pkc": 5e-3}
-"""What rounding may change, a share of the body: PKC's quasi-Newton steps, cut off at a number, turn 1e-14 into 1e-3."""
+"""What rounding may change, a share of the body: PKC's quasi-Newton steps, cut off at a number, make 1e-3 of 1e-14."""
 
 
 def relative(a, b):
