@@ -63,7 +63,7 @@ def reconstruct_perspective(
     intrinsics: Intrinsics,
     cameras: Tensor | None = None,
     *,
-    rounds: int = 3,
+    rounds: int = 2,
     steps: int = 100,
 ) -> Reconstruction:
     """Reconstruct a body before a pinhole camera by a method made for parallel rays.

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
-from kcs_torch.methods.pkc.objective import Weights, at_rate
 from kcs_torch.methods.size import slow_waves
 from kcs_torch.nn.anatomy import HingeEnergy
 from kcs_torch.nn.posture import ForeshorteningEnergy, PostureEnergy, ProportionEnergy, trunk_joints
@@ -19,11 +18,23 @@ __all__ = ["NEAREST", "PinholeEnergy"]
 NEAREST = 0.15
 """Joints are kept at least this share of the body's distance before the camera."""
 
+LENGTH, ACCELERATION = 0.003, 0.05
+"""Standard deviations of a bone's length and of the second difference of its depth at 30 frames a second."""
+
+HINGE, SINE = 0.08, 0.05
+"""Weight of a hinge in a frame at 30 frames a second, and the sine of a wrong bend that costs half of it."""
+
+POSTURE, FORESHORTENING = 6.0, 10.0
+"""Frames that count as one for these energies at 30 frames a second."""
+
 SPEED = 3.0
 """Usual speed towards the camera a second, for a body of 1.75."""
 
 STRAY = 0.1
 """Usual deviation of a slow change of distance from what is given, as a share."""
+
+HEAVY = 4.0
+"""Squared deviations of a length from here on count like an outlier's, in variances."""
 
 CLOSE = 0.3
 """Usual deviation of a bone's depth from the method's, for bodies without a template."""
@@ -33,7 +44,7 @@ class PinholeEnergy:
     """Energy of depths z, lengths L and distances D of a body seen along rays.
 
     Points lie at (u, v, 1) (D + z). Bones keep their length and move smoothly; the distance changes slowly. Where the
-    skeleton has a trunk come the anatomical terms of PKC's objective; elsewhere bones stay near the depths that the
+    skeleton has a trunk come the energies of anatomy; elsewhere bones stay near the depths that the
     method found.
 
     Args:
@@ -48,21 +59,21 @@ class PinholeEnergy:
     def __init__(
         self, skeleton: Skeleton, rays: Tensor, distance: Tensor, near: Tensor, rate: float, noise: float
     ) -> None:
-        self.weights = w = at_rate(Weights(), rate)
+        self.slow = slow = 30.0 / rate  # more frames a second tell no more, and move less from one to the next
         self.skeleton, self.rays, self.distance, self.rate = skeleton, rays, distance, rate
         self.bones = skeleton.bone_index(device=rays.device)
         self.near = self._dz(near)
         self.rigid = list(skeleton.rigid)
-        self.slack = math.hypot(w.length, noise)
+        self.slack = math.hypot(LENGTH, noise)
         self.waves = slow_waves(len(rays), rate, rays)
         self.waves = self.waves - self.waves.mean(0)
         observed = torch.eye(skeleton.num_observed, dtype=rays.dtype, device=rays.device)
         self.complete = skeleton.complete(observed)[0].mT  # virtual joints follow their sources
         self.anatomy = len(trunk_joints(skeleton)) >= 3
         if self.anatomy:
-            self.posture = PostureEnergy(skeleton, correlation=w.posture).to(rays)
-            self.foreshortening = ForeshorteningEnergy(skeleton, correlation=w.foreshortening).to(rays)
-            self.proportions = ProportionEnergy(skeleton, spread=w.proportions, twins=w.twins).to(rays)
+            self.posture = PostureEnergy(skeleton, correlation=POSTURE / slow).to(rays)
+            self.foreshortening = ForeshorteningEnergy(skeleton, correlation=FORESHORTENING / slow).to(rays)
+            self.proportions = ProportionEnergy(skeleton).to(rays)
             self.hinges = HingeEnergy(skeleton).to(rays)
 
     def points(self, depth: Tensor, distance: Tensor) -> Tensor:
@@ -90,21 +101,22 @@ class PinholeEnergy:
 
     def __call__(self, state: Tensor) -> Tensor:
         """The energy of each hypothesis, (H,)."""
-        w = self.weights
         depth, lengths, shares = self.unpack(state)
         distance = self.path(shares)
         points = self.points(depth, distance)
         off = (bone_vectors(points, self.bones).square().sum(-1) - lengths[:, None].square()) / (2 * lengths[:, None])
         dz = self._dz(depth)
-        total = off[..., self.rigid].square().sum((1, 2)) / (2 * self.slack**2)
-        total = total + dz.diff(n=2, dim=1).square().sum((1, 2)) / (2 * w.acceleration**2)
+        each = HEAVY * torch.log1p(off[..., self.rigid].square() / (HEAVY * self.slack**2))
+        total = len(self.rays) / 2 * torch.log1p(each.mean(1)).sum(-1)
+        total = total + dz.diff(n=2, dim=1).square().sum((1, 2)) / (2 * (ACCELERATION * self.slow**2) ** 2)
         total = total + 100 * depth.mean(-1).square().sum(-1)
         total = total + (shares / STRAY).square().sum(-1) / 2
-        total = total + (distance.diff(dim=1) * self.rate / SPEED).square().sum(-1) / (2 * w.posture)
+        total = total + (distance.diff(dim=1) * self.rate / SPEED).square().sum(-1) / (2 * POSTURE / self.slow)
         if not self.anatomy:
             return total + (dz - self.near).square().sum((1, 2)) / (2 * CLOSE**2)
         total = total + self.posture(points, lengths) + self.foreshortening(points, lengths)
-        return total + self.proportions(lengths) + w.hinge / w.sine**2 * self.hinges(points, lengths).sum(-1)
+        hinges = HINGE * self.slow / SINE**2 * self.hinges(points, lengths).sum(-1)
+        return total + self.proportions(lengths) + hinges
 
     def _dz(self, depth: Tensor) -> Tensor:
         """Bones' depths (..., B)."""
