@@ -1,5 +1,6 @@
 """The live mode: one frame at a time, causal, of bounded memory, and near the offline method."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -184,6 +185,17 @@ def test_poses_wait_for_the_solve_and_no_longer(clip):
     assert first == 11 + 4 + 1  # 12 frames, solved while a third as many come
     assert [p.delay for p in found[first : first + 3]] == [5, 6, 7]
     assert found[35 + 12 + 1].delay == 13
+
+
+def test_never_waits_if_so_told(clip):
+    tracker = kt.Tracker("coco17", fps=30, window=36, wait=False)
+    for xy in observed(clip)[:16]:
+        tracker.update(xy)
+    frames = 0
+    while not tracker.update(observed(clip)[16 + frames % 60]).ready and frames < 3000:
+        frames += 1
+        time.sleep(0.01)
+    assert 0 <= frames < 3000
 
 
 def test_bodies_that_show_nothing(clip):

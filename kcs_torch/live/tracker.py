@@ -88,8 +88,8 @@ class Tracker:
     trunk's shape and the signs so far come from the window of the newest frames, solved by :class:`kcs_torch.PKC` as
     before a fixed viewpoint: when a third of the window has come, when it is full, then every ``period`` frames. A
     window is solved in a thread of its own while frames go on. What it finds is taken over a fixed number of frames
-    later, a third of the window's: the same frames give the same poses on every machine. Where frames come faster than
-    that, or the machine is slow, that one update waits for the thread.
+    later, a third of the window's. Where frames come faster, or the machine is slow, that one update waits for the
+    thread, unless ``wait`` is False.
 
     Bone lengths in the tracks' units change when a window has been solved, not between: so does the size of a body that
     comes nearer. The camera is taken to move little. Without a template the viewpoint has to turn: depths are 0 and
@@ -103,6 +103,8 @@ class Tracker:
         period: frames between solves; ten seconds if None.
         units: of the tracks.
         threshold: a joint with less confidence counts as unseen.
+        wait: whether an update waits for a solve that should have ended. True gives the same poses for the same frames;
+            False, for a camera, takes what a solve finds over when it has ended.
         method: whose fields :meth:`result` takes, and the solves, with fewer steps; ``PKC()`` if None.
 
     Raises:
@@ -127,6 +129,7 @@ class Tracker:
         period: int | None = None,
         units: str = "px",
         threshold: float = 0.3,
+        wait: bool = True,
         method: PKC | None = None,
     ) -> None:
         body = get_skeleton(skeleton)
@@ -146,7 +149,7 @@ class Tracker:
             if not isinstance(value, int) or isinstance(value, bool) or value < LEAST:
                 raise OptionError(f"Tracker: {name}: expected at least {LEAST} frames, got {value!r}")
         self.skeleton, self.fps, self.window, self.period = body, rate, window, period
-        self.units, self.threshold = units, least
+        self.units, self.threshold, self.wait = units, least, bool(wait)
         self.method = PKC() if method is None else method
         self._filter: BodyFilter | ChainFilter
         early = EARLY
@@ -313,7 +316,7 @@ class Tracker:
 
     def _advance(self) -> None:
         """Begin to solve the window where that is due; take over what was found."""
-        if self._solving is not None and self._frame >= self._ready:
+        if self._solving is not None and self._frame >= self._ready and (self.wait or self._solving.done()):
             found, self._solving = self._solving.result(), None
             if found is not None:
                 self._adopt(found)
