@@ -193,7 +193,7 @@ def _refine(
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
     distance = _slow(exact.log()[:, None], rate)[:, 0].exp()
     off = (flat - tracks.points).square().sum(-1)[tracks.seen]
-    noise = float((off.mean() / 2).sqrt()) / unit / 2 if len(off) else 0.0
+    noise = math.sqrt(float(off.median()) / 1.39) / unit / 2 if len(off) else 0.0  # whatever outliers there are
     pinhole = PinholeEnergy(lifted.skeleton, rays, distance / unit, start / unit, rate, noise)
     solution = lbfgs(pinhole, pinhole.pack(start / unit), num_steps=steps, tolerance=1e-6)
     energy = pinhole(solution.value)
