@@ -9,7 +9,7 @@ from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.methods.pkc.fixed_view import Hypotheses
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["depth_deviation", "distinct", "told_by_prior"]
+__all__ = ["APART", "depth_deviation", "told_by_prior"]
 
 APART = 0.04
 """Root mean square depth by which solutions must differ to be told apart, a person being about 1.75 tall."""
@@ -25,18 +25,6 @@ FLAT = 0.25
 
 CALIBRATION = 1.0
 """Factor by which deviations are scaled so that two thirds of all joints are within one."""
-
-
-def distinct(found: Hypotheses, count: int) -> Hypotheses:
-    """The best solutions that differ from each other, at most ``count``."""
-    keep: list[int] = []
-    for k in range(len(found.energy)):
-        if len(keep) == count:
-            break
-        far = [float((found.depth[k] - found.depth[j]).square().mean().sqrt()) for j in keep]
-        if bool(torch.isfinite(found.energy[k])) and all(d > APART for d in far):
-            keep.append(k)
-    return found[torch.tensor(keep or [0], device=found.energy.device)]
 
 
 def told_by_prior(found: Hypotheses, skeleton: Skeleton) -> list[str]:

@@ -11,7 +11,7 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.pkc.fixed_view import Hypotheses, fixed_view
-from kcs_torch.methods.pkc.objective import Objective, Weights, at_rate, bone_noise
+from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, bone_noise, pace_of
 from kcs_torch.methods.pkc.trunk import image_scale
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
@@ -49,7 +49,8 @@ class Body:
         self.skeleton, self.rate, self.factor = skeleton, rate, 1 / scale
         self.image = image / scale
         self.noise = noise / scale
-        self.objective = Objective(skeleton, self.image, at_rate(Weights(), rate), self.noise)
+        weights = at_pace(Weights(), rate, pace_of(image, skeleton, rate))
+        self.objective = Objective(skeleton, self.image, weights, self.noise)
 
     def frames(self, depth: Tensor) -> Tensor:
         """The trunk's rotations (T, 3, 3), template to camera, of depths (T, N)."""

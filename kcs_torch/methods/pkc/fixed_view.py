@@ -12,12 +12,12 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limb_paths, limbs_of, waves
-from kcs_torch.methods.pkc.objective import Objective, Weights, at_rate
-from kcs_torch.methods.pkc.trunk import TURN, Trunk, longest_image, mirror, trunk_paths, trunk_turns
+from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, pace_of
+from kcs_torch.methods.pkc.trunk import TURN, Trunk, longest_image, siblings, trunk_misfit, trunk_path, trunk_turns
 from kcs_torch.nn.posture import free_bones
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["Hypotheses", "fixed_view"]
+__all__ = ["Hypotheses", "distinct", "fixed_view"]
 
 COARSE = (1.0, 1.01, 1.03, 1.07, 1.14, 1.25)
 FINE = (1.0, 1.008, 1.02, 1.04, 1.07, 1.12, 1.2)
@@ -25,6 +25,15 @@ FINE = (1.0, 1.008, 1.02, 1.04, 1.07, 1.12, 1.2)
 
 TRUST = 0.1
 """Weight of the limbs' votes for the trunk's sign: each frame's vote already speaks for its neighbours."""
+
+LOOSE = 7.0
+"""By how much lengths are less certain at first."""
+
+BEST = 4
+"""Hypotheses that are refined well."""
+
+ALIKE = 0.02
+"""Root mean square depth below which hypotheses are one, a person being about 1.75 tall."""
 
 SWITCH = 8.0
 """Largest cost of the trunk's change of sign from one frame to the next."""
@@ -48,6 +57,24 @@ class Hypotheses:
 
     def __getitem__(self, index: slice | Tensor) -> Hypotheses:
         return Hypotheses(self.depth[index], self.lengths[index], self.energy[index], self.steps)
+
+    def joined(self, other: Hypotheses) -> Hypotheses:
+        """Both together, best first."""
+        parts = zip(*((h.depth, h.lengths, h.energy) for h in (self, other)), strict=True)
+        depth, lengths, energy = (torch.cat(part) for part in parts)
+        return Hypotheses(depth, lengths, energy, self.steps + other.steps)[energy.argsort()]
+
+
+def distinct(found: Hypotheses, count: int, apart: float) -> Hypotheses:
+    """The best hypotheses whose depths differ by ``apart`` from each other (root mean square), at most ``count``."""
+    keep: list[int] = []
+    for k in range(len(found.energy)):
+        if len(keep) == count:
+            break
+        far = [float((found.depth[k] - found.depth[j]).square().mean().sqrt()) for j in keep]
+        if bool(torch.isfinite(found.energy[k])) and all(d > apart for d in far):
+            keep.append(k)
+    return found[torch.tensor(keep or [0], device=found.energy.device)]
 
 
 def fixed_view(
@@ -86,20 +113,21 @@ def fixed_view(
         The hypotheses, best first.
     """
     slow = 30.0 / rate
-    weights = at_rate(weights or Weights(), rate)
+    pace = pace_of(image, skeleton, rate)
+    weights = at_pace(weights or Weights(), rate, pace)
     noise = torch.zeros_like(image[..., 0]) if noise is None else noise
     costs = SignCosts()
     costs = replace(
         costs,
         acceleration=costs.acceleration * slow**2,
-        posture=costs.posture / slow,
-        foreshortening=costs.foreshortening / slow,
-        hinge=costs.hinge * slow,
+        posture=costs.posture * pace,
+        foreshortening=costs.foreshortening * pace,
+        hinge=costs.hinge / pace,
     )
     image = image - image.mean(-2, keepdim=True)
     search = _Search(skeleton, image, Objective(skeleton, image, weights, noise, anchor), costs, TURN * slow)
     found = search.start(anchor)
-    found = search.refine(found, steps)
+    found = search.refine(found, steps, LOOSE)
     for _ in range(rounds):
         best = found.energy[0]
         found = search.refine(search.moves(found), steps)
@@ -124,11 +152,9 @@ class _Search:
         """Hypotheses from both templates of the trunk."""
         depths, lengths = [], []
         for trunk in self._trunks(anchor):
-            paths = trunk_paths(self.image, trunk, self.objective.posture, self.costs.posture, self.turn)
-            settled = self._settle(paths, anchor)
-            frame = torch.arange(len(self.image), device=self.image.device)
+            first = trunk_path(self.image, trunk, self.objective.posture, self.costs.posture, self.turn)
             tried: list[Tensor] = []
-            for path in (paths[settled, frame], paths[1 - settled, frame], paths[0]):
+            for path in (*self._settled(first, trunk, anchor), first):
                 if not any(bool((path - other).abs().amax() < 1e-6) for other in tried):
                     tried.append(path)
                     z, length = self._place(path, trunk, anchor)
@@ -137,32 +163,26 @@ class _Search:
         z, length = torch.stack(depths), torch.stack(lengths)
         return Hypotheses(z, length, z.new_full((len(z),), torch.inf))
 
-    def refine(self, found: Hypotheses, steps: int) -> Hypotheses:
-        """All a little, then the best few well."""
-        obj = self.objective
-        few = max(steps // 3, 1)
-        z, length, energy, first = obj.minimise(found.depth, found.lengths, few)
-        rest = Hypotheses(z, length, energy)
-        keep = min(4, len(z))
-        z, length, energy, second = obj.minimise(z[:keep], length[:keep], steps)
-        joined = Hypotheses(
-            torch.cat([z, rest.depth[keep:]]),
-            torch.cat([length, rest.lengths[keep:]]),
-            torch.cat([energy, rest.energy[keep:]]),
-            found.steps + first.iterations + second.iterations,
-        )
-        return joined[joined.energy.argsort()]
+    def refine(self, found: Hypotheses, steps: int, loose: float = 1.0) -> Hypotheses:
+        """All a little, with loose lengths first where the start is rough, then the best few that differ."""
+        obj, few = self.objective, max(steps // 3, 1)
+        z, length, made = found.depth, found.lengths, found.steps
+        if loose > 1:
+            z, length, _, solution = obj.minimise(z, length, few, loose)
+            made += solution.iterations
+        z, length, energy, solution = obj.minimise(z, length, few)
+        best = distinct(Hypotheses(z, length, energy, made + solution.iterations), BEST, ALIKE)
+        z, length, energy, solution = obj.minimise(best.depth, best.lengths, steps)
+        return Hypotheses(z, length, energy, best.steps + solution.iterations)
 
     def moves(self, found: Hypotheses) -> Hypotheses:
         """The best, the next ones, and what discrete moves make of the best."""
         z, length = found.depth[0], found.lengths[0]
         points = torch.cat([self.image, z[..., None]], -1)
-        path = self.objective.posture.frame(points)
-        paths = torch.stack([path, mirror(path)])
-        frame = torch.arange(len(z), device=z.device)
-        path = paths[self._settle(paths, length), frame]
         trunk = Trunk(self.objective.posture.rest, length)
+        path, *others = self._settled(self.objective.posture.frame(points), trunk, length)
         new = [self._place(path, trunk, length, z), self._place(path, trunk, None, z)]
+        new += [self._place(other, trunk, length) for other in others]
         new += [(flipped, length) for flipped in self._flips(z)]
         return Hypotheses(
             torch.cat([found.depth[:2], torch.stack([n[0] for n in new])]),
@@ -186,8 +206,15 @@ class _Search:
             out.append(Trunk(rest, length))
         return out
 
-    def _settle(self, paths: Tensor, lengths: Tensor | None) -> Tensor:
-        """Which of two trunk paths each frame takes by the limbs' votes, (T,)."""
+    def _settled(self, path: Tensor, trunk: Trunk, lengths: Tensor | None) -> Tensor:
+        """The path (T, 3, 3), mirrored where the limbs vote for it, and its siblings: (4, T, 3, 3)."""
+        axes = self.objective.posture.axes
+        paths = siblings(path, axes)[:2]
+        choice = self._settle(paths, trunk, lengths)
+        return siblings(paths[choice, torch.arange(len(path), device=path.device)], axes)
+
+    def _settle(self, paths: Tensor, trunk: Trunk, lengths: Tensor | None) -> Tensor:
+        """Which of several trunk paths each frame takes by the limbs' votes, (T,)."""
         posture, free = self.objective.posture, free_bones(self.skeleton)
         flat = bone_vectors(self.image, posture.bones)
         moves = trunk_turns(paths, self.turn, SWITCH)
@@ -196,12 +223,21 @@ class _Search:
             return torch.zeros(len(self.image), dtype=torch.long, device=self.image.device)
         candidates = self._candidates(flat, limbs, COARSE if lengths is None else lengths)
         found = limb_paths(
-            flat, limbs, paths, posture, free, self.costs, self.objective.noise,
-            candidates=candidates, transition=moves, margins=True,
+            flat,
+            limbs,
+            paths,
+            posture,
+            free,
+            self.costs,
+            self.objective.noise,
+            candidates=candidates,
+            transition=moves,
+            margins=True,
         )
         assert found.margins is not None
         votes = (found.margins - found.margins.amin(-1, keepdim=True)).clamp_max(20).sum(0)
-        return best_path(TRUST * votes, trunk_turns(paths, self.turn))
+        off = trunk_misfit(self.image, trunk, posture.trunk, paths).mT / self.costs.posture
+        return best_path(TRUST * votes + off, trunk_turns(paths, self.turn))
 
     def _place(
         self, path: Tensor, trunk: Trunk, lengths: Tensor | None, keep: Tensor | None = None

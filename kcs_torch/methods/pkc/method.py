@@ -13,9 +13,9 @@ from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import Estimate, Method
-from kcs_torch.methods.pkc.answers import depth_deviation, distinct, told_by_prior
+from kcs_torch.methods.pkc.answers import APART, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.body import Body
-from kcs_torch.methods.pkc.fixed_view import Hypotheses
+from kcs_torch.methods.pkc.fixed_view import Hypotheses, distinct
 from kcs_torch.methods.pkc.moving_view import MovingView, moving_view
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import weak_perspective
@@ -69,7 +69,7 @@ class PKC(Method):
     viewpoint: Literal["auto", "fixed", "moving"] = "auto"
     denoise: bool = True
     lifts: int = 6
-    rounds: int = 2
+    rounds: int = 1
     steps: int = 30
     alternatives: int = 4
     seed: int = 0
@@ -99,18 +99,17 @@ class PKC(Method):
             raise OptionError(
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
-        body = Body(skeleton, image, tracks.fps or 30.0, noise) if has_trunk and cameras is None else None
+        body = Body(skeleton, image, tracks.fps or 30.0, noise) if has_trunk else None
         moving: MovingView | None = None
         enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
-        if body is None or (self.viewpoint != "fixed" and enough):
+        if body is None or (enough and (self.viewpoint == "moving" or cameras is not None)):
             moving, first = self._moving(tracks, image, cameras, enough)
-            if moving is None:
+            if moving is None and body is None:
                 return replace(first, notes=(*notes, *first.notes))
         if body is None:
             assert moving is not None
             return self._from_moving(moving, image, cameras, notes)
-        found, _ = self._search(body, moving)
-        return self._from_hypotheses(found, body, image, notes)
+        return self._from_hypotheses(self._search(body, moving, cameras), body, image, cameras, notes)
 
     def _clean(self, tracks: Tracks) -> tuple[Tensor, Tensor, tuple[str, ...]]:
         """Complete tracks (T, N, 2), centred per frame, the noise (T, N) left in them, and what was done."""
@@ -147,10 +146,9 @@ class PKC(Method):
         if not enough:
             return None, first
         rotations = complete_rotation(first.cameras)
-        # A template gives the moving viewpoint a better start than random signs do: the fixed viewpoint's solution.
-        lifts = 0 if self.viewpoint == "auto" and len(trunk_joints(tracks.skeleton)) >= 3 else self.lifts
         if cameras is None:
-            return moving_view(image, tracks.skeleton, first.points, rotations, lifts=lifts, seed=self.seed), first
+            lifts, seed = self.lifts, self.seed
+            return moving_view(image, tracks.skeleton, first.points, rotations, lifts=lifts, seed=seed), first
         bones = tracks.skeleton.bone_index(device=image.device)
         if not tracks.skeleton.is_tree:
             return None, first
@@ -174,35 +172,22 @@ class PKC(Method):
         other = replace(main, points=points * flip, cameras=path[:, :2] * flip, notes=("the mirror image in depth",))
         return replace(main, alternatives=(other,))
 
-    def _search(self, body: Body, moving: MovingView | None) -> tuple[Hypotheses, Tensor]:
-        """All hypotheses of a body with a template, best first, and which came from the moving viewpoint."""
-        fixed = self.viewpoint != "moving" or moving is None  # too few frames leave no choice
-        found = body.search(self.rounds, self.steps) if fixed else None
+    def _search(self, body: Body, moving: MovingView | None, cameras: Tensor | None) -> Hypotheses:
+        """All hypotheses of a body with a template, best first."""
+        found = body.search(self.rounds, self.steps) if self.viewpoint != "moving" or moving is None else None
         if moving is None:
             assert found is not None
-            return found, torch.zeros(len(found.energy), dtype=torch.bool)
-        depths = [moving.pose.points[0, ..., 2] * body.factor]
-        depths.append(-depths[0])
-        if found is not None:  # the fixed viewpoint's solution, where the viewpoint turns after all
-            start = torch.cat([body.image, found.depth[0, ..., None]], -1)[None] / body.factor
-            turned = align_rotations(start, body.frames(found.depth[0])[None], moving.bones)
-            pose = procrustean(start[0, ..., :2], start, turned, moving.bones, rigid=moving.rigid, stages=FINE)
-            depths.append(pose.points[0, ..., 2] * body.factor)
-        ranked = body.rank(torch.stack(depths), steps=self.steps)
-        if found is None:
-            return ranked, torch.ones(len(ranked.energy), dtype=torch.bool)
-        both = Hypotheses(
-            torch.cat([found.depth, ranked.depth]),
-            torch.cat([found.lengths, ranked.lengths]),
-            torch.cat([found.energy, ranked.energy]),
-            found.steps + ranked.steps + MOVING_STEPS,
-        )
-        order = both.energy.argsort()
-        return both[order], (order >= len(found.energy)).cpu()
+            return found
+        depth = moving.pose.points[:1, ..., 2] * body.factor
+        ranked = body.rank(depth if cameras is not None else torch.cat([depth, -depth]), steps=self.steps)
+        ranked = replace(ranked, steps=ranked.steps + MOVING_STEPS)
+        return ranked if found is None else found.joined(ranked)
 
-    def _from_hypotheses(self, found: Hypotheses, body: Body, image: Tensor, notes: tuple[str, ...]) -> Estimate:
+    def _from_hypotheses(
+        self, found: Hypotheses, body: Body, image: Tensor, cameras: Tensor | None, notes: tuple[str, ...]
+    ) -> Estimate:
         """Estimates of the distinct hypotheses, in the tracks' units."""
-        found = distinct(found, self.alternatives + 1)
+        found = distinct(found, self.alternatives + 1, APART)
         told = told_by_prior(found, body.skeleton)
         if told:
             notes = (*notes, f"the depth's sign was decided by the prior for {', '.join(told)}: see the alternatives")
@@ -212,7 +197,7 @@ class PKC(Method):
             one = torch.ones_like(points[:, 0, 0])
             spread = depth_deviation(found[k:] if k else found, body.image, body.skeleton) / body.factor
             value = float(found.energy[k])
-            path = body.frames(depth)[:, :2]
+            path = body.frames(depth)[:, :2] if cameras is None else cameras
             made.append(Estimate(points, path, one, True, found.steps, () if k else notes, spread, value, still=True))
         return replace(made[0], alternatives=tuple(made[1:]))
 

@@ -156,6 +156,8 @@ def moving_view(
             image, points, turned, bones,
             weights=weights, rigid=rigid, stiffness=tight[0], noise=noise, stages=stages,
         )  # fmt: skip
+    if len(pick) == frames and is_tree:  # the finest stages have seen all frames
+        return MovingView(pose, bones, rigid, tight[0])
     if not is_tree:
         bones = spread(pose.points[0])
     pose = procrustean(

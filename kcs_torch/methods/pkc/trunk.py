@@ -7,12 +7,22 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.solvers.pose import fit_cameras
 
-__all__ = ["Trunk", "image_scale", "longest_image", "mirror", "trunk_paths", "trunk_turns"]
+__all__ = [
+    "Trunk",
+    "image_scale",
+    "longest_image",
+    "mirror",
+    "siblings",
+    "trunk_misfit",
+    "trunk_path",
+    "trunk_turns",
+]
 
 FIT = 0.03
 """Standard deviation of the trunk's joints about its template, a standing person being about 1.75 tall."""
@@ -76,8 +86,33 @@ def mirror(rotations: Tensor) -> Tensor:
     return rotations * flip[:, None] * flip
 
 
-def trunk_paths(image: Tensor, trunk: Trunk, posture: PostureEnergy, correlation: float, turn: float) -> Tensor:
-    """A smooth path of the trunk's rotation and its mirror image, (2, T, 3, 3), template to camera.
+def siblings(path: Tensor, axes: Tensor) -> Tensor:
+    """Rotations (T, 3, 3) and those under which a flat trunk looks alike, (4, T, 3, 3).
+
+    The mirror image in depth has the same image. One that faces the viewer may also lean the other way and keep its
+    turn, or turn the other way and keep its lean: the image hardly changes, see :func:`trunk_misfit`.
+
+    Args:
+        path: (T, 3, 3), template to camera.
+        axes: (3, 3), columns: the trunk's two long axes and its normal.
+    """
+    first, second, _ = (path @ axes.to(path)).unbind(-1)
+    leant = first * first.new_tensor([1.0, 1.0, -1.0])
+    other = nearest_rotation(torch.stack([leant, second, torch.linalg.cross(leant, second)], -1) @ axes.to(path).mT)
+    return torch.stack([path, mirror(path), other, mirror(other)])
+
+
+def trunk_misfit(
+    image: Tensor, trunk: Trunk, joints: Tensor, rotations: Tensor, scales: Tensor | float = 1.0
+) -> Tensor:
+    """Half the squared misfit, in deviations, of the trunk's template in each frame, (C, T) of (C, T, 3, 3)."""
+    rest = trunk.rest[joints] - trunk.rest[joints].mean(0)
+    goal = image[:, joints] - image[:, joints].mean(1, keepdim=True)
+    return (scales * (rest @ rotations[..., :2, :].mT) - goal).square().sum((-2, -1)) / (2 * FIT**2)
+
+
+def trunk_path(image: Tensor, trunk: Trunk, posture: PostureEnergy, correlation: float, turn: float) -> Tensor:
+    """A smooth path of the trunk's rotation, template to camera, (T, 3, 3).
 
     Args:
         image: (T, N, 2), in units of the template.
@@ -86,21 +121,17 @@ def trunk_paths(image: Tensor, trunk: Trunk, posture: PostureEnergy, correlation
         correlation: frames that count as one.
         turn: standard deviation of the turn from frame to frame, in radians.
     """
-    frames = len(image)
     joints = posture.trunk
     rest = trunk.rest[joints] - trunk.rest[joints].mean(0)
     goal = image[:, joints] - image[:, joints].mean(1, keepdim=True)
-    one = image.new_ones(frames)
+    one = image.new_ones(len(image))
     fit = fit_cameras(
-        goal, rest.expand(frames, -1, 3), image.new_ones(goal.shape[:2]), 0.9 * one, 1.1 * one, robust=None
+        goal, rest.expand(len(image), -1, 3), image.new_ones(goal.shape[:2]), 0.9 * one, 1.1 * one, robust=None
     )
     rotations = torch.cat([fit.rotations, mirror(fit.rotations)])  # (16, T, 3, 3)
-    scales = fit.scales.repeat(2, 1)[..., None, None]
-    off = (scales * (rest @ rotations[..., :2, :].mT) - goal).square().sum((-2, -1))
-    cost = off.mT / (2 * FIT**2 * correlation)
-    choice = best_path(cost, trunk_turns(rotations, turn))
-    path = rotations[choice, torch.arange(frames, device=image.device)]
-    return torch.stack([path, mirror(path)])
+    off = trunk_misfit(image, trunk, joints, rotations, fit.scales.repeat(2, 1)[..., None, None])
+    choice = best_path(off.mT / correlation, trunk_turns(rotations, turn))
+    return rotations[choice, torch.arange(len(image), device=image.device)]
 
 
 def trunk_turns(rotations: Tensor, turn: float, cap: float | None = None) -> Tensor:
