@@ -29,8 +29,11 @@ TRUST = 0.1
 LOOSE = 7.0
 """By how much lengths are less certain at first."""
 
-BEST = 4
-"""Hypotheses that are refined well."""
+BETTER, BEST = 6, 4
+"""Hypotheses that are refined at all, and well."""
+
+FLIPS = 4
+"""Flips of limbs that are refined."""
 
 ALIKE = 0.02
 """Root mean square depth below which hypotheses are one, a person being about 1.75 tall."""
@@ -150,14 +153,16 @@ class _Search:
 
     def start(self, anchor: Tensor | None) -> Hypotheses:
         """Hypotheses from both templates of the trunk."""
-        depths, lengths = [], []
+        depths: list[Tensor] = []
+        lengths: list[Tensor] = []
         for trunk in self._trunks(anchor):
             first = trunk_path(self.image, trunk, self.objective.posture, self.costs.posture, self.turn)
             tried: list[Tensor] = []
             for path in (*self._settled(first, trunk, anchor), first):
                 if not any(bool((path - other).abs().amax() < 1e-6) for other in tried):
+                    # the first path's lengths serve all
+                    z, length = self._place(path, trunk, lengths[-1] if tried else anchor)
                     tried.append(path)
-                    z, length = self._place(path, trunk, anchor)
                     depths.append(z)
                     lengths.append(length)
         z, length = torch.stack(depths), torch.stack(lengths)
@@ -165,15 +170,16 @@ class _Search:
 
     def refine(self, found: Hypotheses, steps: int, loose: float = 1.0) -> Hypotheses:
         """All a little, with loose lengths first where the start is rough, then the best few that differ."""
-        obj, few = self.objective, max(steps // 3, 1)
-        z, length, made = found.depth, found.lengths, found.steps
+        few = max(steps // 3, 1)
         if loose > 1:
-            z, length, _, solution = obj.minimise(z, length, few, loose)
-            made += solution.iterations
-        z, length, energy, solution = obj.minimise(z, length, few)
-        best = distinct(Hypotheses(z, length, energy, made + solution.iterations), BEST, ALIKE)
-        z, length, energy, solution = obj.minimise(best.depth, best.lengths, steps)
-        return Hypotheses(z, length, energy, best.steps + solution.iterations)
+            found = self._minimise(found, few, loose)
+            found = distinct(found, BETTER, ALIKE)
+        found = distinct(self._minimise(found, few), BEST, ALIKE)
+        return self._minimise(found, steps)
+
+    def _minimise(self, found: Hypotheses, steps: int, loose: float = 1.0) -> Hypotheses:
+        z, lengths, energy, solution = self.objective.minimise(found.depth, found.lengths, steps, loose)
+        return Hypotheses(z, lengths, energy, found.steps + solution.iterations)
 
     def moves(self, found: Hypotheses) -> Hypotheses:
         """The best, the next ones, and what discrete moves make of the best."""
@@ -183,7 +189,10 @@ class _Search:
         path, *others = self._settled(self.objective.posture.frame(points), trunk, length)
         new = [self._place(path, trunk, length, z), self._place(path, trunk, None, z)]
         new += [self._place(other, trunk, length) for other in others]
-        new += [(flipped, length) for flipped in self._flips(z)]
+        flips = torch.stack(self._flips(z) or [z])
+        with torch.no_grad():
+            order = self.objective(flips, length.expand(len(flips), -1)).argsort()[:FLIPS]
+        new += [(flips[k], length) for k in order.tolist()]
         return Hypotheses(
             torch.cat([found.depth[:2], torch.stack([n[0] for n in new])]),
             torch.cat([found.lengths[:2], torch.stack([n[1] for n in new])]),
