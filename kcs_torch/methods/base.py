@@ -31,6 +31,9 @@ __all__ = ["Estimate", "Method"]
 WEAK_TURN = 30.0
 """Degrees of viewpoint turn below which depth is weakly determined."""
 
+FAR_STEPS = 2
+"""How often joints are weighed anew by their distance, when the body is put in its place."""
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -69,6 +72,8 @@ class Method(ABC):
     """
 
     name: ClassVar[str] = ""
+    centred: ClassVar[bool] = True
+    """Whether :meth:`solve` takes tracks about the body's middle in each frame; else about its mean over time."""
 
     def __post_init__(self) -> None:
         hints = typing.get_type_hints(type(self))
@@ -101,10 +106,14 @@ class Method(ABC):
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         with torch.inference_mode(False), torch.no_grad():  # solvers differentiate, which inference mode forbids
             known = tracks.seen.any(-1)
-            middle = interpolate(_mean(tracks.points, tracks.weights), known[:, None])
-            centred = (tracks.points - middle) * tracks.seen[..., None]
-            size = _rms(centred, tracks.weights)
+            # Means over the joints that happen to be seen would jump with every joint that comes and goes.
+            filled = interpolate(tracks.points, tracks.seen)[:, tracks.seen.any(0)]
+            middle = filled.mean(1, keepdim=True) if filled.numel() else tracks.points[:, :1] * 0
+            size = _rms((tracks.points - middle) * tracks.seen[..., None], tracks.weights)
             size = torch.where(size > 0, size, torch.ones_like(size))
+            if not self.centred:
+                middle = middle.mean(0)
+            centred = (tracks.points - middle) * tracks.seen[..., None]
             inner = dataclasses.replace(tracks, points=centred / size, weights=tracks.weights.clone())
             found = self.solve(inner, None if cameras is None else cameras.clone())
             result = self._finish(tracks, found, size, known, time.perf_counter() - begin)
@@ -132,7 +141,7 @@ class Method(ABC):
         """An estimate in the tracks' units and place, with what there is to say about it."""
         points = found.points * size
         seen = points[..., :2] * found.scales[:, None, None]
-        shift = interpolate(_mean(tracks.points - seen, tracks.weights), known[:, None])
+        shift = interpolate(_shift(tracks.points - seen, tracks.weights), known[:, None])
         points, seen = points + torch.nn.functional.pad(shift, (0, 1)), seen + shift
         body = tracks.skeleton
         bones = bone_lengths(points, body.bone_index(device=points.device))
@@ -239,9 +248,17 @@ def _is_a(value: Any, hint: Any) -> bool:
     return isinstance(value, hint) if isinstance(hint, type) else True
 
 
-def _mean(points: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean over joints, (T, 1, D); 0 in frames without a seen joint."""
-    return centre(points, weights)[1]
+def _shift(residuals: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean over joints, (T, 1, D), joints that are far from it counting less; 0 where no joint is seen."""
+    middle = centre(residuals, weights)[1]
+    for _ in range(FAR_STEPS):
+        off = (residuals - middle).abs()
+        far = (off / off.amax().clamp_min(torch.finfo(off.dtype).tiny)).norm(dim=-1)  # no square overflows
+        usual = far[weights > 0].median() if bool((weights > 0).any()) else far.sum()
+        if not bool(usual > 0):
+            break
+        middle = centre(residuals, weights / (1 + (far / (3 * usual)).square()))[1]
+    return middle
 
 
 def _rms(vectors: Tensor, weights: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.pkc.answers import APART, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.fixed_view import Hypotheses, distinct
+from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.pkc.moving_view import MovingView, moving_view
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import weak_perspective
@@ -66,6 +67,7 @@ class PKC(Method):
     """
 
     name: ClassVar[str] = "pkc"
+    centred: ClassVar[bool] = False  # noise and outliers are told apart before the middle is taken
     viewpoint: Literal["auto", "fixed", "moving"] = "auto"
     denoise: bool = True
     lifts: int = 6
@@ -113,13 +115,13 @@ class PKC(Method):
 
     def _clean(self, tracks: Tracks) -> tuple[Tensor, Tensor, tuple[str, ...]]:
         """Complete tracks (T, N, 2), centred per frame, the noise (T, N) left in them, and what was done."""
-        known = tracks.seen.any(0)
         level, keep = 0.0, tracks.seen
         points, notes = tracks.points, []
         if self.denoise:
-            clean = denoise_tracks(points, tracks.weights)
+            keep = plausible(points, keep, tracks.skeleton)
+            clean = denoise_tracks(points, torch.where(keep, tracks.weights, 0))
             level = float(clean.noise.median())
-            wrong = int(clean.outliers.sum())
+            wrong = int((clean.outliers & keep).sum()) + int((tracks.seen & ~keep).sum())
             if wrong:
                 notes.append(f"{wrong} detections ({100 * wrong / int(tracks.seen.sum()):.1f} %) rejected as outliers")
             keep = keep & ~clean.outliers
@@ -130,6 +132,7 @@ class PKC(Method):
             points = torch.where(exact[..., None], points, clean.points)
         else:
             points = interpolate(points, tracks.seen)
+        known = keep.any(0)
         if not bool(known.all()):
             flat = torch.nn.functional.pad(points, (0, 1))
             points = place_unseen(flat, known, tracks.skeleton)[..., :2]
