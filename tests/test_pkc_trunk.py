@@ -1,4 +1,4 @@
-"""The trunk's orientation: its scale, its path and the mirror image of it, from images of a rigid template."""
+"""The trunk's orientation: its scale, its path and what looks like it, from images of a rigid template."""
 
 import math
 
@@ -9,7 +9,16 @@ from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
 from kcs_torch.functional import best_path, bone_lengths
-from kcs_torch.methods.pkc.trunk import Trunk, image_scale, mirror, trunk_paths, trunk_turns
+from kcs_torch.methods.pkc.trunk import (
+    FIT,
+    Trunk,
+    image_scale,
+    mirror,
+    siblings,
+    trunk_misfit,
+    trunk_path,
+    trunk_turns,
+)
 from kcs_torch.nn import PostureEnergy
 
 POSTURE = PostureEnergy("h36m17")
@@ -18,7 +27,8 @@ RIGID = torch.ones(16, dtype=torch.bool)
 
 
 def paths_of(points):
-    return trunk_paths(points[..., :2], TRUNK, POSTURE, 15.0, 0.15)
+    """The path that is found, and its mirror image."""
+    return siblings(trunk_path(points[..., :2], TRUNK, POSTURE, 15.0, 0.15), POSTURE.axes)[:2]
 
 
 def angle(a, b):
@@ -65,6 +75,62 @@ def test_mirror():
     assert_close((flat @ other.mT)[..., 2], -(flat @ turn.mT)[..., 2])
 
 
+def about(axis, angle):
+    """Rotation (3, 3) by an angle about a coordinate axis."""
+    vector = torch.zeros(3).double()
+    vector[axis] = angle
+    return torch.linalg.matrix_exp(torch.linalg.cross(torch.eye(3).double(), vector.expand(3, 3)).mT)
+
+
+def test_siblings_are_rotations():
+    path = rotations(20)
+    found = siblings(path, POSTURE.axes)
+    assert found.shape == (4, 20, 3, 3)
+    assert torch.equal(found[0], path)
+    assert_close(found[1], mirror(path))
+    assert_close(found[3], mirror(found[2]))
+    assert_close(found.mT @ found, torch.eye(3).double().expand_as(found))
+    assert_close(torch.linalg.det(found), torch.ones(4, 20).double())
+
+
+def test_siblings_look_alike():
+    """The mirror image of a flat trunk has its image; the others nearly, lean and turn being small."""
+    flat = normal(9, 3) * torch.tensor([1.0, 1.0, 0.0])
+    flat = flat / flat.norm(dim=-1).max()
+    axes = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]).double()  # upwards, sideways, the normal
+    for lean in (0.0, 0.1, -0.3):
+        for turn in (0.0, 0.2, 0.35):
+            path = (about(1, turn) @ about(0, lean))[None]
+            same, reflected, third, fourth = (flat @ siblings(path, axes).mT)[:, 0]
+            assert_close(same, flat @ path[0].mT)
+            assert_close(reflected, same * torch.tensor([1.0, 1.0, -1.0]))
+            for other in (third, fourth):
+                assert_close(other[..., :2], same[..., :2], rtol=0, atol=2 * abs(lean * turn) + 1e-9)
+
+
+def test_siblings_lean_and_turn_each_way():
+    """Of the trunk's two long axes, every combination of signs in depth is there."""
+    path = (about(1, 0.3) @ about(0, 0.25) @ POSTURE.axes.mT)[None]
+    depths = (siblings(path, POSTURE.axes) @ POSTURE.axes)[:, 0, 2, :2]  # (4, 2)
+    assert (depths.abs() > 0.15).all()
+    assert len({tuple(row) for row in depths.sign().tolist()}) == 4
+
+
+def test_misfit_by_hand():
+    points = 1.1 * POSTURE.rest @ rotations(3).mT + normal(3, 1, 3)
+    image = points[..., :2].clone()
+    turns = rotations(3).expand(2, 3, 3, 3)
+    joints = POSTURE.trunk
+    assert_close(trunk_misfit(image, TRUNK, joints, turns, 1.1), torch.zeros(2, 3).double(), rtol=0, atol=1e-12)
+    image[1, joints[0], 0] += 0.06
+    count = len(joints)
+    expected = 0.06**2 * (1 - 1 / count) / (2 * FIT**2)  # less what the centre takes up
+    assert_close(trunk_misfit(image, TRUNK, joints, turns, 1.1)[0], torch.tensor([0, expected, 0]).double())
+    sizes = torch.tensor([1.1, 1.0]).double()[:, None, None, None]
+    exact, small = trunk_misfit(points[..., :2], TRUNK, joints, turns, sizes)
+    assert (small > 1e-3).all() and (exact < 1e-12).all()
+
+
 def test_turns_by_hand():
     turn = turning(4, 90.0, tilt=0.0)  # 30 degrees a frame
     both = torch.stack([turn, turn[:1].expand(4, 3, 3)])
@@ -107,7 +173,8 @@ def test_paths_are_rotations_whatever_is_seen(frames, dtype):
     posture = PostureEnergy("h36m17").to(dtype)
     trunk = Trunk(posture.rest, posture.rest_lengths)
     for image in (still, 0 * still, still * torch.tensor([0.0, 1.0])):
-        found = trunk_paths(image.to(dtype), trunk, posture, 15.0, 0.15)
-        assert found.shape == (2, frames, 3, 3)
+        path = trunk_path(image.to(dtype), trunk, posture, 15.0, 0.15)
+        assert path.shape == (frames, 3, 3) and path.dtype == dtype
+        found = siblings(path, posture.axes)
         assert_close(found.mT @ found, torch.eye(3).expand_as(found).to(found), rtol=0, atol=1e-4)
         assert_close(found, found[:, :1].expand_as(found), rtol=0, atol=1e-3)  # what does not move does not turn
