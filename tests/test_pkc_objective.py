@@ -1,6 +1,7 @@
-"""The objective of hypotheses: its terms by hand, its gradient, and that the true motion is better than others."""
+"""The objective of hypotheses: its terms by hand, its gradient, its unknowns, and that the true motion is best."""
 
 import itertools
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,8 +11,10 @@ from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths, bone_vectors
-from kcs_torch.methods.pkc.objective import Objective, Weights, at_rate
+from kcs_torch.methods.pkc import objective as module
+from kcs_torch.methods.pkc.objective import Objective, Weights, _Unknowns, at_pace, bone_noise, pace_of
 from kcs_torch.skeleton import SKELETONS
+from kcs_torch.solvers import lbfgs
 
 
 def walk(frames=40, skeleton="h36m17", fps=30.0, **options):
@@ -22,32 +25,25 @@ def walk(frames=40, skeleton="h36m17", fps=30.0, **options):
 
 
 def objective(points, skeleton="h36m17", rate=30.0, **options):
-    weights = at_rate(options.pop("weights", Weights()), rate)
-    noise = options.pop("noise", torch.zeros_like(points[..., 0]))
+    weights = at_pace(options.pop("weights", Weights()), rate, rate / 30)
+    noise = torch.as_tensor(options.pop("noise", 0.0)).double().expand_as(points[..., 0])
     return Objective(SKELETONS[skeleton], points[..., :2], weights, noise=noise, **options)
 
 
-def state_of(found, points):
-    lengths = bone_lengths(points, found.bones).mean(-2)
-    return found.pack(points[None, ..., 2], lengths[None])
+def lengths_of(found, points):
+    return bone_lengths(points, found.bones).mean(-2)
 
 
-@pytest.mark.parametrize("skeleton", ["h36m17", "coco17", "mediapipe33"])
-def test_packing_is_undone(skeleton):
-    """Virtual joints are no unknowns: they follow their sources."""
-    points = walk(5, skeleton)
-    found = objective(points, skeleton)
-    body = SKELETONS[skeleton]
-    depth, lengths = points[None, ..., 2], bone_lengths(points, found.bones).mean(0)[None]
-    state = found.pack(depth, lengths)
-    assert state.shape == (1, 5 * body.num_observed + body.num_bones)
-    again, same = found.unpack(state)
-    assert_close(again, depth)
-    assert_close(same, lengths)
-    wild = normal(1, 5, body.num_joints)
-    once = found.unpack(found.pack(wild, lengths))[0]
-    whole = torch.cat([normal(5, body.num_observed, 2), wild[0, :, : body.num_observed, None]], -1)
-    assert_close(once[0], body.complete(whole)[0][..., 2])
+def energy_of(found, points, lengths=None):
+    return found(points[None, ..., 2], (lengths_of(found, points) if lengths is None else lengths)[None])
+
+
+def of_length(found, points, factor):
+    """A walk whose bones are longer, in the same image: depths (1, T, N) and lengths (1, B)."""
+    lengths = factor * lengths_of(found, points)
+    dz = (lengths**2 - found.flat).clamp_min(0).sqrt() * bone_vectors(points, found.bones)[..., 2].sign()
+    depth = dz @ found.tree.mT
+    return (depth - depth.mean(-1, keepdim=True))[None], lengths[None]
 
 
 def test_terms_by_hand():
@@ -55,29 +51,86 @@ def test_terms_by_hand():
     found = objective(points)
     lengths = bone_lengths(points, found.bones).mean(0)
     off = points + 0.02 * normal(6, 17, 3) * torch.tensor([0.0, 0.0, 1.0])
-    terms = found.terms(found.pack(off[None, ..., 2], 1.05 * lengths[None]))
+    terms = found.terms(off[None, ..., 2], 1.05 * lengths[None])
     bend = bone_vectors(off, found.bones)[..., 2].diff(n=2, dim=0)
     assert_close(terms["smoothness"], (bend.square().sum() / (2 * 0.05**2))[None])
     assert_close(terms["posture"], found.posture(off, 1.05 * lengths)[None])
     assert_close(terms["foreshortening"], found.foreshortening(off, 1.05 * lengths)[None])
     assert_close(terms["proportions"], found.proportions(lengths)[None])
     assert "anchor" not in terms and all(v.shape == (1,) for v in terms.values())
-    assert_close(found(found.pack(off[None, ..., 2], 1.05 * lengths[None])), sum(terms.values()))
+    assert_close(energy_of(found, off, 1.05 * lengths), sum(terms.values()))
     anchored = objective(points, anchor=lengths)
-    anchor = anchored.terms(anchored.pack(off[None, ..., 2], 1.05 * lengths[None]))["anchor"]
+    anchor = anchored.terms(off[None, ..., 2], 1.05 * lengths[None])["anchor"]
     assert anchor.item() == pytest.approx(16 * (torch.tensor(1.05).log().item() / 0.01) ** 2 / 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.004, 0.03])
+def test_length_term_by_hand(noise):
+    points = walk(6)
+    body = replace(SKELETONS["h36m17"], flexible=(3,))
+    noises = noise * (1 + normal(6, 17).abs())
+    found = Objective(body, points[..., :2], Weights(), noise=noises)
+    lengths = 1.03 * lengths_of(found, points)
+    depth = points[..., 2] + 0.01 * normal(6, 17, seed=1)
+    total = 0.0
+    for b, (i, j) in enumerate(found.bones.tolist()):
+        seen, explained, left = 0.0, 0.0, 0.0
+        for t in range(6):
+            flat = (points[t, j, :2] - points[t, i, :2]).square().sum().item()
+            size = lengths[b].item() ** 2
+            off = (flat + (depth[t, j] - depth[t, i]).item() ** 2 - size) / (2 * lengths[b].item())
+            image = min(flat / size, 1) * (noises[t, i] ** 2 + noises[t, j] ** 2).item()
+            variance = 0.003**2 + image
+            seen += 4 * math.log(1 + off**2 / variance / 4) / 6
+            left += 0.8 * image / variance / 6
+        explained = seen if noise == 0 else (seen - left + math.hypot(seen - left, 0.3 * left)) / 2
+        total += 0 if b == 3 else 6 / 2 * math.log(1 + explained)
+    assert found.terms(depth[None], lengths[None])["length"].item() == pytest.approx(total, rel=1e-4)
 
 
 def test_lengths_are_kept_the_less_the_noisier_the_image():
     points = walk(6)
-    right = bone_lengths(points, objective(points).bones).mean(0)
+    right = lengths_of(objective(points), points)
     sizes = torch.tensor([1.0, 1.01, 1.02, 1.05, 1.2]).double()[:, None] * right
     values = []
     for noise in (0.0, 0.003, 0.02):
-        found = objective(points, noise=torch.full((6, 17), noise).double())
-        values.append(found.terms(found.pack(points[None, ..., 2].expand(5, -1, -1), sizes))["length"])
+        value = objective(points, noise=noise).terms(points[None, ..., 2].expand(5, -1, -1), sizes)["length"]
+        values.append(value - value[0])
+        assert (value.diff() > 0).all()
+        assert value[0] < 0.02 * 6 * 16 / 2  # right lengths cost next to nothing
     for stiff, soft in itertools.pairwise(values):
-        assert stiff[0] < 1e-6 and (stiff.diff() > 0).all() and (soft[1:] < stiff[1:]).all()
+        assert (soft[1:] < stiff[1:]).all()
+
+
+def test_noise_is_left_unexplained():
+    """Depths that make every noisy frame's bones as long as the others' gain next to nothing where noise is known."""
+    points = walk(60)
+    noisy = points + 0.01 * normal(60, 17, 3) * torch.tensor([1.0, 1.0, 0.0])
+    gains = []
+    for noise in (0.0, 0.01):
+        found = objective(noisy, noise=noise)
+        lengths = 1.02 * lengths_of(found, points)
+        dz = (lengths**2 - found.flat).clamp_min(0).sqrt() * bone_vectors(points, found.bones)[..., 2].sign()
+        depths = torch.stack([points[..., 2], dz @ found.tree.mT])
+        plain, explained = found.terms(depths, torch.stack([lengths_of(found, points), lengths]))["length"]
+        gains.append(float(plain - explained))
+    assert gains[0] > 500 and gains[1] < 0.1 * gains[0]
+
+
+def test_precision():
+    """Noise counts by the share of the bone that lies in the image."""
+    points = torch.zeros(2, 17, 3).double()
+    points[..., 2] = walk(2)[..., 2]  # every bone points at the camera in frame 0
+    points[1] = walk(2)[1].flip(-1)
+    found = objective(points, noise=0.02)
+    usual = found.posture.rest_lengths
+    precision = found.precision(usual[None])
+    assert precision.shape == (1, 2, 16)
+    assert_close(precision[0, 0], torch.full((16,), 1 / 0.003**2).double())
+    share = (found.flat[1] / usual**2).clamp_max(1)
+    assert_close(precision[0, 1], 1 / (0.003**2 + share * 2 * 0.02**2))
+    assert_close(bone_noise(torch.tensor([[3.0, 4.0]]), torch.tensor([[0, 1]])), torch.tensor([[5.0]]))
+    assert_close(objective(points).precision(usual[None]), torch.full((1, 2, 16), 1 / 0.003**2).double())
 
 
 def test_flexible_bones_may_change_their_length():
@@ -87,19 +140,132 @@ def test_flexible_bones_may_change_their_length():
     for flexible, free in (((0,), True), ((1,), False)):
         body = replace(SKELETONS["h36m17"], flexible=flexible)
         found = Objective(body, points[..., :2], Weights(), noise=torch.zeros(6, 17).double())
-        assert (found.terms(found.pack(points[None, ..., 2], wrong[None]))["length"] < 1e-6) == free
+        assert (found.terms(points[None, ..., 2], wrong[None])["length"] < 1e-6) == free
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.01])
 @pytest.mark.parametrize("frames", [1, 2, 3, 8])
-def test_gradient(frames):
+def test_gradient(frames, noise):
     points = walk(8)[:frames]
-    found = objective(points)
-    assert gradcheck(found, state_of(found, points) + 0.01 * normal(1, frames * 17 + 16), fast=True)
+    found = objective(points, noise=noise)
+    lengths = lengths_of(found, points)[None]
+    depth = points[None, ..., 2]
+    assert gradcheck(found, depth + 0.01 * normal(1, frames, 17), 1.02 * lengths, fast=True)
     still = points[:1].expand(frames, -1, -1)
-    found = objective(still)
-    assert gradcheck(found, state_of(found, still), fast=True)
-    flat = torch.cat([still[..., :2], 0 * still[..., 2:]], -1)
-    assert gradcheck(objective(flat), state_of(found, still) * 0, fast=True)
+    found = objective(still, noise=noise)
+    assert gradcheck(found, still[None, ..., 2], lengths, fast=True)
+    flat = still * torch.tensor([1.0, 1.0, 0.0])
+    assert gradcheck(objective(flat, noise=noise), flat[None, ..., 2], lengths, fast=True)
+
+
+# ---------------------------------------------------------------------- unknowns
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("skeleton", ["h36m17", "coco17", "mediapipe33"])
+def test_unknowns_start_where_they_are_told_to(skeleton, noise):
+    points = walk(5, skeleton)
+    found = objective(points, skeleton, noise=noise)
+    depth = torch.stack([points[..., 2], -0.5 * points[..., 2]])
+    lengths = lengths_of(found, points) * torch.tensor([[1.0], [1.1]])
+    unknowns = _Unknowns(found, depth, lengths)
+    bones = found.skeleton.num_bones
+    assert unknowns.scale.shape == (2, 6 * bones) and (unknowns.scale > 0).all()
+    again, same = unknowns(torch.zeros(2, 6 * bones).double())
+    assert_close(again, depth, rtol=0, atol=1e-12)
+    assert torch.equal(same, lengths)
+
+
+@pytest.mark.parametrize("skeleton", ["h36m17", "coco17", "mediapipe33"])
+def test_unknowns_give_bodies_wherever_they_are(skeleton):
+    """Centred, with virtual joints at their sources and lengths above 0."""
+    points = walk(5, skeleton)
+    found = objective(points, skeleton)
+    body = SKELETONS[skeleton]
+    unknowns = _Unknowns(found, points[None, ..., 2], lengths_of(found, points)[None])
+    depth, lengths = unknowns(30 * normal(1, 6 * body.num_bones))
+    assert (depth - points[..., 2]).abs().max() > 0.1
+    assert depth.mean(-1).abs().max() < 1e-12 and (lengths > 0).all()
+    seen = torch.cat([normal(5, body.num_observed, 2), depth[0, :, : body.num_observed, None]], -1)
+    assert_close(body.complete(seen)[0][..., 2], depth[0])
+
+
+def test_a_length_takes_its_bone_s_depths_along():
+    """Where a bone points at the camera, four fifths of what it grows by."""
+    points = walk(5)
+    found = objective(points)
+    lengths = lengths_of(found, points)[None]
+    unknowns = _Unknowns(found, points[None, ..., 2], lengths)
+    state = torch.zeros(1, 6 * 16).double()
+    state[:, -16:] = 1e-4 / unknowns.scale[:, -16:]
+    depth, grown = unknowns(state)
+    misfit = lambda z, size: found.flat + bone_vectors(z[0, ..., None], found.bones)[..., 0] ** 2 - size**2  # noqa: E731
+    alone = misfit(points[None, ..., 2], grown) - misfit(points[None, ..., 2], lengths)
+    along = misfit(depth, grown) - misfit(points[None, ..., 2], lengths)
+    share = (bone_vectors(points, found.bones)[..., 2] / lengths) ** 2
+    assert_close(along / alone, 0.25 / (share + 0.25), rtol=0, atol=1e-3)
+    assert share.max() > 0.5
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("frames", [1, 2, 5])
+def test_gradient_over_unknowns(frames, noise):
+    points = walk(5)[:frames]
+    found = objective(points, noise=noise)
+    unknowns = _Unknowns(found, *of_length(found, points, 1.05))
+    start = torch.zeros_like(unknowns.scale)
+    for state in (start, 2 * normal(*start.shape)):
+        assert gradcheck(lambda s: found(*unknowns(s)), state, fast=True)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.01])
+def test_unknowns_make_the_objective_round(noise):
+    """The Hessian's condition at a minimum, without the shifts of whole frames, which cost nothing."""
+    points = walk(6, yaw=20.0)
+    found = objective(points, noise=noise)
+    z, sizes, _, _ = found.minimise(points[None, ..., 2], lengths_of(found, points)[None], 100)
+    unknowns = _Unknowns(found, z, sizes)
+    plain = torch.cat([z.flatten(), sizes.flatten().log()])
+    curves = []
+    for energy, state in (
+        (lambda s: found(*unknowns(s[None]))[0], torch.zeros(7 * 16).double()),
+        (lambda s: found(s[: 6 * 17].view(1, 6, 17), s[None, 6 * 17 :].exp())[0], plain),
+    ):
+        hessian = torch.autograd.functional.hessian(energy, state)
+        curves.append(torch.linalg.eigvalsh(hessian)[-7 * 16 :])
+    white, plain = (float(curve[-1] / curve[0]) for curve in curves)
+    assert 1 < white < 0.12 * plain
+    assert 0.1 < curves[0].median() < 10 and curves[0][-1] < 10
+
+
+@pytest.mark.parametrize("factor", [1.03, 1.1])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_few_steps_do(noise, factor):
+    """Twenty steps lead further than sixty on depths and lengths themselves."""
+    points = walk()
+    found = objective(points, noise=noise)
+    depth, lengths = of_length(found, points, factor)
+
+    def plain(state):
+        z, sizes = state.split([40 * 17, 16], 1)
+        z = z.unflatten(1, (40, 17))
+        return found(z - z.mean(-1, keepdim=True), sizes.exp())
+
+    start = torch.cat([depth.flatten(1), lengths.log()], 1)
+    far = plain(lbfgs(plain, start, num_steps=60, tolerance=1e-9).value)
+    energy = found.minimise(depth, lengths, 20)[2]
+    assert energy < far < found(depth, lengths)
+
+
+def test_loose_lengths_first():
+    """As if lengths were known less; the objective itself is left as it is."""
+    points = walk(20)
+    found = objective(points)
+    start = of_length(found, points, 1.1)
+    loose = objective(points, weights=replace(Weights(), length=7 * Weights().length))
+    for one, other in zip(found.minimise(*start, 8, 7.0)[:3], loose.minimise(*start, 8)[:3], strict=True):
+        assert_close(one, other)
+    assert found.weights == Weights()
 
 
 def test_where_nothing_is_seen_it_stays_finite():
@@ -124,12 +290,12 @@ def test_the_true_motion_is_best(yaw):
         if (other - other.mean(-1, keepdim=True) - depth).abs().max() > 0.1:  # else the bone lies in the image plane
             others.append(other - other.mean(-1, keepdim=True))
     with torch.no_grad():
-        true = found(found.pack(depth[None], lengths[None]))
+        true = found(depth[None], lengths[None])
         for other in others:
-            assert found(found.pack(other[None], lengths[None])) > true
+            assert found(other[None], lengths[None]) > true
         for other in (-depth, 0 * depth):
-            assert found(found.pack(other[None], lengths[None])) > true + 100
-        assert found(found.pack(depth[None], 1.1 * lengths[None])) > true + 5
+            assert found(other[None], lengths[None]) > true + 100
+        assert found(depth[None], 1.1 * lengths[None]) > true + 5
 
 
 def test_minimise_lowers_sorts_and_keeps_good_starts():
@@ -137,10 +303,10 @@ def test_minimise_lowers_sorts_and_keeps_good_starts():
     found = objective(points)
     lengths = bone_lengths(points, found.bones).mean(0)
     depth = torch.stack([-points[..., 2], points[..., 2] + 0.02 * normal(40, 17)])
-    before = found(found.pack(depth, lengths.expand(2, -1)))
+    before = found(depth, lengths.expand(2, -1))
     z, sizes, energy, solution = found.minimise(depth, lengths.expand(2, -1), 25)
     assert (energy.diff() >= 0).all() and (energy < before.flip(0)).all()
-    assert_close(energy, found(found.pack(z, sizes)))
+    assert_close(energy, found(z, sizes))
     assert solution.iterations >= 1
     assert (z[0] - points[..., 2]).square().mean().sqrt() < 0.05
     alone = found.minimise(depth[1:], lengths[None], 25)
@@ -154,8 +320,75 @@ def test_frame_rates_count_alike():
     for points, rate in ((slow, 30.0), (fast, 60.0)):
         found = objective(points, rate=rate, weights=replace(Weights(), length=0.05))
         off = points * torch.tensor([1.0, 1.0, 0.8])  # not the best, or all terms were small
-        values.append({k: float(v) for k, v in found.terms(state_of(found, off)).items()})
+        values.append({k: float(v) for k, v in found.terms(off[None, ..., 2], lengths_of(found, off)[None]).items()})
     for name in ("posture", "hinges", "foreshortening", "proportions"):
         assert values[1][name] == pytest.approx(values[0][name], rel=0.15, abs=0.5), name
-    assert at_rate(Weights(), 30.0) == Weights()
-    assert at_rate(Weights(), 60.0).acceleration == pytest.approx(Weights().acceleration / 4)
+    assert at_pace(Weights(), 30.0) == Weights()
+    assert at_pace(Weights(), 60.0).acceleration == pytest.approx(Weights().acceleration / 4)
+    slow = at_pace(Weights(), 30.0, 3.0)
+    assert slow == replace(
+        Weights(), posture=3 * Weights().posture, foreshortening=3 * Weights().foreshortening, hinge=Weights().hinge / 3
+    )
+
+
+# ---------------------------------------------------------------------- noise
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_lengths_do_not_grow_under_noise(seed):
+    """Of the true motion in a noisy image; without being told of the noise they do grow."""
+    points = walk(60)
+    noisy = points + 0.01 * normal(60, 17, 3, seed=seed) * torch.tensor([1.0, 1.0, 0.0])  # 10 mm of 1.75 m
+    grown, wrong = [], []
+    for noise in (0.01, 0.0):
+        found = objective(noisy, noise=noise)
+        lengths = lengths_of(found, points)
+        z, sizes, _, _ = found.minimise(points[None, ..., 2], lengths[None], 60)
+        grown.append((sizes[0] / lengths)[lengths > 0.2])  # a hip of 0.13 is hardly larger than its noise
+        wrong.append(float((z[0] - points[..., 2]).square().mean().sqrt() / points[..., 2].square().mean().sqrt()))
+    assert len(grown[0]) >= 10
+    assert (grown[0] - 1).abs().max() < 0.1 and abs(grown[0].mean() - 1) < 0.02
+    assert grown[1].max() > 1.1 and grown[1].mean() > 1.03
+    assert wrong[0] < 0.35 and wrong[0] < 0.5 * wrong[1]
+
+
+# ---------------------------------------------------------------------- pace
+
+
+def pace(points, rate=30.0):
+    return pace_of(points[..., :2], SKELETONS["h36m17"], rate)
+
+
+def test_slow_motion_counts_less():
+    """A walk in slow motion, three times as slow, has about three frames for one."""
+    assert pace(walk(60)) == 1
+    assert pace(walk(180, fps=90.0)) == pytest.approx(3, rel=0.15)
+    assert pace(walk(360, fps=180.0)) == pytest.approx(2 * pace(walk(180, fps=90.0)), rel=0.03)
+
+
+@pytest.mark.parametrize("fps", [15.0, 60.0, 120.0])
+def test_pace_follows_the_frame_rate(fps):
+    """A clip tells no more for being filmed with more frames a second."""
+    assert pace(walk(int(2 * fps), fps=fps), fps) == pytest.approx(fps / 30)
+    slow = walk(180, fps=90.0)  # at 30 frames a second
+    more = walk(int(6 * fps), fps=3 * fps)  # the same at fps frames a second
+    assert pace(more, fps) == pytest.approx(pace(slow) * fps / 30, rel=0.05)
+
+
+def test_pace_does_not_depend_on_size_and_place():
+    slow = walk(90, fps=120.0)
+    assert pace(slow) > 2
+    assert pace(200 * slow + 7) == pytest.approx(pace(slow))
+    moved = slow + torch.linspace(0, 3, 90)[:, None, None]
+    assert pace(moved) == pytest.approx(pace(slow))
+
+
+def test_pace_of_a_clip_that_does_not_move():
+    """The whole of it counts as a few frames, however long it is."""
+    still = walk(1).expand(60, -1, -1)
+    assert pace(still) == pytest.approx(60 / module.WALK)
+    assert pace(0 * still) == pytest.approx(60 / module.WALK)
+    assert pace(still, 600.0) == 20  # never less than by its rate
+    assert pace(walk(1)) == 1 and pace(walk(2), 60.0) == 2 and pace(walk(2), 15.0) == 0.5
+    named = replace(SKELETONS["h36m17"], template=None, proportions=None)
+    assert pace_of(still[..., :2], named, 60.0) == 2
