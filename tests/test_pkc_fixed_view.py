@@ -2,11 +2,12 @@
 
 import pytest
 import torch
+from numerics import normal
 from samples import walk_in_template_units as walk
 from torch.testing import assert_close
 
 from kcs_torch.functional import bone_lengths
-from kcs_torch.methods.pkc.fixed_view import Hypotheses, fixed_view
+from kcs_torch.methods.pkc.fixed_view import Hypotheses, distinct, fixed_view
 from kcs_torch.nn import PostureEnergy
 from kcs_torch.skeleton import SKELETONS
 
@@ -133,3 +134,45 @@ def test_a_template_that_turns_is_found_again(skeleton):
     points = rest @ turn.view(6, 3, 3).mT
     points = points - points.mean(1, keepdim=True)
     assert error(solve(points, skeleton, steps=8).depth[0], points) < 0.3
+
+
+# ---------------------------------------------------------------------- several hypotheses
+
+BENT = torch.tensor([[-0.9, -0.3, 0.3, 0.9]]).repeat(5, 1).double()  # a chain of three bones that points away
+
+
+def hypotheses(depths, energy, steps=0):
+    lengths = torch.arange(3 * len(depths)).view(-1, 3).double()
+    return Hypotheses(torch.stack(depths), lengths, torch.tensor(energy).double(), steps)
+
+
+@pytest.mark.parametrize("apart", [0.02, 0.04])
+def test_equal_solutions_are_told_once(apart):
+    near = 0.9 * apart
+    shapes = [BENT, BENT + near, -BENT, -BENT + 0.1 * near * normal(5, 4), 2 * BENT]
+    found = hypotheses(shapes, [1.0, 2.0, 3.0, 4.0, 5.0])
+    assert distinct(found, 5, apart).energy.tolist() == [1, 3, 5]
+    assert distinct(found, 2, apart).energy.tolist() == [1, 3]
+    assert distinct(found, 1, apart).energy.tolist() == [1]
+    assert distinct(found, 5, 0.8 * apart).energy.tolist() == [1, 2, 3, 5]
+    kept = distinct(found, 5, apart)
+    assert torch.equal(kept.depth, torch.stack([BENT, -BENT, 2 * BENT])) and kept.lengths[:, 0].tolist() == [0, 6, 12]
+
+
+def test_solutions_that_failed_are_left_out():
+    found = hypotheses([BENT, -BENT, 2 * BENT], [1.0, torch.nan, torch.inf])
+    assert distinct(found, 3, 0.02).energy.tolist() == [1]
+    lost = hypotheses([BENT, -BENT], [torch.nan, torch.nan])
+    assert len(distinct(lost, 3, 0.02).energy) == 1  # something has to be returned
+
+
+def test_joined_hypotheses_are_sorted():
+    one, other = (
+        hypotheses([BENT, 2 * BENT], [1.0, 4.0], 7),
+        hypotheses([-BENT, 3 * BENT, 0 * BENT], [-2.0, 3.0, 9.0], 5),
+    )
+    both = one.joined(other)
+    assert both.energy.tolist() == [-2, 1, 3, 4, 9] and both.steps == 12
+    assert torch.equal(both.depth, torch.stack([-BENT, BENT, 3 * BENT, 2 * BENT, 0 * BENT]))
+    assert both.lengths[:, 0].tolist() == [0, 0, 3, 3, 6]
+    assert torch.equal(other.joined(one).depth, both.depth)
