@@ -9,6 +9,7 @@ from torch.testing import assert_close
 
 from kcs_torch import PKC, KcsWarning, OptionError, Skeleton, Tracks
 from kcs_torch.data import random_motion, walking_person
+from kcs_torch.functional import bone_lengths
 from kcs_torch.methods.pkc import method as module
 
 NAN = math.nan
@@ -157,9 +158,18 @@ def test_seeds_of_random_starts():
 
 def test_known_cameras_tell_the_mirror_images_apart(turning):
     clip, _ = turning
-    result = PKC()(clip.tracks, clip.cameras)
+    result = PKC(viewpoint="moving")(clip.tracks, clip.cameras)
     assert error(result.points, clip.points) < 0.1
     assert torch.equal(result.cameras, clip.cameras) and result.alternatives == ()
+
+
+def test_known_cameras_are_those_of_every_solution(turning):
+    clip, _ = turning
+    result = PKC()(clip.tracks, clip.cameras)
+    assert error(result.points, clip.points) < 0.1
+    for one in (result, *result.alternatives):
+        assert torch.equal(one.cameras, clip.cameras)
+        assert error(one.points * FLIP, clip.points) > 1  # none is the mirror image
 
 
 # ---------------------------------------------------------------------- units, types
@@ -256,7 +266,7 @@ def test_a_leg_never_seen_is_told_and_uncertain():
 
 
 def test_noise_gaps_and_wrong_detections_are_cleaned_first():
-    clip = walking_person(60, turn=0.0, noise=6.0, missing=0.05, generator=torch.Generator().manual_seed(1))
+    clip = walking_person(60, turn=0.0, noise=20.0, missing=0.05, generator=torch.Generator().manual_seed(1))
     points = clip.tracks.points.clone()
     points[::9, 3] += 600.0
     tracks = of(torch.where(clip.tracks.seen[..., None], points, NAN))
@@ -265,6 +275,11 @@ def test_noise_gaps_and_wrong_detections_are_cleaned_first():
     assert "rejected as outliers" in notes and "tracks smoothed" in notes
     assert error(result.points, clip.points) < 0.5
     assert error(result.points, clip.points) < error(raw.points, clip.points)
+    bones = result.skeleton.bone_index()
+    true = bone_lengths(clip.points, bones).mean(0)
+    grown = result.lengths / true
+    assert grown.median() == pytest.approx(1, abs=0.03)
+    assert (grown[true > 200] - 1).abs().max() < 0.1  # mm; a hip of 130 is hardly longer than the noise is large
 
 
 # ---------------------------------------------------------------------- fields
