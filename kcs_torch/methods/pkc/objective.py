@@ -36,6 +36,7 @@ class Weights:
         length: standard deviation of a bone's length about its mean.
         acceleration: standard deviation of a bone's second difference in depth.
         posture: frames that count as one for the posture.
+        kappa: independent frames that the template's directions are worth.
         foreshortening: frames that count as one for the foreshortening.
         hinge: weight of a hinge in a frame.
         sine: sine of a wrong bend that costs half its weight.
@@ -44,8 +45,9 @@ class Weights:
     """
 
     length: float = 0.003
-    acceleration: float = 0.05
+    acceleration: float = 0.08
     posture: float = 6.0
+    kappa: float = 20.0
     foreshortening: float = 10.0
     hinge: float = 0.08
     sine: float = 0.05
@@ -119,7 +121,7 @@ class Objective:
     ) -> None:
         self.skeleton, self.image, self.weights, self.anchor = skeleton, image, weights, anchor
         make = lambda module: module.to(image)  # noqa: E731
-        self.posture = make(PostureEnergy(skeleton, correlation=weights.posture))
+        self.posture = make(PostureEnergy(skeleton, kappa=weights.kappa, correlation=weights.posture))
         self.foreshortening = make(ForeshorteningEnergy(skeleton, correlation=weights.foreshortening))
         self.proportions = make(ProportionEnergy(skeleton, spread=weights.proportions, twins=weights.twins))
         self.hinges = make(HingeEnergy(skeleton))
