@@ -1,0 +1,274 @@
+"""Measure what each ingredient of PKC is worth: switch it off, lift the same clips again, compare.
+
+    python scripts/ablation.py
+    python scripts/ablation.py --parts fixed --cases 20 --csv ablation.csv
+    python scripts/ablation.py --variants "no hinges" "no posture" --suites static_walk
+
+Prints two Markdown tables: ``fixed``, people before a camera that does not move, and ``moving``, bodies without a
+template before one that turns. A figure is the mean over a suite's clips: ``fixed`` shows the distance to the truth
+after one rotation per frame, in mm (the protocol's ``rigid``), ``moving`` that after one rotation for the clip, over
+the deviation of the body (``e3d``); neither fits a scale. Beside them are CPU milliseconds a frame. The truth is for
+scoring alone. Synthetic suites need no data; the others are those of the measuring protocol, where it lies beside the
+repository in ``../shared``, and --cases of each are taken, evenly spread. PyTorch uses one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import kcs_torch as kt
+from kcs_torch.data import SyntheticClip, random_motion, walking_person
+from kcs_torch.functional.align import similarity
+from kcs_torch.methods.pkc.limbs import SignCosts
+from kcs_torch.methods.pkc.trunk import mirror
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+PARTS = {
+    "fixed": ("walk", "walk, 15 mm noise", "static_walk", "static_action", "noise"),
+    "moving": ("tree", "akhter"),
+}
+SYNTHETIC = ("walk", "walk, 15 mm noise", "tree")
+YAWS = (0.0, 45.0, 90.0, 135.0)
+# import_module, as the package's functions have the names of these modules
+BODY, FIXED, MOVING, OBJECTIVE = (
+    import_module(f"kcs_torch.methods.pkc.{name}") for name in ("body", "fixed_view", "moving_view", "objective")
+)
+
+Clip = tuple[str, kt.Tracks, Tensor]
+Run = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What is other than usual.
+
+    Attributes:
+        fields: of the method.
+        changes: (owner, name, what makes the new value of the old one).
+    """
+
+    fields: dict[str, Any] = field(default_factory=dict)
+    changes: tuple[tuple[Any, str, Callable[[Any], Any]], ...] = ()
+
+    @contextmanager
+    def method(self) -> Iterator[kt.PKC]:
+        """The method, for as long as the context lasts; then all is as it was."""
+        with ExitStack() as stack:
+            for owner, name, change in self.changes:
+                stack.enter_context(patch.object(owner, name, change(getattr(owner, name))))
+            yield kt.PKC(**self.fields)
+
+
+def without(term: str, **costs: float) -> Variant:
+    """The objective without a term, and other costs where limbs' lengths and signs are searched."""
+
+    def fewer(terms: Callable[..., dict[str, Tensor]]) -> Callable[..., dict[str, Tensor]]:
+        def kept(*args: Any) -> dict[str, Tensor]:
+            values = terms(*args)
+            del values[term]  # fails where there is no such term
+            return values
+
+        return kept
+
+    return Variant(changes=((OBJECTIVE.Objective, "terms", fewer), searched(**costs)))
+
+
+def searched(**costs: float) -> tuple[Any, str, Callable[[Any], Any]]:
+    """Change costs in the search for limbs' lengths and signs, but not in that for the trunk, which shares them."""
+    put = lambda value: replace(value, **costs) if isinstance(value, SignCosts) else value  # noqa: E731
+    change = lambda search: lambda *args, **more: search(*map(put, args), **more)  # noqa: E731
+    return FIXED, "limb_paths", change
+
+
+def constant(owner: Any, name: str, value: Any) -> tuple[Any, str, Callable[[Any], Any]]:
+    """Another value of a module's constant or function."""
+    return owner, name, lambda _: value
+
+
+def weighted(**weights: float) -> tuple[tuple[Any, str, Callable[[Any], Any]], ...]:
+    """Other weights of the objective, wherever one is made."""
+    return tuple((owner, "Weights", lambda usual: partial(usual, **weights)) for owner in (BODY, FIXED))
+
+
+INF = float("inf")
+EVERYTHING = "everything"
+FIXED_VARIANTS = {
+    EVERYTHING: Variant(),
+    "no cleaning of the tracks": Variant({"denoise": False}),
+    "noise of the image explained in full": Variant(changes=(constant(OBJECTIVE, "NOISE", 0.0),)),
+    "no posture": without("posture", posture=INF),
+    "no hinges": without("hinges", hinge=0.0),
+    "no foreshortening": without("foreshortening", foreshortening=INF),
+    "no proportions": without("proportions", proportions=INF),
+    "left and right not alike": Variant(changes=weighted(twins=INF)),
+    "smoothness a hundred times weaker": Variant(changes=(*weighted(acceleration=0.5), searched(acceleration=0.5))),
+    "every frame counts alike (no pace)": Variant(
+        changes=tuple(constant(owner, "pace_of", lambda image, skeleton, rate: rate / 30) for owner in (BODY, FIXED))
+    ),
+    "lengths tight from the start": Variant(changes=(constant(FIXED, "LOOSE", 1.0),)),
+    "limbs do not vote on the trunk's sign": Variant(changes=(constant(FIXED, "TRUST", 0.0),)),
+    "trunk without its leaning siblings": Variant(
+        changes=(constant(FIXED, "siblings", lambda path, axes: torch.stack([path, mirror(path)])),)
+    ),
+    "no discrete moves": Variant({"rounds": 0}),
+    "one hypothesis, no moves": Variant(
+        {"rounds": 0}, ((FIXED._Search, "start", lambda start: lambda *args: start(*args)[:1]),)
+    ),
+}
+
+
+MOVING_VARIANTS = {
+    EVERYTHING: Variant(),
+    "no log-determinant of the changes": Variant(
+        changes=(
+            (MOVING, "FINE", lambda stages: tuple(replace(stage, still=1.0, moving=0.0) for stage in stages)),
+            (MOVING, "RANKING", lambda stage: replace(stage, moving=0.0)),
+        )
+    ),
+    "lengths free": Variant(
+        changes=(
+            (MOVING, "procrustean", lambda solve: lambda *args, **more: solve(*args, **more | {"stiffness": 0.0})),
+            constant(MOVING, "length_energy", lambda points, *_: points.new_zeros(len(points))),
+        )
+    ),
+    "no coarse stages": Variant(changes=(constant(MOVING, "COARSE", ()), constant(MOVING, "KEPT", ()))),
+    "SfAM's guess as the only start": Variant(changes=(constant(MOVING, "_starts", lambda *_: []),)),
+}
+VARIANTS = {"fixed": FIXED_VARIANTS, "moving": MOVING_VARIANTS}
+
+
+def both_signs(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Points and their mirror image in depth, which parallel rays do not tell apart; centred per frame."""
+    points = points - points.mean(1, keepdim=True)
+    return points, points * points.new_tensor([1.0, 1.0, -1.0])
+
+
+def rigid(points: Tensor, truth: Tensor) -> float:
+    """Mean distance after one rotation per frame, of the better of the two mirror images."""
+    return min(float((similarity(p, truth, scale=False) - truth).norm(dim=-1).mean()) for p in both_signs(points))
+
+
+def e3d(points: Tensor, truth: Tensor) -> float:
+    """Mean distance after one orthogonal matrix for the clip, over the truth's standard deviation."""
+    flat, goal = (x.flatten(0, 1) for x in (both_signs(points)[0], both_signs(truth)[0]))
+    u, _, v = torch.linalg.svd(flat.mT @ goal)
+    spread = both_signs(truth)[0].square().mean(1).sqrt().mean()
+    return float((flat @ u @ v - goal).norm(dim=-1).mean() / spread)
+
+
+FIGURES: dict[str, tuple[Callable[[Tensor, Tensor], float], str]] = {"fixed": (rigid, ".1f"), "moving": (e3d, ".4f")}
+
+
+def synthetic(suite: str, frames: int) -> Iterator[Clip]:
+    """Walks before a fixed camera, or trees of bones in random motion before one that turns."""
+    for seed, yaw in enumerate(YAWS):
+        chance = torch.Generator().manual_seed(seed)
+        clip: SyntheticClip
+        if suite == "tree":
+            body = kt.Skeleton.from_edges([((i - 1) // 2, i) for i in range(1, 15)], 15, name="tree")
+            clip = random_motion(body, frames, swing=20, turn=180, generator=chance)
+        else:
+            clip = walking_person(frames, yaw=yaw, turn=0, noise=15.0 * ("noise" in suite), generator=chance)
+        yield f"{suite} {seed}", clip.tracks, clip.points[:, : clip.skeleton.num_observed]
+
+
+def recorded(shared: Path, suite: str, cases: int, frames: int) -> Iterator[Clip]:
+    """Some clips of one of the protocol's suites."""
+    from benchmark import load_input, load_protocol
+
+    protocol = load_protocol(shared)
+    every = protocol.suites()[suite]
+    for i in sorted(set(np.linspace(0, len(every) - 1, min(cases, len(every))).round().astype(int))):
+        given, truth = protocol.build(shared / "data", {"max_frames": frames} | every[i])
+        label = protocol.case_name(every[i])
+        yield label, load_input(given, label), torch.from_numpy(truth["points3d"])
+
+
+def lift(part: str, name: str, suite: str, clip: Clip) -> Run:
+    """One clip by one variant."""
+    label, tracks, truth = clip
+    with VARIANTS[part][name].method() as method:
+        start = time.process_time()
+        points = method(tracks).observed
+        used = time.process_time() - start
+    what = {"part": part, "variant": name, "suite": suite, "case": label, "frames": len(points)}
+    return what | {"error": FIGURES[part][0](points, truth), "ms": 1000 * used / len(points)}
+
+
+def head(suites: list[str]) -> str:
+    """The first two lines of a Markdown table."""
+    return "\n".join([f"| | {' | '.join(suites)} | ms a frame |", "|---" * (len(suites) + 2) + "|"])
+
+
+def row(name: str, runs: list[Run], suites: list[str], style: str) -> str:
+    """A variant's line: the mean of each suite's clips, and the milliseconds of all frames."""
+    means = [np.mean([run["error"] for run in runs if run["suite"] == suite]) for suite in suites]
+    each = np.average([run["ms"] for run in runs], weights=[run["frames"] for run in runs])
+    return f"| {name} | {' | '.join(format(mean, style) for mean in means)} | {each:.1f} |"
+
+
+def measure(part: str, names: list[str], suites: list[str], options: argparse.Namespace) -> list[Run]:
+    """Lift every clip by every variant, and print a part's table as it grows."""
+    clips: list[tuple[str, Clip]] = []
+    for suite in suites:
+        if suite in SYNTHETIC:
+            found = synthetic(suite, min(options.frames, 90))
+        else:
+            found = recorded(options.shared, suite, options.cases, options.frames)
+        clips += [(suite, clip) for clip in found]
+    lift(part, EVERYTHING, *clips[0])  # what the first run does once does not count
+    print(f"\n{part}\n\n{head(suites)}", flush=True)
+    runs: list[Run] = []
+    for name in names:
+        own = [lift(part, name, suite, clip) for suite, clip in clips]
+        print(row(name, own, suites, FIGURES[part][1]), flush=True)
+        runs += own
+    return runs
+
+
+def main(words: list[str] | None = None) -> None:
+    """Measure what is asked for and print a table a part."""
+    suites = [suite for part in PARTS.values() for suite in part]
+    variants = list(dict.fromkeys(name for part in VARIANTS.values() for name in part))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART", help=", ".join(PARTS))
+    parser.add_argument("--suites", nargs="+", choices=suites, metavar="SUITE", help="; ".join(suites))
+    parser.add_argument("--variants", nargs="+", choices=variants, metavar="VARIANT", help="; ".join(variants))
+    parser.add_argument("--shared", type=Path, default=SHARED, help="folder with protocol/protocol.py and data/")
+    parser.add_argument("--cases", type=int, default=6, help="of each of the protocol's suites, at most")
+    parser.add_argument("--frames", type=int, default=150, help="of most clips, at most; synthetic ones have up to 90")
+    parser.add_argument("--csv", type=Path, help="also write every run here")
+    options = parser.parse_args(words)
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore", kt.KcsWarning)
+    there = suites if (options.shared / "protocol").is_dir() else SYNTHETIC
+    runs: list[Run] = []
+    for part in options.parts:
+        chosen = [suite for suite in PARTS[part] if suite in (options.suites or there)]
+        names = [name for name in VARIANTS[part] if name in (*(options.variants or variants), EVERYTHING)]
+        if chosen:
+            runs += measure(part, names, chosen, options)
+    if options.csv:
+        with options.csv.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(runs[0]))
+            writer.writeheader()
+            writer.writerows(runs)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""scripts/ablation.py: every ingredient is really off, and on again; a run on a few frames."""
+
+import csv
+import sys
+import warnings
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import pytest
+import torch
+
+import kcs_torch as kt
+from kcs_torch.data import walking_person
+
+
+@pytest.fixture(scope="module")
+def script(root):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(root / "scripts"))
+        yield import_module("ablation")
+        for name in ("ablation", "benchmark"):
+            sys.modules.pop(name, None)
+
+
+@pytest.fixture(scope="module")
+def clips(script):
+    """A noisy walk, and a clean one in slow motion, before a fixed camera; a tree before one that turns."""
+    noisy = walking_person(30, yaw=0, turn=0, noise=15, generator=torch.Generator().manual_seed(0)).tracks
+    slow = replace(walking_person(30, fps=150, yaw=0, turn=0).tracks, fps=30)
+    tree = next(iter(script.synthetic("tree", 24)))[1]
+    return {"fixed": [noisy, slow], "moving": [tree]}
+
+
+def lifted(variant, tracks):
+    with variant.method() as method, warnings.catch_warnings():
+        warnings.simplefilter("ignore", kt.KcsWarning)
+        return method(tracks).points
+
+
+def test_a_variant_lasts_as_long_as_its_context(script):
+    for name, variant in (pair for part in script.VARIANTS.values() for pair in part.items()):
+        before = [getattr(owner, attribute) for owner, attribute, _ in variant.changes]
+        with pytest.raises(RuntimeError), variant.method() as method:
+            during = [getattr(owner, attribute) for owner, attribute, _ in variant.changes]
+            assert all(a is not b for a, b in zip(before, during, strict=True)), name
+            assert name == script.EVERYTHING or during or method != kt.PKC()
+            raise RuntimeError
+        after = [getattr(owner, attribute) for owner, attribute, _ in variant.changes]
+        assert all(a is b for a, b in zip(before, after, strict=True)), name
+
+
+@pytest.mark.parametrize("part", ["fixed", "moving"])
+def test_every_ingredient_counts(script, clips, part):
+    """A switch that reaches nothing, as its name has changed in the code, would leave every solution as it is."""
+    usual = [lifted(script.VARIANTS[part][script.EVERYTHING], tracks) for tracks in clips[part]]
+    for name, variant in script.VARIANTS[part].items():
+        if name != script.EVERYTHING:
+            others = (lifted(variant, tracks) for tracks in clips[part])
+            assert not all(torch.equal(*pair) for pair in zip(others, usual, strict=True)), name
+
+
+def test_a_term_that_does_not_exist_cannot_be_switched_off(script, clips):
+    with pytest.raises(KeyError, match="friction"):
+        lifted(script.without("friction"), clips["fixed"][0])
+
+
+def test_figures_are_the_protocols(script, shared):
+    ((_, tracks, truth),) = script.recorded(shared, "static_walk", 1, 20)
+    assert tracks.num_frames == 20
+    bent = truth + 30 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0), dtype=truth.dtype)
+    protocol = import_module("benchmark").load_protocol(shared)
+    for points in (bent, bent * torch.tensor([1.0, 1.0, -1.0])):
+        expected = protocol.score(points.numpy(), truth.numpy(), None)
+        assert script.rigid(points, truth) == pytest.approx(expected["rigid"], rel=1e-6)
+        assert script.e3d(points, truth) == pytest.approx(expected["e3d"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("part", "suite", "variant"),
+    [("fixed", "walk", "no discrete moves"), ("moving", "tree", "SfAM's guess as the only start")],
+)
+def test_script(script, part, suite, variant, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(script, "YAWS", (0.0, 90.0))  # fewer clips
+    path = tmp_path / "runs.csv"
+    script.main(["--suites", suite, "--frames", "12", "--variants", variant, "--csv", str(path)])
+    title, head, line, *rows = filter(None, capsys.readouterr().out.splitlines())
+    assert title == part and head == f"| | {suite} | ms a frame |" and set(line) == {"|", "-"}
+    with path.open(newline="", encoding="utf-8") as file:
+        runs = list(csv.DictReader(file))
+    assert len(runs) == 2 * len(script.YAWS)
+    for shown, name in zip(rows, (script.EVERYTHING, variant), strict=True):
+        cells = [cell.strip() for cell in shown.strip("|").split("|")]
+        errors = [float(run["error"]) for run in runs if run["variant"] == name]
+        assert cells[0] == name and float(cells[1]) == pytest.approx(np.mean(errors), abs=0.051)
+        assert 0 < float(cells[1]) < 100 and float(cells[2]) > 0
