@@ -34,6 +34,7 @@ from torch import Tensor
 import kcs_torch as kt
 from kcs_torch.data import SyntheticClip, random_motion, walking_person
 from kcs_torch.functional.align import similarity
+from kcs_torch.methods.pkc import Weights
 from kcs_torch.methods.pkc.limbs import SignCosts
 from kcs_torch.methods.pkc.trunk import mirror
 
@@ -51,6 +52,7 @@ BODY, FIXED, MOVING, OBJECTIVE = (
 
 Clip = tuple[str, kt.Tracks, Tensor]
 Run = dict[str, Any]
+Change = tuple[Any, str, Callable[[Any], Any]]
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Variant:
     """
 
     fields: dict[str, Any] = field(default_factory=dict)
-    changes: tuple[tuple[Any, str, Callable[[Any], Any]], ...] = ()
+    changes: tuple[Change, ...] = ()
 
     @contextmanager
     def method(self) -> Iterator[kt.PKC]:
@@ -85,22 +87,21 @@ def without(term: str, **costs: float) -> Variant:
 
         return kept
 
-    return Variant(changes=((OBJECTIVE.Objective, "terms", fewer), searched(**costs)))
+    return Variant(changes=((OBJECTIVE.Objective, "terms", fewer), searched(lambda usual: replace(usual, **costs))))
 
 
-def searched(**costs: float) -> tuple[Any, str, Callable[[Any], Any]]:
-    """Change costs in the search for limbs' lengths and signs, but not in that for the trunk, which shares them."""
-    put = lambda value: replace(value, **costs) if isinstance(value, SignCosts) else value  # noqa: E731
-    change = lambda search: lambda *args, **more: search(*map(put, args), **more)  # noqa: E731
-    return FIXED, "limb_paths", change
+def searched(change: Callable[[SignCosts], SignCosts]) -> Change:
+    """Other costs in the search for limbs' lengths and signs, but not in that for the trunk, which shares them."""
+    put = lambda value: change(value) if isinstance(value, SignCosts) else value  # noqa: E731
+    return FIXED, "limb_paths", lambda search: lambda *args, **more: search(*map(put, args), **more)
 
 
-def constant(owner: Any, name: str, value: Any) -> tuple[Any, str, Callable[[Any], Any]]:
+def constant(owner: Any, name: str, value: Any) -> Change:
     """Another value of a module's constant or function."""
     return owner, name, lambda _: value
 
 
-def weighted(**weights: float) -> tuple[tuple[Any, str, Callable[[Any], Any]], ...]:
+def weighted(**weights: float) -> tuple[Change, ...]:
     """Other weights of the objective, wherever one is made."""
     return tuple((owner, "Weights", lambda usual: partial(usual, **weights)) for owner in (BODY, FIXED))
 
@@ -116,7 +117,12 @@ FIXED_VARIANTS = {
     "no foreshortening": without("foreshortening", foreshortening=INF),
     "no proportions": without("proportions", proportions=INF),
     "left and right not alike": Variant(changes=weighted(twins=INF)),
-    "smoothness a hundred times weaker": Variant(changes=(*weighted(acceleration=0.5), searched(acceleration=0.5))),
+    "smoothness a hundred times weaker": Variant(
+        changes=(
+            *weighted(acceleration=10 * Weights().acceleration),
+            searched(lambda usual: replace(usual, acceleration=10 * usual.acceleration)),
+        )
+    ),
     "every frame counts alike (no pace)": Variant(
         changes=tuple(constant(owner, "pace_of", lambda image, skeleton, rate: rate / 30) for owner in (BODY, FIXED))
     ),

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.methods.pkc.fixed_view import Hypotheses
+from kcs_torch.methods.pkc.objective import bone_noise
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["APART", "depth_deviation", "told_by_prior"]
@@ -23,7 +24,10 @@ LENGTH = 0.02
 FLAT = 0.25
 """Share of its length below which a bone's depth is no better known for being small."""
 
-CALIBRATION = 1.0
+NOISE = 0.7
+"""Share of the image's noise that a bone's length and depth take on."""
+
+CALIBRATION = 0.85
 """Factor by which deviations are scaled so that two thirds of all joints are within one."""
 
 
@@ -37,7 +41,7 @@ def told_by_prior(found: Hypotheses, skeleton: Skeleton) -> list[str]:
     return [skeleton.bone_names[b] for b in (share.amax(0) > 0.3).nonzero().flatten().tolist()]
 
 
-def depth_deviation(found: Hypotheses, image: Tensor, skeleton: Skeleton) -> Tensor:
+def depth_deviation(found: Hypotheses, noise: Tensor, skeleton: Skeleton) -> Tensor:
     """Standard deviation of the best solution's depths, (T, N).
 
     A bone's depth dz = sqrt(L^2 - |xy|^2) is off by L dL / |dz|: little where it points at the camera, much where it is
@@ -45,14 +49,15 @@ def depth_deviation(found: Hypotheses, image: Tensor, skeleton: Skeleton) -> Ten
 
     Args:
         found: solutions, best first.
-        image: (T, N, 2).
+        noise: (T, N) standard deviation of the joints' images.
         skeleton: of the N joints.
     """
-    bones = skeleton.bone_index(device=image.device)
+    bones = skeleton.bone_index(device=noise.device)
     dz = bone_vectors(found.depth[0][..., None], bones)[..., 0]  # (T, B)
     length = found.lengths[0].clamp_min(1e-9)
-    off = length * LENGTH / (dz.abs() / length).clamp_min(FLAT)
-    tree = chain_inverse(incidence(bones, skeleton.num_joints, dtype=image.dtype))  # (N, B)
+    wrong = ((length * LENGTH).square() + (NOISE * bone_noise(noise, bones)).square()).sqrt()
+    off = wrong / (dz.abs() / length).clamp_min(FLAT)
+    tree = chain_inverse(incidence(bones, skeleton.num_joints, dtype=noise.dtype))  # (N, B)
     variance = off.square() @ tree.square().mT
     if len(found.energy) > 1:
         share = torch.softmax(-(found.energy - found.energy[0]) / CLOSE, 0)

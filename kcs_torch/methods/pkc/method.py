@@ -198,7 +198,7 @@ class PKC(Method):
         for k, depth in enumerate(found.depth):
             points = torch.cat([image, depth[..., None] / body.factor], -1)
             one = torch.ones_like(points[:, 0, 0])
-            spread = depth_deviation(found[k:] if k else found, body.image, body.skeleton) / body.factor
+            spread = depth_deviation(found[k:] if k else found, body.noise, body.skeleton) / body.factor
             value = float(found.energy[k])
             path = body.frames(depth)[:, :2] if cameras is None else cameras
             made.append(Estimate(points, path, one, True, found.steps, () if k else notes, spread, value, still=True))
