@@ -136,8 +136,6 @@ FIXED_VARIANTS = {
         {"rounds": 0}, ((FIXED._Search, "start", lambda start: lambda *args: start(*args)[:1]),)
     ),
 }
-
-
 MOVING_VARIANTS = {
     EVERYTHING: Variant(),
     "no log-determinant of the changes": Variant(
@@ -233,7 +231,7 @@ def measure(part: str, names: list[str], suites: list[str], options: argparse.Na
     clips: list[tuple[str, Clip]] = []
     for suite in suites:
         if suite in SYNTHETIC:
-            found = synthetic(suite, min(options.frames, 90))
+            found = synthetic(suite, min(options.frames, 60))
         else:
             found = recorded(options.shared, suite, options.cases, options.frames)
         clips += [(suite, clip) for clip in found]
@@ -256,8 +254,8 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--suites", nargs="+", choices=suites, metavar="SUITE", help="; ".join(suites))
     parser.add_argument("--variants", nargs="+", choices=variants, metavar="VARIANT", help="; ".join(variants))
     parser.add_argument("--shared", type=Path, default=SHARED, help="folder with protocol/protocol.py and data/")
-    parser.add_argument("--cases", type=int, default=6, help="of each of the protocol's suites, at most")
-    parser.add_argument("--frames", type=int, default=150, help="of most clips, at most; synthetic ones have up to 90")
+    parser.add_argument("--cases", type=int, default=5, help="of each of the protocol's suites, at most")
+    parser.add_argument("--frames", type=int, default=150, help="of most clips, at most; synthetic ones have up to 60")
     parser.add_argument("--csv", type=Path, help="also write every run here")
     options = parser.parse_args(words)
     torch.set_num_threads(1)
