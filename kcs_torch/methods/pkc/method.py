@@ -49,12 +49,14 @@ class PKC(Method):
     """Both papers' ideas in one statistical model in bone space; the default of :func:`kcs_torch.reconstruct`.
 
     Bone vectors, aligned frame by frame to a common pose, follow one Gaussian, and so do their changes in time; bones
-    keep their length. Where the viewpoint turns this alone gives depth (:func:`moving_view`). Where it hardly does, the
-    depth of a bone is +-sqrt(L^2 - |xy|^2): lengths and signs come from the skeleton's template, spreads and hinges
-    (:func:`fixed_view`). With a template both are tried, and one objective ranks all hypotheses and mirror images.
+    keep their length. Where the viewpoint turns this alone gives depth (:func:`moving_view`), of markers, animals and
+    robots, say. With a template the viewpoint may stand still: the depth of a bone is +-sqrt(L^2 - |xy|^2), and lengths
+    and signs come from the skeleton's template, spreads and hinges (:func:`fixed_view`); one objective ranks many
+    hypotheses, mirror images among them. docs/pkc.md derives it all.
 
     Args:
-        viewpoint: "auto" tries both solvers, "fixed" and "moving" only one.
+        viewpoint: "fixed" lifts by the template, "moving" by the viewpoint's turn; "auto" by the template if there is
+            one. Known cameras always bring in the turn.
         denoise: smooth noisy tracks, fill gaps and reject outliers first (:func:`kcs_torch.solvers.denoise_tracks`).
         lifts: random starts of the moving viewpoint's solver, for skeletons without a template.
         rounds: of discrete moves of the fixed viewpoint's solver.
