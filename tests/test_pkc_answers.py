@@ -1,5 +1,7 @@
 """What is told beside the best solution: which bones the prior decided, and how sure depth is."""
 
+import math
+
 import pytest
 import torch
 from numerics import CHAIN
@@ -34,23 +36,34 @@ def test_bones_that_a_rival_flips():
     assert told_by_prior(rival[:1], CHAIN) == []
 
 
-def test_deviation_by_hand():
+@pytest.mark.parametrize("level", [0.0, 0.05])
+def test_deviation_by_hand(level):
     """Independent bones, dL L / |dz|, add up from the middle: of the chain a-b-c-d, lengths 1, depths 0.6."""
-    image = torch.zeros(5, 4, 2).double()
-    found = depth_deviation(hypotheses([BENT], [0.0]), image, CHAIN)
-    one = answers.LENGTH / 0.6 * answers.CALIBRATION
+    noise = torch.full((5, 4), level).double()
+    found = depth_deviation(hypotheses([BENT], [0.0]), noise, CHAIN)
+    wrong = math.hypot(answers.LENGTH, answers.NOISE * 2**0.5 * level)  # of both ends of a bone
+    one = wrong / 0.6 * answers.CALIBRATION
     outer = one * ((3 / 4) ** 2 + (2 / 4) ** 2 + (1 / 4) ** 2) ** 0.5  # how the three bones move the first joint
     inner = one * ((1 / 4) ** 2 + (2 / 4) ** 2 + (1 / 4) ** 2) ** 0.5
     assert_close(found, torch.tensor([outer, inner, inner, outer]).double().expand(5, 4))
 
 
 def test_deviation_grows_towards_the_image_plane_and_with_rivals():
-    image = torch.zeros(5, 4, 2).double()
-    steep = depth_deviation(hypotheses([BENT], [0.0]), image, CHAIN)
-    flat = depth_deviation(hypotheses([0.5 * BENT], [0.0]), image, CHAIN)
-    none = depth_deviation(hypotheses([0 * BENT], [0.0]), image, CHAIN)
+    exact = torch.zeros(5, 4).double()
+    steep = depth_deviation(hypotheses([BENT], [0.0]), exact, CHAIN)
+    flat = depth_deviation(hypotheses([0.5 * BENT], [0.0]), exact, CHAIN)
+    none = depth_deviation(hypotheses([0 * BENT], [0.0]), exact, CHAIN)
     assert (steep < flat).all() and (flat < none).all() and torch.isfinite(none).all()
-    rivals = [depth_deviation(hypotheses([BENT, -BENT], [0.0, e]), image, CHAIN) for e in (0.0, 10.0, 1e4)]
+    rivals = [depth_deviation(hypotheses([BENT, -BENT], [0.0, e]), exact, CHAIN) for e in (0.0, 10.0, 1e4)]
     assert (rivals[0][:, 0] > rivals[1][:, 0]).all() and (rivals[1][:, 0] > rivals[2][:, 0]).all()
     assert_close(rivals[2], steep)
-    assert rivals[0][0, 3].item() == pytest.approx((steep[0, 3].item() ** 2 + 0.5 * 1.8**2) ** 0.5, rel=0.02)
+    assert rivals[0][0, 3].item() == pytest.approx(math.hypot(steep[0, 3].item(), 1.8 * 0.5**0.5 * answers.CALIBRATION))
+
+
+def test_noise_in_one_frame_is_that_frame_s():
+    noise = torch.zeros(5, 4).double()
+    noise[2, 3] = 0.1  # the end of the last bone
+    clean, found = (depth_deviation(hypotheses([BENT], [0.0]), n, CHAIN) for n in (0 * noise, noise))
+    assert (found[2] > clean[2]).all() and found[2].argmax() == 3
+    others = [0, 1, 3, 4]
+    assert_close(found[others], clean[others])
