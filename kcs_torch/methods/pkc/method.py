@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
-from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.base import Estimate, Method
+from kcs_torch.methods.base import WEAK_TURN, Estimate, Method
 from kcs_torch.methods.pkc.answers import APART, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.fixed_view import Hypotheses, distinct
@@ -39,6 +39,9 @@ FILLED = 0.015
 
 MOVING_STEPS = sum(stage.num_steps for stage in (*COARSE, *FINE))
 """L-BFGS steps of the moving viewpoint's solver, at most."""
+
+TURNING = 90.0
+"""Degrees of the trunk's turn, as the template tells it, from which on the viewpoint's turn is asked as well."""
 
 LEAST_FRAMES = 12
 """Frames from which on the viewpoint may have turned."""
@@ -104,16 +107,24 @@ class PKC(Method):
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
         body = Body(skeleton, image, tracks.fps or 30.0, noise) if has_trunk else None
-        moving: MovingView | None = None
         enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
-        if body is None or (enough and (self.viewpoint == "moving" or cameras is not None)):
-            moving, first = self._moving(tracks, image, cameras, enough)
-            if moving is None and body is None:
-                return replace(first, notes=(*notes, *first.notes))
         if body is None:
-            assert moving is not None
+            moving, first = self._moving(tracks, image, cameras, enough)
+            if moving is None:
+                return replace(first, notes=(*notes, *first.notes))
             return self._from_moving(moving, image, cameras, notes)
-        return self._from_hypotheses(self._search(body, moving, cameras), body, image, cameras, notes)
+        found = None
+        moves = enough and self.viewpoint != "fixed"
+        # Cameras that turn tell the sign of depth: what the template says might contradict them.
+        told = cameras is not None and float(viewpoint_turn(cameras)) >= WEAK_TURN
+        if not moves or (self.viewpoint == "auto" and not told):
+            found = body.search(self.rounds, self.steps)
+            turn = float(viewpoint_turn(body.frames(found.depth[0])[:, :2]))
+            moves = moves and (cameras is not None or turn >= TURNING)
+        if moves:
+            found = self._ranked(body, self._moving(tracks, image, cameras, enough)[0], cameras, found)
+        assert found is not None
+        return self._from_hypotheses(found, body, image, cameras, notes)
 
     def _clean(self, tracks: Tracks) -> tuple[Tensor, Tensor, tuple[str, ...]]:
         """Complete tracks (T, N, 2), centred per frame, the noise (T, N) left in them, and what was done."""
@@ -152,8 +163,8 @@ class PKC(Method):
             return None, first
         rotations = complete_rotation(first.cameras)
         if cameras is None:
-            lifts, seed = self.lifts, self.seed
-            return moving_view(image, tracks.skeleton, first.points, rotations, lifts=lifts, seed=seed), first
+            lifts = 0 if self.viewpoint == "auto" and len(trunk_joints(tracks.skeleton)) >= 3 else self.lifts
+            return moving_view(image, tracks.skeleton, first.points, rotations, lifts=lifts, seed=self.seed), first
         bones = tracks.skeleton.bone_index(device=image.device)
         if not tracks.skeleton.is_tree:
             return None, first
@@ -177,12 +188,11 @@ class PKC(Method):
         other = replace(main, points=points * flip, cameras=path[:, :2] * flip, notes=("the mirror image in depth",))
         return replace(main, alternatives=(other,))
 
-    def _search(self, body: Body, moving: MovingView | None, cameras: Tensor | None) -> Hypotheses:
+    def _ranked(
+        self, body: Body, moving: MovingView | None, cameras: Tensor | None, found: Hypotheses | None
+    ) -> Hypotheses:
         """All hypotheses of a body with a template, best first."""
-        found = body.search(self.rounds, self.steps) if self.viewpoint != "moving" or moving is None else None
-        if moving is None:
-            assert found is not None
-            return found
+        assert moving is not None
         depth = moving.pose.points[:1, ..., 2] * body.factor
         ranked = body.rank(depth if cameras is not None else torch.cat([depth, -depth]), steps=self.steps)
         ranked = replace(ranked, steps=ranked.steps + MOVING_STEPS)
