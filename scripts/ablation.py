@@ -132,6 +132,7 @@ FIXED_VARIANTS = {
         changes=(constant(FIXED, "siblings", lambda path, axes: torch.stack([path, mirror(path)])),)
     ),
     "no discrete moves": Variant({"rounds": 0}),
+    "no turn of the viewpoint asked for": Variant({"viewpoint": "fixed"}),
     "one hypothesis, no moves": Variant(
         {"rounds": 0}, ((FIXED._Search, "start", lambda start: lambda *args: start(*args)[:1]),)
     ),

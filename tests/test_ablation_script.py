@@ -25,17 +25,23 @@ def script(root):
 
 @pytest.fixture(scope="module")
 def clips(script):
-    """A noisy walk, and a clean one in slow motion, before a fixed camera; a tree before one that turns."""
+    """A noisy walk, a clean one in slow motion, and one before a camera that goes round; a tree in motion."""
     noisy = walking_person(30, yaw=0, turn=0, noise=15, generator=torch.Generator().manual_seed(0)).tracks
     slow = replace(walking_person(30, fps=150, yaw=0, turn=0).tracks, fps=30)
+    round_ = walking_person(24, yaw=0, turn=270).tracks
     tree = next(iter(script.synthetic("tree", 24)))[1]
-    return {"fixed": [noisy, slow], "moving": [tree]}
+    return {"fixed": [noisy, slow, round_], "moving": [tree]}
 
 
 def lifted(variant, tracks):
     with variant.method() as method, warnings.catch_warnings():
         warnings.simplefilter("ignore", kt.KcsWarning)
-        return method(tracks).points
+        return method(tracks)
+
+
+def same(one, other):
+    """Whether both were found in as many steps and are alike to the last digit."""
+    return one.diagnostics.iterations == other.diagnostics.iterations and torch.equal(one.points, other.points)
 
 
 def test_a_variant_lasts_as_long_as_its_context(script):
@@ -57,7 +63,7 @@ def test_every_ingredient_counts(script, clips, part):
     for name, variant in script.VARIANTS[part].items():
         if name != script.EVERYTHING:
             others = (lifted(variant, tracks) for tracks in clips[part])
-            assert not all(torch.equal(*pair) for pair in zip(others, usual, strict=True)), name
+            assert not all(same(*pair) for pair in zip(others, usual, strict=True)), name
 
 
 def test_a_term_that_does_not_exist_cannot_be_switched_off(script, clips):
