@@ -39,6 +39,9 @@ KEPT = (12, 6, 3)
 RANKING = Stage(1e-5, 0, 1.0, 1.0, 0.003)
 """Scales at which finished starts are compared: the poses and their changes count alike."""
 
+TIGHT = 10.0
+"""Weight of each length of a tree in the fine stages: bones that are said to be rigid keep their length."""
+
 LOOSE, LOOSER = 0.3, 0.1
 """Weight of each length where the links are no tree (markers, say), in the coarse stages and in the fine ones."""
 
@@ -123,7 +126,7 @@ def moving_view(
     spread = lambda points: rigid_tree(distance_spread(points)[1])  # noqa: E731
     bones = skeleton.bone_index(device=image.device) if is_tree else spread(first[0])
     coarse, fine = (tuple(_soften(s, noise) for s in stages) for stages in (COARSE, FINE))
-    tight = (1.0, 1.0) if is_tree else (LOOSE, LOOSER)
+    tight = (1.0, TIGHT) if is_tree else (LOOSE, LOOSER)
 
     pick = torch.arange(0, frames, max(1, -(-frames // coarse_frames)), device=image.device)
     few, few_weights = image[pick], None if weights is None else weights[pick]
