@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kcs_torch.cli.options import AsJson, FormatName, Threshold, TracksPath, UseSkeleton, check_outputs
+from kcs_torch.cli.options import (
+    AsJson,
+    FormatName,
+    ImageSize,
+    Threshold,
+    TracksPath,
+    Trust,
+    UseSkeleton,
+    check_outputs,
+    image_size,
+)
 from kcs_torch.cli.report import answer, one_line, print_json, progress
 
 if TYPE_CHECKING:
@@ -21,6 +31,8 @@ def info(
     format: FormatName = None,
     skeleton: UseSkeleton = None,
     threshold: Threshold = 0.3,
+    size: ImageSize = None,
+    trust: Trust = False,
     as_json: AsJson = False,
 ) -> None:
     """Show what is in a file of tracks: frames, people, skeleton, joints, and how much is unseen."""
@@ -28,7 +40,14 @@ def info(
         from kcs_torch.io import detect_format, load_people
 
         with progress(f"reading {tracks}"):
-            people = load_people(tracks, format=format, skeleton=skeleton, threshold=threshold)
+            people = load_people(
+                tracks,
+                format=format,
+                skeleton=skeleton,
+                threshold=threshold,
+                image_size=image_size(size),
+                trust=trust,
+            )
             facts = _facts(tracks, format or detect_format(tracks), people)
         if as_json:
             print_json(facts)

@@ -10,10 +10,13 @@ import typer
 from kcs_torch.cli.options import (
     AsJson,
     FormatName,
+    ImageSize,
     Threshold,
     TracksPath,
+    Trust,
     UseSkeleton,
     check_outputs,
+    image_size,
     use_one_thread,
 )
 from kcs_torch.cli.report import answer, describe, print_json, progress, summary
@@ -62,6 +65,8 @@ def lift(
         float | None, typer.Option(metavar="NUMBER", help="Frames a second; as TRACKS says if not given.")
     ] = None,
     threshold: Threshold = 0.3,
+    size: ImageSize = None,
+    trust: Trust = False,
     intrinsics: Annotated[
         str | None,
         typer.Option(
@@ -82,7 +87,16 @@ def lift(
         if intrinsics is not None:
             fields["intrinsics"] = _lens(intrinsics)
         with progress(f"reading {tracks}"):
-            people = _people(tracks, person, format=format, skeleton=skeleton, fps=fps, threshold=threshold)
+            people = _people(
+                tracks,
+                person,
+                format=format,
+                skeleton=skeleton,
+                fps=fps,
+                threshold=threshold,
+                image_size=image_size(size),
+                trust=trust,
+            )
         use_one_thread()
         reports = []
         for number, one in people:

@@ -8,7 +8,18 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["AsJson", "FormatName", "Threshold", "TracksPath", "UseSkeleton", "check_outputs", "use_one_thread"]
+__all__ = [
+    "AsJson",
+    "FormatName",
+    "ImageSize",
+    "Threshold",
+    "TracksPath",
+    "Trust",
+    "UseSkeleton",
+    "check_outputs",
+    "image_size",
+    "use_one_thread",
+]
 
 TracksPath = Annotated[
     str,
@@ -32,6 +43,18 @@ UseSkeleton = Annotated[
 ]
 Threshold = Annotated[
     float, typer.Option("--threshold", metavar="0..1", help="A joint with less confidence counts as unseen.")
+]
+ImageSize = Annotated[
+    str | None,
+    typer.Option(
+        "--image-size",
+        metavar="WIDTHxHEIGHT",
+        help="Size of the video in pixels, for formats whose coordinates are shares of it (MediaPipe).",
+    ),
+]
+Trust = Annotated[
+    bool,
+    typer.Option("--trust", help="Read a file although that takes unpickling it, which can run any code in it."),
 ]
 
 
@@ -65,3 +88,19 @@ def use_one_thread() -> None:
     import torch
 
     torch.set_num_threads(1)
+
+
+def image_size(text: str | None) -> tuple[int, int] | None:
+    """Read ``1920x1080``.
+
+    Raises:
+        OptionError: it is something else.
+    """
+    from kcs_torch.errors import OptionError
+
+    if text is None:
+        return None
+    width, _, height = text.lower().partition("x")
+    if not (width.isascii() and width.isdigit() and height.isascii() and height.isdigit()):
+        raise OptionError(f"--image-size: expected WIDTHxHEIGHT in pixels, such as 1920x1080, got {text!r}")
+    return int(width), int(height)

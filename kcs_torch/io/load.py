@@ -38,6 +38,8 @@ def load_people(
     skeleton: str | Path | Skeleton | None = None,
     fps: float | None = None,
     threshold: float = 0.3,
+    image_size: tuple[int, int] | None = None,
+    trust: bool = False,
 ) -> list[Tracks]:
     """Read the tracks of everybody in a file or folder, the most seen (sum of weights) first.
 
@@ -48,6 +50,8 @@ def load_people(
             matched by name where the file names them, by their order otherwise.
         fps: frames per second; as the file says if None.
         threshold: a joint with less confidence counts as unseen, 0..1.
+        image_size: width and height of the video in pixels, for formats whose coordinates are shares of it (MediaPipe).
+        trust: read a file although that takes unpickling it, which can run any code that is in it.
 
     Returns:
         At least one :class:`Tracks`; all have the same number of frames.
@@ -64,9 +68,11 @@ def load_people(
         raise OptionError(f"threshold: expected a number from 0 to 1, got {threshold}")
     if fps is not None and not 0 < fps < float("inf"):
         raise OptionError(f"fps: expected a positive number or None, got {fps}")
+    if image_size is not None:
+        image_size = _size(image_size)
     probe = Probe(path)
     reader: Reader = READERS[detect_format(path) if format is None else format]
-    people = reader.read(probe.path, Options(skeleton, fps, threshold))
+    people = reader.read(probe.path, Options(skeleton, fps, threshold, image_size, trust))
     return sorted(people, key=_amount_seen, reverse=True)
 
 
@@ -78,6 +84,8 @@ def load_tracks(
     skeleton: str | Path | Skeleton | None = None,
     fps: float | None = None,
     threshold: float = 0.3,
+    image_size: tuple[int, int] | None = None,
+    trust: bool = False,
 ) -> Tracks:
     """Read one person's tracks from a file or folder. Arguments as of :func:`load_people`.
 
@@ -88,6 +96,8 @@ def load_tracks(
         skeleton: a :class:`Skeleton`, a built-in name or a YAML/JSON file; as the file says if None.
         fps: frames per second; as the file says if None.
         threshold: a joint with less confidence counts as unseen, 0..1.
+        image_size: width and height of the video in pixels, for formats whose coordinates are shares of it (MediaPipe).
+        trust: read a file although that takes unpickling it, which can run any code that is in it.
 
     Returns:
         The tracks; ``notes`` say what was assumed.
@@ -100,7 +110,15 @@ def load_tracks(
     """
     if person is not None and (isinstance(person, bool) or not isinstance(person, int) or person < 0):
         raise OptionError(f"person: expected None or a number from 0, got {person!r}")
-    people = load_people(path, format=format, skeleton=skeleton, fps=fps, threshold=threshold)
+    people = load_people(
+        path,
+        format=format,
+        skeleton=skeleton,
+        fps=fps,
+        threshold=threshold,
+        image_size=image_size,
+        trust=trust,
+    )
     if person is not None:
         if person >= len(people):
             some = "1 person" if len(people) == 1 else f"{len(people)} people"
@@ -110,6 +128,17 @@ def load_tracks(
         return people[0]
     note = f"{len(people)} people found: this is the most seen one, number 0"
     return replace(people[0], notes=(*people[0].notes, note))
+
+
+def _size(size: object) -> tuple[int, int]:
+    """Width and height, checked."""
+    try:
+        width, height = size  # type: ignore[misc]
+        if int(width) == width > 0 and int(height) == height > 0:
+            return int(width), int(height)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise OptionError(f"image_size: expected width and height of the video in pixels, such as (1920, 1080), got {size!r}")
 
 
 def _amount_seen(tracks: Tracks) -> float:

@@ -36,11 +36,15 @@ class Options:
         skeleton: a :class:`Skeleton`, a built-in name, or a YAML/JSON file; None: as the file says.
         fps: frames per second; None: as the file says.
         threshold: a joint with less confidence counts as unseen.
+        image_size: width and height of the video in pixels, for formats whose coordinates are shares of it.
+        trust: whether a file that can only be read by unpickling may be; it can then run any code.
     """
 
     skeleton: str | Path | Skeleton | None = None
     fps: float | None = None
     threshold: float = 0.3
+    image_size: tuple[int, int] | None = None
+    trust: bool = False
 
 
 class Probe:
