@@ -130,15 +130,17 @@ def load_tracks(
     return replace(people[0], notes=(*people[0].notes, note))
 
 
-def _size(size: object) -> tuple[int, int]:
+def _size(size: tuple[int, int]) -> tuple[int, int]:
     """Width and height, checked."""
     try:
-        width, height = size  # type: ignore[misc]
-        if int(width) == width > 0 and int(height) == height > 0:
-            return int(width), int(height)
+        width, height = (int(side) for side in size)
+        if (width, height) == tuple(size) and min(width, height) > 0:
+            return width, height
     except (TypeError, ValueError, OverflowError):
         pass
-    raise OptionError(f"image_size: expected width and height of the video in pixels, such as (1920, 1080), got {size!r}")
+    raise OptionError(
+        f"image_size: expected width and height of the video in pixels, such as (1920, 1080), got {size!r}"
+    )
 
 
 def _amount_seen(tracks: Tracks) -> float:
