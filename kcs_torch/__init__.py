@@ -78,7 +78,20 @@ _NAMES = {
     "types": ("Diagnostics", "Reconstruction", "Tracks"),
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names}
-_MODULES = ("data", "errors", "functional", "io", "live", "methods", "nn", "skeleton", "solvers", "types", "viewer")
+_MODULES = (
+    "clean",
+    "data",
+    "errors",
+    "functional",
+    "io",
+    "live",
+    "methods",
+    "nn",
+    "skeleton",
+    "solvers",
+    "types",
+    "viewer",
+)
 
 
 class _Package(ModuleType):

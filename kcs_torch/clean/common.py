@@ -1,0 +1,77 @@
+"""What all of :mod:`kcs_torch.clean` does: rates, runs of seen frames, and new tracks from old."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.types import Tracks
+
+__all__ = ["Array", "frame_rate", "number", "rebuilt", "runs", "share"]
+
+Array = NDArray[np.float64]
+
+
+def number(value: Any, what: str, expected: str, *, above: float = 0.0, below: float = math.inf) -> float:
+    """A finite number within limits, both excluded.
+
+    Raises:
+        OptionError: it is something else; the message says what was expected.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise OptionError(f"{what}: expected {expected}, got {value!r}")
+    if not above < float(value) < below:
+        raise OptionError(f"{what}: expected {expected}, got {float(value):g}")
+    return float(value)
+
+
+def frame_rate(own: float | None, given: float | None, what: str, source: str) -> float:
+    """Frames a second: as given, or as the tracks have it.
+
+    Raises:
+        OptionError: neither is known, or it is no positive number.
+    """
+    if given is None and own is None:
+        raise OptionError(
+            f"{what}: {source} does not say how many frames a second it has: give fps=... (on the command line --fps)"
+        )
+    return number(own if given is None else given, f"{what}: fps", "a positive number of frames a second")
+
+
+def runs(seen: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First frame and end (not included) of each run of True in (T,).
+
+    >>> runs(np.array([True, True, False, True]))
+    [(0, 2), (3, 4)]
+    """
+    steps = np.diff(np.concatenate([[0], seen.astype(np.int8), [0]]))
+    return list(zip(np.flatnonzero(steps == 1).tolist(), np.flatnonzero(steps == -1).tolist(), strict=True))
+
+
+def share(count: int, whole: int) -> str:
+    """A count with its per cent, such as "12 of 4000 (0.3 %)"."""
+    part = 100 * count / max(whole, 1)
+    return f"{count} of {whole} ({part:.0f} %)" if part >= 10 else f"{count} of {whole} ({part:.2g} %)"
+
+
+def rebuilt(tracks: Tracks, points: Tensor, weights: Tensor, note: str, *, fps: float | None = None) -> Tracks:
+    """Tracks with other points (T, N, 2) and weights (T, N) of the observed joints; the virtual ones follow from them.
+
+    Raises:
+        ShapeError: no joint is seen.
+    """
+    weights = weights.to(tracks.weights)
+    points = torch.where(weights[..., None] > 0, points.to(tracks.points), 0)
+    if not bool((weights > 0).any()):
+        raise ShapeError(f"{tracks.source}: {note}: no joint is left seen in any frame")
+    points, weights = tracks.skeleton.complete(points, weights)
+    return replace(
+        tracks, points=points, weights=weights, fps=tracks.fps if fps is None else fps, notes=(*tracks.notes, note)
+    )

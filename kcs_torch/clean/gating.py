@@ -1,0 +1,117 @@
+"""Detections that jump away from where their joint is just before and after."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from kcs_torch.clean.common import frame_rate, number, rebuilt, share
+from kcs_torch.types import Tracks
+
+__all__ = ["gate"]
+
+_SIDE = 5
+"""Neighbours looked at before and after a frame, at most; at high frame rates they lie further apart."""
+
+_LEAST = 3
+"""Neighbours without which a detection is not judged."""
+
+_AROUND = 8
+"""Frames before and after over which the usual error is taken."""
+
+_ROUNDS = 2
+"""What is dropped first no longer spoils the prediction of its neighbours."""
+
+
+def gate(tracks: Tracks, *, threshold: float = 6.0, floor: float = 0.2, reach: float = 0.1) -> Tracks:
+    """Drop detections that jump: they become unseen, and a note says how many and of which joints.
+
+    Each detection y is compared with the straight line p that its joint follows in the frames around it (Siegel's
+    repeated median, which up to half of the neighbours may spoil), and dropped where
+
+        |y - p| > threshold * usual + floor * size.
+
+    ``usual`` is the median of |y - p| of the joint, over the clip or, where it moves more abruptly, over the nearest
+    frames (four times the clip's at most). ``size`` is the body's: the median distance of its joints from their
+    middle. Runs of outliers that last longer than ``reach`` look like motion and stay, as do detections that have
+    fewer than three neighbours.
+
+    Args:
+        tracks: what to clean.
+        threshold: in usual errors.
+        floor: in body sizes; a fifth is about 8 cm of a person.
+        reach: seconds before and after that are looked at: at least three frames, and three where the rate is unknown.
+
+    Returns:
+        Tracks with outliers unseen; all else as it was.
+
+    Raises:
+        OptionError: an option is not positive.
+        ShapeError: nothing is left.
+
+    >>> from kcs_torch.data.synthetic import walking_person
+    >>> tracks = walking_person(60).tracks
+    >>> tracks.points[30, 9] += 100.0
+    >>> cleaned = gate(tracks)
+    >>> cleaned.seen[30, 9].item(), cleaned.notes[-1]
+    (False, 'gate: 1 of 1020 (0.098 %) detections dropped as outliers: neck 1')
+    """
+    number(threshold, "gate: threshold", "a positive number of usual errors")
+    number(floor, "gate: floor", "a positive share of the body's size")
+    number(reach, "gate: reach", "a positive number of seconds")
+    count = tracks.skeleton.num_observed
+    points, seen = tracks.points[:, :count].double(), tracks.seen[:, :count]
+    side = 3 if tracks.fps is None else max(3, round(reach * frame_rate(tracks.fps, None, "gate", tracks.source)))
+    offsets = sorted({round(1 + i * (side - 1) / (_SIDE - 1)) for i in range(_SIDE)})
+    size = _body_size(points, seen)
+    kept = seen
+    for _ in range(_ROUNDS):
+        error = (points - _line(points, kept, offsets)).norm(dim=-1)
+        kept = seen & ~(error > threshold * _usual(error, kept) + floor * size)  # NaN, not judged, is not above
+    dropped = (seen & ~kept).sum(0)
+    total = int(dropped.sum())
+    which = [f"{tracks.skeleton.joints[n]} {int(dropped[n])}" for n in dropped.argsort(descending=True).tolist()]
+    which = which[: int((dropped > 0).sum())]
+    names = f": {', '.join(which[:6])}{', ...' if len(which) > 6 else ''}" if which else ""
+    note = f"gate: {share(total, int(seen.sum()))} detections dropped as outliers{names}"
+    return rebuilt(tracks, tracks.points[:, :count], tracks.weights[:, :count] * kept, note)
+
+
+def _line(points: Tensor, seen: Tensor, offsets: list[int]) -> Tensor:
+    """(T, N, 2) where the lines through a joint's seen neighbours put it; NaN where there are too few."""
+    frames = len(points)
+    shifts = [*(-k for k in reversed(offsets)), *offsets]
+    held = torch.where(seen[..., None], points, math.nan)
+    blank = torch.full_like(held, math.nan)
+
+    def at(shift: int) -> Tensor:
+        if abs(shift) >= frames:
+            return blank
+        return torch.cat([held[shift:], blank[:shift]]) if shift > 0 else torch.cat([blank[shift:], held[:shift]])
+
+    near = torch.stack([at(k) for k in shifts], -1)  # (T, N, 2, K)
+    time = torch.tensor(shifts, dtype=points.dtype, device=points.device)
+    apart = time[:, None] - time
+    apart.fill_diagonal_(math.nan)
+    slope = ((near[..., :, None] - near[..., None, :]) / apart).nanmedian(-1).values.nanmedian(-1, keepdim=True).values
+    place = (near - slope * time).nanmedian(-1).values
+    enough = near.isfinite().sum(-1) >= _LEAST
+    return torch.where(enough, place, math.nan)
+
+
+def _usual(error: Tensor, seen: Tensor) -> Tensor:
+    """(T, N) median error of each joint: about each frame, but within one to four times that of the clip."""
+    known = torch.where(seen, error, math.nan)
+    clip = known.nanmedian(0, keepdim=True).values
+    around = torch.nn.functional.pad(known.mT, (_AROUND, _AROUND), value=math.nan).unfold(-1, 2 * _AROUND + 1, 1)
+    near = around.nanmedian(-1).values.mT.nan_to_num(0.0)
+    return torch.maximum(clip, torch.minimum(near, 4 * clip)).nan_to_num(0.0)
+
+
+def _body_size(points: Tensor, seen: Tensor) -> Tensor:
+    """Median distance of the seen joints from the middle of those of their frame."""
+    kept = seen[..., None].to(points.dtype)
+    middle = (points * kept).sum(1, keepdim=True) / kept.sum(1, keepdim=True).clamp_min(1)
+    return (points - middle).norm(dim=-1)[seen].median()

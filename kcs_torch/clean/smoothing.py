@@ -1,0 +1,135 @@
+"""Tracks and motion without what is faster than a cut-off."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import overload
+
+import numpy as np
+import torch
+
+from kcs_torch.clean.common import Array, frame_rate, number, rebuilt, runs, share
+from kcs_torch.clean.filters import FILTERS, Filter
+from kcs_torch.errors import unknown
+from kcs_torch.functional import bone_lengths
+from kcs_torch.types import Reconstruction, Tracks
+
+__all__ = ["SMOOTHERS", "smooth"]
+
+SMOOTHERS = tuple(FILTERS)
+"""Names that :func:`smooth` takes."""
+
+
+@overload
+def smooth(motion: Tracks, method: str = ..., cutoff: float = ..., *, fps: float | None = ...) -> Tracks: ...
+@overload
+def smooth(
+    motion: Reconstruction, method: str = ..., cutoff: float = ..., *, fps: float | None = ...
+) -> Reconstruction: ...
+def smooth(
+    motion: Tracks | Reconstruction, method: str = "butterworth", cutoff: float = 6.0, *, fps: float | None = None
+) -> Tracks | Reconstruction:
+    """Take out of a motion what is faster than a cut-off, within runs of seen frames.
+
+    Gaps stay gaps: each run of frames in which a joint is seen is filtered by itself, and runs that are too short are
+    left as they are. Frames count by their weights relative to the best of their run; even weights give the plain
+    filter. A note says by how much the joints moved.
+
+    Args:
+        motion: tracks, or a result: then its 3D points and the depth of its root, not its tracks. Bones of a smoothed
+            result keep their length less exactly; its lengths and ``bone_variation`` are told anew.
+        method: "butterworth" (order 4, no lag, -3 dB at the cut-off), "savgol" (Savitzky-Golay, cubic, no lag) or
+            "one-euro" (causal; follows fast motion).
+        cutoff: in Hz.
+        fps: frames a second; as the motion says if None.
+
+    Returns:
+        The same kind of thing.
+
+    Raises:
+        OptionError: the method is unknown, the rate is unknown, or the cut-off is not below half of it.
+
+    >>> from kcs_torch.data.synthetic import walking_person
+    >>> tracks = walking_person(60, noise=3.0, generator=torch.Generator().manual_seed(0)).tracks
+    >>> smooth(tracks, cutoff=4.0).notes[-1]
+    'smooth (Butterworth of order 4 without lag, 4 Hz): joints moved by 3.5 mm (root mean square)'
+    """
+    if method not in FILTERS:
+        raise unknown("method of smooth", method, FILTERS)
+    tracks = motion if isinstance(motion, Tracks) else motion.tracks
+    rate = frame_rate(motion.fps, fps, "smooth", tracks.source)
+    expected = f"above 0 and below half of the {rate:g} frames a second, {rate / 2:g} Hz"
+    number(cutoff, "smooth: cutoff", expected, below=rate / 2)
+    if isinstance(motion, Reconstruction):
+        return _smooth_result(motion, method, cutoff, rate)
+    count = tracks.skeleton.num_observed
+    points = tracks.points[:, :count].detach().double().cpu().numpy()
+    weights = tracks.weights[:, :count].detach().double().cpu().numpy()
+    seen = weights > 0
+    chosen = FILTERS[method](cutoff, rate, _size(points[seen]))
+    moved, short = _smooth_runs(points, weights, chosen)
+    change = math.sqrt(float(np.square(moved - points).sum(-1)[seen].mean()))
+    note = f"smooth ({chosen.words}): joints moved by {change:.2g} {tracks.units} (root mean square)"
+    if short:
+        left = share(short, int(seen.sum()))
+        note += f"; {left} detections, in runs of fewer than {chosen.least} frames, were left as they are"
+    return rebuilt(tracks, torch.from_numpy(moved), tracks.weights[:, :count], note)
+
+
+def _smooth_runs(points: Array, weights: Array, chosen: Filter) -> tuple[Array, int]:
+    """Points (T, N, D) smoothed run by run, and how many detections are in runs that are too short."""
+    out, short = points.copy(), 0
+    for joint in range(points.shape[1]):
+        for start, stop in runs(weights[:, joint] > 0):
+            if stop - start < chosen.least:
+                short += stop - start
+                continue
+            part = weights[start:stop, joint]
+            out[start:stop, joint] = chosen.apply(points[start:stop, joint], part / part.max())
+    return out, short
+
+
+def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: float) -> Reconstruction:
+    """A result with smoothed points and root; the other solutions are smoothed like it."""
+    points = result.points.detach().double().cpu().numpy()
+    chosen = FILTERS[method](cutoff, rate, _size(points.reshape(-1, 3)))
+    words = chosen.words
+    if len(points) < chosen.least:
+        note = f"smooth 3D ({words}): left as it is: {len(points)} frames are fewer than {chosen.least}"
+        return replace(result, diagnostics=replace(result.diagnostics, notes=(*result.diagnostics.notes, note)))
+    moved = _smooth_runs(points, np.ones(points.shape[:2]), chosen)[0]
+    change = math.sqrt(float(np.square(moved - points).sum(-1).mean()))
+    new = torch.from_numpy(moved).to(result.points)
+    bones = bone_lengths(new, result.skeleton.bone_index(device=new.device))
+    ratio = bones / bones.mean(0).clamp_min(torch.finfo(bones.dtype).tiny)
+    spread = ratio.std(0, correction=0)[list(result.skeleton.rigid)]
+    told = f"joints moved by {change:.2g} {result.units} (root mean square); the reprojection is that before"
+    note = f"smooth 3D ({words}): {told}"
+    facts = replace(
+        result.diagnostics,
+        bone_variation=float(100 * spread.median()) if spread.numel() else math.nan,
+        notes=(*result.diagnostics.notes, note),
+    )
+
+    def path(values: torch.Tensor | None) -> torch.Tensor | None:
+        if values is None:
+            return None
+        one = values.detach().double().cpu().numpy()[:, None]
+        return torch.from_numpy(chosen.apply(one, np.ones(len(one)))[:, 0]).to(values)
+
+    return replace(
+        result,
+        points=new,
+        lengths=bones.median(0).values,
+        diagnostics=facts,
+        root_depth=path(result.root_depth),
+        distance=path(result.distance),
+        alternatives=tuple(_smooth_result(other, method, cutoff, rate) for other in result.alternatives),
+    )
+
+
+def _size(points: Array) -> float:
+    """Root mean square distance of points (..., D) from their middle, never 0: what one-euro measures speeds in."""
+    size = math.sqrt(float(np.square(points - points.mean(0)).sum(-1).mean()))
+    return size if size > 0 else 1.0

@@ -1,0 +1,101 @@
+"""Other frames of the same motion: a part of a clip, another frame rate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from kcs_torch.clean.common import frame_rate, number, rebuilt, runs
+from kcs_torch.errors import OptionError, ShapeError, unknown
+from kcs_torch.types import Tracks
+
+__all__ = ["resample", "trim"]
+
+_KINDS = {"linear": 1, "cubic": 3}
+_EPS = 1e-6  # of a frame: rounding of times must not make a seen frame unseen
+
+
+def trim(tracks: Tracks, start: int | None = None, stop: int | None = None) -> Tracks:
+    """Take the frames from ``start`` to ``stop``, which is not included; counted from 0, as Python's slices are.
+
+    Args:
+        tracks: what to take them of.
+        start: first frame; the clip's first if None.
+        stop: frame after the last; the clip's end if None, or if it lies beyond.
+
+    Raises:
+        OptionError: these are no frames of the clip.
+        ShapeError: no joint is seen in them.
+
+    >>> from kcs_torch.data.synthetic import walking_person
+    >>> trim(walking_person(60).tracks, 10, 30).notes[-1]
+    'trim: frames 10 to 29 of 60'
+    """
+    frames = tracks.num_frames
+    for name, value in (("start", start), ("stop", stop)):
+        if value is not None and (isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0):
+            raise OptionError(f"trim: {name}: expected a frame counted from 0, or None, got {value!r}")
+    first, end = start or 0, frames if stop is None else min(stop, frames)
+    if not first < end:
+        raise OptionError(f"trim: expected frames within 0:{frames} of {tracks.source}, got {first}:{stop}")
+    cut = tracks.frames(first, end)
+    if not bool(cut.seen.any()):
+        raise ShapeError(f"{tracks.source}: no joint is seen in frames {first} to {end - 1}")
+    note = f"trim: frames {first} to {end - 1} of {frames}"
+    return replace(cut, notes=(*tracks.notes, note))
+
+
+def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: float | None = None) -> Tracks:
+    """Put the same motion at another frame rate, by splines within runs of seen frames.
+
+    Gaps stay gaps: a new frame sees a joint where the old frames on either side do. Nothing is smoothed: where the
+    rate falls, noise stays what it is, so smooth first.
+
+    Args:
+        tracks: what to resample.
+        fps: the new frames a second.
+        kind: "cubic" or "linear".
+        source_fps: the old frames a second; as the tracks say if None.
+
+    Returns:
+        Tracks whose frame k is at time k / fps of the old clip.
+
+    Raises:
+        OptionError: a rate is unknown or no positive number.
+        ShapeError: no joint is seen in any new frame.
+
+    >>> from kcs_torch.data.synthetic import walking_person
+    >>> resample(walking_person(61, fps=30).tracks, 60).num_frames
+    121
+    """
+    if kind not in _KINDS:
+        raise unknown("kind of resample", kind, _KINDS)
+    number(fps, "resample: fps", "a positive number of frames a second")
+    rate = frame_rate(tracks.fps, source_fps, "resample", tracks.source)
+    from scipy.interpolate import make_interp_spline
+
+    frames, count = tracks.num_frames, tracks.skeleton.num_observed
+    length = math.floor((frames - 1) * fps / rate + _EPS) + 1
+    if length > 1_000_000 and length > 10 * frames:
+        raise OptionError(f"resample: fps: expected a rate near the {rate:g} frames a second of the clip, got {fps:g}")
+    place = np.minimum(np.arange(length) * (rate / fps), frames - 1)  # in old frames
+    points = tracks.points[:, :count].detach().double().cpu().numpy()
+    weights = tracks.weights[:, :count].detach().double().cpu().numpy()
+    new_points, new_weights = np.zeros((length, count, 2)), np.zeros((length, count))
+    for joint in range(count):
+        for start, stop in runs(weights[:, joint] > 0):
+            inside = np.flatnonzero((place >= start - _EPS) & (place <= stop - 1 + _EPS))
+            if not len(inside):
+                continue
+            at, time = place[inside].clip(start, stop - 1), np.arange(start, stop)
+            if stop - start == 1:
+                new_points[inside, joint], new_weights[inside, joint] = points[start, joint], weights[start, joint]
+                continue
+            degree = _KINDS[kind] if stop - start > 3 else 1  # a cubic takes four frames
+            new_points[inside, joint] = make_interp_spline(time, points[start:stop, joint], degree)(at)
+            new_weights[inside, joint] = np.interp(at, time, weights[start:stop, joint])
+    note = f"resample: from {frames} frames at {rate:g} a second to {length} at {fps:g} ({kind})"
+    return rebuilt(tracks, torch.from_numpy(new_points), torch.from_numpy(new_weights), note, fps=float(fps))
