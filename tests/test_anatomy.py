@@ -171,6 +171,20 @@ def test_unknown_joints_are_named():
         template_by_names("humann", ["left_hip"])
 
 
+def test_fingers_of_a_whole_person_hang_down():
+    names = ["left_elbow", "left_wrist", "left_thumb4", "left_forefinger1", "left_middle_finger4", "left_pinky_finger1"]
+    body = dict(zip(names, template_by_names("human", names), strict=True))
+    wrist, tip = body["left_wrist"], body["left_middle_finger4"]
+    assert tip[1] > body["left_forefinger1"][1] > wrist[1]  # y is down
+    assert body["left_thumb4"][2] < body["left_forefinger1"][2] < body["left_pinky_finger1"][2]  # thumbs to the front
+    assert tip[0] < wrist[0]  # the palm is to the thigh
+    assert math.dist(tip, wrist) == pytest.approx(0.193, abs=0.01)
+    twin = template_by_names("human", [n.replace("left", "right") for n in names])
+    assert twin == tuple((-x, y, z) for x, y, z in body.values())
+    with pytest.raises(SkeletonError, match="left_thumb4"):
+        template_by_names("human", ["left_wrist", "left_thumb4"])  # a hand alone is none of a person
+
+
 def test_hands():
     hand = place("wrist", "thumb_tip", "index_finger_tip", "pinky_tip", kind="hand")
     assert hand["pinky_tip"][0] < hand["index_finger_tip"][0] < hand["thumb_tip"][0]  # a right palm to the viewer

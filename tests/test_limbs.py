@@ -109,8 +109,11 @@ def test_built_in_skeletons(name):
     limbs = {"lfemur", "rfemur", "lhumerus", "rhumerus"} if name == "cmu31" else {"lknee", "rknee", "lelbow", "relbow"}
     feet = {"ltibia", "rtibia"} if name == "cmu31" else {"lankle", "rankle"}
     fingers = {f"{f}{j}" for f in ("indexfinger", "middlefinger", "ringfinger", "pinky") for j in ("pip", "dip")}
-    with_feet = {"body25", "body25b", "halpe26", "mediapipe33", "smpl24", "cmu21", "cmu31"}
-    assert joints == (fingers if name == "hand21" else limbs | feet if name in with_feet else limbs)
+    with_feet = {"body25", "body25b", "halpe26", "mediapipe33", "smpl24", "cmu21", "cmu31", "wholebody63"}
+    long = ("forefinger", "middlefinger", "ringfinger", "pinkyfinger")
+    hands = {f"{side}{finger}{i}" for side in "lr" for finger in long for i in "23"}
+    extra = hands if name == "wholebody63" else set()
+    assert joints == (fingers if name == "hand21" else limbs | feet | extra if name in with_feet else limbs)
     assert {body.side(i) for i in body.contacts} == (set() if name == "hand21" else {"left", "right"})
     # twins bend alike
     twin = {a: b for pair in body.mirror for a, b in (pair, pair[::-1])}

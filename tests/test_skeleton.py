@@ -44,6 +44,14 @@ PUBLISHED = {
         "l_knee l_ankle r_eye l_eye r_ear l_ear l_bigtoe l_smalltoe l_heel r_bigtoe r_smalltoe r_heel"
     ),
     "body25b": COCO + " upperneck headtop l_bigtoe l_smalltoe l_heel r_bigtoe r_smalltoe r_heel",
+    "wholebody63": COCO
+    + " l_bigtoe l_smalltoe l_heel r_bigtoe r_smalltoe r_heel "
+    + " ".join(
+        f"{side}_{finger}{i}"
+        for side in "lr"
+        for finger in ("thumb", "forefinger", "middlefinger", "ringfinger", "pinkyfinger")
+        for i in range(1, 5)
+    ),
     "halpe26": COCO + " head neck hip l_bigtoe r_bigtoe l_smalltoe r_smalltoe l_heel r_heel",
     "mpi15": (
         "head neck r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist r_hip r_knee r_ankle l_hip l_knee "
@@ -277,7 +285,7 @@ def test_the_list_of_built_in_skeletons():
         "mediapipe33",
         "hand21",
     }
-    assert expected | {"cmu31", "cmu21", "cmu17", "ap10k", "smpl24"} <= set(SKELETONS)
+    assert expected | {"wholebody63", "cmu31", "cmu21", "cmu17", "ap10k", "smpl24"} <= set(SKELETONS)
     assert "nothing" not in SKELETONS and SKELETONS.get("nothing") is None and 3 not in SKELETONS
     assert SKELETONS["coco17"] is SKELETONS["coco17"]
     assert [SKELETONS[n].num_joints for n in ("cmu31", "cmu21", "cmu17", "hand21")] == [31, 21, 17, 21]

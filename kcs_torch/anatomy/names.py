@@ -94,11 +94,12 @@ def _hand_names() -> dict[str, str]:
     for finger, joints in FINGER_JOINTS.items():
         for number, joint in enumerate(joints, 1):
             part = f"{finger}_{joint}"
-            for word in (finger, f"{finger}finger", "little" if finger == "pinky" else finger):
+            for word in (finger, f"{finger}finger", {"pinky": "little", "index": "forefinger"}.get(finger, finger)):
                 names |= {f"{word}{joint}": part, f"{word}{joint}fe": part, f"{word}{number}": part}
                 names |= {f"hand{word}{joint}": part, f"hand{word}{number}": part}
     numbered = ["wrist", *(f"{finger}_{joint}" for finger, joints in FINGER_JOINTS.items() for joint in joints)]
-    return {"handwrist": "wrist", "palmbase": "wrist", **names, **{f"hand{i}": p for i, p in enumerate(numbered)}}
+    roots = dict.fromkeys(("handwrist", "handroot", "palmbase"), "wrist")
+    return {**roots, **names, **{f"hand{i}": p for i, p in enumerate(numbered)}}
 
 
 _HAND_NAMES = _hand_names()

@@ -10,6 +10,7 @@ Joint centres follow published proportions of the adult body, for a stature of 1
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from kcs_torch.anatomy.names import FINGER_JOINTS, part_of, side_of
@@ -92,6 +93,24 @@ def _hand_points() -> dict[str, Point]:
 _HAND = _hand_points()
 
 
+def _hanging_hand() -> dict[str, Point]:
+    """The left hand of somebody who stands relaxed: fingers down, thumb forward, palm to the thigh."""
+    wrist, palm = _LEFT["wrist"], _LEFT["hand"]
+    long = math.hypot(palm[1] - wrist[1], palm[2] - wrist[2])
+    down, forward = (palm[1] - wrist[1]) / long, (palm[2] - wrist[2]) / long
+    points = {}
+    for part, (across, along, out) in _HAND.items():
+        if part != "wrist":
+            height, front = along * down + across * forward, along * forward - across * down
+            points[part] = (round(wrist[0] - out, 6), round(wrist[1] + height, 6), round(wrist[2] + front, 6))
+    return points
+
+
+_LEFT_FINGERS = _hanging_hand()
+# A sided joint of these says that its fingers are those of a whole person.
+_ABOVE_HANDS = frozenset(["hip", "knee", "ankle", "shoulder", "arm", "elbow"])
+
+
 def template_by_names(kind: str, names: Sequence[str]) -> tuple[Point, ...]:
     """Place joints by their names: a relaxed person, or an open hand, that faces the viewer.
 
@@ -120,7 +139,7 @@ def template_by_names(kind: str, names: Sequence[str]) -> tuple[Point, ...]:
         return _place_hand(_known_parts(kind, names))
     out = []
     for side, place in places_by_names(names):
-        x, height, forward = _CENTRE[place] if side == "centre" else _LEFT[place]
+        x, height, forward = _CENTRE[place] if side == "centre" else (_LEFT | _LEFT_FINGERS)[place]
         y = round(_CENTRE["midhip"][1] - height, 6)
         out.append((-x if side == "right" else x, y, -forward if forward else 0.0))
     return tuple(out)
@@ -157,6 +176,9 @@ def places_of_known(names: Sequence[str]) -> list[tuple[str, str] | None]:
 def _known_parts(kind: str, names: Sequence[str]) -> list[tuple[str, str]]:
     """(side, part) of every joint; all must be known."""
     parts = [(side_of(n), part_of(n, kind)) for n in names]
+    if kind == "human" and any(side != "centre" and part in _ABOVE_HANDS for side, part in parts):
+        fingers = [None if side == "centre" else part_of(n, "hand") for n, (side, _) in zip(names, parts, strict=True)]
+        parts = [(side, part or finger) for (side, part), finger in zip(parts, fingers, strict=True)]
     strange = [n for n, (_, part) in zip(names, parts, strict=True) if part is None]
     if strange:
         raise SkeletonError(

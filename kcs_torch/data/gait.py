@@ -51,7 +51,7 @@ def joint_segments(names: Sequence[str]) -> list[str]:
     """
     out = []
     for side, place in places_by_names(names):
-        segment = _SEGMENT_OF[place]
+        segment = _SEGMENT_OF.get(place, "forearm")  # the rest are fingers
         out.append(segment if segment in ("pelvis", "trunk", "head") else f"{segment} {side}")
     return out
 
