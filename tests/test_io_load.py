@@ -2,9 +2,8 @@
 
 import sys
 
-import numpy as np
 import pytest
-from samples import person, write_openpose
+from samples import SAMPLES
 
 import kcs_torch as kt
 from kcs_torch.errors import FormatError, OptionError, SkeletonError
@@ -15,13 +14,11 @@ from kcs_torch.io.registry import Probe, need
 @pytest.fixture
 def samples(tmp_path):
     """One path of every format."""
-    from scipy.io import savemat
-
-    points = person()[..., :2]
-    np.savez(tmp_path / "a.npz", points2d=points)
-    savemat(tmp_path / "a.mat", {"points2d": points})
-    write_openpose(tmp_path / "json", [p[None] for p in person()])
-    return {"npz": tmp_path / "a.npz", "mat": tmp_path / "a.mat", "openpose": tmp_path / "json"}
+    paths = {}
+    for name, writers in SAMPLES.items():
+        (folder := tmp_path / name).mkdir()
+        paths[name] = writers[0](folder)
+    return paths
 
 
 def test_there_is_a_sample_of_every_format(samples):
@@ -70,7 +67,7 @@ def test_a_new_format_is_one_new_file(tmp_path, monkeypatch):
         ("a.json", b"{}", "got JSON with other content"),
         ("a.json", b"[" * 100_000, "nested too deeply"),
         ("a.csv", b"x,y\n1,2\n", "a file that begins with b'x,y"),
-        ("a.h5", b"\x89HDF\r\n\x1a\n" + bytes(50), "a binary file with other content"),
+        ("a.h5", b"\x89HDF\r\n\x1a\n" + bytes(50), r"an HDF5 file that cannot be read \(damaged"),
         ("a.zip", b"PK\x03\x04" + bytes(50), "a binary file with other content"),
         ("a.txt", b"", "an empty file"),
     ],

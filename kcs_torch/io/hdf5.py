@@ -1,4 +1,4 @@
-"""Read real arrays of an HDF5 file (MATLAB 7.3) that nobody vouches for.
+"""Read an HDF5 file that nobody vouches for.
 
 Some damaged files crash the HDF5 library or make it unpack without end, whatever is checked before. So another process
 reads them, with bounds on its time and memory; that costs a fraction of a second.
@@ -13,7 +13,7 @@ import subprocess
 import sys
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +22,46 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.archive import LARGE, RATIO
 from kcs_torch.io.registry import need, read_error
 
-__all__ = ["read_hdf5"]
+__all__ = ["Tree", "read_hdf5", "read_tree"]
 
 PATIENCE = 60.0  # seconds, and one more for each 16 MiB
+
+
+class Tree(NamedTuple):
+    """What an HDF5 file holds, two levels down; names are like ``tracks`` and ``group/table``.
+
+    Attributes:
+        shapes: of all datasets, and of the fields read of tables (``group/table/index``).
+        attributes: of the file (under the empty name), its groups and datasets, as text; bytes are Latin-1.
+        texts: the wanted datasets and fields of text.
+        arrays: the wanted datasets and fields of real numbers.
+    """
+
+    shapes: dict[str, tuple[int, ...]]
+    attributes: dict[str, dict[str, str]]
+    texts: dict[str, list[str]]
+    arrays: dict[str, NDArray[np.float64]]
+
+
+def read_tree(path: Path, wanted: Collection[str], limit: int) -> Tree:
+    """Read what a file holds, and the datasets that are wanted: real numbers, text, or tables of both.
+
+    Args:
+        path: the file.
+        wanted: names of datasets, with ``*`` and ``?`` as in file names.
+        limit: how many numbers each of them may have.
+
+    Raises:
+        FormatError: the file cannot be read or is damaged, a wanted dataset is neither numbers nor text or too large,
+            or h5py is not installed.
+    """
+    return _ask(path, "HDF5", wanted=list(wanted), limit=limit, depth=2, texts=True)
 
 
 def read_hdf5(
     path: Path, wanted: Collection[str], limit: int
 ) -> tuple[dict[str, tuple[int, ...]], dict[str, NDArray[Any]]]:
-    """Read the shapes of all variables, and those variables that are wanted; as ``read_matlab`` of older versions.
+    """Read the shapes of all variables of a MATLAB 7.3 file, and those variables that are wanted; as ``read_matlab``.
 
     Args:
         path: the file.
@@ -44,12 +75,19 @@ def read_hdf5(
         FormatError: the file cannot be read or is damaged, a wanted variable is not real or too large, or h5py is not
             installed.
     """
-    need("h5py", f"{path}: MATLAB 7.3", FormatError)
+    tree = _ask(path, "MATLAB 7.3", wanted=list(wanted), limit=limit, depth=1, texts=False)
+    return {k: v[::-1] for k, v in tree.shapes.items()}, {k: v.T for k, v in tree.arrays.items()}
+
+
+def _ask(path: Path, kind: str, **request: Any) -> Tree:
+    """Let the worker read."""
+    need("h5py", f"{path}: {kind}", FormatError)
     worker = Path(__file__).with_name("hdf5_worker.py")
     places = os.pathsep.join(p for p in sys.path if p)  # where this process would find h5py
+    request |= {"path": str(path), "kind": kind, "matlab": kind != "HDF5", "large": LARGE, "ratio": RATIO}
     try:
         done = subprocess.run(
-            [sys.executable or "python3", "-P", str(worker), str(path), *map(str, (limit, LARGE, RATIO)), *wanted],
+            [sys.executable or "python3", "-P", str(worker), json.dumps(request)],
             env=os.environ | {"PYTHONPATH": places, "OPENBLAS_NUM_THREADS": "1"},
             timeout=PATIENCE + path.stat().st_size / 2**24,
             stdin=subprocess.DEVNULL,
@@ -62,18 +100,26 @@ def read_hdf5(
     try:
         if done.returncode:
             raise ValueError(f"it ended with status {done.returncode}")
-        line = done.stdout.index(b"\n") + 1
-        answer = json.loads(done.stdout[:line])
+        at = done.stdout.index(b"\n") + 1
+        answer = json.loads(done.stdout[:at])
         if "error" in answer:
             raise FormatError(f"{path}: {answer['error']}")
-        shapes = {k if k.isprintable() else ascii(k): tuple(map(int, v)) for k, v in answer["shapes"].items()}
-        values, at = {}, line
-        for name in answer["read"]:
-            count = math.prod(shapes[name])
-            values[name] = np.frombuffer(done.stdout, "<f8", count, at).reshape(shapes[name])
+        tree = Tree(
+            {_printable(k): tuple(map(int, v)) for k, v in answer["shapes"].items()},
+            answer.get("attributes", {}),
+            {_printable(k): list(map(str, v)) for k, v in answer.get("texts", {}).items()},
+            {},
+        )
+        for name in map(_printable, answer["read"]):
+            count = math.prod(tree.shapes[name])
+            tree.arrays[name] = np.frombuffer(done.stdout, "<f8", count, at).reshape(tree.shapes[name])
             at += 8 * count
     except FormatError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise FormatError(f"{path}: damaged: the HDF5 library failed on it: {error}") from None
-    return shapes, values
+    return tree
+
+
+def _printable(name: str) -> str:
+    return name if name.isprintable() else ascii(name)

@@ -1,8 +1,14 @@
-"""Read real arrays of an HDF5 file (MATLAB 7.3) in a process of its own; see ``hdf5.py``.
+"""Read an HDF5 file in a process of its own; see ``hdf5.py``.
 
-Run by its path, so that only numpy and h5py are loaded. It writes one line of JSON to its standard output, either
-``{"error": text}`` or ``{"shapes": {name: shape}, "read": [name, ...]}`` with MATLAB's order of dimensions, and then
-the numbers of the variables read, as little-endian doubles, one variable after the other.
+Run by its path, so that only numpy and h5py are loaded. Its argument is a request in JSON, with the path. It writes one
+line of JSON to its standard output, either ``{"error": text}`` or
+
+- ``shapes``: of all datasets by name (``tracks``, ``group/table``), and of the fields read of a table,
+- ``attributes``: of the file (under the empty name), its groups and its datasets, as text; bytes are Latin-1,
+- ``texts``: what the wanted datasets of text hold,
+- ``read``: the names of the wanted datasets of real numbers,
+
+and then the numbers of the latter, as little-endian doubles, one dataset after the other.
 """
 
 from __future__ import annotations
@@ -12,52 +18,129 @@ import json
 import math
 import os
 import sys
+from collections.abc import Iterator
+from fnmatch import fnmatchcase
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 ROOM = 2**30  # bytes of memory for this process besides the numbers
+MOST = 4096  # members of one group, attributes of one object, that are looked at
+LONG = 2**22  # bytes of one attribute, and of the texts of one dataset
 
 
 class Refused(Exception):
     """Says why the file is not read."""
 
 
-def main(path: str, limit: int, large: int, ratio: int, wanted: list[str]) -> None:
-    """Write the answer. ``large``: bytes from which on an array may not be ``ratio`` times larger than the file."""
+def main(request: dict[str, Any]) -> None:
+    """Write the answer; ``Request`` of ``hdf5.py`` says what may be asked."""
     import h5py
 
     allow(room := ROOM)
     arrays: list[NDArray[np.float64]] = []
+    kind, path = request["kind"], request["path"]
     try:
         with h5py.File(path, "r") as file:
-            # Only what is stored in this very file: links could lead to other files, or round in circles.
-            names = [k for k in file if isinstance(k, str) and isinstance(file.get(k, getlink=True), h5py.HardLink)]
-            variables = {k: v for k in names if isinstance(v := file[k], h5py.Dataset)}
-            shapes = {k: (v.shape or ())[::-1] for k, v in variables.items()}
-            for name in (read := [k for k in wanted if k in variables]):
-                room += 4 * check(name, variables[name], limit, max(large, ratio * os.path.getsize(path)))
+            objects = dict(members(file, request["depth"]))
+            data = {k: v for k, v in objects.items() if isinstance(v, h5py.Dataset)}
+            answer: dict[str, Any] = {
+                "shapes": {k: v.shape or () for k, v in data.items()},
+                "attributes": {k: attributes(v) for k, v in objects.items()} if request["texts"] else {},
+                "texts": {},
+                "read": [],
+            }
+            most = max(request["large"], request["ratio"] * os.path.getsize(path))
+            for name in (k for k in data if any(fnmatchcase(k, w) for w in request["wanted"])):
+                room += 4 * check(name, data[name], request, most)
                 allow(room)
-                arrays.append(np.asarray(variables[name]).T.astype("<f8"))
-        answer: dict[str, Any] = {"shapes": shapes, "read": read}
+                if request["texts"] and (text := texts(data[name])) is not None:
+                    answer["texts"][name] = text
+                    continue
+                for part, values in fields(name, data[name]):
+                    if values.dtype.kind == "S":
+                        answer["texts"][part] = [v.decode("utf-8", "replace") for v in values.ravel().tolist()]
+                    else:
+                        arrays.append(np.asarray(values, "<f8"))
+                        answer["read"].append(part)
+                        answer["shapes"][part] = values.shape
     except Refused as error:
         answer, arrays = {"error": str(error)}, []
     except Exception as error:  # h5py raises many kinds on damaged files
-        answer, arrays = {"error": f"damaged or truncated, or no MATLAB 7.3 file: {error}"}, []
+        answer, arrays = {"error": f"damaged or truncated, or no {kind} file: {error}"}, []
     sys.stdout.buffer.write(json.dumps(answer).encode() + b"\n")
     for array in arrays:
         sys.stdout.buffer.write(np.ascontiguousarray(array).data)
 
 
-def check(name: str, data: Any, limit: int, most: int) -> int:
-    """Refuse what is no array of real numbers in this file, and a damaged header's claims; else tell the bytes."""
-    shape = (data.shape or ())[::-1]
+def members(group: Any, depth: int, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield a group and what is in it, ``depth`` levels down.
+
+    Only what is stored in this very file: links could lead to other files, or round in circles.
+    """
+    import h5py
+
+    yield name, group
+    for key in islice(group, MOST):
+        if not isinstance(key, str) or not isinstance(group.get(key, getlink=True), h5py.HardLink):
+            continue
+        value, label = group[key], f"{name}/{key}" if name else key
+        if isinstance(value, h5py.Dataset):
+            yield label, value
+        elif isinstance(value, h5py.Group) and depth > 1:
+            yield from members(value, depth - 1, label)
+
+
+def attributes(item: Any) -> dict[str, str]:
+    """The attributes that are text, bytes (as Latin-1) or one whole number; those that cannot be read are left out."""
+    found = {}
+    for key in islice(item.attrs, MOST):
+        with contextlib.suppress(Exception):
+            stored = item.attrs.get_id(key)
+            if math.prod(stored.shape or (1,)) * stored.dtype.itemsize > LONG:
+                continue
+            value = item.attrs[key]
+            if isinstance(value, bytes):
+                found[str(key)] = value.decode("latin-1")
+            elif isinstance(value, (str, np.integer)):
+                found[str(key)] = str(value)[:LONG]
+    return found
+
+
+def texts(data: Any) -> list[str] | None:
+    """What a dataset of text holds; None of other datasets."""
+    import h5py
+
+    if h5py.check_string_dtype(data.dtype) is None:
+        return None
+    values = [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in np.ravel(data[()]).tolist()]
+    if sum(map(len, values)) > LONG:
+        raise Refused(f"'{data.name}': expected names, got more than {LONG} letters")
+    return values
+
+
+def fields(name: str, data: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    """The numbers of a dataset, or its columns if it is a table."""
+    values = np.asarray(data)
+    if values.dtype.names is None:
+        yield name, values
+    for column in values.dtype.names or ():
+        if values[column].dtype.kind in "fiubS":
+            yield f"{name}/{column}", values[column]
+
+
+def check(name: str, data: Any, request: dict[str, Any], most: int) -> int:
+    """Refuse what is no array of real numbers (or text) in this file, and a damaged header's claims; else its bytes."""
+    shape = data.shape or ()
+    wide = max(math.prod(data.dtype[c].shape or (1,)) for c in data.dtype.names) if data.dtype.names else 1
     size = max(8, data.dtype.itemsize) * math.prod(shape)
-    if data.shape is None or data.dtype.kind not in "fiub":
+    if data.shape is None or data.dtype.kind not in ("fiubSOV" if request["texts"] else "fiub"):
         raise Refused(f"'{name}': expected real numbers, got {data.dtype}")
-    if math.prod(max(d, 1) for d in shape) > limit:
-        raise Refused(f"'{name}': {shape} are more numbers than a file of tracks holds")
+    if math.prod(max(d, 1) for d in shape) * wide > request["limit"]:
+        shown = tuple(shape[::-1]) if request["matlab"] else tuple(shape)
+        raise Refused(f"'{name}': {shown} are more numbers than a file of tracks holds")
     if data.external or data.is_virtual:
         raise Refused(f"'{name}': expected its numbers in this file, got those of another one: refused")
     if size > most:
@@ -76,5 +159,4 @@ def allow(memory: int) -> None:
 
 
 if __name__ == "__main__":
-    bounds = [int(n) for n in sys.argv[2:5]]
-    main(sys.argv[1], bounds[0], bounds[1], bounds[2], sys.argv[5:])
+    main(json.loads(sys.argv[1]))

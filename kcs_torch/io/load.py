@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from kcs_torch.errors import FormatError, OptionError, unknown
+from kcs_torch.io.hdf5 import read_tree
 from kcs_torch.io.registry import Options, Probe, Reader, discover
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
@@ -162,6 +163,12 @@ def _describe(probe: Probe) -> str:
         except (OSError, ValueError) as error:
             return f"text that is not JSON ({error})"
         return "JSON with other content"
-    if probe.head.startswith((b"\x89HDF", b"PK\x03\x04", b"\x80")):
+    if probe.head.startswith(b"\x89HDF"):
+        try:
+            held = sorted(read_tree(probe.path, (), 0).shapes)
+        except FormatError as error:
+            return f"an HDF5 file that cannot be read ({str(error).removeprefix(f'{probe.path}: ')})"
+        return f"an HDF5 file with other content ({', '.join(held[:8]) or 'nothing'}{', ...' if len(held) > 8 else ''})"
+    if probe.head.startswith((b"PK\x03\x04", b"\x80")):
         return "a binary file with other content"
     return f"a file that begins with {probe.head[:16]!r}"

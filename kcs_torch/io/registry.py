@@ -1,6 +1,7 @@
 """What a reader and a writer are, and where they are found: one file of ``io/formats`` a family of formats.
 
-A new format is one new file in ``io/formats`` that holds a ``READERS`` or a ``WRITERS`` tuple; nothing else changes.
+A new format is one new file in ``io/formats`` that holds a ``READERS``, ``MOTION_READERS`` or ``WRITERS`` tuple;
+nothing changes elsewhere.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import importlib
 import importlib.util
 import pkgutil
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
@@ -21,10 +22,24 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
 if TYPE_CHECKING:
-    from kcs_torch.types import Reconstruction
+    from kcs_torch.io.hdf5 import Tree
+    from kcs_torch.types import Motion, Reconstruction
 
-__all__ = ["Options", "Probe", "Reader", "Writer", "discover", "need", "read_error"]
+__all__ = [
+    "MotionOptions",
+    "MotionReader",
+    "Options",
+    "Probe",
+    "Reader",
+    "Saving",
+    "Writer",
+    "discover",
+    "discover_motion",
+    "need",
+    "read_error",
+]
 
+RATE = 30.0  # frames per second of files that need a number where none is known
 HEAD = 65536  # bytes of a file that a reader may look at to recognise it
 
 
@@ -45,6 +60,24 @@ class Options:
     threshold: float = 0.3
     image_size: tuple[int, int] | None = None
     trust: bool = False
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """What a caller may say about a file of 3D motion, handed to every reader of such.
+
+    Attributes:
+        skeleton: a :class:`Skeleton`, a built-in name, or a YAML/JSON file (for AMC also its .asf); None: as the file
+            says.
+        fps: frames per second; None: as the file says.
+        up: which axis of the file points up (see ``Motion.from_arrays``); None: as the file says.
+        units: of the file's numbers; None: as the file says.
+    """
+
+    skeleton: str | Path | Skeleton | None = None
+    fps: float | None = None
+    up: str | None = None
+    units: str | None = None
 
 
 class Probe:
@@ -90,6 +123,18 @@ class Probe:
         """The files of a folder in natural order, or those whose names begin like, or match, a path that is none."""
         return () if self.is_file else tuple(sibling_files(self.path))
 
+    @cached_property
+    def hdf5(self) -> Tree | None:
+        """What is in an HDF5 file, but its numbers; None of other files, and of those that cannot be read."""
+        if not self.head.startswith(b"\x89HDF"):
+            return None
+        from kcs_torch.io.hdf5 import read_tree
+
+        try:
+            return read_tree(self.path, (), 0)
+        except FormatError:
+            return None
+
     def like(self, suffix: str) -> tuple[Path, ...]:
         """The files of a folder that have a suffix."""
         return tuple(f for f in self.files if f.suffix.lower() == suffix)
@@ -113,31 +158,88 @@ class Reader:
 
 
 @dataclass(frozen=True)
+class MotionReader:
+    """A format that 3D motion comes in.
+
+    Attributes:
+        name: what ``format=`` calls it.
+        summary: one line for lists of formats.
+        recognises: tells from a :class:`Probe`, by content and cheaply, whether the path is of this format.
+        read: reads the motion of one body.
+    """
+
+    name: str
+    summary: str
+    recognises: Callable[[Probe], bool]
+    read: Callable[[Path, MotionOptions], Motion]
+
+
+@dataclass(frozen=True)
+class Saving:
+    """How a motion is to be written, and what is to be said of it afterwards.
+
+    Attributes:
+        up: which axis is to point up in the file: y or z.
+        notes: sentences for the user; writers add to them.
+        warnings: what the user has to know; writers add to them.
+    """
+
+    up: str = "y"
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def rate(self, motion: Motion) -> float:
+        """Frames per second of a file that cannot do without."""
+        if motion.fps is None:
+            self.warnings.append(f"the frame rate is not known: {RATE:g} is written; say which with fps=... or --fps")
+            return RATE
+        return motion.fps
+
+
+@dataclass(frozen=True)
 class Writer:
-    """A format that results go out in.
+    """A format that results, motion or tracks go out in; :func:`kcs_torch.save` makes files appear whole or not at all.
 
     Attributes:
         suffix: of the file, with its dot; it chooses the writer.
         summary: one line for lists of formats.
-        write: writes a result to a path; :func:`kcs_torch.save` sees to it that the file appears whole or not at all.
+        write: writes a result, in the camera's axes; None: as motion.
+        write_motion: writes motion, y up; None: it cannot be written.
+        write_tracks: writes tracks; None: they cannot be written.
+        unit: of length that files of this kind are usually in; empty: motion keeps its own.
+        turns: whether a result is written as motion if the user says which axis shall point up.
     """
 
     suffix: str
     summary: str
-    write: Callable[[Reconstruction, Path], None]
+    write: Callable[[Reconstruction, Path], None] | None = None
+    write_motion: Callable[[Motion, Path, Saving], None] | None = None
+    write_tracks: Callable[[Tracks, Path], None] | None = None
+    unit: str = ""
+    turns: bool = False
 
 
 def discover() -> tuple[Mapping[str, Reader], Mapping[str, Writer]]:
     """Collect the readers by name and the writers by suffix from every file of ``io/formats``."""
-    from kcs_torch.io import formats
-
-    found = [importlib.import_module(f"{formats.__name__}.{m.name}") for m in pkgutil.iter_modules(formats.__path__)]
+    found = _modules()
     readers: Iterable[Reader] = (r for module in found for r in getattr(module, "READERS", ()))
     writers: Iterable[Writer] = (w for module in found for w in getattr(module, "WRITERS", ()))
     return (
         {r.name: r for r in sorted(readers, key=lambda r: natural_key(r.name))},
         {w.suffix: w for w in sorted(writers, key=lambda w: natural_key(w.suffix))},
     )
+
+
+def discover_motion() -> Mapping[str, MotionReader]:
+    """Collect the readers of 3D motion by name from every file of ``io/formats``."""
+    readers: Iterable[MotionReader] = (r for module in _modules() for r in getattr(module, "MOTION_READERS", ()))
+    return {r.name: r for r in sorted(readers, key=lambda r: natural_key(r.name))}
+
+
+def _modules() -> list[ModuleType]:
+    from kcs_torch.io import formats
+
+    return [importlib.import_module(f"{formats.__name__}.{m.name}") for m in pkgutil.iter_modules(formats.__path__)]
 
 
 def need(package: str, what: str, error: type[KcsError]) -> ModuleType:

@@ -1,0 +1,170 @@
+"""DeepLabCut CSV and HDF5, labels and predictions, one animal or several; Lightning Pose writes the same CSV.
+
+Columns are named by scorer, individuals (where there are several), bodyparts and coords: x, y, likelihood.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from array import array
+from collections.abc import Iterator
+from operator import itemgetter
+from pathlib import Path
+
+import numpy as np
+
+from kcs_torch.errors import FormatError
+from kcs_torch.io.animals import LIMIT, Animal, build_animals, frames_of, refuse_3d
+from kcs_torch.io.hdf5_pandas import Table, pandas_group, read_pandas
+from kcs_torch.io.registry import Options, Probe, Reader, read_error
+from kcs_torch.types import Tracks
+
+__all__ = ["READERS"]
+
+_LEVELS = (("scorer", "bodyparts", "coords"), ("scorer", "individuals", "bodyparts", "coords"))
+_COORDS = ("x", "y", "likelihood")
+_BOM = b"\xef\xbb\xbf"
+_EMPTY = ("", "nan", "NaN", "NA", "null", "None")
+
+
+def recognises(probe: Probe) -> bool:
+    """Tell the CSV by the first cells of its header, the HDF5 by a pandas table whose columns are body parts."""
+    if probe.hdf5 is not None:
+        return pandas_group(probe.hdf5) is not None
+    lines = probe.head.removeprefix(_BOM).split(b"\n", 2)
+    return (
+        len(lines) == 3
+        and lines[0][:6] == b"scorer"
+        and lines[0][6:7] in (b",", b";", b"\t")
+        and lines[1].startswith((b"individuals", b"bodyparts"))
+    )
+
+
+def read(path: Path, options: Options) -> list[Tracks]:
+    """Read every animal."""
+    notes: list[str] = []
+    table = read_pandas(path) if Probe(path).head.startswith(b"\x89HDF") else _read_csv(path, notes)
+    if not table.rows:
+        raise FormatError(f"{path}: expected at least one row of numbers, got a header only")
+    columns = _by_animal(table, path, notes)
+    order, frames = frames_of(table.rows, path, notes)
+    length = frames[-1] + 1
+    if length * sum(map(len, columns.values())) * 3 > LIMIT:
+        raise FormatError(f"{path}: {length} frames of {len(columns)} animals are more than fits: split the file")
+    animals = []
+    for name, parts in columns.items():
+        filled = np.full((length, len(parts), 3), np.nan)
+        for joint, where in enumerate(parts.values()):
+            for i, coord in enumerate(_COORDS):
+                filled[frames, joint, i] = table.values[order, where[coord]] if coord in where else 1.0
+        animals.append(Animal(name, list(parts), filled[..., :2], filled[..., 2]))
+    return build_animals(animals, options, path, notes)
+
+
+def _by_animal(table: Table, path: Path, notes: list[str]) -> dict[str, dict[str, dict[str, int]]]:
+    """The column of each coordinate of each joint of each animal."""
+    scorers = list(dict.fromkeys(c[0] for c in table.columns if c[-1] in _COORDS))
+    animals: dict[str, dict[str, dict[str, int]]] = {}
+    others: dict[str, None] = {}
+    for i, (scorer, *names, part, coord) in enumerate(table.columns):
+        if coord == "z":
+            raise refuse_3d(path)
+        if coord not in _COORDS:
+            others[coord] = None
+        elif scorer == scorers[0]:
+            where = animals.setdefault(names[0] if names else "", {}).setdefault(part, {})
+            if coord in where:
+                raise FormatError(f"{path}: expected one column '{coord}' of '{part}', got two")
+            where[coord] = i
+    for name, parts in animals.items():
+        for part, where in parts.items():
+            if "x" not in where or "y" not in where:
+                whose = f" of '{name}'" if name else ""
+                raise FormatError(f"{path}: expected columns x and y of '{part}'{whose}, got {', '.join(where)}")
+    if not animals:
+        raise FormatError(f"{path}: expected columns x and y, got {', '.join(others) or 'none'}")
+    if len(scorers) > 1:
+        notes.append(f"{len(scorers)} scorers' columns: those of '{scorers[0]}' are read")
+    if any(others):
+        notes.append(f"columns left out: {', '.join(filter(None, others))}")
+    return animals
+
+
+def _read_csv(path: Path, notes: list[str]) -> Table:
+    """Read the columns of coordinates of a CSV file; numbers go straight into one array."""
+    numbers, short = array("d"), 0
+    rows: list[tuple[str, ...]] = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+            delimiter = file.readline()[6:7]
+            file.seek(0)
+            lines = csv.reader(file, delimiter=delimiter if delimiter in (",", ";", "\t") else ",")
+            header = _header(lines, path)
+            width, first = len(header[0]), _first_column(header)
+            columns = list(zip(*header, strict=True))
+            take = [i for i in range(first, width) if columns[i][-1] in (*_COORDS, "z")]
+            if not take:
+                raise FormatError(f"{path}: expected columns {', '.join(_COORDS)}, got none of them")
+            cells = itemgetter(*take) if len(take) > 1 else lambda line: (line[take[0]],)
+            for line in lines:
+                if not any(line):
+                    continue
+                if len(line) > width or len(line) <= first:
+                    raise FormatError(f"{path}: line {lines.line_num}: expected {width} cells, got {len(line)}")
+                short += len(line) < width
+                line += [""] * (width - len(line))
+                values = cells(line)
+                if not rows and not any(values) and not any(c.isdigit() for c in "".join(line[:first])):
+                    continue  # pandas may write the name of the index in a line of its own
+                try:
+                    numbers.extend([float(v) if v not in _EMPTY else math.nan for v in values])
+                except ValueError as error:
+                    raise FormatError(f"{path}: line {lines.line_num}: expected numbers: {error}") from None
+                rows.append(tuple(line[:first]))
+    except OSError as error:
+        raise read_error(path, error) from None
+    except (csv.Error, ValueError) as error:
+        if isinstance(error, FormatError):
+            raise
+        raise FormatError(f"{path}: expected DeepLabCut's CSV, got damaged text: {error}") from None
+    if short:
+        lines_end = "1 line ends" if short == 1 else f"{short} lines end"
+        notes.append(f"{lines_end} before the last column: what is missing is unseen")
+    left = [c for i, c in enumerate(columns) if i >= first and i not in set(take)]
+    if left:
+        notes.append(f"columns left out: {', '.join(dict.fromkeys(c[-1] or c[0] for c in left))}")
+    return Table([columns[i] for i in take], np.frombuffer(numbers).reshape(-1, len(take)), rows)
+
+
+def _header(lines: Iterator[list[str]], path: Path) -> list[list[str]]:
+    """The three or four lines of names."""
+    header: list[list[str]] = []
+    for line in lines:
+        header.append(line)
+        if line[:1] == ["coords"] or len(header) == 4:
+            break
+    names = tuple(line[0] if line else "" for line in header)
+    if names not in _LEVELS:
+        raise FormatError(f"{path}: expected lines scorer, (individuals,) bodyparts, coords, got {', '.join(names)}")
+    if len({len(line) for line in header}) > 1:
+        raise FormatError(f"{path}: expected as many cells in each line of the header, got {[len(h) for h in header]}")
+    return header
+
+
+def _first_column(header: list[list[str]]) -> int:
+    """How many columns name the row: one, or three with the image's folders and name apart, which have no header."""
+    first = 1
+    while first < min(3, len(header[0])) and not any(line[first] for line in header):
+        first += 1
+    return first
+
+
+READERS = (
+    Reader(
+        "deeplabcut",
+        "DeepLabCut CSV and HDF5, one animal or several; Lightning Pose CSV",
+        recognises,
+        read,
+    ),
+)

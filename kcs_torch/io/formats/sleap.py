@@ -1,0 +1,222 @@
+"""SLEAP's analysis files, HDF5 and CSV: predictions and labels of one animal or several."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcs_torch.errors import FormatError
+from kcs_torch.io.animals import LIMIT, Animal, build_animals, frames_of, refuse_3d
+from kcs_torch.io.hdf5 import Tree, read_tree
+from kcs_torch.io.link import link_people
+from kcs_torch.io.registry import Options, Probe, Reader, read_error
+from kcs_torch.types import Tracks
+
+__all__ = ["READERS"]
+
+_FIRST = b"track,frame_idx,instance.score"
+_BOM = b"\xef\xbb\xbf"
+_FPS = 30.0  # assumed for how long somebody may be out of sight, where nothing is known
+_ORDERS = (("track", "xy", "node", "frame"), ("frame", "track", "node", "xy"))
+"""Of the dimensions of ``tracks``: SLEAP's own, which MATLAB sees reversed, and that of sleap-io's "standard" files."""
+_WANTED = ("tracks", "point_scores", "node_names", "track_names", "edge_inds")
+
+
+def recognises(probe: Probe) -> bool:
+    """Tell the HDF5 by its datasets, a project (which is refused) by its own, the CSV by its header."""
+    if probe.hdf5 is not None:
+        shapes = probe.hdf5.shapes
+        if len(shapes.get("tracks", ())) == 4:
+            return "node_names" in shapes or "track_occupancy" in shapes or len(shapes) == 1
+        return _is_project(probe.hdf5)
+    return probe.head.removeprefix(_BOM).startswith(_FIRST)
+
+
+def read(path: Path, options: Options) -> list[Tracks]:
+    """Read every track as one animal."""
+    notes: list[str] = []
+    if Probe(path).head.startswith(b"\x89HDF"):
+        animals, edges = _read_hdf5(path, notes)
+    else:
+        animals, edges = _read_csv(path, options, notes), None
+    return build_animals(animals, options, path, notes, edges=edges)
+
+
+def _is_project(tree: Tree) -> bool:
+    return {"frames", "instances", "pred_points"} <= set(tree.shapes) and "metadata" in tree.attributes
+
+
+def _read_hdf5(path: Path, notes: list[str]) -> tuple[list[Animal], NDArray[np.int64] | None]:
+    tree = read_tree(path, _WANTED, LIMIT)
+    if _is_project(tree):
+        raise FormatError(
+            f"{path}: expected SLEAP's analysis file, got a project: write one with "
+            f"sleap-convert --format analysis {path.name}"
+        )
+    if "tracks" not in tree.arrays or tree.arrays["tracks"].ndim != 4:
+        held = ", ".join(f"{k} {v}" for k, v in sorted(tree.shapes.items())[:8]) or "nothing"
+        raise FormatError(f"{path}: expected 'tracks' (tracks, 2, nodes, frames), got {held}")
+    names = tree.texts.get("node_names")
+    points = _in_order(tree, "tracks", names, path)
+    tracks, _, nodes = points.shape[:3]
+    if names is None:
+        notes.append("the file does not name the joints")
+        names = [f"joint{i}" for i in range(nodes)]
+    scores = np.ones(points.shape[:3])
+    if "point_scores" in tree.arrays:
+        scores = _in_order(tree, "point_scores", names, path)[..., 0]
+        if scores.shape != points.shape[:3]:
+            raise FormatError(f"{path}: 'point_scores': expected the shape {points.shape[:3]}, got {scores.shape}")
+        scores = _by_hand(points, scores, notes)
+    called = tree.texts.get("track_names", [])
+    if len(called) != tracks:
+        called = [f"track {i}" for i in range(tracks)]
+    animals = [Animal(called[i] if tracks > 1 else "", names, points[i], scores[i]) for i in range(tracks)]
+    return animals, _edges(tree, nodes, path)
+
+
+def _in_order(tree: Tree, key: str, names: list[str] | None, path: Path) -> NDArray[np.float64]:
+    """A dataset with its dimensions in the order track, frame, node, and x, y (or a single one) last."""
+    array = tree.arrays[key]
+    plain = key != "tracks"
+    told = tree.attributes.get(key, {}).get("dims")
+    orders = [tuple(d for d in order if not (plain and d == "xy")) for order in _ORDERS]
+    if told is not None:
+        orders = [_dims(told, key, path)]
+        if sorted(orders[0]) != sorted(d for d in _ORDERS[0] if not (plain and d == "xy")):
+            raise FormatError(f"{path}: '{key}': expected dims such as {json.dumps(_ORDERS[0])}, got {told[:80]}")
+    for order in orders:
+        if len(order) != array.ndim:
+            continue
+        size = dict(zip(order, array.shape, strict=True))
+        if size.get("xy", 2) == 2 and size["node"] == (len(names) if names is not None else size["node"]):
+            moved = array.transpose([order.index(d) for d in ("track", "frame", "node", "xy") if d in order])
+            return moved.reshape((*moved.shape[:3], -1))
+    if not plain and told is None and array.shape[-1] == 3:
+        raise refuse_3d(path)
+    named = "" if names is None else f" of {len(names)} nodes"
+    raise FormatError(f"{path}: '{key}': expected dimensions {', '.join(orders[0])}{named}, got {array.shape}")
+
+
+def _dims(told: str, key: str, path: Path) -> tuple[str, ...]:
+    """The names of a dataset's dimensions, from JSON."""
+    try:
+        names = json.loads(told)
+    except (ValueError, RecursionError):
+        names = None
+    if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+        raise FormatError(f"{path}: '{key}': expected dims such as {json.dumps(_ORDERS[0])}, got {told[:80]!r}")
+    return tuple(names)
+
+
+def _by_hand(points: NDArray[np.float64], scores: NDArray[np.float64], notes: list[str]) -> NDArray[np.float64]:
+    """Points without a score were placed by hand."""
+    placed = np.isfinite(points).all(-1) & np.isnan(scores)
+    if placed.any():
+        notes.append(f"{int(placed.sum())} points have no score, as those placed by hand: their confidence is 1")
+    return np.where(placed, 1.0, scores)
+
+
+def _edges(tree: Tree, nodes: int, path: Path) -> NDArray[np.int64] | None:
+    """The skeleton's own links, which need not be a tree."""
+    if "edge_inds" not in tree.arrays:
+        return None
+    edges = tree.arrays["edge_inds"]
+    if edges.ndim != 2 or edges.shape[1] != 2 or not np.isin(edges, np.arange(nodes)).all():
+        raise FormatError(f"{path}: 'edge_inds': expected (edges, 2) node numbers 0..{nodes - 1}, got {edges.shape}")
+    return edges.astype(np.int64) if edges.size else None
+
+
+def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
+    """Read the table with one line for every animal in every frame."""
+    instances: dict[str, dict[int, list[NDArray[np.float64]]]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+            lines = csv.reader(file)
+            header = next(lines, [])
+            names = list(dict.fromkeys(c.rpartition(".")[0] for c in header[3:]))
+            places = [[_place(header, f"{n}.{c}") for c in ("x", "y", "score")] for n in names]
+            if not names or any(None in p[:2] for p in places):
+                raise FormatError(f"{path}: expected columns node.x, node.y, node.score, got {', '.join(header[3:7])}")
+            for line in lines:
+                if len(line) != len(header):
+                    raise FormatError(f"{path}: line {lines.line_num}: expected {len(header)} cells, got {len(line)}")
+                try:
+                    frame = int(line[1])
+                    values = [[_number(line[i]) if i is not None else math.nan for i in p] for p in places]
+                except ValueError as error:
+                    raise FormatError(f"{path}: line {lines.line_num}: expected numbers: {error}") from None
+                if not 0 <= frame < 10**15:
+                    raise FormatError(f"{path}: line {lines.line_num}: expected a frame number, got {frame}")
+                instances.setdefault(line[0], {}).setdefault(frame, []).append(np.array(values))
+    except OSError as error:
+        raise read_error(path, error) from None
+    except csv.Error as error:
+        raise FormatError(f"{path}: expected SLEAP's analysis CSV, got damaged text: {error}") from None
+    if not instances:
+        raise FormatError(f"{path}: expected at least one animal, got a header only")
+    numbers = sorted({f for frames in instances.values() for f in frames})
+    places_of = dict(zip(numbers, frames_of([(f,) for f in numbers], path, notes)[1], strict=True))
+    length = places_of[numbers[-1]] + 1
+    if length * len(names) * 3 * len(instances) > LIMIT:
+        raise FormatError(
+            f"{path}: {length} frames of {len(instances)} tracks are more than fits: join tracks in SLEAP"
+        )
+    tracks: dict[str, NDArray[np.float64]] = {}
+    twice = 0
+    for name, frames in instances.items():
+        if not name and max(map(len, frames.values())) > 1:
+            tracks |= _linked(frames, places_of, length, len(names), options, notes)
+            continue
+        whole = tracks.setdefault(name, np.full((length, len(names), 3), np.nan))
+        for frame, found in frames.items():
+            twice += len(found) - 1
+            whole[places_of[frame]] = found[0]
+    if twice:
+        notes.append(f"{twice} lines tell a frame of a track again: the first one counts")
+    scores = _by_hand(*_split(tracks), notes)
+    return [
+        Animal(name if len(tracks) > 1 else "", names, whole[..., :2], scores[i])
+        for i, (name, whole) in enumerate(tracks.items())
+    ]
+
+
+def _split(tracks: dict[str, NDArray[np.float64]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    every = np.stack(list(tracks.values()))
+    return every[..., :2], every[..., 2]
+
+
+def _linked(
+    frames: dict[int, list[NDArray[np.float64]]],
+    places: dict[int, int],
+    length: int,
+    joints: int,
+    options: Options,
+    notes: list[str],
+) -> dict[str, NDArray[np.float64]]:
+    """Several animals a frame that were not tracked: follow them."""
+    detections = [np.zeros((0, joints, 3))] * length
+    for frame, found in frames.items():
+        poses = np.stack(found)
+        poses[..., 2] = np.where(np.isnan(poses[..., 2]), 1.0, poses[..., 2])
+        poses[~np.isfinite(poses).all(-1)] = 0
+        detections[places[frame]] = poses
+    linked = link_people(detections, max_gap=max(round(options.fps or _FPS), 1))
+    notes.append("animals without a track are followed over the frames by where they are")
+    return {f"untracked {i}": np.where(t[..., 2:] > 0, t, np.nan) for i, t in enumerate(linked)}
+
+
+def _place(header: list[str], column: str) -> int | None:
+    return header.index(column) if column in header else None
+
+
+def _number(cell: str) -> float:
+    return float(cell) if cell else math.nan
+
+
+READERS = (Reader("sleap", "SLEAP analysis HDF5 and CSV, one animal or several", recognises, read),)
