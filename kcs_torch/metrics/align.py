@@ -1,0 +1,79 @@
+"""The alignments after which motion is compared."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import OptionError, ShapeError, unknown
+from kcs_torch.functional import centre, nearest_rotation
+
+__all__ = ["ALIGNMENTS", "align"]
+
+ALIGNMENTS = {
+    "none": "as it stands",
+    "root": "the root joint of each frame moved onto the true one",
+    "scale": "the root joint of each frame moved onto the true one, and each frame scaled about it",
+    "rigid": "each frame moved and turned, not scaled",
+    "similarity": "each frame moved, turned and scaled (Procrustes)",
+    "sequence": "each frame moved; all frames turned and scaled by the same (Procrustes over the clip)",
+}
+"""What each alignment does, by name."""
+
+
+def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = None, root: int | None = None) -> Tensor:
+    """Move a prediction onto the truth in the way named, by least squares; never mirrored.
+
+    Args:
+        pred: (..., T, N, 3).
+        truth: (..., T, N, 3), of the same shape.
+        how: a name in :data:`ALIGNMENTS`.
+        weights: (..., T, N), 0 where a joint of the truth is unknown; all 1 if None.
+        root: index of the root joint for ``root`` and ``scale``; the middle of all joints if None.
+
+    Returns:
+        (..., T, N, 3), where the truth is.
+
+    Raises:
+        ShapeError: the shapes differ.
+        OptionError: there is no such alignment, or no such root.
+
+    >>> truth = torch.randn(5, 17, 3, generator=torch.Generator().manual_seed(0))
+    >>> torch.allclose(align(3 * truth + 1, truth, "similarity"), truth, atol=1e-4)
+    True
+    """
+    if how not in ALIGNMENTS:
+        raise unknown("alignment", how, ALIGNMENTS)
+    if pred.shape != truth.shape or pred.ndim < 3 or pred.shape[-1] != 3:
+        raise ShapeError(
+            f"align: expected two of shape (..., T, N, 3), got {tuple(pred.shape)} and {tuple(truth.shape)}"
+        )
+    if weights is not None and weights.shape != truth.shape[:-1]:
+        raise ShapeError(f"weights: expected shape {tuple(truth.shape[:-1])}, got {tuple(weights.shape)}")
+    if how == "none":
+        return pred
+    mass = torch.ones_like(truth[..., 0]) if weights is None else weights.to(truth)
+    if how in ("root", "scale") and root is not None:
+        if not -truth.shape[-2] <= root < truth.shape[-2]:
+            raise OptionError(f"root: expected a joint index below {truth.shape[-2]}, got {root}")
+        mean = truth[..., root, None, :]
+        source, target = pred - pred[..., root, None, :], truth - mean
+    else:
+        source = centre(pred, mass)[0]
+        target, mean = centre(truth, mass)
+    if how == "root":
+        return source + mean
+    left = source * mass[..., None]
+    if how == "sequence":
+        left, whole = left.flatten(-3, -2)[..., None, :, :], lambda x: x.flatten(-3, -2)[..., None, :, :]
+    else:
+        whole = lambda x: x  # noqa: E731
+    if how != "scale":
+        source = source @ nearest_rotation(left.mT @ whole(target))
+    if how == "rigid":
+        return source + mean
+    heavy = source * mass[..., None]
+    size = whole(heavy * source).sum((-2, -1))
+    overlap = whole(heavy * target).sum((-2, -1))
+    factor = overlap / torch.where(size > 0, size, torch.ones_like(size))
+    return source * factor[..., None, None] + mean

@@ -1,0 +1,180 @@
+"""The metrics against the measuring protocol, scipy and closed forms; with batches, gaps and mirrors."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from numerics import rotations
+from scipy.spatial import procrustes as scipy_procrustes
+from scipy.spatial.transform import Rotation
+
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional import similarity
+from kcs_torch.metrics import ALIGNMENTS, align, bone_deviation, e3d, mpjpe, pck
+
+BONES = [(0, 1), (1, 2), (2, 3), (0, 4)]
+
+
+def clip(*batch, frames=12, joints=6, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(*batch, frames, joints, 3, generator=generator, dtype=torch.float64)
+
+
+def moved(points, seed=1):
+    """Turned, shifted and scaled differently in every frame."""
+    generator = torch.Generator().manual_seed(seed)
+    frames = points.shape[-3]
+    turns = torch.from_numpy(Rotation.random(frames, rng=np.random.default_rng(seed)).as_matrix())
+    size = 0.5 + torch.rand(frames, 1, 1, generator=generator, dtype=torch.float64)
+    shift = torch.randn(frames, 1, 3, generator=generator, dtype=torch.float64)
+    return size * (points @ turns) + shift, turns, size, shift
+
+
+@pytest.mark.parametrize("how", ALIGNMENTS)
+def test_each_alignment_undoes_what_it_names_and_no_more(how):
+    truth = clip()
+    both, turns, size, shift = moved(truth)
+    one = 1.7 * (truth @ turns[:1])
+    undone = {
+        "root": truth + shift,
+        "scale": size * truth + shift,
+        "rigid": truth @ turns + shift,
+        "similarity": both,
+        "sequence": one + shift,
+    }
+    rank = {"none": (), "root": ("root",), "scale": ("root", "scale"), "rigid": ("root", "rigid")}
+    able = {**rank, "similarity": tuple(undone), "sequence": ("root", "sequence")}
+    for name, pred in undone.items():
+        error = mpjpe(pred, truth, align=how)
+        assert (float(error) < 1e-9) == (name in able[how]), name
+
+
+def test_mirrors_are_not_undone():
+    truth = clip()
+    mirrored = truth * torch.tensor([1.0, 1.0, -1.0])
+    assert all(float(mpjpe(mirrored, truth, align=how)) > 0.1 for how in ALIGNMENTS)
+    assert float(e3d(mirrored, truth)) < 1e-9  # which papers allow
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
+def test_batches_are_many_clips(batch):
+    truth, pred = clip(*batch), clip(*batch, seed=1)
+    weights = (clip(*batch, seed=2)[..., 0] > -1).double()
+    flat = lambda x: x.reshape(-1, *x.shape[len(batch) :])  # noqa: E731
+    for how in ALIGNMENTS:
+        for figure in (
+            lambda p, t, w, how=how: mpjpe(p, t, align=how, weights=w, root=1),
+            lambda p, t, w, how=how: pck(p, t, 1.0, align=how, weights=w),
+            lambda p, t, w: e3d(p, t, weights=w),
+            lambda p, t, w: bone_deviation(p, BONES, weights=w),
+        ):
+            together = figure(pred, truth, weights)
+            assert together.shape == batch
+            alone = [figure(*one) for one in zip(flat(pred), flat(truth), flat(weights), strict=True)]
+            assert torch.allclose(together.reshape(-1), torch.stack(alone))
+
+
+def test_unknown_joints_count_nothing():
+    truth, pred = clip(), clip(seed=1)
+    weights = torch.ones(12, 6, dtype=torch.float64)
+    weights[:, 5] = 0
+    weights[3, 2] = 0
+    spoilt = torch.where(weights[..., None] > 0, truth, torch.full_like(truth, 1e3))
+    for how in ALIGNMENTS:
+        assert torch.allclose(
+            mpjpe(pred, truth, align=how, weights=weights), mpjpe(pred, spoilt, align=how, weights=weights)
+        )
+    assert torch.allclose(e3d(pred, truth, weights=weights), e3d(pred, spoilt, weights=weights))
+    whole = weights.clone()
+    whole[3] = 0
+    kept = [t for t in range(12) if t != 3]
+    for how in ALIGNMENTS:
+        assert torch.allclose(
+            mpjpe(pred, truth, align=how, weights=whole), mpjpe(pred[kept][:, :5], truth[kept][:, :5], align=how)
+        )
+
+
+def test_frames_without_the_root_count_nothing():
+    truth, pred = clip(), clip(seed=1)
+    weights = torch.ones(12, 6, dtype=torch.float64)
+    weights[4, 0] = 0
+    kept = [t for t in range(12) if t != 4]
+    assert torch.allclose(mpjpe(pred, truth, weights=weights, root=0), mpjpe(pred[kept], truth[kept], root=0))
+
+
+def test_similarity_against_scipy_and_our_own():
+    truth, pred = clip(), clip(seed=1)
+    assert torch.allclose(align(pred, truth, "similarity"), similarity(pred, truth))
+    assert torch.allclose(align(pred, truth, "sequence"), similarity(pred, truth, sequence=True))
+    assert torch.allclose(align(pred, truth, "rigid"), similarity(pred, truth, scale=False))
+    for t in range(3):
+        target = (truth[t] - truth[t].mean(0)).numpy()
+        turn, _ = Rotation.align_vectors(target, (pred[t] - pred[t].mean(0)).numpy())
+        expected = turn.apply((pred[t] - pred[t].mean(0)).numpy()) + truth[t].mean(0).numpy()
+        assert np.allclose(align(pred[t : t + 1], truth[t : t + 1], "rigid")[0].numpy(), expected)
+    near = truth + 0.05 * pred  # so near that scipy's best turn is no mirror
+    _, _, disparity = scipy_procrustes(truth[0].numpy(), near[0].numpy())
+    ours = align(near[:1], truth[:1], "similarity")
+    target = truth[0] - truth[0].mean(0)
+    assert float((ours - truth[:1]).square().sum() / target.square().sum()) == pytest.approx(disparity)
+
+
+def test_against_the_protocol(shared):
+    sys.path.insert(0, str(shared / "protocol"))
+    import protocol
+
+    generator = torch.Generator().manual_seed(3)
+    truth = 300 * clip(frames=40, joints=8)
+    gaps = torch.rand(40, 8, generator=generator) < 0.1
+    pred = truth @ rotations(seed=3) * 1.1 + 40 * clip(frames=40, joints=8, seed=5)
+    weights = (~gaps).double()
+    theirs = protocol.score(
+        pred.numpy(), np.where(gaps[..., None].numpy(), np.nan, truth.numpy()), np.array([(0, 1), (1, 2), (2, 7)])
+    )
+    ours = {
+        "rigid": mpjpe(pred, truth, align="rigid", weights=weights),
+        "pa": mpjpe(pred, truth, align="similarity", weights=weights),
+        "seq_pa": mpjpe(pred, truth, align="sequence", weights=weights),
+        "e3d": e3d(pred, truth, weights=weights),
+    }
+    for name, figure in ours.items():
+        assert float(figure) == pytest.approx(theirs[name], rel=1e-6), name
+
+
+def test_bone_deviation_is_the_protocols_figure():
+    points = clip(frames=30)
+    length = np.linalg.norm(points[:, [a for a, _ in BONES]] - points[:, [b for _, b in BONES]], axis=-1)
+    expected = np.sort(length.std(0) / length.mean(0))
+    assert float(bone_deviation(points, BONES)) in (pytest.approx(expected[1]), pytest.approx(expected[2]))
+    assert float(bone_deviation(points[:1].expand(9, -1, -1), BONES)) < 1e-7
+
+
+def test_pck_counts_joints():
+    truth = torch.zeros(2, 4, 3)
+    pred = truth.clone()
+    pred[0, 0, 0], pred[1, 1, 1] = 3, 5
+    assert float(pck(pred, truth, 2.9, align="none")) == 0.75
+    assert float(pck(pred, truth, 3.0, align="none")) == 0.875
+    assert float(pck(pred, truth, 5.0, align="none")) == 1
+
+
+def test_what_is_wrong_is_said():
+    with pytest.raises(OptionError, match="did you mean 'similarity'"):
+        mpjpe(clip(), clip(), align="similarty")
+    with pytest.raises(OptionError, match="root: expected a joint index below 6"):
+        mpjpe(clip(), clip(), root=6)
+    with pytest.raises(ShapeError, match="two of shape"):
+        e3d(clip(), clip(joints=5))
+    with pytest.raises(ShapeError, match="weights"):
+        mpjpe(clip(), clip(), weights=torch.ones(12, 5))
+    with pytest.raises(ShapeError, match="pairs of joints"):
+        bone_deviation(clip(), [])
+
+
+def test_figures_have_gradients():
+    pred = clip(seed=1).requires_grad_()
+    for how in ALIGNMENTS:
+        (grad,) = torch.autograd.grad(mpjpe(pred, clip(), align=how), pred)
+        assert torch.isfinite(grad).all()
+        assert grad.abs().sum() > 0
