@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from kcs_torch import functional, nn, solvers
+    from kcs_torch import functional, metrics, nn, solvers
     from kcs_torch.errors import (
         ConvergenceWarning,
         FormatError,
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
         ShapeError,
         SkeletonError,
     )
-    from kcs_torch.io import load_tracks, save
+    from kcs_torch.io import load_motion, load_tracks, save
     from kcs_torch.live import LivePose, Tracker
     from kcs_torch.methods import KCS, METHODS, PKC, Method, SfAM, find_skeleton
     from kcs_torch.reconstruct import reconstruct
     from kcs_torch.skeleton import SKELETONS, Skeleton
-    from kcs_torch.types import Diagnostics, Reconstruction, Tracks
+    from kcs_torch.types import Diagnostics, Motion, Reconstruction, Tracks
 
     __version__: str
 
@@ -41,6 +41,7 @@ __all__ = [
     "KcsWarning",
     "LivePose",
     "Method",
+    "Motion",
     "OptionError",
     "OutputError",
     "Reconstruction",
@@ -52,7 +53,9 @@ __all__ = [
     "Tracks",
     "find_skeleton",
     "functional",
+    "load_motion",
     "load_tracks",
+    "metrics",
     "nn",
     "reconstruct",
     "save",
@@ -70,12 +73,12 @@ _NAMES = {
         "ShapeError",
         "SkeletonError",
     ),
-    "io": ("load_tracks", "save"),
+    "io": ("load_motion", "load_tracks", "save"),
     "live": ("LivePose", "Tracker"),
     "methods": ("KCS", "METHODS", "PKC", "Method", "SfAM", "find_skeleton"),
     "reconstruct": ("reconstruct",),
     "skeleton": ("SKELETONS", "Skeleton"),
-    "types": ("Diagnostics", "Reconstruction", "Tracks"),
+    "types": ("Diagnostics", "Motion", "Reconstruction", "Tracks"),
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names}
 _MODULES = (
@@ -86,6 +89,7 @@ _MODULES = (
     "io",
     "live",
     "methods",
+    "metrics",
     "nn",
     "skeleton",
     "solvers",

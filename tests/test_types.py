@@ -369,7 +369,7 @@ def test_scaled_refuses(options, words):
 
 def test_scaled_by_what_is_not_there():
     result = walk_result()
-    with pytest.raises(OptionError, match="is zero in this reconstruction"):
+    with pytest.raises(OptionError, match="is zero or unknown in this motion"):
         replace(result, lengths=0 * result.lengths).scaled(units="m", height=1.75)
     arm = Skeleton.from_names(["a", "b"], [("a", "b")])
     tracks = Tracks.from_arrays(grid(12, 2), skeleton=arm)

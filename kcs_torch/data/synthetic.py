@@ -12,7 +12,7 @@ from torch import Tensor
 from kcs_torch.anatomy import template_by_names
 from kcs_torch.data.gait import STRIDE_SECONDS, joint_segments, outer, rank, segment_rotations, walking_path
 from kcs_torch.errors import OptionError, SkeletonError
-from kcs_torch.functional import bone_lengths, bone_vectors, chain_inverse, incidence, points_from_bones
+from kcs_torch.functional import bone_lengths, bone_vectors, chain_inverse, incidence, orbit, points_from_bones
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
 
@@ -239,12 +239,7 @@ def _film(
 ) -> SyntheticClip:
     """See world points (T, N, 3) from an orbiting camera."""
     num_frames = len(points)
-    angle = torch.deg2rad(yaw + turn * torch.linspace(0, 1, num_frames, dtype=torch.float64))
-    c, s, o, i = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
-    orbit = torch.stack([torch.stack(row, -1) for row in ((c, o, -s), (o, i, o), (s, o, c))], -2)
-    p = math.radians(pitch)
-    tilt = points.new_tensor([[1, 0, 0], [0, math.cos(p), -math.sin(p)], [0, math.sin(p), math.cos(p)]])
-    cameras = tilt @ orbit  # (T, 3, 3)
+    cameras = orbit(yaw + turn * torch.linspace(0, 1, num_frames, dtype=torch.float64), pitch)  # (T, 3, 3)
     points = points - (points.amin((0, 1)) + points.amax((0, 1))) / 2  # the camera turns about the middle of it all
     points = (points @ cameras.mT).to(dtype)
     seen = points[:, : body.num_observed, :2].clone()

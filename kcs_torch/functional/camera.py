@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -13,6 +15,7 @@ __all__ = [
     "camera_disagreement",
     "complete_rotation",
     "factorize",
+    "orbit",
     "orthonormality_defect",
     "project",
     "rows_to_cameras",
@@ -139,3 +142,23 @@ def camera_disagreement(first: Tensor, second: Tensor) -> Tensor:
         trace = ((source @ gauge[..., None, :, :]) * target).sum((-2, -1))
         angles.append(torch.rad2deg(torch.arccos(((trace - 1) / 2).clamp(-1, 1))).median(-1).values)
     return torch.minimum(*angles)
+
+
+def orbit(yaw: Tensor, pitch: float = 0.0) -> Tensor:
+    """Return world-to-camera rotations of a camera that stands around a body and looks at it.
+
+    Args:
+        yaw: (...) degrees by which it stands to the body's left of its front: 0 looks along z, 90 along x.
+        pitch: degrees by which it looks down.
+
+    Returns:
+        (..., 3, 3); the world has y down, like the camera.
+
+    >>> (orbit(torch.tensor(90.0)) @ torch.tensor([1.0, 0, 0])).round().tolist()
+    [0.0, 0.0, 1.0]
+    """
+    angle, p = torch.deg2rad(yaw), math.radians(pitch)
+    c, s, o, i = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    turn = torch.stack([torch.stack(row, -1) for row in ((c, o, -s), (o, i, o), (s, o, c))], -2)
+    tilt = yaw.new_tensor([[1, 0, 0], [0, math.cos(p), -math.sin(p)], [0, math.sin(p), math.cos(p)]])
+    return tilt @ turn

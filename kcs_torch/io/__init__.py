@@ -1,18 +1,24 @@
-"""Files in and out: :func:`load_tracks`, :func:`load_people`, :func:`save` and the lists of formats."""
+"""Files in and out: :func:`load_tracks`, :func:`load_people`, :func:`load_motion`, :func:`save`, lists of formats."""
 
 from kcs_torch.io.formats.npz import load_reconstruction
 from kcs_torch.io.link import link_people
 from kcs_torch.io.load import READERS, WRITERS, detect_format, load_people, load_tracks
-from kcs_torch.io.registry import Reader, Writer
+from kcs_torch.io.motion import MOTION_READERS, detect_motion_format, load_motion
+from kcs_torch.io.registry import MotionReader, Reader, Saving, Writer
 from kcs_torch.io.write import save, writer_for
 
 __all__ = [
+    "MOTION_READERS",
     "READERS",
     "WRITERS",
+    "MotionReader",
     "Reader",
+    "Saving",
     "Writer",
     "detect_format",
+    "detect_motion_format",
     "link_people",
+    "load_motion",
     "load_people",
     "load_reconstruction",
     "load_tracks",

@@ -1,39 +1,94 @@
-"""Write results to files; the suffix chooses the format."""
+"""Write results, motion and tracks to files; the suffix chooses the format."""
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from kcs_torch.errors import OutputError
+from kcs_torch.errors import KcsWarning, OptionError, OutputError, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.load import WRITERS
-from kcs_torch.io.registry import Writer
-
-if TYPE_CHECKING:
-    from kcs_torch.types import Reconstruction
+from kcs_torch.io.registry import Saving, Writer
+from kcs_torch.types import Motion, Reconstruction, Tracks
+from kcs_torch.types.size import METRES, unit_ratio
 
 __all__ = ["save", "writer_for"]
 
+UP = ("y", "z")
 
-def save(result: Reconstruction, path: str | Path) -> Path:
-    """Write a result to a file in the format of its suffix (see ``kcs_torch.io.WRITERS``).
+
+def save(
+    data: Reconstruction | Motion | Tracks,
+    path: str | Path,
+    *,
+    up: str | None = None,
+    units: str | None = None,
+    notes: list[str] | None = None,
+) -> Path:
+    """Write to a file in the format of its suffix (see ``kcs_torch.io.WRITERS``).
 
     Missing parent folders are created. The file appears whole or not at all; one that was there is replaced.
 
+    Results stay in the camera's axes (x right, y down, z away) in .npz, .json, .html, .png and, unless ``up`` is given,
+    in .csv. Files for other tools (.bvh, .trc, .c3d) hold motion with y or z up (:meth:`Motion.of`), in the unit that
+    is usual there: BVH centimetres, TRC metres, C3D millimetres. Where the size of the body is not known, numbers stay
+    as they are and a warning says so: :meth:`Reconstruction.scaled` sets the size.
+
     Args:
-        result: a :class:`Reconstruction`.
-        path: where to; .npz (everything, exactly), .csv, .json, .html (a player) or .png (key frames).
+        data: a :class:`Reconstruction`, a :class:`Motion` or, to .npz only, :class:`Tracks`.
+        path: where to.
+        up: the axis that points up in the file: y or z.
+        units: of length in the file: m, cm, mm, in or ft.
+        notes: sentences on how it was written are added to it; where None, those that matter are warnings.
 
     Returns:
         The path.
 
     Raises:
-        OutputError: the suffix is unknown, or the file cannot be written; nothing is left half-written.
+        OutputError: the suffix is unknown or does not suit, or the file cannot be written; nothing is left behind.
+        OptionError: ``up`` or ``units`` is unknown or cannot be met.
     """
     writer = writer_for(path)
+    saving = Saving(up or "y")
+    if up is not None and up not in UP:
+        raise unknown("axis for up", up, UP)
+    if isinstance(data, Tracks):
+        if writer.write_tracks is None:
+            raise OutputError(
+                f"{path}: expected 3D motion, got 2D tracks, which go to {_suffixes('write_tracks')}: reconstruct() or "
+                "`kcs-torch lift` makes motion of them"
+            )
+        if up is not None or units is not None:
+            raise OptionError("up and units are for 3D motion, got 2D tracks")
+        with atomic_path(path) as temporary:
+            writer.write_tracks(data, temporary)
+        return Path(path)
+    if isinstance(data, Reconstruction) and writer.write is not None and (up is None or not writer.turns):
+        if up is not None:
+            raise OptionError(f"{path}: up is for {_suffixes('turns')}; this one holds results in the camera's axes")
+        if units is not None:
+            data = data.scaled(units=units, factor=_ratio(data.units, units))
+        with atomic_path(path) as temporary:
+            writer.write(data, temporary)
+        return Path(path)
+    if writer.write_motion is None:
+        raise OutputError(f"{path}: expected a result, got motion, which goes to {_suffixes('write_motion')}")
+    motion = Motion.of(data) if isinstance(data, Reconstruction) else data
+    wanted = units or writer.unit
+    if units is not None or (wanted and motion.units in METRES):
+        motion = motion.scaled(units=wanted, factor=_ratio(motion.units, wanted))
+    elif wanted:
+        saving.warnings.append(
+            f"the true size is not known: lengths are in {motion.units or 'an unknown unit'}; set it with "
+            "scaled(units=..., height=1.75) or --scale height=1.75m"
+        )
     with atomic_path(path) as temporary:
-        writer.write(result, temporary)
+        writer.write_motion(motion, temporary, saving)
+    if notes is not None:
+        notes.extend([*saving.warnings, *saving.notes])
+    else:
+        for warning in saving.warnings:
+            warnings.warn(f"{path}: {warning}", KcsWarning, stacklevel=2)
     return Path(path)
 
 
@@ -48,3 +103,25 @@ def writer_for(path: str | Path) -> Writer:
         got = f"'{suffix}'" if suffix else "none"
         raise OutputError(f"{path}: expected a file with one of the suffixes {', '.join(WRITERS)}, got {got}")
     return WRITERS[suffix]
+
+
+def _ratio(old: str, new: str) -> float:
+    """How many new units an old one has.
+
+    Raises:
+        OptionError: that is not known.
+    """
+    if new not in METRES and new != old:
+        raise unknown("unit of length", new, METRES)
+    ratio = unit_ratio(old, new)
+    if ratio is None:
+        raise OptionError(
+            f"units: the true size is not known, only lengths in {old or 'an unknown unit'}; set it first with "
+            f"scaled(units={new!r}, height=...) or --scale height=..."
+        )
+    return ratio
+
+
+def _suffixes(what: str) -> str:
+    """The suffixes of those writers that can do something."""
+    return ", ".join(suffix for suffix, writer in WRITERS.items() if getattr(writer, what))

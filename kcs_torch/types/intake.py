@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError, SkeletonError
+from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton
 
-__all__ = ["as_floats", "as_number", "choose_skeleton", "joint_order"]
+__all__ = ["Intake", "as_floats", "as_number", "choose_skeleton", "joint_order", "take_in"]
 
 
 def as_floats(value: Any, what: str, ndim: int) -> Tensor:
@@ -114,3 +115,91 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
         f"{source}: expected the {len(wanted)} joints of skeleton '{body.name}', got {len(names)} joints, none of them "
         f"named {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''}; they are {', '.join(names)}"
     )
+
+
+class Intake(NamedTuple):
+    """Arrays of one body's motion, checked: observed joints in the skeleton's order, 0 where unseen."""
+
+    points: Tensor  # (T, num_observed, dims)
+    weights: Tensor  # (T, num_observed)
+    skeleton: Skeleton
+    fps: float | None
+    notes: list[str]
+
+
+def take_in(
+    points: Any,
+    confidence: Any,
+    *,
+    dims: int,
+    skeleton: str | Path | Skeleton | None,
+    joint_names: Sequence[str] | None,
+    edges: Any,
+    fps: float | None,
+    threshold: float,
+    source: str,
+    notes: Sequence[str],
+) -> Intake:
+    """Check arrays of one body's motion in ``dims`` dimensions; arguments and errors as of ``Tracks.from_arrays``."""
+    remarks = list(notes)
+    xy = as_floats(points, f"{source}: points", 3)
+    if confidence is not None:
+        confidence = as_floats(confidence, f"{source}: confidence", 2)
+    if xy.shape[-1] != dims:
+        raise ShapeError(f"{source}: points: expected shape (frames, joints, {dims}), got {tuple(xy.shape)}")
+    num_frames, num_joints = xy.shape[:2]
+    if num_frames < 1:
+        raise ShapeError(f"{source}: expected at least 1 frame, got none")
+    if num_joints < 2:
+        raise ShapeError(f"{source}: expected at least 2 joints, got {num_joints}")
+    rate = as_number(fps)
+    if fps is not None and (rate is None or rate <= 0):
+        raise ShapeError(f"{source}: fps: expected a positive number or None, got {fps!r}")
+    if rate is not None and not math.isfinite(rate):
+        rate = None
+    least = as_number(threshold)
+    if least is None or not 0 <= least <= 1:
+        raise OptionError(f"{source}: threshold: expected a confidence within 0..1, got {threshold!r}")
+    names = None if joint_names is None else [str(n) for n in joint_names]
+    if names is not None and len(names) != num_joints:
+        raise ShapeError(f"{source}: joint_names: expected {num_joints} names, got {len(names)}")
+    if skeleton is not None and names is not None:
+        order = joint_order(names, get_skeleton(skeleton), source, remarks)
+        if order is not None:
+            xy = xy[:, order]
+            confidence = confidence if confidence is None else confidence[:, order]
+    body = choose_skeleton(skeleton, names, edges, xy.shape[1], source, remarks)
+    label = lambda t, n: f"frame {int(t)}, joint '{body.joints[int(n)]}'"  # noqa: E731
+    infinite = torch.isinf(xy).any(-1)
+    if infinite.any():
+        raise ShapeError(
+            f"{source}: points: {label(*infinite.nonzero()[0])} is infinite; write NaN where a joint is unseen"
+        )
+    seen = torch.isfinite(xy).all(-1)
+    if confidence is None:
+        weights = seen.to(xy.dtype)
+    else:
+        weights = confidence.to(xy)
+        if weights.shape != seen.shape:
+            raise ShapeError(f"{source}: confidence: expected shape {tuple(seen.shape)}, got {tuple(weights.shape)}")
+        if torch.isinf(weights).any():
+            raise ShapeError(
+                f"{source}: confidence: {label(*torch.isinf(weights).nonzero()[0])} is infinite; expected 0..1"
+            )
+        weights = torch.nan_to_num(weights, nan=0.0)
+        if (weights < 0).any():
+            raise ShapeError(f"{source}: confidence: {label(*(weights < 0).nonzero()[0])} is negative; expected 0..1")
+        if (weights > 1).any():
+            where = label(*(weights > 1).nonzero()[0])
+            raise ShapeError(
+                f"{source}: confidence: {where} is {float(weights.max()):g} at most; expected 0..1: "
+                "divide by the largest"
+            )
+        weights = torch.where(seen & (weights >= threshold), weights, torch.zeros_like(weights))
+    seen = weights > 0
+    if not seen.any():
+        raise ShapeError(
+            f"{source}: no joint is seen in any frame (confidence threshold {threshold:g}): nothing to reconstruct"
+        )
+    xy = torch.where(seen[..., None], xy, torch.zeros_like(xy))
+    return Intake(xy, weights, body, rate, remarks)

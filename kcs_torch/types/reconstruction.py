@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.types.size import size_factor
 from kcs_torch.types.tracks import Tracks
 
 __all__ = ["Diagnostics", "Reconstruction"]
@@ -149,24 +149,7 @@ class Reconstruction:
         Raises:
             OptionError: not exactly one of ``factor`` and a size is given, or it is not positive.
         """
-        if (factor is None) == (len(sizes) != 1):
-            raise OptionError("scaled: expected either factor=... or exactly one size, such as height=1.75")
-        if factor is None:
-            (name, size), *_ = sizes.items()
-            if name == "height":
-                own = self._height()
-            elif name in self.skeleton.bone_names:
-                own = float(self.lengths[self.skeleton.bone_names.index(name)])
-            else:
-                raise OptionError(
-                    f"scaled: unknown size {name!r}: expected 'height' or a bone, "
-                    f"one of {', '.join(self.skeleton.bone_names)}"
-                )
-            if not own > 0:
-                raise OptionError(f"scaled: {name} is zero in this reconstruction")
-            factor = size / own
-        if not (factor > 0 and np.isfinite(factor)):
-            raise OptionError(f"scaled: expected a positive factor, got {factor}")
+        factor = size_factor(self.skeleton, self.lengths, factor, sizes)
         spread = None if self.uncertainty is None else self.uncertainty * factor
         return replace(
             self,
@@ -189,30 +172,3 @@ class Reconstruction:
         from kcs_torch.io import save
 
         return save(self, path)
-
-    def _height(self) -> float:
-        """Longest path through the bones: head to foot of the straightened body."""
-        neighbours: dict[int, list[tuple[int, float]]] = {i: [] for i in range(self.skeleton.num_joints)}
-        for (a, b), length in zip(self.skeleton.bones, self.lengths.tolist(), strict=True):
-            neighbours[a].append((b, length))
-            neighbours[b].append((a, length))
-        names = list(self.skeleton.joints)
-        tops = [i for i, n in enumerate(names) if "head" in n.lower() or "nose" in n.lower()]
-        feet = [i for i, n in enumerate(names) if any(w in n.lower() for w in ("ankle", "heel", "foot"))]
-        if not tops or not feet:
-            raise OptionError(
-                "scaled: height needs a head and a foot among the joints; "
-                f"skeleton '{self.skeleton.name}' has none: give a bone"
-            )
-        best = 0.0
-        for top in tops:
-            reach = {top: 0.0}
-            stack = [top]
-            while stack:
-                i = stack.pop()
-                for j, length in neighbours[i]:
-                    if j not in reach:
-                        reach[j] = reach[i] + length
-                        stack.append(j)
-            best = max([best, *(reach[f] for f in feet if f in reach)])
-        return best

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.skeleton import Skeleton, get_skeleton
-from kcs_torch.types.intake import as_floats, as_number, choose_skeleton, joint_order
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.types.intake import take_in
 
 __all__ = ["Tracks"]
 
@@ -77,72 +74,20 @@ class Tracks:
             OptionError: the threshold is no confidence.
             SkeletonError: the joint count does not fit the skeleton (the message says which one it fits).
         """
-        remarks = list(notes)
-        xy = as_floats(points, f"{source}: points", 3)
-        if confidence is not None:
-            confidence = as_floats(confidence, f"{source}: confidence", 2)
-        if xy.shape[-1] != 2:
-            raise ShapeError(f"{source}: points: expected shape (frames, joints, 2), got {tuple(xy.shape)}")
-        num_frames, num_joints = xy.shape[:2]
-        if num_frames < 1:
-            raise ShapeError(f"{source}: expected at least 1 frame, got none")
-        if num_joints < 2:
-            raise ShapeError(f"{source}: expected at least 2 joints, got {num_joints}")
-        rate = as_number(fps)
-        if fps is not None and (rate is None or rate <= 0):
-            raise ShapeError(f"{source}: fps: expected a positive number or None, got {fps!r}")
-        if rate is not None and not math.isfinite(rate):
-            rate = None
-        least = as_number(threshold)
-        if least is None or not 0 <= least <= 1:
-            raise OptionError(f"{source}: threshold: expected a confidence within 0..1, got {threshold!r}")
-        names = None if joint_names is None else [str(n) for n in joint_names]
-        if names is not None and len(names) != num_joints:
-            raise ShapeError(f"{source}: joint_names: expected {num_joints} names, got {len(names)}")
-        if skeleton is not None and names is not None:
-            order = joint_order(names, get_skeleton(skeleton), source, remarks)
-            if order is not None:
-                xy = xy[:, order]
-                confidence = confidence if confidence is None else confidence[:, order]
-        body = choose_skeleton(skeleton, names, edges, xy.shape[1], source, remarks)
-        label = lambda t, n: f"frame {int(t)}, joint '{body.joints[int(n)]}'"  # noqa: E731
-        infinite = torch.isinf(xy).any(-1)
-        if infinite.any():
-            raise ShapeError(
-                f"{source}: points: {label(*infinite.nonzero()[0])} is infinite; write NaN where a joint is unseen"
-            )
-        seen = torch.isfinite(xy).all(-1)
-        if confidence is None:
-            weights = seen.to(xy.dtype)
-        else:
-            weights = confidence.to(xy)
-            if weights.shape != seen.shape:
-                raise ShapeError(
-                    f"{source}: confidence: expected shape {tuple(seen.shape)}, got {tuple(weights.shape)}"
-                )
-            if torch.isinf(weights).any():
-                raise ShapeError(
-                    f"{source}: confidence: {label(*torch.isinf(weights).nonzero()[0])} is infinite; expected 0..1"
-                )
-            weights = torch.nan_to_num(weights, nan=0.0)
-            if (weights < 0).any():
-                raise ShapeError(
-                    f"{source}: confidence: {label(*(weights < 0).nonzero()[0])} is negative; expected 0..1"
-                )
-            if (weights > 1).any():
-                where = label(*(weights > 1).nonzero()[0])
-                raise ShapeError(
-                    f"{source}: confidence: {where} is {float(weights.max()):g} at most; expected 0..1: "
-                    "divide by the largest"
-                )
-            weights = torch.where(seen & (weights >= threshold), weights, torch.zeros_like(weights))
-        seen = weights > 0
-        if not seen.any():
-            raise ShapeError(
-                f"{source}: no joint is seen in any frame (confidence threshold {threshold:g}): nothing to reconstruct"
-            )
-        xy = torch.where(seen[..., None], xy, torch.zeros_like(xy))
-        xy, weights = body.complete(xy, weights)
+        taken = take_in(
+            points,
+            confidence,
+            dims=2,
+            skeleton=skeleton,
+            joint_names=joint_names,
+            edges=edges,
+            fps=fps,
+            threshold=threshold,
+            source=source,
+            notes=notes,
+        )
+        body, remarks = taken.skeleton, taken.notes
+        xy, weights = body.complete(taken.points, taken.weights)
         never = [body.joints[n] for n in (weights == 0).all(0).nonzero().flatten().tolist()]
         if never:
             remarks.append(f"never seen, so placed by the skeleton alone: {', '.join(never)}")
@@ -150,7 +95,7 @@ class Tracks:
         if blank:
             shown = ", ".join(map(str, blank[:8])) + (", ..." if len(blank) > 8 else "")
             remarks.append(f"{len(blank)} frames without any seen joint (frame {shown}): filled from their neighbours")
-        return cls(xy, weights, body, rate, units, source, tuple(remarks))
+        return cls(xy, weights, body, taken.fps, units, source, tuple(remarks))
 
     def __repr__(self) -> str:
         return (

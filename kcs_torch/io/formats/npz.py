@@ -9,6 +9,9 @@ Tracks are ``points2d`` (T, N, 2) with NaN where unseen, ``confidence`` (T, N), 
 - ``cameras`` (T, 2, 3), ``scales`` (T,), ``units3d``, ``method``, and where they are known ``uncertainty`` (T, M),
   ``root_depth`` (T,) and ``distance`` (T,);
 - ``skeleton``, ``diagnostics`` and ``notes`` as JSON text.
+
+3D motion is ``points3d`` (T, N, 3) with NaN where unseen and ``up``, the axis that points up; without it the axes are
+the camera's. ``joint_names``, ``edges``, ``fps``, ``units``, ``skeleton`` and ``notes`` are as above.
 """
 
 from __future__ import annotations
@@ -26,12 +29,14 @@ from torch import Tensor
 from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io.archive import Archive
 from kcs_torch.io.build import build_tracks
+from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.plain import plain
-from kcs_torch.io.registry import Options, Probe, Reader, Writer
+from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, Saving, Writer
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types import Diagnostics, Reconstruction, Tracks
+from kcs_torch.types import Diagnostics, Motion, Reconstruction, Tracks
+from kcs_torch.types.axes import from_y_up
 
-__all__ = ["READERS", "WRITERS", "load_reconstruction"]
+__all__ = ["MOTION_READERS", "READERS", "WRITERS", "load_reconstruction"]
 
 
 def recognises(probe: Probe) -> bool:
@@ -45,7 +50,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
     if "points2d" not in file and "points3d" in file:
         raise FormatError(
             f"{path}: expected 2D tracks under 'points2d', got 3D motion only (points3d): "
-            "project it first, or give a file of tracks"
+            "load_motion(path).tracks() films it"
         )
     points = file.array("points2d", "fiu", 3)
     return [
@@ -64,9 +69,33 @@ def read(path: Path, options: Options) -> list[Tracks]:
     ]
 
 
-def write(result: Reconstruction, path: Path) -> None:
-    """Write everything that a result holds, so that :func:`load_reconstruction` gives it back exactly."""
-    tracks, body = result.tracks, result.skeleton
+def write_tracks(tracks: Tracks, path: Path) -> None:
+    """Write tracks, so that the reader gives them back."""
+    _save(_tracks_out(tracks), path)
+
+
+def write_motion(motion: Motion, path: Path, saving: Saving) -> None:
+    """Write 3D motion, so that :func:`kcs_torch.load_motion` gives it back."""
+    body = motion.skeleton
+    points = plain(from_y_up(motion.points, saving.up))
+    weights = plain(motion.weights)
+    arrays = {
+        "points3d": np.where(weights[..., None] > 0, points, np.nan),
+        "confidence": weights,
+        "joint_names": np.array(body.joints),
+        "edges": np.array(body.bones, np.int64).reshape(-1, 2),
+        "fps": np.float64(math.nan if motion.fps is None else motion.fps),
+        "units": np.array(motion.units),
+        "up": np.array(saving.up),
+        "source": np.array(motion.source),
+        "skeleton": np.array(json.dumps(body.to_dict())),
+        "notes": np.array(json.dumps(motion.notes)),
+    }
+    _save(arrays, path)
+
+
+def _tracks_out(tracks: Tracks) -> dict[str, Any]:
+    body = tracks.skeleton
     n = body.num_observed
     points, weights = plain(tracks.points), plain(tracks.weights)
     inside = [b for b in body.bones if max(b) < n]
@@ -77,6 +106,24 @@ def write(result: Reconstruction, path: Path) -> None:
         "edges": np.array(inside, np.int64).reshape(-1, 2),
         "fps": np.float64(math.nan if tracks.fps is None else tracks.fps),
         "units": np.array(tracks.units),
+        "source": np.array(tracks.source),
+        "skeleton": np.array(json.dumps(body.to_dict())),
+        "notes": np.array(json.dumps(tracks.notes)),
+    }
+    if body.virtual:
+        arrays |= {"points2d_virtual": points[:, n:], "confidence_virtual": weights[:, n:]}
+    return arrays
+
+
+def _save(arrays: dict[str, Any], path: Path) -> None:
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def write(result: Reconstruction, path: Path) -> None:
+    """Write everything that a result holds, so that :func:`load_reconstruction` gives it back exactly."""
+    body = result.skeleton
+    arrays = _tracks_out(result.tracks) | {
         "points3d": plain(result.observed),
         "points3d_all": plain(result.points),
         "joint_names_all": np.array(body.joints),
@@ -86,17 +133,11 @@ def write(result: Reconstruction, path: Path) -> None:
         "scales": plain(result.scales),
         "units3d": np.array(result.units),
         "method": np.array(result.method),
-        "source": np.array(tracks.source),
-        "skeleton": np.array(json.dumps(body.to_dict())),
         "diagnostics": np.array(json.dumps(_diagnostics_out(result.diagnostics))),
-        "notes": np.array(json.dumps(tracks.notes)),
     }
-    if body.virtual:
-        arrays |= {"points2d_virtual": points[:, n:], "confidence_virtual": weights[:, n:]}
     maybe = {"uncertainty": result.uncertainty, "root_depth": result.root_depth, "distance": result.distance}
     arrays |= {key: plain(value) for key, value in maybe.items() if value is not None}
-    with path.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+    _save(arrays, path)
 
 
 def load_reconstruction(path: str | Path) -> Reconstruction:
@@ -160,6 +201,40 @@ def load_reconstruction(path: str | Path) -> Reconstruction:
     )
 
 
+def read_motion(path: Path, options: MotionOptions) -> Motion:
+    """Read the 3D motion of a native file, or of a result."""
+    file = Archive(path)
+    if "points3d_all" in file and "diagnostics" in file and options.skeleton is None and options.up is None:
+        motion = Motion.of(load_reconstruction(path))
+        return dataclasses.replace(motion, fps=options.fps or motion.fps, units=options.units or motion.units)
+    if "points3d" not in file:
+        raise FormatError(f"{path}: expected 3D motion under 'points3d', got {', '.join(file.keys) or 'nothing'}")
+    points = torch.from_numpy(file.array("points3d", "fiu", 3).astype(np.float64))
+    confidence = file.array("confidence", "fiub", 2).astype(np.float64) if "confidence" in file else None
+    if confidence is not None and "points2d" not in file and confidence.shape == points.shape[:2]:
+        points[torch.from_numpy(confidence) <= 0] = math.nan
+    if points.shape[2] != 3:
+        raise FormatError(f"{path}: 'points3d': expected shape (frames, joints, 3), got {tuple(points.shape)}")
+    notes = _json(file, "notes", list) if "notes" in file else []
+    if "up" not in file and options.up is None:
+        notes.append("the axes are taken to be the camera's, y down: give up=... if they are not")
+    names = file.texts("joint_names") if "joint_names" in file else [f"joint{i}" for i in range(points.shape[1])]
+    if len(names) != points.shape[1]:
+        raise FormatError(f"{path}: 'joint_names': expected {points.shape[1]} names, got {len(names)}")
+    return build_motion(
+        points,
+        options,
+        source=str(path),
+        names=names,
+        edges=file.array("edges", "iu") if "edges" in file else None,
+        skeleton=_skeleton(file) if "skeleton" in file else None,
+        fps=file.number("fps") if "fps" in file else None,
+        units=file.text("units3d" if "units3d" in file else "units") if "units" in file else "",
+        up=file.text("up") if "up" in file else "-y",
+        notes=[str(note) for note in notes],
+    )
+
+
 def _skeleton(file: Archive) -> Skeleton:
     try:
         return Skeleton.from_dict(_json(file, "skeleton", dict), source=f"{file.path}: 'skeleton'")
@@ -194,4 +269,17 @@ def _diagnostics_in(file: Archive) -> Diagnostics:
 
 
 READERS = (Reader("npz", "native .npz: points2d, and confidence, edges, joint_names, fps, units", recognises, read),)
-WRITERS = (Writer(".npz", "native .npz: everything, exactly; readable again as tracks and as a result", write),)
+MOTION_READERS = (
+    MotionReader(
+        "npz", "native .npz: points3d, and up, edges, joint_names, fps, units; or a result", recognises, read_motion
+    ),
+)
+WRITERS = (
+    Writer(
+        ".npz",
+        "native .npz: everything, exactly; readable again as tracks and as a result",
+        write,
+        write_motion,
+        write_tracks,
+    ),
+)

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcs_torch.io.plain import plain
-from kcs_torch.io.registry import Writer
-from kcs_torch.types import Reconstruction
+from kcs_torch.io.registry import Saving, Writer
+from kcs_torch.types import Motion, Reconstruction
+from kcs_torch.types.axes import from_y_up
 
 __all__ = ["WRITERS"]
 
@@ -25,19 +27,30 @@ def write_csv(result: Reconstruction, path: Path) -> None:
     ``time [s]`` is empty where the frame rate is unknown; ``distance [px]`` comes last where it is known. Numbers have
     9 significant digits.
     """
-    points = plain(result.points)
+    more = {} if result.distance is None else {"distance": plain(result.distance)}
+    _write_rows(plain(result.points), result, more, path)
+
+
+def write_motion_csv(motion: Motion, path: Path, saving: Saving) -> None:
+    """Write the same of motion, with y or z up; the cells of joints that are unseen are empty."""
+    points = plain(from_y_up(motion.points, saving.up))
+    _write_rows(np.where(plain(motion.seen)[..., None] > 0, points, np.nan), motion, {}, path)
+
+
+def _write_rows(
+    points: NDArray[Any], moved: Reconstruction | Motion, more: dict[str, NDArray[Any]], path: Path
+) -> None:
+    unit = f" [{moved.units}]" if moved.units else ""
     header = ["frame", "time [s]"]
-    header += [f"{_cell(joint)}_{axis} [{result.units}]" for joint in result.skeleton.joints for axis in "xyz"]
-    rows = points.reshape(len(points), -1)
-    if result.distance is not None:
-        header.append(f"distance [{result.units}]")
-        rows = np.concatenate([rows, plain(result.distance)[:, None]], 1)
+    header += [f"{_cell(joint)}_{axis}{unit}" for joint in moved.skeleton.joints for axis in "xyz"]
+    header += [f"{name}{unit}" for name in more]
+    rows = np.concatenate([points.reshape(len(points), -1), *(v[:, None] for v in more.values())], 1)
     with path.open("w", newline="", encoding="utf-8", errors="replace") as file:
         writer = csv.writer(file)
         writer.writerow(header)
         for frame, row in enumerate(rows.tolist()):
-            time = f"{frame / result.fps:.6g}" if result.fps else ""
-            writer.writerow([frame, time, *(f"{v:.9g}" for v in row)])
+            time = f"{frame / moved.fps:.6g}" if moved.fps else ""
+            writer.writerow([frame, time, *("" if math.isnan(v) else f"{v:.9g}" for v in row)])
 
 
 def write_json(result: Reconstruction, path: Path) -> None:
@@ -90,6 +103,6 @@ def _finite(value: Any) -> Any:
 
 
 WRITERS = (
-    Writer(".csv", "one row a frame: frame, time, and x, y, z of each joint", write_csv),
+    Writer(".csv", "one row a frame: frame, time, and x, y, z of each joint", write_csv, write_motion_csv, turns=True),
     Writer(".json", "joints, bones, 3D points, cameras, lengths and diagnostics", write_json),
 )

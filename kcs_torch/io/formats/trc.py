@@ -1,0 +1,113 @@
+"""TRC (Track Row Column) of motion capture: markers as a table. Read by OpenSim, Blender add-ons and Pose2Sim.
+
+The first two header lines name the columns of the third; the fourth names the markers, three columns each. Cells are
+separated by tabs, in files of some programs by commas. A marker that is unseen has empty cells. The file does not say
+which axis points up.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import torch
+
+from kcs_torch.errors import FormatError
+from kcs_torch.io.build_motion import build_motion, distinct, numbers, read_lines
+from kcs_torch.io.plain import plain
+from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer
+from kcs_torch.types import Motion
+from kcs_torch.types.axes import from_y_up
+
+__all__ = ["MOTION_READERS", "WRITERS"]
+
+_UNSEEN = ("", "nan", "NaN", "NAN", "-nan", "nan(ind)")
+
+
+def recognises(probe: Probe) -> bool:
+    """Tell by the first word."""
+    return probe.head.removeprefix(b"\xef\xbb\xbf").startswith(b"PathFileType")
+
+
+def read(path: Path, options: MotionOptions) -> Motion:
+    """Read the markers."""
+    lines = read_lines(path, strip=False)  # tabs mark empty cells
+    split = "\t" if "\t" in lines[0] else ","
+    rows = [[cell.strip() for cell in line.split(split)] for line in lines]
+    header = dict(zip(rows[1], rows[2], strict=False)) if len(rows) > 2 else {}
+    at = next((i for i, row in enumerate(rows[:8]) if row[0].startswith("Frame#")), None)
+    if at is None:
+        raise FormatError(f"{path}: expected a line that begins with Frame# and names the markers, got none")
+    names = rows[at][2::3]
+    while names and not names[-1]:
+        names.pop()
+    if not names:
+        raise FormatError(f"{path}: line {at + 1}: expected names of markers, got none")
+    frames: list[list[float]] = []
+    for number, row in enumerate(rows[at + 1 :], at + 2):
+        if not any(row) or not row[0]:  # the line below the names holds X1, Y1, Z1, ...; an empty one may follow
+            continue
+        cells = row[2:]
+        if any(cells[3 * len(names) :]):
+            raise FormatError(
+                f"{path}: line {number}: expected {3 * len(names)} numbers of {len(names)} markers, got {len(cells)}"
+            )
+        cells = cells[: 3 * len(names)] + [""] * (3 * len(names) - len(cells))
+        filled = iter(numbers([c for c in cells if c not in _UNSEEN], f"{path}: line {number}"))
+        frames.append([math.nan if c in _UNSEEN else next(filled) for c in cells])
+    if not frames:
+        raise FormatError(f"{path}: expected a line a frame below the names of the markers, got none")
+    notes = []
+    told = header.get("NumFrames", "")
+    if told.isdigit() and int(told) != len(frames):
+        notes.append(f"the header tells {told} frames, the file has {len(frames)}")
+    rate = header.get("DataRate", "")
+    return build_motion(
+        torch.tensor(frames, dtype=torch.float64).reshape(len(frames), len(names), 3),
+        options,
+        source=str(path),
+        names=distinct(names),
+        fps=_rate(rate, path) if rate else None,
+        units=header.get("Units", "").lower(),
+        notes=notes,
+    )
+
+
+def _rate(text: str, path: Path) -> float | None:
+    value = numbers([text], f"{path}: line 3: DataRate")[0]
+    return value if value > 0 else None
+
+
+def write(motion: Motion, path: Path, saving: Saving) -> None:
+    """Write the joints as markers; numbers have 9 significant digits."""
+    points, seen = plain(from_y_up(motion.points, saving.up)), plain(motion.seen) > 0
+    rate, count = saving.rate(motion), motion.num_frames
+    names = [re.sub(r"\s+", "_", joint) for joint in motion.skeleton.joints]
+    facts = (f"{rate:.9g}", f"{rate:.9g}", count, len(names), motion.units or "mm", f"{rate:.9g}", 1, count)
+    keys = [
+        "DataRate",
+        "CameraRate",
+        "NumFrames",
+        "NumMarkers",
+        "Units",
+        "OrigDataRate",
+        "OrigDataStartFrame",
+        "OrigNumFrames",
+    ]
+    axes = [f"{axis}{number}" for number in range(1, len(names) + 1) for axis in "XYZ"]
+    with path.open("w", encoding="utf-8", errors="replace", newline="\n") as file:
+        line = lambda *cells: file.write("\t".join(map(str, cells)) + "\n")  # noqa: E731
+        line("PathFileType", 4, "(X/Y/Z)", path.name)
+        line(*keys)
+        line(*facts)
+        line("Frame#", "Time", *(cell for name in names for cell in (name, "", "")))
+        line("", "", *axes)
+        line()
+        for frame, (row, there) in enumerate(zip(points.tolist(), seen.tolist(), strict=True)):
+            cells = [f"{v:.9g}" if known else "" for joint, known in zip(row, there, strict=True) for v in joint]
+            line(frame + 1, f"{frame / rate:.6f}", *cells)
+
+
+MOTION_READERS = (MotionReader("trc", "TRC of motion capture: markers; y up unless told", recognises, read),)
+WRITERS = (Writer(".trc", "TRC: markers in metres, y up, for OpenSim and others", None, write, unit="m"),)

@@ -1,0 +1,279 @@
+"""3D motion from elsewhere, or on its way out: :class:`Motion`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import OptionError
+from kcs_torch.functional import orbit
+from kcs_torch.skeleton import SKELETONS, Skeleton
+from kcs_torch.types.axes import from_y_up, to_y_up
+from kcs_torch.types.intake import take_in
+from kcs_torch.types.intrinsics import Intrinsics
+from kcs_torch.types.reconstruction import Reconstruction
+from kcs_torch.types.size import size_factor
+from kcs_torch.types.tracks import Tracks
+
+__all__ = ["Motion"]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """3D motion of one body in a world of right-handed axes with y up.
+
+    Seen from a camera on the z axis, x points right and z towards the viewer; a body that faces +z has its left at +x.
+    Build it with :meth:`from_arrays`, :meth:`of` (from a result) or :func:`kcs_torch.load_motion`.
+
+    Attributes:
+        points: (T, N, 3) in ``units``; finite, and 0 where unseen.
+        weights: (T, N) in [0, 1]; 0 where unseen.
+        skeleton: names and bones of the N joints (markers have no bones).
+        fps: frames per second, or None where unknown.
+        units: of ``points``: "m", "cm", "mm"; empty where unknown.
+        source: where the motion comes from (a file name), for messages.
+        notes: what was changed or assumed on the way in, one sentence each.
+    """
+
+    points: Tensor
+    weights: Tensor
+    skeleton: Skeleton
+    fps: float | None = None
+    units: str = ""
+    source: str = "motion"
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def from_arrays(
+        cls,
+        points: Any,
+        confidence: Any = None,
+        *,
+        up: str = "y",
+        skeleton: str | Path | Skeleton | None = None,
+        joint_names: Sequence[str] | None = None,
+        edges: Any = None,
+        fps: float | None = None,
+        units: str = "",
+        source: str = "motion",
+        notes: Sequence[str] = (),
+    ) -> Motion:
+        """Check arrays of one body's motion and wrap them.
+
+        Args:
+            points: (T, N, 3) array or tensor; NaN where unseen.
+            confidence: (T, N) within 0..1, 0 where unseen; 1 where None.
+            up: which axis of ``points`` points up: y, z, x, -y (the camera's axes: x right, y down, z away) or -z.
+            skeleton: as of :meth:`Tracks.from_arrays`; joints are matched by name. Virtual joints that are not among
+                the points are the mean of their sources.
+            joint_names: N names.
+            edges: (B, 2) (parent, child) indices.
+            fps: frames per second; NaN and None mean unknown.
+            units: of the points.
+            source: for messages.
+            notes: sentences to carry along.
+
+        Raises:
+            ShapeError: wrong shapes, infinite values, nothing seen at all.
+            SkeletonError: the joint count does not fit the skeleton.
+            OptionError: there is no such axis.
+
+        >>> walk = Motion.from_arrays(torch.rand(10, 17, 3), up="z", skeleton="h36m17", units="m")
+        >>> walk
+        Motion('motion': 10 frames, 17 joints of skeleton 'h36m17', fps None, m, 0.0 % unseen)
+        """
+        names = None if joint_names is None else [str(n) for n in joint_names]
+        if skeleton is None and edges is None and names is not None:  # with the virtual joints that a result has
+            skeleton = next((s for s in SKELETONS.values() if s.virtual and set(s.joints) == set(names)), None)
+        taken = take_in(
+            points,
+            confidence,
+            dims=3,
+            skeleton=skeleton,
+            joint_names=names,
+            edges=edges,
+            fps=fps,
+            threshold=0.0,
+            source=source,
+            notes=notes,
+        )
+        body = taken.skeleton
+        xyz, weights = body.complete(taken.points, taken.weights)
+        given = [] if names is None else [n for n in body.joints[body.num_observed :] if n in names]
+        if given:  # the file's own virtual joints go before the means
+            whole = torch.as_tensor(points).to(xyz)[:, [(names or []).index(n) for n in given]]
+            seen = torch.isfinite(whole).all(-1)
+            at = [body.index(n) for n in given]
+            xyz[:, at] = torch.where(seen[..., None], whole, torch.zeros_like(whole))
+            weights[:, at] = seen.to(weights)
+        return cls(to_y_up(xyz, up), weights, body, taken.fps, units, source, tuple(dict.fromkeys(taken.notes)))
+
+    @classmethod
+    def of(cls, result: Reconstruction) -> Motion:
+        """Turn a result so that the camera's up is y, and let the body move through space where that is known.
+
+        Where the distance to the camera is known, the camera is the origin. Elsewhere the origin lies at the lowest
+        point of the clip, below the middle of the first frame.
+
+        Args:
+            result: of a method; ``scaled()`` before if sizes matter.
+        """
+        notes = [*result.tracks.notes, *result.diagnostics.notes]
+        known = result.distance is not None or result.root_depth is not None
+        points = to_y_up(result.in_space() if known else result.points, "-y")
+        if not known:
+            notes.append("how far the body walks towards or away from the camera is not known: it stays at one depth")
+        if result.distance is None:
+            low, middle = points[..., 1].amin(), points[0].mean(0)
+            points = points - torch.stack([middle[0], low, middle[2]])
+        weights = torch.ones_like(points[..., 0])
+        return cls(
+            points,
+            weights,
+            result.skeleton,
+            result.fps,
+            result.units,
+            result.tracks.source,
+            tuple(dict.fromkeys(notes)),
+        )
+
+    def __repr__(self) -> str:
+        return (
+            f"Motion({self.source!r}: {self.num_frames} frames, {self.num_joints} joints of skeleton "
+            f"'{self.skeleton.name}', fps {self.fps}, {self.units or 'unit unknown'}, "
+            f"{100 * self.unseen_share:.1f} % unseen)"
+        )
+
+    @property
+    def num_frames(self) -> int:
+        return self.points.shape[0]
+
+    @property
+    def num_joints(self) -> int:
+        return self.points.shape[1]
+
+    @property
+    def seen(self) -> Tensor:
+        """(T, N), True where a joint is seen."""
+        return self.weights > 0
+
+    @property
+    def unseen_share(self) -> float:
+        """Share of joints that are unseen, 0..1."""
+        return float(1 - self.seen.double().mean())
+
+    @property
+    def lengths(self) -> Tensor:
+        """(B,) mean bone lengths over the frames in which both ends are seen; NaN where there is none."""
+        a, b = self.skeleton.bone_index(device=self.points.device).unbind(-1)
+        both = self.seen[:, a] & self.seen[:, b]
+        length = (self.points[:, b] - self.points[:, a]).norm(dim=-1)
+        return torch.where(both, length, torch.full_like(length, math.nan)).nanmean(0)
+
+    def to(self, *args: Any, **kwargs: Any) -> Motion:
+        """Move or cast the tensors, as ``Tensor.to``."""
+        return replace(self, points=self.points.to(*args, **kwargs), weights=self.weights.to(*args, **kwargs))
+
+    def frames(self, start: int, stop: int, step: int = 1) -> Motion:
+        """A run of frames; with a step, every so many, at the slower rate."""
+        rate = None if self.fps is None else self.fps / step
+        return replace(self, points=self.points[start:stop:step], weights=self.weights[start:stop:step], fps=rate)
+
+    def scaled(self, *, units: str, factor: float | None = None, **sizes: float) -> Motion:
+        """The same motion in another unit; arguments and errors as of :meth:`Reconstruction.scaled`."""
+        factor = size_factor(self.skeleton, self.lengths, factor, sizes)
+        return replace(self, points=self.points * factor, units=units)
+
+    def in_camera(self, *, yaw: float = 0.0, pitch: float = 0.0, turn: float = 0.0) -> Tensor:
+        """See the motion from a camera that looks at the middle of it all.
+
+        Args:
+            yaw: degrees by which the camera stands to the side in the first frame: 0 on the z axis, 90 on the x axis.
+            pitch: degrees by which it looks down.
+            turn: degrees by which it walks on around the body until the last frame.
+
+        Returns:
+            (T, N, 3): x right, y down, z away from the camera, from the middle of the seen joints' bounding box.
+        """
+        steps = torch.linspace(0, 1, self.num_frames, dtype=self.points.dtype, device=self.points.device)
+        cameras = orbit(yaw + turn * steps, pitch)
+        far = torch.full_like(self.points, math.inf)
+        seen = self.seen[..., None]
+        low, high = torch.where(seen, self.points, far).amin((0, 1)), torch.where(seen, self.points, -far).amax((0, 1))
+        points = from_y_up(self.points - (low + high) / 2, "-y") @ cameras.mT
+        return torch.where(seen, points, torch.zeros_like(points))
+
+    def tracks(
+        self,
+        *,
+        yaw: float = 0.0,
+        pitch: float = 0.0,
+        turn: float = 0.0,
+        intrinsics: Any = None,
+        distance: float | None = None,
+        noise: float = 0.0,
+        generator: torch.Generator | None = None,
+    ) -> Tracks:
+        """Film the motion: 2D tracks to try a method on, or to train with; :meth:`in_camera` is their truth.
+
+        Args:
+            yaw: as of :meth:`in_camera`.
+            pitch: as of :meth:`in_camera`.
+            turn: as of :meth:`in_camera`.
+            intrinsics: of a pinhole camera, (fx, fy, cx, cy) or a matrix K; tracks are then in pixels. None: parallel
+                rays, and tracks in the motion's own units.
+            distance: from the pinhole to the middle of the motion, in the motion's units; so far that all is in the
+                image if None.
+            noise: standard deviation of the tracks, in their unit.
+            generator: for the noise.
+
+        Raises:
+            OptionError: a number is out of range, or the camera would stand within the motion.
+
+        >>> walk = Motion.from_arrays(torch.rand(10, 17, 3), skeleton="h36m17", units="m")
+        >>> walk.tracks(yaw=45, intrinsics=(1000, 1000, 640, 360)).units
+        'px'
+        """
+        if not (math.isfinite(noise) and noise >= 0):
+            raise OptionError(f"noise: expected a number not below 0, got {noise}")
+        points = self.in_camera(yaw=yaw, pitch=pitch, turn=turn)
+        if intrinsics is None:
+            image, units = points[..., :2].clone(), self.units or "px"
+        else:
+            lens = Intrinsics.of(intrinsics)
+            if distance is None:  # of a ball around it all that fits into the nearer half of the image
+                distance = float(points.norm(dim=-1).max()) * (1 + lens.focal / max(min(lens.cx, lens.cy), 1.0))
+            if not (math.isfinite(distance) and distance > 0 and float(points[..., 2].min()) + distance > 0):
+                least = -float(points[..., 2].min())
+                raise OptionError(f"distance: expected more than {least:g}, before all joints, got {distance}")
+            image, units = lens.project(points + points.new_tensor([0.0, 0.0, distance])), "px"
+        if noise:
+            draw = torch.randn(image.shape, generator=generator, dtype=image.dtype, device=image.device)
+            image = image + noise * draw
+        count = self.skeleton.num_observed
+        return Tracks.from_arrays(
+            torch.where(self.seen[..., None], image, torch.full_like(image, math.nan))[:, :count],
+            self.weights[:, :count],
+            skeleton=self.skeleton,
+            fps=self.fps,
+            units=units,
+            threshold=0.0,
+            source=self.source,
+            notes=self.notes,
+        )
+
+    def save(self, path: str | Path) -> Path:
+        """Write to a file; its suffix chooses the format (.npz, .bvh, .c3d, .csv, .trc). See :func:`kcs_torch.save`.
+
+        Raises:
+            OutputError: the suffix is unknown or the file cannot be written; nothing is left half-written.
+        """
+        from kcs_torch.io import save
+
+        return save(self, path)
