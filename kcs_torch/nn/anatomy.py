@@ -45,13 +45,14 @@ class HingeEnergy(SkeletonModule):
         self.register_buffer("sign", torch.tensor([h.sign for h in hinges]), persistent=False)
         self.register_buffer("firm", torch.tensor([h.firm for h in hinges]), persistent=False)
 
-    def forward(self, points: Tensor, lengths: Tensor | None = None) -> Tensor:
+    def forward(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """Return the energy of each frame.
 
         Args:
             points: (..., T, N, 3).
             lengths: (..., B) of the bones; None takes each bone's root mean square over the T frames, as is always done
                 for the axes.
+            weights: (..., T) of the frames: 0 for one that pads a shorter clip; all 1 if None.
 
         Returns:
             (..., T), without unit.
@@ -59,10 +60,11 @@ class HingeEnergy(SkeletonModule):
         Raises:
             ShapeError: the shapes do not fit.
         """
-        wrong = (-self.bend(points, lengths)).clamp_min(0)
-        return 0.5 * (self.firm.to(wrong.dtype) * wrong.square()).sum(-1)
+        wrong = (-self.bend(points, lengths, weights)).clamp_min(0)
+        each = 0.5 * (self.firm.to(wrong.dtype) * wrong.square()).sum(-1)
+        return each if weights is None else each * weights
 
-    def bend(self, points: Tensor, lengths: Tensor | None = None) -> Tensor:
+    def bend(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """The sine s of each hinge, (..., T, H), positive where it bends its way; arguments as in :meth:`forward`."""
         self.check(points, clip=True)
         if points.shape[-1] != 3:
@@ -74,11 +76,11 @@ class HingeEnergy(SkeletonModule):
         parent, joint, child, left, right = ends.unbind(-3)  # each (..., T, H, 3)
         upper, lower, axis = joint - parent, child - joint, left - right
         if lengths is None:
-            upper, lower = _to_size(upper), _to_size(lower)
+            upper, lower = _to_size(upper, weights), _to_size(lower, weights)
         else:
             above, below = lengths.to(wide.dtype)[..., None, self.limbs].unbind(-1)  # each (..., 1, H)
             upper, lower = _divide(upper, above[..., None]), _divide(lower, below[..., None])
-        return (self.sign.to(wide.dtype) * _triple(upper, lower, _to_size(axis))).to(points.dtype)
+        return (self.sign.to(wide.dtype) * _triple(upper, lower, _to_size(axis, weights))).to(points.dtype)
 
 
 def _triple(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
@@ -86,9 +88,14 @@ def _triple(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     return (torch.linalg.cross(a, b) * c).sum(-1)
 
 
-def _to_size(vectors: Tensor) -> Tensor:
+def _to_size(vectors: Tensor, weights: Tensor | None) -> Tensor:
     """Vectors (..., T, H, 3) over their root mean square length in the clip; 0 where they all are."""
-    square = vectors.square().sum(-1, keepdim=True).mean(-3, keepdim=True)
+    square = vectors.square().sum(-1, keepdim=True)
+    if weights is None:
+        square = square.mean(-3, keepdim=True)
+    else:
+        share = weights.to(square)[..., None, None]
+        square = (share * square).sum(-3, keepdim=True) / share.sum(-3, keepdim=True).clamp_min(1e-9)
     return _divide(vectors, torch.where(square > 0, square, torch.ones_like(square)).sqrt())
 
 

@@ -112,12 +112,14 @@ class PostureEnergy(SkeletonModule):
             lengths = vectors.square().sum(-1).mean(-2).clamp_min(torch.finfo(points.dtype).tiny).sqrt()
         return vectors @ self.frame(points) / lengths[..., None, :, None]
 
-    def forward(self, points: Tensor, lengths: Tensor | None = None) -> Tensor:
+    def forward(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """Return the energy of each clip.
 
         Args:
             points: (..., T, N, 3).
             lengths: (..., B); None takes each bone's root mean square over the T frames.
+            weights: (..., T) how many independent frames each frame counts for, 0 for one that pads a shorter clip (give
+                lengths then); 1 / correlation if None.
 
         Returns:
             (...).
@@ -128,11 +130,17 @@ class PostureEnergy(SkeletonModule):
         local = self.directions(points, lengths)
         wide = local.to(torch.promote_types(local.dtype, torch.float32))
         y = ((wide - self.mean.to(wide)) / self.deviation.to(wide)).flatten(-2)
-        frames = y.shape[-2]
-        count = frames / self.correlation
-        mean = y.mean(-2, keepdim=True)
-        scatter = (y - mean).mT @ (y - mean) / self.correlation
-        scatter = scatter + count * self.kappa / (count + self.kappa) * (mean.mT @ mean)
+        count: Tensor | float
+        if weights is None:
+            count, mean = y.shape[-2] / self.correlation, y.mean(-2, keepdim=True)
+            scatter = (y - mean).mT @ (y - mean) / self.correlation
+        else:
+            share = weights.to(wide)[..., None]
+            count = share.sum((-2, -1))
+            mean = (share * y).sum(-2, keepdim=True) / count[..., None, None]
+            scatter = ((y - mean) * share).mT @ (y - mean)
+        pull = torch.as_tensor(count * self.kappa / (count + self.kappa)).to(wide)
+        scatter = scatter + pull[..., None, None] * (mean.mT @ mean)
         eye = torch.eye(scatter.shape[-1], dtype=wide.dtype, device=wide.device)
         factor, _ = torch.linalg.cholesky_ex(eye + scatter / self.strength)
         log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)

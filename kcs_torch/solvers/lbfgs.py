@@ -32,7 +32,7 @@ def lbfgs(
         start: (H, D).
         num_steps: steps, at most.
         memory: pairs of differences kept.
-        tolerance: stop where ten steps lower every energy by less than this share of its size.
+        tolerance: a problem rests once ten steps lower its energy by less than this share of its size.
         max_trials: halvings of a step; a problem whose step fails restarts from steepest descent, then rests.
         first_step: length of the first step, a share of the start's root mean square (of 1 where that is 0).
 
@@ -109,8 +109,9 @@ def lbfgs(
         scale = torch.where(kept, curve / dot(y, y).clamp_min(tiny), scale)
         x, value, gradient = new_x, new_value, new_gradient
         past.append(value)
-        drop = past[-11:][0] - value
-        if bool(resting.all()) or (made >= 10 and bool((drop <= (tolerance * value.abs()).maximum(least)).all())):
+        if made >= 10:
+            resting = resting | (past[-11] - value <= (tolerance * value.abs()).maximum(least))
+        if bool(resting.all()):
             settled = True
             break
     return Solution(x, settled, made)

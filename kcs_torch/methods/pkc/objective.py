@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.iterate import Solution
 from kcs_torch.solvers.lbfgs import lbfgs
 
-__all__ = ["Objective", "Weights", "at_pace", "bone_noise", "pace_of"]
+__all__ = ["Objective", "Task", "Weights", "at_pace", "bone_noise", "minimise_all", "pace_of"]
 
 NOISE, CORNER = 0.8, 0.3
 """Share of the noise's variance that is not to be explained, and how gently its cost sets in."""
@@ -136,6 +137,12 @@ class Objective:
         self.clear = least / (weights.length**2 + self.noise.square())  # a guessed image is no evidence
         observed = torch.eye(skeleton.num_observed, dtype=image.dtype, device=image.device)
         self.complete = skeleton.complete(observed)[0].mT  # (No, N): virtual joints follow their sources
+        # Of several clips together, see joined(): which frames are real (H, T), what they count for the posture, and
+        # whose lengths are anchored (H,).
+        self.count: Tensor | int = len(image)
+        self.time: Tensor | None = None
+        self.share: Tensor | None = None
+        self.held: Tensor | float = 1.0
 
     def terms(self, depth: Tensor, lengths: Tensor) -> dict[str, Tensor]:
         """Each term's value, (H,), of depths (H, T, N) and lengths (H, B)."""
@@ -143,16 +150,19 @@ class Objective:
         points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
         dz = depth[..., self.bones[:, 1]] - depth[..., self.bones[:, 0]]  # (H, T, B)
         off = (self.flat + dz.square() - lengths[:, None].square()) / (2 * lengths[:, None])
+        bend = dz.diff(n=2, dim=1).square()
+        if self.time is not None:
+            bend = bend * self.time[:, 2:, None]
         out = {
             "length": self._length(off, lengths),
-            "smoothness": dz.diff(n=2, dim=1).square().sum((1, 2)) / (2 * w.acceleration**2),
-            "posture": self.posture(points, lengths),
-            "hinges": w.hinge / w.sine**2 * self.hinges(points, lengths).sum(-1),
+            "smoothness": bend.sum((1, 2)) / (2 * w.acceleration**2),
+            "posture": self.posture(points, lengths, self.share),
+            "hinges": w.hinge / w.sine**2 * self.hinges(points, lengths, self.time).sum(-1),
             "foreshortening": self.foreshortening(points, lengths, self.clear),
             "proportions": self.proportions(lengths),
         }
         if self.anchor is not None:
-            out["anchor"] = ((lengths / self.anchor).log() / 0.01).square().sum(-1) / 2
+            out["anchor"] = self.held * ((lengths / self.anchor).log() / 0.01).square().sum(-1) / 2
         return out
 
     def _length(self, off: Tensor, lengths: Tensor) -> Tensor:
@@ -162,19 +172,24 @@ class Objective:
         the noise away would have to be large, and the body with them.
         """
         precision = self.precision(lengths)
-        spread = (HEAVY * torch.log1p(precision * off.square() / HEAVY)).mean(1)  # (H, B)
+        spread = self._mean(HEAVY * torch.log1p(precision * off.square() / HEAVY))  # (H, B)
         if self.noisy:
-            noise = NOISE * (self.rigid - self.weights.length**2 * precision).mean(1)
+            noise = NOISE * self._mean(self.rigid - _wide(self.weights.length, 2) ** 2 * precision)
             over = spread - noise
             spread = (over + (over.square() + (CORNER * noise).square() + 1e-12).sqrt()) / 2
-        return len(self.image) / 2 * torch.log1p(spread).sum(-1)
+        return self.count / 2 * torch.log1p(spread).sum(-1)
+
+    def _mean(self, values: Tensor) -> Tensor:
+        """Mean over time (H, B) of (H, T, B), which is 0 in frames that pad a clip."""
+        return values.mean(1) if self.time is None else values.sum(1) / _wide(self.count, 1)
 
     def precision(self, lengths: Tensor) -> Tensor:
         """1 / s^2 (H, T, B): an image's noise counts less the more the bone points at the camera."""
+        least = _wide(self.weights.length, 2) ** 2
         if not self.noisy:
-            return (self.rigid / self.weights.length**2).expand(*lengths.shape[:1], *self.flat.shape)
+            return (self.rigid / least).expand(*lengths.shape[:1], *self.flat.shape[-2:])
         share = (self.flat / lengths[:, None].square()).clamp_max(1)
-        return self.rigid / (self.weights.length**2 + share * self.noise.square())
+        return self.rigid / (least + share * self.noise.square())
 
     def __call__(self, depth: Tensor, lengths: Tensor) -> Tensor:
         """The energy (H,) of depths (H, T, N) and lengths (H, B)."""
@@ -188,18 +203,124 @@ class Objective:
         A start whose bones are far from constant is best refined with lengths ``loose`` times less certain first; the
         energies are then those of the loose objective.
         """
-        if loose > 1:
-            rough = copy(self)
-            rough.weights = replace(self.weights, length=loose * self.weights.length)
-            return rough.minimise(depth, lengths, num_steps)
-        unknowns = _Unknowns(self, depth, lengths)
-        start = depth.new_zeros(len(depth), unknowns.scale.shape[-1])
-        solution = lbfgs(lambda state: self(*unknowns(state)), start, num_steps=num_steps, tolerance=1e-5)
-        with torch.no_grad():
-            depth, lengths = unknowns(solution.value)
-            energy = self(depth, lengths)
+        depth, lengths, energy, solution = self.refined(depth, lengths, num_steps, loose)
         order = energy.argsort()
         return depth[order], lengths[order], energy[order], solution
+
+    def refined(
+        self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0
+    ) -> tuple[Tensor, Tensor, Tensor, Solution[Tensor]]:
+        """As :meth:`minimise`, in the order of the hypotheses."""
+        goal = copy(self)
+        goal.weights = replace(self.weights, length=loose * self.weights.length)
+        unknowns = _Unknowns(goal, depth, lengths)
+        start = depth.new_zeros(len(depth), unknowns.scale.shape[-1])
+        solution = lbfgs(lambda state: goal(*unknowns(state)), start, num_steps=num_steps, tolerance=1e-5)
+        with torch.no_grad():
+            depth, lengths = unknowns(solution.value)
+            energy = goal(depth, lengths)
+        return depth, lengths, energy, solution
+
+    @classmethod
+    def joined(cls, parts: Sequence[Objective], counts: Sequence[int]) -> Objective:
+        """One objective over the hypotheses of several clips of one skeleton, those of shorter ones padded.
+
+        Args:
+            parts: the clips' objectives.
+            counts: of the hypotheses of each clip, which follow each other.
+        """
+        first = parts[0]
+        out = copy(first)
+        frames = [len(part.image) for part in parts]
+        each = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor(counts)).to(first.image.device)
+
+        def padded(tensors: list[Tensor]) -> Tensor:
+            return torch.nn.utils.rnn.pad_sequence(tensors, batch_first=True)[each]
+
+        gather = lambda values: first.image.new_tensor(values)[each]  # noqa: E731
+        names = [f.name for f in fields(Weights)]
+        out.weights = Weights(**{name: gather([getattr(part.weights, name) for part in parts]) for name in names})
+        out.image = padded([part.image for part in parts])
+        out.flat, out.noise = padded([part.flat for part in parts]), padded([part.noise for part in parts])
+        out.time = padded([part.image.new_ones(n) for part, n in zip(parts, frames, strict=True)])
+        out.rigid = first.rigid * out.time[..., None]
+        out.count, out.noisy = gather(frames), any(part.noisy for part in parts)
+        out.share = out.time / gather([part.posture.correlation for part in parts])[:, None]
+        ratio = [first.foreshortening.correlation / part.foreshortening.correlation for part in parts]
+        out.clear = padded([part.clear.expand_as(part.flat) * r for part, r in zip(parts, ratio, strict=True)])
+        if any(part.anchor is not None for part in parts):
+            one = first.image.new_ones(first.skeleton.num_bones)
+            out.anchor = torch.stack([one if part.anchor is None else part.anchor for part in parts])[each]
+            out.held = gather([float(part.anchor is not None) for part in parts])
+        return out
+
+
+@dataclass(frozen=True)
+class Task:
+    """Hypotheses that are to be refined, as :meth:`Objective.minimise` does.
+
+    Attributes:
+        objective: of the clip.
+        depth: (H, T, N).
+        lengths: (H, B).
+        num_steps: of L-BFGS.
+        loose: by how much lengths are less certain.
+    """
+
+    objective: Objective
+    depth: Tensor
+    lengths: Tensor
+    num_steps: int
+    loose: float = 1.0
+
+
+TOGETHER = 16384
+"""Frames of hypotheses that are refined as one batch; more would only fall out of the processor's cache."""
+
+
+def minimise_all(tasks: Sequence[Task]) -> list[tuple[Tensor, Tensor, Tensor, Solution[Tensor]]]:
+    """:meth:`Objective.minimise` of each task; those of one skeleton and equal settings are refined together."""
+    groups: dict[object, list[int]] = {}
+    for i, task in enumerate(tasks):
+        groups.setdefault((task.objective.skeleton, task.num_steps, task.loose, task.depth.dtype), []).append(i)
+    out: dict[int, tuple[Tensor, Tensor, Tensor, Solution[Tensor]]] = {}
+    for group in groups.values():
+        for run in _runs(sorted(group, key=lambda i: tasks[i].depth.shape[1]), tasks):
+            out |= zip(run, _minimise_joined([tasks[i] for i in run]), strict=True)
+    return [out[i] for i in range(len(tasks))]
+
+
+def _runs(order: list[int], tasks: Sequence[Task]) -> list[list[int]]:
+    """Tasks in order of length, cut into runs that are not too large."""
+    runs: list[list[int]] = []
+    rows = 0
+    for i in order:
+        count, frames = tasks[i].depth.shape[:2]
+        if not runs or (rows + count) * frames > TOGETHER:
+            runs.append([])
+            rows = 0
+        runs[-1].append(i)
+        rows += count
+    return runs
+
+
+def _minimise_joined(tasks: list[Task]) -> list[tuple[Tensor, Tensor, Tensor, Solution[Tensor]]]:
+    """Tasks of one skeleton and equal settings, padded to the longest."""
+    if len(tasks) == 1:
+        (task,) = tasks
+        return [task.objective.minimise(task.depth, task.lengths, task.num_steps, task.loose)]
+    counts = [len(task.depth) for task in tasks]
+    most = max(task.depth.shape[1] for task in tasks)
+    pad = lambda z: torch.nn.functional.pad(z, (0, 0, 0, most - z.shape[1]))  # noqa: E731
+    joined = Objective.joined([task.objective for task in tasks], counts)
+    depth, lengths = torch.cat([pad(task.depth) for task in tasks]), torch.cat([task.lengths for task in tasks])
+    depth, lengths, energy, solution = joined.refined(depth, lengths, tasks[0].num_steps, tasks[0].loose)
+    out = []
+    for task, *part in zip(tasks, *(x.split(counts) for x in (depth, lengths, energy)), strict=True):
+        order = part[2].argsort()
+        found = [x[order] for x in part]
+        out.append((found[0][:, : task.depth.shape[1]], found[1], found[2], solution))
+    return out
 
 
 class _Unknowns:
@@ -222,14 +343,17 @@ class _Unknowns:
         off = (objective.flat + self.dz.square() - size.square()) / (2 * size)
         precision = objective.precision(lengths)
         each = precision * off.square()
-        spread = (HEAVY * torch.log1p(each / HEAVY)).mean(1, keepdim=True)
+        spread = objective._mean(HEAVY * torch.log1p(each / HEAVY))[:, None]
         pull = precision / (1 + spread.clamp_max(1))
-        shape = w.posture * (posture.deviation.square().mean(-1) * size.square()).clamp_min(1e-3)
-        curve = pull * (self.dz / size).square() + 6 / w.acceleration**2 + 5 / shape  # (H, T, B)
+        shape = _wide(w.posture, 2) * (posture.deviation.square().mean(-1) * size.square()).clamp_min(1e-3)
+        curve = pull * (self.dz / size).square() + 6 / _wide(w.acceleration, 2) ** 2 + 5 / shape  # (H, T, B)
         self.shear = size.square() * self.dz / (self.dz.square() + (0.5 * size).square())
         left = size - self.dz * self.shear / size
-        bend = self.shear.diff(n=2, dim=1).square().sum(1) / w.acceleration**2
-        along = (pull * left.square()).sum(1) + 1 / w.proportions**2 + bend  # (H, B)
+        bend = self.shear.diff(n=2, dim=1).square()
+        if objective.time is not None:
+            bend = bend * objective.time[:, 2:, None]
+        bend = bend.sum(1) / _wide(w.acceleration, 1) ** 2
+        along = (pull * left.square()).sum(1) + 1 / _wide(w.proportions, 1) ** 2 + bend  # (H, B)
         self.scale = torch.cat([curve.flatten(1), along], 1).rsqrt()
 
     def __call__(self, state: Tensor) -> tuple[Tensor, Tensor]:
@@ -241,3 +365,8 @@ class _Unknowns:
         own = dz @ obj.tree[: obj.skeleton.num_observed].mT
         depth = own @ obj.complete
         return depth - depth.mean(-1, keepdim=True), self.lengths * grown.exp()
+
+
+def _wide(value: Tensor | float, dims: int) -> Tensor | float:
+    """A number, or one for each hypothesis (H,), with further dimensions of one."""
+    return value[(..., *[None] * dims)] if isinstance(value, Tensor) else value
