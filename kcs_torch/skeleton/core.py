@@ -16,6 +16,7 @@ from kcs_torch.anatomy import UNKNOWN_SPREAD, Hinge
 from kcs_torch.errors import FormatError, SkeletonError, unknown
 from kcs_torch.skeleton.check import check_facts, check_tree
 from kcs_torch.skeleton.graph import find_cycle, find_pieces
+from kcs_torch.skeleton.mapping import map_joints
 from kcs_torch.skeleton.parse import arguments, facts_by_names, hinge_to_dict
 
 __all__ = ["Skeleton"]
@@ -283,6 +284,18 @@ class Skeleton:
         if joint not in self.joints:
             raise unknown(f"joint of skeleton '{self.name}'", joint, self.joints, SkeletonError)
         return self.joints.index(joint)
+
+    def mapping_to(self, other: Skeleton) -> dict[str, str]:
+        """Say which joint of this skeleton is which of another: ``{its name: our name}``, virtual ones included.
+
+        By name, in any usual spelling (:func:`map_joints`); joints that only one of them has are left out.
+
+        >>> from kcs_torch.skeleton import SKELETONS
+        >>> [SKELETONS["coco17"].mapping_to(SKELETONS["body25"])[j] for j in ("RWrist", "MidHip", "Neck")]
+        ['right_wrist', 'pelvis', 'neck']
+        """
+        found = map_joints(self.joints, other.joints)
+        return {joint: self.joints[i] for joint, i in zip(other.joints, found, strict=True) if i is not None}
 
     def bone_index(self, *, device: torch.device | str | None = None) -> Tensor:
         """Bones as an integer tensor (B, 2) of (parent, child)."""
