@@ -90,13 +90,13 @@ def _in_order(tree: Tree, key: str, names: list[str] | None, path: Path) -> NDAr
         orders = [_dims(told, key, path)]
         if sorted(orders[0]) != sorted(d for d in _ORDERS[0] if not (plain and d == "xy")):
             raise FormatError(f"{path}: '{key}': expected dims such as {json.dumps(_ORDERS[0])}, got {told[:80]}")
-    for order in orders:
-        if len(order) != array.ndim:
-            continue
-        size = dict(zip(order, array.shape, strict=True))
-        if size.get("xy", 2) == 2 and size["node"] == (len(names) if names is not None else size["node"]):
-            moved = array.transpose([order.index(d) for d in ("track", "frame", "node", "xy") if d in order])
-            return moved.reshape((*moved.shape[:3], -1))
+    sizes = [dict(zip(o, array.shape, strict=True)) for o in orders if len(o) == array.ndim]
+    fits = [s for s in sizes if s.get("xy", 2) == 2 and (names is None or s["node"] == len(names))]
+    if fits:
+        # Two orders may fit, of as many nodes as frames say: the number of tracks tells, or it is SLEAP's own.
+        order = list(max(fits, key=lambda s: s["track"] == len(tree.texts.get("track_names", []))))
+        moved = array.transpose([order.index(d) for d in ("track", "frame", "node", "xy") if d in order])
+        return moved.reshape((*moved.shape[:3], -1))
     if not plain and told is None and array.shape[-1] == 3:
         raise refuse_3d(path)
     named = "" if names is None else f" of {len(names)} nodes"
@@ -178,7 +178,8 @@ def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
             twice += len(found) - 1
             whole[places_of[frame]] = found[0]
     if twice:
-        notes.append(f"{twice} lines tell a frame of a track again: the first one counts")
+        lines_tell = "1 line tells" if twice == 1 else f"{twice} lines tell"
+        notes.append(f"{lines_tell} a frame of a track again: the first one counts")
     scores = _by_hand(*_split(tracks), notes)
     return [
         Animal(name if len(tracks) > 1 else "", names, whole[..., :2], scores[i])
