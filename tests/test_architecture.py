@@ -27,12 +27,13 @@ ALLOWED = {
     "metrics": {"functional"} | BASE,
     "clean": {"functional"} | BASE,
     "data": {"functional"} | BASE,
+    "detect": {"io"} | BASE,
     "viewer": {"functional"} | BASE,
     "io": {"functional", "viewer"} | BASE,
     "reconstruct": {"functional", "solvers", "nn", "methods"} | BASE,
     "live": {"functional", "solvers", "nn", "methods"} | BASE,
     "training": {"functional", "solvers", "nn", "methods", "metrics", "data"} | BASE,
-    "cli": {"", "functional", "methods", "reconstruct", "io", "data", "viewer", "metrics", "clean"} | BASE,
+    "cli": {"", "functional", "methods", "reconstruct", "io", "data", "viewer", "metrics", "clean", "detect"} | BASE,
     "": {"functional", "solvers", "nn", "methods", "reconstruct", "live", "io", "metrics"} | BASE,
 }
 # Imports made only when called, against the direction: a convenience of the object that the user holds.
@@ -44,7 +45,6 @@ OUTSIDE = {
     "hydra": set(),
     "omegaconf": set(),
     "torchmetrics": {"metrics", "training"},
-    "plotly": {"viewer"},
     "matplotlib": {"viewer"},
     "scipy": {"clean", "data", "io"},
     "typer": {"cli"},

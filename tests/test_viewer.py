@@ -2,7 +2,6 @@
 
 import base64
 import json
-import re
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -16,7 +15,7 @@ from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.io import save
 from kcs_torch.skeleton import SKELETONS, Skeleton
 from kcs_torch.viewer import player, sheet
-from kcs_torch.viewer.colours import COLOURS, bone_side
+from kcs_torch.viewer.colours import COLOURS, bone_keys, bone_side, joint_keys
 from kcs_torch.viewer.summary import summarise
 
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)>&amp;\u2028'
@@ -57,74 +56,165 @@ def scene(text):
     return json.loads(data, parse_constant=pytest.fail)
 
 
-def shown(data):
-    """The points (T, N, 3) that the script draws."""
-    flat = np.frombuffer(base64.b64decode(data["points"]), "<f4")
-    return flat.reshape(data["frames"], len(data["joints"]), 3)
+def unpack(part):
+    """What the script makes of an array."""
+    raw = base64.b64decode(part["data"])
+    values = np.frombuffer(raw, {"i2": "<i2", "f4": "<f4", "u1": "u1"}[part["kind"]])
+    return np.where(values == -32768, np.nan, values * part["step"]) if part["kind"] == "i2" else values
+
+
+def shown(data, solution=0, person=0):
+    """The points (T, N, 3) that the script draws, about the scene's middle."""
+    one = data["people"][person]
+    motion = one["solutions"][solution]
+    centres = unpack(motion["centres"]).reshape(one["frames"], 1, 3)
+    return unpack(motion["points"]).reshape(one["frames"], len(one["joints"]), 3) + centres
+
+
+def two_people(result):
+    """The same person twice, the second beside the first and for half as long."""
+    half = result.tracks.frames(0, 6)
+    other = replace(result, points=result.points[:6] + 1, tracks=replace(half, points=half.points + 1))
+    return [result, replace(other, scales=result.scales[:6], uncertainty=None)]
 
 
 # ---------------------------------------------------------------------- the page
 
 
-def test_page_holds_the_motion_with_y_up(result):
+def test_page_holds_the_motion(result):
     data = scene(player(result))
     points = result.points.numpy()
-    upright = np.stack([points[..., 0], points[..., 2], -points[..., 1]], -1)
-    upright -= np.median(upright, axis=(0, 1))
-    assert np.allclose(shown(data), upright, atol=1e-4 * np.abs(upright).max())
-    assert (data["frames"], data["fps"], data["clock"]) == (12, 25.0, True)
-    assert data["joints"] == list(result.skeleton.joints)
+    middle = np.median(points, axis=(0, 1))
+    assert np.allclose(data["middle"], middle)
+    assert np.allclose(shown(data), points - middle, atol=1e-4 * np.ptp(points))
+    assert (data["total"], data["step"], data["fps"]) == (12, 1, 25.0)
+    assert data["people"][0]["joints"] == list(result.skeleton.joints)
+    spread = unpack(data["people"][0]["spread"]).reshape(12, -1)
+    assert np.allclose(spread, result.uncertainty, atol=1e-4 * float(result.uncertainty.max()))
 
 
-def test_page_needs_no_network(result):
+def test_page_needs_no_network_and_is_small(result):
     text = player(result)
+    assert len(text) < 70_000
     page = Page(text)
     assert not [e for e in page.elements if "src" in e or "href" in e]
-    assert "@@" not in re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
-    assert any("Plotly" in e["text"] and len(e["text"]) > 10**6 for e in page.all("script"))
-    for control in ("play", "slider", "mirror", "follow", "speed", "plot"):
+    assert "@@" not in text
+    for control in ("play", "slider", "mirror", "follow", "walk", "bars", "names", "speed", "person", "solution"):
         assert [e for e in page.elements if e.get("id") == control], control
 
 
 def test_page_has_the_bones_of_each_side(result):
-    bones = scene(player(result))["bones"]
+    bones = scene(player(result))["people"][0]["bones"]
     body = result.skeleton
-    assert sorted(tuple(b) for side in bones.values() for b in side) == sorted(body.bones)
-    assert [body.index("left_knee"), body.index("left_ankle")] in bones["left"]
-    assert [body.index("right_hip"), body.index("right_knee")] in bones["right"]
-    assert all("left" not in body.joints[i] and "right" not in body.joints[i] for b in bones["centre"] for i in b)
+    assert [tuple(b[:2]) for b in bones] == list(body.bones)
+    assert [body.index("left_knee"), body.index("left_ankle"), "left"] in bones
+    assert [body.index("right_hip"), body.index("right_knee"), "right"] in bones
+    middle = [body.joints[i] for a, b, key in bones for i in (a, b) if key == "centre"]
+    assert not [name for name in middle if "left" in name or "right" in name]
 
 
-def test_the_box_stays_over_the_clip_and_in_the_mirror(result):
+def test_tracks_are_shown_where_they_are_seen(result):
+    data = scene(player(result))["people"][0]
+    seen = result.tracks.seen.numpy()
+    tracks = unpack(data["tracks"]).reshape(*seen.shape, 2)
+    assert (np.isfinite(tracks).all(-1) == seen).all()
+    given = result.tracks.points.numpy()[seen]
+    assert np.allclose(tracks[seen], given - np.median(given, axis=0), atol=1e-3 * np.ptp(given))
+    assert ((unpack(data["weights"]).reshape(seen.shape) > 0) == seen).all()
+
+
+def test_the_projection_lies_on_the_tracks(result):
+    """Scale and shift of each frame take the points onto the tracks, as far as those of the result do."""
     data = scene(player(result))
-    points = shown(data)
-    for image in (points, points * [1, -1, 1]):
-        assert (image >= data["fixed"]["low"]).all()
-        assert (image <= data["fixed"]["high"]).all()
-    centres = np.frombuffer(base64.b64decode(data["centres"]), "<f4").reshape(-1, 1, 3)
-    assert (points - centres >= data["follow"]["low"]).all()
-    assert (points - centres <= data["follow"]["high"]).all()
-    assert data["fixed"]["ground"] == pytest.approx(points[..., 2].min(), abs=1e-3)
+    one = data["people"][0]
+    fit = unpack(one["fit"]).reshape(-1, 1, 3)
+    drawn = fit[..., :1] * shown(data)[..., :2] + fit[..., 1:]
+    seen = result.tracks.seen.numpy()
+    tracks = unpack(one["tracks"]).reshape(*seen.shape, 2)
+    gap = np.where(seen[..., None], tracks - drawn, 0)
+    weighted = (result.tracks.weights.numpy()[..., None] * gap).sum(1)
+    assert np.allclose(weighted, 0, atol=1e-3 * np.nanmax(np.abs(tracks)))
 
 
-def test_lost_points_do_not_shrink_the_body(result):
+def test_before_a_known_lens_the_projection_is_a_pinholes(result):
+    distance = torch.full((12,), 5 * float(result.points.abs().max()), dtype=torch.float64)
+    space = result.points + torch.nn.functional.pad(distance[:, None, None], (2, 0))
+    image = space[..., :2] / space[..., 2:] * torch.tensor([900.0, 1100.0]) + torch.tensor([320.0, 240.0])
+    near = replace(result, distance=distance, tracks=replace(result.tracks, points=image))
+    data = scene(player(near))
+    middle = np.median(image.numpy()[result.tracks.seen.numpy()], axis=0)
+    assert np.allclose(data["people"][0]["lens"], [900, 1100, 320 - middle[0], 240 - middle[1]], rtol=1e-6, atol=1e-3)
+    assert np.allclose(unpack(data["people"][0]["path"]), distance)
+
+
+def test_lost_points_do_not_cost_the_body_its_digits(result):
     points = torch.cat([result.points] * 20)
     tracks = replace(
         result.tracks, points=torch.cat([result.tracks.points] * 20), weights=torch.cat([result.tracks.weights] * 20)
     )
-    many = replace(result, points=points, tracks=tracks)
-    plain = scene(player(many))["fixed"]
-    points = points.clone()
     points[3, 4] = 1e7
-    far = scene(player(replace(many, points=points)))["fixed"]
-    size = np.subtract(plain["high"], plain["low"])
-    assert (np.subtract(far["high"], far["low"]) < 2 * size.max()).all()
+    many = replace(result, points=points, tracks=tracks, scales=torch.cat([result.scales] * 20), uncertainty=None)
+    body = shown(scene(player(many)))[20:32]
+    points = result.points.numpy()
+    body = np.roll(body, -4, axis=0)  # 20 = 12 + 8
+    assert np.allclose(np.diff(body, axis=1), np.diff(points, axis=1), atol=2e-3 * np.ptp(points))
 
 
 def test_small_motion_far_from_the_origin_is_kept(result):
     far = replace(result, points=result.points + 1e9)
     near = shown(scene(player(result)))
     assert np.allclose(shown(scene(player(far))), near, atol=1e-3 * np.abs(near).max())
+
+
+def test_long_clips_show_every_nth_frame_and_say_so(result, monkeypatch):
+    whole = 12 * result.points.shape[1] * 7
+    monkeypatch.setattr("kcs_torch.viewer.scene.MOST_NUMBERS", whole // 3)
+    text = player(result)
+    data = scene(text)
+    assert (data["step"], data["total"], data["people"][0]["frames"]) == (3, 12, 4)
+    third = result.points[::3].numpy()
+    assert np.allclose(shown(data), third - data["middle"], atol=1e-4 * np.ptp(third))
+    assert any("every 3rd frame shown" in e["text"] for e in Page(text).all("p"))
+
+
+def test_alternatives_are_told_apart(result):
+    body = result.skeleton
+    arm = result.points.clone()
+    arm[:, body.index("left_wrist"), 2] += torch.linspace(0, 50, 12)
+    others = (replace(result.mirrored(), objective=3.0), replace(result, points=arm, objective=7.25))
+    data = scene(player(replace(result, objective=2.0, alternatives=others)))
+    labels = [s["label"] for s in data["people"][0]["solutions"]]
+    assert labels == [
+        "1 best · objective 2.0",
+        "2 mirror image · objective 3.0",
+        "3 other depth of left_wrist · objective 7.2",
+    ]
+    assert np.allclose(shown(data, 2)[..., 2], arm[..., 2] - data["middle"][2], atol=1e-4 * np.ptp(arm.numpy()))
+
+
+def test_several_people_share_a_scene(result):
+    people = two_people(result)
+    text = player(people)
+    data = scene(text)
+    assert [p["name"] for p in data["people"]] == ["person 0", "person 1"]
+    assert [p["frames"] for p in data["people"]] == [12, 6]
+    apart = shown(data, person=1) - shown(data)[:6]
+    assert np.allclose(apart, 1, atol=1e-4 * np.ptp(result.points.numpy()))
+    assert data["people"][1]["spread"] is None
+    assert any("behind each other is not known" in e["text"] for e in Page(text).all("li"))
+    methods = scene(player([result, replace(result, method="other")]))
+    assert [p["name"] for p in methods["people"]] == ["SfAM", "other"]
+    assert [p["name"] for p in scene(player(people, names=["a", "b"]))["people"]] == ["a", "b"]
+
+
+def test_people_of_no_clip_are_told(result):
+    other = replace(result, tracks=replace(result.tracks, fps=50.0))
+    with pytest.raises(OptionError, match="people of one clip, got frame rates"):
+        player([result, other])
+    with pytest.raises(OptionError, match="at least one result"):
+        player([])
+    with pytest.raises(OptionError, match="expected 1 names, got 2"):
+        player(result, names=["a", "b"])
 
 
 def test_names_from_files_are_text_and_not_markup(result):
@@ -137,9 +227,8 @@ def test_names_from_files_are_text_and_not_markup(result):
         e["tag"] for e in clean.elements if e["tag"] != "li"
     ]
     assert any(EVIL in e["text"] for e in page.all("li"))
-    label = scene(text)["joints"][0]  # plotly takes tags in its labels for markup
-    assert "<" not in label
-    assert "&lt;img" in label
+    assert scene(text)["people"][0]["joints"][0] == EVIL  # the script draws names as text
+    assert text.count("</script") == player(result).count("</script")
 
 
 def test_title_and_summary_are_on_the_page(result):
@@ -200,7 +289,7 @@ def test_sheet_draws_bones_in_the_colours_of_their_sides(result):
     from matplotlib.colors import to_hex
 
     (lines,) = sheet(result, frames=2).axes[2].collections[:1]
-    wanted = sorted(COLOURS[bone_side(result.skeleton, b)] for b in range(result.skeleton.num_bones))
+    wanted = sorted(COLOURS[key] for key in bone_keys(result.skeleton))
     assert sorted(to_hex(c) for c in lines.get_colors()) == wanted
 
 
@@ -244,7 +333,7 @@ def test_too_few_frames_are_told(result):
 
 @pytest.mark.parametrize(
     ("view", "module", "package"),
-    [(player, "plotly.offline", "plotly"), (sheet, "matplotlib.figure", "matplotlib")],
+    [(sheet, "matplotlib.figure", "matplotlib")],
 )
 def test_a_missing_package_is_told(result, monkeypatch, view, module, package):
     monkeypatch.setitem(sys.modules, module, None)
@@ -274,3 +363,12 @@ def test_both_sides_have_bones(name):
     body = SKELETONS[name]
     sides = [bone_side(body, b) for b in range(body.num_bones)]
     assert sides.count("left") == sides.count("right") > 0
+
+
+def test_fingers_have_a_colour_each():
+    hand = SKELETONS["hand21"]
+    keys, ends = bone_keys(hand), joint_keys(hand)
+    fingers = {j.split("_")[0]: ends[k] for k, j in enumerate(hand.joints) if j.endswith("tip")}
+    assert len(set(fingers.values())) == 5
+    assert ends[hand.index("wrist")] == "centre"
+    assert set(keys) == set(fingers.values())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.types import Reconstruction
-from kcs_torch.viewer.colours import COLOURS, bone_side
+from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.summary import summarise
 
 if TYPE_CHECKING:
@@ -103,10 +103,11 @@ def _body(axis: Any, result: Reconstruction, places: NDArray[Any], depth: NDArra
     if depth is not None:
         bones.sort(key=lambda b: -depth[list(body.bones[b])].mean())
     segments = [places[list(body.bones[b])] for b in bones]
-    colours = [COLOURS[bone_side(body, b)] for b in bones]
+    keys, ends = bone_keys(body), joint_keys(body)
+    colours = [COLOURS[keys[b]] for b in bones]
     axis.add_collection(LineCollection(segments, colors=colours, linewidths=1.8, capstyle="round"))
     dots = np.flatnonzero(known)
-    axis.scatter(*places[dots].T, s=5, c=[COLOURS[body.side(int(j))] for j in dots], zorder=3)
+    axis.scatter(*places[dots].T, s=5, c=[COLOURS[ends[j]] for j in dots], zorder=3)
 
 
 def _middle(places: NDArray[Any]) -> NDArray[Any]:

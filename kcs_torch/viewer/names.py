@@ -1,0 +1,22 @@
+"""What to call the people of one picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from kcs_torch.types import Reconstruction
+
+__all__ = ["person_names"]
+
+
+def person_names(results: Sequence[Reconstruction]) -> list[str]:
+    """Name people by what tells them apart: the source's file, else the method, else their number."""
+    sources = [Path(r.tracks.source).name for r in results]
+    methods = [r.method for r in results]
+    if len(results) == 1:
+        return sources
+    for names in (sources, methods):
+        if len(set(names)) == len(names):
+            return names
+    return [f"person {k}" for k in range(len(results))]
