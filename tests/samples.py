@@ -203,6 +203,64 @@ def write_sleap_csv(path: Path, lines, nodes=ANIMAL) -> Path:
     return path
 
 
+def _alphapose(folder: Path, joints=17, image="{}.jpg", **more) -> Path:
+    people = [
+        {"image_id": image.format(t), "category_id": 1, "keypoints": np.ravel(p).tolist(), "score": 3.1, **more}
+        for t, p in enumerate(person(joints=joints))
+    ]
+    return write_json(folder / "alphapose-results.json", people)
+
+
+def _alphapose_images(folder: Path) -> Path:
+    people = {
+        f"{t}.jpg": {"version": "", "bodies": [{"joints": np.ravel(p).tolist()}]}
+        for t, p in enumerate(person(joints=18))
+    }
+    return write_json(folder / "alphapose-cmu.json", people)
+
+
+def _coco_results(folder: Path) -> Path:
+    people = [
+        {"image_id": t, "category_id": 1, "keypoints": np.ravel(p).tolist(), "score": 0.8}
+        for t, p in enumerate(person(joints=17))
+    ]
+    return write_json(folder / "results.json", people)
+
+
+def coco_annotations(num_frames=4, names=("hip", "knee", "foot"), skeleton=((1, 2), (2, 3))) -> dict:
+    """What an annotation file holds; every joint is seen."""
+    found = person(num_frames, len(names), confidence=2)
+    category = {"id": 1, "name": "leg", "keypoints": list(names), "skeleton": [list(p) for p in skeleton]}
+    return {
+        "images": [{"id": 70 + t, "file_name": f"frame{t:03d}.png"} for t in range(num_frames)],
+        "annotations": [
+            {"id": t, "image_id": 70 + t, "category_id": 1, "keypoints": np.ravel(p).tolist(), "bbox": [0, 0, 9, 9]}
+            for t, p in enumerate(found)
+        ],
+        "categories": [category],
+    }
+
+
+def mmpose_frames(joints=17, num_frames=4) -> list:
+    """Frames of one person, as MMPose's video demo writes them."""
+    return [
+        {"frame_id": t + 1, "instances": [{"keypoints": p[:, :2].tolist(), "keypoint_scores": p[:, 2].tolist()}]}
+        for t, p in enumerate(person(num_frames, joints))
+    ]
+
+
+def _mmpose_folder(folder: Path) -> Path:
+    (folder / "predictions").mkdir()
+    for frame in mmpose_frames():
+        write_json(folder / "predictions" / f"{frame['frame_id']:06d}.json", frame["instances"])
+    return folder / "predictions"
+
+
+def write_json(path: Path, data) -> Path:
+    path.write_text(json.dumps(data), encoding="utf-8")
+    return path
+
+
 def _deeplabcut(write, name, individuals=()):
     columns = deeplabcut_columns(individuals)
     return lambda folder: write(folder / name, columns, deeplabcut_values(columns))
@@ -212,6 +270,16 @@ SAMPLES: dict[str, tuple[Callable[[Path], Path], ...]] = {
     "npz": (write_npz,),
     "mat": (write_mat, write_mat_4, write_mat_hdf5),
     "openpose": (lambda folder: write_openpose(folder / "json", [p[None] for p in person()]),),
+    "alphapose": (_alphapose, lambda folder: _alphapose(folder, 26, "clip/{:05d}.png", idx=[1]), _alphapose_images),
+    "coco": (_coco_results, lambda folder: write_json(folder / "annotations.json", coco_annotations())),
+    "mmpose": (
+        lambda folder: write_json(folder / "results.json", mmpose_frames()),
+        lambda folder: write_json(
+            folder / "results_clip.json", {"meta_info": {"dataset_name": "coco"}, "instance_info": mmpose_frames()}
+        ),
+        lambda folder: write_json(folder / "000785.json", mmpose_frames()[0]["instances"]),
+        _mmpose_folder,
+    ),
     "deeplabcut": (
         _deeplabcut(write_deeplabcut_csv, "mouse.csv"),
         _deeplabcut(write_deeplabcut_csv, "mice.csv", ("m1", "m2")),

@@ -404,6 +404,22 @@ def test_joints_are_matched_by_name_with_a_given_skeleton():
     assert torch.equal(wider.points, points)
 
 
+def test_joints_of_another_spelling_are_matched_by_name():
+    names = SKELETONS["body25"].joints
+    points = torch.randn(4, 25, 2, dtype=torch.float64)
+    body = SKELETONS["coco18"]
+    tracks = Tracks.from_arrays(points, skeleton=body, joint_names=[n.lower() for n in names])
+    assert torch.equal(tracks.points[:, :18], points[:, [names.index(j) for j in body.joints[:18]]])
+
+
+def test_as_many_joints_in_another_order_are_no_other_skeletons():
+    points = torch.randn(4, 17, 2, dtype=torch.float64)
+    with pytest.raises(SkeletonError, match="17 joints of skeleton 'h36m17'.*none of them named pelvis, spine"):
+        Tracks.from_arrays(points, skeleton="h36m17", joint_names=SKELETONS["coco17"].joints[:17])
+    tracks = Tracks.from_arrays(points, skeleton="h36m17", joint_names=[f"p{i}" for i in range(17)])
+    assert any("in their order" in n for n in tracks.notes)
+
+
 # ---------------------------------------------------------------------- whatever comes in
 
 anything = st.recursive(

@@ -14,13 +14,14 @@ _SPARSE = 20  # frames per file, above which numbers in file names are no frame 
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sort key that compares runs of digits as numbers.
+    """Sort key that compares runs of digits as numbers, however long they are.
 
     >>> sorted(["f10", "f2", "f1"], key=natural_key)
     ['f1', 'f2', 'f10']
     """
     parts = re.split(r"([0-9]+)", name)
-    return [(1, int(p), "") if i % 2 else (0, 0, p) for i, p in enumerate(parts)]
+    digits = [p.lstrip("0") for p in parts]
+    return [(1, len(d), d) if i % 2 else (0, 0, p) for i, (p, d) in enumerate(zip(parts, digits, strict=True))]
 
 
 def sibling_files(path: Path) -> list[Path]:
@@ -41,7 +42,9 @@ def sibling_files(path: Path) -> list[Path]:
     return sorted(files, key=lambda f: natural_key(f.name))
 
 
-def frame_numbers(numbers: Sequence[int | None], notes: list[str]) -> list[int]:
+def frame_numbers(
+    numbers: Sequence[int | None], notes: list[str], *, names: str = "file names", whole: str = "file"
+) -> list[int]:
     """Turn the numbers of a folder's files, ascending, into frame indices that begin at 0.
 
     Files numbered 7, 8, 10 are frames 0, 1, 3. A common step (0, 5, 10) is taken for a frame's width. What was
@@ -50,6 +53,8 @@ def frame_numbers(numbers: Sequence[int | None], notes: list[str]) -> list[int]:
     Args:
         numbers: the number of each file, None where its name holds none.
         notes: sentences for the user; added to.
+        names: what holds the numbers, for the notes.
+        whole: what a frame without a number lacks, for the notes.
 
     >>> notes = []
     >>> frame_numbers([7, 8, 10], notes), notes
@@ -60,21 +65,21 @@ def frame_numbers(numbers: Sequence[int | None], notes: list[str]) -> list[int]:
         return list(range(len(numbers)))
     steps = [b - a for a, b in itertools.pairwise(known)]
     if len(known) < len(numbers) or min(steps) < 1:
-        notes.append("the file names hold no frame numbers: frames are taken in the order of the names")
+        notes.append(f"the {names} hold no frame numbers: frames are taken in the order of the {names}")
         return list(range(len(numbers)))
     step = math.gcd(*steps)
     frames = [(n - known[0]) // step for n in known]
     if frames[-1] + 1 > _SPARSE * len(frames):
         notes.append(
-            f"the numbers of the {len(frames)} file names run from {known[0]} to {known[-1]}, too far apart for "
-            "frame numbers: frames are taken in the order of the names"
+            f"the numbers of the {len(frames)} {names} run from {known[0]} to {known[-1]}, too far apart for "
+            f"frame numbers: frames are taken in the order of the {names}"
         )
         return list(range(len(numbers)))
     if step > 1:
-        notes.append(f"the file names count in steps of {step}: each step is taken as one frame")
+        notes.append(f"the {names} count in steps of {step}: each step is taken as one frame")
     gaps = sorted(set(range(frames[-1] + 1)) - set(frames))
     if gaps:
         shown = ", ".join(str(known[0] + g * step) for g in gaps[:5]) + (", ..." if len(gaps) > 5 else "")
         verb, plural = ("has", "") if len(gaps) == 1 else ("have", "s")
-        notes.append(f"{len(gaps)} of {frames[-1] + 1} frames {verb} no file (number{plural} {shown}): unseen")
+        notes.append(f"{len(gaps)} of {frames[-1] + 1} frames {verb} no {whole} (number{plural} {shown}): unseen")
     return frames

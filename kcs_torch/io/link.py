@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["link_people"]
+__all__ = ["follow_people", "link_people"]
 
 Array = NDArray[np.float64]
 
@@ -27,6 +27,7 @@ _SIZE = 0.2  # cost of a size that differs by a factor of e
 _VELOCITY = 0.4  # share of the newest displacement in the running velocity
 _SPEED_UP = 0.1  # sizes of the person by which the running velocity changes in a frame, at most
 _COAST = 0.9  # the velocity fades by this factor with each frame of a gap
+_MOST_OPEN = 200  # people who may be out of sight at a time; of more, those seen last
 
 
 @dataclass
@@ -59,11 +60,24 @@ def link_people(detections: Sequence[Array], *, max_gap: int = 30) -> list[Array
     >>> a[:, 0, 0].tolist(), b[:, 0, 0].tolist()
     ([0.0, 0.0], [50.0, 51.0])
     """
+    tracks = []
+    for seen in follow_people(detections, max_gap=max_gap):
+        track = np.zeros((len(detections), *detections[seen[0][0]].shape[1:]))
+        for t, index in seen:
+            track[t] = detections[t][index]
+        tracks.append(track)
+    return tracks
+
+
+def follow_people(detections: Sequence[Array], *, max_gap: int = 30) -> list[list[tuple[int, int]]]:
+    """Say who is who, as :func:`link_people`, which see: each person as (frame, index among its detections)."""
     people: list[_Person] = []
     open_people: list[_Person] = []
     for t, found in enumerate(detections):
         visible = np.flatnonzero((found[..., 2] > 0).any(-1)) if len(found) else np.zeros(0, int)
         open_people = [p for p in open_people if t - p.frame <= max_gap]
+        if len(open_people) > _MOST_OPEN:
+            open_people = sorted(open_people, key=lambda p: (p.frame, p.strength))[-_MOST_OPEN:]
         taken = _assign(open_people, found[visible], t) if len(visible) else {}
         for k, index in enumerate(visible):
             person = taken.get(k)
@@ -75,14 +89,9 @@ def link_people(detections: Sequence[Array], *, max_gap: int = 30) -> list[Array
             else:
                 _update(person, found[index], t)
                 person.seen.append((t, int(index)))
-    tracks = []
-    for person in people:
-        shape = detections[person.seen[0][0]].shape[1:]
-        track = np.zeros((len(detections), *shape))
-        for t, index in person.seen:
-            track[t] = detections[t][index]
-        tracks.append(track)
-    return sorted(tracks, key=lambda a: -float(a[..., 2].sum()))
+    amounts = [sum(float(detections[t][i, :, 2].sum()) for t, i in p.seen) for p in people]
+    order = sorted(range(len(people)), key=lambda k: -amounts[k])
+    return [people[k].seen for k in order]
 
 
 def _assign(people: list[_Person], found: Array, frame: int) -> dict[int, _Person]:

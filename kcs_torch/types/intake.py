@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
-from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton
+from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton, map_joints
 
 __all__ = ["Intake", "as_floats", "as_number", "choose_skeleton", "joint_order", "take_in"]
 
@@ -95,20 +95,21 @@ def choose_skeleton(
 
 
 def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[str]) -> list[int] | None:
-    """Return where each joint of ``body`` stands among ``names``; None: take the joints in their order.
+    """Return where each joint of ``body`` stands among ``names``, in any spelling; None: take them in their order.
 
     Raises:
-        SkeletonError: there are more or fewer names than joints, and some joints are not among them.
+        SkeletonError: some joints are not among the names, and these are more or fewer, or in another order.
     """
     wanted = body.joints[: body.num_observed]
     if tuple(names) == wanted:
         return None
-    where = {n: i for i, n in enumerate(names)}
-    missing = [n for n in wanted if n not in where]
+    exact = {n: i for i, n in enumerate(names)}
+    found = [exact.get(n) for n in wanted] if exact.keys() >= set(wanted) else map_joints(names, wanted)
+    missing = [n for n, i in zip(wanted, found, strict=True) if i is None]
     if not missing:
         notes.append(f"joints matched by name with skeleton '{body.name}'; {len(names) - len(wanted)} left out")
-        return [where[n] for n in wanted]
-    if len(names) == len(wanted):
+        return [i for i in found if i is not None]
+    if len(names) == len(wanted) and all(i in (None, j) for j, i in enumerate(found)):
         notes.append(f"joints taken in their order as those of skeleton '{body.name}': their names differ")
         return None
     raise SkeletonError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -10,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from kcs_torch.errors import FormatError, ShapeError
-from kcs_torch.io.build import build_tracks
+from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
-from kcs_torch.io.link import link_people
-from kcs_torch.io.registry import Options, Probe, Reader, read_error
-from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
+from kcs_torch.io.jsonfile import outline, read_json
+from kcs_torch.io.layout import mean_bone
+from kcs_torch.io.people import Sighting, people_tracks
+from kcs_torch.io.registry import Options, Probe, Reader
+from kcs_torch.skeleton import SKELETONS, get_skeleton
 from kcs_torch.types import Tracks
 
 __all__ = ["READERS"]
@@ -28,19 +27,16 @@ LAYOUTS = {25: ("body25", "body25b"), 18: ("coco18",), 15: ("mpi15",), 21: ("han
 _BODY = "pose_keypoints_2d"
 _OTHERS = ("face_keypoints_2d", "hand_left_keypoints_2d", "hand_right_keypoints_2d")
 _NAME = re.compile(r"(?P<prefix>.*?)(?P<number>[0-9]+)?(?:_keypoints)?\Z", re.DOTALL)
-_BLANK = b"\xef\xbb\xbf \t\r\n"  # what may stand before the JSON, a byte order mark included
 _FARTHEST = 1e9  # pixels
 _CLEARLY = 0.7  # bones this much shorter, by another layout's order of joints, tell that it is the right one
-_OVERSHOOT = 1.5  # some networks' confidences pass 1; above this they are on another scale
-_FPS = 30.0  # assumed for how long somebody may be out of sight, where nothing is known
 
 Person = NDArray[np.float64]  # (..., N, 3): x, y, confidence
 
 
 def recognises(probe: Probe) -> bool:
-    """Tell by the word "people" in the JSON of the path, or of some files of the folder."""
+    """Tell by the key "people" in the JSON of the path, or of some files of the folder."""
     if probe.is_file:
-        return probe.head.lstrip(_BLANK).startswith(b"{") and b'"people"' in probe.head
+        return any(route[0] == "people" for route in outline(probe.head) if len(route) > 1)
     files = probe.like(".json")
     return any(f.stem.endswith("_keypoints") or _is_frame(f) for f in (*files[:3], *files[-1:]))
 
@@ -61,28 +57,11 @@ def read(path: Path, options: Options) -> list[Tracks]:
     joints = next((len(p) for people in found for p in people), None)
     if joints is None:
         raise FormatError(f"{path}: expected people in at least one of {len(files)} files, got none with '{_BODY}'")
-    detections = [np.zeros((0, joints, 3))] * (frames[-1] + 1)
-    for frame, people in zip(frames, found, strict=True):
-        if people:
-            detections[frame] = np.stack(people)
-    layout = _layout(joints, detections, options, path, notes)
-    linked = link_people(detections, max_gap=max(round(options.fps or _FPS), 1))
-    visible = [t for t in linked if (t[..., 2] >= max(options.threshold, 1e-12)).any()]
-    if not visible:
-        raise ShapeError(f"{path}: no joint has a confidence of {options.threshold:g} or more: lower the threshold")
-    if len(visible) < len(linked):
-        notes.append(f"{len(linked) - len(visible)} people never reach the confidence threshold: left out")
-    return [
-        build_tracks(
-            np.where(track[..., 2:] > 0, track[..., :2], np.nan),
-            track[..., 2],
-            options,
-            source=str(path),
-            skeleton=layout,
-            notes=notes,
-        )
-        for track in visible
-    ]
+    people: list[list[Sighting]] = [[] for _ in range(frames[-1] + 1)]
+    for frame, persons in zip(frames, found, strict=True):
+        people[frame] = [Sighting(p) for p in persons]
+    layout = _layout(joints, [np.stack(p) for p in found if p], options, path, notes)
+    return people_tracks(people, options, source=str(path), names=None, skeleton=layout, notes=notes)
 
 
 def _frame_files(probe: Probe, notes: list[str]) -> tuple[Sequence[Path], list[int]]:
@@ -112,7 +91,7 @@ def _read_files(files: Sequence[Path], notes: list[str]) -> list[list[Person]]:
     """The people of each frame's file."""
     found: list[list[Person]] = []
     first: tuple[int, Path] | None = None
-    others, halves, largest = False, 0, 0.0
+    others, halves = False, 0
     for file in files:
         found.append([])
         for person in _people(file):
@@ -130,27 +109,17 @@ def _read_files(files: Sequence[Path], notes: list[str]) -> list[list[Person]]:
             unseen = ~np.isfinite(joints).all(-1) | (joints[:, :2] == 0).any(-1)
             halves += int((unseen & (joints[:, 2] > 0)).sum())
             joints[unseen] = 0
-            largest = max(largest, float(joints[:, 2].max()))
-            if largest <= _OVERSHOOT:
-                joints[:, 2] = joints[:, 2].clip(max=1)
             found[-1].append(joints)
     if others:
         notes.append("face and hand joints are left out: only the body is read")
     if halves:
         notes.append(f"{halves} joints whose x or y is exactly 0 are taken as unseen")
-    if 1 < largest <= _OVERSHOOT:
-        notes.append(f"confidences above 1 (up to {largest:.3g}) are taken as 1")
     return found
 
 
 def _people(file: Path) -> Iterable[dict[str, Any]]:
     """The people of one frame's file."""
-    try:
-        data = json.loads(file.read_bytes())
-    except OSError as error:
-        raise read_error(file, error) from None
-    except (ValueError, RecursionError) as error:  # also of bytes that are no text
-        raise FormatError(f"{file}: expected JSON, got text that does not parse: {error}") from None
+    data = read_json(file)
     people = data.get("people") if isinstance(data, dict) else None
     if not isinstance(people, list) or not all(isinstance(p, dict) for p in people):
         raise FormatError(f"{file}: expected OpenPose's {{'people': [...]}}, got other JSON")
@@ -177,7 +146,7 @@ def _layout(joints: int, detections: list[Person], options: Options, path: Path,
     """The built-in skeleton that a number of joints means; None where the caller's own fits."""
     if joints in LAYOUTS:
         usual, *others = LAYOUTS[joints]
-        spread = {name: _mean_bone(SKELETONS[name], np.concatenate(detections)) for name in (usual, *others)}
+        spread = {name: mean_bone(SKELETONS[name], np.concatenate(detections)) for name in (usual, *others)}
         best = min(spread, key=lambda name: spread[name])
         if spread[best] < _CLEARLY * spread[usual]:
             notes.append(f"{3 * joints} numbers a person are {usual} as a rule; the joints' places say {best}")
@@ -189,16 +158,6 @@ def _layout(joints: int, detections: list[Person], options: Options, path: Path,
     fits = [s.name for s in SKELETONS.values() if s.num_observed == joints]
     hint = f"; {joints} joints fit skeleton={' or '.join(map(repr, fits))}" if fits else "; give skeleton=..."
     raise FormatError(f"{path}: expected {known} numbers a person, got {3 * joints}{hint}")
-
-
-def _mean_bone(skeleton: Skeleton, people: Person) -> float:
-    """Mean length of the bones that all detections (P, N, 3) have by a skeleton: small if it is the right one."""
-    data = torch.from_numpy(people)
-    points, weights = skeleton.complete(data[..., :2], data[..., 2])
-    start, end = skeleton.bone_index().unbind(-1)
-    weight = torch.minimum(weights[:, start], weights[:, end])
-    length = (points[:, end] - points[:, start]).norm(dim=-1)
-    return float((weight * length).sum() / weight.sum().clamp(min=1e-9)) if weight.any() else math.inf
 
 
 READERS = (Reader("openpose", "OpenPose JSON: a folder with one file a frame, or one file", recognises, read),)

@@ -1,0 +1,79 @@
+"""Frames of a file that names its images: ``12.jpg``, ``clip/frame_000012.png``, 785."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Hashable, Mapping, Sequence
+
+from kcs_torch.io.folders import frame_numbers, natural_key
+from kcs_torch.io.jsonfile import as_text
+from kcs_torch.io.people import Sighting
+
+__all__ = ["as_track_id", "by_image", "by_number", "last_number"]
+
+_NAME = re.compile(r"(?P<prefix>.*?)(?P<number>[0-9]{1,15})?(?P<suffix>\.[A-Za-z]\w*)?\Z", re.DOTALL)
+
+
+def by_image(images: Mapping[str, Sequence[Sighting]], notes: list[str]) -> list[list[Sighting]]:
+    """Put the people of each image into frames by the numbers in the images' names, or in the order of the names.
+
+    Args:
+        images: the people of each image by its name.
+        notes: sentences for the user on what was assumed; added to.
+
+    Returns:
+        The people of each frame; the first image is frame 0.
+    """
+    names = sorted(images, key=natural_key)
+    matches = [_NAME.match(name) for name in names]
+    numbers = [int(m["number"]) if m and m["number"] else None for m in matches]
+    prefixes = {m["prefix"] for m in matches if m}
+    if len(prefixes) > 1:
+        notes.append(f"the images' names begin in {len(prefixes)} ways: frames are taken in the order of the names")
+        return [list(images[name]) for name in names]
+    order = sorted(range(len(names)), key=lambda i: (numbers[i] is None, numbers[i] or 0))
+    return _spread([images[names[i]] for i in order], [numbers[i] for i in order], notes, as_text(names[order[0]]))
+
+
+def by_number(numbered: Mapping[int, Sequence[Sighting]], notes: list[str], *, first: int = 0) -> list[list[Sighting]]:
+    """Put the people of each numbered frame in order, frames without any between them. As :func:`by_image`.
+
+    Args:
+        numbered: the people of each frame by its number.
+        notes: sentences for the user on what was assumed; added to.
+        first: with what the numbers usually begin; only another beginning is noted.
+    """
+    numbers = sorted(numbered)
+    shown = "" if numbers and numbers[0] in (first, 0, 1) else str(numbers[0])
+    return _spread([numbered[n] for n in numbers], numbers, notes, shown)
+
+
+def _spread(
+    people: Sequence[Sequence[Sighting]], numbers: Sequence[int | None], notes: list[str], first: str
+) -> list[list[Sighting]]:
+    frames = frame_numbers(numbers, notes, names="images", whole="person")
+    out: list[list[Sighting]] = [[] for _ in range(frames[-1] + 1)] if frames else []
+    for frame, found in zip(frames, people, strict=True):
+        out[frame] = list(found)
+    if numbers and numbers[0] not in (None, 0, 1) and first:
+        notes.append(f"frame 0 is image {first}")
+    return out
+
+
+def last_number(name: str) -> int | None:
+    """The number at the end of a file's or an image's name, before its suffix; None where there is none.
+
+    >>> last_number("cam1_0012.json"), last_number("first.json")
+    (12, None)
+    """
+    match = _NAME.match(name)
+    return int(match["number"]) if match and match["number"] else None
+
+
+def as_track_id(value: object) -> Hashable:
+    """A track id as detectors write it, a number or text, sometimes in a list of one; None for anything else."""
+    while isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)) or value == -1 or value != value:
+        return None
+    return value

@@ -1,0 +1,164 @@
+"""From the people that a detector lists frame by frame to one :class:`Tracks` each."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcs_torch.errors import FormatError, ShapeError
+from kcs_torch.io.build import build_tracks
+from kcs_torch.io.layout import choose_layout
+from kcs_torch.io.link import follow_people
+from kcs_torch.io.registry import Options
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.types import Tracks
+
+__all__ = ["Sighting", "people_tracks"]
+
+_OVERSHOOT = 1.5  # some networks' confidences pass 1 a little; above this they are on another scale
+_WELL_SEEN = 0.95  # quantile of the confidences that counts as certain where they are on another scale
+_MOST_IN_FRAME = 100  # people of one frame
+_MOST_NUMBERS = 5e7  # of all tracks together: each person has a place in every frame
+_FPS = 30.0  # assumed for how long somebody may be out of sight, where nothing is known
+
+
+class Sighting(NamedTuple):
+    """One person in one frame.
+
+    Attributes:
+        joints: (N, 3) x, y, confidence; NaN or confidence 0 where unseen.
+        track: who it is, where the file says so.
+    """
+
+    joints: NDArray[np.float64]
+    track: Hashable = None
+
+
+def people_tracks(
+    frames: Sequence[Sequence[Sighting]],
+    options: Options,
+    *,
+    source: str,
+    names: Sequence[str] | None = None,
+    edges: Any = None,
+    skeleton: str | Skeleton | None = None,
+    fps: float | None = None,
+    notes: Sequence[str] = (),
+) -> list[Tracks]:
+    """Follow the people of T frames and wrap each as :class:`Tracks`.
+
+    By the file's track ids where every person has one and no frame has one twice; by their places otherwise. Joints
+    are recognised by their number where neither names nor a skeleton are given.
+
+    Args:
+        frames: the people of each frame.
+        options: of the caller.
+        source: the path.
+        names: the file's joint names.
+        edges: the file's (B, 2) bones.
+        skeleton: the file's own skeleton.
+        fps: the file's frames per second.
+        notes: sentences for the user.
+
+    Raises:
+        FormatError: nobody is in any frame, or people have different numbers of joints.
+        ShapeError: no joint reaches the threshold.
+        SkeletonError: the joints do not fit the skeleton.
+    """
+    remarks = list(notes)
+    frames = _checked(frames, source, remarks)
+    everybody = [s.joints for frame in frames for s in frame]
+    if not everybody:
+        raise FormatError(f"{source}: expected people in at least one of {len(frames)} frames, got none")
+    if names is None and skeleton is None:
+        skeleton, names = choose_layout(everybody, options, source, remarks)
+    people = _by_ids(frames)
+    if people is None:
+        gap = max(round(min(options.fps or fps or _FPS, 1e6)), 1)
+        people = follow_people([np.array([s.joints for s in frame]) for frame in frames], max_gap=gap)
+    elif len(people) > 1:
+        remarks.append("people are followed by the file's own track ids")
+    least = max(options.threshold, 1e-12)
+    visible = [seen for seen in people if any((frames[t][i].joints[:, 2] >= least).any() for t, i in seen)]
+    if not visible:
+        raise ShapeError(f"{source}: no joint has a confidence of {options.threshold:g} or more: lower the threshold")
+    if len(visible) < len(people):
+        remarks.append(f"{len(people) - len(visible)} people never reach the confidence threshold: left out")
+    most = max(int(_MOST_NUMBERS / (len(frames) * everybody[0].size)), 1)
+    if len(visible) > most:
+        remarks.append(f"{len(visible) - most} people who are seen least are left out: {most} tracks fill the memory")
+    out = []
+    for seen in visible[:most]:
+        track = np.zeros((len(frames), *everybody[0].shape))
+        for t, i in seen:
+            track[t] = frames[t][i].joints
+        points = np.where(track[..., 2:] > 0, track[..., :2], np.nan)
+        out.append(
+            build_tracks(
+                points,
+                track[..., 2],
+                options,
+                source=source,
+                names=names,
+                edges=edges,
+                skeleton=skeleton,
+                fps=fps,
+                notes=remarks,
+            )
+        )
+    return out
+
+
+def _checked(frames: Sequence[Sequence[Sighting]], source: str, notes: list[str]) -> list[list[Sighting]]:
+    """The same people with confidences within 0..1, 0 where unseen; those without any joint are left out."""
+    counts = Counter(len(s.joints) for frame in frames for s in frame)
+    if len(counts) > 1:
+        (usual, _), (other, _) = counts.most_common(2)
+        odd = next(t for t, found in enumerate(frames) if any(len(s.joints) == other for s in found))
+        raise FormatError(f"{source}: expected {usual} joints of every person, got {other} in frame {odd}")
+    scores = np.concatenate([s.joints[:, 2] for frame in frames for s in frame] or [np.zeros(0)])
+    scores = scores[scores > 0]
+    largest, scale = float(scores.max(initial=0)), 1.0
+    if largest > _OVERSHOOT:
+        scale = float(np.quantile(scores, _WELL_SEEN))
+        notes.append(f"confidences up to {largest:.4g}: divided by {scale:.4g}, which 5 % of them pass, and cut at 1")
+    elif largest > 1:
+        notes.append(f"confidences above 1 (up to {largest:.3g}) are taken as 1")
+    out, negative, crowded = [], 0, 0
+    for frame in frames:
+        kept = []
+        for sighting in frame:
+            joints = sighting.joints.copy()
+            negative += int((joints[:, 2] < 0).sum())
+            unseen = ~np.isfinite(joints).all(-1) | (joints[:, :2] == 0).all(-1) | (joints[:, 2] <= 0)
+            joints[:, 2] = (joints[:, 2] / scale).clip(max=1)
+            joints[unseen] = 0
+            if not unseen.all():
+                kept.append(sighting._replace(joints=joints))
+        if len(kept) > _MOST_IN_FRAME:
+            crowded += 1
+            kept = sorted(kept, key=lambda s: -s.joints[:, 2].sum())[:_MOST_IN_FRAME]
+        out.append(kept)
+    if negative:
+        notes.append(f"{negative} joints of negative confidence are taken as unseen")
+    if crowded:
+        notes.append(f"{crowded} frames have more than {_MOST_IN_FRAME} people: the best seen are taken")
+    return out
+
+
+def _by_ids(frames: Sequence[Sequence[Sighting]]) -> list[list[tuple[int, int]]] | None:
+    """(frame, index) of each person by track ids, the most seen first; None where they do not say who is who."""
+    people: dict[Hashable, list[tuple[int, int]]] = {}
+    amount: dict[Hashable, float] = {}
+    for t, frame in enumerate(frames):
+        ids = [s.track for s in frame]
+        if None in ids or len(set(ids)) < len(ids):
+            return None
+        for i, sighting in enumerate(frame):
+            people.setdefault(sighting.track, []).append((t, i))
+            amount[sighting.track] = amount.get(sighting.track, 0.0) + float(sighting.joints[:, 2].sum())
+    return sorted(people.values(), key=lambda seen: -amount[frames[seen[0][0]][seen[0][1]].track])
