@@ -250,7 +250,7 @@ def test_a_line_with_the_name_of_the_index_is_no_frame(tmp_path):
         (lambda t: "".join(t.splitlines(keepends=True)[:3]), "a header only"),
         (lambda t: t.replace("\n0,", "\n0,many,", 1), "line 4: expected 10 cells, got 11"),
         (lambda t: t.replace("\n1,", "\n1,2,x", 1).replace(",0.9\n", "\n", 2), "line 5: expected numbers"),
-        (lambda t: t.replace("\n1,", "\n1,99999999999", 1), "frame 1, joint 'snout': expected pixels, got 1e[+]13"),
+        (lambda t: t.replace("\n1,", "\n1,99999999999", 1), "frame 1, joint 'snout': expected pixels, got 1e[+]14"),
         (lambda t: t.replace("bodyparts,snout", "bodyparts", 1), "as many cells in each line"),
         (lambda t: t.replace("0.9", "0.1"), "lower the threshold"),
         (lambda t: t.replace("0.9", "-0.9", 1), "is negative"),
