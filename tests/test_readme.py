@@ -79,9 +79,10 @@ def test_methods_are_those_of_the_registry():
 
 
 def test_formats_are_those_of_the_registries():
-    from kcs_torch.io import READERS, WRITERS
+    from kcs_torch.io import MOTION_READERS, READERS, WRITERS
 
     assert sorted(table("reads")) == sorted(READERS)
+    assert sorted(table("reads motion")) == sorted(MOTION_READERS)
     assert sorted(table("writes")) == sorted(WRITERS)
 
 

@@ -1,6 +1,6 @@
 """The mathematics: plain functions of tensors with any leading batch dimensions."""
 
-from kcs_torch.functional.align import centre, nearest_rotation, procrustes, similarity
+from kcs_torch.functional.align import centre, minimal_turn, nearest_rotation, procrustes, similarity
 from kcs_torch.functional.camera import (
     back_project,
     camera_disagreement,
@@ -51,6 +51,7 @@ __all__ = [
     "jitter",
     "kcs_matrix",
     "log_det",
+    "minimal_turn",
     "nearest_rotation",
     "nuclear_norm",
     "orbit",

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 
-__all__ = ["centre", "nearest_rotation", "procrustes", "similarity"]
+__all__ = ["centre", "minimal_turn", "nearest_rotation", "procrustes", "similarity"]
 
 
 def centre(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -29,6 +29,35 @@ def centre(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tenso
         total = torch.where(total > 0, total, torch.ones_like(total))
         mean = (points * weights[..., None]).sum(-2, keepdim=True) / total
     return points - mean, mean
+
+
+def minimal_turn(source: Tensor, target: Tensor) -> Tensor:
+    """Return the rotation R of least angle that takes one direction to another: R source || target.
+
+    Args:
+        source: (..., 3), of any length.
+        target: (..., 3), of any length.
+
+    Returns:
+        (..., 3, 3); the identity where either is zero, a half turn about some normal where they are opposite.
+
+    >>> minimal_turn(torch.tensor([2.0, 0, 0]), torch.tensor([0.0, 3, 0])).tolist()
+    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    a, b = torch.nn.functional.normalize(source, dim=-1), torch.nn.functional.normalize(target, dim=-1)
+    a, b = torch.broadcast_tensors(a, b)
+    still = (a.square().sum(-1) < 0.5) | (b.square().sum(-1) < 0.5)
+    x, y, z = torch.linalg.cross(a, b).unbind(-1)
+    o = torch.zeros_like(x)
+    spin = torch.stack([torch.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
+    cosine = (a * b).sum(-1)[..., None, None]
+    opposite = cosine < -1 + 1e-6
+    eye = torch.eye(3, dtype=a.dtype, device=a.device)
+    turn = eye + spin + spin @ spin / torch.where(opposite, torch.ones_like(cosine), 1 + cosine)
+    normal = torch.linalg.cross(a, eye[a.abs().argmin(-1)])  # of the half turn
+    normal = torch.nn.functional.normalize(normal, dim=-1)
+    half = 2 * normal[..., :, None] * normal[..., None, :] - eye
+    return torch.where(still[..., None, None], eye, torch.where(opposite, half, turn))
 
 
 def nearest_rotation(matrix: Tensor, *, reflect: bool = False) -> Tensor:

@@ -180,11 +180,13 @@ class Saving:
 
     Attributes:
         up: which axis is to point up in the file: y or z.
+        name: of the file, which writers see under a temporary one.
         notes: sentences for the user; writers add to them.
         warnings: what the user has to know; writers add to them.
     """
 
     up: str = "y"
+    name: str = ""
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 from kcs_torch.errors import KcsWarning, OptionError, OutputError, unknown
@@ -49,7 +50,7 @@ def save(
         OptionError: ``up`` or ``units`` is unknown or cannot be met.
     """
     writer = writer_for(path)
-    saving = Saving(up or "y")
+    saving = Saving(up or "y", Path(path).name)
     if up is not None and up not in UP:
         raise unknown("axis for up", up, UP)
     if isinstance(data, Tracks):
@@ -74,6 +75,7 @@ def save(
     if writer.write_motion is None:
         raise OutputError(f"{path}: expected a result, got motion, which goes to {_suffixes('write_motion')}")
     motion = Motion.of(data) if isinstance(data, Reconstruction) else data
+    motion = replace(motion, points=motion.points.detach())
     wanted = units or writer.unit
     if units is not None or (wanted and motion.units in METRES):
         motion = motion.scaled(units=wanted, factor=_ratio(motion.units, wanted))

@@ -107,7 +107,8 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
     found = [exact.get(n) for n in wanted] if exact.keys() >= set(wanted) else map_joints(names, wanted)
     missing = [n for n, i in zip(wanted, found, strict=True) if i is None]
     if not missing:
-        notes.append(f"joints matched by name with skeleton '{body.name}'; {len(names) - len(wanted)} left out")
+        spare = len(names) - len(wanted)
+        notes.append(f"joints matched by name with skeleton '{body.name}'" + (f"; {spare} left out" if spare else ""))
         return [i for i in found if i is not None]
     if len(names) == len(wanted) and all(i in (None, j) for j, i in enumerate(found)):
         notes.append(f"joints taken in their order as those of skeleton '{body.name}': their names differ")

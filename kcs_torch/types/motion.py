@@ -13,9 +13,9 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError
 from kcs_torch.functional import orbit
-from kcs_torch.skeleton import SKELETONS, Skeleton
+from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
 from kcs_torch.types.axes import from_y_up, to_y_up
-from kcs_torch.types.intake import take_in
+from kcs_torch.types.intake import as_floats, take_in
 from kcs_torch.types.intrinsics import Intrinsics
 from kcs_torch.types.reconstruction import Reconstruction
 from kcs_torch.types.size import size_factor
@@ -89,8 +89,16 @@ class Motion:
         Motion('motion': 10 frames, 17 joints of skeleton 'h36m17', fps None, m, 0.0 % unseen)
         """
         names = None if joint_names is None else [str(n) for n in joint_names]
-        if skeleton is None and edges is None and names is not None:  # with the virtual joints that a result has
-            skeleton = next((s for s in SKELETONS.values() if s.virtual and set(s.joints) == set(names)), None)
+        if skeleton is None and names is not None:
+            skeleton = _same(names, edges)
+            edges = None if skeleton is not None else edges
+        whole, order = points, names
+        if names is not None and skeleton is not None and confidence is None:
+            body = get_skeleton(skeleton)
+            extra = set(body.joints[body.num_observed :])
+            if extra & set(names) and set(body.joints[: body.num_observed]) <= set(names):
+                keep = [i for i, n in enumerate(names) if n not in extra]
+                points, names = as_floats(points, f"{source}: points", 3)[:, keep], [names[i] for i in keep]
         taken = take_in(
             points,
             confidence,
@@ -105,12 +113,12 @@ class Motion:
         )
         body = taken.skeleton
         xyz, weights = body.complete(taken.points, taken.weights)
-        given = [] if names is None else [n for n in body.joints[body.num_observed :] if n in names]
-        if given:  # the file's own virtual joints go before the means
-            whole = torch.as_tensor(points).to(xyz)[:, [(names or []).index(n) for n in given]]
-            seen = torch.isfinite(whole).all(-1)
+        given = [n for n in body.joints[body.num_observed :] if n in (order or ())]
+        if given and order is not None:  # the file's own virtual joints go before the means
+            own = torch.as_tensor(whole).to(xyz)[:, [order.index(n) for n in given]]
+            seen = torch.isfinite(own).all(-1)
             at = [body.index(n) for n in given]
-            xyz[:, at] = torch.where(seen[..., None], whole, torch.zeros_like(whole))
+            xyz[:, at] = torch.where(seen[..., None], own, torch.zeros_like(own))
             weights[:, at] = seen.to(weights)
         return cls(to_y_up(xyz, up), weights, body, taken.fps, units, source, tuple(dict.fromkeys(taken.notes)))
 
@@ -277,3 +285,18 @@ class Motion:
         from kcs_torch.io import save
 
         return save(self, path)
+
+
+def _same(names: Sequence[str], edges: Any) -> Skeleton | None:
+    """The built-in skeleton with just these joints, in any order and with its virtual ones, and just these bones."""
+    for body in SKELETONS.values():
+        if len(names) == body.num_joints and set(names) == set(body.joints):
+            if edges is None:
+                return body
+            try:
+                pairs = {frozenset((names[int(a)], names[int(b)])) for a, b in edges}
+            except (TypeError, ValueError, IndexError):
+                return None
+            if pairs == {frozenset((body.joints[a], body.joints[b])) for a, b in body.bones}:
+                return body
+    return None

@@ -98,7 +98,7 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
     axes = [f"{axis}{number}" for number in range(1, len(names) + 1) for axis in "XYZ"]
     with path.open("w", encoding="utf-8", errors="replace", newline="\n") as file:
         line = lambda *cells: file.write("\t".join(map(str, cells)) + "\n")  # noqa: E731
-        line("PathFileType", 4, "(X/Y/Z)", path.name)
+        line("PathFileType", 4, "(X/Y/Z)", re.sub(r"\s+", "_", saving.name))
         line(*keys)
         line(*facts)
         line("Frame#", "Time", *(cell for name in names for cell in (name, "", "")))

@@ -1,0 +1,123 @@
+"""C3D of motion capture laboratories: markers, in binary. Read and written by ezc3d.
+
+The library follows the pointers of a damaged file in C++ and crashes on some. So another process reads, with bounds on
+its time and memory; that costs a fraction of a second.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from kcs_torch.errors import FormatError, OutputError
+from kcs_torch.io.build_motion import build_motion, distinct
+from kcs_torch.io.plain import plain
+from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer, need, read_error
+from kcs_torch.types import Motion
+from kcs_torch.types.axes import from_y_up
+
+__all__ = ["MOTION_READERS", "WRITERS"]
+
+PATIENCE = 60.0  # seconds, and one more for each 16 MiB
+_SCREEN = {"y": ("+X", "+Y"), "z": ("+X", "+Z")}  # which axes point right and up on a screen
+
+
+def recognises(probe: Probe) -> bool:
+    """Tell by the second byte, and by the parameters' own header, to which the first one points."""
+    head = probe.head
+    if len(head) < 512 or head[1] != 0x50 or not head[0]:
+        return False
+    at = 512 * (head[0] - 1)
+    return at + 4 > len(head) or head[at + 3] in (83, 84, 85, 86)  # the processor's type
+
+
+def read(path: Path, options: MotionOptions) -> Motion:
+    """Read the markers."""
+    answer, points = _ask(path)
+    notes = []
+    names = [str(name).strip() for name in answer["labels"]][: points.shape[1]]
+    names = distinct(names + [""] * (points.shape[1] - len(names)))
+    there = np.isfinite(points).all(-1).any(0)
+    if not there.any():
+        raise FormatError(f"{path}: expected markers, got none that is seen in any frame")
+    if not there.all():
+        gone = [name for name, seen in zip(names, there, strict=True) if not seen]
+        notes.append(f"never seen, left out: {', '.join(gone[:8])}{', ...' if len(gone) > 8 else ''}")
+    rate = float(answer["rate"])
+    return build_motion(
+        torch.from_numpy(points[:, there].copy()),
+        options,
+        source=str(path),
+        names=[name for name, seen in zip(names, there, strict=True) if seen],
+        fps=rate if 0 < rate < 1e6 else None,
+        units=str(answer["units"]).strip().lower(),
+        up=next((axis for axis in ("y", "z") if answer["y_screen"].strip() == f"+{axis.upper()}"), None),
+        notes=notes,
+    )
+
+
+def _ask(path: Path) -> tuple[dict[str, Any], np.ndarray[Any, np.dtype[np.float64]]]:
+    """Let the worker read."""
+    need("ezc3d", f"{path}: C3D", FormatError)
+    worker = Path(__file__).parents[1] / "c3d_worker.py"
+    places = os.pathsep.join(p for p in sys.path if p)  # where this process would find ezc3d
+    try:
+        done = subprocess.run(
+            [sys.executable or "python3", "-P", str(worker), str(path)],
+            env=os.environ | {"PYTHONPATH": places, "OPENBLAS_NUM_THREADS": "1"},
+            timeout=PATIENCE + path.stat().st_size / 2**24,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise FormatError(f"{path}: damaged: ezc3d gave no answer in {error.timeout:.0f} seconds") from None
+    except OSError as error:
+        raise read_error(path, error) from None
+    try:
+        if done.returncode:
+            raise ValueError(f"it ended with status {done.returncode}")
+        at = done.stdout.index(b"\n") + 1
+        answer = json.loads(done.stdout[:at])
+        if "error" in answer:
+            raise FormatError(f"{path}: {answer['error']}")
+        frames, markers = map(int, answer["shape"])
+        return answer, np.frombuffer(done.stdout, "<f8", frames * markers * 3, at).reshape(frames, markers, 3)
+    except FormatError:
+        raise
+    except (ValueError, KeyError, TypeError) as error:
+        raise FormatError(f"{path}: damaged: ezc3d failed on it: {error}") from None
+
+
+def write(motion: Motion, path: Path, saving: Saving) -> None:
+    """Write the joints as markers; the file holds single precision."""
+    ezc3d = need("ezc3d", str(path), OutputError)
+    points, seen = plain(from_y_up(motion.points, saving.up)), plain(motion.seen) > 0
+    frames, count = seen.shape
+    if count > 255:
+        raise OutputError(f"{path}: expected up to 255 joints, got {count}: C3D holds no more")
+    file = ezc3d.c3d()
+    whole = np.ones((4, count, frames))
+    whole[:3] = np.where(seen[..., None], points, np.nan).transpose(2, 1, 0)
+    names = [joint.encode("utf-8", "replace").decode()[:120] for joint in motion.skeleton.joints]
+    facts = file["parameters"]["POINT"]
+    facts["RATE"]["value"] = [saving.rate(motion)]
+    facts["LABELS"]["value"] = names
+    facts["UNITS"]["value"] = [motion.units or "mm"]
+    right, up = _SCREEN[saving.up]
+    file.add_parameter("POINT", "X_SCREEN", [right])
+    file.add_parameter("POINT", "Y_SCREEN", [up])
+    file["data"]["points"] = whole
+    file["data"]["meta_points"]["residuals"] = np.where(seen, 0.0, -1.0).T[None]
+    file["data"]["meta_points"]["camera_masks"] = np.zeros((7, count, frames), bool)
+    file.write(str(path))
+
+
+MOTION_READERS = (MotionReader("c3d", "C3D of motion capture: markers (needs ezc3d)", recognises, read),)
+WRITERS = (Writer(".c3d", "C3D: markers in millimetres, y up, for biomechanics (needs ezc3d)", None, write, unit="mm"),)
