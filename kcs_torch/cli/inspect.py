@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ from kcs_torch.cli.options import (
     check_outputs,
     image_size,
 )
+from kcs_torch.cli.pictures import check_picture, write_picture
 from kcs_torch.cli.report import answer, one_line, print_json, progress
 
 if TYPE_CHECKING:
@@ -33,12 +35,24 @@ def info(
     threshold: Threshold = 0.3,
     size: ImageSize = None,
     trust: Trust = False,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="Draw a frame with the joints' names at the joints: .png, .svg or .pdf.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show what is in a file of tracks: frames, people, skeleton, joints, and how much is unseen."""
     with answer(as_json):
         from kcs_torch.io import detect_format, load_people
 
+        if output is not None:
+            check_picture(output, source=tracks)
         with progress(f"reading {tracks}"):
             people = load_people(
                 tracks,
@@ -49,10 +63,19 @@ def info(
                 trust=trust,
             )
             facts = _facts(tracks, format or detect_format(tracks), people)
+        if output is not None:
+            from kcs_torch.viewer import draw_tracks
+
+            with progress(f"drawing {output}"):
+                write_picture(lambda: draw_tracks(people), output)
         if as_json:
             print_json(facts)
+            return
+        typer.echo(_spoken(facts))
+        if output is not None:
+            typer.echo(f"wrote {output}")
         else:
-            typer.echo(_spoken(facts))
+            typer.echo(f"see which joint is which: kcs-torch info {shlex.quote(tracks)} -o picture.png")
 
 
 def _facts(path: str, format: str, people: list[Tracks]) -> dict[str, Any]:

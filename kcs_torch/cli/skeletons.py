@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcs_torch.cli.options import AsJson, check_outputs
+from kcs_torch.cli.pictures import is_picture, write_picture
 from kcs_torch.cli.report import answer, print_json
 
 if TYPE_CHECKING:
@@ -58,7 +59,13 @@ def show_skeleton(
     ],
     output: Annotated[
         list[Path],
-        typer.Option("--output", "-o", metavar="FILE", help="Draw its template: .png or .html.", show_default=False),
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="Draw it with the joints' names: .png, .svg or .pdf; or its template as a page to turn: .html.",
+            show_default=False,
+        ),
     ] = [],  # noqa: B006 (typer reads it and never changes it)
     as_json: AsJson = False,
 ) -> None:
@@ -67,9 +74,14 @@ def show_skeleton(
         from kcs_torch.skeleton import get_skeleton
 
         body = get_skeleton(name)
-        check_outputs(output)
+        check_outputs([path for path in output if not is_picture(path)])
         for path in output:
-            _draw(body, path)
+            if is_picture(path):
+                from kcs_torch.viewer import draw_skeleton
+
+                write_picture(lambda: draw_skeleton(body), path)
+            else:
+                _save_template(body, path)
         if as_json:
             print_json(body.to_dict())
         else:
@@ -128,8 +140,8 @@ def _tree(body: Skeleton) -> Tree:
     return top
 
 
-def _draw(body: Skeleton, path: Path) -> None:
-    """Draw the template pose as a motion of one frame.
+def _save_template(body: Skeleton, path: Path) -> None:
+    """Write the template pose as a motion of one frame.
 
     Raises:
         SkeletonError: the skeleton has none.

@@ -1,0 +1,48 @@
+"""Pictures that commands write: a figure's suffix chooses the format."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["PICTURES", "check_picture", "is_picture", "write_picture"]
+
+PICTURES = (".png", ".svg", ".pdf")
+
+
+def is_picture(path: Path) -> bool:
+    """Whether the suffix is that of a picture."""
+    return path.suffix.lower() in PICTURES
+
+
+def check_picture(path: Path, *, source: str) -> None:
+    """Make sure that a path is that of a picture, and not that of what is drawn.
+
+    Raises:
+        OutputError: it is not.
+    """
+    from kcs_torch.errors import OutputError
+
+    if not is_picture(path):
+        got = f"'{path.suffix}'" if path.suffix else "none"
+        raise OutputError(f"{path}: expected a picture with one of the suffixes {', '.join(PICTURES)}, got {got}")
+    if path.exists() and path.resolve() == Path(source).resolve():
+        raise OutputError(f"{path}: expected another file than the tracks, which it would replace")
+
+
+def write_picture(draw: Callable[[], Figure], path: Path) -> None:
+    """Draw a figure and write it, whole or not at all.
+
+    Raises:
+        OutputError: the place cannot be written to.
+    """
+    from kcs_torch.io.atomic import atomic_path
+
+    with atomic_path(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph")  # names of joints may hold letters that the font has not
+        draw().savefig(temporary, format=path.suffix[1:].lower())

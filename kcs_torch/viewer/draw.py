@@ -1,0 +1,212 @@
+"""Pictures that show which joint is which: tracks on one frame, and a skeleton by itself."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcs_torch.errors import OptionError, OutputError
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.types import Tracks
+from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
+from kcs_torch.viewer.labels import write_labels
+from kcs_torch.viewer.layout import flat_layout
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["clearest_frame", "draw_skeleton", "draw_tracks", "new_figure"]
+
+LOOK = 100  # frames from the first in which anybody is seen, among which a clear one is looked for
+CLEAR = 0.9  # share of the most joints seen in any of these frames, from which on a frame is clear
+NAMED = 3  # people drawn by themselves, with names
+SIDE = 8.0  # inches of a panel
+MANY = 45  # joints from which on a panel is larger and its letters are smaller
+Array = NDArray[np.float64]
+
+
+def draw_tracks(people: Tracks | Sequence[Tracks], *, frame: int | None = None) -> Figure:
+    """Draw one frame of tracks with the joints' numbers and names, so that a wrong order of joints is seen at once.
+
+    Of several people the first panel shows all, and one panel each the three of whom most is seen.
+
+    Args:
+        people: tracks of the people of one clip.
+        frame: which; if None, see :func:`clearest_frame`.
+
+    Returns:
+        A matplotlib figure, of no window; ``figure.savefig(path)`` writes it.
+
+    Raises:
+        OptionError: there is nobody, or no such frame.
+        OutputError: matplotlib is not installed.
+    """
+    people = [people] if isinstance(people, Tracks) else list(people)
+    if not people:
+        raise OptionError("draw_tracks: expected tracks of at least one person, got none")
+    frames = max(p.num_frames for p in people)
+    chosen = clearest_frame(people) if frame is None else frame
+    if not 0 <= chosen < frames:
+        raise OptionError(f"draw_tracks: expected a frame from 0 to {frames - 1}, got {frame}")
+    poses = [_pose(p, chosen) for p in people]
+    counts = [int(np.isfinite(x[: p.skeleton.num_observed]).all(-1).sum()) for p, x in zip(people, poses, strict=True)]
+    there = [k for k in range(len(people)) if counts[k]] or [0]
+    named = sorted(sorted(there, key=lambda k: -counts[k])[:NAMED])
+    panels: list[list[int]] = ([there] if len(people) > 1 else []) + [[k] for k in named]
+    figure, axes = _panels(len(panels), max(p.num_joints for p in people))
+    head = f"{Path(people[0].source).name}: frame {chosen} of {frames} (the first is 0)"
+    which = ", the first that is clear" if frame is None and chosen else ""
+    _title(figure, f"{head}{which} · skeleton {people[0].skeleton.name}")
+    for axis, members in zip(axes, panels, strict=True):
+        together = len(panels) > 1 and axis is axes[0]
+        _fit(axis, np.concatenate([poses[k] for k in members]))
+        for k in members:
+            _body(axis, people[k].skeleton, poses[k], named=not together)
+            if together:
+                _tag(axis, poses[k], f"person {k}")
+        if together:
+            axis.set_title(f"{len(there)} of {len(people)} people are seen", fontsize=11)
+        else:
+            _say(axis, people[members[0]], poses[members[0]], f"person {members[0]}: " if len(people) > 1 else "")
+    return figure
+
+
+def draw_skeleton(skeleton: Skeleton) -> Figure:
+    """Draw a skeleton with the joints' numbers and names: mirror pairs in their colours, virtual joints hollow.
+
+    It shows the template pose from where its joints are best told apart. Of a skeleton without one it shows which
+    joints the bones join.
+
+    Returns:
+        A matplotlib figure, of no window; ``figure.savefig(path)`` writes it.
+
+    Raises:
+        OutputError: matplotlib is not installed.
+    """
+    figure, (axis,) = _panels(1, skeleton.num_joints)
+    virtual = skeleton.num_joints - skeleton.num_observed
+    facts = [f"{skeleton.num_observed} joints", *([f"{virtual} virtual (hollow)"] if virtual else [])]
+    facts += [
+        f"{skeleton.num_bones} bones",
+        *([f"{len(skeleton.flexible)} flexible (dashed)"] * bool(skeleton.flexible)),
+    ]
+    facts += ["template pose" if skeleton.template is not None else "no template pose: only what joins what"]
+    _title(figure, f"{skeleton.name}: {', '.join(facts)}")
+    places = flat_layout(skeleton)
+    _fit(axis, places)
+    _body(axis, skeleton, places, named=True)
+    return figure
+
+
+def clearest_frame(people: Sequence[Tracks]) -> int:
+    """The first frame in which nine tenths of the joints are seen that are seen at once near the start of the clip."""
+    total = np.zeros(max(p.num_frames for p in people), int)
+    for person in people:
+        total[: person.num_frames] += person.seen.sum(1).cpu().numpy()
+    first = int(np.argmax(total > 0))
+    near = total[first : first + LOOK]
+    return first + int(np.argmax(near >= CLEAR * near.max()))
+
+
+def new_figure(width: float, height: float, dpi: int) -> Figure:
+    """An empty figure of no window, in inches.
+
+    Raises:
+        OutputError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise OutputError(f"a picture needs the package matplotlib ({error}): pip install matplotlib") from None
+    figure = Figure(figsize=(width, height), dpi=dpi)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _panels(count: int, joints: int) -> tuple[Figure, list[Any]]:
+    side = SIDE * (1.6 if joints > MANY else 1.0)
+    figure = new_figure(side * count, side + 0.6, 110)
+    axes = figure.subplots(1, count, squeeze=False)[0]
+    figure.subplots_adjust(left=0.01, right=0.99, bottom=0.45 / (side + 0.6), top=1 - 0.65 / (side + 0.6), wspace=0.02)
+    for axis in axes:
+        axis.set_xticks([])
+        axis.set_yticks([])
+        for spine in axis.spines.values():
+            spine.set_color("#dddddd")
+    return figure, list(axes)
+
+
+def _title(figure: Figure, text: str) -> None:
+    width = int(11 * figure.get_size_inches()[0])
+    lines = textwrap.wrap(text.encode("utf-8", "replace").decode(), width)
+    figure.suptitle("\n".join(lines[:2]), fontsize=12, y=1 - 0.1 / figure.get_size_inches()[1], parse_math=False)
+
+
+def _pose(tracks: Tracks, frame: int) -> Array:
+    """(N, 2); NaN where unseen."""
+    if frame >= tracks.num_frames:
+        return np.full((tracks.num_joints, 2), np.nan)
+    points = tracks.points[frame].detach().cpu().double().numpy()
+    return np.where(tracks.seen[frame].cpu().numpy()[:, None], points, np.nan)
+
+
+def _fit(axis: Any, places: Array) -> None:
+    """Limits with room for names around the known places, both axes in one scale, y down."""
+    known = places[np.isfinite(places).all(-1)]
+    low, high = (known.min(0), known.max(0)) if len(known) else (np.zeros(2), np.ones(2))
+    box = axis.get_window_extent()
+    size = np.maximum(high - low, 1e-9)
+    scale = min(0.68 * box.width / size[0], 0.84 * box.height / size[1])
+    half = np.array([box.width, box.height]) / scale / 2
+    middle = (low + high) / 2
+    axis.set_xlim(middle[0] - half[0], middle[0] + half[0])
+    axis.set_ylim(middle[1] + half[1], middle[1] - half[1])
+
+
+def _body(axis: Any, skeleton: Skeleton, places: Array, *, named: bool) -> None:
+    from matplotlib.collections import LineCollection
+
+    bones, ends = bone_keys(skeleton), joint_keys(skeleton)
+    known = np.isfinite(places.sum(-1))
+    drawn = [b for b, (p, c) in enumerate(skeleton.bones) if known[p] and known[c]]
+    lines = np.array([places[list(skeleton.bones[b])] for b in drawn]).reshape(-1, 2, 2)
+    styles = ["--" if b in set(skeleton.flexible) else "-" for b in drawn]
+    colours = [COLOURS[bones[b]] for b in drawn]
+    thin = skeleton.num_joints > MANY or not named
+    axis.add_collection(
+        LineCollection(list(lines), colors=colours, linewidths=1.3 if thin else 2.6, linestyles=styles, alpha=0.75)
+    )
+    hues = np.array([COLOURS[key] for key in ends])
+    hollow = np.arange(len(places)) >= skeleton.num_observed
+    faces = np.where(hollow, "#ffffff", hues)
+    axis.scatter(
+        *places[known].T, s=12 if thin else 42, c=faces[known], edgecolors=hues[known], linewidths=1.4, zorder=3
+    )
+    if named:
+        names = [n if n == f"joint{j}" or hollow[j] else f"{j} {n}" for j, n in enumerate(skeleton.joints)]
+        write_labels(axis, places, names, list(hues), lines, size=7.0 if skeleton.num_joints > MANY else 10.5)
+
+
+def _tag(axis: Any, places: Array, words: str) -> None:
+    known = places[np.isfinite(places).all(-1)]
+    if len(known):
+        top = known[known[:, 1].argmin()]
+        axis.annotate(words, top, (0, 8), textcoords="offset points", ha="center", fontsize=10, weight="bold")
+
+
+def _say(axis: Any, tracks: Tracks, places: Array, start: str) -> None:
+    """How many joints are seen above the panel, and which are not below it."""
+    body = tracks.skeleton
+    known = np.isfinite(places[: body.num_observed]).all(-1)
+    axis.set_title(f"{start}{known.sum()} of {body.num_observed} joints seen", fontsize=11)
+    unseen = [body.joints[j] for j in np.flatnonzero(~known)]
+    if unseen:
+        text = f"unseen: {', '.join(unseen)}".encode("utf-8", "replace").decode()
+        lines = textwrap.wrap(text, 110)
+        axis.set_xlabel("\n".join([*lines[:2], *(["..."] if len(lines) > 2 else [])]), fontsize=8, parse_math=False)
