@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from kcs_torch.cli import demo, inspect, lift, skeletons
+from kcs_torch.cli import convert, demo, detect, doctor, inspect, lift, score, skeletons
 
 __all__ = ["app", "main"]
 
@@ -20,8 +20,12 @@ app = typer.Typer(
 )
 app.command()(demo.demo)
 app.command()(lift.lift)
+app.command()(detect.detect)
 app.command()(inspect.info)
+app.command()(doctor.doctor)
 app.command()(inspect.view)
+app.command()(convert.convert)
+app.command()(score.score)
 app.add_typer(skeletons.app, name="skeletons")
 
 

@@ -1,5 +1,6 @@
 """Files in and out: :func:`load_tracks`, :func:`load_people`, :func:`load_motion`, :func:`save`, lists of formats."""
 
+from kcs_torch.io.anything import load_any
 from kcs_torch.io.formats.npz import load_reconstruction
 from kcs_torch.io.link import link_people
 from kcs_torch.io.load import READERS, WRITERS, detect_format, load_people, load_tracks
@@ -18,6 +19,7 @@ __all__ = [
     "detect_format",
     "detect_motion_format",
     "link_people",
+    "load_any",
     "load_motion",
     "load_people",
     "load_reconstruction",

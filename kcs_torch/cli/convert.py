@@ -1,0 +1,99 @@
+"""``kcs-torch convert``: from one kind of file to another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from kcs_torch.cli.options import ImageSize, Threshold, Trust, check_outputs, image_size, person_number
+from kcs_torch.cli.outputs import Scale, Units, Up, parse_scale, write_files
+from kcs_torch.cli.report import answer, one_line, progress
+
+__all__ = ["FromUnits", "FromUp", "convert"]
+
+FromUp = Annotated[
+    str | None,
+    typer.Option(
+        "--from-up", metavar="y|z|x|-y|-z", help="The axis that points up in a file of 3D motion that does not say it."
+    ),
+]
+FromUnits = Annotated[
+    str | None, typer.Option("--from-units", metavar="m|cm|mm|in|ft", help="The unit of a file that does not say it.")
+]
+
+
+def convert(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="IN",
+            help="2D tracks, a result of `kcs-torch lift` (.npz), or 3D motion (.trc, .c3d, .bvh, .amc, .npz).",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="OUT...",
+            help="Where to write: tracks to .npz; motion to .npz, .bvh, .c3d, .csv or .trc; results to all formats.",
+            show_default=False,
+        ),
+    ],
+    up: Up = None,
+    scale: Scale = None,
+    units: Units = None,
+    from_up: FromUp = None,
+    from_units: FromUnits = None,
+    format: Annotated[
+        str | None, typer.Option("--format", metavar="NAME", help="Format of IN; found by content if not given.")
+    ] = None,
+    skeleton: Annotated[
+        str | None,
+        typer.Option(
+            "--skeleton",
+            metavar="NAME|FILE",
+            help="A built-in skeleton or a YAML or JSON file, whose joints are found by name; for .amc its .asf file.",
+        ),
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(metavar="NUMBER", help="Frames a second; as IN says if not given.")
+    ] = None,
+    person: Annotated[
+        str | None, typer.Option(metavar="NUMBER", help="Whose 2D tracks, counted from 0; the most seen if not given.")
+    ] = None,
+    threshold: Threshold = 0.3,
+    size: ImageSize = None,
+    trust: Trust = False,
+) -> None:
+    """Convert tracks, results and motion from one kind of file to another."""
+    with answer():
+        from kcs_torch.errors import OptionError
+        from kcs_torch.io import load_any
+        from kcs_torch.types import Reconstruction, Tracks
+
+        check_outputs(output, source=source)
+        true_size = parse_scale(scale)
+        with progress(f"reading {source}"):
+            data = load_any(
+                source,
+                format=format,
+                skeleton=skeleton,
+                fps=fps,
+                up=from_up,
+                units=from_units,
+                person=person_number(person),
+                threshold=threshold,
+                image_size=image_size(size),
+                trust=trust,
+            )
+        known = () if isinstance(data, Reconstruction) else data.notes
+        if true_size is not None:
+            if isinstance(data, Tracks):
+                raise OptionError("--scale: 2D tracks have no true size: lift them first")
+            data = data.scaled(**true_size)
+        for note in (*known, *write_files(data, output, up, units)):
+            typer.echo(f"note: {one_line(note)}", err=True)
+        for path in output:
+            typer.echo(f"wrote {path}")

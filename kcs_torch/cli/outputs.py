@@ -1,0 +1,103 @@
+"""How commands write: which way is up, in which unit, and of which size."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+import typer
+
+from kcs_torch.cli.report import progress
+
+if TYPE_CHECKING:
+    from kcs_torch.types import Motion, Reconstruction, Tracks
+
+_Sized = TypeVar("_Sized", "Motion", "Reconstruction")
+
+__all__ = ["Scale", "Units", "Up", "parse_scale", "sized", "write_files"]
+
+Up = Annotated[
+    str | None,
+    typer.Option(
+        "--up",
+        metavar="y|z",
+        help="The axis that points up in .bvh, .c3d, .csv and .trc files; y if not given. Other files, and .csv if it "
+        "is not given, hold results in the camera's axes (y down).",
+        show_default=False,
+    ),
+]
+Units = Annotated[
+    str | None,
+    typer.Option(
+        metavar="m|cm|mm|in|ft",
+        help="Unit of length in the files; if not given .bvh cm, .trc m, .c3d mm, others as the motion is.",
+        show_default=False,
+    ),
+]
+Scale = Annotated[
+    str | None,
+    typer.Option(
+        "--scale",
+        metavar="SIZE",
+        help="The true size: height=1.75m (head to foot), a bone such as left_knee-left_ankle=430mm, or factor=2mm "
+        "(millimetres of one unit).",
+        show_default=False,
+    ),
+]
+
+
+def parse_scale(text: str | None) -> dict[str, Any] | None:
+    """Read ``--scale`` as arguments of ``scaled``.
+
+    Raises:
+        OptionError: it is of another form.
+
+    >>> parse_scale("height=1.75m")
+    {'units': 'm', 'height': 1.75}
+    """
+    from kcs_torch.errors import OptionError
+    from kcs_torch.types.size import METRES
+
+    if text is None:
+        return None
+    found = re.fullmatch(r"(.+)=\s*([0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*([a-z]+)", text.strip())
+    if found is None or found[3] not in METRES or not 0 < float(found[2]) < float("inf"):
+        raise OptionError(
+            "--scale: expected height=1.75m, a bone such as left_knee-left_ankle=430mm, or factor=2mm, with one of the "
+            f"units {', '.join(METRES)}; got {text!r}"
+        )
+    return {"units": found[3], found[1].strip(): float(found[2])}
+
+
+def sized(data: _Sized, scale: dict[str, Any] | None) -> _Sized:
+    """The motion in its true size."""
+    return data if scale is None else data.scaled(**scale)
+
+
+def write_files(
+    data: Reconstruction | Motion | Tracks, paths: Sequence[Path], up: str | None = None, units: str | None = None
+) -> list[str]:
+    """Write all files; return what is to be said of each.
+
+    Raises:
+        OptionError: an axis is asked for, but no file is of a kind that takes it.
+    """
+    from kcs_torch.errors import OptionError
+    from kcs_torch.io import save, writer_for
+    from kcs_torch.types import Reconstruction
+
+    def turns(path: Path) -> bool:
+        writer = writer_for(path)
+        return not isinstance(data, Reconstruction) or writer.turns or writer.write is None
+
+    if up is not None and not any(map(turns, paths)):
+        raise OptionError(f"--up: expected a .bvh, .c3d, .csv or .trc file to write, got {', '.join(map(str, paths))}")
+    told = []
+    for path in paths:
+        notes: list[str] = []
+        with progress(f"writing {path}"):
+            save(data, path, up=up if turns(path) else None, units=units, notes=notes)
+        told += [f"{path}: {note}" for note in notes]
+    return told

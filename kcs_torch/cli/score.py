@@ -1,0 +1,105 @@
+"""``kcs-torch score``: how far a motion is from the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from kcs_torch.cli.convert import FromUnits
+from kcs_torch.cli.options import AsJson
+from kcs_torch.cli.outputs import Scale, parse_scale, sized
+from kcs_torch.cli.report import answer, one_line, print_json, progress
+
+if TYPE_CHECKING:
+    from kcs_torch.metrics import Comparison
+
+__all__ = ["score"]
+
+_Up = "The axis that points up in {}, if the file does not say it: y, z, x, -y (the camera's axes) or -z."
+
+
+def score(
+    pred: Annotated[
+        str,
+        typer.Argument(
+            metavar="PRED", help="A result of `kcs-torch lift` (.npz), or any file of 3D motion.", show_default=False
+        ),
+    ],
+    truth: Annotated[
+        str,
+        typer.Argument(
+            metavar="TRUTH", help="A file of 3D motion: .trc, .c3d, .bvh, .amc, or .npz.", show_default=False
+        ),
+    ],
+    align: Annotated[
+        list[str],
+        typer.Option(
+            metavar="NAME",
+            help="Alignment before distances are taken: none, root, scale, rigid (each frame turned), similarity "
+            "(turned and scaled: PA-MPJPE), sequence (one turn and scale for the clip); may be repeated. If not given, "
+            "all that sizes allow.",
+            show_default=False,
+        ),
+    ] = [],  # noqa: B006 (typer reads it and never changes it)
+    root: Annotated[
+        str | None, typer.Option(metavar="JOINT", help="TRUTH's root joint; its pelvis if not given and there is one.")
+    ] = None,
+    mirror: Annotated[bool, typer.Option("--mirror", help="Score the mirror image in depth of PRED.")] = False,
+    within: Annotated[
+        float | None, typer.Option(metavar="NUMBER", help="Distance for PCK, in TRUTH's unit; 150 mm if not given.")
+    ] = None,
+    scale: Scale = None,
+    pred_up: Annotated[str | None, typer.Option(metavar="AXIS", help=_Up.format("PRED"))] = None,
+    truth_up: Annotated[str | None, typer.Option(metavar="AXIS", help=_Up.format("TRUTH"))] = None,
+    pred_fps: Annotated[float | None, typer.Option(metavar="NUMBER", help="PRED's frames a second.")] = None,
+    truth_fps: Annotated[float | None, typer.Option(metavar="NUMBER", help="TRUTH's frames a second.")] = None,
+    from_units: FromUnits = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare a motion with the truth: joints by name, frames by number or time, each figure with its alignment."""
+    with answer(as_json):
+        from kcs_torch.io import load_motion
+        from kcs_torch.metrics import compare
+
+        with progress(f"reading {pred}"):
+            ours = sized(load_motion(pred, up=pred_up, fps=pred_fps), parse_scale(scale))
+        with progress(f"reading {truth}"):
+            theirs = load_motion(truth, up=truth_up, fps=truth_fps, units=from_units)
+        found = compare(ours, theirs, align=align or None, root=root, mirror=mirror, within=within)
+        if as_json:
+            print_json(dataclasses.asdict(found))
+        else:
+            typer.echo(_spoken(found, pred, truth))
+
+
+def _spoken(found: Comparison, pred: str, truth: str) -> str:
+    from kcs_torch.metrics import ALIGNMENTS
+
+    unit = f" {found.units}" if found.units else ""
+    names = [ours if ours == theirs else f"{ours} = {theirs}" for ours, theirs in found.joints]
+    lines = [f"{pred} against {truth}: {found.frames} frames, {len(names)} joints: {', '.join(names)}"]
+    near = f"  PCK within {found.pck_within:g}{unit}" if found.pck else ""
+    lines.append(f"{'aligned by':<12}{'MPJPE' + (f' [{found.units}]' if unit else ''):>14}{near}")
+    for how, error in found.mpjpe.items():
+        share = f"  {100 * found.pck[how]:.1f} %".ljust(len(near)) if found.pck else ""
+        what = ALIGNMENTS[how]
+        if how in ("root", "scale"):
+            what = what.replace("the root joint", found.root if found.root else "the middle")
+        lines.append(f"{how:<12}{error:>14.4g}{share}  {what}")
+    rows: dict[str, Any] = {"e3d": f"{found.e3d:.4f} (one orthogonal matrix for the clip)"}
+    true = found.bone_deviation_truth
+    rows["bone deviation"] = f"{100 * found.bone_deviation:.2f} %"
+    rows["bone deviation"] += " (no bones in the truth)" if math.isnan(true) else f" (truth: {100 * true:.2f} %)"
+    if math.isnan(found.e3d):
+        del rows["e3d"]
+    if math.isnan(found.bone_deviation):
+        del rows["bone deviation"]
+    lines += [f"{name:<16}{text}" for name, text in rows.items()]
+    better = [how for how in found.mpjpe if found.mirrored[how] < 0.98 * found.mpjpe[how]]
+    if better:
+        shown = ", ".join(f"{how} {found.mirrored[how]:.4g}{unit}" for how in better)
+        lines.append(f"note: the mirror image in depth is nearer ({shown}): --mirror scores it")
+    return "\n".join([*lines, *(f"note: {one_line(note)}" for note in found.notes)])
