@@ -256,6 +256,40 @@ def _mmpose_folder(folder: Path) -> Path:
     return folder / "predictions"
 
 
+def mediapipe_frames(num_frames=4, size=1.0, joints=33) -> list:
+    """Frames of one pose as MediaPipe's results are usually saved; of ``size`` 1 they are shares of the image."""
+    found = person(num_frames, joints) * [size / 1000, size / 1000, 1]
+    return [
+        {"frame": t, "pose_landmarks": [{"x": x, "y": y, "z": -0.1, "visibility": v} for x, y, v in pose.tolist()]}
+        for t, pose in enumerate(found)
+    ]
+
+
+def write_mediapipe_csv(path: Path, size=1.0, num_frames=4) -> Path:
+    from kcs_torch.skeleton import SKELETONS
+
+    names = SKELETONS["mediapipe33"].joints[:33]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["frame", *(f"{n}_{c}" for n in names for c in ("x", "y", "visibility"))])
+        for t, pose in enumerate(person(num_frames, 33) * [size / 1000, size / 1000, 1]):
+            writer.writerow([t, *pose.ravel().tolist()])
+    return path
+
+
+def write_npy(path: Path, array) -> Path:
+    np.save(path, array)
+    return path
+
+
+def write_videopose3d(path: Path, positions=None, **more) -> Path:
+    walk = walking_person(4, skeleton="h36m17").points[:, :17, :2].numpy() + 500
+    symmetry = [[4, 5, 6, 11, 12, 13], [1, 2, 3, 14, 15, 16]]
+    positions = {"S1": {"Walking 1": [walk.astype("f4"), walk[:3]]}} if positions is None else positions
+    np.savez(path, positions_2d=positions, **{"metadata": {"num_joints": 17, "keypoints_symmetry": symmetry}, **more})
+    return path
+
+
 def write_json(path: Path, data) -> Path:
     path.write_text(json.dumps(data), encoding="utf-8")
     return path
@@ -280,6 +314,14 @@ SAMPLES: dict[str, tuple[Callable[[Path], Path], ...]] = {
         lambda folder: write_json(folder / "000785.json", mmpose_frames()[0]["instances"]),
         _mmpose_folder,
     ),
+    "mediapipe": (
+        lambda folder: write_json(folder / "pixels.json", mediapipe_frames(size=1000)),
+        lambda folder: write_json(folder / "landmarks.json", mediapipe_frames()),
+        lambda folder: write_mediapipe_csv(folder / "landmarks.csv"),
+        lambda folder: write_npy(folder / "landmarks.npy", person(4, 33)[:, :, [0, 1, 2, 2]] / 1000),
+        lambda folder: write_npy(folder / "hand.npy", person(4, 21)[:, :, :2]),
+    ),
+    "videopose3d": (lambda folder: write_videopose3d(folder / "data_2d_h36m_gt.npz"),),
     "deeplabcut": (
         _deeplabcut(write_deeplabcut_csv, "mouse.csv"),
         _deeplabcut(write_deeplabcut_csv, "mice.csv", ("m1", "m2")),
@@ -296,6 +338,79 @@ SAMPLES: dict[str, tuple[Callable[[Path], Path], ...]] = {
 }
 """Of every reader, functions that write a small valid file (or folder) into a folder and tell its path.
 
-The first is loaded by ``load_tracks(path)`` without options and has 4 frames. A new reader needs one here; the fuzz
+The first is loaded by ``load_tracks(path, trust=True)`` and has 4 frames. A new reader needs one here; the fuzz
 test takes all of them.
 """
+
+
+def _saved(name: str) -> Callable[[Path], Path]:
+    """A walk of 4 frames, in the format of the name's suffix."""
+
+    def write(folder: Path) -> Path:
+        import warnings
+
+        import kcs_torch as kt
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return kt.save(kt.types.Motion.of(walk_result(4)), folder / name)
+
+    return write
+
+
+ASF = """:version 1.10
+:name leg
+:units
+  mass 1.0
+  length 0.45
+  angle deg
+:root
+  order TX TY TZ RX RY RZ
+  axis XYZ
+  position 0 0 0
+  orientation 0 0 0
+:bonedata
+  begin
+     id 1
+     name femur
+     direction 0.34 -0.93 0
+     length 7.16
+     axis 0 0 20 XYZ
+     dof rx ry rz
+     limits (-160.0 20.0)
+            (-70.0 70.0)
+            (-60.0 70.0)
+  end
+  begin
+     id 2
+     name tibia
+     direction 0.34 -0.93 0
+     length 7.49
+     axis 0 0 20 XYZ
+     dof rx
+     limits (-10.0 170.0)
+  end
+:hierarchy
+  begin
+    root femur
+    femur tibia
+  end
+"""
+
+
+def write_amc(folder: Path) -> Path:
+    """A leg that swings: the motion, and the skeleton beside it."""
+    (folder / "35.asf").write_text(ASF)
+    frames = [f"{t}\nroot {t} 17 0 0 {t} 0\nfemur {5 * t} 0 0\ntibia {9 * t}\n" for t in range(1, 5)]
+    (folder / "35_01.amc").write_text(":FULLY-SPECIFIED\n:DEGREES\n" + "".join(frames))
+    return folder / "35_01.amc"
+
+
+MOTION_SAMPLES: dict[str, tuple[Callable[[Path], Path], ...]] = {
+    "npz": (_saved("motion.npz"),),
+    "trc": (_saved("a.trc"),),
+    "bvh": (_saved("a.bvh"),),
+    "c3d": (_saved("a.c3d"),),
+    "amc": (write_amc,),
+}
+"""Of every reader of 3D motion, as ``SAMPLES``."""

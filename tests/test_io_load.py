@@ -34,7 +34,7 @@ def test_content_decides_and_not_the_name(samples, tmp_path):
     for name, path in samples.items():
         other = path.rename(tmp_path / f"{name}.csv")
         assert detect_format(other) == name
-        assert load_tracks(other).num_frames == 4
+        assert load_tracks(other, trust=True).num_frames == 4
 
 
 def test_lists_of_formats():

@@ -11,13 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
+from kcs_torch.io.pickles import load_arrays
 from kcs_torch.io.registry import read_error
 
-__all__ = ["Archive"]
+__all__ = ["Archive", "array_names"]
 
 LIMIT = 4 * 2**30  # bytes of one file's arrays, unpacked
 RATIO = 200  # unpacked over packed bytes, above which a large array is no measurement
 LARGE = 256 * 2**20
+
+
+def array_names(path: Path) -> set[str]:
+    """Names of the arrays of an .npz file; nothing where it cannot be read."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")}
+    except Exception:  # zipfile raises many kinds on damaged files
+        return set()
 
 
 class Archive:
@@ -94,6 +104,30 @@ class Archive:
         """Read a list of strings. Raises as :meth:`array`."""
         return [_decode(v) for v in self.array(key, "US", 1)]
 
+    def objects(self, key: str) -> Any:
+        """Unpickle one array of objects, a nest of arrays, lists, mappings, numbers and texts: see ``io/pickles.py``.
+
+        Raises:
+            FormatError: it is missing or damaged, holds no objects, or asks for anything else.
+        """
+        what = f"{self.path}: '{key}'"
+        if key not in self.members:
+            raise FormatError(f"{self.path}: expected an array '{key}', got {', '.join(self.keys) or 'none'}")
+        try:
+            with zipfile.ZipFile(self.path) as archive, archive.open(self.members[key]) as stream:
+                file = cast(BinaryIO, stream)
+                _, dtype = _header(file)
+                if not dtype.hasobject:
+                    raise FormatError(f"{what}: expected pickled objects, got an array of {dtype}")
+                found = load_arrays(file, what)
+        except FormatError:
+            raise
+        except OSError as error:
+            raise read_error(what, error) from None
+        except Exception as error:  # zipfile, zlib and numpy raise many kinds on damaged files
+            raise FormatError(f"{what} is damaged or truncated: {error}") from None
+        return found
+
     def _single(self, key: str, kinds: str) -> Any:
         array = self.array(key, kinds)
         if array.size != 1:
@@ -105,10 +139,7 @@ class Archive:
         with zipfile.ZipFile(self.path) as archive:
             with archive.open(member) as stream:
                 file = cast(BinaryIO, stream)
-                # Versions above 2 are for arrays of records, which no file of ours holds.
-                new = np.lib.format.read_magic(file) > (1, 0)
-                header = np.lib.format.read_array_header_2_0 if new else np.lib.format.read_array_header_1_0
-                shape, _, dtype = header(file)
+                shape, dtype = _header(file)
                 start = stream.tell()
             if dtype.hasobject:
                 raise FormatError(f"{self.path}: '{key}' holds pickled objects, which could run code: refused")
@@ -117,6 +148,15 @@ class Archive:
                 raise FormatError(f"{self.path}: '{key}': its size does not fit its shape {shape} of {dtype}")
             with archive.open(member) as stream:
                 return np.lib.format.read_array(cast(BinaryIO, stream), allow_pickle=False)
+
+
+def _header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of an array."""
+    # Versions above 2 are for arrays of records, which no file of ours holds.
+    new = np.lib.format.read_magic(file) > (1, 0)
+    header = np.lib.format.read_array_header_2_0 if new else np.lib.format.read_array_header_1_0
+    shape, _, dtype = header(file)
+    return shape, dtype
 
 
 def _decode(value: Any) -> str:

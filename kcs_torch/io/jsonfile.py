@@ -168,7 +168,10 @@ def _numbers(values: list[Any], where: str) -> list[float]:
 
 def as_text(value: Any) -> str:
     """Text of a file as it can be printed: short, and without halves of characters."""
-    text = str(value)
+    try:
+        text = str(value)
+    except ValueError:  # Python writes no integers of more than 4300 digits
+        text = "a number of very many digits"
     text = text if len(text) <= 200 else f"{text[:197]}..."
     return text.encode("utf-8", "replace").decode("utf-8")
 

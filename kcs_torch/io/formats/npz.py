@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import FormatError, KcsError
-from kcs_torch.io.archive import Archive
+from kcs_torch.io.archive import Archive, array_names
 from kcs_torch.io.build import build_tracks
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.plain import plain
@@ -41,7 +41,8 @@ __all__ = ["MOTION_READERS", "READERS", "WRITERS", "load_reconstruction"]
 
 def recognises(probe: Probe) -> bool:
     """Tell a zip archive of .npy files, damaged ones included, by its first member."""
-    return probe.head.startswith(b"PK\x03\x04") and b".npy" in probe.head[:512]
+    zipped = probe.head.startswith(b"PK\x03\x04") and b".npy" in probe.head[:512]
+    return zipped and "positions_2d" not in array_names(probe.path)  # that is VideoPose3D's
 
 
 def read(path: Path, options: Options) -> list[Tracks]:

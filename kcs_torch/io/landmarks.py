@@ -1,0 +1,198 @@
+"""Landmarks as people save MediaPipe's in JSON, of several layouts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcs_torch.errors import FormatError
+from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_joints, as_text, entries, read_json
+from kcs_torch.io.people import Sighting
+from kcs_torch.skeleton import SKELETONS
+
+__all__ = ["BODIES", "FRAME_KEYS", "KEYS", "Landmarks", "read_landmarks_json"]
+
+BODIES = {33: "mediapipe33", 21: "hand21"}
+_POSE = ("pose_landmarks", "poseLandmarks", "landmarks", "landmark", "keypoints")
+_HANDS = ("hand_landmarks", "handLandmarks", "multi_hand_landmarks", "multiHandLandmarks")
+_ONE_HAND = {
+    "left_hand_landmarks": "left",
+    "leftHandLandmarks": "left",
+    "right_hand_landmarks": "right",
+    "rightHandLandmarks": "right",
+}
+KEYS = frozenset([*_POSE[:2], *_HANDS, *_ONE_HAND])
+"""Keys that only MediaPipe's results have."""
+_LISTS = ("frames", "results", "data", "detections")
+FRAME_KEYS = ("frame", "frame_id", "frame_number", "frame_idx", "frame_index", "index")
+
+
+@dataclass
+class Landmarks:
+    """What a file holds: people by the number of the frame, and what it says of the video."""
+
+    frames: dict[int, list[Sighting]] = field(default_factory=dict)
+    names: tuple[str, ...] | None = None  # None: the usual 33 or 21
+    size: tuple[float, float] | None = None
+    fps: float | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+def read_landmarks_json(path: Path) -> Landmarks:
+    """Read a list of frames, or an object that holds one; poses where there are any, hands otherwise."""
+    data = read_json(path)
+    out = Landmarks()
+    if isinstance(data, dict):
+        sides = [_positive(data, k) for k in ("width", "height")]
+        sides = sides if all(sides) else [_positive(data, k) for k in ("image_width", "image_height")]
+        if isinstance(sizes := data.get("image_size"), list) and len(sizes) == 2:
+            sides = [_positive({"": v}, "") for v in sizes]
+        out.size = (sides[0], sides[1]) if sides[0] and sides[1] else None
+        out.fps = _positive(data, "fps")
+    poses: dict[int, list[Sighting]] = {}
+    hands: dict[int, list[Sighting]] = {}
+    for number, frame, where in _frames(data, path):
+        if number in poses:
+            raise FormatError(f"{where}: expected every frame once, got frame {number} again")
+        poses[number], hands[number] = _people(frame, where)
+    out.frames = poses
+    if not any(poses.values()) and any(hands.values()):
+        out.frames = hands
+    elif any(hands.values()):
+        out.notes.append("the hands are left out: only the pose is read")
+    return out
+
+
+def _frames(data: Any, path: Path) -> Iterator[tuple[int, Any, str]]:
+    """The number, content and place of each frame."""
+    if isinstance(data, dict):
+        key = next((k for k in _LISTS if isinstance(data.get(k), list)), None)
+        if key is not None:
+            yield from _frames(data[key], path)
+        elif data and all(k.isdecimal() and len(k) < 16 for k in data):
+            yield from ((int(k), frame, f"{path}: frame {int(k)}") for k, frame in data.items())
+        else:
+            yield 0, data, str(path)
+        return
+    if not isinstance(data, list):
+        raise FormatError(f"{path}: expected a list of frames with landmarks, got other JSON")
+    if _is_person(data):
+        yield 0, data, str(path)
+        return
+    for i, frame in enumerate(data):
+        number: int | None = i
+        if isinstance(frame, dict):
+            key = next((k for k in FRAME_KEYS if k in frame), None)
+            number = i if key is None else as_frame_number(frame[key])
+            if number is None:
+                raise FormatError(f"{path}: entry {i}: '{key}': expected a whole number, got {as_text(frame[key])}")
+        yield number or 0, frame, f"{path}: frame {number}"
+
+
+def _people(frame: Any, where: str) -> tuple[list[Sighting], list[Sighting]]:
+    """Poses and hands of a frame."""
+    found: list[tuple[Any, Any]] = []  # landmarks and who it is
+    if isinstance(frame, dict):
+        sides = frame.get("handedness", frame.get("handednesses"))
+        for key in (*_POSE, *_HANDS):
+            people = _each_person(frame.get(key))
+            who = [_side(s) for s in sides] if isinstance(sides, list) and key not in _POSE[:2] else []
+            found += zip(people, who if len(who) == len(people) else [None] * len(people), strict=True)
+            if people and key in _POSE:
+                break
+        found += [(p, side) for key, side in _ONE_HAND.items() for p in _each_person(frame.get(key))]
+        if not found and not KEYS & set(frame) and not set(_POSE) & set(frame):
+            raise FormatError(f"{where}: expected 'pose_landmarks' or 'hand_landmarks', got {_keys(frame)}")
+    elif isinstance(frame, list) or frame is None:
+        found = [(p, None) for p in _each_person(frame)]
+    else:
+        raise FormatError(f"{where}: expected landmarks, got {as_text(frame)}")
+    poses: list[Sighting] = []
+    hands: list[Sighting] = []
+    for landmarks, who in found:
+        joints = _joints(landmarks, where)
+        if len(joints) not in BODIES:
+            raise FormatError(f"{where}: expected 33 landmarks of a pose or 21 of a hand, got {len(joints)}")
+        (poses if len(joints) == 33 else hands).append(Sighting(joints, who))
+    return poses, hands
+
+
+def _is_person(value: Any) -> bool:
+    """Whether this is the list of one person's landmarks."""
+    first = value[0] if isinstance(value, list) and value else None
+    if isinstance(first, dict):
+        return "x" in first and "y" in first
+    return isinstance(first, list) and len(first) > 1 and all(isinstance(v, (int, float)) for v in first)
+
+
+def _each_person(value: Any) -> list[Any]:
+    """The landmarks of each person; nobody where there is nothing."""
+    value = _inside(value)
+    if not value:
+        return []
+    if not isinstance(value, list) or _is_person(value):
+        return [value]
+    return [inside for person in value if (inside := _inside(person))]
+
+
+def _inside(value: Any) -> Any:
+    """The landmarks in MediaPipe's messages, which hold them in an object."""
+    if isinstance(value, dict):
+        return next((value[k] for k in ("landmark", "landmarks") if k in value), value)
+    return value
+
+
+def _joints(landmarks: Any, where: str) -> NDArray[np.float64]:
+    """x, y, visibility of each landmark; visibility NaN where it is not given."""
+    if isinstance(landmarks, dict):  # by name
+        by_name = {str(k).lower().replace(" ", "_"): v for k, v in landmarks.items()}
+        body = next((b for b in map(SKELETONS.get, BODIES.values()) if b and set(by_name) & set(b.joints)), None)
+        if body is None:
+            raise FormatError(f"{where}: expected landmarks, got an object with {_keys(landmarks)}")
+        landmarks = [by_name.get(j, {"x": None, "y": None}) for j in body.joints[: body.num_observed]]
+    if not isinstance(landmarks, list) or not landmarks:
+        raise FormatError(f"{where}: expected a list of landmarks, got {as_text(landmarks)}")
+    if isinstance(landmarks[0], dict):
+        rows = []
+        for here, mark in entries(landmarks, where):
+            if "x" not in mark or "y" not in mark:
+                raise FormatError(f"{here}: expected a landmark with 'x' and 'y', got {_keys(mark)}")
+            seen = next((mark[k] for k in ("visibility", "score", "confidence") if mark.get(k) is not None), None)
+            rows.append([mark["x"], mark["y"], seen])
+        return as_joints(rows, where)
+    joints = as_joints(landmarks, where)
+    width = len(landmarks[0]) if isinstance(landmarks[0], list) else 3
+    if width > 3:  # x, y, z, visibility
+        joints[:, 2] = as_joints([row[2:4] for row in landmarks], where)[:, 1]
+    elif width == 2:
+        joints[:, 2] = math.nan
+    return joints
+
+
+def _side(value: Any) -> Any:
+    """'left' or 'right' as MediaPipe's classifications say it, however deep they are."""
+    for _ in range(4):
+        if isinstance(value, list) and value:
+            value = value[0]
+        elif isinstance(value, dict):
+            keys = ("category_name", "categoryName", "label", "display_name", "classification")
+            value = next((value[k] for k in keys if value.get(k)), None)
+    return value.lower() if isinstance(value, str) and value.lower() in ("left", "right") else None
+
+
+def _positive(data: dict[str, Any], key: str) -> float | None:
+    value = data.get(key)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < FARTHEST:
+        return None
+    return float(value)
+
+
+def _keys(value: dict[str, Any]) -> str:
+    shown = ", ".join(as_text(k) for k in list(value)[:6])
+    return f"the keys {shown}" if shown else "no keys"
