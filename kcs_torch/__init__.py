@@ -84,6 +84,7 @@ _HOME = {name: module for module, names in _NAMES.items() for name in names}
 _MODULES = (
     "clean",
     "data",
+    "detect",
     "errors",
     "functional",
     "io",

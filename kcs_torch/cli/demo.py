@@ -14,7 +14,7 @@ from kcs_torch.cli.report import answer, describe, print_json, progress, summary
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["demo"]
+__all__ = ["demo", "rigid_error"]
 
 
 def demo(
@@ -46,8 +46,8 @@ def demo(
                 result.save(path)
         flat = truth * torch.tensor([1.0, 1.0, 0.0])
         facts: dict[str, Any] = summary(result) | {
-            "error": _rigid_error(result.points, truth),
-            "error_flat": _rigid_error(flat, truth),
+            "error": rigid_error(result.points, truth),
+            "error_flat": rigid_error(flat, truth),
             "files": files,
         }
         if as_json:
@@ -61,7 +61,7 @@ def demo(
         typer.echo(f"  wrote {', '.join(map(str, files))}")
 
 
-def _rigid_error(points: Tensor, truth: Tensor) -> float:
+def rigid_error(points: Tensor, truth: Tensor) -> float:
     """Mean distance after a rotation per frame, of the better of the points and their mirror image in depth."""
     import torch
 

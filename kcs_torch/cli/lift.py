@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from kcs_torch.cli.cleaning import Fill, Frames, Gate, Resample, Smooth, Smooth3D, cleaner, finisher
+from kcs_torch.cli.detect import DetectorName, Models, What, numbered, people_of
 from kcs_torch.cli.options import (
     AsJson,
     FormatName,
@@ -17,12 +19,15 @@ from kcs_torch.cli.options import (
     UseSkeleton,
     check_outputs,
     image_size,
+    person_number,
     use_one_thread,
 )
 from kcs_torch.cli.report import answer, describe, print_json, progress, summary
 
 if TYPE_CHECKING:
-    from kcs_torch.types import Intrinsics, Tracks
+    from collections.abc import Callable
+
+    from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 
 __all__ = ["MethodName", "Settings", "lift", "method_fields"]
 
@@ -78,31 +83,59 @@ def lift(
     mirror: Annotated[
         bool, typer.Option("--mirror", help="Write the mirror image in depth, which fits the tracks as well.")
     ] = False,
+    frames: Frames = None,
+    gate: Gate = False,
+    fill: Fill = None,
+    smooth: Smooth = None,
+    resample: Resample = None,
+    smooth_3d: Smooth3D = None,
+    detector: DetectorName = "auto",
+    models: Models = [],  # noqa: B006
+    what: What = "pose",
     as_json: AsJson = False,
 ) -> None:
-    """Turn 2D joint tracks into 3D motion."""
+    """Turn 2D joint tracks, or a video where a detector is installed, into 3D motion."""
     with answer(as_json):
         check_outputs(output, source=tracks)
         fields = method_fields(method, settings)
         if intrinsics is not None:
             fields["intrinsics"] = _lens(intrinsics)
-        with progress(f"reading {tracks}"):
-            people = _people(
+        person_number(person)
+        finish = finisher(smooth_3d)
+        if format is None and _is_video(tracks):
+            clean = cleaner(None, gate, fill, smooth, resample)
+            people = people_of(
                 tracks,
                 person,
-                format=format,
+                detector=detector,
+                what=what,
+                models=models,
+                frames=frames,
                 skeleton=skeleton,
                 fps=fps,
                 threshold=threshold,
-                image_size=image_size(size),
-                trust=trust,
             )
+        else:
+            clean = cleaner(frames, gate, fill, smooth, resample)
+            with progress(f"reading {tracks}"):
+                people = _people(
+                    tracks,
+                    person,
+                    format=format,
+                    skeleton=skeleton,
+                    fps=fps,
+                    threshold=threshold,
+                    image_size=image_size(size),
+                    trust=trust,
+                )
         use_one_thread()
         reports = []
         for number, one in people:
-            names = [_numbered(path, number) if person == "all" else path for path in output]
+            names = [numbered(path, number) if person == "all" else path for path in output]
             check_outputs(names, source=tracks)
-            reports.append(_lift_one(one, method, fields, mirror, names))
+            cleaned = clean(one)
+            reports.append(_lift_one(cleaned, method, fields, mirror, finish, names))
+            reports[-1]["cleaning"] = list(cleaned.notes[len(one.notes) :])
             if not as_json:
                 typer.echo(describe(reports[-1]))
                 typer.echo(f"  wrote {', '.join(map(str, names))}")
@@ -144,22 +177,28 @@ def _lens(text: str) -> Intrinsics:
 
 def _people(tracks: str, person: str | None, **options: Any) -> list[tuple[int, Tracks]]:
     """The chosen people, each with their number."""
-    from kcs_torch.errors import OptionError
     from kcs_torch.io import load_people, load_tracks
 
     if person == "all":
         return list(enumerate(load_people(tracks, **options)))
-    if person is not None and not (person.isascii() and person.isdigit()):
-        raise OptionError(f"--person: expected a number from 0, or all, got {person!r}")
-    number = None if person is None else int(person)
+    number = person_number(person)
     return [(number or 0, load_tracks(tracks, person=number, **options))]
 
 
-def _numbered(path: Path, number: int) -> Path:
-    return path.with_name(f"{path.stem}_{number}{path.suffix}")
+def _is_video(path: str) -> bool:
+    from kcs_torch.io.video import is_video
+
+    return is_video(path)
 
 
-def _lift_one(tracks: Tracks, method: str, fields: dict[str, Any], mirror: bool, outputs: list[Path]) -> dict[str, Any]:
+def _lift_one(
+    tracks: Tracks,
+    method: str,
+    fields: dict[str, Any],
+    mirror: bool,
+    finish: Callable[[Reconstruction], Reconstruction],
+    outputs: list[Path],
+) -> dict[str, Any]:
     """Reconstruct one person and write the result; return what there is to say of it."""
     import kcs_torch as kt
 
@@ -167,6 +206,7 @@ def _lift_one(tracks: Tracks, method: str, fields: dict[str, Any], mirror: bool,
         result = kt.reconstruct(tracks, method=method, **fields)
     if mirror:
         result = result.mirrored()
+    result = finish(result)
     for path in outputs:
         with progress(f"writing {path}"):
             result.save(path)

@@ -18,6 +18,7 @@ __all__ = [
     "UseSkeleton",
     "check_outputs",
     "image_size",
+    "person_number",
     "use_one_thread",
 ]
 
@@ -88,6 +89,21 @@ def use_one_thread() -> None:
     import torch
 
     torch.set_num_threads(1)
+
+
+def person_number(text: str | None) -> int | None:
+    """Read ``--person``: a number from 0; None where nobody or ``all`` is named.
+
+    Raises:
+        OptionError: it is something else.
+    """
+    from kcs_torch.errors import OptionError
+
+    if text is None or text == "all":
+        return None
+    if not (text.isascii() and text.isdigit()):
+        raise OptionError(f"--person: expected a number from 0, or all, got {text!r}")
+    return int(text)
 
 
 def image_size(text: str | None) -> tuple[int, int] | None:

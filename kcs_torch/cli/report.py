@@ -6,7 +6,7 @@ import json
 import math
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -49,18 +49,20 @@ def answer(as_json: bool = False) -> Iterator[None]:
 
 
 @contextmanager
-def progress(text: str) -> Iterator[None]:
-    """Show that something is under way, on a terminal only."""
+def progress(text: str) -> Iterator[Callable[[int, int], None]]:
+    """Show that something is under way, on a terminal only; what it gives tells how much is done, and of how much."""
     if not sys.stderr.isatty():
-        yield
+        yield lambda done, total: None
         return
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        bar.add_task(text.replace("[", r"\["), total=None)
-        yield
+        words = text.replace("[", r"\[")
+        task = bar.add_task(words, total=None)
+        # The total is often a guess: a count says what is known.
+        yield lambda done, total: bar.update(task, description=f"{words}: {done}{f' of {total}' if total else ''}")
 
 
 def print_json(value: Any) -> None:

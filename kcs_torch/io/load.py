@@ -9,6 +9,7 @@ from pathlib import Path
 from kcs_torch.errors import FormatError, OptionError, unknown
 from kcs_torch.io.hdf5 import read_tree
 from kcs_torch.io.registry import Options, Probe, Reader, discover
+from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
@@ -55,7 +56,7 @@ def load_people(
         trust: read a file although that takes unpickling it, which can run any code that is in it.
 
     Returns:
-        At least one :class:`Tracks`; all have the same number of frames.
+        At least one :class:`Tracks`; those of one video have the same number of frames.
 
     Raises:
         FormatError: the path cannot be read as tracks.
@@ -135,7 +136,7 @@ def _size(size: tuple[int, int]) -> tuple[int, int]:
     """Width and height, checked."""
     try:
         width, height = (int(side) for side in size)
-        if (width, height) == tuple(size) and min(width, height) > 0:
+        if (width, height) == tuple(size) and min(width, height) > 0 and max(width, height) <= 10**6:
             return width, height
     except (TypeError, ValueError, OverflowError):
         pass
@@ -163,6 +164,8 @@ def _describe(probe: Probe) -> str:
         except (OSError, ValueError) as error:
             return f"text that is not JSON ({error})"
         return "JSON with other content"
+    if looks_like_video(probe.head):
+        return "a video: find the joints in it first, with `kcs-torch detect VIDEO -o tracks.npz`"
     if probe.head.startswith(b"\x89HDF"):
         try:
             held = sorted(read_tree(probe.path, (), 0).shapes)

@@ -1,0 +1,140 @@
+"""Options of ``kcs-torch lift`` that clean tracks before, and smooth motion after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from kcs_torch.types import Reconstruction, Tracks
+
+__all__ = ["Fill", "Frames", "Gate", "Resample", "Smooth", "Smooth3D", "cleaner", "finisher", "frame_range"]
+
+_PANEL = "Cleaning (nothing of this happens unasked; each step is told in the report)"
+
+Frames = Annotated[
+    str | None,
+    typer.Option(
+        "--frames",
+        metavar="A:B",
+        help="Take frames A to B, counted from 0, B not included; A: and :B go to the ends.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Gate = Annotated[
+    bool,
+    typer.Option("--gate", help="Drop detections that jump away from their joint's path.", rich_help_panel=_PANEL),
+]
+Fill = Annotated[
+    int | None,
+    typer.Option(
+        metavar="FRAMES", help="Fill gaps of up to so many frames, with a lower weight.", rich_help_panel=_PANEL
+    ),
+]
+Smooth = Annotated[
+    str | None,
+    typer.Option(
+        "--smooth",
+        metavar="METHOD=HZ",
+        help="Smooth the tracks: butterworth=6, savgol=6 or one-euro=1, with the cut-off in Hz.",
+        rich_help_panel=_PANEL,
+    ),
+]
+Resample = Annotated[
+    float | None,
+    typer.Option(metavar="FPS", help="Put the tracks at another frame rate.", rich_help_panel=_PANEL),
+]
+Smooth3D = Annotated[
+    str | None,
+    typer.Option(
+        "--smooth-3d",
+        metavar="METHOD=HZ",
+        help="Smooth the 3D motion; bones then keep their length less exactly.",
+        rich_help_panel=_PANEL,
+    ),
+]
+
+
+def frame_range(text: str | None) -> tuple[int, int | None]:
+    """Read ``100:400``, ``100:`` or ``:400``.
+
+    Raises:
+        OptionError: it is something else.
+    """
+    from kcs_torch.errors import OptionError
+
+    if text is None:
+        return 0, None
+    first, colon, last = text.strip().partition(":")
+    plain = all(part == "" or (part.isascii() and part.isdigit()) for part in (first, last))
+    if not colon or not plain or (last and int(last) <= int(first or 0)):
+        raise OptionError(f"--frames: expected A:B with A below B, such as 100:400, 100: or :400, got {text!r}")
+    return int(first or 0), int(last) if last else None
+
+
+def cleaner(
+    frames: str | None, gate: bool, fill: int | None, smooth: str | None, resample: float | None
+) -> Callable[[Tracks], Tracks]:
+    """What the options ask for, in the order in which it makes sense: cut, gate, fill, smooth, resample.
+
+    Raises:
+        OptionError: an option cannot be read.
+    """
+    start, stop = frame_range(frames)
+    low_pass = _filter("--smooth", smooth)
+
+    def clean(tracks: Tracks) -> Tracks:
+        from kcs_torch import clean as step
+
+        if frames is not None:
+            tracks = step.trim(tracks, start, stop)
+        if gate:
+            tracks = step.gate(tracks)
+        if fill is not None:
+            tracks = step.fill(tracks, fill)
+        if low_pass is not None:
+            tracks = step.smooth(tracks, *low_pass)
+        if resample is not None:
+            tracks = step.resample(tracks, resample)
+        return tracks
+
+    return clean
+
+
+def finisher(smooth: str | None) -> Callable[[Reconstruction], Reconstruction]:
+    """What ``--smooth-3d`` asks for.
+
+    Raises:
+        OptionError: it cannot be read.
+    """
+    low_pass = _filter("--smooth-3d", smooth)
+
+    def finish(result: Reconstruction) -> Reconstruction:
+        from kcs_torch import clean as step
+
+        return result if low_pass is None else step.smooth(result, *low_pass)
+
+    return finish
+
+
+def _filter(option: str, text: str | None) -> tuple[str, float] | None:
+    """A smoother and its cut-off."""
+    if text is None:
+        return None
+    from kcs_torch.clean import SMOOTHERS
+    from kcs_torch.errors import OptionError, unknown
+
+    name, equals, cutoff = text.partition("=")
+    name = name.strip()
+    if equals and name not in SMOOTHERS:
+        raise unknown(f"method for {option}", name, SMOOTHERS)
+    try:
+        hertz = float(cutoff)
+    except ValueError:
+        raise OptionError(
+            f"{option}: expected a method and a cut-off in Hz, such as butterworth=6, got {text!r}; "
+            f"methods are {', '.join(SMOOTHERS)}"
+        ) from None
+    return name, hertz
