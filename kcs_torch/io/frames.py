@@ -25,6 +25,8 @@ def by_image(images: Mapping[str, Sequence[Sighting]], notes: list[str]) -> list
         The people of each frame; the first image is frame 0.
     """
     names = sorted(images, key=natural_key)
+    if not names:
+        return []
     matches = [_NAME.match(name) for name in names]
     numbers = [int(m["number"]) if m and m["number"] else None for m in matches]
     prefixes = {m["prefix"] for m in matches if m}
@@ -44,7 +46,7 @@ def by_number(numbered: Mapping[int, Sequence[Sighting]], notes: list[str], *, f
         first: with what the numbers usually begin; only another beginning is noted.
     """
     numbers = sorted(numbered)
-    shown = "" if numbers and numbers[0] in (first, 0, 1) else str(numbers[0])
+    shown = "" if not numbers or numbers[0] in (first, 0, 1) else str(numbers[0])
     return _spread([numbered[n] for n in numbers], numbers, notes, shown)
 
 
