@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kcs_torch.errors import FormatError
 from kcs_torch.io.registry import read_error
 
-__all__ = ["as_frame_number", "as_joints", "as_text", "entries", "outline", "read_json"]
+__all__ = ["as_frame_number", "as_joints", "as_text", "entries", "outline", "read_json", "short"]
 
 LIMIT = 2**30  # bytes of one file; Python needs several times as much
 FARTHEST = 1e9  # pixels
@@ -160,8 +160,8 @@ def _numbers(values: list[Any], where: str) -> list[float]:
             v = math.nan
         elif type(v) not in (int, float):
             raise FormatError(f"{where}: number {i}: expected a number, got {_kind(v)}")
-        elif not (math.isnan(v) if isinstance(v, float) else False) and not abs(v) <= FARTHEST:
-            raise FormatError(f"{where}: number {i} is {_short(v)}: expected pixels and confidences")
+        elif abs(v) > FARTHEST:
+            raise FormatError(f"{where}: number {i} is {short(v)}: expected pixels and confidences")
         out.append(float(v))
     return out
 
@@ -193,5 +193,6 @@ def _kind(value: Any) -> str:
     return names.get(type(value), "a number")
 
 
-def _short(value: float) -> str:
+def short(value: float) -> str:
+    """A number for a message; Python writes no integers of more than 4300 digits, nor as floats of more than 308."""
     return f"{value:.3g}" if isinstance(value, float) else f"a number of {len(hex(abs(value))) - 2} hexadecimal digits"

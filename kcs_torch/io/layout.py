@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import SkeletonError
 from kcs_torch.io.registry import Options
-from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
+from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton, map_joints
 
-__all__ = ["choose_layout", "mean_bone", "names_of"]
+__all__ = ["choose_layout", "mean_bone", "named_layout", "names_of"]
 
 _CLEARLY = 0.7  # bones this much shorter, by another layout's order of joints, tell that it is the right one
 _ENOUGH = 2000  # people, of whom the bones are measured
@@ -96,6 +96,30 @@ def choose_layout(
         rest = " or ".join(name for name in (usual, *others) if name != best)
         notes.append(f"{count} joints without names: {why}; if they are {rest}, give --skeleton")
     return best, names_of(best, count)
+
+
+def named_layout(names: Sequence[str], notes: list[str]) -> str | None:
+    """The built-in skeleton, the largest, that has nearly all of its joints from a file with these names.
+
+    Args:
+        names: the file's joints, in any spelling.
+        notes: sentences for the user; added to.
+
+    >>> names = [n.upper() for n in SKELETONS["coco17"].joints[:17]]
+    >>> named_layout(names, []), named_layout(["left_ear", "tail"], [])
+    ('coco17', None)
+    """
+    exact = guess_skeleton(names)
+    if exact is not None:
+        return exact.name
+    best, most = None, 11  # fewer joints are no body
+    for name, body in SKELETONS.items():
+        wanted = body.joints[: body.num_observed]
+        if most < len(wanted) <= len(names) and None not in map_joints(names, wanted):
+            best, most = name, len(wanted)
+    if best is not None:
+        notes.append(f"{most} of the file's {len(names)} joints are by their names those of {best}")
+    return best
 
 
 def mean_bone(skeleton: Skeleton, people: NDArray[np.float64]) -> float:

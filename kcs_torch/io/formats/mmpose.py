@@ -9,9 +9,9 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.frames import as_track_id, by_number, last_number
 from kcs_torch.io.jsonfile import as_frame_number, as_joints, as_text, entries, outline, read_json
+from kcs_torch.io.layout import named_layout, names_of
 from kcs_torch.io.people import Sighting, people_tracks
 from kcs_torch.io.registry import Options, Probe, Reader
-from kcs_torch.skeleton import SKELETONS
 from kcs_torch.types import Tracks
 
 __all__ = ["READERS"]
@@ -104,16 +104,16 @@ def _tracks(
     """With the joints that the meta information names; by their number where it names none."""
     count = next((len(s.joints) for frame in frames for s in frame), 0)
     names = _names(meta, count)
-    links = meta.get("skeleton_links")
-    skeleton = _DATASETS.get(str(meta.get("dataset_name")).lower()) if names is None else None
-    if skeleton is not None and SKELETONS[skeleton].num_observed != count:
-        skeleton = None
+    skeleton = None if names is None else named_layout(names, notes)
+    known = _DATASETS.get(str(meta.get("dataset_name")).lower())
+    if skeleton is None and known is not None and len(names_of(known, count)) == count:
+        skeleton, names = known, list(names_of(known, count))
     return people_tracks(
         frames,
         options,
         source=str(path),
         names=names,
-        edges=_pairs(links, count) if names is not None else None,
+        edges=_pairs(meta.get("skeleton_links"), count) if skeleton is None and names is not None else None,
         skeleton=skeleton,
         notes=notes,
     )
@@ -139,6 +139,4 @@ def _pairs(links: Any, count: int) -> list[tuple[int, int]] | None:
     return list(pairs.values()) or None
 
 
-READERS = (
-    Reader("mmpose", "MMPose JSON: the people of all frames, or a folder of images", recognises, read),
-)
+READERS = (Reader("mmpose", "MMPose JSON: the people of all frames, or a folder of images", recognises, read),)

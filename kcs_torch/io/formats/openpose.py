@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
-from kcs_torch.io.jsonfile import outline, read_json
+from kcs_torch.io.jsonfile import FARTHEST, outline, read_json, short
 from kcs_torch.io.layout import mean_bone
 from kcs_torch.io.people import Sighting, people_tracks
 from kcs_torch.io.registry import Options, Probe, Reader
@@ -27,7 +26,6 @@ LAYOUTS = {25: ("body25", "body25b"), 18: ("coco18",), 15: ("mpi15",), 21: ("han
 _BODY = "pose_keypoints_2d"
 _OTHERS = ("face_keypoints_2d", "hand_left_keypoints_2d", "hand_right_keypoints_2d")
 _NAME = re.compile(r"(?P<prefix>.*?)(?P<number>[0-9]+)?(?:_keypoints)?\Z", re.DOTALL)
-_FARTHEST = 1e9  # pixels
 _CLEARLY = 0.7  # bones this much shorter, by another layout's order of joints, tell that it is the right one
 
 Person = NDArray[np.float64]  # (..., N, 3): x, y, confidence
@@ -135,8 +133,8 @@ def _numbers(values: Any, file: Path) -> list[float]:
     if len(values) % 3:
         raise FormatError(f"{file}: '{_BODY}': expected 3 numbers a joint, got {len(values)} numbers")
     for i, v in enumerate(values):
-        if not (math.isnan(v) or abs(v) <= _FARTHEST):
-            raise FormatError(f"{file}: '{_BODY}': number {i} is {v:.3g}: expected pixels and confidences")
+        if abs(v) > FARTHEST:
+            raise FormatError(f"{file}: '{_BODY}': number {i} is {short(v)}: expected pixels and confidences")
         if i % 3 == 2 and v < 0:
             raise FormatError(f"{file}: '{_BODY}': joint {i // 3} has a negative confidence {v:g}; expected 0..1")
     return values
