@@ -406,11 +406,24 @@ def write_amc(folder: Path) -> Path:
     return folder / "35_01.amc"
 
 
+def _animal_3d():
+    columns = deeplabcut_columns(coords="xyz")
+    return columns, deeplabcut_values(columns)
+
+
 MOTION_SAMPLES: dict[str, tuple[Callable[[Path], Path], ...]] = {
     "npz": (_saved("motion.npz"),),
     "trc": (_saved("a.trc"),),
     "bvh": (_saved("a.bvh"),),
     "c3d": (_saved("a.c3d"),),
     "amc": (write_amc,),
+    "deeplabcut": (
+        lambda folder: write_deeplabcut_csv(folder / "rat.csv", *_animal_3d()),
+        lambda folder: write_deeplabcut_table(folder / "rat.h5", *_animal_3d()),
+        lambda folder: write_deeplabcut_fixed(folder / "fixed.h5", *_animal_3d()),
+    ),
+    "sleap": (
+        lambda folder: write_sleap_hdf5(folder / "points3d.h5", _animal_3d()[1].reshape(4, 1, 3, 3), edge_inds=None),
+    ),
 }
 """Of every reader of 3D motion, as ``SAMPLES``."""

@@ -25,6 +25,7 @@ from kcs_torch.errors import FormatError, KcsError, ShapeError, SkeletonError
 from kcs_torch.io import READERS, animals, detect_format, hdf5, load_people, load_tracks
 from kcs_torch.io.formats import sleap
 from kcs_torch.io.literals import read_literals
+from kcs_torch.io.motion import detect_motion_format
 from kcs_torch.io.registry import Probe
 
 pytest.importorskip("h5py")
@@ -244,7 +245,7 @@ def test_a_line_with_the_name_of_the_index_is_no_frame(tmp_path):
     ("change", "message"),
     [
         (lambda t: t.replace("coords", "what", 1), "expected lines scorer"),
-        (lambda t: t.replace("coords,x", "coords,a", 1), "expected columns x and y of 'snout', got y, likelihood"),
+        (lambda t: t.replace("coords,x", "coords,a", 1), "expected columns x, y of 'snout', got y, likelihood"),
         (lambda t: t.replace("coords,x,y", "coords,x,x", 1), "expected one column 'x' of 'snout', got two"),
         (lambda t: t.replace("likelihood", "z"), "3D motion"),
         (lambda t: "".join(t.splitlines(keepends=True)[:3]), "a header only"),
@@ -531,6 +532,51 @@ def test_sleap_csv_without_places(tmp_path):
     (tmp_path / "a.csv").write_text("track,frame_idx,instance.score\n")
     with pytest.raises(FormatError, match="expected columns node.x"):
         load_tracks(tmp_path / "a.csv")
+
+
+# ---------------------------------------------------------------------- 3D motion
+
+
+def test_reads_real_files_of_motion(raw):
+    rat = kt.load_motion(raw / "sleap" / "points3d.h5")
+    assert (rat.num_frames, rat.num_joints, rat.source[-11:]) == (120, 15, "points3d.h5")
+    hand = kt.load_motion(raw / "deeplabcut" / "reachingDEMO_3D.h5", up="-y", fps=100)
+    assert (hand.num_frames, hand.num_joints, hand.fps) == (800, 33, 100)
+    assert hand.skeleton.joints[:3] == ("nose", "Left_wrist", "left_backofhand")
+    assert 100 * (1 - hand.seen.double().mean()) == pytest.approx(17.5, abs=0.1)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_deeplabcut_motion(tmp_path, layout):
+    columns = deeplabcut_columns(["m1", "m2"], coords="xyz")
+    values = deeplabcut_values(columns)
+    values[2, :9] = np.nan
+    path = LAYOUTS[layout](tmp_path / f"rat.{layout}", columns, values)
+    assert detect_motion_format(path) == "deeplabcut"
+    motion = kt.load_motion(path)
+    assert np.array_equal(motion.points.numpy(), values[:, 9:].reshape(4, 3, 3))
+    assert motion.skeleton.joints == ANIMAL
+    assert "2 animals: this is 'm2', the most seen one" in motion.notes
+    flat = LAYOUTS[layout](tmp_path / f"flat.{layout}", *_animal())
+    with pytest.raises(FormatError, match="load_tracks\\(\\) reads 2D tracks"):
+        kt.load_motion(flat)
+    with pytest.raises(FormatError, match="expected columns x, y, z of 'snout', got x, y; load_tracks"):
+        kt.load_motion(flat, format="deeplabcut")
+
+
+def test_sleap_motion_of_two_animals(tmp_path):
+    points = np.random.default_rng(0).normal(size=(5, 2, 3, 3))
+    points[0, 0, 0, 0] = np.nan
+    alone = {"node_names": None, "edge_inds": None}
+    path = write_sleap_hdf5(tmp_path / "a.h5", points, **alone)
+    assert np.array_equal(kt.load_motion(path).points.numpy(), points[:, 1])
+    with pytest.raises(FormatError, match="3D motion"):
+        load_tracks(path)
+    assert kt.load_motion(write_sleap_hdf5(tmp_path / "b.h5", points[:, :1])).skeleton.bones == ((0, 1), (1, 2))
+    three_frames = write_sleap_hdf5(tmp_path / "c.h5", points, track_names=np.array([b"a"] * 5))
+    assert [len(p.points) for p in load_people(three_frames)] == [3] * 5
+    with pytest.raises(FormatError, match="expected 3D motion"):
+        kt.load_motion(write_sleap_hdf5(tmp_path / "d.h5", points[..., :2]), format="sleap")
 
 
 # ---------------------------------------------------------------------- bounds

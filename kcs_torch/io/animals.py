@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kcs_torch.errors import FormatError, ShapeError
 from kcs_torch.io.build import build_tracks
 from kcs_torch.io.folders import frame_numbers
-from kcs_torch.io.registry import Options
+from kcs_torch.io.registry import Options, brief
 from kcs_torch.types import Tracks
 
 __all__ = ["LIMIT", "Animal", "build_animals", "frames_of", "refuse_3d"]
@@ -67,7 +67,7 @@ def frames_of(rows: Sequence[tuple[str | float, ...]], path: Path, notes: list[s
         found = _NUMBER.search(_SUFFIX.sub("", name))
         numbers.append(int(found[1][-18:]) if found else None)
     if len(videos) > 1:
-        shown = ", ".join(list(videos)[:4]) + (", ..." if len(videos) > 4 else "")
+        shown = ", ".join(brief(v) for v in list(videos)[:4]) + (", ..." if len(videos) > 4 else "")
         raise FormatError(f"{path}: expected the frames of one video, got rows of {len(videos)} ({shown}): split it")
     if videos:
         notes.append("rows are placed by the numbers in the images' names")
@@ -108,7 +108,7 @@ def build_animals(
     if not whole:
         raise FormatError(f"{path}: expected an animal with at least 2 joints, got none")
     if len(whole) < len(animals):
-        alone = ", ".join(a.name for a in animals if len(a.joints) < 2)
+        alone = ", ".join(brief(a.name) for a in animals if len(a.joints) < 2)
         shared.append(f"left out, as one joint alone is no body: {alone}")
     for animal in whole:
         _check(animal, path)
@@ -117,7 +117,7 @@ def build_animals(
         raise ShapeError(f"{path}: no joint has a confidence of {options.threshold:g} or more: lower the threshold")
     if len(seen) < len(whole):
         missing = [a.name for a in whole if not any(a is s for s in seen)]
-        shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
+        shown = ", ".join(map(brief, missing[:5])) + (", ..." if len(missing) > 5 else "")
         shared.append(
             f"{len(missing)} of {len(whole)} animals never reach the confidence threshold ({shown}): left out"
         )
@@ -126,7 +126,7 @@ def build_animals(
         shared.append(f"most of the {len(seen)} animals are seen in few frames: pieces of tracks, which are not joined")
     people = []
     for animal in seen:
-        own = [f"the file calls this animal '{animal.name}'"] if animal.name else []
+        own = [f"the file calls this animal '{brief(animal.name)}'"] if animal.name else []
         confidence = None if animal.confidence is None else _within_one(animal.confidence, own)
         people.append(
             build_tracks(
@@ -158,9 +158,9 @@ def _check(animal: Animal, path: Path) -> None:
         far = np.argwhere(np.abs(animal.points) > _FARTHEST)
     if len(far):
         t, n, axis = far[0].tolist()
-        whose = f" of '{animal.name}'" if animal.name else ""
-        value = animal.points[t, n, axis]
-        raise FormatError(f"{path}: frame {t}, joint '{animal.joints[n]}'{whose}: expected pixels, got {value:.3g}")
+        whose = f" of '{brief(animal.name)}'" if animal.name else ""
+        joint, value = brief(animal.joints[n]), animal.points[t, n, axis]
+        raise FormatError(f"{path}: frame {t}, joint '{joint}'{whose}: expected pixels, got {value:.3g}")
 
 
 def _within_one(confidence: NDArray[np.float64], notes: list[str]) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.hdf5 import Tree, read_tree
 from kcs_torch.io.literals import read_literals
 
-__all__ = ["Table", "pandas_group", "read_pandas"]
+__all__ = ["Table", "has_column", "pandas_group", "read_pandas"]
 
 LIMIT = 2**28  # numbers in a table
 _WANTED = ("*/table", "*/axis1", "*/axis1_*", "*/block*_items_*", "*/block*_values")
@@ -42,6 +42,22 @@ def pandas_group(tree: Tree) -> str | None:
         if any("bodyparts" in text for attributes in inside for text in attributes.values()):
             return group
     return None
+
+
+def has_column(path: Path, coord: str) -> bool:
+    """Whether a table has a column of this innermost name; False of files that cannot be read."""
+    try:
+        tree = read_tree(path, ("*/block0_items_*",), LIMIT)
+        group = pandas_group(tree)
+        if group is None:
+            return False
+        if f"{group}/table" in tree.shapes:
+            names = _names(tree, group, "values_block_0")
+        else:
+            names = _columns(_levels(tree, f"{group}/block0_items"))
+        return any(name[-1] == coord for name in names)
+    except (FormatError, ValueError, LookupError, TypeError):
+        return False
 
 
 def read_pandas(path: Path) -> Table:
@@ -78,9 +94,13 @@ def _table(tree: Tree, group: str) -> tuple[Blocks, list[tuple[str | float, ...]
     for name, values in tree.arrays.items():
         block = name.removeprefix(prefix)
         if name.startswith(prefix) and re.fullmatch(r"values_block_[0-9]+", block):
-            names = read_literals(tree.attributes[f"{group}/table"][f"{block}_kind"].encode("latin-1"))
-            blocks.append((_columns(names), values.reshape(len(values), -1)))
+            blocks.append((_names(tree, group, block), values.reshape(len(values), -1)))
     return blocks, _listed(tree, f"{prefix}index")
+
+
+def _names(tree: Tree, group: str, block: str) -> list[tuple[str, ...]]:
+    """The names of the columns of a block of the "table" layout."""
+    return _columns(read_literals(tree.attributes[f"{group}/table"][f"{block}_kind"].encode("latin-1")))
 
 
 def _fixed(tree: Tree, group: str) -> tuple[Blocks, list[tuple[str | float, ...]]]:

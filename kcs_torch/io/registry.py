@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import pkgutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -33,6 +33,7 @@ __all__ = [
     "Reader",
     "Saving",
     "Writer",
+    "brief",
     "discover",
     "discover_motion",
     "need",
@@ -208,6 +209,7 @@ class Writer:
         write: writes a result, in the camera's axes; None: as motion.
         write_motion: writes motion, y up; None: it cannot be written.
         write_tracks: writes tracks; None: they cannot be written.
+        write_people: writes the results of several people of one clip to one file; None: it takes one only.
         unit: of length that files of this kind are usually in; empty: motion keeps its own.
         turns: whether a result is written as motion if the user says which axis shall point up.
     """
@@ -217,6 +219,7 @@ class Writer:
     write: Callable[[Reconstruction, Path], None] | None = None
     write_motion: Callable[[Motion, Path, Saving], None] | None = None
     write_tracks: Callable[[Tracks, Path], None] | None = None
+    write_people: Callable[[Sequence[Reconstruction], Path], None] | None = None
     unit: str = ""
     turns: bool = False
 
@@ -260,6 +263,12 @@ def need(package: str, what: str, error: type[KcsError]) -> ModuleType:
     except ImportError as reason:
         name = package.partition(".")[0]
         raise error(f"{what}: needs the package {name} ({reason}): pip install {name}") from None
+
+
+def brief(value: Any, most: int = 100) -> str:
+    """A text from a file as a message shows it, cut where it is long."""
+    text = str(value)
+    return text if len(text) <= most else f"{text[: most - 4]} ..."
 
 
 def read_error(path: Any, error: BaseException) -> FormatError:

@@ -8,16 +8,18 @@ import math
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.animals import LIMIT, Animal, build_animals, frames_of, refuse_3d
+from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5 import Tree, read_tree
 from kcs_torch.io.link import link_people
-from kcs_torch.io.registry import Options, Probe, Reader, read_error
-from kcs_torch.types import Tracks
+from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief, read_error
+from kcs_torch.types import Motion, Tracks
 
-__all__ = ["READERS"]
+__all__ = ["MOTION_READERS", "READERS"]
 
 _FIRST = b"track,frame_idx,instance.score"
 _BOM = b"\xef\xbb\xbf"
@@ -47,6 +49,36 @@ def read(path: Path, options: Options) -> list[Tracks]:
     return build_animals(animals, options, path, notes, edges=edges)
 
 
+def recognises_motion(probe: Probe) -> bool:
+    """Tell 3D points that are triangulated from SLEAP's by their dataset and its last dimension."""
+    return probe.hdf5 is not None and recognises(probe) and _is_3d(probe.hdf5)
+
+
+def _is_3d(tree: Tree) -> bool:
+    """Whether ``tracks`` are (frames, tracks, nodes, 3), and not (tracks, 2, nodes, 3 frames)."""
+    shape = tree.shapes.get("tracks", ())
+    told = "dims" in tree.attributes.get("tracks", {})
+    return len(shape) == 4 and shape[3] == 3 and not told and (shape[1] != 2 or len(tree.shapes) == 1)
+
+
+def read_motion(path: Path, options: MotionOptions) -> Motion:
+    """Read the 3D motion of the animal that is seen most: ``tracks`` (frames, tracks, nodes, 3)."""
+    tree = read_tree(path, _WANTED, LIMIT)
+    points = tree.arrays.get("tracks", np.zeros(0))
+    if points.ndim != 4 or points.shape[3] != 3 or 0 in points.shape:
+        raise FormatError(f"{path}: expected 3D motion 'tracks' (frames, tracks, nodes, 3), got {points.shape}")
+    names = tree.texts.get("node_names")
+    if names is None or len(names) != points.shape[2]:
+        names = [f"joint{i}" for i in range(points.shape[2])]
+    most = int(np.isfinite(points).sum((0, 2, 3)).argmax())
+    several = points.shape[1] > 1
+    notes = [f"{points.shape[1]} animals: this is number {most}, the most seen one"] if several else []
+    edges = _edges(tree, points.shape[2], path)
+    return build_motion(
+        torch.from_numpy(points[:, most].copy()), options, source=str(path), names=names, edges=edges, notes=notes
+    )
+
+
 def _is_project(tree: Tree) -> bool:
     return {"frames", "instances", "pred_points"} <= set(tree.shapes) and "metadata" in tree.attributes
 
@@ -61,6 +93,8 @@ def _read_hdf5(path: Path, notes: list[str]) -> tuple[list[Animal], NDArray[np.i
     if "tracks" not in tree.arrays or tree.arrays["tracks"].ndim != 4:
         held = ", ".join(f"{k} {v}" for k, v in sorted(tree.shapes.items())[:8]) or "nothing"
         raise FormatError(f"{path}: expected 'tracks' (tracks, 2, nodes, frames), got {held}")
+    if _is_3d(tree):
+        raise refuse_3d(path)
     names = tree.texts.get("node_names")
     points = _in_order(tree, "tracks", names, path)
     tracks, _, nodes = points.shape[:3]
@@ -94,11 +128,11 @@ def _in_order(tree: Tree, key: str, names: list[str] | None, path: Path) -> NDAr
     fits = [s for s in sizes if s.get("xy", 2) == 2 and (names is None or s["node"] == len(names))]
     if fits:
         # Two orders may fit, of as many nodes as frames say: the number of tracks tells, or it is SLEAP's own.
-        order = list(max(fits, key=lambda s: s["track"] == len(tree.texts.get("track_names", []))))
+        known = len(tree.texts.get("track_names", []))
+        chosen = max(fits, key=lambda size: size["track"] == known)
+        order = list(chosen)
         moved = array.transpose([order.index(d) for d in ("track", "frame", "node", "xy") if d in order])
         return moved.reshape((*moved.shape[:3], -1))
-    if not plain and told is None and array.shape[-1] == 3:
-        raise refuse_3d(path)
     named = "" if names is None else f" of {len(names)} nodes"
     raise FormatError(f"{path}: '{key}': expected dimensions {', '.join(orders[0])}{named}, got {array.shape}")
 
@@ -142,7 +176,9 @@ def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
             names = list(dict.fromkeys(c.rpartition(".")[0] for c in header[3:]))
             places = [[_place(header, f"{n}.{c}") for c in ("x", "y", "score")] for n in names]
             if not names or any(None in p[:2] for p in places):
-                raise FormatError(f"{path}: expected columns node.x, node.y, node.score, got {', '.join(header[3:7])}")
+                raise FormatError(
+                    f"{path}: expected columns node.x, node.y, node.score, got {brief(', '.join(header[3:7]))}"
+                )
             for line in lines:
                 if len(line) != len(header):
                     raise FormatError(f"{path}: line {lines.line_num}: expected {len(header)} cells, got {len(line)}")
@@ -150,9 +186,9 @@ def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
                     frame = int(line[1])
                     values = [[_number(line[i]) if i is not None else math.nan for i in p] for p in places]
                 except ValueError as error:
-                    raise FormatError(f"{path}: line {lines.line_num}: expected numbers: {error}") from None
+                    raise FormatError(f"{path}: line {lines.line_num}: expected numbers: {brief(error)}") from None
                 if not 0 <= frame < 10**15:
-                    raise FormatError(f"{path}: line {lines.line_num}: expected a frame number, got {frame}")
+                    raise FormatError(f"{path}: line {lines.line_num}: expected a frame number, got {brief(line[1])}")
                 instances.setdefault(line[0], {}).setdefault(frame, []).append(np.array(values))
     except OSError as error:
         raise read_error(path, error) from None
@@ -220,4 +256,9 @@ def _number(cell: str) -> float:
     return float(cell) if cell else math.nan
 
 
+MOTION_READERS = (
+    MotionReader(
+        "sleap", "3D points triangulated from SLEAP's (points3d.h5); y up unless told", recognises_motion, read_motion
+    ),
+)
 READERS = (Reader("sleap", "SLEAP analysis HDF5 and CSV, one animal or several", recognises, read),)
