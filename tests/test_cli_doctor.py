@@ -47,6 +47,13 @@ def test_all_is_well(needs):
         assert words in text
 
 
+def test_the_cores_packages_load(root, monkeypatch):
+    """Under whatever name they are imported, such as yaml of pyyaml."""
+    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    monkeypatch.setattr(doctor.metadata, "requires", lambda name: project["dependencies"])
+    assert json.loads(run("--json").stdout)["problems"] == []
+
+
 def test_extras_say_what_for_and_how(needs):
     extras = {e["name"]: e for e in json.loads(run("--json").stdout)["extras"]}
     assert extras["onnx"]["install"] == 'pip install "nothing-of-that-name>=2"'

@@ -26,12 +26,12 @@ PURPOSES = {
     "hdf5": "reading HDF5: MATLAB 7.3, DeepLabCut, SLEAP",
     "mocap": "reading and writing C3D files",
     "onnx": "kcs-torch detect and lift of videos, by RTMPose and RTMO models of your own",
+    "rerun": "recordings for the rerun viewer",
     "test": "running the tests",
     "train": "training networks",
+    "video": "films as .mp4",
 }
 """What each extra is for."""
-
-_IMPORTED_AS = {"pyyaml": "yaml"}
 
 
 def doctor(as_json: AsJson = False) -> None:
@@ -114,10 +114,16 @@ def _problem(name: str, need: str) -> str | None:
     if least is not None and _numbers(version) < _numbers(least.group(1)):
         return f"{name}: is {version}, expected {need}: {fix}"
     try:
-        importlib.import_module(_IMPORTED_AS.get(name.lower(), name))
+        importlib.import_module(_module(name))
     except Exception as error:  # packages built for others raise whatever they like
         return f"{name}: does not load ({one_line(error)}): {fix} --force-reinstall"
     return None
+
+
+def _module(name: str) -> str:
+    """What a package is imported as."""
+    found = [m for m, owners in metadata.packages_distributions().items() if name.lower() in map(str.lower, owners)]
+    return name if name in found else min((m for m in found if not m.startswith("_")), default=name)
 
 
 def _numbers(version: str) -> tuple[int, ...]:
