@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
+from kcs_torch.io.jsonfile import as_text
 from kcs_torch.io.pickles import load_arrays
 from kcs_torch.io.registry import read_error
 
@@ -45,7 +46,9 @@ class Archive:
         except OSError as error:
             raise read_error(path, error) from None
         except Exception as error:  # zipfile raises many kinds on damaged files
-            raise FormatError(f"{path}: expected an .npz archive, got a damaged or truncated one: {error}") from None
+            raise FormatError(
+                f"{path}: expected an .npz archive, got a damaged or truncated one: {as_text(error)}"
+            ) from None
         self.members = {m.filename.removesuffix(".npy"): m for m in members if m.filename.endswith(".npy")}
         for key, member in self.members.items():
             packed = max(member.compress_size, 1)
@@ -85,7 +88,7 @@ class Archive:
         except OSError as error:
             raise read_error(f"{self.path}: '{key}'", error) from None
         except Exception as error:  # zipfile, zlib and numpy raise many kinds on damaged files
-            raise FormatError(f"{self.path}: '{key}' is damaged or truncated: {error}") from None
+            raise FormatError(f"{self.path}: '{key}' is damaged or truncated: {as_text(error)}") from None
         if array.dtype.kind not in kinds:
             raise FormatError(f"{self.path}: '{key}': expected {_say(kinds)}, got an array of {array.dtype}")
         if ndim is not None and array.ndim != ndim:
@@ -125,7 +128,7 @@ class Archive:
         except OSError as error:
             raise read_error(what, error) from None
         except Exception as error:  # zipfile, zlib and numpy raise many kinds on damaged files
-            raise FormatError(f"{what} is damaged or truncated: {error}") from None
+            raise FormatError(f"{what} is damaged or truncated: {as_text(error)}") from None
         return found
 
     def _single(self, key: str, kinds: str) -> Any:

@@ -46,6 +46,7 @@ def outline(head: bytes) -> frozenset[Route]:
         return frozenset()
     found: set[Route] = set()
     route: list[str] = []
+    objects: list[bool] = []  # whether each level is an object, not a list
     wants_key = False
     for match in _TOKEN.finditer(head.lstrip(_BLANK)):
         token = match.group()
@@ -53,14 +54,16 @@ def outline(head: bytes) -> frozenset[Route]:
             wants_key = token == b"{"
             found.add((*route, "dict" if wants_key else "list"))
             route.append("" if wants_key else "[]")
+            objects.append(wants_key)
             if len(route) > _DEEPEST:
                 break
         elif token in (b"}", b"]"):
             route.pop()
+            objects.pop()
             if not route:
                 break
         elif token == b",":
-            wants_key = route[-1] != "[]"
+            wants_key = objects[-1]
         elif token == b":":
             wants_key = False
         elif token == b'"':  # a text that is cut off

@@ -13,6 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from kcs_torch.errors import FormatError
+from kcs_torch.io.jsonfile import as_text
 
 __all__ = ["load_arrays", "opened"]
 
@@ -82,7 +83,7 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _STAND_INS:
-            raise FormatError(f"asks for {module}.{name}, which is no array: refused")
+            raise FormatError(f"asks for {as_text(module)}.{as_text(name)}, which is no array: refused")
         make = _STAND_INS[module, name]
         return lambda *arguments: make(*arguments)  # a new one each time: a pickle may change what it was given
 
@@ -102,7 +103,7 @@ def load_arrays(file: BinaryIO, what: str) -> Any:
     except FormatError as error:
         raise FormatError(f"{what}: {error}") from None
     except Exception as error:  # unpickling raises every kind on damaged files
-        raise FormatError(f"{what}: is damaged or truncated: {type(error).__name__} {error}") from None
+        raise FormatError(f"{what}: is damaged or truncated: {type(error).__name__} {as_text(error)}") from None
 
 
 def opened(value: Any) -> Any:
