@@ -113,9 +113,11 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
     if len(names) == len(wanted) and all(i in (None, j) for j, i in enumerate(found)):
         notes.append(f"joints taken in their order as those of skeleton '{body.name}': their names differ")
         return None
+    listed = ", ".join(names)
     raise SkeletonError(
         f"{source}: expected the {len(wanted)} joints of skeleton '{body.name}', got {len(names)} joints, none of them "
-        f"named {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''}; they are {', '.join(names)}"
+        f"named {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''}; they are {listed[:1000]}"
+        + (" ..." if len(listed) > 1000 else "")
     )
 
 

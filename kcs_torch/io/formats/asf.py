@@ -85,7 +85,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
 def _beside(path: Path) -> Path:
     """The ASF file of an AMC file: of the same name, of the name before its last underscore, or the only one there."""
     try:
-        there = sorted(f for f in path.parent.iterdir() if f.suffix.lower() == ".asf")
+        there = sorted(f for f in path.parent.iterdir() if f.suffix.lower() == ".asf" and f.is_file())
     except OSError:
         there = []
     for stem in (path.stem, path.stem.rpartition("_")[0]):
