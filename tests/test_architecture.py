@@ -46,6 +46,9 @@ OUTSIDE = {
     "omegaconf": set(),
     "torchmetrics": {"metrics", "training"},
     "matplotlib": {"viewer"},
+    "PIL": {"viewer"},
+    "imageio_ffmpeg": {"viewer"},
+    "rerun": {"viewer"},
     "scipy": {"clean", "data", "io"},
     "typer": {"cli"},
     "rich": {"cli"},
@@ -119,7 +122,8 @@ def test_every_outside_package_is_declared():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     needs = [*project["dependencies"], *(n for extra in project["optional-dependencies"].values() for n in extra)]
     declared = {re.match(r"[\w-]+", need).group(0).lower() for need in needs}
-    named = {"yaml": "pyyaml", "hydra": "hydra-core", "mpl_toolkits": "matplotlib"}
+    named = {"yaml": "pyyaml", "hydra": "hydra-core", "mpl_toolkits": "matplotlib", "PIL": "pillow"}
+    named |= {"imageio_ffmpeg": "imageio-ffmpeg", "rerun": "rerun-sdk"}
     for path in FILES:
         outside = {name.split(".")[0] for name, _, _ in imports(path)} - sys.stdlib_module_names - {"kcs_torch"}
         assert {named.get(n, n) for n in outside} <= declared, path

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from needs import SUFFIXES
 from typer.testing import CliRunner
 
 import kcs_torch as kt
@@ -73,20 +74,16 @@ def test_console_script_answers_an_error_with_one_line(tmp_path):
 @pytest.fixture(scope="module")
 def lifted(openpose_folder, tmp_path_factory):
     """A result in every format, and the JSON that the command printed."""
-    from kcs_torch.io import WRITERS
-
     folder = tmp_path_factory.mktemp("lifted")
-    outputs = [folder / f"walk{suffix}" for suffix in WRITERS]
+    outputs = [folder / f"walk{suffix}" for suffix in SUFFIXES]
     words = [w for path in outputs for w in ("-o", path)]
     done = run("lift", openpose_folder, *words, *QUICK, "--fps", 25, "--json")
     return folder, json.loads(done.stdout)
 
 
 def test_lift_writes_every_format_and_nothing_else(lifted):
-    from kcs_torch.io import WRITERS
-
     folder, _ = lifted
-    assert {p.name for p in folder.iterdir()} == {f"walk{suffix}" for suffix in WRITERS}
+    assert {p.name for p in folder.iterdir()} == {f"walk{suffix}" for suffix in SUFFIXES}
 
 
 @pytest.mark.filterwarnings("ignore:.*never seen")  # the detector's missed joint
@@ -102,7 +99,7 @@ def test_lift_writes_what_the_library_computes(lifted, openpose_folder):
     assert person["unseen_share"] == pytest.approx(1 / 25)
     assert person["converged"] is result.diagnostics.converged
     assert person["bone_variation"] == pytest.approx(result.diagnostics.bone_variation)
-    assert [Path(f).name for f in person["files"]] == [f"walk{s}" for s in kt.io.WRITERS]
+    assert [Path(f).name for f in person["files"]] == [f"walk{s}" for s in SUFFIXES]
 
 
 def test_lift_reports_in_words(openpose_folder, tmp_path):

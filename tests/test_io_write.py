@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from needs import SUFFIXES
 from samples import walk_result
 
 import kcs_torch as kt
 from kcs_torch.errors import OutputError
 from kcs_torch.io import WRITERS, load_reconstruction, registry, save, write
 from kcs_torch.io.atomic import atomic_path
-
-SUFFIXES = sorted(WRITERS)
 
 
 @pytest.fixture(scope="module")

@@ -131,8 +131,13 @@ def _spoken(facts: dict[str, Any]) -> str:
 
 
 def view(
-    result: Annotated[
-        Path, typer.Argument(metavar="RESULT", help="A result written by `kcs-torch lift` (.npz).", show_default=False)
+    results: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RESULT...",
+            help="A result written by `kcs-torch lift` (.npz), or several of the same clip to see together.",
+            show_default=False,
+        ),
     ],
     output: Annotated[
         list[Path],
@@ -140,24 +145,29 @@ def view(
             "--output",
             "-o",
             metavar="FILE",
-            help="Where to write: .html (a player), .png (key frames), .csv or .json; may be repeated. "
-            "RESULT with the suffix .html if not given.",
+            help="Where to write: .html (a player), .png (key frames), .gif, .mp4, .rrd, .csv or .json; may be "
+            "repeated. The first RESULT with the suffix .html if not given.",
             show_default=False,
         ),
     ] = [],  # noqa: B006 (typer reads it and never changes it)
     mirror: Annotated[bool, typer.Option("--mirror", help="Show the mirror image in depth.")] = False,
 ) -> None:
-    """Show a result: write a page with a 3D player, or a sheet of key frames."""
+    """Show results: write a page with a 3D player, a sheet of key frames, a film."""
     with answer():
-        from kcs_torch.io import load_reconstruction
+        from kcs_torch.io import load_reconstruction, save_people
 
-        outputs = output or [result.with_suffix(".html")]
-        check_outputs(outputs, source=str(result))
-        with progress(f"reading {result}"):
-            motion = load_reconstruction(result)
-        if mirror:
-            motion = motion.mirrored()
+        outputs = output or [results[0].with_suffix(".html")]
+        for result in results:
+            check_outputs(outputs, source=str(result))
+        people = []
+        for result in results:
+            with progress(f"reading {result}"):
+                motion = load_reconstruction(result)
+            people.append(motion.mirrored() if mirror else motion)
         for path in outputs:
             with progress(f"writing {path}"):
-                motion.save(path)
+                if len(people) > 1:
+                    save_people(people, path)
+                else:
+                    people[0].save(path)
             typer.echo(f"wrote {path}")

@@ -51,7 +51,8 @@ def lift(
             "--output",
             "-o",
             metavar="FILE",
-            help="Where to write: .npz (everything), .csv, .json, .html (a player) or .png; may be repeated.",
+            help="Where to write: .npz (everything); .bvh, .c3d, .trc, .csv or .json; .html (a player), .png, .gif, "
+            ".mp4 or .rrd (rerun); may be repeated.",
             show_default=False,
         ),
     ],
@@ -63,7 +64,8 @@ def lift(
         str | None,
         typer.Option(
             metavar="NUMBER|all",
-            help="Whom to take, counted from 0, the most seen first; or all, each to a file of its own (OUT_0, OUT_1).",
+            help="Whom to take, counted from 0, the most seen first; or all, each to a file of its own (OUT_0, OUT_1); "
+            "pages, films and recordings also together (OUT).",
         ),
     ] = None,
     fps: Annotated[
@@ -96,6 +98,8 @@ def lift(
 ) -> None:
     """Turn 2D joint tracks, or a video where a detector is installed, into 3D motion."""
     with answer(as_json):
+        from kcs_torch.io import save_people, writer_for
+
         check_outputs(output, source=tracks)
         fields = method_fields(method, settings)
         if intrinsics is not None:
@@ -129,19 +133,31 @@ def lift(
                     trust=trust,
                 )
         use_one_thread()
-        reports = []
+        reports, results = [], []
+        together = [path for path in output if person == "all" and writer_for(path).write_people is not None]
+        if together and frames == "seen":  # each has a first frame of their own then
+            typer.echo(f"note: {', '.join(map(str, together))} not written: people begin at different frames", err=True)
+            together = []
         for number, one in people:
             names = [numbered(path, number) if person == "all" else path for path in output]
             check_outputs(names, source=tracks)
             cleaned = clean(one)
-            reports.append(_lift_one(cleaned, method, fields, mirror, finish, names))
+            result = _lift_one(cleaned, method, fields, mirror, finish, names)
+            if together:
+                results.append(result)
+            reports.append(summary(result))
             reports[-1]["cleaning"] = list(cleaned.notes[len(one.notes) :])
             if not as_json:
                 typer.echo(describe(reports[-1]))
                 typer.echo(f"  wrote {', '.join(map(str, names))}")
             reports[-1] |= {"person": number, "files": names}
+        for path in together:
+            with progress(f"writing {path}"):
+                save_people(results, path)
+            if not as_json:
+                typer.echo(f"wrote {path}: everybody")
         if as_json:
-            print_json({"people": reports})
+            print_json({"people": reports, **({"together": together} if together else {})})
 
 
 def method_fields(method: str, settings: list[str]) -> dict[str, Any]:
@@ -198,8 +214,8 @@ def _lift_one(
     mirror: bool,
     finish: Callable[[Reconstruction], Reconstruction],
     outputs: list[Path],
-) -> dict[str, Any]:
-    """Reconstruct one person and write the result; return what there is to say of it."""
+) -> Reconstruction:
+    """Reconstruct one person and write the result."""
     import kcs_torch as kt
 
     with progress(f"reconstructing {tracks.num_frames} frames of {tracks.num_joints} joints"):
@@ -210,4 +226,4 @@ def _lift_one(
     for path in outputs:
         with progress(f"writing {path}"):
             result.save(path)
-    return summary(result)
+    return result

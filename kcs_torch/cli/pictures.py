@@ -5,10 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from typing import Any
 
 __all__ = ["PICTURES", "check_picture", "is_picture", "write_picture"]
 
@@ -35,8 +32,8 @@ def check_picture(path: Path, *, source: str) -> None:
         raise OutputError(f"{path}: expected another file than the tracks, which it would replace")
 
 
-def write_picture(draw: Callable[[], Figure], path: Path) -> None:
-    """Draw a figure and write it, whole or not at all.
+def write_picture(draw: Callable[[], Any], path: Path) -> None:
+    """Draw a matplotlib figure and write it, whole or not at all.
 
     Raises:
         OutputError: the place cannot be written to.

@@ -6,7 +6,7 @@ from kcs_torch.io.link import link_people
 from kcs_torch.io.load import READERS, WRITERS, detect_format, load_people, load_tracks
 from kcs_torch.io.motion import MOTION_READERS, detect_motion_format, load_motion
 from kcs_torch.io.registry import MotionReader, Reader, Saving, Writer
-from kcs_torch.io.write import save, writer_for
+from kcs_torch.io.write import save, save_people, writer_for
 
 __all__ = [
     "MOTION_READERS",
@@ -25,5 +25,6 @@ __all__ = [
     "load_reconstruction",
     "load_tracks",
     "save",
+    "save_people",
     "writer_for",
 ]

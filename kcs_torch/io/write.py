@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from kcs_torch.io.registry import Saving, Writer
 from kcs_torch.types import Motion, Reconstruction, Tracks
 from kcs_torch.types.size import METRES, unit_ratio
 
-__all__ = ["save", "writer_for"]
+__all__ = ["save", "save_people", "writer_for"]
 
 UP = ("y", "z")
 
@@ -91,6 +92,21 @@ def save(
     else:
         for warning in saving.warnings:
             warnings.warn(f"{path}: {warning}", KcsWarning, stacklevel=2)
+    return Path(path)
+
+
+def save_people(results: Sequence[Reconstruction], path: str | Path) -> Path:
+    """Write several people of one clip to one file: .html, .gif, .mp4 or .rrd.
+
+    Raises:
+        OutputError: files of this suffix hold one person, or it is unknown, or the file cannot be written.
+        OptionError: there is nobody, or the frame rates differ.
+    """
+    writer = writer_for(path)
+    if writer.write_people is None:
+        raise OutputError(f"{path}: several people in one file go to {_suffixes('write_people')}")
+    with atomic_path(path) as temporary:
+        writer.write_people(results, temporary)
     return Path(path)
 
 

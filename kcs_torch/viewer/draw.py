@@ -16,6 +16,7 @@ from kcs_torch.types import Tracks
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.labels import write_labels
 from kcs_torch.viewer.layout import flat_layout
+from kcs_torch.viewer.names import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -144,7 +145,7 @@ def _panels(count: int, joints: int) -> tuple[Figure, list[Any]]:
 
 def _title(figure: Figure, text: str) -> None:
     width = int(11 * figure.get_size_inches()[0])
-    lines = textwrap.wrap(text.encode("utf-8", "replace").decode(), width)
+    lines = textwrap.wrap(printable(text), width)
     figure.suptitle("\n".join(lines[:2]), fontsize=12, y=1 - 0.1 / figure.get_size_inches()[1], parse_math=False)
 
 
@@ -207,6 +208,5 @@ def _say(axis: Any, tracks: Tracks, places: Array, start: str) -> None:
     axis.set_title(f"{start}{known.sum()} of {body.num_observed} joints seen", fontsize=11)
     unseen = [body.joints[j] for j in np.flatnonzero(~known)]
     if unseen:
-        text = f"unseen: {', '.join(unseen)}".encode("utf-8", "replace").decode()
-        lines = textwrap.wrap(text, 110)
+        lines = textwrap.wrap(printable(f"unseen: {', '.join(unseen)}"), 110)
         axis.set_xlabel("\n".join([*lines[:2], *(["..."] if len(lines) > 2 else [])]), fontsize=8, parse_math=False)

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kcs_torch.viewer.names import printable
+
 __all__ = ["write_labels"]
 
 DIRECTIONS = 24
@@ -100,5 +102,5 @@ def _inside(low: Array, high: Array, points: Array) -> Array:
 
 def _plain(name: str) -> str:
     """A name as one line of letters that can be drawn, not too long."""
-    line = " ".join(name.encode("utf-8", "replace").decode().split())
+    line = " ".join(printable(name).split())
     return line if len(line) <= 40 else line[:39] + "…"

@@ -7,13 +7,18 @@ from pathlib import Path
 
 from kcs_torch.types import Reconstruction
 
-__all__ = ["person_names"]
+__all__ = ["person_names", "printable"]
+
+
+def printable(text: str) -> str:
+    """Text that can be encoded: names of files may hold bytes that are no letters."""
+    return text.encode("utf-8", "replace").decode()
 
 
 def person_names(results: Sequence[Reconstruction]) -> list[str]:
     """Name people by what tells them apart: the source's file, else the method, else their number."""
-    sources = [Path(r.tracks.source).name for r in results]
-    methods = [r.method for r in results]
+    sources = [printable(Path(r.tracks.source).name) for r in results]
+    methods = [printable(r.method) for r in results]
     if len(results) == 1:
         return sources
     for names in (sources, methods):

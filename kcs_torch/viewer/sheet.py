@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.types import Reconstruction
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
+from kcs_torch.viewer.names import printable
 from kcs_torch.viewer.summary import summarise
 
 if TYPE_CHECKING:
@@ -74,8 +75,7 @@ def _draw(result: Reconstruction, chosen: NDArray[Any], rows: list[Any], figure_
     axes = figure.subplots(len(rows), len(chosen), squeeze=False)
     title = [f"{result.method}: {Path(result.tracks.source).name}", summarise(result)]
     lines = [line for text in title for line in textwrap.wrap(text, int(14 * size[0]))]
-    text = "\n".join(lines).encode("utf-8", "replace").decode()  # names of files may hold bytes that are no letters
-    figure.suptitle(text, fontsize=9, parse_math=False)
+    figure.suptitle(printable("\n".join(lines)), fontsize=9, parse_math=False)
     for (label, places, depths), half, line in zip(rows, halves, axes, strict=True):
         for i, axis in enumerate(line):
             _body(axis, result, places[i], None if depths is None else depths[i])

@@ -1,0 +1,68 @@
+"""Commands that show something: info and skeletons as pictures, several people in one page."""
+
+import json
+
+import pytest
+from matplotlib.image import imread
+from samples import walk_result
+from test_cli import QUICK, run
+
+from kcs_torch.io import save
+
+
+def people(page):
+    text = page.read_text(encoding="utf-8")
+    start = text.index('type="application/json">') + len('type="application/json">')
+    return json.loads(text[start : text.index("</script>", start)])["people"]
+
+
+def test_info_draws_the_joints_names(openpose_folder, tmp_path):
+    done = run("info", openpose_folder, "-o", tmp_path / "body.png")
+    assert done.stdout.endswith(f"wrote {tmp_path / 'body.png'}\n")
+    assert imread(tmp_path / "body.png").shape[1] > 1500  # two people: three panels
+    run("info", openpose_folder, "--output", tmp_path / "body.svg", "--json")
+    assert (tmp_path / "body.svg").read_text(encoding="utf-8").rstrip().endswith("</svg>")
+
+
+def test_info_offers_the_picture(openpose_folder):
+    assert f"kcs-torch info {openpose_folder} -o picture.png" in run("info", openpose_folder).stdout
+
+
+def test_info_draws_to_pictures_only(openpose_folder, tmp_path):
+    done = run("info", openpose_folder, "-o", tmp_path / "body.npz", code=2)
+    assert "expected a picture with one of the suffixes .png, .svg, .pdf, got '.npz'" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf", ".html"])
+def test_skeletons_are_drawn(tmp_path, suffix):
+    path = tmp_path / f"body{suffix}"
+    assert f"wrote {path}" in run("skeletons", "show", "hand21", "-o", path).stdout
+    assert path.stat().st_size > 3000
+
+
+def test_a_skeleton_without_a_template_is_drawn(tmp_path):
+    (tmp_path / "stick.yaml").write_text("joints: [a, b, c]\nbones: [[a, b], [b, c]]\n")
+    run("skeletons", "show", tmp_path / "stick.yaml", "-o", tmp_path / "stick.png")
+    assert imread(tmp_path / "stick.png").shape[0] > 300
+    assert "no template" in run("skeletons", "show", tmp_path / "stick.yaml", "-o", tmp_path / "a.html", code=2).stderr
+
+
+@pytest.mark.filterwarnings("ignore:.*(never seen|without any seen joint|viewpoint turned)")
+def test_lift_of_everybody_makes_one_page_of_all(openpose_folder, tmp_path):
+    words = ("-o", tmp_path / "walk.html", "-o", tmp_path / "walk.csv", "--person", "all", "--fps", 25)
+    done = run("lift", openpose_folder, *words, *QUICK, "--json")
+    names = {"walk_0.html", "walk_1.html", "walk.html", "walk_0.csv", "walk_1.csv"}
+    assert {p.name for p in tmp_path.iterdir()} == names
+    assert len(people(tmp_path / "walk.html")) == 2
+    assert len(people(tmp_path / "walk_0.html")) == 1
+    assert json.loads(done.stdout)["together"] == [str(tmp_path / "walk.html")]
+
+
+def test_view_shows_several_results_together(tmp_path):
+    for name in ("a.npz", "b.npz"):
+        save(walk_result(4, name=name), tmp_path / name)
+    run("view", tmp_path / "a.npz", tmp_path / "b.npz")
+    assert [p["name"] for p in people(tmp_path / "a.html")] == ["a.npz", "b.npz"]
+    done = run("view", tmp_path / "a.npz", tmp_path / "b.npz", "-o", tmp_path / "c.csv", code=2)
+    assert "several people in one file go to" in done.stderr
