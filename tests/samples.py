@@ -13,7 +13,7 @@ import torch
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths
 from kcs_torch.nn import PostureEnergy
-from kcs_torch.types import Diagnostics, Reconstruction
+from kcs_torch.types import Diagnostics, Motion, Reconstruction
 
 
 def walk_result(num_frames=12, *, skeleton="coco17", dtype=torch.float64, fps=25.0, uncertain=True, name="walk.npz"):
@@ -34,6 +34,11 @@ def walk_result(num_frames=12, *, skeleton="coco17", dtype=torch.float64, fps=25
         uncertainty=clip.points[..., 2].abs() + 1 if uncertain else None,
         units="m",
     )
+
+
+def walking_motion(num_frames=12, skeleton="coco17"):
+    """The same person of 1.75 m as motion, y up, in metres."""
+    return Motion.of(walk_result(num_frames, skeleton=skeleton).scaled(units="m", factor=1e-3))
 
 
 def walk_in_template_units(num_frames=40, *, skeleton="h36m17", dtype=torch.float64, **options):

@@ -17,7 +17,7 @@ from kcs_torch.types import Motion
 
 __all__ = ["build_motion", "distinct", "numbers", "read_lines"]
 
-LIMIT = 2**29  # bytes of a text file
+LIMIT = 2**28  # bytes of a text file
 
 
 def build_motion(
@@ -106,7 +106,7 @@ def read_lines(path: Path, *, strip: bool = True) -> list[str]:
     """The lines of a text file, stripped unless told otherwise.
 
     Raises:
-        FormatError: it cannot be read, or is larger than 512 MiB.
+        FormatError: it cannot be read, or is larger than 256 MiB.
     """
     try:
         size = path.stat().st_size

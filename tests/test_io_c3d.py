@@ -1,0 +1,91 @@
+"""C3D files: a real one, our own read back, and damaged ones, which must not take this process down."""
+
+import random
+from dataclasses import replace
+
+import ezc3d
+import numpy as np
+import pytest
+import torch
+from samples import walking_motion as walk
+
+import kcs_torch as kt
+from kcs_torch.errors import FormatError, OutputError
+from kcs_torch.io import detect_motion_format, load_motion, save
+
+
+def test_real_file(shared):
+    path = shared / "data" / "raw_formats" / "c3d" / "runway03.c3d"
+    motion = load_motion(path)
+    assert (motion.num_frames, motion.num_joints, motion.fps, motion.units) == (379, 12, 200, "mm")
+    assert motion.skeleton.joints[:3] == ("RCrest", "RHip", "RMTP")
+    assert "never seen, left out: *12, *13, *14, *15" in motion.notes
+    points = ezc3d.c3d(str(path))["data"]["points"][:3, :12].transpose(2, 1, 0)
+    assert np.allclose(motion.points.numpy(), points[..., [0, 2, 1]] * [1, 1, -1])  # z is up, as the file says
+    shoulder, ankle = motion.skeleton.index("RShoulder"), motion.skeleton.index("RAnkle")
+    assert bool((motion.points[:, shoulder, 1] > motion.points[:, ankle, 1]).all())
+    assert torch.allclose(load_motion(path, up="y").points, torch.from_numpy(points))
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_what_is_written_is_read_back(tmp_path, up):
+    motion = walk()
+    weights = motion.weights.clone()
+    weights[3, 4] = 0
+    motion = replace(motion, weights=weights, points=motion.points * weights[..., None])
+    path = save(motion, tmp_path / "w.c3d", up=up)
+    back = load_motion(path)  # which reads the axes from the file
+    assert torch.allclose(back.points, 1000 * motion.points, rtol=1e-6, atol=1e-4)
+    assert torch.equal(back.seen, motion.seen)
+    assert (back.skeleton, back.fps, back.units) == (motion.skeleton, 25, "mm")
+    raw = ezc3d.c3d(str(path))["data"]["points"][:3].transpose(2, 1, 0)
+    assert np.nanmax(raw[..., "xyz".index(up)]) == pytest.approx(1000 * float(motion.points[..., 1].max()), rel=1e-5)
+
+
+def test_too_many_joints_are_refused(tmp_path):
+    motion = kt.Motion.from_arrays(torch.zeros(2, 300, 3), fps=30, units="m")
+    with pytest.raises(OutputError, match="up to 255 joints"):
+        save(motion, tmp_path / "w.c3d")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_only_begins_like_one(tmp_path):
+    path = tmp_path / "x.c3d"
+    path.write_bytes(b"\x02\x50" + bytes(510))
+    with pytest.raises(FormatError, match=r"x.c3d: damaged"):
+        load_motion(path)
+    path.write_bytes(b"\x02\x50" + bytes(2000))  # the parameters' own header is not one
+    with pytest.raises(FormatError, match="got something else"):
+        detect_motion_format(path)
+
+
+def test_damaged_files_end_in_our_errors(tmp_path):
+    good = save(walk(4), tmp_path / "w.c3d").read_bytes()
+    outcomes = []
+    for seed in range(10):  # each costs the start of a process
+        pick = random.Random(seed)
+        data = bytearray(good)
+        for _ in range(20):
+            data[pick.randrange(2, len(data) if seed % 2 else 1024)] = pick.randrange(256)
+        (tmp_path / "m.c3d").write_bytes(data[: len(data) // 2] if seed == 0 else data)
+        try:
+            outcomes.append(load_motion(tmp_path / "m.c3d", format="c3d").points.isfinite().all())
+        except kt.KcsError as error:
+            assert "m.c3d" in str(error)
+            outcomes.append(None)
+    assert None in outcomes
+
+
+def test_a_crash_of_the_library_is_an_error_of_the_file(tmp_path, monkeypatch):
+    from kcs_torch.io.formats import c3d
+
+    path = save(walk(4), tmp_path / "w.c3d")
+    worker = tmp_path / "c3d_worker.py"
+    worker.write_text("import os; os.abort()")
+    monkeypatch.setattr(c3d, "__file__", str(tmp_path / "formats" / "c3d.py"))
+    with pytest.raises(FormatError, match="ezc3d failed on it: it ended with status -6"):
+        load_motion(path)
+    worker.write_text("import time; time.sleep(60)")
+    monkeypatch.setattr(c3d, "PATIENCE", 0.3)
+    with pytest.raises(FormatError, match="gave no answer"):
+        load_motion(path)

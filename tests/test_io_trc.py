@@ -1,0 +1,113 @@
+"""TRC files: real ones, our own, and damaged ones."""
+
+import random
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from samples import walking_motion as walk
+
+import kcs_torch as kt
+from kcs_torch.errors import FormatError
+from kcs_torch.io import load_motion, save
+
+HEAD = """PathFileType\t4\t(X/Y/Z)\tx.trc
+DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames
+60\t60\t2\t2\tmm\t60\t1\t2
+Frame#\tTime\tHip\t\t\tKnee\t\t
+\t\tX1\tY1\tZ1\tX2\tY2\tZ2
+"""
+ROWS = "1\t0.0\t1\t2\t3\t4\t5\t6\n2\t0.016\t1\t2\t3\t\t\t\n"
+
+
+def write(folder, text):
+    path = folder / "x.trc"
+    path.write_text(text)
+    return path
+
+
+def test_cells_by_hand(tmp_path):
+    motion = load_motion(write(tmp_path, HEAD + "\n" + ROWS))
+    assert motion.points.tolist() == [[[1, 2, 3], [4, 5, 6]], [[1, 2, 3], [0, 0, 0]]]
+    assert motion.seen.tolist() == [[True, True], [True, False]]
+    assert (motion.fps, motion.units, motion.skeleton.joints) == (60, "mm", ("Hip", "Knee"))
+    assert load_motion(write(tmp_path, HEAD + ROWS.replace("\t\t\t\n", "\n"))).seen.tolist()[1] == [True, False]
+    assert torch.equal(
+        load_motion(write(tmp_path, HEAD.replace("\t", ",") + ROWS.replace("\t", ","))).points, motion.points
+    )
+    nan = load_motion(write(tmp_path, HEAD + ROWS.replace("\t4\t5\t6", "\tNaN\tNaN\tNaN")))
+    assert nan.seen.tolist() == [[True, False], [True, False]]
+    assert load_motion(tmp_path / "x.trc", up="z").points[0, 0].tolist() == [1, 3, -2]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (HEAD, "a line a frame below the names"),
+        (HEAD + "1\t0\t1\t2\tthree\t4\t5\t6\n", "line 6: expected numbers, got 'three'"),
+        (HEAD + ROWS + "3\t0\t1\t2\tinf\t4\t5\t6\n", "line 8: expected numbers, got 'inf'"),
+        (HEAD + "1\t0\t1\t2\t3\t4\t5\t6\t7\n", "line 6: expected 6 numbers of 2 markers, got 7"),
+        (HEAD.replace("Frame#", "Bild"), "a line that begins with Frame#"),
+        (HEAD.replace("Hip\t\t\tKnee", ""), "line 4: expected names of markers"),
+        (HEAD.replace("60\t60", "fast\t60") + ROWS, "line 3: DataRate: expected numbers, got 'fast'"),
+        ("PathFileType", "a line that begins with Frame#"),
+    ],
+)
+def test_damage_is_named(tmp_path, text, message):
+    with pytest.raises(FormatError, match=message):
+        load_motion(write(tmp_path, text))
+
+
+def test_the_header_is_not_believed(tmp_path):
+    motion = load_motion(write(tmp_path, HEAD.replace("60\t2\t2", "60\t999999999\t2") + ROWS))
+    assert motion.num_frames == 2
+    assert "the header tells 999999999 frames, the file has 2" in motion.notes
+
+
+def test_real_files(shared):
+    folder = shared / "data" / "raw_formats" / "trc"
+    raw = load_motion(folder / "S00_P00_T01_BalancingTrial_0-100.trc")
+    assert (raw.num_frames, raw.num_joints, raw.fps, raw.units) == (100, 21, 60, "m")
+    head, ankle = raw.skeleton.index("Head"), raw.skeleton.index("RAnkle")
+    assert float((raw.points[:, head, 1] - raw.points[:, ankle, 1]).mean()) > 1.2
+    table = np.loadtxt(folder / "S00_P00_T01_BalancingTrial_0-100.trc", skiprows=5, delimiter="\t", usecols=range(65))
+    assert np.array_equal(raw.points.numpy().reshape(100, -1), table[:, 2:])
+    markers = load_motion(folder / "pyomeca_markers.trc")
+    assert (markers.num_joints, markers.units) == (51, "mm")
+    assert "the header tells 652 frames, the file has 93" in markers.notes
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    motion = walk()
+    weights = motion.weights.clone()
+    weights[3, 4] = 0
+    motion = replace(motion, weights=weights, points=motion.points * weights[..., None])
+    back = load_motion(save(motion, tmp_path / "walk one.trc"))
+    assert torch.allclose(back.points, motion.points, atol=1e-8)
+    assert torch.equal(back.seen, motion.seen)
+    assert back.skeleton == motion.skeleton  # found by the names
+    lines = (tmp_path / "walk one.trc").read_text().split("\n")
+    assert lines[0] == "PathFileType\t4\t(X/Y/Z)\twalk_one.trc"
+    assert lines[2].split("\t") == ["25", "25", "12", "19", "m", "25", "1", "12"]
+    assert {len(line.split("\t")) for line in lines[6:-1]} == {2 + 3 * 19}
+    upright = load_motion(save(motion, tmp_path / "z.trc", up="z"), up="z")
+    assert torch.allclose(upright.points, motion.points, atol=1e-8)
+
+
+def test_mutated_files_end_in_our_errors(tmp_path):
+    text = save(walk(4), tmp_path / "w.trc").read_text()
+    read = 0
+    for seed in range(150):
+        pick = random.Random(seed)
+        letters = list(text)
+        for _ in range(pick.choice([1, 2, 8])):
+            at = pick.randrange(len(letters))
+            letters[at : at + pick.choice([0, 1, 30])] = pick.choice(["", "\t", "\n", "x", "nan", "1e999", "-", "\0"])
+        (tmp_path / "m.trc").write_text("".join(letters))
+        try:
+            assert load_motion(tmp_path / "m.trc").points.isfinite().all()
+            read += 1
+        except kt.KcsError as error:
+            assert "m.trc" in str(error)
+    assert 0 < read < 150
