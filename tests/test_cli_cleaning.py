@@ -116,7 +116,7 @@ MISTAKES = {
     "smooth of nothing": (["--smooth", "savgol="], "such as butterworth=6"),
     "smooth too fast": (["--smooth", "butterworth=15"], "15 Hz, got 15"),
     "smooth-3d": (["--smooth-3d", "median=3"], "method for --smooth-3d 'median'"),
-    "frames": (["--frames", "30"], "such as 100:400, 100: or :400, got '30'"),
+    "frames": (["--frames", "30"], "such as 100:400, 100: or :400, or seen, got '30'"),
     "frames backwards": (["--frames", "30:20"], "A below B"),
     "frames of a word": (["--frames", "a:b"], "got 'a:b'"),
     "frames beyond": (["--frames", "60:"], "within 0:60"),

@@ -168,8 +168,8 @@ def test_where_the_detector_goes_over_to_somebody_else_a_new_track_begins(video,
     first, second = detect_video(video.path)
     assert np.flatnonzero(first.seen.any(1)).tolist() == list(range(25))
     assert np.flatnonzero(second.seen.any(1)).tolist() == list(range(25, 40))
-    assert "in sight from frame 0 to 24 only: --frames 0:25 leaves the rest out" in first.notes
-    assert "in sight from frame 25 to 39 only: --frames 25:40 leaves the rest out" in second.notes
+    assert "in sight from frame 0 to 24 only: `kcs-torch lift --frames seen` leaves the rest out" in first.notes
+    assert "in sight from frame 25 to 39 only: `kcs-torch lift --frames seen` leaves the rest out" in second.notes
 
 
 def test_two_hands_are_followed(video, mediapipe):
@@ -543,6 +543,14 @@ def test_lift_of_a_video(video, two_people):
     assert any(note.startswith("MediaPipe Pose on 20 frames") for note in person["notes"])
     assert [note.split(":")[0] for note in person["cleaning"]] == ["gate"]
     np.testing.assert_allclose(kt.load_tracks(out).points[:, :33], two_people[2:22], atol=1e-6)
+
+
+def test_lift_of_the_frames_in_which_somebody_is_in_sight(video, two_people):
+    out = video.folder / "walk.npz"
+    words = ["--person", 1, "--frames", "seen", "-m", "sfam", "--json"]
+    (person,) = json.loads(run("lift", video.path, "-o", out, *words).stdout)["people"]
+    assert person["cleaning"] == ["trim: frames 25 to 39 of 40"]
+    np.testing.assert_allclose(kt.load_tracks(out).points[:, :33], two_people[25:], atol=1e-6)
 
 
 def test_lift_of_a_video_by_ones_own_models(video, rtmlib):

@@ -10,7 +10,9 @@ import typer
 if TYPE_CHECKING:
     from kcs_torch.types import Reconstruction, Tracks
 
-__all__ = ["Fill", "Frames", "Gate", "Resample", "Smooth", "Smooth3D", "cleaner", "finisher", "frame_range"]
+__all__ = ["SEEN", "Fill", "Frames", "Gate", "Resample", "Smooth", "Smooth3D", "cleaner", "finisher", "frame_range"]
+
+SEEN = "seen"
 
 _PANEL = "Cleaning (nothing of this happens unasked; each step is told in the report)"
 
@@ -18,8 +20,9 @@ Frames = Annotated[
     str | None,
     typer.Option(
         "--frames",
-        metavar="A:B",
-        help="Take frames A to B, counted from 0, B not included; A: and :B go to the ends.",
+        metavar="A:B|seen",
+        help="Take frames A to B, counted from 0, B not included (A: and :B go to the ends), or those from the first "
+        "to the last in which the person is in sight.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -58,19 +61,19 @@ Smooth3D = Annotated[
 
 
 def frame_range(text: str | None) -> tuple[int, int | None]:
-    """Read ``100:400``, ``100:`` or ``:400``.
+    """Read ``100:400``, ``100:`` or ``:400``; all frames for ``seen``, which depends on the person.
 
     Raises:
         OptionError: it is something else.
     """
     from kcs_torch.errors import OptionError
 
-    if text is None:
+    if text is None or text == SEEN:
         return 0, None
     first, colon, last = text.strip().partition(":")
     plain = all(part == "" or (part.isascii() and part.isdigit()) for part in (first, last))
     if not colon or not plain or (last and int(last) <= int(first or 0)):
-        raise OptionError(f"--frames: expected A:B with A below B, such as 100:400, 100: or :400, got {text!r}")
+        raise OptionError(f"--frames: expected A:B, A below B, such as 100:400, 100: or :400, or seen, got {text!r}")
     return int(first or 0), int(last) if last else None
 
 
@@ -88,7 +91,10 @@ def cleaner(
     def clean(tracks: Tracks) -> Tracks:
         from kcs_torch import clean as step
 
-        if frames is not None:
+        if frames == SEEN:
+            seen = tracks.seen.any(1).nonzero().flatten()
+            tracks = step.trim(tracks, int(seen[0]), int(seen[-1]) + 1)
+        elif frames is not None:
             tracks = step.trim(tracks, start, stop)
         if gate:
             tracks = step.gate(tracks)

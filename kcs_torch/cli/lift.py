@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kcs_torch.cli.cleaning import Fill, Frames, Gate, Resample, Smooth, Smooth3D, cleaner, finisher
+from kcs_torch.cli.cleaning import SEEN, Fill, Frames, Gate, Resample, Smooth, Smooth3D, cleaner, finisher
 from kcs_torch.cli.detect import DetectorName, Models, What, numbered, people_of
 from kcs_torch.cli.options import (
     AsJson,
@@ -107,7 +107,7 @@ def lift(
         person_number(person)
         finish = finisher(smooth_3d)
         if format is None and _is_video(tracks):
-            clean = cleaner(None, gate, fill, smooth, resample)
+            clean = cleaner(SEEN if frames == SEEN else None, gate, fill, smooth, resample)
             people = people_of(
                 tracks,
                 person,

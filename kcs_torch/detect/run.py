@@ -109,10 +109,8 @@ def _remarks(tracks: Tracks, start: int) -> list[str]:
     seen = tracks.seen.any(1).nonzero().flatten()
     first, last = int(seen[0]), int(seen[-1])
     if last - first + 1 < _MOSTLY * tracks.num_frames:
-        span = f"{start + first}:{start + last + 1}"
-        remarks.append(
-            f"in sight from frame {start + first} to {start + last} only: --frames {span} leaves the rest out"
-        )
+        span = f"from frame {start + first} to {start + last}"
+        remarks.append(f"in sight {span} only: `kcs-torch lift --frames seen` leaves the rest out")
     if tracks.fps is None:
         remarks.append("the video does not say its frame rate: give fps=... (--fps)")
     return remarks
