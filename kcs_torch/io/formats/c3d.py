@@ -66,6 +66,8 @@ def read(path: Path, options: MotionOptions) -> Motion:
 def _ask(path: Path) -> tuple[dict[str, Any], np.ndarray[Any, np.dtype[np.float64]]]:
     """Let the worker read."""
     need("ezc3d", f"{path}: C3D", FormatError)
+    if not path.is_file():
+        raise FormatError(f"{path}: expected a C3D file, got a folder or the beginning of a name")
     worker = Path(__file__).parents[1] / "c3d_worker.py"
     places = os.pathsep.join(p for p in sys.path if p)  # where this process would find ezc3d
     try:
