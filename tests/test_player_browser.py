@@ -98,6 +98,18 @@ def test_everything_is_on_one_screen(page, result):
     assert browser.run("document.documentElement.scrollHeight") <= 720
 
 
+def test_pictures_keep_their_shape_when_the_window_changes(page, result):
+    browser = page(result)
+    shapes = "[...document.querySelectorAll('canvas')].map(c => [c.width, c.height, c.clientWidth, c.clientHeight])"
+    before = browser.run(shapes)
+    browser.run("document.querySelector('details').open = true")
+    browser.settle()
+    browser.settle()
+    after = browser.run(shapes)
+    assert after != before
+    assert all(a == c and b == d for a, b, c, d in after)
+
+
 def test_play_and_pause(page, result):
     browser = page(result)
     before = picture(browser)

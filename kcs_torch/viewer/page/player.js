@@ -136,12 +136,13 @@ measureImage();
 [state.yaw, state.pitch] = VIEWS.three;
 refit();
 let size = "";
-new ResizeObserver(() => {  // a window of another shape is filled anew
+const resized = new ResizeObserver(() => {  // a picture of another shape is filled anew
   const now = `${byId("space").clientWidth} ${byId("space").clientHeight}`;
   if (size && now !== size) fit();
   size = now;
   redraw();
-}).observe(document.body);
+});
+document.querySelectorAll("canvas").forEach(canvas => resized.observe(canvas));
 // For scripts and for tests of the page.
 window.player = {
   state, show, play: () => setPlaying(true), pause: () => setPlaying(false),
