@@ -22,6 +22,7 @@ from kcs_torch.cli.options import (
     person_number,
     use_one_thread,
 )
+from kcs_torch.cli.outputs import Scale, Units, Up, check_up, parse_scale, sized, write_files
 from kcs_torch.cli.report import answer, describe, print_json, progress, summary
 
 if TYPE_CHECKING:
@@ -91,6 +92,9 @@ def lift(
     smooth: Smooth = None,
     resample: Resample = None,
     smooth_3d: Smooth3D = None,
+    up: Up = None,
+    scale: Scale = None,
+    units: Units = None,
     detector: DetectorName = "auto",
     models: Models = [],  # noqa: B006
     what: What = "pose",
@@ -106,6 +110,8 @@ def lift(
             fields["intrinsics"] = _lens(intrinsics)
         person_number(person)
         finish = finisher(smooth_3d)
+        size_of = parse_scale(scale)
+        check_up(up, output)
         if format is None and _is_video(tracks):
             clean = cleaner(SEEN if frames == SEEN else None, gate, fill, smooth, resample)
             people = people_of(
@@ -142,10 +148,12 @@ def lift(
             names = [numbered(path, number) if person == "all" else path for path in output]
             check_outputs(names, source=tracks)
             cleaned = clean(one)
-            result = _lift_one(cleaned, method, fields, mirror, finish, names)
+            result = sized(_lift_one(cleaned, method, fields, mirror, finish), size_of)
+            told = write_files(result, names, up, units)
             if together:
                 results.append(result)
             reports.append(summary(result))
+            reports[-1]["notes"] += told
             reports[-1]["cleaning"] = list(cleaned.notes[len(one.notes) :])
             if not as_json:
                 typer.echo(describe(reports[-1]))
@@ -213,17 +221,12 @@ def _lift_one(
     fields: dict[str, Any],
     mirror: bool,
     finish: Callable[[Reconstruction], Reconstruction],
-    outputs: list[Path],
 ) -> Reconstruction:
-    """Reconstruct one person and write the result."""
+    """Reconstruct one person."""
     import kcs_torch as kt
 
     with progress(f"reconstructing {tracks.num_frames} frames of {tracks.num_joints} joints"):
         result = kt.reconstruct(tracks, method=method, **fields)
     if mirror:
         result = result.mirrored()
-    result = finish(result)
-    for path in outputs:
-        with progress(f"writing {path}"):
-            result.save(path)
-    return result
+    return finish(result)

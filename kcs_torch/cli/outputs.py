@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _Sized = TypeVar("_Sized", "Motion", "Reconstruction")
 
-__all__ = ["Scale", "Units", "Up", "parse_scale", "sized", "write_files"]
+__all__ = ["Scale", "Units", "Up", "check_up", "parse_scale", "sized", "write_files"]
 
 Up = Annotated[
     str | None,
@@ -76,6 +76,31 @@ def sized(data: _Sized, scale: dict[str, Any] | None) -> _Sized:
     return data if scale is None else data.scaled(**scale)
 
 
+def check_up(up: str | None, paths: Sequence[Path]) -> None:
+    """Make sure that the axis that shall point up is one, and that a file holds it.
+
+    Raises:
+        OptionError: it is none, or results do not go so to any of the files.
+    """
+    from kcs_torch.errors import OptionError, unknown
+    from kcs_torch.io.write import UP
+
+    if up is None:
+        return
+    if up not in UP:
+        raise unknown("axis for --up", up, UP)
+    if not any(map(_turns, paths)):
+        raise OptionError(f"--up: expected a .bvh, .c3d, .csv or .trc file to write, got {', '.join(map(str, paths))}")
+
+
+def _turns(path: Path) -> bool:
+    """Whether a result goes to this file with y or z up."""
+    from kcs_torch.io import writer_for
+
+    writer = writer_for(path)
+    return writer.turns or writer.write is None
+
+
 def write_files(
     data: Reconstruction | Motion | Tracks, paths: Sequence[Path], up: str | None = None, units: str | None = None
 ) -> list[str]:
@@ -84,20 +109,16 @@ def write_files(
     Raises:
         OptionError: an axis is asked for, but no file is of a kind that takes it.
     """
-    from kcs_torch.errors import OptionError
-    from kcs_torch.io import save, writer_for
+    from kcs_torch.io import save
     from kcs_torch.types import Reconstruction
 
-    def turns(path: Path) -> bool:
-        writer = writer_for(path)
-        return not isinstance(data, Reconstruction) or writer.turns or writer.write is None
-
-    if up is not None and not any(map(turns, paths)):
-        raise OptionError(f"--up: expected a .bvh, .c3d, .csv or .trc file to write, got {', '.join(map(str, paths))}")
+    if isinstance(data, Reconstruction):
+        check_up(up, paths)
     told = []
     for path in paths:
         notes: list[str] = []
+        fits = not isinstance(data, Reconstruction) or _turns(path)
         with progress(f"writing {path}"):
-            save(data, path, up=up if turns(path) else None, units=units, notes=notes)
+            save(data, path, up=up if fits else None, units=units, notes=notes)
         told += [f"{path}: {note}" for note in notes]
     return told
