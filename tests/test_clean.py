@@ -8,6 +8,8 @@ import pytest
 import scipy.interpolate
 import scipy.signal
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import kcs_torch as kt
 from kcs_torch.clean.common import runs
@@ -103,6 +105,23 @@ def test_savgol_is_scipys_and_its_gain_at_the_cutoff_is_near_3_db():
     np.testing.assert_allclose(smoothed.points, scipy.signal.savgol_filter(points, window, 3, axis=0), atol=1e-9)
     _, response = scipy.signal.freqz(scipy.signal.savgol_coeffs(window, 3), worN=[5.0], fs=FPS)
     assert abs(response[0]) == pytest.approx(math.sqrt(0.5), abs=0.12)
+
+
+@pytest.mark.parametrize("cutoff", [0.05, 0.3, 1.0, 2.0, 5.0, 9.0, 12.0])
+def test_savgol_takes_the_window_whose_gain_is_nearest(cutoff):
+    note = kt.clean.smooth(tracks_of(sine(1.0)), "savgol", cutoff).notes[-1]
+    window = int(note.split("over ")[1].split()[0])
+    windows = range(5, 2 * round(3 * FPS / cutoff) + 9, 2 if cutoff > 0.3 else 40)
+
+    def miss(length):
+        _, response = scipy.signal.freqz(scipy.signal.savgol_coeffs(length, 3), worN=[cutoff], fs=FPS)
+        return abs(abs(response[0]) - math.sqrt(0.5))
+
+    assert miss(window) <= min(miss(length) for length in windows) + 1e-9
+
+
+def test_savgol_near_half_the_frame_rate_is_the_shortest():
+    assert "over 5 frames" in kt.clean.smooth(tracks_of(sine(1.0)), "savgol", 24.9).notes[-1]
 
 
 def test_smooth_solves_its_weighted_problem():
@@ -425,3 +444,46 @@ def test_runs(pattern):
         assert stop == len(seen) or not seen[stop]
         covered[start:stop] = True
     np.testing.assert_array_equal(covered, seen)
+
+
+@st.composite
+def wild_tracks(draw):
+    """Tracks of any length, with any gaps, weights and sizes."""
+    frames, joints = draw(st.integers(1, 40)), draw(st.integers(2, 4))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    points = rng.normal(size=(frames, joints, 2)) * 10.0 ** draw(st.integers(-30, 30))
+    if draw(st.booleans()):
+        points = np.round(points / np.abs(points).max())  # many equal values
+    weights = rng.uniform(size=(frames, joints)) * (rng.uniform(size=(frames, joints)) < draw(st.floats(0.05, 1)))
+    weights[rng.integers(frames), rng.integers(joints)] = 1.0
+    return tracks_of(points, weights, fps=draw(st.sampled_from([1.0, 24.0, 30.0, 1000.0])))
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    wild_tracks(), st.sampled_from(kt.clean.SMOOTHERS), st.floats(0.001, 0.499), st.integers(1, 50), st.floats(0.3, 3)
+)
+def test_wild_tracks_stay_tracks(tracks, method, cutoff, longest, factor):
+    """Every step gives finite points, weights that keep their rule, and one more note; or says that nothing is left."""
+    steps = {
+        "gate": kt.clean.gate,
+        "smooth": lambda t: kt.clean.smooth(t, method, cutoff * t.fps),
+        "fill": lambda t: kt.clean.fill(t, longest),
+        "resample": lambda t: kt.clean.resample(t, factor * t.fps),
+    }
+    for name, step in steps.items():
+        try:
+            cleaned = step(tracks)
+        except kt.ShapeError as error:
+            assert "no joint is left seen" in str(error)
+            continue
+        assert bool(cleaned.points.isfinite().all()) and bool((cleaned.points[~cleaned.seen] == 0).all())
+        assert bool((cleaned.weights >= 0).all() and (cleaned.weights <= 1).all())
+        assert cleaned.notes[:-1] == tracks.notes and cleaned.notes[-1].startswith(name)
+        if name == "smooth":
+            torch.testing.assert_close(cleaned.weights, tracks.weights, rtol=0, atol=0)
+        if name == "gate":
+            assert not bool((cleaned.seen & ~tracks.seen).any())
+        if name == "fill":
+            assert not bool((tracks.seen & ~cleaned.seen).any())
+            torch.testing.assert_close(cleaned.points[tracks.seen], tracks.points[tracks.seen], rtol=0, atol=0)

@@ -53,17 +53,24 @@ def savgol(cutoff: float, fps: float, size: float) -> Filter:
     """Savitzky-Golay: a cubic through as many frames as bring its gain at the cut-off nearest to -3 dB."""
     from scipy.signal import savgol_coeffs, savgol_filter
 
-    def gain(window: int, frequency: float) -> float:
-        taps = savgol_coeffs(window, _SAVGOL_DEGREE)
-        return float(taps @ np.cos(2 * math.pi * frequency / fps * (np.arange(window) - window // 2)))
+    def gain(half: int) -> float:
+        taps = savgol_coeffs(2 * half + 1, _SAVGOL_DEGREE)
+        return float(taps @ np.cos(2 * math.pi * cutoff / fps * np.arange(-half, half + 1)))
 
-    longest = 2 * math.ceil(fps / cutoff) + 7
-    window = min(range(5, longest + 1, 2), key=lambda w: abs(gain(w, cutoff) - math.sqrt(0.5)))
+    # The gain falls with the window's length until far below -3 dB; twice Schafer's estimate (2011) is beyond that.
+    below, above = 2, math.ceil(1.25 * fps / cutoff) + 4
+    while above - below > 1:
+        middle = (below + above) // 2
+        below, above = (middle, above) if gain(middle) > math.sqrt(0.5) else (below, middle)
+    half = 2  # the shortest that a cubic smooths: nothing cuts at a higher frequency
+    if gain(half) > math.sqrt(0.5):
+        half = min(below, above, key=lambda h: abs(gain(h) - math.sqrt(0.5)))
+    window = 2 * half + 1
 
     def smooth(values: Array) -> Array:
         return np.asarray(savgol_filter(values, window, _SAVGOL_DEGREE, axis=0))
 
-    words = f"Savitzky-Golay, a cubic over {window} frames, gain {gain(window, cutoff):.2f} at {cutoff:g} Hz"
+    words = f"Savitzky-Golay, a cubic over {window} frames, gain {gain(half):.2f} at {cutoff:g} Hz"
     return Filter(words, window, _weighted(smooth))
 
 
