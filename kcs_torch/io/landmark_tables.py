@@ -124,6 +124,7 @@ def _layout(
             joints = body.joints[: body.num_observed]
             if set(marks) == set(joints) or (body.name == "mediapipe33" and set(marks) < set(joints)):
                 names = joints
+                break
     keys = list(marks) if names is None else list(names)
     blank: dict[str, int] = {}
     columns = []

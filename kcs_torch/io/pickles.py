@@ -52,7 +52,7 @@ class _Array:
 
     def __setstate__(self, state: Any) -> None:
         _, shape, kind, columns_first, raw = state
-        if kind.holds_objects:
+        if kind.holds_objects and isinstance(raw, list):
             self.value = raw[0] if tuple(shape) == () else list(raw)
         else:
             self.value = kind.array(raw).reshape(shape, order="F" if columns_first else "C")

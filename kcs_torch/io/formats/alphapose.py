@@ -34,7 +34,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
     """Read everybody, by the file's track ids or linked over the frames."""
     data = read_json(path)
     notes: list[str] = []
-    images: dict[str, list[Sighting]] = {}
+    images: dict[str, list[Sighting]] = {name: [] for name in data} if isinstance(data, dict) else {}
     for where, image, person, key in _people(data, path):
         here = f"{where} (image {as_text(image)}): '{key}'"
         if key not in person:

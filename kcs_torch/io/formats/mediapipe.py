@@ -50,7 +50,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
         raise FormatError(f"{path}: expected a file of landmarks, got a folder")
     if probe.head.startswith(b"\x93NUMPY"):
         found = read_npy(path)
-    elif outline(probe.head):
+    elif outline(probe.head) or probe.suffix == ".json":
         found = read_landmarks_json(path)
     else:
         found = read_csv(path)

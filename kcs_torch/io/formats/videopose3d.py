@@ -48,7 +48,10 @@ def read(path: Path, options: Options) -> list[Tracks]:
     size = sum(array.nbytes for _, array in sequences)
     if size > file.members[_KEY].file_size:  # one array many times, or one whose numbers are not in the file
         raise FormatError(f"{path}: '{_KEY}' claims {size} bytes of arrays, more than it holds: refused")
-    meta = file.objects("metadata") if "metadata" in file else None
+    try:
+        meta = file.objects("metadata")
+    except FormatError:  # it only helps to tell the skeleton
+        meta = None
     return [_tracks(array, where, meta, path, options) for where, array in sequences]
 
 

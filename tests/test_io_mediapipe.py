@@ -1,0 +1,367 @@
+"""MediaPipe landmarks: JSON, CSV and NPY; the size of the image, visibility, hands, and files that are none."""
+
+import json
+
+import numpy as np
+import pytest
+from samples import mediapipe_frames, person, write_json, write_mediapipe_csv, write_npy
+
+from kcs_torch.errors import FormatError, KcsError
+from kcs_torch.io import detect_format, load_people, load_tracks
+from kcs_torch.skeleton import SKELETONS
+
+SIZE = (1000, 1000)
+NAMES = SKELETONS["mediapipe33"].joints[:33]
+POSE, HAND = person(4, 33), person(4, 21)
+SEEN = 0.3 + 0.7 * 0.8  # the weight of the samples' visibility
+
+
+def marks(pose, visibility=True):
+    """One person's landmarks, shares of an image of 1000 pixels."""
+    return [
+        {"x": x / 1000, "y": y / 1000, "z": 0.0} | ({"visibility": v} if visibility else {})
+        for x, y, v in np.asarray(pose).tolist()
+    ]
+
+
+def read(tmp_path, data, **options):
+    path = write_json(tmp_path / "a.json", data)
+    assert detect_format(path) == "mediapipe"
+    return load_people(path, image_size=SIZE, **options)
+
+
+def same(tracks, points):
+    return np.allclose(tracks.points[:, : points.shape[1]], points[..., :2])
+
+
+# ---------------------------------------------------------------------- size and visibility
+
+
+def test_shares_of_the_image_need_its_size(tmp_path):
+    path = write_json(tmp_path / "a.json", mediapipe_frames())
+    with pytest.raises(FormatError, match=r"a\.json: .*image_size=\(width, height\), .*--image-size 1920x1080"):
+        load_tracks(path)
+    tracks = load_tracks(path, image_size=(1000, 500), fps=30)
+    assert np.allclose(tracks.points[:, :33], POSE[..., :2] * [1, 0.5])
+    assert (tracks.skeleton.name, tracks.fps, tracks.units) == ("mediapipe33", 30, "px")
+
+
+def test_the_file_may_tell_the_size_and_the_rate(tmp_path):
+    for sides in (
+        {"width": 1000, "height": 500},
+        {"image_size": [1000, 500]},
+        {"image_width": 1000, "image_height": 500},
+    ):
+        path = write_json(tmp_path / "a.json", {**sides, "fps": 25, "frames": mediapipe_frames()})
+        tracks = load_tracks(path)
+        assert np.allclose(tracks.points[:, :33], POSE[..., :2] * [1, 0.5])
+        assert tracks.fps == 25
+    assert same(load_tracks(path, image_size=SIZE, fps=50), POSE)
+    path = write_json(tmp_path / "a.json", {"width": -3, "height": "x", "fps": True, "frames": mediapipe_frames()})
+    assert load_tracks(path, image_size=SIZE).fps is None
+
+
+def test_pixels_stay_pixels(tmp_path):
+    for options in ({}, {"image_size": (640, 480)}):
+        tracks = load_tracks(write_json(tmp_path / "a.json", mediapipe_frames(size=1000)), **options)
+        assert same(tracks, POSE)
+        assert "the coordinates are pixels already" in tracks.notes
+
+
+def test_what_is_hidden_is_not_unseen_unless_out_of_the_image(tmp_path):
+    pose = POSE.copy()
+    pose[0, 5, 2], pose[0, 6, 2], pose[0, 7, 2] = 0.0, 1.0, 0.5
+    pose[0, 8] = 200, 1020, 0.2  # below the image's edge
+    pose[0, 9] = 200, 1020, 0.9
+    (tracks,) = read(tmp_path, [marks(p) for p in pose])
+    assert tracks.weights[0, 5:10].tolist() == pytest.approx([0.3, 1.0, 0.65, 0.0, 0.9])
+    assert tracks.weights[1, :33].numpy() == pytest.approx(SEEN)
+    assert any(n.startswith("visibility v tells what is hidden") for n in tracks.notes)
+    (strict,) = read(tmp_path, [marks(p) for p in pose], threshold=0.5)
+    assert strict.weights[0, 5:8].tolist() == pytest.approx([0.0, 1.0, 0.65])
+
+
+@pytest.mark.parametrize("visibility", [None, 0.0], ids=["absent", "zero everywhere"])
+def test_no_visibility_is_full_confidence(tmp_path, visibility):
+    pose = POSE if visibility is None else POSE * [1, 1, 0]
+    (tracks,) = read(tmp_path, [marks(p, visibility is not None) for p in pose])
+    assert (tracks.weights == 1).all()
+    assert not any("visibility" in n for n in tracks.notes)
+
+
+# ---------------------------------------------------------------------- JSON
+
+LAYOUTS = {
+    "dictionaries": lambda p: {"pose_landmarks": marks(p)},
+    "web": lambda p: {"poseLandmarks": marks(p), "poseWorldLandmarks": marks(p)},
+    "tasks, a list a person": lambda p: {"pose_landmarks": [marks(p)], "pose_world_landmarks": [marks(p)]},
+    "web tasks": lambda p: {"pose_landmarks": [{"landmarks": marks(p)}]},
+    "message": lambda p: {"pose_landmarks": {"landmark": marks(p)}},
+    "numbers": lambda p: {"pose_landmarks": [[m["x"], m["y"], m["z"], m["visibility"]] for m in marks(p)]},
+    "by name": lambda p: {"pose_landmarks": {n.upper(): m for n, m in zip(NAMES, marks(p), strict=True)}},
+    "bare": lambda p: marks(p),
+    "bare, a list a person": lambda p: [marks(p)],
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_every_layout_of_json(tmp_path, name):
+    (tracks,) = read(tmp_path, [LAYOUTS[name](p) for p in POSE])
+    assert same(tracks, POSE)
+    assert tracks.weights.numpy() == pytest.approx(SEEN)
+
+
+def test_frames_by_number(tmp_path):
+    frames = {"3": {"pose_landmarks": marks(POSE[0])}, "10": {"pose_landmarks": marks(POSE[1])}}
+    (tracks,) = read(tmp_path, {**frames, "5": {"pose_landmarks": None}})
+    assert tracks.seen.any(1).nonzero().flatten().tolist() == [0, 7]
+    assert any("frame 0 is image 3" in n for n in tracks.notes)
+    (one,) = read(tmp_path, {"pose_landmarks": marks(POSE[0])})
+    assert one.num_frames == 1
+
+
+@pytest.mark.parametrize("nobody", [{"pose_landmarks": None}, {"pose_landmarks": []}, {"pose_landmarks": [[]]}])
+def test_frames_without_anybody(tmp_path, nobody):
+    (tracks,) = read(tmp_path, [nobody, *({"pose_landmarks": marks(p)} for p in POSE)])
+    assert tracks.seen.any(1).tolist() == [False, True, True, True, True]
+
+
+def test_several_people_are_followed(tmp_path):
+    far = person(4, 33, at=(800.0, 700.0), confidence=0.5)
+    frames = [[POSE[t], far[t]][:: 1 if t % 2 else -1] for t in range(4)]
+    a, b = read(tmp_path, [{"pose_landmarks": [marks(p) for p in pair]} for pair in frames])
+    assert same(a, POSE) and same(b, far)
+
+
+def test_hands_are_left_out_beside_a_pose_and_read_alone(tmp_path):
+    frames = [{"pose_landmarks": marks(p), "right_hand_landmarks": marks(h)} for p, h in zip(POSE, HAND, strict=True)]
+    (pose,) = read(tmp_path, frames)
+    assert same(pose, POSE)
+    assert "the hands are left out: only the pose is read" in pose.notes
+    left = person(4, 21, at=(800.0, 500.0))
+    for frame, hand in zip(frames, left, strict=True):
+        del frame["pose_landmarks"]
+        frame["left_hand_landmarks"] = marks(hand * [1, 1, 0])
+    hands = read(tmp_path, frames)
+    assert {h.skeleton.name for h in hands} == {"hand21"}
+    assert any(same(h, HAND) for h in hands) and any(same(h, left) for h in hands)
+    assert any("mirror the result of a left one" in n for n in hands[0].notes)
+
+
+def test_handedness_tells_hands_apart(tmp_path):
+    other = person(4, 21, at=(230.0, 320.0))
+    frames = []
+    for t in range(4):
+        sides = [("Left", HAND[t]), ("Right", other[t])][:: 1 if t % 2 else -1]
+        frames.append(
+            {
+                "hand_landmarks": [marks(h, False) for _, h in sides],
+                "handedness": [[{"index": 0, "score": 0.9, "category_name": side}] for side, _ in sides],
+            }
+        )
+    a, b = read(tmp_path, frames)
+    assert {same(a, HAND), same(b, HAND)} == {same(a, other), same(b, other)} == {True, False}
+    assert any("track ids" in n for n in a.notes)
+
+
+# ---------------------------------------------------------------------- tables
+
+
+def test_csv(tmp_path):
+    path = write_mediapipe_csv(tmp_path / "a.csv")
+    assert detect_format(path) == "mediapipe"
+    tracks = load_tracks(path, image_size=SIZE)
+    assert same(tracks, POSE)
+    assert tracks.weights.numpy() == pytest.approx(SEEN)
+
+
+def test_csv_with_other_headers(tmp_path):
+    text = write_mediapipe_csv(tmp_path / "a.csv").read_text()
+    for change in (
+        text.upper(),
+        text.replace("_x", ".x").replace("_y", ".y").replace("_visibility", ".score"),
+        text.replace(",", ";"),
+        "\ufeff" + text.replace("frame", "frame_number"),
+        text.replace("\r\n", "\n") + "\n",
+    ):
+        (tmp_path / "b.csv").write_text(change, encoding="utf-8", newline="")
+        assert detect_format(tmp_path / "b.csv") == "mediapipe"
+        assert same(load_tracks(tmp_path / "b.csv", image_size=SIZE), POSE)
+
+
+def test_csv_of_numbered_landmarks(tmp_path):
+    """As a popular tutorial writes them: pose and face in a row."""
+    for count in (33, 501):
+        header = ",".join(["class", *(f"{c}{i}" for i in range(1, count + 1) for c in "xyzv")])
+        rows = [[x / 1000, y / 1000, 0, v] for pose in POSE for x, y, v in pose.tolist()]
+        lines = [np.ravel(rows[33 * t : 33 * (t + 1)] + [[0.1, 0.1, 0, 0]] * (count - 33)).tolist() for t in range(4)]
+        text = "\n".join([header, *("walk," + ",".join(map(str, line)) for line in lines)])
+        (tmp_path / "a.csv").write_text(text)
+        tracks = load_tracks(tmp_path / "a.csv", image_size=SIZE)
+        assert same(tracks, POSE)
+        assert any("the first 33 are read" in n for n in tracks.notes) == (count == 501)
+
+
+def table(columns, rows):
+    return "\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)])
+
+
+def test_csv_of_some_landmarks(tmp_path):
+    names = SKELETONS["coco17"].joints[:17]
+    rows = [[t, *person(4, 17)[t].ravel().tolist()] for t in range(4)]
+    text = table(["frame", *(f"{n}_{c}" for n in names for c in ("x", "y", "confidence"))], rows)
+    (tmp_path / "a.csv").write_text(text)
+    assert load_tracks(tmp_path / "a.csv").skeleton.name == "coco17"
+    assert same(load_tracks(tmp_path / "a.csv"), person(4, 17))
+    (tmp_path / "b.csv").write_text(text.replace("nose_", "mouth_left_"))
+    tracks = load_tracks(tmp_path / "b.csv")
+    assert tracks.skeleton.name == "mediapipe33"
+    assert tracks.seen[0].sum() == 19  # with pelvis and neck
+    assert np.allclose(tracks.points[:, 9], person(4, 17)[:, 0, :2])
+
+
+def test_csv_of_several_people(tmp_path):
+    far = person(4, 33, at=(800.0, 700.0), confidence=0.5)
+    columns = ["frame", "person", *(f"{n}_{c}" for n in NAMES for c in ("x", "y", "visibility"))]
+    rows = [[t, k, *pose[t].ravel().tolist()] for t in range(4) for k, pose in (("b", far), ("a", POSE))]
+    (tmp_path / "a.csv").write_text(table(columns, rows))
+    a, b = load_people(tmp_path / "a.csv")
+    assert same(a, POSE) and same(b, far)
+
+
+def test_blank_cells_are_unseen(tmp_path):
+    lines = write_mediapipe_csv(tmp_path / "a.csv").read_text().splitlines()
+    cells = lines[2].split(",")
+    lines[2] = ",".join([cells[0], "", "nan", *cells[3:]])
+    lines[3] = "2" + "," * (len(cells) - 1)
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    tracks = load_tracks(tmp_path / "a.csv", image_size=SIZE)
+    assert tracks.seen[:, :33].sum(1).tolist() == [33, 32, 0, 33]
+
+
+@pytest.mark.parametrize(
+    ("array", "note"),
+    [
+        (POSE[:, :, [0, 1, 2, 2]], None),
+        (POSE[:, :, [0, 1, 2, 2]].reshape(4, 132), None),
+        (POSE[:, :, :2], None),
+        (POSE.reshape(4, 99), "third number of each landmark"),
+        (np.concatenate([POSE[:, :, [0, 1, 2, 2]].reshape(4, 132), np.ones((4, 1530))], 1), "the first 132 are read"),
+    ],
+    ids=["4", "flat", "2", "3", "holistic"],
+)
+def test_npy(tmp_path, array, note):
+    array = array.astype("f4")
+    array[..., :2] = array[..., :2]
+    path = write_npy(tmp_path / "a.npy", array)
+    assert detect_format(path) == "mediapipe"
+    tracks = load_tracks(path)
+    assert np.allclose(tracks.points[:, :33], POSE[..., :2], atol=1e-3)
+    assert note is None or any(note in n for n in tracks.notes)
+    assert tracks.weights.numpy() == pytest.approx(1 if array.shape[-1] == 2 else SEEN)
+
+
+def test_npy_of_depths_and_of_hands(tmp_path):
+    deep = POSE.copy()
+    deep[..., 2] = np.linspace(-0.5, 0.5, 33)
+    assert (load_tracks(write_npy(tmp_path / "a.npy", deep)).weights == 1).all()
+    assert same(load_tracks(write_npy(tmp_path / "a.npy", HAND[..., :2])), HAND)
+    blank = POSE.copy()
+    blank[1] = np.nan
+    assert load_tracks(write_npy(tmp_path / "a.npy", blank)).seen.any(1).tolist() == [True, False, True, True]
+
+
+# ---------------------------------------------------------------------- files that are none
+
+GOOD = {"frame": 0, "pose_landmarks": marks(POSE[0])}
+BROKEN_JSON = [
+    (3, "expected a list of frames with landmarks, got other JSON"),
+    ([3], "frame 0: expected landmarks, got 3"),
+    ([], "landmarks in at least one of 0 frames"),
+    ([{"pose_landmarks": []}], "landmarks in at least one of 1 frames, got none"),
+    ([{"a": 1}], r"frame 0: expected 'pose_landmarks' or 'hand_landmarks', got the keys a"),
+    ([GOOD, GOOD], "frame 0: expected every frame once, got frame 0 again"),
+    ([{**GOOD, "frame": "x"}], "entry 0: 'frame': expected a whole number, got x"),
+    ([{"pose_landmarks": marks(POSE[0])[:20]}], "33 landmarks of a pose or 21 of a hand, got 20"),
+    ([{"pose_landmarks": "abc"}], "expected a list of landmarks, got abc"),
+    ([{"pose_landmarks": [1, 2]}], "expected a list of landmarks, got 1"),
+    ([{"pose_landmarks": {"a": 1}}], "got an object with the keys a"),
+    (
+        [{"pose_landmarks": [*marks(POSE[0])[:32], {"x": 1}]}],
+        "entry 32: expected a landmark with 'x' and 'y', got the keys",
+    ),
+    ([{"pose_landmarks": [*marks(POSE[0])[:32], 7]}], "entry 32: expected an object"),
+    ([{"pose_landmarks": [*marks(POSE[0])[:32], {"x": "a", "y": 1}]}], "expected a number, got text"),
+    ([{"pose_landmarks": [*marks(POSE[0])[:32], {"x": 1e300, "y": 1}]}], "is 1e"),
+]
+
+
+@pytest.mark.parametrize(("data", "message"), BROKEN_JSON)
+def test_json_that_is_none_is_told(tmp_path, data, message):
+    path = write_json(tmp_path / "broken.json", data)
+    with pytest.raises(KcsError, match=message) as caught:
+        load_people(path, format="mediapipe", image_size=SIZE)
+    assert "broken.json" in str(caught.value)
+
+
+def test_messages_within_messages_end(tmp_path):
+    nest = marks(POSE[0])
+    for _ in range(300):
+        nest = {"landmark": nest}
+    (tmp_path / "a.json").write_text(json.dumps([{"pose_landmarks": nest}]))
+    with pytest.raises(FormatError, match="a.json"):
+        load_people(tmp_path / "a.json", image_size=SIZE)
+
+
+HEADER = ",".join(["frame", *(f"{n}_{c}" for n in NAMES for c in "xy")])
+ROW = ",".join(["0.5"] * 66)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b\n1,2\n", "expected columns such as nose_x, nose_y, got 'a,b'"),
+        (f"{HEADER}\n", "landmarks in at least one of 0 frames"),
+        (f"{HEADER}\n0,{ROW}\n1,2\n", "row 3: expected 67 values as in the first row, got 2"),
+        (f"{HEADER}\n0,{ROW}\n0,{ROW}\n", "row 3: expected every frame once, or a column 'person', got frame 0 again"),
+        (f"{HEADER}\nx,{ROW}\n", "row 2: 'frame': expected a number, got 'x'"),
+        (f"{HEADER}\n0.5,{ROW}\n", "row 2: 'frame': expected a whole number, got 0.5"),
+        (f"{HEADER}\n,{ROW}\n", "row 2: 'frame': expected a whole number, got $"),
+        (f"{HEADER}\n0,a{ROW}\n", "row 2: 'nose_x': expected a number, got 'a0.5'"),
+        (f"{HEADER}\n0,inf{ROW[3:]}\n", "row 2: 'nose_x': expected a coordinate or a visibility, got inf"),
+        (f"{HEADER}\n0,{'9' * 200_000},{ROW[4:]}\n", "text that does not parse"),
+    ],
+)
+def test_csv_that_is_none_is_told(tmp_path, text, message):
+    (tmp_path / "broken.csv").write_text(text)
+    with pytest.raises(KcsError, match=message) as caught:
+        load_people(tmp_path / "broken.csv", format="mediapipe", image_size=SIZE)
+    assert "broken.csv" in str(caught.value)
+
+
+def test_npy_that_is_none_is_told(tmp_path):
+    def told(array, message, **options):
+        path = tmp_path / "broken.npy"
+        np.save(path, array, **options)
+        with pytest.raises(KcsError, match=message):
+            load_people(path, format="mediapipe", image_size=SIZE)
+        return path.read_bytes()
+
+    told(np.zeros((4, 17, 2)), r"\(frames, 33 or 21, 2 to 5\), got shape \(4, 17, 2\)")
+    told(np.array([{"a": 1}], object), "got none of numbers", allow_pickle=True)
+    told(np.full((4, 33, 2), 1e12), "numbers beyond")
+    told(np.full((4, 33, 2), np.inf), "numbers beyond")
+    told(np.full((4, 33, 2), np.nan), "landmarks in at least one of 4 frames")
+    good = told(np.zeros((4, 33, 2)), "expected people in at least one")
+    (tmp_path / "cut.npy").write_bytes(good[:-9])
+    with pytest.raises(FormatError, match=r"cut\.npy: is damaged or truncated"):
+        load_people(tmp_path / "cut.npy", image_size=SIZE)
+    (tmp_path / "large.npy").write_bytes(good.replace(b"(4, 33, 2)", b"(999999999, 33, 2)")[: len(good)])
+    with pytest.raises(FormatError, match=r"large\.npy"):
+        load_people(tmp_path / "large.npy", format="mediapipe", image_size=SIZE)
+
+
+def test_a_folder_is_none(tmp_path):
+    (tmp_path / "a.csv").write_text(HEADER)
+    with pytest.raises(FormatError, match="expected a file of landmarks, got a folder"):
+        load_people(tmp_path, format="mediapipe", image_size=SIZE)
