@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from kcs_torch.io import load_motion, load_tracks, save
     from kcs_torch.live import LivePose, Tracker
     from kcs_torch.methods import KCS, METHODS, PKC, Method, SfAM, find_skeleton
-    from kcs_torch.reconstruct import reconstruct
+    from kcs_torch.reconstruct import reconstruct, reconstruct_all
     from kcs_torch.skeleton import SKELETONS, Skeleton
     from kcs_torch.types import Diagnostics, Motion, Reconstruction, Tracks
 
@@ -58,6 +58,7 @@ __all__ = [
     "metrics",
     "nn",
     "reconstruct",
+    "reconstruct_all",
     "save",
     "solvers",
 ]
@@ -76,7 +77,7 @@ _NAMES = {
     "io": ("load_motion", "load_tracks", "save"),
     "live": ("LivePose", "Tracker"),
     "methods": ("KCS", "METHODS", "PKC", "Method", "SfAM", "find_skeleton"),
-    "reconstruct": ("reconstruct",),
+    "reconstruct": ("reconstruct", "reconstruct_all"),
     "skeleton": ("SKELETONS", "Skeleton"),
     "types": ("Diagnostics", "Motion", "Reconstruction", "Tracks"),
 }

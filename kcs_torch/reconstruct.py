@@ -1,7 +1,8 @@
-"""The entry call: :func:`reconstruct`."""
+"""The entry calls: :func:`reconstruct`, and :func:`reconstruct_all` of several bodies."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from kcs_torch.methods.perspective import reconstruct_perspective
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 
-__all__ = ["reconstruct"]
+__all__ = ["reconstruct", "reconstruct_all"]
 
 DEFAULT = "pkc"
 """What "auto" stands for."""
@@ -73,17 +74,56 @@ def reconstruct(
         tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units)
     if find:
         tracks = replace(tracks, skeleton=find_skeleton(tracks))
+    chosen = _method(method, fields)
+    if lens is not None:
+        return reconstruct_perspective(chosen, tracks, lens, cameras)
+    return chosen(tracks, cameras)
+
+
+def reconstruct_all(
+    people: Iterable[Tracks], *, method: str | Method = "auto", intrinsics: Any = None, **fields: Any
+) -> list[Reconstruction]:
+    """Turn the tracks of several bodies, or of many clips, into 3D motion, as one batch where the method can.
+
+    Args:
+        people: tracks of any lengths, such as :func:`kcs_torch.io.load_people` gives.
+        method: as of :func:`reconstruct`.
+        intrinsics: of the camera that saw them all, as of :func:`reconstruct`.
+        **fields: of the method.
+
+    Returns:
+        A :class:`Reconstruction` of each, in their order.
+
+    Raises:
+        OptionError: as :func:`reconstruct`; or something is not :class:`Tracks`.
+        ShapeError: the intrinsics have the wrong shape or values.
+
+    >>> from kcs_torch.data.synthetic import walking_person
+    >>> both = reconstruct_all([walking_person(40).tracks, walking_person(30, yaw=60).tracks], method="kcs")
+    >>> [len(one.points) for one in both]
+    [40, 30]
+    """
+    people = list(people)
+    for i, one in enumerate(people):
+        if not isinstance(one, Tracks):
+            raise OptionError(f"reconstruct_all: item {i}: expected Tracks (see Tracks.from_arrays), got {type(one)}")
+    chosen = _method(method, fields)
+    if intrinsics is not None:
+        lens = Intrinsics.of(intrinsics)
+        return [reconstruct_perspective(chosen, one, lens) for one in people]
+    return chosen.many(people)
+
+
+def _method(method: str | Method, fields: dict[str, Any]) -> Method:
+    """The method that a name and its fields, or a :class:`Method`, stand for."""
     if isinstance(method, Method):
         if fields:
             raise OptionError(
                 f"reconstruct: fields ({', '.join(fields)}) go with a method's name; set them on the method itself"
             )
-    else:
-        if method == "auto":
-            method = DEFAULT
-        if not isinstance(method, str) or method not in METHODS:
-            raise unknown("method", method, ["auto", *METHODS])
-        method = METHODS[method].from_options(**fields)
-    if lens is not None:
-        return reconstruct_perspective(method, tracks, lens, cameras)
-    return method(tracks, cameras)
+        return method
+    if method == "auto":
+        method = DEFAULT
+    if not isinstance(method, str) or method not in METHODS:
+        raise unknown("method", method, ["auto", *METHODS])
+    return METHODS[method].from_options(**fields)

@@ -105,20 +105,53 @@ class Method(ABC):
         if cameras is not None:
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         with torch.inference_mode(False), torch.no_grad():  # solvers differentiate, which inference mode forbids
-            known = tracks.seen.any(-1)
-            # Means over the joints that happen to be seen would jump with every joint that comes and goes.
-            filled = interpolate(tracks.points, tracks.seen)[:, tracks.seen.any(0)]
-            middle = filled.mean(1, keepdim=True) if filled.numel() else tracks.points[:, :1] * 0
-            size = _rms((tracks.points - middle) * tracks.seen[..., None], tracks.weights)
-            size = torch.where(size > 0, size, torch.ones_like(size))
-            if not self.centred:
-                middle = middle.mean(0)
-            centred = (tracks.points - middle) * tracks.seen[..., None]
-            inner = dataclasses.replace(tracks, points=centred / size, weights=tracks.weights.clone())
+            inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
             result = self._finish(tracks, found, size, known, time.perf_counter() - begin)
         self._warn(result)
         return result
+
+    def many(self, tracks: Sequence[Tracks]) -> list[Reconstruction]:
+        """Reconstruct several clips, of one length or many: together where the method can, else one by one.
+
+        Args:
+            tracks: of any number of bodies.
+
+        Returns:
+            What a call for each gives, up to rounding (which may choose the other of two solutions that are as good);
+            ``diagnostics.seconds`` is each one's share.
+
+        Warns:
+            KcsWarning: as a call does.
+            ConvergenceWarning: as a call does.
+        """
+        begin = time.perf_counter()
+        with torch.inference_mode(False), torch.no_grad():
+            parts = [self._normalised(one) for one in tracks]
+            found = self.solve_all([inner for inner, _, _ in parts])
+            each = (time.perf_counter() - begin) / max(len(tracks), 1)
+            rows = zip(tracks, found, parts, strict=True)
+            results = [self._finish(one, estimate, size, known, each) for one, estimate, (_, size, known) in rows]
+        for result in results:
+            self._warn(result)
+        return results
+
+    def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
+        """Reconstruct normalised tracks of several clips; one by one unless a method knows better."""
+        return [self.solve(one, None) for one in tracks]
+
+    def _normalised(self, tracks: Tracks) -> tuple[Tracks, Tensor, Tensor]:
+        """Tracks about their middle, of root mean square 1; that size; and the frames (T,) that show something."""
+        # Means over the joints that happen to be seen would jump with every joint that comes and goes.
+        filled = interpolate(tracks.points, tracks.seen)[:, tracks.seen.any(0)]
+        middle = filled.mean(1, keepdim=True) if filled.numel() else tracks.points[:, :1] * 0
+        size = _rms((tracks.points - middle) * tracks.seen[..., None], tracks.weights)
+        size = torch.where(size > 0, size, torch.ones_like(size))
+        if not self.centred:
+            middle = middle.mean(0)
+        centred = (tracks.points - middle) * tracks.seen[..., None]
+        inner = dataclasses.replace(tracks, points=centred / size, weights=tracks.weights.clone())
+        return inner, size, tracks.seen.any(-1)
 
     def _warn(self, result: Reconstruction) -> None:
         """Tell what the user should not miss."""

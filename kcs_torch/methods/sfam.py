@@ -18,6 +18,7 @@ from kcs_torch.functional.temporal import blend_windows, interpolate, window_sta
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.cameras import orthographic_cameras
 from kcs_torch.methods.unseen import place_unseen
+from kcs_torch.nn.anatomy import HingeEnergy
 from kcs_torch.nn.unrolled import UnrolledSfAM
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.camera_path import constant_path
@@ -94,38 +95,87 @@ class SfAM(Method):
         window = min(self.window or frames, frames)
         starts = window_starts(frames, window, min(self.overlap, window - 1))
         cut = lambda x: torch.stack([x[s : s + window] for s in starts])  # noqa: E731
-        tracks = _fill_blank_frames(tracks)
-        filled = complete_tracks(cut(tracks.points), cut(tracks.seen))
-        points, weights = cut(tracks.points), cut(tracks.weights)
-        if self.trajectories is not None:
-            basis = dct_basis(window, min(self.trajectories, window), dtype=filled.dtype, device=filled.device)
-            filled = torch.einsum("tk,sk,wsnd->wtnd", basis, basis, filled)
-            points = filled * (weights > 0)[..., None]
-        if cameras is not None:
-            rows = cut(cameras)
-        else:  # some windows at a time: the search tries several starts for each
-            rows = torch.cat([orthographic_cameras(part, self.rank) for part in filled.split(CHUNK)])
-        solution = self.shape(points, rows, weights, tracks.skeleton)
-        local = solution.value @ complete_rotation(rows).mT  # (W, T, N, 3) in each frame's camera
+        filled = _fill_blank_frames(tracks)
+        points, seen, weights = cut(filled.points), cut(filled.seen), cut(filled.weights)
+        known = None if cameras is None else cut(cameras)
+        local, rows, solution = self._windows(points, seen, weights, tracks.skeleton, known)
         flip = torch.ones(len(starts), 3, dtype=local.dtype, device=local.device)
         if cameras is None:  # known cameras know their mirror
             flip[:, 2] = _mirror_signs(local, starts)
         joined = blend_windows(local * flip[:, None, None], starts, frames)
-        joined = place_unseen(joined, tracks.seen.any(0), tracks.skeleton)
-        path = cameras
-        notes: tuple[str, ...] = ()
-        if path is None:
-            path, notes = self._path(_join_rotations(complete_rotation(rows * flip[:, None, None]), starts, frames))
-        return Estimate(joined, path, torch.ones_like(joined[:, 0, 0]), solution.converged, solution.iterations, notes)
+        path = None
+        if cameras is None:
+            path = _join_rotations(complete_rotation(rows * flip[:, None, None]), starts, frames)
+        return self._estimate(tracks, joined, path, cameras, solution)
 
-    def shape(self, tracks: Tensor, cameras: Tensor, weights: Tensor, skeleton: Skeleton) -> Solution[Tensor]:
-        """Algorithm 1 with known cameras, for a batch of windows of one body.
+    def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
+        """Solve clips of one skeleton and equally many frames as one batch of windows."""
+        groups: dict[object, list[int]] = {}
+        for i, one in enumerate(tracks):
+            whole = self.lengths == "shape" and one.num_frames <= (self.window or one.num_frames)
+            groups.setdefault((one.skeleton, one.num_frames, one.points.dtype) if whole else i, []).append(i)
+        out: dict[int, Estimate] = {}
+        for group in groups.values():
+            if len(group) == 1:
+                out[group[0]] = self.solve(tracks[group[0]], None)
+                continue
+            clips = [tracks[i] for i in group]
+            filled = [_fill_blank_frames(one) for one in clips]
+            points = torch.stack([one.points for one in filled])
+            seen, weights = torch.stack([one.seen for one in filled]), torch.stack([one.weights for one in filled])
+            local, rows, solution = self._windows(points, seen, weights, clips[0].skeleton, None, one_body=False)
+            turned = complete_rotation(rows)
+            for i, one, shape, path in zip(group, clips, local, turned, strict=True):
+                out[i] = self._estimate(one, shape, path, None, solution)
+        return [out[i] for i in range(len(tracks))]
+
+    def _windows(
+        self,
+        points: Tensor,
+        seen: Tensor,
+        weights: Tensor,
+        skeleton: Skeleton,
+        cameras: Tensor | None,
+        one_body: bool = True,
+    ) -> tuple[Tensor, Tensor, Solution[Tensor]]:
+        """Windows (W, T, N, 2): their points (W, T, N, 3) in each frame's camera, and the cameras (W, T, 2, 3)."""
+        filled = complete_tracks(points, seen)
+        if self.trajectories is not None:
+            window = points.shape[1]
+            basis = dct_basis(window, min(self.trajectories, window), dtype=filled.dtype, device=filled.device)
+            filled = torch.einsum("tk,sk,wsnd->wtnd", basis, basis, filled)
+            points = filled * (weights > 0)[..., None]
+        rows = cameras
+        if rows is None:  # some windows at a time: the search tries several starts for each
+            rows = torch.cat([orthographic_cameras(part, self.rank) for part in filled.split(CHUNK)])
+        solution = self.shape(points, rows, weights, skeleton, one_body=one_body)
+        return solution.value @ complete_rotation(rows).mT, rows, solution
+
+    def _estimate(
+        self, tracks: Tracks, points: Tensor, path: Tensor | None, cameras: Tensor | None, solution: Solution[Tensor]
+    ) -> Estimate:
+        """What is found of one clip: points (T, N, 3), with its own camera path (T, 3, 3) or the known cameras."""
+        notes: tuple[str, ...] = ()
+        if cameras is None:
+            assert path is not None
+            sign = points.new_tensor([1.0, 1.0, _mirror(points, tracks.skeleton)])
+            points = points * sign
+            cameras, notes = self._path(complete_rotation(path[:, :2] * sign))
+        points = place_unseen(points, tracks.seen.any(0), tracks.skeleton)
+        one = torch.ones_like(points[:, 0, 0])
+        return Estimate(points, cameras, one, solution.converged, solution.iterations, notes)
+
+    def shape(
+        self, tracks: Tensor, cameras: Tensor, weights: Tensor, skeleton: Skeleton, *, one_body: bool = True
+    ) -> Solution[Tensor]:
+        """Algorithm 1 with known cameras, for a batch of windows.
 
         Args:
             tracks: (W, T, N, 2), centred.
             cameras: (W, T, 2, 3).
             weights: (W, T, N).
             skeleton: of the N joints.
+            one_body: the windows show one body, whose bones have one length in all of them.
 
         Returns:
             The shapes (W, T, N, 3) in the windows' world frames.
@@ -156,7 +206,7 @@ class SfAM(Method):
             articulate_from=self.articulate_from if self.beta > 0 else 1.0,
             learnable=False,
         ).to(tracks.device)
-        return solver.solve(tracks, cameras, weights=weights, lengths=lengths, one_body=True)
+        return solver.solve(tracks, cameras, weights=weights, lengths=lengths, one_body=one_body)
 
     def _path(self, rotations: Tensor) -> tuple[Tensor, tuple[str, ...]]:
         """Reported cameras (T, 2, 3): free, or of constant angular velocity where that explains them."""
@@ -193,6 +243,20 @@ def _fill_blank_frames(tracks: Tracks) -> Tracks:
         points=torch.where(made[..., None], filled, tracks.points),
         weights=torch.where(made, torch.ones_like(tracks.weights), tracks.weights),
     )
+
+
+def _mirror(points: Tensor, skeleton: Skeleton) -> float:
+    """1, or -1 where the mirror image in depth is the one to report: nothing but the joints' hinges can tell.
+
+    Without hinges it is the image that leans to the right or down as it goes away: any rule will do, as long as it does
+    not depend on a search's start.
+    """
+    flip = points.new_tensor([1.0, 1.0, -1.0])
+    wrong = HingeEnergy(skeleton).to(points.device)(torch.stack([points, points * flip])).sum(-1)
+    if bool((wrong[0] - wrong[1]).abs() > 1e-3 * wrong.sum()):
+        return 1.0 if bool(wrong[0] < wrong[1]) else -1.0
+    lean = (points[..., 2:] * points[..., :2]).sum((0, 1))
+    return 1.0 if bool(lean[lean.abs().argmax()] >= 0) else -1.0
 
 
 def _mirror_signs(parts: Tensor, starts: list[int]) -> Tensor:

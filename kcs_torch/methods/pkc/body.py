@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -10,7 +11,8 @@ from torch import Tensor
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
-from kcs_torch.methods.pkc.fixed_view import Hypotheses, fixed_view
+from kcs_torch.methods.pkc.fixed_view import Hypotheses, refined, searching
+from kcs_torch.methods.pkc.lockstep import Search, together
 from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, bone_noise, pace_of
 from kcs_torch.methods.pkc.trunk import image_scale
 from kcs_torch.nn.posture import PostureEnergy
@@ -56,16 +58,15 @@ class Body:
         """The trunk's rotations (T, 3, 3), template to camera, of depths (T, N)."""
         return nearest_rotation(self.objective.posture.frame(torch.cat([self.image, depth[..., None]], -1)))
 
-    def rank(self, depth: Tensor, steps: int) -> Hypotheses:
+    def rank(self, depth: Tensor, steps: int) -> Search[Hypotheses]:
         """Depths (H, T, N) from elsewhere, refined on the objective, best first."""
         points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
         lengths = bone_lengths(points, self.objective.bones).median(1).values
         usual = self.objective.posture.rest_lengths
         lengths = torch.where(lengths > 1e-3 * usual, lengths, usual)
-        z, lengths, energy, solution = self.objective.minimise(depth, lengths, steps)
-        return Hypotheses(z, lengths, energy, solution.iterations)
+        return (yield from refined(self.objective, Hypotheses(depth, lengths, depth.new_zeros(len(depth))), steps))
 
-    def search(self, rounds: int, steps: int) -> Hypotheses:
+    def search(self, rounds: int, steps: int) -> Search[Hypotheses]:
         """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best."""
         stride = max(1, round(self.rate / 30)) if self.rate >= FAST else 1
         image = self.image[::stride]
@@ -74,27 +75,26 @@ class Body:
         size = min(BLOCK, frames)
         starts = window_starts(frames, size, min(OVERLAP, size - 1))
         noise = self.noise[::stride]
-        lift = partial(fixed_view, self.skeleton, rate=rate, rounds=rounds, steps=steps)
+        lift = partial(searching, self.skeleton, rate=rate, rounds=rounds, steps=steps)
         if len(starts) == 1:
-            found = lift(image, noise=noise)
+            found = yield from lift(image, noise=noise)
         else:
             blocks = torch.stack([image[s : s + size] for s in starts])
             moved = bone_vectors(blocks, self.objective.bones).diff(dim=1).square().sum((1, 2, 3))
             order = moved.argsort(descending=True).tolist()  # lengths come from the liveliest block
-            depths: list[Tensor] = [image.new_zeros(0)] * len(starts)
-            lengths, made = None, 0
-            for i in order:
-                best = lift(blocks[i], noise=noise[starts[i] : starts[i] + size], anchor=lengths)[:1]
-                lengths = best.lengths[0] if lengths is None else lengths
-                depths[i], made = best.depth[0], made + best.steps
+            part = lambda i, anchor: lift(blocks[i], noise=noise[starts[i] : starts[i] + size], anchor=anchor)  # noqa: E731
+            first = (yield from part(order[0], None))[:1]
+            lengths = first.lengths[0]
+            others = yield from together([part(i, lengths) for i in order[1:]])
+            best = [first, *others]
+            depths = [best[order.index(i)].depth[0] for i in range(len(starts))]
             joined = blend_windows(torch.stack(depths), starts, frames)
-            assert lengths is not None
-            found = Hypotheses(joined[None], lengths[None], joined.new_zeros(1), made)
+            found = Hypotheses(joined[None], lengths[None], joined.new_zeros(1), sum(one.steps for one in best))
         if stride > 1 or len(starts) > 1:
-            found = self._on_all_frames(found[:4], stride, steps)
+            found = yield from self._on_all_frames(found[:4], stride, steps)
         return found
 
-    def _on_all_frames(self, found: Hypotheses, stride: int, steps: int) -> Hypotheses:
+    def _on_all_frames(self, found: Hypotheses, stride: int, steps: int) -> Search[Hypotheses]:
         """Hypotheses of every ``stride``-th frame on all frames, refined."""
         frames = len(self.image)
         known = torch.zeros(frames, 1, dtype=torch.bool, device=self.image.device)
@@ -102,5 +102,4 @@ class Body:
         full = found.depth.new_zeros(len(found.depth), frames, 1, found.depth.shape[-1])
         full[:, ::stride] = found.depth[:, :, None]
         depth = interpolate(full, known)[:, :, 0]
-        z, lengths, energy, solution = self.objective.minimise(depth, found.lengths, steps)
-        return Hypotheses(z, lengths, energy, found.steps + solution.iterations)
+        return (yield from refined(self.objective, replace(found, depth=depth), steps))

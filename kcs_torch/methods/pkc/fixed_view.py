@@ -11,13 +11,14 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
+from kcs_torch.methods.pkc import lockstep
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limb_paths, limbs_of, waves
-from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, pace_of
+from kcs_torch.methods.pkc.objective import Objective, Task, Weights, at_pace, pace_of
 from kcs_torch.methods.pkc.trunk import TURN, Trunk, longest_image, siblings, trunk_misfit, trunk_path, trunk_turns
 from kcs_torch.nn.posture import free_bones
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["Hypotheses", "distinct", "fixed_view"]
+__all__ = ["Hypotheses", "distinct", "fixed_view", "refined", "searching"]
 
 COARSE = (1.0, 1.01, 1.03, 1.07, 1.14, 1.25)
 FINE = (1.0, 1.008, 1.02, 1.04, 1.07, 1.12, 1.2)
@@ -115,6 +116,22 @@ def fixed_view(
     Returns:
         The hypotheses, best first.
     """
+    settings = {"rate": rate, "noise": noise, "rounds": rounds, "steps": steps, "weights": weights, "anchor": anchor}
+    return lockstep.run(searching(skeleton, image, **settings))  # type: ignore[arg-type]
+
+
+def searching(
+    skeleton: Skeleton,
+    image: Tensor,
+    *,
+    rate: float = 30.0,
+    noise: Tensor | None = None,
+    rounds: int = 2,
+    steps: int = 30,
+    weights: Weights | None = None,
+    anchor: Tensor | None = None,
+) -> lockstep.Search[Hypotheses]:
+    """:func:`fixed_view` as a search, which may run beside others."""
     slow = 30.0 / rate
     pace = pace_of(image, skeleton, rate)
     weights = at_pace(weights or Weights(), rate, pace)
@@ -129,14 +146,19 @@ def fixed_view(
     )
     image = image - image.mean(-2, keepdim=True)
     search = _Search(skeleton, image, Objective(skeleton, image, weights, noise, anchor), costs, TURN * slow)
-    found = search.start(anchor)
-    found = search.refine(found, steps, LOOSE)
+    found = yield from search.refine(search.start(anchor), steps, LOOSE)
     for _ in range(rounds):
         best = found.energy[0]
-        found = search.refine(search.moves(found), steps)
+        found = yield from search.refine(search.moves(found), steps)
         if not bool(found.energy[0] < best - 0.5):
             break
     return found
+
+
+def refined(objective: Objective, found: Hypotheses, steps: int, loose: float = 1.0) -> lockstep.Search[Hypotheses]:
+    """Hypotheses refined on the objective, best first."""
+    ((z, lengths, energy, solution),) = yield [Task(objective, found.depth, found.lengths, steps, loose)]
+    return Hypotheses(z, lengths, energy, found.steps + solution.iterations)
 
 
 @dataclass(frozen=True)
@@ -168,18 +190,14 @@ class _Search:
         z, length = torch.stack(depths), torch.stack(lengths)
         return Hypotheses(z, length, z.new_full((len(z),), torch.inf))
 
-    def refine(self, found: Hypotheses, steps: int, loose: float = 1.0) -> Hypotheses:
+    def refine(self, found: Hypotheses, steps: int, loose: float = 1.0) -> lockstep.Search[Hypotheses]:
         """All a little, with loose lengths first where the start is rough, then the best few that differ."""
         few = max(steps // 3, 1)
         if loose > 1:
-            found = self._minimise(found, few, loose)
+            found = yield from refined(self.objective, found, few, loose)
             found = distinct(found, BETTER, ALIKE)
-        found = distinct(self._minimise(found, few), BEST, ALIKE)
-        return self._minimise(found, steps)
-
-    def _minimise(self, found: Hypotheses, steps: int, loose: float = 1.0) -> Hypotheses:
-        z, lengths, energy, solution = self.objective.minimise(found.depth, found.lengths, steps, loose)
-        return Hypotheses(z, lengths, energy, found.steps + solution.iterations)
+        found = yield from refined(self.objective, found, few)
+        return (yield from refined(self.objective, distinct(found, BEST, ALIKE), steps))
 
     def moves(self, found: Hypotheses) -> Hypotheses:
         """The best, the next ones, and what discrete moves make of the best."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -17,6 +18,7 @@ from kcs_torch.methods.pkc.answers import APART, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.fixed_view import Hypotheses, distinct
 from kcs_torch.methods.pkc.gate import plausible
+from kcs_torch.methods.pkc.lockstep import Search, run, together
 from kcs_torch.methods.pkc.moving_view import MovingView, moving_view
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import weak_perspective
@@ -88,17 +90,25 @@ class PKC(Method):
 
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Clean the tracks, try both viewpoints, rank what they give."""
+        return run(self._steps(tracks, cameras))
+
+    def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
+        """Several clips, whose hypotheses are refined together."""
+        return run(together([self._steps(one, None) for one in tracks]))
+
+    def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Estimate]:
         image, noise, notes = self._clean(tracks)
         size = weak_perspective(image, tracks.seen, tracks.skeleton, tracks.fps or 30.0)
         if size is None:
-            return self._solve(tracks, image, noise, cameras, notes)
+            return (yield from self._solve(tracks, image, noise, cameras, notes))
         share = float(size.amax() / size.amin())
         notes = (*notes, f"weak perspective: the body's size in the image varies by a factor of {share:.2f}")
-        return _with_size(self._solve(tracks, image / size[:, None, None], noise, cameras, notes), size)
+        found = yield from self._solve(tracks, image / size[:, None, None], noise, cameras, notes)
+        return _with_size(found, size)
 
     def _solve(
         self, tracks: Tracks, image: Tensor, noise: Tensor, cameras: Tensor | None, notes: tuple[str, ...]
-    ) -> Estimate:
+    ) -> Search[Estimate]:
         """Solve complete tracks (T, N, 2) of a body whose size in the image does not change."""
         skeleton = tracks.skeleton
         has_trunk = len(trunk_joints(skeleton)) >= 3
@@ -118,11 +128,11 @@ class PKC(Method):
         # Cameras that turn tell the sign of depth: what the template says might contradict them.
         told = cameras is not None and float(viewpoint_turn(cameras)) >= WEAK_TURN
         if not moves or (self.viewpoint == "auto" and not told):
-            found = body.search(self.rounds, self.steps)
+            found = yield from body.search(self.rounds, self.steps)
             turn = float(viewpoint_turn(body.frames(found.depth[0])[:, :2]))
             moves = moves and (cameras is not None or turn >= TURNING)
         if moves:
-            found = self._ranked(body, self._moving(tracks, image, cameras, enough)[0], cameras, found)
+            found = yield from self._ranked(body, self._moving(tracks, image, cameras, enough)[0], cameras, found)
         assert found is not None
         return self._from_hypotheses(found, body, image, cameras, notes)
 
@@ -190,11 +200,11 @@ class PKC(Method):
 
     def _ranked(
         self, body: Body, moving: MovingView | None, cameras: Tensor | None, found: Hypotheses | None
-    ) -> Hypotheses:
+    ) -> Search[Hypotheses]:
         """All hypotheses of a body with a template, best first."""
         assert moving is not None
         depth = moving.pose.points[:1, ..., 2] * body.factor
-        ranked = body.rank(depth if cameras is not None else torch.cat([depth, -depth]), steps=self.steps)
+        ranked = yield from body.rank(depth if cameras is not None else torch.cat([depth, -depth]), self.steps)
         ranked = replace(ranked, steps=ranked.steps + MOVING_STEPS)
         return ranked if found is None else found.joined(ranked)
 

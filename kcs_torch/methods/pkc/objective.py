@@ -238,8 +238,8 @@ class Objective:
             return torch.nn.utils.rnn.pad_sequence(tensors, batch_first=True)[each]
 
         gather = lambda values: first.image.new_tensor(values)[each]  # noqa: E731
-        names = [f.name for f in fields(Weights)]
-        out.weights = Weights(**{name: gather([getattr(part.weights, name) for part in parts]) for name in names})
+        each_weight = {f.name: gather([getattr(part.weights, f.name) for part in parts]) for f in fields(Weights)}
+        out.weights = Weights(**each_weight)  # type: ignore[arg-type]  # (H,) each
         out.image = padded([part.image for part in parts])
         out.flat, out.noise = padded([part.flat for part in parts]), padded([part.noise for part in parts])
         out.time = padded([part.image.new_ones(n) for part, n in zip(parts, frames, strict=True)])
