@@ -15,6 +15,7 @@ from kcs_torch.cli.report import answer, one_line, print_json, progress
 
 if TYPE_CHECKING:
     from kcs_torch.metrics import Comparison
+    from kcs_torch.types import Motion
 
 __all__ = ["score"]
 
@@ -65,7 +66,7 @@ def score(
         from kcs_torch.metrics import compare
 
         with progress(f"reading {pred}"):
-            ours = sized(load_motion(pred, up=pred_up, fps=pred_fps), parse_scale(scale))
+            ours = _motion(pred, parse_scale(scale), up=pred_up, fps=pred_fps)
         with progress(f"reading {truth}"):
             theirs = load_motion(truth, up=truth_up, fps=truth_fps, units=from_units)
         found = compare(ours, theirs, align=align or None, root=root, mirror=mirror, within=within)
@@ -73,6 +74,19 @@ def score(
             print_json(dataclasses.asdict(found))
         else:
             typer.echo(_spoken(found, pred, truth))
+
+
+def _motion(path: str, size: dict[str, Any] | None, **options: Any) -> Motion:
+    """A result, which knows its own bones' lengths, or any other motion; in its true size."""
+    from kcs_torch.io import load_any, load_motion
+    from kcs_torch.io.anything import kind_of
+    from kcs_torch.types import Motion, Reconstruction
+
+    if kind_of(path) == "result":
+        data = load_any(path, **options)
+        assert isinstance(data, Reconstruction)
+        return Motion.of(sized(data, size))
+    return sized(load_motion(path, **options), size)
 
 
 def _spoken(found: Comparison, pred: str, truth: str) -> str:

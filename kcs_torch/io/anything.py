@@ -14,7 +14,7 @@ from kcs_torch.io.registry import Probe
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion, Reconstruction, Tracks
 
-__all__ = ["load_any"]
+__all__ = ["kind_of", "load_any"]
 
 
 def load_any(
@@ -50,8 +50,7 @@ def load_any(
     """
     if format is not None and format not in READERS and format not in MOTION_READERS:
         raise unknown("format", format, {*READERS, *MOTION_READERS})
-    probe = Probe(path)
-    kind = _kind(probe, format)
+    kind = kind_of(path, format)
     if kind == "result":
         if skeleton is not None or up is not None or units is not None or person is not None:
             raise OptionError(f"{path}: a result has its own skeleton, axes, units and person; save it as motion first")
@@ -73,8 +72,13 @@ def load_any(
     )
 
 
-def _kind(probe: Probe, format: str | None) -> str:
-    """Say "result", "motion" or "tracks"."""
+def kind_of(path: str | Path, format: str | None = None) -> str:
+    """Say whether there is a "result", "motion" or "tracks".
+
+    Raises:
+        FormatError: nothing that is known is there.
+    """
+    probe = Probe(path)
     if format == "npz" or (format is None and MOTION_READERS["npz"].recognises(probe)):
         keys = Archive(probe.path).keys
         if {"points3d_all", "diagnostics", "points2d"} <= set(keys):

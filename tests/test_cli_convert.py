@@ -1,0 +1,238 @@
+"""``kcs-torch convert`` and ``score``: raw detections to files of other tools and back, and what they say."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from samples import walk_result, walking_motion
+from typer.testing import CliRunner
+
+import kcs_torch as kt
+from kcs_torch.cli import app
+from kcs_torch.cli.outputs import parse_scale
+from kcs_torch.errors import OptionError
+from kcs_torch.io import load_motion, load_reconstruction, save
+from kcs_torch.types import Motion
+
+
+def run(*words, code=0):
+    done = CliRunner().invoke(app, [str(w) for w in words])
+    assert done.exit_code == code, done.output
+    return done
+
+
+# ---------------------------------------------------------------------- the whole way
+
+
+def test_raw_detections_to_every_tool_and_back(shared, tmp_path):
+    raw = shared / "data" / "raw_formats" / "openpose" / "pose2sim_cam01_json"
+    at = lambda name: tmp_path / name  # noqa: E731
+    run("convert", raw, at("tracks.npz"))
+    tracks = kt.load_tracks(at("tracks.npz"))
+    assert torch.equal(tracks.points, kt.load_tracks(raw).points)
+    save(tracks.frames(0, 30), at("short.npz"))
+    done = run("lift", at("short.npz"), "-o", at("r.npz"), "--method", "kcs", "--fps", 60)
+    assert "wrote" in done.output
+    done = run("convert", at("r.npz"), at("r.bvh"), at("r.trc"), at("r.c3d"), "--scale", "height=1.75m")
+    assert "from ours" in done.stderr
+    result = load_reconstruction(at("r.npz")).scaled(units="m", height=1.75)
+    expected = Motion.of(result)
+    for name, factor, close in (("r.trc", 1, 1e-7), ("r.c3d", 1000, 1e-3)):
+        motion = load_motion(at(name))
+        assert motion.skeleton == expected.skeleton
+        assert motion.fps == 60
+        assert torch.allclose(motion.points, factor * expected.points, atol=close)
+    motion = load_motion(at("r.bvh"))
+    off = (motion.points / 100 - expected.points).norm(dim=-1)
+    words = next(line for line in done.stderr.splitlines() if "from ours" in line).split()
+    assert float(words[words.index("to") + 1]) == pytest.approx(100 * float(off.max()), rel=0.01)  # as it was told
+    told = run("score", at("r.npz"), at("r.trc"), "--scale", "height=1.75m", "--align", "root").output
+    assert "30 frames" in told
+    assert float(next(line for line in told.splitlines() if line.startswith("root")).split()[1]) < 1e-6
+
+
+def test_results_go_to_all_formats(tmp_path):
+    save(walk_result(), tmp_path / "r.npz")
+    outputs = [tmp_path / f"o{suffix}" for suffix in (".npz", ".bvh", ".trc", ".c3d", ".csv", ".json", ".html", ".png")]
+    run("convert", tmp_path / "r.npz", *outputs)
+    assert all(path.stat().st_size > 500 for path in outputs)
+    assert torch.equal(load_reconstruction(outputs[0]).points, walk_result().points)
+
+
+def test_motion_goes_from_one_tool_to_another(tmp_path):
+    motion = walking_motion(10)
+    save(motion, tmp_path / "a.bvh", notes=[])
+    run("convert", tmp_path / "a.bvh", tmp_path / "b.c3d", tmp_path / "b.npz", "--from-units", "cm")
+    run("convert", tmp_path / "b.c3d", tmp_path / "c.trc", "--up", "z")
+    run("convert", tmp_path / "c.trc", tmp_path / "d.bvh", tmp_path / "d.csv", "--from-up", "z", "--units", "m")
+    assert load_motion(tmp_path / "c.trc").units == "m"
+    for name, factor in (("b.c3d", 1000), ("b.npz", 100), ("d.bvh", 1)):
+        found = load_motion(tmp_path / name)
+        assert torch.allclose(found.points / factor, motion.points, atol=1e-5), name
+        assert found.skeleton == motion.skeleton
+    table = np.genfromtxt(tmp_path / "d.csv", delimiter=",", skip_header=1)
+    assert np.allclose(table[:, 2:].reshape(10, -1, 3), motion.points, atol=1e-5)
+
+
+def test_real_capture_to_animation(shared, tmp_path):
+    amc = shared / "data" / "raw_formats" / "asf_amc" / "35_01.amc"
+    done = run("convert", amc, tmp_path / "w.bvh", tmp_path / "w.npz", "--fps", 120)
+    assert "skeleton of 35.asf" in done.stderr
+    motion = load_motion(tmp_path / "w.bvh")
+    assert torch.allclose(10 * motion.points, load_motion(amc).points, atol=1e-3)  # mm
+    assert motion.fps == pytest.approx(120, rel=1e-4)
+
+
+# ---------------------------------------------------------------------- options
+
+
+def test_scale_is_read():
+    assert parse_scale("height=1.75m") == {"units": "m", "height": 1.75}
+    assert parse_scale("left_knee-left_ankle=430mm") == {"units": "mm", "left_knee-left_ankle": 430}
+    assert parse_scale("factor = 2 mm") == {"units": "mm", "factor": 2}
+    assert parse_scale(".5=1e-1in") == {"units": "in", ".5": 0.1}
+    assert parse_scale(None) is None
+    for wrong in ("1.75", "height=1.75", "height=m", "height=-1m", "height=0m", "height=1px", "=1m", "height=1e999m"):
+        with pytest.raises(OptionError, match="--scale: expected height=1.75m"):
+            parse_scale(wrong)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["r.npz", "o.npz", "--up", "z"], "--up: expected a .bvh, .c3d, .csv or .trc file"),
+        (["r.npz", "o.trc", "--up", "x"], "unknown axis for --up 'x'"),
+        (["r.npz", "o.trc", "--scale", "height"], "--scale: expected"),
+        (["r.npz", "o.trc", "--scale", "tail=1m"], "unknown size 'tail'"),
+        (["r.npz", "o.trc", "--units", "ell"], "unknown unit of length 'ell'"),
+        (["r.npz", "o.trc", "--skeleton", "coco17"], "a result has its own skeleton"),
+        (["r.npz", "r.npz"], "expected another file"),
+        (["r.npz", "o.xyz"], "one of the suffixes"),
+        (["r.npz", "missing/../o.trc", "--format", "nothing"], "unknown format 'nothing'"),
+        (["t.npz", "o.bvh"], "got 2D tracks, which go to .npz"),
+        (["t.npz", "o.npz", "--scale", "height=1m"], "2D tracks have no true size"),
+        (["t.npz", "o.npz", "--from-up", "z"], "are for 3D motion, got 2D tracks"),
+        (["t.npz", "o.npz", "--up", "z"], "are for 3D motion|--up"),
+        (["m.trc", "o.html"], "got motion, which goes to"),
+        (["text", "o.npz"], "expected tracks or motion in one of"),
+        (["absent", "o.npz"], "no such file"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    save(walk_result(), "r.npz")
+    save(walk_result().tracks, "t.npz")
+    save(walking_motion(), "m.trc")
+    (tmp_path / "text").write_text("hello")
+    before = sorted(p.name for p in tmp_path.iterdir())
+    done = run("convert", *words, code=2)
+    import re
+
+    assert re.search(message, done.stderr), done.stderr
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
+
+
+def test_lift_writes_in_true_size(tmp_path, openpose_folder):
+    outputs = [tmp_path / f"o{suffix}" for suffix in (".npz", ".trc", ".csv")]
+    words = ["-o", outputs[0], "-o", outputs[1], "-o", outputs[2], "--method", "kcs", "--fps", 30]
+    run("lift", openpose_folder, *words, "--scale", "LKnee-LAnkle=430mm", "--up", "z")
+    result = load_reconstruction(outputs[0])
+    assert result.units == "mm"
+    assert float(result.lengths[result.skeleton.bone_names.index("LKnee-LAnkle")]) == pytest.approx(430)
+    expected = Motion.of(result).points
+    assert torch.allclose(1000 * load_motion(outputs[1], up="z").points, expected, atol=1e-3)
+    table = np.genfromtxt(outputs[2], delimiter=",", skip_header=1)[:, 2:].reshape(len(expected), -1, 3)
+    assert np.allclose(table[..., 2], expected[..., 1], atol=1e-3)  # z is up there too
+    told = run("lift", openpose_folder, "-o", tmp_path / "p.bvh", "--method", "kcs", "--json").stdout
+    notes = json.loads(told)["people"][0]["notes"]
+    assert any("the true size is not known: lengths are in px" in note for note in notes)
+    assert any("the frame rate is not known" in note for note in notes)
+
+
+# ---------------------------------------------------------------------- score
+
+
+@pytest.fixture
+def scored(tmp_path):
+    """A result in metres, its truth by other names in millimetres, and noise between them."""
+    result = walk_result(20).scaled(units="m", factor=1e-3)
+    save(result, tmp_path / "pred.npz")
+    motion = Motion.of(result)
+    noise = torch.randn(motion.points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    names = ["".join(w.capitalize() for w in n.split("_")) for n in motion.skeleton.joints]
+    truth = Motion.from_arrays(motion.points + 0.02 * noise, joint_names=names, fps=25, units="m")
+    save(truth, tmp_path / "truth.trc", units="mm")
+    return tmp_path
+
+
+def test_score_names_what_it_compares(scored):
+    told = run("score", scored / "pred.npz", scored / "truth.trc").output
+    assert "20 frames, 19 joints" in told
+    assert "left_hip = LeftHip" in told
+    assert "MPJPE [mm]" in told
+    assert "PCK within 150 mm" in told
+    rows = {line.split()[0]: line for line in told.splitlines() if line}
+    for how in ("root", "scale", "rigid", "similarity", "sequence"):
+        assert 10 < float(rows[how].split()[1]) < 60
+        assert "100.0 %" in rows[how]
+    assert "Pelvis of each frame moved" in rows["root"]
+    assert "no bones in the truth" in told
+    assert "mirror image" not in told
+
+
+def test_score_as_json(scored):
+    words = ["score", scored / "pred.npz", scored / "truth.trc", "--align", "similarity", "--align", "none", "--json"]
+    data = json.loads(run(*words).stdout)
+    found = kt.metrics.compare(
+        load_motion(scored / "pred.npz"), load_motion(scored / "truth.trc"), align=["similarity", "none"]
+    )
+    assert data["mpjpe"] == pytest.approx(found.mpjpe)
+    assert data["joints"][0] == list(found.joints[0])
+    assert data["bone_deviation_truth"] is None
+    assert math.isnan(found.bone_deviation_truth)
+    assert data["units"] == "mm"
+
+
+def test_score_tells_of_a_mirror(scored):
+    save(load_reconstruction(scored / "pred.npz").mirrored(), scored / "flip.npz")
+    told = run("score", scored / "flip.npz", scored / "truth.trc", "--align", "rigid").output
+    assert "note: the mirror image in depth is nearer (rigid" in told
+    plain = run("score", scored / "pred.npz", scored / "truth.trc", "--align", "rigid").output
+    mirrored = run("score", scored / "flip.npz", scored / "truth.trc", "--align", "rigid", "--mirror").output
+    pick = lambda text: next(line for line in text.splitlines() if line.startswith("rigid"))  # noqa: E731
+    assert pick(mirrored) == pick(plain)
+
+
+def test_score_says_what_does_not_fit(scored):
+    save(walking_motion(15), scored / "short.trc")
+    for words, message in [
+        (["short.trc"], "expected as many frames in both"),
+        (["truth.trc", "--align", "best"], "unknown alignment 'best'"),
+        (["truth.trc", "--root", "Tail"], "unknown root"),
+        (["absent.trc"], "no such file"),
+        (["truth.trc", "--truth-up", "w"], "axis for up"),
+    ]:
+        done = run("score", scored / "pred.npz", scored / words[0], *words[1:], code=2)
+        assert message in done.stderr
+    done = run("score", scored / "pred.npz", scored / "short.trc", "--json", code=2)
+    assert json.loads(done.stdout)["type"] == "ShapeError"
+    save(walk_result(20).tracks, scored / "tracks.npz")
+    done = run("score", scored / "tracks.npz", scored / "truth.trc", code=2)
+    assert "expected 3D motion under 'points3d'" in done.stderr
+
+
+def test_score_takes_the_unit_of_files_without_one(scored):
+    save(load_motion(scored / "truth.trc"), scored / "truth.npz")
+    motion = Motion.of(load_reconstruction(scored / "pred.npz"))
+    save(motion, scored / "pred.bvh", notes=[])
+    words = ["score", scored / "pred.bvh", scored / "truth.npz", "--align", "root"]
+    done = run(*words, code=2)
+    assert "keeps sizes" in done.stderr
+    told = run(*words, "--scale", "factor=1cm").output
+    same = run("score", scored / "pred.npz", scored / "truth.npz", "--align", "root").output
+    pick = lambda text: float(next(l for l in text.splitlines() if l.startswith("root")).split()[1])  # noqa: E731, E741
+    assert pick(told) == pytest.approx(pick(same), rel=1e-3)
