@@ -113,6 +113,17 @@ def test_somebody_far_off_is_somebody_new_however_well_seen():
     assert len(link_people([pose, pose + np.array([20.0, 0, 0])])) == 1
 
 
+def test_a_person_among_more_ghosts_than_are_remembered():
+    frames, names = crowd(4, num_people=1, num_frames=20, lost=0.2)
+    rng = np.random.default_rng(0)
+    for t, found in enumerate(frames):
+        far = rng.uniform(10_000, 1e6, (60, 1, 1)) + rng.normal(0, 50, (60, 17, 2))
+        frames[t] = np.concatenate([np.concatenate([far, np.full((60, 17, 1), 0.2)], -1), found])
+        names[t] = [-1] * 60 + names[t]
+    main = link_people(frames)[0]
+    assert [n for n in who(main, frames, names) if n is not None] == [0] * sum(0 in n for n in names)
+
+
 def test_empty_and_blank_detections():
     assert link_people([]) == []
     assert link_people([np.zeros((0, 3, 3)), np.zeros((2, 3, 3))]) == []
