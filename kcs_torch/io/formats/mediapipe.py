@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,12 @@ _HIDDEN = 0.3
 detections of the same video, joints of visibility below 0.5 are off by 2.5 times as much as the others, not by more:
 a guess that is worth something."""
 _SHARES = 2.0  # coordinates whose median is above this are no shares of the image
-_NAMED = frozenset(j for b in BODIES.values() for j in SKELETONS[b].joints[: SKELETONS[b].num_observed])
+
+
+@cache
+def _named() -> frozenset[str]:
+    """Names of all landmarks; loading skeletons is left until they are needed."""
+    return frozenset(j for b in BODIES.values() for j in SKELETONS[b].joints[: SKELETONS[b].num_observed])
 
 
 def recognises(probe: Probe) -> bool:
@@ -40,7 +46,7 @@ def recognises(probe: Probe) -> bool:
     marks, cells = csv_columns(header.decode("utf-8", "replace").strip())
     if cells[:2] == ["track", "frame_idx"]:  # SLEAP's
         return False
-    return len(_NAMED & set(marks)) >= 10 or (len(marks) >= 21 and all(m.isdecimal() for m in marks))
+    return len(_named() & set(marks)) >= 10 or (len(marks) >= 21 and all(m.isdecimal() for m in marks))
 
 
 def read(path: Path, options: Options) -> list[Tracks]:
