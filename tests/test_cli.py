@@ -36,7 +36,7 @@ def run(*words, code=0):
 
 def test_help_lists_every_command():
     text = run("--help").stdout
-    for command in ("demo", "lift", "info", "view", "skeletons"):
+    for command in ("demo", "detect", "doctor", "lift", "info", "view", "skeletons"):
         assert command in text
 
 
@@ -162,7 +162,7 @@ MISTAKES = {
     "no value": (["lift", "IN", "-o", "OUT.npz", "-m", "sfam", "--set", "beta"], "OptionError", "name=value"),
     "bad value": (["lift", "IN", "-o", "OUT.npz", "-m", "sfam", "--set", "beta=much"], "OptionError", "a number"),
     "skeleton": (["lift", "IN", "-o", "OUT.npz", "--skeleton", "body52"], "SkeletonError", "did you mean 'body25'"),
-    "wrong skeleton": (["lift", "IN", "-o", "OUT.npz", "--skeleton", "coco17"], "SkeletonError", "coco17"),
+    "wrong skeleton": (["lift", "IN", "-o", "OUT.npz", "--skeleton", "hand21"], "SkeletonError", "hand21"),
     "format": (["lift", "IN", "-o", "OUT.npz", "--format", "opnpose"], "OptionError", "did you mean 'openpose'"),
     "person": (["lift", "IN", "-o", "OUT.npz", "--person", "7"], "FormatError", "2 people"),
     "person's name": (["lift", "IN", "-o", "OUT.npz", "--person", "-1"], "OptionError", "a number from 0, or all"),
