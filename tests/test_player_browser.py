@@ -10,6 +10,7 @@ from browser import Browser, find_chromium
 from matplotlib.image import imread
 from samples import walk_result
 
+from kcs_torch.skeleton import Skeleton
 from kcs_torch.viewer import player
 
 EVIL = '</script><script>document.title = "ran"</script><img src=x onerror="document.title = 1">'
@@ -208,6 +209,18 @@ def test_what_is_unknown_is_not_offered(page):
     browser = page(plain)
     for name in ("pick-person", "pick-solution", "pick-walk", "pick-bars", "spread"):
         assert hidden(browser, name), name
+    dots = replace(plain.tracks, skeleton=Skeleton.from_edges([], plain.skeleton.num_joints, tree=False))
+    assert hidden(page(replace(plain, tracks=dots)), "lengths")
+
+
+def test_a_body_that_goes_far_is_followed(page, result):
+    browser = page(result)
+    assert not browser.run("document.getElementById('follow').checked")
+    far = torch.linspace(0, 20 * float(np.ptp(result.points.numpy())), 40, dtype=torch.float64)
+    away = replace(result, points=result.points + torch.nn.functional.pad(far[:, None, None], (0, 2)))
+    browser = page(away)
+    assert browser.run("document.getElementById('follow').checked")
+    assert share(picture(browser), "#0072b2") > 2e-4
 
 
 def test_pointing_tells_the_joints_name(page, result):

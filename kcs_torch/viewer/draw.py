@@ -132,9 +132,9 @@ def new_figure(width: float, height: float, dpi: int) -> Figure:
 
 def _panels(count: int, joints: int) -> tuple[Figure, list[Any]]:
     side = SIDE * (1.6 if joints > MANY else 1.0)
-    figure = new_figure(side * count, side + 0.6, 110)
+    figure = new_figure(side * count, side + 0.7, 110)
     axes = figure.subplots(1, count, squeeze=False)[0]
-    figure.subplots_adjust(left=0.01, right=0.99, bottom=0.45 / (side + 0.6), top=1 - 0.65 / (side + 0.6), wspace=0.02)
+    figure.subplots_adjust(left=0.01, right=0.99, bottom=0.45 / (side + 0.7), top=1 - 0.75 / (side + 0.7), wspace=0.02)
     for axis in axes:
         axis.set_xticks([])
         axis.set_yticks([])
@@ -144,9 +144,9 @@ def _panels(count: int, joints: int) -> tuple[Figure, list[Any]]:
 
 
 def _title(figure: Figure, text: str) -> None:
-    width = int(11 * figure.get_size_inches()[0])
+    width = int(12 * figure.get_size_inches()[0])
     lines = textwrap.wrap(printable(text), width)
-    figure.suptitle("\n".join(lines[:2]), fontsize=12, y=1 - 0.1 / figure.get_size_inches()[1], parse_math=False)
+    figure.suptitle("\n".join(lines[:2]), fontsize=11, y=1 - 0.08 / figure.get_size_inches()[1], parse_math=False)
 
 
 def _pose(tracks: Tracks, frame: int) -> Array:

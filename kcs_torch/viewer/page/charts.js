@@ -24,7 +24,7 @@ class Chart {
   set(lines, { least, both }) {
     this.lines = lines;
     this.both = both;
-    this.top = nice(Math.max(1.05 * quantile(lines.flatMap(l => Array.from(l.values, Math.abs)), 0.999), least));
+    this.top = nice(Math.max(1.05 * quantile(lines.flatMap(l => Array.from(l.values, Math.abs)), 0.99), least));
     this.stale = true;
   }
 

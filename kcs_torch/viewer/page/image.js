@@ -32,7 +32,7 @@ const drawImage = bodies => {
   bodies.forEach(({ person }, k) => {
     const first = state.frame * person.count, own = person.tracks.subarray(2 * first, 2 * (first + person.count));
     const seen = j => !Number.isNaN(own[2 * j]);
-    const broad = Math.min(Math.max(0.02 * sight.body * scale, 1.5), 4);
+    const broad = Math.min(Math.max(0.02 * sight.body * scale, person.bones.length ? 1.5 : 3), 4);
     for (const [a, b, side] of person.bones)
       if (seen(a) && seen(b)) stroke(pen, at(own, a), at(own, b), person.colours[side], broad);
     for (const [a, b] of person.bones) {

@@ -18,7 +18,7 @@ const draw = () => {
   drawSpace(bodies);
   drawImage(bodies);
   const at = state.hover && state.hover.person.number === state.person ? state.hover.joint : -1;
-  lengths.draw(line => line.ends.includes(at));
+  if (!lengths.section.hidden) lengths.draw(line => line.ends.includes(at));
   if (!spread.section.hidden) spread.draw(line => line.joint === at);
 };
 const show = frame => { state.frame = ((frame % frames) + frames) % frames; redraw(); };
@@ -30,8 +30,9 @@ const plot = () => {
     const [a, b, side] = person.bones[person.rigid[k]];
     return { name: `${name(a)}-${name(b)}`, ends: [a, b], color: person.colours[side], values };
   }), { least: 1, both: true });
+  lengths.section.hidden = !person.rigid.length;
   spread.section.hidden = !person.spread;
-  main.classList.toggle("plain", !person.spread);
+  main.dataset.charts = Number(!lengths.section.hidden) + Number(!spread.section.hidden);
   if (person.spread) spread.set(person.joints.map((joint, j) => ({
     name: joint, joint: j, color: person.colours[person.sides[j]],
     values: Float32Array.from({ length: person.frames }, (_, t) => person.spread[t * person.count + j]),
@@ -134,6 +135,9 @@ listSolutions();
 listenSpace(byId("space"), redraw);
 measureImage();
 [state.yaw, state.pitch] = VIEWS.three;
+measure();
+// A body that goes far would be small.
+if (people.length === 1 && room.size > 2.5 * people[0].size) byId("follow").checked = state.follow = true;
 refit();
 let size = "";
 const resized = new ResizeObserver(() => {  // a picture of another shape is filled anew

@@ -133,7 +133,8 @@ const drawSpace = bodies => {
   for (const { person, joints } of bodies) {
     const at = j => see(joints[3 * j], joints[3 * j + 1], joints[3 * j + 2]);
     const known = j => !Number.isNaN(joints[3 * j]);
-    const thick = 0.021 * person.size, radius = new Float64Array(person.count).fill(0.011 * person.size);
+    const thick = 0.021 * person.size, loose = person.bones.length ? 0.011 : 0.025;
+    const radius = new Float64Array(person.count).fill(loose * person.size);
     const faint = person.blank[state.frame] ? 0.65 : 0, shadow = [];
     for (const [a, b, side] of person.bones) {
       if (!known(a) || !known(b)) continue;
