@@ -30,8 +30,8 @@ const plot = () => {
     const [a, b, side] = person.bones[person.rigid[k]];
     return { name: `${name(a)}-${name(b)}`, ends: [a, b], color: person.colours[side], values };
   }), { least: 1, both: true });
-  lengths.section.hidden = !person.rigid.length;
-  spread.section.hidden = !person.spread;
+  lengths.section.hidden = !person.rigid.length || frames === 1;
+  spread.section.hidden = !person.spread || frames === 1;
   main.dataset.charts = Number(!lengths.section.hidden) + Number(!spread.section.hidden);
   if (person.spread) spread.set(person.joints.map((joint, j) => ({
     name: joint, joint: j, color: person.colours[person.sides[j]],
@@ -121,6 +121,8 @@ document.addEventListener("keydown", e => {
   show(state.frame + step * (e.shiftKey ? 10 : 1));
 });
 
+play.parentElement.hidden = frames === 1;
+byId("pick-speed").hidden = frames === 1;
 byId("pick-person").hidden = people.length < 2;
 byId("pick-walk").hidden = !people.some(p => p.path);
 byId("pick-bars").hidden = !people.some(p => p.spread);
