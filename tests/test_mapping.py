@@ -56,9 +56,11 @@ def test_any_two_built_in_humans(first, second):
     # all limbs are found, on their own sides
     assert len([j for j in found if side_of(j) != "centre"]) >= len(LIMBS)
     assert all(side_of(theirs) == side_of(ours) for theirs, ours in found.items())
-    # and lie in the same places, metres; motion capture has wrists, pelvis and upper neck a little off
+    # and lie in the same places, metres; motion capture has wrists, pelvis and upper neck a little off, and what SMPL
+    # names its head is where the skull turns
     for theirs, ours in found.items():
-        assert math.dist(a.template[a.index(ours)], b.template[b.index(theirs)]) < 0.101, (theirs, ours)
+        limit = 0.21 if "smpl24" in (first, second) and ours.lower() == theirs.lower() == "head" else 0.101
+        assert math.dist(a.template[a.index(ours)], b.template[b.index(theirs)]) < limit, (theirs, ours)
 
 
 def test_joints_that_only_one_has_are_left_out():

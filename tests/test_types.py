@@ -343,8 +343,9 @@ def test_scaled_by_height():
     points = torch.tensor([[0.0, -3, 0], [0, 0, 0], [0, 2, 0], [0, 1, 0]]).double().expand(12, 4, 3)
     tracks = Tracks.from_arrays(points[..., :2], skeleton=chain)
     body = replace(result, points=points, lengths=torch.tensor([3.0, 2, 1]).double(), tracks=tracks)
-    tall = body.scaled(units="m", height=1.75)  # head to the farther foot: 5 units
-    assert_close(tall.points, points * 0.35)
+    # 5 units from the head's top to an ankle, which is 166 cm of 175, and 4 to the ball of a foot, which is 171.5
+    own = 1.75 * (5 / 1.66 + 4 / 1.715) / 2
+    assert_close(body.scaled(units="m", height=1.75).points, points * 1.75 / own, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -358,6 +359,9 @@ def test_scaled_by_height():
         ({"factor": INF}, "positive factor"),
         ({"factor": NAN}, "positive factor"),
         ({"height": -1.75}, "positive factor"),
+        ({"factor": "2"}, "factor: expected a number, got '2'"),
+        ({"height": "1.75"}, "height: expected a number, got '1.75'"),
+        ({"factor": torch.ones(2)}, "factor: expected a number"),
         ({"width": 1.0}, "unknown size 'width': expected 'height' or a bone"),
     ],
 )

@@ -16,7 +16,9 @@ from collections.abc import Sequence
 from kcs_torch.anatomy.names import FINGER_JOINTS, part_of, side_of
 from kcs_torch.errors import SkeletonError, unknown
 
-__all__ = ["places_by_names", "places_of_known", "template_by_names"]
+__all__ = ["places_by_names", "places_of_known", "share_of_stature", "template_by_names"]
+
+STATURE = 1.75
 
 Point = tuple[float, float, float]
 
@@ -173,6 +175,15 @@ def places_of_known(names: Sequence[str]) -> list[tuple[str, str] | None]:
     return [None if p is None else (s, _resolve(p, s, present)) for s, p in zip(sides, parts, strict=True)]
 
 
+def share_of_stature(place: str) -> float:
+    """How high a place of the centre or the left side lies above the floor, as a share of the stature.
+
+    >>> round(share_of_stature("headtop"), 3), round(share_of_stature("ankle"), 3)
+    (0.989, 0.04)
+    """
+    return (_CENTRE[place] if place in _CENTRE else _LEFT[place])[1] / STATURE
+
+
 def _known_parts(kind: str, names: Sequence[str]) -> list[tuple[str, str]]:
     """(side, part) of every joint; all must be known."""
     parts = [(side_of(n), part_of(n, kind)) for n in names]
@@ -201,7 +212,7 @@ def _resolve(part: str, side: str, present: set[str]) -> str:
             "neck": "upperneck" if "thorax" in present else "neck",
             "lowerneck": "neck1",
             "upperneck": "neck2" if "lowerneck" in present else "upperneck",
-            "head": "headtop" if present & {"neck2", "lowerneck"} and "headtop" not in present else "head",
+            "head": _head(present, bool(chain)),
         }.get(part, part)
     return {
         "hipjoint": "hip_inner" if "hip" in present else "hip",
@@ -216,6 +227,13 @@ def _resolve(part: str, side: str, present: set[str]) -> str:
         "arm": "shoulder",
         "hand": "hand" if "wrist" in present else "wrist",
     }.get(part, part)
+
+
+def _head(present: set[str], chain: bool) -> str:
+    """Where a joint named head is: in the middle of the head, but motion capture puts it where the skull turns."""
+    if present & {"neck2", "lowerneck"} and "headtop" not in present:
+        return "headtop"  # a bone named by its far end
+    return "upperneck" if chain and "thorax" not in present else "head"
 
 
 def _place_hand(parts: Sequence[tuple[str, str]]) -> tuple[Point, ...]:

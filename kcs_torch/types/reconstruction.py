@@ -143,11 +143,16 @@ class Reconstruction:
         Args:
             units: name of the new unit.
             factor: new units per old unit; or instead one size by name:
-            **sizes: ``height=1.75`` (head to foot of the straightened body, along the bones) or
-                ``length=0.43, `` given as ``{"left_knee-left_ankle": 0.43}`` through ``**``.
+            **sizes: ``height=1.75``, the person's stature, or the length of a bone, given as
+                ``**{"left_knee-left_ankle": 0.43}``. The stature is that of the straightened body from the topmost
+                joint of the head to the heels or ankles, enlarged by what usually lies above and below these: a nose is
+                8.6 % of the stature below the top of the head, a joint named head 5 % (where the skull turns, in motion
+                capture, 12.6 %), an ankle 4 % above the floor. Individuals differ by some per cent; a bone that has
+                been measured is more exact.
 
         Raises:
-            OptionError: not exactly one of ``factor`` and a size is given, or it is not positive.
+            OptionError: not exactly one of ``factor`` and a size is given, it is no positive number, or the skeleton
+                has no head or no leg to tell a stature from.
         """
         factor = size_factor(self.skeleton, self.lengths, factor, sizes)
         spread = None if self.uncertainty is None else self.uncertainty * factor

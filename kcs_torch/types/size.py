@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
-from kcs_torch.skeleton import Skeleton
+from kcs_torch.skeleton import Skeleton, stature_weights
+from kcs_torch.types.intake import as_number
 
 __all__ = ["METRES", "size_factor", "unit_ratio"]
 
@@ -45,7 +47,8 @@ def size_factor(
     if (factor is None) == (len(sizes) != 1):
         raise OptionError(f"{what}: expected either factor=... or exactly one size, such as height=1.75")
     if factor is None:
-        (name, size), *_ = sizes.items()
+        (name, given), *_ = sizes.items()
+        size = _number(given, f"{what}: {name}")
         if name == "height":
             own = _height(body, lengths, what)
         elif name in body.bone_names:
@@ -57,33 +60,31 @@ def size_factor(
         if not own > 0:
             raise OptionError(f"{what}: {name} is zero or unknown in this motion")
         factor = size / own
+    factor = _number(factor, f"{what}: factor")
     if not (factor > 0 and math.isfinite(factor)):
         raise OptionError(f"{what}: expected a positive factor, got {factor}")
     return factor
 
 
+def _number(value: object, what: str) -> float:
+    """A number, or a tensor of one, as a float.
+
+    Raises:
+        OptionError: it is none.
+    """
+    number = as_number(value.item() if isinstance(value, Tensor) and value.numel() == 1 else value)
+    if number is None:
+        raise OptionError(f"{what}: expected a number, got {value!r}")
+    return number
+
+
 def _height(body: Skeleton, lengths: Tensor, what: str) -> float:
-    """Longest path through the bones: head to foot of the straightened body."""
-    neighbours: dict[int, list[tuple[int, float]]] = {i: [] for i in range(body.num_joints)}
-    for (a, b), length in zip(body.bones, lengths.tolist(), strict=True):
-        neighbours[a].append((b, length))
-        neighbours[b].append((a, length))
-    names = list(body.joints)
-    tops = [i for i, n in enumerate(names) if "head" in n.lower() or "nose" in n.lower()]
-    feet = [i for i, n in enumerate(names) if any(w in n.lower() for w in ("ankle", "heel", "foot"))]
-    if not tops or not feet:
+    """The person's stature; the mean over those legs whose bones are known."""
+    weights = stature_weights(body)
+    if weights is None:
         raise OptionError(
             f"{what}: height needs a head and a foot among the joints; skeleton '{body.name}' has none: give a bone"
         )
-    best = 0.0
-    for top in tops:
-        reach = {top: 0.0}
-        stack = [top]
-        while stack:
-            i = stack.pop()
-            for j, length in neighbours[i]:
-                if j not in reach:
-                    reach[j] = reach[i] + length
-                    stack.append(j)
-        best = max([best, *(reach[f] for f in feet if f in reach)])
-    return best
+    weights = weights.to(lengths)
+    rows = torch.where(weights != 0, weights * lengths, torch.zeros_like(weights)).sum(-1)
+    return float(rows.nanmean())
