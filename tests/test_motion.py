@@ -332,5 +332,5 @@ def test_every_real_file_is_of_one_format(shared):
     assert set(found.values()) <= set(MOTION_READERS)
     for path in files:  # none of them is also read as tracks
         if path.name in found:
-            with pytest.raises(FormatError):
+            with pytest.raises(FormatError, match="3D|motion|three"):
                 kt.load_tracks(path)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from kcs_torch.errors import FormatError, OptionError, unknown
 from kcs_torch.io.hdf5 import read_tree
+from kcs_torch.io.motion import MOTION_READERS
 from kcs_torch.io.registry import Options, Probe, Reader, discover
 from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton
@@ -151,6 +152,9 @@ def _amount_seen(tracks: Tracks) -> float:
 
 def _describe(probe: Probe) -> str:
     """What a path that no reader recognises holds, in a few words."""
+    motion = [reader.name for reader in MOTION_READERS.values() if reader.recognises(probe)]
+    if motion:
+        return f"3D motion ({motion[0]}): load_motion(path).tracks() films it; `kcs-torch convert` and `score` take it"
     if probe.files:
         suffixes = sorted({f.suffix or f.name for f in probe.files})
         shown = ", ".join(suffixes[:5]) + (", ..." if len(suffixes) > 5 else "")

@@ -77,6 +77,13 @@ def save(
         raise OutputError(f"{path}: expected a result, got motion, which goes to {_suffixes('write_motion')}")
     motion = Motion.of(data) if isinstance(data, Reconstruction) else data
     motion = replace(motion, points=motion.points.detach())
+    if isinstance(data, Reconstruction):
+        known = data.distance is not None or data.root_depth is not None
+        saving.notes.append(
+            "the body walks through space, by the depth that was found"
+            if known
+            else "the body stays at one depth: how far it walks towards or away from the camera is not known"
+        )
     wanted = units or writer.unit
     if units is not None or (wanted and motion.units in METRES):
         motion = motion.scaled(units=wanted, factor=_ratio(motion.units, wanted))

@@ -6,10 +6,12 @@ the far end of each bone; y is up. The files do not tell the frame rate.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import roma
 import torch
 from torch import Tensor
@@ -207,7 +209,7 @@ def _parents_first(body: _Body, path: Path) -> list[_Bone]:
 def _angles(lines: Sequence[str], body: _Body, path: Path) -> dict[str, Tensor]:
     """The channel values (T, C) of the root and each bone that moves."""
     kinds = {"root": body.root.channels} | {b.name: b.channels for b in body.bones.values() if b.channels}
-    values: dict[str, list[list[float]]] = {name: [] for name in kinds}
+    values: dict[str, list[array[float]]] = {name: [] for name in kinds}
     frames = 0
     for number, words in _words(lines, body):
         where = f"{path}: line {number}"
@@ -224,11 +226,11 @@ def _angles(lines: Sequence[str], body: _Body, path: Path) -> dict[str, Tensor]:
         row = numbers(words[1:], where)
         if len(row) != len(kinds[name]):
             raise FormatError(f"{where}: '{name}': expected {len(kinds[name])} numbers, got {len(row)}")
-        values[name].append(row)
+        values[name].append(array("d", row))
     if not frames:
         raise FormatError(f"{path}: expected frames, each below a line with its number, got none")
     _complete(values, frames, f"{path}: line {len(lines)}")
-    return {n: torch.tensor(v, dtype=torch.float64).reshape(frames, len(kinds[n])) for n, v in values.items()}
+    return {n: torch.from_numpy(np.array(v, np.float64)).reshape(frames, len(kinds[n])) for n, v in values.items()}
 
 
 def _words(lines: Sequence[str], body: _Body) -> Iterator[tuple[int, list[str]]]:
@@ -240,7 +242,7 @@ def _words(lines: Sequence[str], body: _Body) -> Iterator[tuple[int, list[str]]]
             yield number, words
 
 
-def _complete(values: dict[str, list[list[float]]], frames: int, where: str) -> None:
+def _complete(values: dict[str, list[array[float]]], frames: int, where: str) -> None:
     missing = [name for name, rows in values.items() if len(rows) < frames]
     if missing:
         raise FormatError(f"{where}: frame {frames}: expected all bones, got none for {', '.join(missing[:5])}")

@@ -10,6 +10,7 @@ Written in centimetres, as most programs take it (Blender takes 1 unit for 1 m: 
 from __future__ import annotations
 
 import re
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -153,19 +154,19 @@ def _frames(lines: Sequence[str], start: int, count: int, path: Path, notes: lis
         at += 1
     if told is None or seconds is None:
         raise FormatError(f"{path}: expected Frames: and Frame Time: after MOTION, got the end of the file")
-    rows = []
+    rows: list[array[float]] = []
     for number, line in enumerate(lines[at:], at + 1):
         if not line:
             continue
         row = numbers(line.split(), f"{path}: line {number}")
         if len(row) != count:
             raise FormatError(f"{path}: line {number}: expected {count} numbers, one a channel, got {len(row)}")
-        rows.append(row)
+        rows.append(array("d", row))
     if not rows:
         raise FormatError(f"{path}: expected a line a frame below Frame Time, got none")
     if told != len(rows):
         notes.append(f"the header tells {told} frames, the file has {len(rows)}")
-    return torch.tensor(rows, dtype=torch.float64).reshape(len(rows), count), seconds
+    return torch.from_numpy(np.array(rows, np.float64)).reshape(len(rows), count), seconds
 
 
 def _positions(nodes: Sequence[_Node], values: Tensor) -> Tensor:

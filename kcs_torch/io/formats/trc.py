@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import math
 import re
+from array import array
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from kcs_torch.errors import FormatError
@@ -34,9 +36,10 @@ def read(path: Path, options: MotionOptions) -> Motion:
     """Read the markers."""
     lines = read_lines(path, strip=False)  # tabs mark empty cells
     split = "\t" if "\t" in lines[0] else ","
-    rows = [[cell.strip() for cell in line.split(split)] for line in lines]
+    cells_of = lambda line: [cell.strip() for cell in line.split(split)]  # noqa: E731
+    rows = [cells_of(line) for line in lines[:8]]
     header = dict(zip(rows[1], rows[2], strict=False)) if len(rows) > 2 else {}
-    at = next((i for i, row in enumerate(rows[:8]) if row[0].startswith("Frame#")), None)
+    at = next((i for i, row in enumerate(rows) if row[0].startswith("Frame#")), None)
     if at is None:
         raise FormatError(f"{path}: expected a line that begins with Frame# and names the markers, got none")
     names = rows[at][2::3]
@@ -44,8 +47,9 @@ def read(path: Path, options: MotionOptions) -> Motion:
         names.pop()
     if not names:
         raise FormatError(f"{path}: line {at + 1}: expected names of markers, got none")
-    frames: list[list[float]] = []
-    for number, row in enumerate(rows[at + 1 :], at + 2):
+    frames: list[array[float]] = []
+    for number, line in enumerate(lines[at + 1 :], at + 2):
+        row = cells_of(line)
         if not any(row) or not row[0]:  # the line below the names holds X1, Y1, Z1, ...; an empty one may follow
             continue
         cells = row[2:]
@@ -55,7 +59,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
             )
         cells = cells[: 3 * len(names)] + [""] * (3 * len(names) - len(cells))
         filled = iter(numbers([c for c in cells if c not in _UNSEEN], f"{path}: line {number}"))
-        frames.append([math.nan if c in _UNSEEN else next(filled) for c in cells])
+        frames.append(array("d", [math.nan if c in _UNSEEN else next(filled) for c in cells]))
     if not frames:
         raise FormatError(f"{path}: expected a line a frame below the names of the markers, got none")
     notes = []
@@ -64,7 +68,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
         notes.append(f"the header tells {told} frames, the file has {len(frames)}")
     rate = header.get("DataRate", "")
     return build_motion(
-        torch.tensor(frames, dtype=torch.float64).reshape(len(frames), len(names), 3),
+        torch.from_numpy(np.array(frames, np.float64)).reshape(len(frames), len(names), 3),
         options,
         source=str(path),
         names=distinct(names),
