@@ -61,7 +61,8 @@ def unknown(what: str, name: object, choices: Iterable[str], error: type[KcsErro
     "unknown method 'sfma': did you mean 'sfam'? (choices: kcs, sfam)"
     """
     choices = sorted(choices)
-    close = difflib.get_close_matches(str(name), choices, n=2)
+    shown = repr(name) if len(repr(name)) <= 100 else f"{repr(name)[:96]} ..."  # it may come from a file
+    close = difflib.get_close_matches(str(name)[:100], choices, n=2)
     hint = f": did you mean {' or '.join(repr(c) for c in close)}?" if close else ":"
     listing = f"(choices: {', '.join(choices)})" if close else f"choices are {', '.join(choices)}"
-    return error(f"unknown {what} {name!r}{hint} {listing}")
+    return error(f"unknown {what} {shown}{hint} {listing}")

@@ -445,6 +445,9 @@ def test_edges_need_not_be_a_tree(tmp_path):
     [
         ({"tracks": np.zeros((4, 5, 6, 7))}, None, "expected dimensions track, xy, node, frame of 3 nodes"),
         ({"tracks": np.zeros((4, 1, 3, 3))}, None, "3D motion"),
+        ({"tracks": np.zeros((2, 2, 3, 0))}, None, "at least one frame of one animal, got 0 of 2"),
+        ({"tracks": np.zeros((0, 2, 3, 4))}, None, "at least one frame of one animal, got 4 of 0"),
+        ({"tracks": np.zeros((1, 2, 3, 0)), "point_scores": np.zeros((1, 3, 0))}, None, "at least one frame"),
         ({"edge_inds": [[0, 3]]}, None, "'edge_inds': expected .* node numbers 0..2"),
         ({"edge_inds": [[0.5, 1]]}, None, "'edge_inds'"),
         ({"edge_inds": [[1, 1]]}, None, "edges"),

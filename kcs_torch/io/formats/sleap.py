@@ -97,7 +97,9 @@ def _read_hdf5(path: Path, notes: list[str]) -> tuple[list[Animal], NDArray[np.i
         raise refuse_3d(path)
     names = tree.texts.get("node_names")
     points = _in_order(tree, "tracks", names, path)
-    tracks, _, nodes = points.shape[:3]
+    tracks, frames, nodes = points.shape[:3]
+    if 0 in (tracks, frames):
+        raise FormatError(f"{path}: expected at least one frame of one animal, got {frames} of {tracks}")
     if names is None:
         notes.append("the file does not name the joints")
         names = [f"joint{i}" for i in range(nodes)]
@@ -132,7 +134,7 @@ def _in_order(tree: Tree, key: str, names: list[str] | None, path: Path) -> NDAr
         chosen = max(fits, key=lambda size: size["track"] == known)
         order = list(chosen)
         moved = array.transpose([order.index(d) for d in ("track", "frame", "node", "xy") if d in order])
-        return moved.reshape((*moved.shape[:3], -1))
+        return moved[..., None] if plain else moved
     named = "" if names is None else f" of {len(names)} nodes"
     raise FormatError(f"{path}: '{key}': expected dimensions {', '.join(orders[0])}{named}, got {array.shape}")
 
