@@ -14,6 +14,7 @@ from samples import walk_result
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.io import save
 from kcs_torch.skeleton import SKELETONS, Skeleton
+from kcs_torch.types import Diagnostics, Reconstruction, Tracks
 from kcs_torch.viewer import player, sheet
 from kcs_torch.viewer.colours import COLOURS, bone_keys, bone_side, joint_keys
 from kcs_torch.viewer.summary import summarise
@@ -167,8 +168,7 @@ def test_small_motion_far_from_the_origin_is_kept(result):
 
 
 def test_long_clips_show_every_nth_frame_and_say_so(result, monkeypatch):
-    whole = 12 * result.points.shape[1] * 7
-    monkeypatch.setattr("kcs_torch.viewer.scene.MOST_NUMBERS", whole // 3)
+    monkeypatch.setattr("kcs_torch.viewer.scene.MOST_NUMBERS", 12 * (7 * result.points.shape[1] + 14) // 3)
     text = player(result)
     data = scene(text)
     assert (data["step"], data["total"], data["people"][0]["frames"]) == (3, 12, 4)
@@ -372,3 +372,17 @@ def test_fingers_have_a_colour_each():
     assert len(set(fingers.values())) == 5
     assert ends[hand.index("wrist")] == "centre"
     assert set(keys) == set(fingers.values())
+
+
+def test_pages_are_bounded():
+    """Many joints, or many frames of few joints: no more than is told."""
+    for frames, joints in ((4000, 133), (60_000, 3)):
+        body = Skeleton.from_edges([(i, i + 1) for i in range(joints - 1)], joints)
+        points = torch.randn(frames, joints, 3, generator=torch.Generator().manual_seed(0))
+        tracks = Tracks.from_arrays(points[..., :2], skeleton=body, source="long.npz")
+        facts = Diagnostics(0.0, 0.0, 0.0, 0.0, True, 1)
+        eye = torch.eye(3)[None, :2].expand(frames, 2, 3)
+        long = Reconstruction(points, eye, torch.ones(frames), torch.ones(joints - 1), tracks, "any", facts)
+        text = player(replace(long, alternatives=(long, long)))
+        assert 4e6 < len(text) < 9e6
+        assert "frame shown" in text

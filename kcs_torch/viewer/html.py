@@ -30,8 +30,9 @@ def player(
     right vermilion, what is between them grey. One may choose the mirror image, the alternatives, and the body's path
     through space where it is known. Space plays and pauses; arrows step.
 
-    The page needs no network and no other package. It holds 50 kB and 25 bytes for each joint of a frame, but no more
-    than 9 MB: of clips with more frames than fit, every second, third, ... frame is shown, and the page says so.
+    The page needs no network and no other package. It holds 40 kB, about 20 bytes for each joint of a frame and half as
+    many for each alternative, but no more than 9 MB: of clips with more frames than fit, every second, third, ... frame
+    is shown, and the page says so.
 
     Args:
         results: one motion, or several of the same clip: each stands where its own tracks are; what lies between

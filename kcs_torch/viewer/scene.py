@@ -74,8 +74,9 @@ def _points(result: Reconstruction) -> Array:
 
 def _numbers(result: Reconstruction) -> int:
     """How many 16-bit numbers a result takes."""
-    joints = result.points.shape[1]
-    return len(result.points) * joints * (3 * (1 + len(result.alternatives)) + 4)
+    frames, joints = result.points.shape[:2]
+    solutions = 1 + len(result.alternatives)
+    return frames * (joints * (3 * solutions + 4) + 6 * solutions + 8)
 
 
 def _person(result: Reconstruction, name: str, frames: slice, middle: Array, middle2d: Array) -> dict[str, Any]:
