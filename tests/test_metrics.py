@@ -168,6 +168,8 @@ def test_what_is_wrong_is_said():
         e3d(clip(), clip(joints=5))
     with pytest.raises(ShapeError, match="weights"):
         mpjpe(clip(), clip(), weights=torch.ones(12, 5))
+    with pytest.raises(ShapeError, match="expected finite points"):
+        mpjpe(clip(), torch.full_like(clip(), torch.nan))
     with pytest.raises(ShapeError, match="pairs of joints"):
         bone_deviation(clip(), [])
 

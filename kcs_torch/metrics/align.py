@@ -35,7 +35,7 @@ def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = Non
         (..., T, N, 3), where the truth is.
 
     Raises:
-        ShapeError: the shapes differ.
+        ShapeError: the shapes differ, or a number is not finite.
         OptionError: there is no such alignment, or no such root.
 
     >>> truth = torch.randn(5, 17, 3, generator=torch.Generator().manual_seed(0))
@@ -48,6 +48,8 @@ def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = Non
         raise ShapeError(
             f"align: expected two of shape (..., T, N, 3), got {tuple(pred.shape)} and {tuple(truth.shape)}"
         )
+    if not bool(torch.isfinite(pred).all() and torch.isfinite(truth).all()):
+        raise ShapeError("align: expected finite points; write 0 where a joint is unknown, and 0 into its weight")
     if weights is not None and weights.shape != truth.shape[:-1]:
         raise ShapeError(f"weights: expected shape {tuple(truth.shape[:-1])}, got {tuple(weights.shape)}")
     if how == "none":
