@@ -55,7 +55,7 @@ ImageSize = Annotated[
 ]
 Trust = Annotated[
     bool,
-    typer.Option("--trust", help="Read a file although that takes unpickling it, which can run any code in it."),
+    typer.Option("--trust", help="Read a file although it is a pickle (VideoPose3D's .npz); no code of it is run."),
 ]
 
 

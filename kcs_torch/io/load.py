@@ -54,7 +54,7 @@ def load_people(
         fps: frames per second; as the file says if None.
         threshold: a joint with less confidence counts as unseen, 0..1.
         image_size: width and height of the video in pixels, for formats whose coordinates are shares of it (MediaPipe).
-        trust: read a file although that takes unpickling it, which can run any code that is in it.
+        trust: read a file although it is a pickle (VideoPose3D's .npz): arrays and numbers are taken from it, no code.
 
     Returns:
         At least one :class:`Tracks`; those of one video have the same number of frames.
@@ -100,7 +100,7 @@ def load_tracks(
         fps: frames per second; as the file says if None.
         threshold: a joint with less confidence counts as unseen, 0..1.
         image_size: width and height of the video in pixels, for formats whose coordinates are shares of it (MediaPipe).
-        trust: read a file although that takes unpickling it, which can run any code that is in it.
+        trust: read a file although it is a pickle (VideoPose3D's .npz): arrays and numbers are taken from it, no code.
 
     Returns:
         The tracks; ``notes`` say what was assumed.

@@ -53,7 +53,7 @@ class Options:
         fps: frames per second; None: as the file says.
         threshold: a joint with less confidence counts as unseen.
         image_size: width and height of the video in pixels, for formats whose coordinates are shares of it.
-        trust: whether a file that can only be read by unpickling may be; it can then run any code.
+        trust: whether a pickle (VideoPose3D's .npz) may be read; arrays, lists and numbers are taken from it, no code.
     """
 
     skeleton: str | Path | Skeleton | None = None

@@ -39,8 +39,8 @@ def read(path: Path, options: Options) -> list[Tracks]:
     if not options.trust:
         raise FormatError(
             f"{path}: VideoPose3D keeps its tracks as a pickle, a kind of file that can run code as it is read. This "
-            "reader makes nothing but arrays, lists and numbers of it; if you trust where it comes from, say so with "
-            "trust=True, on the command line --trust"
+            "reader takes nothing but arrays, lists and numbers from it and runs no code; if you trust where the file "
+            "comes from, say so with trust=True, on the command line --trust"
         )
     sequences = list(_sequences(file.objects(_KEY), str(path)))
     if not sequences:
