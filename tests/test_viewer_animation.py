@@ -74,6 +74,18 @@ def test_a_person_who_comes_later_is_not_there_before(result):
     assert (first < 128).mean() < 0.95 * (there < 128).mean()
 
 
+def test_somebody_who_goes_far_is_drawn_as_large(result):
+    """Ink in both halves stays about the same when the body also moves away by twenty of its sizes."""
+    far = torch.linspace(0, 20 * float(np.ptp(result.points.numpy())), 12, dtype=torch.float64)[:, None, None]
+    away = torch.nn.functional.pad(far, (0, 1))
+    tracks = replace(result.tracks, points=result.tracks.points + away)
+    moved = replace(result, points=result.points + torch.nn.functional.pad(away, (0, 1)), tracks=tracks)
+    still, moving = (list(animation(r)[0])[6] < 128 for r in (result, moved))
+    half = still.shape[1] // 2
+    for part in (np.s_[:, :half], np.s_[:, half:]):
+        assert moving[part].mean() > 0.6 * still[part].mean()
+
+
 def test_gif_loops_through_every_frame(result, tmp_path):
     with Image.open(save(result, tmp_path / "walk.gif")) as film:
         assert film.n_frames == 6  # 25 frames a second are too many for a GIF: every second one
