@@ -88,6 +88,18 @@ def test_by_hand(files):
     assert torch.allclose(motion.points[1] / UNIT, turned, atol=1e-9)
 
 
+def test_bones_may_stand_in_any_order(files):
+    expected = load_motion(files / "s_01.amc")
+    first, *bones = ASF.partition(":bonedata")[2].partition(":hierarchy")[0].split("  begin\n")
+    turned = first + "".join("  begin\n" + bone for bone in reversed(bones))
+    (files / "s.asf").write_text(
+        ASF.partition(":bonedata")[0] + ":bonedata" + turned + ":hierarchy" + ASF.partition(":hierarchy")[2]
+    )
+    found = load_motion(files / "s_01.amc")
+    at = [found.skeleton.index(name) for name in expected.skeleton.joints]
+    assert torch.equal(found.points[:, at], expected.points)
+
+
 def test_radians_and_other_orders(files):
     (files / "s_01.amc").write_text(AMC.replace("DEGREES", "RADIANS").replace("90", str(math.pi / 2)))
     (files / "s.asf").write_text(ASF.replace("axis 0 0 90 XYZ", f"axis 0 0 {math.pi / 2} XYZ"))

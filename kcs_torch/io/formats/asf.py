@@ -189,20 +189,19 @@ def _kinds(words: Sequence[str], where: str) -> tuple[str, ...]:
 
 
 def _parents_first(body: _Body, path: Path) -> list[_Bone]:
-    """The bones in their file's order, but parents before children."""
-    done, out = {"root"}, []
-    waiting = list(body.bones.values())
-    while waiting:
-        ready = [b for b in waiting if b.parent in done]
-        if not ready:
-            loose = waiting[0]
-            raise FormatError(f"{path}: line {loose.line}: bone '{loose.name}' hangs on nothing in :hierarchy")
-        # One sweep takes all that their own sweep's forerunners allow.
-        for bone in waiting:
-            if bone.parent in done:
-                done.add(bone.name)
-                out.append(bone)
-        waiting = [b for b in waiting if b.name not in done]
+    """The bones from the root outwards, those of one parent in their file's order."""
+    children: dict[str, list[_Bone]] = {}
+    for bone in body.bones.values():
+        children.setdefault(bone.parent, []).append(bone)
+    out: list[_Bone] = []
+    stack = list(reversed(children.get("root", [])))
+    while stack:
+        out.append(stack.pop())
+        stack += reversed(children.get(out[-1].name, []))
+    if len(out) < len(body.bones):
+        reached = {bone.name for bone in out}
+        loose = next(bone for bone in body.bones.values() if bone.name not in reached)
+        raise FormatError(f"{path}: line {loose.line}: bone '{loose.name}' hangs on nothing in :hierarchy")
     return out
 
 
