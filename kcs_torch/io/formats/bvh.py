@@ -4,8 +4,8 @@ Read without a library: any order and number of channels, wrong text answered wi
 parent (zero offset) are left out, ends of chains (End Site) become joints of their own. BVH has no unit, and y is up.
 
 Written in centimetres, as most programs take it (Blender takes 1 unit for 1 m: import with a scale of 0.01, or write
-``units="m"``; it turns y up by itself), with the rest pose of the skeleton's template. How far the file's joints are from
-ours is told.
+``units="m"``; it turns y up by itself), with the rest pose of the skeleton's template. How far the file's joints are
+from ours is told.
 """
 
 from __future__ import annotations
