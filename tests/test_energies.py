@@ -384,6 +384,64 @@ def test_nothing_seen_is_no_energy(kind, dtype):
         assert torch.equal(grad, torch.zeros_like(grad))
 
 
+WEIGHTED = {
+    "bone length": lambda x, y, r, w: BoneLengthEnergy(BODY)(x, None, w),
+    "bone length, given": lambda x, y, r, w: BoneLengthEnergy(BODY)(x, torch.ones(6, dtype=x.dtype), w),
+    "reprojection": lambda x, y, r, w: ReprojectionEnergy()(x, y, r, w),
+    "reprojection, no shift": lambda x, y, r, w: ReprojectionEnergy(translation=False)(x, y, r, w),
+    "reprojection, huber": lambda x, y, r, w: ReprojectionEnergy(huber=0.5)(x, y, r, w),
+    "smoothness": lambda x, y, r, w: SmoothnessEnergy()(x, w),
+}
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+def test_what_weighs_nothing_may_be_nan(name):
+    """Unseen joints are NaN in tracks, and in the poses of others: neither value nor gradient may know."""
+    energy = WEIGHTED[name]
+    points, tracks, cameras = scene()
+    weights = torch.ones(points.shape[:-1]).double()
+    weights[1, 2] = weights[3, 5] = 0
+    weights[4] = 0  # and a frame without anybody
+    expected = energy(points, tracks, cameras, weights)
+    gone = [torch.where(weights[..., None] > 0, a, torch.nan).requires_grad_() for a in (points, tracks)]
+    cameras = cameras.clone().requires_grad_()
+    value = energy(*gone, cameras, weights)
+    assert_close(value, expected)
+    grads = torch.autograd.grad(value.sum(), [*gone, cameras], allow_unused=True)
+    for grad in filter(lambda g: g is not None, grads):
+        assert torch.isfinite(grad).all()
+    assert not grads[0][weights == 0].any() and grads[0].any()
+    assert gradcheck(
+        lambda x: energy(torch.where(weights[..., None] > 0, x, torch.nan), gone[1], cameras, weights), points
+    )
+
+
+def test_the_plain_gradient_knows_no_nan_either():
+    points, tracks, cameras = scene()
+    weights = torch.ones(points.shape[:-1]).double()
+    weights[1, 2] = 0
+    expected = ReprojectionEnergy().grad(points, tracks, cameras, weights)
+    tracks[1, 2] = torch.nan
+    assert_close(ReprojectionEnergy().grad(points, tracks, cameras, weights), expected)
+
+
+@pytest.mark.parametrize("dtype", HALVES)
+@pytest.mark.parametrize("name", ["bone length", "symmetry", "smoothness"])
+def test_half_precision_in_millimetres(name, dtype):
+    energy = ENERGIES[name]
+    body = 300 * clip(joints=7)[:1] + 5 * normal(300, 7, 3)  # longer than a sum of lengths in half precision could be
+    points = body.to(dtype)
+    finite(lambda x: energy(x) / 1000, points)
+    assert_close(
+        energy(points).double(), energy(points.double()).clamp_max(torch.finfo(dtype).max), rtol=0.02, atol=1.0
+    )
+    finite(lambda x: ReprojectionEnergy()(x, points[..., :2] + 40, None), points)
+    huge = ReprojectionEnergy(translation=False)(points, points[..., :2] + 400)  # 7 joints times 160 000
+    assert_close(
+        huge.double(), torch.full_like(huge, 1).double() * min(1.12e6, torch.finfo(dtype).max), rtol=0.02, atol=0
+    )
+
+
 @given(st.integers(0, 10**6), st.floats(-6, 6), st.sampled_from(FLOATS), st.sampled_from(KINDS))
 @settings(max_examples=60, deadline=None)
 def test_nothing_is_nan_at_any_scale(seed, power, dtype, kind):

@@ -96,6 +96,18 @@ def test_a_length_of_zero_is_no_nan():
     assert energy(legs(-30, -30), lengths).item() == 0
 
 
+@pytest.mark.parametrize("given", [False, True])
+def test_frames_of_no_weight_may_be_anything(given):
+    energy, points = HingeEnergy("h36m17"), normal(5, 17, 3)
+    lengths = torch.ones(16).double() if given else None
+    weights = torch.tensor([1.0, 1, 0, 1, 0]).double()
+    gone = torch.where(weights[:, None, None] > 0, points, torch.nan).requires_grad_()
+    value = energy(gone, lengths, weights)
+    assert_close(value, energy(points, lengths, weights))
+    (grad,) = torch.autograd.grad(value.sum(), gone)
+    assert torch.isfinite(grad).all() and not grad[weights == 0].any() and grad.any()
+
+
 @pytest.mark.parametrize("batch", BATCHES)
 def test_batches(batch):
     points = normal(*batch, 4, 6, 3)

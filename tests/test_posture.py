@@ -167,6 +167,68 @@ def test_posture_in_batches_and_half_precision():
     assert_close(POSTURE(WALK.bfloat16()).double(), POSTURE(WALK), rtol=0.1, atol=0)
 
 
+@pytest.mark.parametrize("name", ["right_hip-right_knee", "spine-thorax"])
+def test_a_bone_of_length_zero_says_nothing(name):
+    """Of a network that begins at zero, or a body part that has never been seen."""
+    lengths = bone_lengths(WALK[:6], BONES).mean(0)
+    lengths[MAN.bone_names.index(name)] = 0
+    finite(POSTURE, WALK[:6], lengths)
+    assert gradcheck(lambda x: POSTURE(x, lengths), WALK[:6])
+    finite(POSTURE, WALK[:6], torch.zeros(16).double())
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_frames_of_no_weight_may_be_anything(given):
+    """They pad a shorter clip."""
+    lengths = bone_lengths(WALK[:6], BONES).mean(0) if given else None
+    padded = torch.cat([WALK[:6], torch.full((3, 17, 3), math.nan).double()]).requires_grad_()
+    weights = torch.tensor([1 / 15] * 6 + [0.0] * 3).double()
+    value = POSTURE(padded, lengths, weights)
+    assert_close(value, POSTURE(WALK[:6], lengths))
+    (grad,) = torch.autograd.grad(value, padded)
+    assert torch.isfinite(grad).all() and not grad[6:].any() and grad[:6].any()
+    assert POSTURE(padded, lengths, 0 * weights).item() == 0
+
+
+def test_bones_of_no_weight_may_be_anything():
+    energy, lengths = ForeshorteningEnergy(MAN), bone_lengths(WALK[:6], BONES).mean(0)
+    weights = torch.ones(6, 16).double()
+    weights[:, [b for b, ends in enumerate(MAN.bones) if 6 in ends]] = 0
+    gone = WALK[:6].clone()
+    gone[:, 6] = math.nan
+    gone.requires_grad_()
+    value = energy(gone, lengths, weights)
+    assert_close(value, energy(WALK[:6], lengths, weights))
+    (grad,) = torch.autograd.grad(value, gone)
+    assert torch.isfinite(grad).all() and not grad[:, 6].any() and grad.any()
+
+
+def test_feet_that_do_not_stand_may_be_anything():
+    body = SKELETONS["body25"]
+    energy, first = ContactEnergy(body), body.contacts[0]
+    points, velocity = normal(5, 25, 3), normal(5, seed=1)
+    stand = torch.ones(5, len(body.contacts)).double()
+    stand[2, 0] = 0
+    gone = points.clone()
+    gone[2, first] = math.nan
+    gone.requires_grad_()
+    value = energy(gone, velocity, stand)
+    assert_close(value, energy(points, velocity, stand))
+    (grad,) = torch.autograd.grad(value, gone)
+    assert torch.isfinite(grad).all() and not grad[2, first].any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_in_millimetres(dtype):
+    points = (1000 * WALK[:6]).to(dtype)
+    lengths = bone_lengths(points, BONES).mean(0)
+    cases = {"posture": POSTURE, "foreshortening": ForeshorteningEnergy(MAN)}
+    for name, energy in cases.items():
+        finite(energy, points, lengths)
+        exact = energy(points.double(), lengths.double())
+        assert_close(energy(points, lengths).double(), exact, rtol=0.02, atol=0.02, msg=name)
+
+
 @pytest.mark.parametrize("name", ["coco17", "mediapipe33", "hand21", "ap10k"])
 def test_posture_knows_every_template(name):
     body = SKELETONS[name]

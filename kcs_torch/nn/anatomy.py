@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.nn.layers import SkeletonModule
+from kcs_torch.nn.layers import SkeletonModule, known_frames, wide
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["HingeEnergy"]
@@ -71,16 +71,16 @@ class HingeEnergy(SkeletonModule):
             raise ShapeError(f"HingeEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
         if lengths is not None and lengths.shape[-1:] != (len(self.bones),):
             raise ShapeError(f"HingeEnergy: expected lengths (..., {len(self.bones)}), got {tuple(lengths.shape)}")
-        wide = points.to(torch.promote_types(points.dtype, torch.float32))  # squares in mm leave half precision's range
-        ends = wide.index_select(-2, self.joints.mT.reshape(-1)).unflatten(-2, (5, len(self.joints)))
+        full = wide(known_frames(points, weights))
+        ends = full.index_select(-2, self.joints.mT.reshape(-1)).unflatten(-2, (5, len(self.joints)))
         parent, joint, child, left, right = ends.unbind(-3)  # each (..., T, H, 3)
         upper, lower, axis = joint - parent, child - joint, left - right
         if lengths is None:
             upper, lower = _to_size(upper, weights), _to_size(lower, weights)
         else:
-            above, below = lengths.to(wide.dtype)[..., None, self.limbs].unbind(-1)  # each (..., 1, H)
+            above, below = lengths.to(full.dtype)[..., None, self.limbs].unbind(-1)  # each (..., 1, H)
             upper, lower = _divide(upper, above[..., None]), _divide(lower, below[..., None])
-        return (self.sign.to(wide.dtype) * _triple(upper, lower, _to_size(axis, weights))).to(points.dtype)
+        return (self.sign.to(full.dtype) * _triple(upper, lower, _to_size(axis, weights))).to(points.dtype)
 
 
 def _triple(a: Tensor, b: Tensor, c: Tensor) -> Tensor:

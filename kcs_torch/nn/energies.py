@@ -1,7 +1,8 @@
 """Energies: one module is the loss of a network and the term of a solver.
 
 Each returns energies per frame (..., T) or per clip (...); the reduction is left to the caller. Weights of 0 take a
-joint out; an energy over nothing is 0, not NaN.
+joint out, whatever its coordinates are, NaN included; an energy over nothing is 0, not NaN. Half precision is widened
+inside; what it cannot hold comes back as its largest number.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.spectral import log_det, nuclear_norm, svt
-from kcs_torch.nn.layers import SkeletonModule, full_precision
+from kcs_torch.nn.layers import SkeletonModule, full_precision, known, narrow, wide
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lm import fit_bones
 
@@ -61,7 +62,7 @@ class BoneLengthEnergy(SkeletonModule):
         check_weights(weights, points, self)
         if lengths is not None and lengths.shape[-1:] != (len(self.bones),):
             raise ShapeError(f"BoneLengthEnergy: expected lengths (..., {len(self.bones)}), got {tuple(lengths.shape)}")
-        size = bone_lengths(points, self.bones)  # (..., T, B)
+        size = bone_lengths(known(wide(points), weights), self.bones)  # (..., T, B)
         share = self.rigid.to(size.dtype).expand_as(size)
         if weights is not None:
             share = share * torch.minimum(weights[..., self.bones[:, 0]], weights[..., self.bones[:, 1]])
@@ -70,7 +71,7 @@ class BoneLengthEnergy(SkeletonModule):
             lengths = (size * share).sum(-2, keepdim=True) / torch.where(total > 0, total, torch.ones_like(total))
         else:
             lengths = lengths[..., None, :]
-        return 0.5 * (share * (size - lengths).square()).sum(-1)
+        return narrow(0.5 * (share * (size - lengths).square()).sum(-1), points)
 
     def prox(self, points: Tensor, lengths: Tensor, stiffness: Tensor | float = 1.5, *, num_steps: int = 3) -> Tensor:
         """argmin_A stiffness * energy(A) + 1/2 |A - points|^2, by :func:`kcs_torch.solvers.fit_bones`.
@@ -124,17 +125,18 @@ class ReprojectionEnergy(nn.Module):
         Raises:
             ShapeError: the shapes do not fit.
         """
-        square = self.residual(points, tracks, cameras, weights).square().sum(-1)
+        residual = self.residual(points, tracks, cameras, weights)
+        square = wide(residual).square().sum(-1)
         if self.huber is not None:
             far = square > self.huber**2
             root = torch.where(far, square, torch.ones_like(square)).sqrt()
             square = torch.where(far, 2 * self.huber * root - self.huber**2, square)
-        return 0.5 * (square if weights is None else square * weights).sum(-1)
+        return narrow(0.5 * (square if weights is None else square * weights).sum(-1), residual)
 
     def residual(
         self, points: Tensor, tracks: Tensor, cameras: Tensor | None = None, weights: Tensor | None = None
     ) -> Tensor:
-        """R x + t - y, (..., T, N, 2)."""
+        """R x + t - y, (..., T, N, 2); of no meaning where the weight is 0."""
         check_clip(points, self)
         if tracks.shape[-3:] != (*points.shape[-3:-1], 2):
             expected = f"(..., {points.shape[-3]}, {points.shape[-2]}, 2)"
@@ -143,6 +145,7 @@ class ReprojectionEnergy(nn.Module):
             expected = f"(..., {points.shape[-3]}, 2, 3)"
             raise ShapeError(f"ReprojectionEnergy: expected cameras {expected}, got {tuple(cameras.shape)}")
         check_weights(weights, points, self)
+        points, tracks = known(points, weights), known(tracks, weights)
         with full_precision(points):
             dtype = torch.promote_types(points.dtype, tracks.dtype)
             seen = points[..., :2] if cameras is None else project(points.to(dtype), cameras.to(dtype))
@@ -218,11 +221,11 @@ class SmoothnessEnergy(nn.Module):
         check_weights(weights, points, self)
         frames = points.shape[-3]
         if frames <= self.order:
-            return points.new_zeros(points.shape[:-2]) + 0 * points.sum((-2, -1))
-        square = points.diff(n=self.order, dim=-3).square().sum(-1)  # (..., T - n, N)
+            return points.new_zeros(points.shape[:-2]) + 0 * known(points, weights).sum((-2, -1))
+        square = known(wide(points), weights).diff(n=self.order, dim=-3).square().sum(-1)  # (..., T - n, N)
         if weights is not None:
             square = square * weights.unfold(-2, self.order + 1, 1).amin(-1)
-        return nn.functional.pad(0.5 * square.sum(-1), (self.order, 0))
+        return narrow(nn.functional.pad(0.5 * square.sum(-1), (self.order, 0)), points)
 
 
 class SymmetryEnergy(SkeletonModule):
@@ -242,8 +245,8 @@ class SymmetryEnergy(SkeletonModule):
     def forward(self, points: Tensor) -> Tensor:
         """Return (..., T) of points (..., T, N, 3)."""
         self.check(points, clip=True)
-        size = bone_lengths(points, self.bones)
-        return 0.5 * (size[..., self.pairs[:, 0]] - size[..., self.pairs[:, 1]]).square().sum(-1)
+        size = bone_lengths(wide(points), self.bones)
+        return narrow(0.5 * (size[..., self.pairs[:, 0]] - size[..., self.pairs[:, 1]]).square().sum(-1), points)
 
 
 def check_clip(points: Tensor, module: nn.Module) -> None:

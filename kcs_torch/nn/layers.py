@@ -126,6 +126,31 @@ def full_precision(tensor: Tensor) -> torch.autocast:
     return torch.autocast(tensor.device.type, enabled=False)
 
 
+def wide(tensor: Tensor) -> Tensor:
+    """At least in single precision: squares of millimetres or pixels leave the range of half precision."""
+    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+
+
+def narrow(value: Tensor, like: Tensor) -> Tensor:
+    """A value in the dtype of ``like``; beyond its range it is the largest number, with the gradient it has."""
+    if value.dtype == like.dtype:
+        return value
+    top = torch.finfo(like.dtype).max
+    return (value + (value.clamp(-top, top) - value).detach()).to(like.dtype)
+
+
+def known(values: Tensor, weights: Tensor | None) -> Tensor:
+    """Values (..., D), 0 where the weights (...) are: what is not known is often NaN, and 0 times NaN is NaN."""
+    if weights is None:
+        return values
+    return torch.where(weights[..., None] > 0, values, torch.zeros((), dtype=values.dtype, device=values.device))
+
+
+def known_frames(points: Tensor, weights: Tensor | None) -> Tensor:
+    """Points (..., T, N, D), 0 in frames whose weight (..., T) is 0."""
+    return points if weights is None else known(points.flatten(-2), weights).unflatten(-1, points.shape[-2:])
+
+
 def inverse_softplus(value: Tensor) -> Tensor:
     """Return x with softplus(x) = value, for positive values, without overflow."""
     return value + torch.log(-torch.expm1(-value))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.nn.layers import SkeletonModule
+from kcs_torch.nn.layers import SkeletonModule, known, known_frames, narrow, wide
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["ContactEnergy", "ForeshorteningEnergy", "PostureEnergy", "ProportionEnergy"]
@@ -102,24 +102,35 @@ class PostureEnergy(SkeletonModule):
         turned = torch.stack([first, second, torch.linalg.cross(first, second)], -1)
         return turned @ self.axes.to(part).mT
 
-    def directions(self, points: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Bones seen from the trunk over their lengths, (..., T, B, 3); arguments as in :meth:`forward`."""
+    def directions(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
+        """Bones seen from the trunk over their lengths, (..., T, B, 3), 0 where a length is 0; as in :meth:`forward`.
+
+        Half precision comes back as single.
+        """
         self.check(points, clip=True)
         if points.shape[-1] != 3:
             raise ShapeError(f"PostureEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
+        points = wide(known_frames(points, weights))
         vectors = bone_vectors(points, self.bones)
         if lengths is None:
-            lengths = vectors.square().sum(-1).mean(-2).clamp_min(torch.finfo(points.dtype).tiny).sqrt()
-        return vectors @ self.frame(points) / lengths[..., None, :, None]
+            square = vectors.square().sum(-1)
+            if weights is None:
+                square = square.mean(-2)
+            else:
+                seen = (weights > 0).to(square)[..., None]
+                square = (square * seen).sum(-2) / seen.sum(-2).clamp_min(1)
+            lengths = square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
+        lengths = lengths.to(vectors.dtype)[..., None, :, None]
+        return vectors @ self.frame(points) / torch.where(lengths > 0, lengths, torch.inf)
 
     def forward(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """Return the energy of each clip.
 
         Args:
             points: (..., T, N, 3).
-            lengths: (..., B); None takes each bone's root mean square over the T frames.
-            weights: (..., T) how many independent frames each frame counts for, 0 for one that pads a shorter clip (give
-                lengths then); 1 / correlation if None.
+            lengths: (..., B); None takes each bone's root mean square over the frames that count.
+            weights: (..., T) how many independent frames each frame counts for, 0 for one that pads a shorter clip;
+                1 / correlation if None.
 
         Returns:
             (...).
@@ -127,24 +138,23 @@ class PostureEnergy(SkeletonModule):
         Raises:
             ShapeError: the shapes do not fit.
         """
-        local = self.directions(points, lengths)
-        wide = local.to(torch.promote_types(local.dtype, torch.float32))
-        y = ((wide - self.mean.to(wide)) / self.deviation.to(wide)).flatten(-2)
+        local = self.directions(points, lengths, weights)
+        y = ((local - self.mean.to(local)) / self.deviation.to(local)).flatten(-2)
         count: Tensor | float
         if weights is None:
             count, mean = y.shape[-2] / self.correlation, y.mean(-2, keepdim=True)
             scatter = (y - mean).mT @ (y - mean) / self.correlation
         else:
-            share = weights.to(wide)[..., None]
+            share = weights.to(local)[..., None]
             count = share.sum((-2, -1))
-            mean = (share * y).sum(-2, keepdim=True) / count[..., None, None]
+            mean = (share * y).sum(-2, keepdim=True) / torch.where(count > 0, count, 1)[..., None, None]
             scatter = ((y - mean) * share).mT @ (y - mean)
-        pull = torch.as_tensor(count * self.kappa / (count + self.kappa)).to(wide)
+        pull = torch.as_tensor(count * self.kappa / (count + self.kappa)).to(local)
         scatter = scatter + pull[..., None, None] * (mean.mT @ mean)
-        eye = torch.eye(scatter.shape[-1], dtype=wide.dtype, device=wide.device)
+        eye = torch.eye(scatter.shape[-1], dtype=local.dtype, device=local.device)
         factor, _ = torch.linalg.cholesky_ex(eye + scatter / self.strength)
         log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        return ((count + self.strength) / 2 * log_det).to(points.dtype)
+        return narrow((count + self.strength) / 2 * log_det, points)
 
 
 class ForeshorteningEnergy(SkeletonModule):
@@ -170,9 +180,9 @@ class ForeshorteningEnergy(SkeletonModule):
     def forward(self, points: Tensor, lengths: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return (...) of points (..., T, N, 3), lengths (..., B) and the bones' weights (..., T, B) or None."""
         self.check(points, clip=True)
-        depth = bone_vectors(points, self.bones)[..., 2]
-        each = self.free.to(depth) * foreshortening(depth, lengths[..., None, :], self.eps)
-        return (each if weights is None else each * weights).sum((-2, -1)) / self.correlation
+        depth = known(bone_vectors(wide(points), self.bones)[..., 2:], weights)[..., 0]
+        each = self.free.to(depth) * foreshortening(depth, wide(lengths)[..., None, :], self.eps)
+        return narrow((each if weights is None else each * weights).sum((-2, -1)) / self.correlation, points)
 
 
 class ProportionEnergy(SkeletonModule):
@@ -244,12 +254,13 @@ class ContactEnergy(SkeletonModule):
             standing: c (..., T, C).
         """
         self.check(points, clip=True)
-        depth = points[..., self.contacts, 2]
-        move = depth[..., 1:, :] - depth[..., :-1, :] + velocity[..., 1:, None]
+        depth, velocity = wide(points)[..., self.contacts, 2], wide(velocity)
         both = torch.minimum(standing[..., 1:, :], standing[..., :-1, :])
+        step = known((depth[..., 1:, :] - depth[..., :-1, :])[..., None], both)[..., 0]
+        move = step + velocity[..., 1:, None]
         slip = (both * torch.log1p((move / self.slip).square())).sum((-2, -1)) / 2
         steady = ((velocity[..., 2:] - velocity[..., 1:-1]) / self.change).square().sum(-1) / 2
-        return slip + steady + 5e-4 * (velocity[..., 1:] / self.slip).square().sum(-1)
+        return narrow(slip + steady + 5e-4 * (velocity[..., 1:] / self.slip).square().sum(-1), points)
 
 
 def foreshortening(depth: Tensor, length: Tensor, eps: float) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.nn.energies import check_weights
-from kcs_torch.nn.layers import full_precision, inverse_softplus
+from kcs_torch.nn.layers import full_precision, inverse_softplus, known
 from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution, iterate, relative_change
@@ -92,6 +92,7 @@ class UnrolledFPC(nn.Module):
     ) -> Solution[Tensor]:
         """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still."""
         self._check(tracks, cameras, weights, start)
+        tracks = known(tracks, weights)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
@@ -241,6 +242,7 @@ class UnrolledSfAM(UnrolledFPC):
         ``lengths`` are then proportions (B,), brought to the scale of the shape.
         """
         self._check(tracks, cameras, weights, start)
+        tracks = known(tracks, weights)
         joints, count = self.skeleton.num_joints, self.skeleton.num_bones
         given = None if lengths is None else tuple(lengths.shape)
         if tracks.shape[-2] != joints or (given is not None and given[-1:] != (count,)):
