@@ -153,6 +153,15 @@ def test_lift_writes_in_true_size(tmp_path, openpose_folder):
     assert any("the frame rate is not known" in note for note in notes)
 
 
+def test_view_writes_in_true_size(tmp_path):
+    save(walk_result(), tmp_path / "r.npz")
+    words = ["view", tmp_path / "r.npz", "-o", tmp_path / "r.trc", "-o", tmp_path / "r.json"]
+    run(*words, "--scale", "factor=2cm", "--up", "z", "--units", "m")
+    expected = Motion.of(walk_result().scaled(units="m", factor=0.02)).points
+    assert torch.allclose(load_motion(tmp_path / "r.trc", up="z").points, expected, atol=1e-6)
+    assert json.loads((tmp_path / "r.json").read_text())["units"] == "m"
+
+
 # ---------------------------------------------------------------------- score
 
 

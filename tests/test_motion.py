@@ -229,6 +229,7 @@ def test_arrays_of_others_are_taken_as_a_cameras(tmp_path):
         ({"points3d": np.ones((3, 4, 2))}, r"expected shape \(frames, joints, 3\)"),
         ({"points3d": np.ones((3, 4, 3)), "joint_names": np.array(["a"])}, "expected 4 names, got 1"),
         ({"points3d": np.array([None])}, "pickled"),
+        ({"points3d": np.ones((3, 4, 3)), "up": np.array("w")}, "'up': expected one of y, z, x, -y, -z, got 'w'"),
     ],
 )
 def test_other_archives_are_refused(tmp_path, arrays, message):

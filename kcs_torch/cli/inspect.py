@@ -19,6 +19,7 @@ from kcs_torch.cli.options import (
     check_outputs,
     image_size,
 )
+from kcs_torch.cli.outputs import Scale, Units, Up, check_up, parse_scale, sized, write_files
 from kcs_torch.cli.pictures import check_picture, write_picture
 from kcs_torch.cli.report import answer, one_line, print_json, progress
 
@@ -151,23 +152,33 @@ def view(
         ),
     ] = [],  # noqa: B006 (typer reads it and never changes it)
     mirror: Annotated[bool, typer.Option("--mirror", help="Show the mirror image in depth.")] = False,
+    up: Up = None,
+    scale: Scale = None,
+    units: Units = None,
 ) -> None:
     """Show results: write a page with a 3D player, a sheet of key frames, a film."""
     with answer():
+        from kcs_torch.errors import OptionError
         from kcs_torch.io import load_reconstruction, save_people
 
         outputs = output or [results[0].with_suffix(".html")]
+        size = parse_scale(scale)
+        check_up(up, outputs)
+        if len(results) > 1 and units is not None:
+            raise OptionError("--units: expected one RESULT; several are shown in the unit that they have, or --scale says")
         for result in results:
             check_outputs(outputs, source=str(result))
         people = []
         for result in results:
             with progress(f"reading {result}"):
                 motion = load_reconstruction(result)
-            people.append(motion.mirrored() if mirror else motion)
-        for path in outputs:
-            with progress(f"writing {path}"):
-                if len(people) > 1:
+            people.append(sized(motion.mirrored() if mirror else motion, size))
+        if len(people) == 1:
+            for note in write_files(people[0], outputs, up, units):
+                typer.echo(f"note: {one_line(note)}", err=True)
+        else:
+            for path in outputs:
+                with progress(f"writing {path}"):
                     save_people(people, path)
-                else:
-                    people[0].save(path)
+        for path in outputs:
             typer.echo(f"wrote {path}")

@@ -6,9 +6,12 @@ Tracks are ``points2d`` (T, N, 2) with NaN where unseen, ``confidence`` (T, N), 
 
 - ``points3d_all`` (T, M, 3) and ``joint_names_all`` (M,): with the virtual joints, which come last; ``bones`` (B, 2)
   are (parent, child) indices into them and ``lengths`` (B,) their lengths;
-- ``cameras`` (T, 2, 3), ``scales`` (T,), ``units3d``, ``method``, and where they are known ``uncertainty`` (T, M),
-  ``root_depth`` (T,) and ``distance`` (T,);
-- ``skeleton``, ``diagnostics`` and ``notes`` as JSON text.
+- ``cameras`` (T, 2, 3), ``scales`` (T,), ``units3d``, ``method``, ``objective``, and where they are known
+  ``uncertainty`` (T, M), ``root_depth`` (T,) and ``distance`` (T,);
+- ``skeleton``, ``diagnostics`` and ``notes`` as JSON text;
+- ``alternatives``, how many other solutions there are, best first: all of the above that belongs to number 1 begins with
+  ``alternative1_`` (``alternative1_points3d_all``, ...). What they share with the result, tracks and skeleton, is there
+  once.
 
 3D motion is ``points3d`` (T, N, 3) with NaN where unseen and ``up``, the axis that points up; without it the axes are
 the camera's. ``joint_names``, ``edges``, ``fps``, ``units``, ``skeleton`` and ``notes`` are as above.
@@ -34,7 +37,7 @@ from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, Saving, Writer
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Motion, Reconstruction, Tracks
-from kcs_torch.types.axes import from_y_up
+from kcs_torch.types.axes import AXES, from_y_up
 
 __all__ = ["MOTION_READERS", "READERS", "WRITERS", "load_reconstruction"]
 
@@ -126,19 +129,34 @@ def write(result: Reconstruction, path: Path) -> None:
     body = result.skeleton
     arrays = _tracks_out(result.tracks) | {
         "points3d": plain(result.observed),
-        "points3d_all": plain(result.points),
         "joint_names_all": np.array(body.joints),
         "bones": np.array(body.bones, np.int64).reshape(-1, 2),
+        "alternatives": np.int64(len(result.alternatives)),
+    }
+    for k, solution in enumerate((result, *result.alternatives)):
+        arrays |= {_prefix(k) + key: value for key, value in _solution_out(solution).items()}
+    _save(arrays, path)
+
+
+def _prefix(number: int) -> str:
+    """What the names of a solution's arrays begin with."""
+    return f"alternative{number}_" if number else ""
+
+
+def _solution_out(result: Reconstruction) -> dict[str, Any]:
+    """What solutions of the same tracks do not share."""
+    arrays = {
+        "points3d_all": plain(result.points),
         "lengths": plain(result.lengths),
         "cameras": plain(result.cameras),
         "scales": plain(result.scales),
         "units3d": np.array(result.units),
         "method": np.array(result.method),
+        "objective": np.float64(result.objective),
         "diagnostics": np.array(json.dumps(_diagnostics_out(result.diagnostics))),
     }
     maybe = {"uncertainty": result.uncertainty, "root_depth": result.root_depth, "distance": result.distance}
-    arrays |= {key: plain(value) for key, value in maybe.items() if value is not None}
-    _save(arrays, path)
+    return arrays | {key: plain(value) for key, value in maybe.items() if value is not None}
 
 
 def load_reconstruction(path: str | Path) -> Reconstruction:
@@ -161,44 +179,69 @@ def load_reconstruction(path: str | Path) -> Reconstruction:
             f"{path}: expected a result that save() wrote, got a file without {', '.join(missing)}; "
             "load_tracks() reads tracks"
         )
+    tracks = _tracks_in(file)
+    best = _solution_in(file, tracks)
+    others = file.number("alternatives") if "alternatives" in file else 0
+    if others != others // 1 or not 0 <= others <= len(file.keys):
+        raise FormatError(f"{path}: 'alternatives': expected how many there are, got {others:g}")
+    return dataclasses.replace(
+        best, alternatives=tuple(_solution_in(file, tracks, _prefix(k)) for k in range(1, int(others) + 1))
+    )
+
+
+def _tensor(file: Archive, key: str, *shape: int) -> Tensor:
+    array = file.array(key, "f", len(shape))
+    if array.shape != shape or array.dtype.itemsize not in (4, 8):
+        raise FormatError(f"{file.path}: '{key}': expected {shape} floats, got {array.shape} of {array.dtype}")
+    return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
+
+
+def _tracks_in(file: Archive) -> Tracks:
+    """The tracks of a result, exactly."""
     body = _skeleton(file)
-
-    def tensor(key: str, *shape: int) -> Tensor:
-        array = file.array(key, "f", len(shape))
-        if array.shape != shape or array.dtype.itemsize not in (4, 8):
-            raise FormatError(f"{path}: '{key}': expected {shape} floats, got {array.shape} of {array.dtype}")
-        return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
-
     t, n, m = len(file.array("points2d", "f", 3)), body.num_observed, body.num_joints
-    points, weights = tensor("points2d", t, n, 2), tensor("confidence", t, n)
+    points, weights = _tensor(file, "points2d", t, n, 2), _tensor(file, "confidence", t, n)
     points = torch.where(weights[..., None] > 0, points, torch.zeros_like(points))
     if body.virtual:
-        points = torch.cat([points, tensor("points2d_virtual", t, m - n, 2)], 1)
-        weights = torch.cat([weights, tensor("confidence_virtual", t, m - n)], 1)
+        points = torch.cat([points, _tensor(file, "points2d_virtual", t, m - n, 2)], 1)
+        weights = torch.cat([weights, _tensor(file, "confidence_virtual", t, m - n)], 1)
     if not (torch.isfinite(points).all() and (weights >= 0).all()):
-        raise FormatError(f"{path}: 'points2d': expected finite numbers wherever the confidence is above 0")
+        raise FormatError(f"{file.path}: 'points2d': expected finite numbers wherever the confidence is above 0")
     fps = file.number("fps") if "fps" in file else math.nan
-    tracks = Tracks(
+    return Tracks(
         points,
         weights,
         body,
         None if math.isnan(fps) else fps,
         file.text("units") if "units" in file else "px",
-        file.text("source") if "source" in file else str(path),
+        file.text("source") if "source" in file else str(file.path),
         tuple(map(str, _json(file, "notes", list))) if "notes" in file else (),
     )
+
+
+def _solution_in(file: Archive, tracks: Tracks, prefix: str = "") -> Reconstruction:
+    """One solution for the tracks of the file."""
+    t, m = tracks.num_frames, tracks.skeleton.num_joints
+
+    def tensor(key: str, *shape: int) -> Tensor:
+        return _tensor(file, prefix + key, *shape)
+
+    def maybe(key: str, *shape: int) -> Tensor | None:
+        return tensor(key, *shape) if prefix + key in file else None
+
     return Reconstruction(
         points=tensor("points3d_all", t, m, 3),
         cameras=tensor("cameras", t, 2, 3),
         scales=tensor("scales", t),
-        lengths=tensor("lengths", body.num_bones),
+        lengths=tensor("lengths", tracks.skeleton.num_bones),
         tracks=tracks,
-        method=file.text("method") if "method" in file else "unknown",
-        diagnostics=_diagnostics_in(file),
-        uncertainty=tensor("uncertainty", t, m) if "uncertainty" in file else None,
-        root_depth=tensor("root_depth", t) if "root_depth" in file else None,
-        distance=tensor("distance", t) if "distance" in file else None,
-        units=file.text("units3d") if "units3d" in file else "",
+        method=file.text(prefix + "method") if prefix + "method" in file else "unknown",
+        diagnostics=_diagnostics_in(file, prefix + "diagnostics"),
+        uncertainty=maybe("uncertainty", t, m),
+        root_depth=maybe("root_depth", t),
+        distance=maybe("distance", t),
+        units=file.text(prefix + "units3d") if prefix + "units3d" in file else "",
+        objective=file.number(prefix + "objective") if prefix + "objective" in file else math.nan,
     )
 
 
@@ -219,6 +262,9 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
     notes = _json(file, "notes", list) if "notes" in file else []
     if "up" not in file and options.up is None:
         notes.append("the axes are taken to be the camera's, y down: give up=... if they are not")
+    axis = file.text("up") if "up" in file else "-y"
+    if axis not in AXES:
+        raise FormatError(f"{path}: 'up': expected one of {', '.join(AXES)}, got {axis[:20]!r}")
     names = file.texts("joint_names") if "joint_names" in file else [f"joint{i}" for i in range(points.shape[1])]
     if len(names) != points.shape[1]:
         raise FormatError(f"{path}: 'joint_names': expected {points.shape[1]} names, got {len(names)}")
@@ -231,7 +277,7 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         skeleton=_skeleton(file) if "skeleton" in file else None,
         fps=file.number("fps") if "fps" in file else None,
         units=file.text("units3d" if "units3d" in file else "units") if "units" in file else "",
-        up=file.text("up") if "up" in file else "-y",
+        up=axis,
         notes=[str(note) for note in notes],
     )
 
@@ -259,14 +305,14 @@ def _diagnostics_out(diagnostics: Diagnostics) -> dict[str, Any]:
     return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}
 
 
-def _diagnostics_in(file: Archive) -> Diagnostics:
-    values = _json(file, "diagnostics", dict)
+def _diagnostics_in(file: Archive, key: str) -> Diagnostics:
+    values = _json(file, key, dict)
     known = {f.name: values[f.name] for f in dataclasses.fields(Diagnostics) if f.name in values}
     known = {k: math.nan if v is None else tuple(v) if isinstance(v, list) else v for k, v in known.items()}
     try:
         return Diagnostics(**known)
     except TypeError as error:
-        raise FormatError(f"{file.path}: 'diagnostics': {error}") from None
+        raise FormatError(f"{file.path}: '{key}': {error}") from None
 
 
 READERS = (Reader("npz", "native .npz: points2d, and confidence, edges, joint_names, fps, units", recognises, read),)
