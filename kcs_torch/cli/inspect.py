@@ -165,7 +165,9 @@ def view(
         size = parse_scale(scale)
         check_up(up, outputs)
         if len(results) > 1 and units is not None:
-            raise OptionError("--units: expected one RESULT; several are shown in the unit that they have, or --scale says")
+            raise OptionError(
+                "--units: expected one RESULT; several are shown in the unit that they have, or --scale says"
+            )
         for result in results:
             check_outputs(outputs, source=str(result))
         people = []
