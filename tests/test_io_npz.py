@@ -253,6 +253,38 @@ def test_results_come_back_exactly(tmp_path, skeleton, dtype):
     assert repr(back.diagnostics) == repr(result.diagnostics)  # repr: NaN is not NaN
 
 
+def solutions():
+    """A result with a mirror image, and a solution of its own distance, units left open and no uncertainty."""
+    best = replace(walk_result(), objective=-109.25 - 1e-13, root_depth=torch.linspace(0, 1, 12).double())
+    far = torch.linspace(5, 6, 12).double()
+    facts = replace(best.diagnostics, notes=("the mirror image in depth",), reprojection_rms=2 / 3)
+    mirror = replace(best.mirrored(), objective=-100.0, diagnostics=facts)
+    other = replace(best, points=best.points + 1 / 3, objective=float("nan"), distance=far, uncertainty=None)
+    return replace(best, alternatives=(mirror, replace(other, root_depth=None, lengths=best.lengths / 3)))
+
+
+def test_objective_and_alternatives_come_back_exactly(tmp_path):
+    result = solutions()
+    back = load_reconstruction(save(result, tmp_path / "r.npz"))
+    assert len(back.alternatives) == 2
+    for ours, theirs in zip((result, *result.alternatives), (back, *back.alternatives), strict=True):
+        for name in ("points", "cameras", "scales", "lengths", "uncertainty", "root_depth", "distance"):
+            assert same(getattr(theirs, name), getattr(ours, name)), name
+        assert repr(theirs.objective) == repr(ours.objective)
+        assert repr(theirs.diagnostics) == repr(ours.diagnostics)
+        assert (theirs.method, theirs.units) == (ours.method, ours.units)
+        assert theirs.tracks is back.tracks
+
+
+def test_a_result_of_an_earlier_version_has_no_alternatives(tmp_path):
+    path = save(solutions(), tmp_path / "r.npz")
+    with np.load(path) as file:
+        old = {k: v for k, v in file.items() if k not in ("alternatives", "objective") and "alternative" not in k}
+    np.savez(path, **old)
+    back = load_reconstruction(path)
+    assert back.alternatives == () and np.isnan(back.objective)
+
+
 def test_results_without_uncertainty_come_back(tmp_path):
     back = load_reconstruction(save(walk_result(uncertain=False), tmp_path / "r.npz"))
     assert back.uncertainty is None
@@ -307,10 +339,17 @@ def test_results_are_tracks_again(tmp_path):
         ("skeleton", np.array('{"joints": ["a", "a"], "bones": []}'), "given twice"),
         ("diagnostics", np.array("{}"), "'diagnostics'"),
         ("notes", np.array("7"), "'notes': expected a JSON list"),
+        ("objective", np.array("best"), "'objective': expected"),
+        ("alternatives", np.array(3), "expected an array 'alternative3_points3d_all'"),
+        ("alternatives", np.array(10**9), "'alternatives': expected how many"),
+        ("alternatives", np.array(-1), "'alternatives': expected how many"),
+        ("alternatives", np.array(np.nan), "'alternatives': expected how many"),
+        ("alternative1_points3d_all", np.zeros((12, 3, 3)), "'alternative1_points3d_all': expected"),
+        ("alternative2_diagnostics", np.array("{}"), "'alternative2_diagnostics'"),
     ],
 )
 def test_damaged_results_are_told(tmp_path, key, value, message):
-    path = save(walk_result(), tmp_path / "r.npz")
+    path = save(solutions(), tmp_path / "r.npz")
     with np.load(path) as file:
         content = dict(file)
     del content[key]
