@@ -9,9 +9,8 @@ Tracks are ``points2d`` (T, N, 2) with NaN where unseen, ``confidence`` (T, N), 
 - ``cameras`` (T, 2, 3), ``scales`` (T,), ``units3d``, ``method``, ``objective``, and where they are known
   ``uncertainty`` (T, M), ``root_depth`` (T,) and ``distance`` (T,);
 - ``skeleton``, ``diagnostics`` and ``notes`` as JSON text;
-- ``alternatives``, how many other solutions there are, best first: all of the above that belongs to number 1 begins with
-  ``alternative1_`` (``alternative1_points3d_all``, ...). What they share with the result, tracks and skeleton, is there
-  once.
+- ``alternatives``, how many other solutions there are, best first: what belongs to number 1 begins with
+  ``alternative1_`` (``alternative1_points3d_all``, ...). Tracks and skeleton are those of the result.
 
 3D motion is ``points3d`` (T, N, 3) with NaN where unseen and ``up``, the axis that points up; without it the axes are
 the camera's. ``joint_names``, ``edges``, ``fps``, ``units``, ``skeleton`` and ``notes`` are as above.
