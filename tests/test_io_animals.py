@@ -59,6 +59,7 @@ FILES = {  # frames, joints of the first animal, and the unseen share in per cen
     "sleap/minimal_instance.000_centered_pair_low_quality.analysis.csv": (1, ("A", "B"), [0]),
     "sleap/predictions.analysis.h5": (3000, FLY, [1.67, 2.24]),
 }
+NO_BONES = "the file names no bones: give a skeleton, or let reconstruct(..., skeleton='auto') find one"
 OTHERS = {
     "deeplabcut/reachingDEMO_3D.h5": "got 3D motion .*load_motion reads",
     "sleap/points3d.h5": "got 3D motion .*load_motion reads",
@@ -142,7 +143,7 @@ def test_deeplabcut_layouts(tmp_path, layout):
     assert (~tracks.seen).nonzero().tolist() == [[1, 1], [2, 0]]
     assert np.array_equal(tracks.points[0].numpy(), values[0].reshape(3, 3)[:, :2])
     assert tracks.weights[0, 0] == 0.9
-    assert tracks.notes == ()
+    assert tracks.notes == (NO_BONES,)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -215,7 +216,7 @@ def test_lightning_pose_has_more_columns(tmp_path):
     )
     tracks = load_tracks(path)
     assert np.array_equal(tracks.points.numpy(), values[:, :15].reshape(4, 3, 5)[..., :2])
-    assert tracks.notes == ("columns left out: x_ens_median, y_ens_var, resnet",)
+    assert tracks.notes == ("columns left out: x_ens_median, y_ens_var, resnet", NO_BONES)
 
 
 def test_confidences_a_little_above_one_are_one(tmp_path):
@@ -274,7 +275,7 @@ def test_short_lines_are_unseen_there(tmp_path):
     path.write_text(path.read_text().rstrip().rpartition(",")[0].rpartition(",")[0])
     tracks = load_tracks(path)
     assert (~tracks.seen).nonzero().tolist() == [[3, 2]]
-    assert tracks.notes == ("1 line ends before the last column: what is missing is unseen",)
+    assert tracks.notes == ("1 line ends before the last column: what is missing is unseen", NO_BONES)
 
 
 def test_animals_that_say_nothing_are_left_out(tmp_path):
@@ -429,7 +430,7 @@ def test_old_files_without_names_or_scores(tmp_path):
     )
     tracks = load_tracks(path)
     assert tracks.skeleton.joints == ("joint0", "joint1", "joint2")
-    assert (tracks.skeleton.bones, tracks.notes) == ((), ("the file does not name the joints",))
+    assert (tracks.skeleton.bones, tracks.notes) == ((), ("the file does not name the joints", NO_BONES))
 
 
 def test_edges_need_not_be_a_tree(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ LIMIT = 2**28  # numbers of all animals in all frames
 _OVERSHOOT = 1.5  # some networks' confidences pass 1 a little; above this they are on another scale
 _FARTHEST = 1e9  # pixels
 _FRAGMENT = 0.1  # share of the frames, below which an animal that is seen is a piece of somebody's track
+_NO_BONES = "the file names no bones: give a skeleton, or let reconstruct(..., skeleton='auto') find one"
 _SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]*\Z")
 _NUMBER = re.compile(r"([0-9]+)\Z")
 
@@ -128,18 +130,17 @@ def build_animals(
     for animal in seen:
         own = [f"the file calls this animal '{brief(animal.name)}'"] if animal.name else []
         confidence = None if animal.confidence is None else _within_one(animal.confidence, own)
-        people.append(
-            build_tracks(
-                animal.points,
-                confidence,
-                options,
-                source=str(path),
-                names=animal.joints,
-                edges=edges,
-                fps=fps,
-                notes=[*shared, *own],
-            )
+        tracks = build_tracks(
+            animal.points,
+            confidence,
+            options,
+            source=str(path),
+            names=animal.joints,
+            edges=edges,
+            fps=fps,
+            notes=[*shared, *own],
         )
+        people.append(tracks if tracks.skeleton.bones else replace(tracks, notes=(*tracks.notes, _NO_BONES)))
     return people
 
 

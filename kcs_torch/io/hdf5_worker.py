@@ -143,6 +143,12 @@ def check(name: str, data: Any, request: dict[str, Any], most: int) -> int:
         raise Refused(f"'{name}': {shown} are more numbers than a file of tracks holds")
     if data.external or data.is_virtual:
         raise Refused(f"'{name}': expected its numbers in this file, got those of another one: refused")
+    import h5py
+
+    packing = data.id.get_create_plist()
+    for code, *_, label in (packing.get_filter(i) for i in range(packing.get_nfilters())):
+        if not h5py.h5z.filter_avail(code):
+            raise Refused(f"'{name}': packed by {label.decode('latin-1')}, which h5py lacks: write it with zlib")
     if size > most:
         raise Refused(f"'{name}': expected up to {most} bytes in a file of this size, got {size}: refused as a bomb")
     return size
