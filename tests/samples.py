@@ -74,6 +74,12 @@ def write_npz(folder: Path) -> Path:
     return path
 
 
+def write_result(folder: Path) -> Path:
+    import kcs_torch as kt
+
+    return kt.save(walk_result(4), folder / "result.npz")
+
+
 def write_mat(folder: Path) -> Path:
     from scipy.io import savemat
 
@@ -306,7 +312,7 @@ def _deeplabcut(write, name, individuals=()):
 
 
 SAMPLES: dict[str, tuple[Callable[[Path], Path], ...]] = {
-    "npz": (write_npz,),
+    "npz": (write_npz, write_result),
     "mat": (write_mat, write_mat_4, write_mat_hdf5),
     "openpose": (lambda folder: write_openpose(folder / "json", [p[None] for p in person()]),),
     "alphapose": (_alphapose, lambda folder: _alphapose(folder, 26, "clip/{:05d}.png", idx=[1]), _alphapose_images),
@@ -417,7 +423,7 @@ def _animal_3d():
 
 
 MOTION_SAMPLES: dict[str, tuple[Callable[[Path], Path], ...]] = {
-    "npz": (_saved("motion.npz"),),
+    "npz": (_saved("motion.npz"), write_result),
     "trc": (_saved("a.trc"),),
     "bvh": (_saved("a.bvh"),),
     "c3d": (_saved("a.c3d"),),

@@ -604,6 +604,21 @@ def test_a_missing_h5py_is_told(tmp_path, monkeypatch):
         load_tracks(path)
 
 
+def test_packing_that_h5py_lacks_is_named(tmp_path):
+    import h5py
+
+    path = write_sleap_hdf5(tmp_path / "a.h5", sleap_points())
+    with h5py.File(path, "r+") as file:
+        del file["tracks"]
+        packing = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        packing.set_chunk((1, 2, 3, 4))
+        packing.set_filter(32001, h5py.h5z.FLAG_OPTIONAL)  # Blosc
+        space = h5py.h5s.create_simple((1, 2, 3, 4))
+        h5py.h5d.create(file.id, b"tracks", h5py.h5t.NATIVE_DOUBLE, space, packing)
+    with pytest.raises(FormatError, match="'tracks': packed by .*, which h5py lacks: write it with zlib"):
+        load_tracks(path)
+
+
 def test_other_hdf5_is_described(tmp_path):
     path = write_sleap_hdf5(tmp_path / "a.h5", sleap_points()[0], node_names=None, edge_inds=None)
     with pytest.raises(FormatError, match=r"an HDF5 file with other content \(tracks\)"):
