@@ -110,6 +110,17 @@ def test_lift_reports_in_words(openpose_folder, tmp_path):
     assert str(tmp_path / "a.npz") in done.stdout
 
 
+def test_lift_says_which_folders_it_makes(openpose_folder, tmp_path):
+    path = tmp_path / "new" / "deep" / "a.npz"
+    done = run("lift", openpose_folder, "-o", path, "-m", "sfam")
+    assert f"wrote {path}, in new folders: {path.parent}" in done.stdout
+    done = run("lift", openpose_folder, "-o", path, "-m", "sfam")
+    assert f"wrote {path}" in done.stdout and "new folder" not in done.stdout
+    path = tmp_path / "third" / "a.npz"
+    done = run("lift", openpose_folder, "-o", path, "-m", "sfam", "--json")
+    assert json.loads(done.stdout)["people"][0]["new_folders"] == [str(path.parent)]
+
+
 @pytest.mark.parametrize("method", kt.METHODS)
 def test_lift_by_each_method(openpose_folder, tmp_path, method):
     done = run("lift", openpose_folder, "-o", tmp_path / "a.npz", "--method", method, "--json")

@@ -19,6 +19,7 @@ from kcs_torch.cli.options import (
     UseSkeleton,
     check_outputs,
     image_size,
+    new_folders,
     person_number,
     use_one_thread,
 )
@@ -86,6 +87,16 @@ def lift(
     mirror: Annotated[
         bool, typer.Option("--mirror", help="Write the mirror image in depth, which fits the tracks as well.")
     ] = False,
+    solution: Annotated[
+        int,
+        typer.Option(
+            "--solution",
+            metavar="NUMBER",
+            min=1,
+            help="Write the solution of this number instead of the best, which is 1; the report lists them, with their "
+            "objective (lower is better) and how they differ.",
+        ),
+    ] = 1,
     frames: Frames = None,
     gate: Gate = False,
     fill: Fill = None,
@@ -148,17 +159,19 @@ def lift(
             names = [numbered(path, number) if person == "all" else path for path in output]
             check_outputs(names, source=tracks)
             cleaned = clean(one)
-            result = sized(_lift_one(cleaned, method, fields, mirror, finish), size_of)
+            result = sized(_lift_one(cleaned, method, fields, solution, mirror, finish), size_of)
+            made = new_folders(names)
             told = write_files(result, names, up, units)
             if together:
                 results.append(result)
-            reports.append(summary(result))
+            reports.append(summary(result, solution))
             reports[-1]["notes"] += told
             reports[-1]["cleaning"] = list(cleaned.notes[len(one.notes) :])
             if not as_json:
                 typer.echo(describe(reports[-1]))
-                typer.echo(f"  wrote {', '.join(map(str, names))}")
-            reports[-1] |= {"person": number, "files": names}
+                folders = f", in new folders: {', '.join(map(str, made))}" if made else ""
+                typer.echo(f"  wrote {', '.join(map(str, names))}{folders}")
+            reports[-1] |= {"person": number, "files": names, "new_folders": made}
         for path in together:
             with progress(f"writing {path}"):
                 save_people(results, path)
@@ -219,6 +232,7 @@ def _lift_one(
     tracks: Tracks,
     method: str,
     fields: dict[str, Any],
+    solution: int,
     mirror: bool,
     finish: Callable[[Reconstruction], Reconstruction],
 ) -> Reconstruction:
@@ -226,7 +240,7 @@ def _lift_one(
     import kcs_torch as kt
 
     with progress(f"reconstructing {tracks.num_frames} frames of {tracks.num_joints} joints"):
-        result = kt.reconstruct(tracks, method=method, **fields)
+        result = kt.reconstruct(tracks, method=method, **fields).solution(solution)
     if mirror:
         result = result.mirrored()
     return finish(result)

@@ -18,6 +18,7 @@ __all__ = [
     "UseSkeleton",
     "check_outputs",
     "image_size",
+    "new_folders",
     "person_number",
     "use_one_thread",
 ]
@@ -82,6 +83,11 @@ def check_outputs(outputs: Sequence[Path], source: str | None = None) -> None:
                 raise _NothingWritten
         except _NothingWritten:
             pass
+
+
+def new_folders(outputs: Sequence[Path]) -> list[Path]:
+    """The folders that writing these files would make: a slip of the pen in a path makes one as well."""
+    return [folder for folder in dict.fromkeys(path.parent for path in outputs) if not folder.exists()]
 
 
 def use_one_thread() -> None:

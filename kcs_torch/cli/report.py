@@ -82,9 +82,25 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def summary(result: Reconstruction) -> dict[str, Any]:
-    """What there is to say of a result, as plain data."""
+def summary(result: Reconstruction, solution: int = 1) -> dict[str, Any]:
+    """What there is to say of a result, as plain data; ``solution`` is its number among those of its tracks."""
+    from kcs_torch.metrics import difference
+
     facts, tracks = result.diagnostics, result.tracks
+    others = []
+    for k, other in enumerate(result.alternatives, 1):
+        number = k if k < solution else k + 1
+        apart = difference(result, other)
+        others.append(
+            {
+                "solution": number,
+                "objective": other.objective,
+                "rms_difference": apart.rms,
+                "mirrored": apart.mirrored,
+                "flipped": apart.flipped,
+                "differs": str(apart),
+            }
+        )
     return {
         "source": tracks.source,
         "frames": tracks.num_frames,
@@ -100,6 +116,9 @@ def summary(result: Reconstruction) -> dict[str, Any]:
         "converged": facts.converged,
         "iterations": facts.iterations,
         "seconds": facts.seconds,
+        "solution": solution,
+        "objective": result.objective,
+        "alternatives": others,
         "notes": list(dict.fromkeys((*tracks.notes, *facts.notes))),
     }
 
@@ -119,4 +138,9 @@ def describe(facts: dict[str, Any]) -> str:
     }
     head = f"{facts['source']}: {facts['frames']} frames, {facts['joints']} joints ({facts['skeleton']}){rate}"
     lines = [head, *(f"  {name:<15} {text}" for name, text in rows.items())]
+    best = "" if math.isnan(facts["objective"]) else f" ({facts['objective']:.1f} here)"
+    for other in facts["alternatives"]:
+        value = "" if math.isnan(other["objective"]) else f"objective {other['objective']:.1f}{best}, "
+        apart = f"{other['rms_difference']:.3g} {facts['units']} away (root mean square)"
+        lines.append(f"  solution {other['solution']:<6} {value}{apart}: {other['differs']}")
     return "\n".join([*lines, *(f"  note: {one_line(note)}" for note in facts["notes"])])

@@ -121,6 +121,21 @@ class Reconstruction:
         root = None if self.root_depth is None else -self.root_depth
         return replace(self, points=self.points * flip, cameras=self.cameras * flip, root_depth=root)
 
+    def solution(self, number: int) -> Reconstruction:
+        """The solution of this number, with all the others as its alternatives: 1 is this one, 2 the first alternative.
+
+        Raises:
+            OptionError: there is none.
+        """
+        if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= 1 + len(self.alternatives):
+            count = len(self.alternatives) + 1
+            raise OptionError(
+                f"{self.tracks.source}: solution: expected a number from 1 to {count}, got {number!r}"
+                + (": this method or clip has one solution only" if count == 1 else "")
+            )
+        every = (replace(self, alternatives=()), *self.alternatives)
+        return replace(every[number - 1], alternatives=(*every[: number - 1], *every[number:]))
+
     def in_space(self) -> Tensor:
         """(T, N, 3): the points with the root's depth path added, so that a walking body moves through space.
 

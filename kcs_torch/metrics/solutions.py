@@ -1,0 +1,82 @@
+"""How two solutions of the same tracks differ: what is nearer in one and farther in the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from kcs_torch.errors import ShapeError
+from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.types import Reconstruction
+
+__all__ = ["Difference", "difference"]
+
+LEVEL = 0.1
+"""Share of its length below which a bone's depth has no sign to speak of."""
+
+MIRRORED = 0.3
+"""A mirror image's depths add up to less than this share of their difference."""
+
+FEW = 0.05
+"""Share of frames in which a bone must be flipped to be named."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How a solution differs from another.
+
+    Attributes:
+        rms: root mean square distance of the joints, each pose about its own middle in depth, in the solutions' unit.
+        mirrored: whether it is nearly the mirror image in depth.
+        flipped: bones that tip the other way in depth, and the share of frames in which they do; most often first.
+    """
+
+    rms: float
+    mirrored: bool
+    flipped: dict[str, float]
+
+    def __str__(self) -> str:
+        if self.mirrored:
+            return "the mirror image in depth"
+        if not self.flipped:
+            return "depths differ, no bone tips the other way"
+        some = [f"{bone} in {100 * share:.0f} %" for bone, share in list(self.flipped.items())[:4]]
+        more = f" and {len(self.flipped) - 4} more" if len(self.flipped) > 4 else ""
+        return f"other sign of depth: {', '.join(some)}{more} of the frames"
+
+
+def difference(best: Reconstruction, other: Reconstruction) -> Difference:
+    """Compare two solutions of the same tracks.
+
+    Args:
+        best: the one.
+        other: the other, usually of ``best.alternatives``.
+
+    Raises:
+        ShapeError: they are not of the same frames and joints.
+
+    >>> import kcs_torch as kt
+    >>> from kcs_torch.data import walking_person
+    >>> result = kt.reconstruct(walking_person(30).tracks, method="sfam")
+    >>> print(difference(result, result.mirrored()))
+    the mirror image in depth
+    """
+    if best.points.shape != other.points.shape:
+        shapes = f"{tuple(best.points.shape)} and {tuple(other.points.shape)}"
+        raise ShapeError(f"difference: expected solutions of the same frames and joints, got points {shapes}")
+    ours, theirs = best.points.detach().double(), other.points.detach().double()
+    both = torch.stack([ours, theirs.to(ours.device)])
+    depth = both[..., 2] - both[..., 2].mean(-1, keepdim=True)
+    apart = torch.cat([(both[1] - both[0])[..., :2], (depth[1] - depth[0])[..., None]], -1)
+    rms = float(apart.square().sum(-1).mean().sqrt())
+    add, subtract = depth.sum(0).square().mean().sqrt(), (depth[1] - depth[0]).square().mean().sqrt()
+    body = best.skeleton
+    flipped: dict[str, float] = {}
+    if body.num_bones:
+        tips = bone_vectors(both, body.bone_index(device=both.device))
+        steep = (tips[..., 2].abs() > LEVEL * tips.norm(dim=-1)).all(0)
+        share = (steep & (tips[0, ..., 2] * tips[1, ..., 2] < 0)).double().mean(0)
+        order = share.argsort(descending=True, stable=True).tolist()
+        flipped = {body.bone_names[b]: float(share[b]) for b in order if share[b] >= FEW}
+    return Difference(rms, bool(add < MIRRORED * subtract), flipped)
