@@ -188,3 +188,33 @@ def test_solution_is_that_of_the_normal_equations():
     for h in range(2):
         exact = torch.linalg.solve(torch.diag(w[0, h].flatten()) + prior, (w * y)[0, h].flatten())
         assert_close(found[0, h].flatten(), exact, rtol=1e-6, atol=1e-6 * math.sqrt(length))
+
+
+def strides(frames=120):
+    """Tracks (T, N, 2) of a walk whose feet stand still two frames in three and then go far at once."""
+    tracks = walk(frames)
+    time = torch.arange(frames) % 12
+    swing = torch.where(time < 8, 0.0, ((time - 8) / 4 * math.pi).sin()).double()
+    tracks[:, [3, 6]] += 400 * swing[:, None, None] * torch.tensor([1.0, -0.3], dtype=torch.float64)
+    return tracks
+
+
+def test_quick_strides_are_no_outliers():
+    tracks = strides()
+    found = denoise_tracks(tracks, torch.ones(tracks.shape[:2]))
+    assert not found.outliers.any()
+    tracks[40, 2] += 500
+    tracks[77, 10] -= 500
+    assert denoise_tracks(tracks, torch.ones(tracks.shape[:2])).outliers.nonzero().tolist() == [[40, 2], [77, 10]]
+
+
+def test_what_joints_do_together_is_no_noise():
+    """A camera that shakes moves all joints; white noise moves each for itself."""
+    tracks = walk(120)
+    size = rms(tracks - tracks.mean(1, keepdim=True))
+    shaken = tracks + 0.02 * size * normal(120, 1, 2)
+    ones = torch.ones(tracks.shape[:2])
+    assert float(denoise_tracks(shaken, ones).noise.mean()) < 0.004 * size
+    assert rms(denoise_tracks(shaken, ones).points - shaken) < 0.003 * size
+    both = denoise_tracks(shaken + 0.02 * size * normal(120, 17, 2, seed=1), ones)
+    assert float(both.noise.mean()) > 0.016 * size

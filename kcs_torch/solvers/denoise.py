@@ -25,6 +25,11 @@ _CHUNK = 256  # windows solved at once: bounds memory
 # Of the body's size: below it nothing is gained, and gaps would converge more slowly.
 _LEAST_NOISE = 1e-3
 _TINY = 1e-30
+# The floor of a spectrum is motion where less than the first share of its power is every joint's own, and noise from
+# the second on.
+_SHARED = (0.15, 0.35)
+_ENOUGH = 20  # quick modes from which on that can be told
+_COMMON, _RATIO = 0.7, 1.318  # a quantile of distances, and what it is over the median for a Gaussian in the plane
 
 
 class Denoised(NamedTuple):
@@ -55,8 +60,9 @@ def denoise_tracks(
 
     g_i is the clip's spectrum and Q_b its covariance between the 2N coordinates, for every octave b of modes, both
     estimated from the clip (moments, with shrinkage to independent joints). s^2 is the level at which the spectrum
-    stops falling, so that clean tracks come back as they are but for their own jitter. Given these, x is the minimum
-    of sum w_tn |y_tn - x_tn|^2 / s^2 + sum_i x_i^T (g_i Q_b)^-1 x_i, by conjugate gradients with the solution for even
+    stops falling, unless joints move together there, and at least what quick modes do not share: clean tracks come back
+    as they are but for their own jitter. Given these, x is the minimum of
+    sum w_tn |y_tn - x_tn|^2 / s^2 + sum_i x_i^T (g_i Q_b)^-1 x_i, by conjugate gradients with the solution for even
     weights as preconditioner. Cost is linear in T.
 
     A joint is an outlier where it is further from what the rest of the clip predicts than ``threshold`` times the
@@ -137,7 +143,11 @@ class _Model:
         self.share = w.mean((1, 2, 3)).clamp_min(1e-3)[:, None, None, None]
         z = self.basis.mT @ (x + w * (y - x))
         typical = z.square().movedim(2, 1).flatten(2).median(-1).values / 0.4549  # of chi-square: blind to impacts
-        self.measured = _spectrum_floor(typical) / self.share.flatten()
+        floor = _spectrum_floor(typical)
+        alone = _apart(z[:, :, length // 2 :].flatten(1, 2))
+        alone = torch.where(alone.isfinite(), alone, floor)
+        own = ((alone / floor.clamp_min(_TINY) - _SHARED[0]) / (_SHARED[1] - _SHARED[0])).clamp(0, 1)
+        self.measured = torch.lerp(alone, torch.maximum(alone, floor), own) / self.share.flatten()
         self.noise = self.measured.clamp_min(_LEAST_NOISE**2)
         left = (self.noise * self.share.flatten())[:, None]  # noise power in a mode: what is filled has none
         order = torch.arange(1, length + 1, dtype=y.dtype, device=y.device)
@@ -239,6 +249,22 @@ def _spectrum_floor(power: Tensor) -> Tensor:
     return (scale * level[:, 0]).flatten(1).gather(1, best)[:, 0]
 
 
+def _apart(quick: Tensor) -> Tensor:
+    """Variance (K,) of what the quickest modes (K, n, M) do not share: white noise is every joint's own, motion is not.
+
+    The smaller eigenvalues of the coordinates' covariance, over those of as much white noise of variance 1; infinite
+    where there are too few modes to tell.
+    """
+    count, size = quick.shape[1:]
+    if count < _ENOUGH or size < 8:
+        return torch.full_like(quick[:, 0, 0], math.inf)
+    noise = torch.randn(count, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(quick)
+    rank = min(size, count)
+    low = slice(size - rank + rank // 8, size - rank + rank // 2)  # virtual joints are no measurements
+    usual = torch.linalg.eigvalsh(noise.mT @ noise)[..., low].mean(-1)
+    return torch.linalg.eigvalsh(quick.mT @ quick)[..., low].mean(-1).clamp_min(0) / usual.clamp_min(_TINY)
+
+
 def _fill(values: Tensor, seen: Tensor) -> Tensor:
     """(K, T, N, 2) where to start in the gaps: joints go with the body, and about its centre with each other."""
     points = interpolate(values, seen)
@@ -279,7 +305,9 @@ def _stray_from_neighbours(values: Tensor, seen: Tensor, threshold: float, floor
 def _far(error: Tensor, seen: Tensor, threshold: float, floor: float, spread: int = 8) -> Tensor:
     """(K, T, N), True where a seen joint's error, in body sizes, is far above what is usual for it."""
     known = torch.where(seen, error, torch.full_like(error, math.nan))
-    clip = known.nanmedian(1, keepdim=True).values
+    # Of a Gaussian's distances the quantile is at the median. It is above it where a joint is still most of the time
+    # and then swings: no quick stride is an outlier, no outliers are as common.
+    clip = torch.maximum(known.nanmedian(1, keepdim=True).values, known.nanquantile(_COMMON, 1, keepdim=True) / _RATIO)
     around = torch.nn.functional.pad(known.mT, (spread, spread), value=math.nan).unfold(-1, 2 * spread + 1, 1)
     # Bounded, as near the ends of a clip one outlier may spoil the prediction of all that is around.
     usual = torch.maximum(clip, torch.minimum(around.nanmedian(-1).values.mT, 4 * clip)).nan_to_num(0.0)
