@@ -187,6 +187,7 @@ def test_edges_that_are_no_tree_yield_to_known_names():
         (torch.full((4, 17, 2), NAN), "no joint is seen"),
         (with_value(grid(), (2, 3, 1), INF), "frame 2, joint 'joint3' is infinite"),
         (with_value(grid(), (0, 16, 0), -INF), "frame 0, joint 'joint16' is infinite"),
+        (with_value(grid(), (0, 16, 0), -1e308), "frame 0, joint 'joint16': expected coordinates whose sums"),
     ],
 )
 def test_bad_points(points, words):

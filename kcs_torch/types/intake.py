@@ -18,6 +18,8 @@ from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton
 
 __all__ = ["Intake", "as_floats", "as_number", "choose_skeleton", "joint_order", "take_in"]
 
+_SPARE = 1e6  # coordinates are smaller than the largest number by this factor, so that their sums are finite
+
 
 def as_floats(value: Any, what: str, ndim: int) -> Tensor:
     """An array-like as a floating tensor of ``ndim`` dimensions; tensors keep their device and single precision.
@@ -179,6 +181,10 @@ def take_in(
         raise ShapeError(
             f"{source}: points: {label(*infinite.nonzero()[0])} is infinite; write NaN where a joint is unseen"
         )
+    large = (xy.abs() > torch.finfo(xy.dtype).max / _SPARE).any(-1)
+    if large.any():
+        where, most = label(*large.nonzero()[0]), float(xy[large].abs().nan_to_num().max())
+        raise ShapeError(f"{source}: points: {where}: expected coordinates whose sums are finite, got {most:.3g}")
     seen = torch.isfinite(xy).all(-1)
     if confidence is None:
         weights = seen.to(xy.dtype)
