@@ -13,6 +13,9 @@ from kcs_torch.errors import OptionError, ShapeError
 
 __all__ = ["Intrinsics"]
 
+WIDEST = 20.0
+"""Tangent of the angle off the optical axis that no lens without distortion reaches for half of what it shows."""
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -66,8 +69,20 @@ class Intrinsics:
         return math.sqrt(self.fx) * math.sqrt(self.fy)
 
     def rays(self, image: Tensor) -> Tensor:
-        """(..., 3) directions (X/Z, Y/Z, 1) of image points (..., 2)."""
+        """(..., 3) directions (X/Z, Y/Z, 1) of image points (..., 2).
+
+        Raises:
+            OptionError: half of them would lie more than 87 degrees off the optical axis, which no lens without
+                distortion shows: the intrinsics are of another camera, or in another unit than the points.
+        """
         x, y = (image[..., 0] - self.cx) / self.fx, (image[..., 1] - self.cy) / self.fy
+        off = torch.maximum(x.abs(), y.abs()).detach().flatten().nanmedian()
+        if bool(off > WIDEST):
+            across = float(image.detach().abs().flatten().nanmedian())
+            raise OptionError(
+                "intrinsics: expected focal lengths and a principal point in the unit of the tracks, whose coordinates "
+                f"are about {across:.3g}, got {self}: half of all points would lie beside the camera, not before it"
+            )
         return torch.stack([x, y, torch.ones_like(x)], -1)
 
     def project(self, points: Tensor) -> Tensor:
