@@ -84,15 +84,17 @@ class Pose:
         points: (H, T, N, 3) in the camera frame.
         rotations: (H, T, 3, 3), world to camera: ``points @ rotations`` are the aligned poses.
         objective: (H,) at the last stage's scales; the lowest is best.
+        drop: (H,) by how much the last ten steps lowered it.
     """
 
     points: Tensor
     rotations: Tensor
     objective: Tensor
+    drop: Tensor
 
     def __getitem__(self, index: Tensor | slice) -> Pose:
         """Some of the hypotheses."""
-        return Pose(self.points[index], self.rotations[index], self.objective[index])
+        return Pose(self.points[index], self.rotations[index], self.objective[index], self.drop[index])
 
 
 def procrustean(
@@ -135,7 +137,7 @@ def procrustean(
     stiff = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device).expand(len(rigid))
     free = 3 if noise > 0 else 1
     share = tracks.new_ones(frames, joints) if weights is None else weights
-    value = points.new_zeros(hypotheses)
+    value = drop = points.new_zeros(hypotheses)
     for stage in stages:
         precision = _precision(points, tracks, share, noise)
         levels = aligned_levels(points, rotations, bones, stage)
@@ -161,12 +163,15 @@ def procrustean(
             return total if extra is None else total + extra(x)
 
         start = points.new_zeros(hypotheses, frames * (free * joints + 3))
-        found = lbfgs(energy, start, num_steps=stage.num_steps, first_step=1.0, tolerance=1e-8).value
+        solution = lbfgs(energy, start, num_steps=stage.num_steps, first_step=1.0, tolerance=1e-8)
+        found = solution.value
+        assert solution.drop is not None
+        drop = solution.drop
         points, rotations = move(found)
         rotations = nearest_rotation(rotations)  # rounding would add up
         with torch.no_grad():
             value = energy(found)
-    return Pose(points, rotations, value)
+    return Pose(points, rotations, value, drop)
 
 
 def depth_deviation(

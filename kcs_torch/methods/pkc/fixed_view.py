@@ -52,21 +52,25 @@ class Hypotheses:
         lengths: (H, B).
         energy: (H,) of the objective.
         steps: L-BFGS steps made for them.
+        drop: (H,) by how much the last ten steps lowered the energies; None before any.
     """
 
     depth: Tensor
     lengths: Tensor
     energy: Tensor
     steps: int = 0
+    drop: Tensor | None = None
 
     def __getitem__(self, index: slice | Tensor) -> Hypotheses:
-        return Hypotheses(self.depth[index], self.lengths[index], self.energy[index], self.steps)
+        drop = None if self.drop is None else self.drop[index]
+        return Hypotheses(self.depth[index], self.lengths[index], self.energy[index], self.steps, drop)
 
     def joined(self, other: Hypotheses) -> Hypotheses:
         """Both together, best first."""
         parts = zip(*((h.depth, h.lengths, h.energy) for h in (self, other)), strict=True)
         depth, lengths, energy = (torch.cat(part) for part in parts)
-        return Hypotheses(depth, lengths, energy, self.steps + other.steps)[energy.argsort()]
+        drop = None if self.drop is None or other.drop is None else torch.cat([self.drop, other.drop])
+        return Hypotheses(depth, lengths, energy, self.steps + other.steps, drop)[energy.argsort()]
 
 
 def distinct(found: Hypotheses, count: int, apart: float) -> Hypotheses:
@@ -158,7 +162,7 @@ def searching(
 def refined(objective: Objective, found: Hypotheses, steps: int, loose: float = 1.0) -> lockstep.Search[Hypotheses]:
     """Hypotheses refined on the objective, best first."""
     ((z, lengths, energy, solution),) = yield [Task(objective, found.depth, found.lengths, steps, loose)]
-    return Hypotheses(z, lengths, energy, found.steps + solution.iterations)
+    return Hypotheses(z, lengths, energy, found.steps + solution.iterations, solution.drop)
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,10 @@ MOVING_STEPS = sum(stage.num_steps for stage in (*COARSE, *FINE))
 TURNING = 90.0
 """Degrees of the trunk's turn, as the template tells it, from which on the viewpoint's turn is asked as well."""
 
+NATS, STILL = 0.01, 1e-3
+"""A solution has settled where the last ten steps lowered the fixed viewpoint's objective by no more than so much a
+frame (and by 1 in all), and the moving viewpoint's by no more than this share."""
+
 LEAST_FRAMES = 12
 """Frames from which on the viewpoint may have turned."""
 
@@ -74,6 +78,7 @@ class PKC(Method):
     """
 
     name: ClassVar[str] = "pkc"
+    reckons_in_seconds: ClassVar[bool] = True
     centred: ClassVar[bool] = False  # noise and outliers are told apart before the middle is taken
     viewpoint: Literal["auto", "fixed", "moving"] = "auto"
     denoise: bool = True
@@ -191,7 +196,8 @@ class PKC(Method):
         path = moving.cameras()[0] if cameras is None else complete_rotation(cameras)
         one = torch.ones_like(points[:, 0, 0])
         value = float(moving.pose.objective[0])
-        main = Estimate(points, path[:, :2], one, True, MOVING_STEPS, notes, moving.deviation(path), value)
+        settled = bool(moving.pose.drop[0] <= STILL * moving.pose.objective[0].abs())
+        main = Estimate(points, path[:, :2], one, settled, MOVING_STEPS, notes, moving.deviation(path), value)
         if cameras is not None or not self.alternatives:
             return main
         flip = points.new_tensor([1.0, 1.0, -1.0])
@@ -223,7 +229,10 @@ class PKC(Method):
             spread = depth_deviation(found[k:] if k else found, body.noise, body.skeleton) / body.factor
             value = float(found.energy[k])
             path = body.frames(depth)[:, :2] if cameras is None else cameras
-            made.append(Estimate(points, path, one, True, found.steps, () if k else notes, spread, value, still=True))
+            settled = found.drop is None or bool(found.drop[k] <= max(1.0, NATS * len(points)))
+            made.append(
+                Estimate(points, path, one, settled, found.steps, () if k else notes, spread, value, still=True)
+            )
         return replace(made[0], alternatives=tuple(made[1:]))
 
 

@@ -133,7 +133,8 @@ def moving_view(
     made = _starts(few, skeleton, bones, turns, lifts if joints > ROBOT else 20 * lifts, frames, pick, seed)
     points = torch.cat([first[:, pick], *(p for p, _ in made)])
     turned = align_rotations(points, torch.cat([rotations[None, pick], *(r for _, r in made)]), bones)
-    pose = Pose(points, turned, points.new_zeros(len(points)))
+    zero = points.new_zeros(len(points))
+    pose = Pose(points, turned, zero, zero)
     order = torch.arange(len(points))
     for stage, kept in zip(coarse, KEPT, strict=True):
         pose = procrustean(

@@ -204,8 +204,7 @@ class Objective:
         energies are then those of the loose objective.
         """
         depth, lengths, energy, solution = self.refined(depth, lengths, num_steps, loose)
-        order = energy.argsort()
-        return depth[order], lengths[order], energy[order], solution
+        return _sorted(depth, lengths, energy, solution)
 
     def refined(
         self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0
@@ -316,11 +315,20 @@ def _minimise_joined(tasks: list[Task]) -> list[tuple[Tensor, Tensor, Tensor, So
     depth, lengths = torch.cat([pad(task.depth) for task in tasks]), torch.cat([task.lengths for task in tasks])
     depth, lengths, energy, solution = joined.refined(depth, lengths, tasks[0].num_steps, tasks[0].loose)
     out = []
-    for task, *part in zip(tasks, *(x.split(counts) for x in (depth, lengths, energy)), strict=True):
-        order = part[2].argsort()
-        found = [x[order] for x in part]
-        out.append((found[0][:, : task.depth.shape[1]], found[1], found[2], solution))
+    assert solution.drop is not None
+    for task, *part in zip(tasks, *(x.split(counts) for x in (depth, lengths, energy, solution.drop)), strict=True):
+        z, size, value, drop = part
+        out.append(_sorted(z[:, : task.depth.shape[1]], size, value, replace(solution, drop=drop)))
     return out
+
+
+def _sorted(
+    depth: Tensor, lengths: Tensor, energy: Tensor, solution: Solution[Tensor]
+) -> tuple[Tensor, Tensor, Tensor, Solution[Tensor]]:
+    """Hypotheses by energy, and by how much each was lowered last."""
+    order = energy.argsort()
+    assert solution.drop is not None
+    return depth[order], lengths[order], energy[order], replace(solution, drop=solution.drop[order])
 
 
 class _Unknowns:
