@@ -37,7 +37,8 @@ from kcs_torch.errors import KcsError
 from kcs_torch.io import MOTION_READERS, READERS, load_motion, load_people
 
 ROOM = 1536 * 2**20  # bytes of memory for reading, besides what is loaded before
-PATIENCE = 10.0  # seconds for one input
+PATIENCE = 20.0  # seconds for one input, and for a worker that reads it, which is asked a few times:
+WORKER = 3.0
 LONGEST = 3000  # letters of a message
 LARGEST = 300_000  # bytes of a real file that is taken
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "raw_formats"

@@ -180,7 +180,7 @@ def odd_array(array: np.ndarray, rng: Random, canary) -> np.ndarray:
         case 4:
             return array.transpose(rng.sample(range(array.ndim), array.ndim))
         case 5:
-            return np.zeros(tuple(rng.choice([0, 1, 2, 3, 17, 300]) for _ in range(rng.randrange(5))))
+            return np.zeros([rng.choice([0, 1, 2, 3, 17]) for _ in range(rng.randrange(4))] + rng.choice([[], [300]]))
         case 6:
             return np.full(array.shape, rng.choice([0.0, -1.0, np.nan, np.inf, 1e308]))
         case 7:

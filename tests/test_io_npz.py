@@ -336,6 +336,7 @@ def test_results_are_tracks_again(tmp_path):
         ("confidence", np.full((12, 17), np.nan), "'points2d': expected finite"),
         ("skeleton", np.array("{"), "'skeleton': expected JSON"),
         ("skeleton", np.array("[]"), "'skeleton': expected a JSON dict"),
+        ("skeleton", np.array("9" * 5000), "'skeleton': expected JSON"),
         ("skeleton", np.array('{"joints": ["a", "a"], "bones": []}'), "given twice"),
         ("diagnostics", np.array("{}"), "'diagnostics'"),
         ("notes", np.array("7"), "'notes': expected a JSON list"),

@@ -289,9 +289,10 @@ def _skeleton(file: Archive) -> Skeleton:
 
 
 def _json(file: Archive, key: str, kind: type) -> Any:
+    text = file.text(key)
     try:
-        value = json.loads(file.text(key))
-    except (json.JSONDecodeError, RecursionError) as error:
+        value = json.loads(text)
+    except (ValueError, RecursionError) as error:  # of JSON, and of numbers with thousands of digits
         raise FormatError(f"{file.path}: '{key}': expected JSON text, got {error}") from None
     if not isinstance(value, kind):
         raise FormatError(f"{file.path}: '{key}': expected a JSON {kind.__name__}, got {type(value).__name__}")
