@@ -22,6 +22,7 @@ from samples import (
     deeplabcut_values,
     person,
     sleap_points,
+    write_deeplabcut_fixed,
     write_deeplabcut_table,
     write_openpose,
     write_sleap_hdf5,
@@ -43,7 +44,7 @@ def no_hang():
         raise TimeoutError("a reader waits for ever")
 
     before = signal.signal(signal.SIGALRM, end)
-    signal.alarm(600)
+    signal.alarm(1200)
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
@@ -191,6 +192,24 @@ def test_hdf5_bombs_are_refused(tmp_path):
     assert path.stat().st_size < 10**6
     with pytest.raises(FormatError, match="refused as a bomb"):
         load_people(path)
+
+
+def test_a_dataset_under_many_names_is_no_bomb(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    columns = deeplabcut_columns()
+    path = write_deeplabcut_fixed(tmp_path / "a.h5", columns, deeplabcut_values(columns))
+    with h5py.File(path, "r+") as file:
+        group = file["df_with_missing"]
+        zeros = group.create_dataset(
+            "zeros", (10**6, 9), "f8", chunks=(10**6, 9), compression="gzip", compression_opts=1
+        )
+        zeros[:] = 0
+        for i in range(1, 200):  # 14 GB, together
+            group[f"block{i}_values"] = zeros
+        for i in range(200):
+            file[f"g{i}"] = group
+    with pytest.raises(FormatError, match="refused as a bomb"):
+        load_tracks(path, format="deeplabcut")
 
 
 @pytest.mark.parametrize(

@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 ROOM = 2**30  # bytes of memory for this process besides the numbers
-MOST = 4096  # members of one group, attributes of one object, that are looked at
-LONG = 2**22  # bytes of one attribute, and of the texts of one dataset
+MOST = 16384  # objects, and attributes of one object, that are looked at
+LONG = 2**22  # letters of all attributes, and of the texts of all datasets
 
 
 class Refused(Exception):
@@ -44,20 +44,25 @@ def main(request: dict[str, Any]) -> None:
     kind, path = request["kind"], request["path"]
     try:
         with h5py.File(path, "r") as file:
-            objects = dict(members(file, request["depth"]))
+            objects = dict(islice(members(file, request["depth"]), MOST))
             data = {k: v for k, v in objects.items() if isinstance(v, h5py.Dataset)}
             answer: dict[str, Any] = {
                 "shapes": {k: v.shape or () for k, v in data.items()},
-                "attributes": {k: attributes(v) for k, v in objects.items()} if request["texts"] else {},
+                "attributes": attributes(objects) if request["texts"] else {},
                 "texts": {},
                 "read": [],
             }
-            most = max(request["large"], request["ratio"] * os.path.getsize(path))
+            # For all that is read together: one dataset may stand under many names.
+            most, letters = max(request["large"], request["ratio"] * os.path.getsize(path)), LONG
             for name in (k for k in data if any(fnmatchcase(k, w) for w in request["wanted"])):
-                room += 4 * check(name, data[name], request, most)
-                allow(room)
+                size = check(name, data[name], request, most)
+                most -= size
+                allow(room := room + 4 * size)
                 if request["texts"] and (text := texts(data[name])) is not None:
                     answer["texts"][name] = text
+                    letters -= sum(map(len, text)) + len(text)
+                    if letters < 0:
+                        raise Refused(f"'{name}': expected names, got more than {LONG} letters")
                     continue
                 for part, values in fields(name, data[name]):
                     if values.dtype.kind == "S":
@@ -83,7 +88,7 @@ def members(group: Any, depth: int, name: str = "") -> Iterator[tuple[str, Any]]
     import h5py
 
     yield name, group
-    for key in islice(group, MOST):
+    for key in group:
         if not isinstance(key, str) or not isinstance(group.get(key, getlink=True), h5py.HardLink):
             continue
         value, label = group[key], f"{name}/{key}" if name else key
@@ -93,19 +98,23 @@ def members(group: Any, depth: int, name: str = "") -> Iterator[tuple[str, Any]]
             yield from members(value, depth - 1, label)
 
 
-def attributes(item: Any) -> dict[str, str]:
+def attributes(objects: dict[str, Any]) -> dict[str, dict[str, str]]:
     """The attributes that are text, bytes (as Latin-1) or one whole number; those that cannot be read are left out."""
-    found = {}
-    for key in islice(item.attrs, MOST):
-        with contextlib.suppress(Exception):
-            stored = item.attrs.get_id(key)
-            if math.prod(stored.shape or (1,)) * stored.dtype.itemsize > LONG:
-                continue
-            value = item.attrs[key]
-            if isinstance(value, bytes):
-                found[str(key)] = value.decode("latin-1")
-            elif isinstance(value, (str, np.integer)):
-                found[str(key)] = str(value)[:LONG]
+    found: dict[str, dict[str, str]] = {}
+    left = LONG
+    for name, item in objects.items():
+        found[name] = {}
+        for key in islice(item.attrs, MOST):
+            with contextlib.suppress(Exception):
+                stored = item.attrs.get_id(key)
+                if math.prod(stored.shape or (1,)) * stored.dtype.itemsize > left:
+                    continue
+                value = item.attrs[key]
+                if isinstance(value, bytes):
+                    value = value.decode("latin-1")
+                if isinstance(value, (str, np.integer)) and len(str(value)) <= left:
+                    found[name][str(key)] = str(value)
+                    left -= len(str(value))
     return found
 
 
@@ -115,10 +124,7 @@ def texts(data: Any) -> list[str] | None:
 
     if h5py.check_string_dtype(data.dtype) is None:
         return None
-    values = [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in np.ravel(data[()]).tolist()]
-    if sum(map(len, values)) > LONG:
-        raise Refused(f"'{data.name}': expected names, got more than {LONG} letters")
-    return values
+    return [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in np.ravel(data[()]).tolist()]
 
 
 def fields(name: str, data: Any) -> Iterator[tuple[str, NDArray[Any]]]:
