@@ -1,7 +1,8 @@
 """What every method keeps to, on ordinary clips and at the edges: finite numbers, invariances, no side effects."""
 
 import math
-from dataclasses import replace
+import warnings
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from kcs_torch import (
 )
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_lengths, viewpoint_turn
+from kcs_torch.methods.base import Estimate, Method
 
 NAN = math.nan
 quiet = pytest.mark.filterwarnings("ignore::kcs_torch.errors.KcsWarning")
@@ -463,3 +465,82 @@ def test_skeleton_without_template_or_bones_still_names_itself():
     body = Skeleton.from_edges([], 17, name="dots", tree=False)
     result = reconstruct(tracks_of(WALK, skeleton=body), method="kcs")
     assert any("'dots' has no template" in n for n in result.diagnostics.notes)
+
+
+# ---------------------------------------------------------------------- what the user is told
+
+
+def notes(tracks, method, **fields):
+    return " | ".join(reconstruct(tracks, method=method, **fields).diagnostics.notes)
+
+
+@quiet
+@pytest.mark.parametrize(("method", "told"), [("kcs", False), ("sfam", False), ("pkc", True)])
+def test_an_assumed_frame_rate_is_told_where_it_matters(method, told):
+    assert ("30 frames a second assumed" in notes(tracks_of(WALK), method)) is told
+    assert "assumed" not in notes(tracks_of(WALK, fps=30), method)
+
+
+@quiet
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("place", [0.0, 1e6])
+def test_joints_that_coincide_are_told(method, place):
+    drift = place + torch.linspace(0, 100, 12)[:, None, None].expand(12, 17, 2)
+    result = reconstruct(tracks_of(drift), method=method)
+    told = " | ".join(result.diagnostics.notes)
+    assert "all joints lie at one point in every frame" in told
+    assert result.root_depth is None and "root depth" not in told
+    assert "one point" not in notes(tracks_of(WALK), method)
+
+
+@quiet
+@pytest.mark.parametrize("method", METHODS)
+def test_a_body_without_rigid_bones_is_told(method):
+    none = Tracks.from_arrays(WALK[:, :5])
+    assert none.skeleton.num_bones == 0
+    assert "the skeleton has no bones" in notes(none, method)
+    names = ["a", "b", "c"]
+    bending = Skeleton.from_names(names, [("a", "b"), ("b", "c")], flexible=[("a", "b"), ("b", "c")])
+    assert "the skeleton has no rigid bones" in notes(tracks_of(WALK[:, :3], skeleton=bending), method)
+    assert "the skeleton has no" not in notes(tracks_of(WALK), method)
+
+
+@dataclass(frozen=True)
+class Breathing(Method):
+    """Gives the walk back, growing and shrinking by a share."""
+
+    name = "breathing"
+    share: float = 0.2
+    settled: bool = True
+
+    def solve(self, tracks, cameras):
+        size = 1 + self.share * torch.tensor([1.0, -1.0]).double().repeat(6)
+        points = CLIP.points / 1000 * size[:, None, None]
+        return Estimate(points, CLIP.cameras, torch.ones(12).double(), self.settled, 3)
+
+
+def caught_from(method):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = method(CLIP.tracks).diagnostics
+    return found, [str(w.message) for w in caught if "bone lengths vary" in str(w.message)]
+
+
+def test_bones_that_do_not_keep_their_length_are_warned_of():
+    found, told = caught_from(Breathing())
+    assert found.bone_variation == pytest.approx(20, rel=1e-3)
+    assert len(told) == 1 and "walking_person: bone lengths vary by 20.0 %: joints may be wrong" in told[0]
+    assert any("bone lengths vary by more than 5 %" in note for note in found.notes)
+
+
+def test_bones_that_nearly_keep_it_or_are_not_held_or_not_found_yet_are_not():
+    found, told = caught_from(Breathing(share=0.04))
+    assert found.bone_variation < 5 and not told and "vary" not in " ".join(found.notes)
+    assert not caught_from(Breathing(settled=False))[1]  # that it did not converge says why
+
+    class Free(Breathing):
+        keeps_lengths = False
+
+    found, told = caught_from(Free())
+    assert found.bone_variation > 5 and not told and "vary" not in " ".join(found.notes)
+    assert not METHODS["kcs"].keeps_lengths and METHODS["sfam"].keeps_lengths and METHODS["pkc"].keeps_lengths

@@ -150,6 +150,7 @@ def test_a_body_that_nobody_has_described():
     assert result.root_depth is None
 
 
+@pytest.mark.filterwarnings("ignore:.*bone lengths vary")  # one start may end in the wrong valley
 def test_seeds_of_random_starts():
     clip = robot()
     one, same, other = (PKC(lifts=1, seed=seed)(clip.tracks).points for seed in (1, 1, 2))

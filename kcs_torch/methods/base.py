@@ -31,8 +31,16 @@ __all__ = ["Estimate", "Method"]
 WEAK_TURN = 30.0
 """Degrees of viewpoint turn below which depth is weakly determined."""
 
+LOOSE = 5.0
+"""Per cent of bone variation from which on the tracks are hardly those of a body of this skeleton."""
+
 FAR_STEPS = 2
 """How often joints are weighed anew by their distance, when the body is put in its place."""
+
+_WHY_LOOSE = (
+    "joints may be wrong, swapped or in another order, the skeleton may be another, parts of the body may bend, or the "
+    "camera may be so near that its intrinsics matter"
+)
 
 
 @dataclass(frozen=True)
@@ -74,6 +82,10 @@ class Method(ABC):
     name: ClassVar[str] = ""
     centred: ClassVar[bool] = True
     """Whether :meth:`solve` takes tracks about the body's middle in each frame; else about its mean over time."""
+    keeps_lengths: ClassVar[bool] = True
+    """Whether bones keep their length as far as the tracks admit; else lengths that vary say nothing of the tracks."""
+    reckons_in_seconds: ClassVar[bool] = False
+    """Whether the frame rate matters; 30 frames a second are assumed where it is unknown."""
 
     def __post_init__(self) -> None:
         hints = typing.get_type_hints(type(self))
@@ -167,6 +179,10 @@ class Method(ABC):
                 stacklevel=users_level(),
             )
 
+        if found.bone_variation > LOOSE and self.keeps_lengths and found.converged:
+            message = f"{tracks.source}: bone lengths vary by {found.bone_variation:.1f} %: {_WHY_LOOSE}"
+            warnings.warn(message, KcsWarning, stacklevel=users_level())
+
     def _unsettled(self, steps: int) -> str:
         return f"{self.name} did not settle within {steps} steps"
 
@@ -191,14 +207,27 @@ class Method(ABC):
             )
         if not found.converged:
             notes.append(self._unsettled(found.iterations))
+        percent = float(100 * variation[rigid].median()) if rigid else math.nan
+        if percent > LOOSE and self.keeps_lengths:
+            notes.append(f"bone lengths vary by more than {LOOSE:g} %: {_WHY_LOOSE}")
+        if not rigid:
+            kind = "no bones" if not body.num_bones else "no rigid bones"
+            notes.append(
+                f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown"
+            )
+        if tracks.fps is None and self.reckons_in_seconds:
+            notes.append("30 frames a second assumed: set the tracks' fps if it is another rate")
+        pointlike = not bool(_extent(tracks) > 0)
+        if pointlike:
+            notes.append("all joints lie at one point in every frame: there is no pose to find")
         root = None
-        if found.still:
+        if found.still and not pointlike:
             root, remark = root_depth(points, tracks)
             notes.append(remark)
         diagnostics = Diagnostics(
             viewpoint_turn=turn,
             unseen_share=tracks.unseen_share,
-            bone_variation=float(100 * variation[rigid].median()) if rigid else math.nan,
+            bone_variation=percent,
             reprojection_rms=float(_rms(seen - tracks.points, tracks.seen.to(points.dtype))),
             converged=found.converged,
             iterations=found.iterations,
@@ -292,6 +321,16 @@ def _shift(residuals: Tensor, weights: Tensor) -> Tensor:
             break
         middle = centre(residuals, weights / (1 + (far / (3 * usual)).square()))[1]
     return middle
+
+
+def _extent(tracks: Tracks) -> Tensor:
+    """How far seen joints lie apart, at most, in a frame; 0 where it is rounding."""
+    seen = tracks.seen[..., None]
+    far = torch.full_like(tracks.points, math.inf)
+    low = torch.where(seen, tracks.points, far).amin(1)
+    apart = torch.where(seen, tracks.points, -far).amax(1) - low
+    apart = torch.where(apart > 8 * torch.finfo(apart.dtype).eps * low.abs(), apart, torch.zeros_like(apart))
+    return apart.amax() if apart.numel() else apart.sum()
 
 
 def _rms(vectors: Tensor, weights: Tensor) -> Tensor:

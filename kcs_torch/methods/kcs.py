@@ -61,6 +61,7 @@ class KCS(Method):
     """
 
     name: ClassVar[str] = "kcs"
+    keeps_lengths: ClassVar[bool] = False
     template: Sequence[Sequence[float]] | None = None
     links: tuple[tuple[str, str], ...] = ()
     arrangement: Literal["stacked", "frames"] = "stacked"
