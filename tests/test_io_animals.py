@@ -593,6 +593,18 @@ def test_many_pieces_in_a_long_clip_do_not_fill_the_memory(tmp_path, monkeypatch
         load_tracks(write_sleap_csv(tmp_path / "a.csv", lines))
 
 
+@pytest.mark.parametrize(("bound", "value"), [("LINES", 5), ("LINE", 60)])
+def test_tables_of_text_are_bounded(tmp_path, monkeypatch, bound, value):
+    paths = [
+        write_deeplabcut_csv(tmp_path / "a.csv", *_animal()),
+        write_sleap_csv(tmp_path / "b.csv", [["a", t, 0.9, *CELLS] for t in range(9)]),
+    ]
+    monkeypatch.setattr(animals, bound, value)
+    for path in paths:
+        with pytest.raises(FormatError, match=r"line \d: expected up to .* lines of .* letters"):
+            load_tracks(path)
+
+
 def test_a_missing_h5py_is_told(tmp_path, monkeypatch):
     path = write_sleap_hdf5(tmp_path / "a.h5", sleap_points())
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,9 +17,10 @@ from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.registry import Options, brief
 from kcs_torch.types import Tracks
 
-__all__ = ["LIMIT", "Animal", "build_animals", "frames_of", "refuse_3d"]
+__all__ = ["LIMIT", "Animal", "bounded_lines", "build_animals", "frames_of", "refuse_3d"]
 
 LIMIT = 2**28  # numbers of all animals in all frames
+LINES, LINE = 2**23, 2**23  # of a table of text, and letters of one
 _OVERSHOOT = 1.5  # some networks' confidences pass 1 a little; above this they are on another scale
 _FARTHEST = 1e9  # pixels
 _FRAGMENT = 0.1  # share of the frames, below which an animal that is seen is a piece of somebody's track
@@ -78,6 +79,18 @@ def frames_of(rows: Sequence[tuple[str | float, ...]], path: Path, notes: list[s
         order.sort(key=lambda i: numbers[i] or 0)
     frames = frame_numbers([numbers[i] for i in order], notes, names="rows", whole="row")
     return order, frames
+
+
+def bounded_lines(file: Iterable[str], path: Path) -> Iterator[str]:
+    """The lines of a table of text, within bounds on their length and number.
+
+    Raises:
+        FormatError: a line is longer, or there are more, than any table of tracks has.
+    """
+    for number, line in enumerate(file, 1):
+        if len(line) > LINE or number > LINES:
+            raise FormatError(f"{path}: line {number}: expected up to {LINES} lines of {LINE} letters: split the file")
+        yield line
 
 
 def _whole(value: str | float) -> int | None:

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.animals import LIMIT, Animal, build_animals, frames_of, refuse_3d
+from kcs_torch.io.animals import LIMIT, Animal, bounded_lines, build_animals, frames_of, refuse_3d
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5 import Tree, read_tree
 from kcs_torch.io.link import link_people
@@ -173,7 +173,7 @@ def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
     instances: dict[str, dict[int, list[NDArray[np.float64]]]] = {}
     try:
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            lines = csv.reader(file)
+            lines = csv.reader(bounded_lines(file, path))
             header = next(lines, [])
             names = list(dict.fromkeys(c.rpartition(".")[0] for c in header[3:]))
             places = [[_place(header, f"{n}.{c}") for c in ("x", "y", "score")] for n in names]
