@@ -1,5 +1,6 @@
 """The live mode: one frame at a time, causal, of bounded memory, and near the offline method."""
 
+import threading
 import time
 from dataclasses import replace
 
@@ -255,6 +256,24 @@ def test_bad_confidence(clip, value):
         kt.Tracker("coco17", fps=30).update(observed(clip)[0], sure)
     with pytest.raises(kt.ShapeError, match=r"frame 0: confidence: expected shape \(17,\)"):
         kt.Tracker("coco17", fps=30).update(observed(clip)[0], np.ones(5))
+
+
+def test_closing_ends_the_thread_and_keeps_the_window(clip):
+    frames = observed(clip)
+    before = set(threading.enumerate())
+    fields = {"viewpoint": "fixed", "steps": 3}
+    with kt.Tracker("coco17", fps=30, window=20, method=kt.METHODS["pkc"](**fields)) as tracker:
+        poses = follow(tracker, frames[:22])
+        (thread,) = set(threading.enumerate()) - before
+    assert not thread.is_alive() and len(poses) == 22
+    assert tracker.tracks().num_frames == 20
+    with pytest.raises(kt.OptionError, match="Tracker: closed"):
+        tracker.update(frames[22])
+    tracker.close()
+    with pytest.raises(ZeroDivisionError), kt.Tracker("coco17", fps=30) as tracker:
+        raise ZeroDivisionError
+    with pytest.raises(kt.OptionError, match="Tracker: closed"):
+        tracker.update(frames[0])
 
 
 def test_bad_options():

@@ -6,7 +6,7 @@ from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -87,9 +87,9 @@ class Tracker:
     depths by the forward half of a second-order Viterbi recursion, and bones of constant length. Bone lengths, the
     trunk's shape and the signs so far come from the window of the newest frames, solved by :class:`kcs_torch.PKC` as
     before a fixed viewpoint: when a third of the window has come, when it is full, then every ``period`` frames. A
-    window is solved in a thread of its own while frames go on. What it finds is taken over a fixed number of frames
-    later, a third of the window's. Where frames come faster, or the machine is slow, that one update waits for the
-    thread, unless ``wait`` is False.
+    window is solved in a thread of its own while frames go on; :meth:`close`, or the end of a ``with`` block, ends it.
+    What a solve finds is taken over a fixed number of frames later, a third of the window's. Where frames come faster,
+    or the machine is slow, that one update waits for the thread, unless ``wait`` is False.
 
     Bone lengths in the tracks' units change when a window has been solved, not between: so does the size of a body that
     comes nearer. The camera is taken to move little. Without a template the viewpoint has to turn: depths are 0 and
@@ -113,9 +113,9 @@ class Tracker:
 
     >>> from kcs_torch.data import walking_person
     >>> clip = walking_person(45, skeleton="coco17").tracks
-    >>> tracker = Tracker("coco17", fps=30, units="mm")
-    >>> for xy in clip.points[:, :17]:  # (17, 2), NaN where unseen
-    ...     pose = tracker.update(xy)
+    >>> with Tracker("coco17", fps=30, units="mm") as tracker:
+    ...     for xy in clip.points[:, :17]:  # (17, 2), NaN where unseen
+    ...         pose = tracker.update(xy)
     >>> pose.frame, pose.points.shape, pose.ready
     (44, torch.Size([19, 3]), True)
     """
@@ -163,6 +163,7 @@ class Tracker:
         self._rigid = torch.zeros(body.num_bones, dtype=torch.bool)
         self._rigid[list(body.rigid)] = True
         self._thread = ThreadPoolExecutor(1, "kcs_torch.live")
+        self._closed = False
         self._frame = -1
         self.reset()
 
@@ -192,7 +193,10 @@ class Tracker:
 
         Raises:
             ShapeError: the shape is wrong or a value infinite or out of range; the frame is then not taken.
+            OptionError: the tracker is closed.
         """
+        if self._closed:
+            raise OptionError("Tracker: closed: it takes no frames any more; make another one")
         points, weights, like = self._take(xy, confidence)
         self._frame += 1
         seen = weights > 0
@@ -217,6 +221,20 @@ class Tracker:
         else:
             self._advance()
         return out
+
+    def close(self) -> None:
+        """End the thread that solves windows, after the solve under way. What the window holds stays: see result().
+
+        Closing twice does no harm; so does not closing, but a thread then ends only with the tracker.
+        """
+        self._closed, self._solving = True, None
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
     def tracks(self) -> Tracks:
         """The window's frames, with their gaps.
