@@ -289,6 +289,15 @@ def test_smoothness_of_too_few_frames_is_zero_with_a_gradient():
     assert torch.equal(grad, torch.zeros_like(grad))
 
 
+def test_energies_of_no_skeleton_say_so_in_a_line():
+    with pytest.raises(OptionError, match="expected kind 'nuclear' or 'log_det' and eps > 0, got a Skeleton and"):
+        LowRankEnergy(BODY)
+    with pytest.raises(OptionError, match="expected a whole order >= 1, got a Skeleton"):
+        SmoothnessEnergy(BODY)
+    with pytest.raises(OptionError, match=r"got 1\.5"):
+        SmoothnessEnergy(1.5)
+
+
 def test_smoothness_order_out_of_range():
     with pytest.raises(OptionError, match="order"):
         SmoothnessEnergy(0)

@@ -172,9 +172,8 @@ class LowRankEnergy(nn.Module):
     def __init__(self, kind: str = "nuclear", *, eps: float = 1e-3) -> None:
         super().__init__()
         if kind not in ("nuclear", "log_det") or not eps > 0:
-            raise OptionError(
-                f"LowRankEnergy: expected kind 'nuclear' or 'log_det' and eps > 0, got {kind!r} and {eps}"
-            )
+            shown = repr(kind) if isinstance(kind, str) else f"a {type(kind).__name__}"
+            raise OptionError(f"LowRankEnergy: expected kind 'nuclear' or 'log_det' and eps > 0, got {shown} and {eps}")
         self.kind, self.eps = kind, eps
 
     def forward(self, points: Tensor) -> Tensor:
@@ -211,8 +210,9 @@ class SmoothnessEnergy(nn.Module):
 
     def __init__(self, order: int = 2) -> None:
         super().__init__()
-        if order < 1:
-            raise OptionError(f"SmoothnessEnergy: expected order >= 1, got {order}")
+        if not isinstance(order, int) or order < 1:
+            shown = order if isinstance(order, (int, float)) else f"a {type(order).__name__}"
+            raise OptionError(f"SmoothnessEnergy: expected a whole order >= 1, got {shown}")
         self.order = order
 
     def forward(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
