@@ -52,8 +52,12 @@ class Forks:
     """Stands in for ``subprocess`` in the modules that run workers: see ``fork_server.py``."""
 
     def __init__(self, folder: Path) -> None:
-        server = Path(__file__).with_name("fork_server.py")
         self.out = folder / "answer"
+        self.start()
+
+    def start(self) -> None:
+        """Start the server; anew after a hang, as its answers would then belong to earlier questions."""
+        server = Path(__file__).with_name("fork_server.py")
         self.process = subprocess.Popen(
             [sys.executable, str(server)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
@@ -62,7 +66,7 @@ class Forks:
         request = {
             "argv": [c for c in command[1:] if c != "-P"],
             "out": str(self.out),
-            "timeout": min(timeout, PATIENCE),
+            "timeout": min(timeout, WORKER),
         }
         self.process.stdin.write(json.dumps(request) + "\n")
         self.process.stdin.flush()
@@ -285,6 +289,9 @@ def main() -> None:
             except (Exception, Hang) as error:
                 signal.setitimer(signal.ITIMER_REAL, 0)
                 results = ["failed"]
+                if isinstance(error, Hang):
+                    forks.process.kill()
+                    forks.start()
                 failures.append({"input": number, "sample": sample.label, "error": repr(error)[:300]})
                 failures[-1]["trace"] = traceback.format_exc()[-1200:]
                 if asked.keep is not None:

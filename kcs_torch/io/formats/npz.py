@@ -204,7 +204,7 @@ def _tracks_in(file: Archive) -> Tracks:
     if body.virtual:
         points = torch.cat([points, _tensor(file, "points2d_virtual", t, m - n, 2)], 1)
         weights = torch.cat([weights, _tensor(file, "confidence_virtual", t, m - n)], 1)
-    if not (torch.isfinite(points).all() and (weights >= 0).all()):
+    if not (torch.isfinite(points).all() and (weights >= 0).all() and (weights <= 1).all()):
         raise FormatError(f"{file.path}: 'points2d': expected finite numbers wherever the confidence is above 0")
     fps = file.number("fps") if "fps" in file else math.nan
     return Tracks(
@@ -223,10 +223,13 @@ def _solution_in(file: Archive, tracks: Tracks, prefix: str = "") -> Reconstruct
     t, m = tracks.num_frames, tracks.skeleton.num_joints
 
     def tensor(key: str, *shape: int) -> Tensor:
-        return _tensor(file, prefix + key, *shape)
+        values = _tensor(file, prefix + key, *shape)
+        if not torch.isfinite(values).all():
+            raise FormatError(f"{file.path}: '{prefix + key}': expected finite numbers, got others")
+        return values
 
     def maybe(key: str, *shape: int) -> Tensor | None:
-        return tensor(key, *shape) if prefix + key in file else None
+        return _tensor(file, prefix + key, *shape) if prefix + key in file else None
 
     return Reconstruction(
         points=tensor("points3d_all", t, m, 3),
