@@ -7,10 +7,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from kcs_torch import PKC, KcsWarning, OptionError, Skeleton, Tracks
+from kcs_torch import PKC, ConvergenceWarning, KcsWarning, OptionError, Skeleton, Tracks
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_lengths
 from kcs_torch.methods.pkc import method as module
+
+# Many tests take few steps, after which nothing has settled.
+pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")
 
 NAN = math.nan
 FLIP = torch.tensor([1.0, 1.0, -1.0]).double()
@@ -151,6 +154,7 @@ def test_a_body_that_nobody_has_described():
 
 
 @pytest.mark.filterwarnings("ignore:.*bone lengths vary")  # one start may end in the wrong valley
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
 def test_seeds_of_random_starts():
     clip = robot()
     one, same, other = (PKC(lifts=1, seed=seed)(clip.tracks).points for seed in (1, 1, 2))
@@ -312,3 +316,64 @@ def test_fields_out_of_range(field, value):
 def test_unknown_fields_are_answered_with_the_right_one():
     with pytest.raises(OptionError, match="did you mean 'rounds'"):
         PKC.from_options(round=1)
+
+
+def test_says_whether_it_settled(still):
+    clip, found = still
+    assert found.diagnostics.converged
+    with pytest.warns(ConvergenceWarning, match="did not settle"):
+        hasty = PKC(viewpoint="fixed", rounds=0, steps=1)(clip.tracks)
+    assert not hasty.diagnostics.converged
+
+
+def test_depth_that_is_a_guess_is_told():
+    """Without a template nothing tells depth before a camera that stands still."""
+    body = replace(walking_person(2).tracks.skeleton, template=None, proportions=None, spread=None, hinges=())
+    for turn, told in ((0.0, True), (180.0, False)):
+        clip = walking_person(60, turn=turn, yaw=30.0)
+        tracks = replace(clip.tracks, skeleton=body)
+        if told:
+            with pytest.warns(KcsWarning, match="little more than a guess"):
+                found = PKC()(tracks)
+            assert error(found.points, clip.points) > 0.3
+            assert found.uncertainty.mean() > 0.3 * centred(clip.points)[..., 2].square().mean().sqrt()
+        else:
+            found = PKC()(tracks)
+            assert error(found.points, clip.points) < 0.1 or error(found.points * FLIP, clip.points) < 0.1
+        assert any("guess" in note for note in found.diagnostics.notes) == told
+        assert not any("template and lengths" in note for note in found.diagnostics.notes)
+
+
+def test_poses_are_held_where_nobody_is_seen():
+    """A model of motion would run off beyond the clip's ends."""
+    clip = walking_person(60, turn=0.0, yaw=40.0)
+    weights = clip.tracks.weights.clone()
+    weights[:12], weights[-9:] = 0, 0
+    noise = 0.01 * centred(clip.points).square().sum(-1).mean().sqrt()
+    points = clip.tracks.points + noise * torch.randn(
+        clip.tracks.points.shape, generator=torch.Generator().manual_seed(0)
+    )
+    found = PKC()(replace(clip.tracks, points=torch.where(weights[..., None] > 0, points, 0), weights=weights))
+    size = bone_lengths(found.points, clip.tracks.skeleton.bone_index())
+    assert (size[:12] < 1.3 * size.median(0).values).all() and (size[-9:] < 1.3 * size.median(0).values).all()
+    assert any("21 frames at the clip's ends" in note for note in found.diagnostics.notes)
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+def test_too_little_for_the_moving_viewpoint_is_told():
+    clip = random_motion(Skeleton.from_names(list("abc"), [("a", "b"), ("b", "c")]), turn=180)
+    assert any("solved by sfam" in note for note in PKC()(clip.tracks).diagnostics.notes)
+
+
+def test_several_clips_at_once():
+    """Clips of several lengths and frame rates, noisy and clean, give what each gives alone."""
+    clips = [
+        walking_person(n, turn=0.0, yaw=40.0, noise=x, fps=f).tracks
+        for n, x, f in ((20, 0, 30.0), (31, 8, 30.0), (24, 0, 20.0))
+    ]
+    method = PKC(rounds=0, steps=4)
+    for alone, one in zip(map(method, clips), method.many(clips), strict=True):
+        assert_close(one.points, alone.points, rtol=1e-3, atol=2.0)
+        assert_close(one.objective, alone.objective, rtol=1e-2, atol=0.5)
+        assert len(one.alternatives) == len(alone.alternatives)
+    assert method.many([]) == []

@@ -12,7 +12,17 @@ from torch.testing import assert_close
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths, bone_vectors
 from kcs_torch.methods.pkc import objective as module
-from kcs_torch.methods.pkc.objective import Objective, Weights, _Unknowns, at_pace, bone_noise, pace_of
+from kcs_torch.methods.pkc.lockstep import run, together
+from kcs_torch.methods.pkc.objective import (
+    Objective,
+    Task,
+    Weights,
+    _Unknowns,
+    at_pace,
+    bone_noise,
+    minimise_all,
+    pace_of,
+)
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.solvers import lbfgs
 
@@ -224,7 +234,7 @@ def test_unknowns_make_the_objective_round(noise):
     """The Hessian's condition at a minimum, without the shifts of whole frames, which cost nothing."""
     points = walk(6, yaw=20.0)
     found = objective(points, noise=noise)
-    z, sizes, _, _ = found.minimise(points[None, ..., 2], lengths_of(found, points)[None], 100)
+    z, sizes, *_ = found.minimise(points[None, ..., 2], lengths_of(found, points)[None], 100)
     unknowns = _Unknowns(found, z, sizes)
     plain = torch.cat([z.flatten(), sizes.flatten().log()])
     curves = []
@@ -272,7 +282,7 @@ def test_loose_lengths_first():
 def test_where_nothing_is_seen_it_stays_finite():
     for points in (torch.zeros(4, 17, 3).double(), walk(4) * torch.tensor([0.0, 1.0, 1.0])):
         found = objective(points)
-        depth, lengths, energy, _ = found.minimise(0 * points[None, ..., 2], found.posture.rest_lengths[None], 5)
+        depth, lengths, energy, *_ = found.minimise(0 * points[None, ..., 2], found.posture.rest_lengths[None], 5)
         assert all(torch.isfinite(x).all() for x in (depth, lengths, energy))
 
 
@@ -305,10 +315,10 @@ def test_minimise_lowers_sorts_and_keeps_good_starts():
     lengths = bone_lengths(points, found.bones).mean(0)
     depth = torch.stack([-points[..., 2], points[..., 2] + 0.02 * normal(40, 17)])
     before = found(depth, lengths.expand(2, -1))
-    z, sizes, energy, solution = found.minimise(depth, lengths.expand(2, -1), 25)
+    z, sizes, energy, _, steps = found.minimise(depth, lengths.expand(2, -1), 25)
     assert (energy.diff() >= 0).all() and (energy < before.flip(0)).all()
     assert_close(energy, found(z, sizes))
-    assert solution.iterations >= 1
+    assert steps >= 1
     assert (z[0] - points[..., 2]).square().mean().sqrt() < 0.05
     alone = found.minimise(depth[1:], lengths[None], 25)
     assert_close(alone[2][0], energy[0], rtol=1e-3, atol=0)
@@ -344,7 +354,7 @@ def test_lengths_do_not_grow_under_noise(seed):
     for noise in (0.01, 0.0):
         found = objective(noisy, noise=noise)
         lengths = lengths_of(found, points)
-        z, sizes, _, _ = found.minimise(points[None, ..., 2], lengths[None], 60)
+        z, sizes, *_ = found.minimise(points[None, ..., 2], lengths[None], 60)
         grown.append((sizes[0] / lengths)[lengths > 0.2])  # a hip of 0.13 is hardly larger than its noise
         wrong.append(float((z[0] - points[..., 2]).square().mean().sqrt() / points[..., 2].square().mean().sqrt()))
     assert len(grown[0]) >= 10
@@ -393,3 +403,64 @@ def test_pace_of_a_clip_that_does_not_move():
     assert pace(walk(1)) == 1 and pace(walk(2), 60.0) == 2 and pace(walk(2), 15.0) == 0.5
     named = replace(SKELETONS["h36m17"], template=None, proportions=None)
     assert pace_of(still[..., :2], named, 60.0) == 2
+
+
+def several():
+    """Tasks of three clips that differ in length, frame rate, noise and anchor."""
+    tasks = []
+    for i, (frames, rate, noise, anchored) in enumerate(
+        ((20, 30.0, 0.0, False), (33, 60.0, 0.01, True), (26, 20.0, 0.0, False))
+    ):
+        points = walk(frames, fps=rate)
+        usual = bone_lengths(points, objective(points).bones).mean(0)
+        found = objective(points, rate=rate, noise=noise, anchor=usual if anchored else None)
+        depth = points[..., 2] + 0.05 * normal(2 + i, frames, 17, seed=i)
+        tasks.append(Task(found, depth - depth.mean(-1, keepdim=True), usual.expand(2 + i, -1), 3))
+    return tasks
+
+
+def test_clips_together_have_the_energies_of_each():
+    tasks = several()
+    counts = [len(task.depth) for task in tasks]
+    joined = Objective.joined([task.objective for task in tasks], counts)
+    pad = lambda z: torch.nn.functional.pad(z, (0, 0, 0, 33 - z.shape[1]), value=0.7)  # noqa: E731
+    depth, lengths = torch.cat([pad(task.depth) for task in tasks]), torch.cat([task.lengths for task in tasks])
+    together = joined.terms(depth, lengths)
+    for task, *rows in zip(tasks, *(term.split(counts) for term in together.values()), strict=True):
+        alone = task.objective.terms(task.depth, task.lengths)
+        for name, row in zip(together, rows, strict=True):
+            assert_close(row, alone.get(name, torch.zeros_like(row)), rtol=1e-8, atol=1e-6)
+
+
+def test_clips_are_refined_together_as_alone():
+    tasks = several()
+    for task, found in zip(tasks, minimise_all(tasks), strict=True):
+        alone = task.objective.minimise(task.depth, task.lengths, task.num_steps, task.loose)
+        assert_close(found.energy, alone.energy, rtol=1e-6, atol=1e-6)
+        assert_close(found.depth, alone.depth, rtol=0, atol=1e-5)
+        assert_close(found.moved, alone.moved, rtol=1e-3, atol=1e-6)
+
+
+def test_runs_are_not_too_large(monkeypatch):
+    tasks = several()
+    monkeypatch.setattr(module, "TOGETHER", 100)
+    runs = module._runs(list(range(3)), tasks)
+    assert sorted(i for run in runs for i in run) == [0, 1, 2] and len(runs) == 3
+
+
+def test_searches_in_lockstep():
+    """Each search gets the answers to its own tasks, however many it asks for and however long it goes on."""
+
+    def search(task, rounds):
+        energies = []
+        for k in range(rounds):
+            answers = yield [replace(task, num_steps=1 + k)] * (1 + k % 2)
+            assert len(answers) == 1 + k % 2
+            energies.append(float(answers[0].energy[0]))
+        return energies
+
+    tasks = several()
+    found = run(together([search(task, rounds) for task, rounds in zip(tasks, (2, 0, 3), strict=True)]))
+    for task, rounds, energies in zip(tasks, (2, 0, 3), found, strict=True):
+        assert_close(energies, run(search(task, rounds)), rtol=1e-6, atol=1e-6)
+    assert run(together([])) == []

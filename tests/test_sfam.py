@@ -326,3 +326,11 @@ def test_motion_capture_in_the_world_frame(shared, name, bound):
     )
     assert score["e3d_world"] < bound
     assert score["e3d"] < 0.06
+
+
+def test_several_clips_at_once():
+    """Clips of equal length go as one batch, others for themselves: all give what each gives alone."""
+    clips = [walking_person(n, turn=150.0, yaw=y).tracks for n, y in ((40, 0.0), (40, 50.0), (33, 20.0), (40, 90.0))]
+    for alone, one in zip(map(SfAM(), clips), SfAM().many(clips), strict=True):
+        assert_close(one.points, alone.points, rtol=0, atol=0.02 * float(alone.points.std()))
+        assert_close(one.cameras, alone.cameras, rtol=0, atol=0.02)

@@ -58,6 +58,7 @@ class Estimate:
         objective: value that ranks the solutions of one method on one clip, lower is better; NaN where it has none.
         alternatives: further solutions, best first.
         still: whether the camera may be taken to stand still, so that feet tell the root's depth.
+        doubt: why depth is little more than a guess, a sentence; empty where it is more. The user is warned.
     """
 
     points: Tensor
@@ -70,6 +71,7 @@ class Estimate:
     objective: float = math.nan
     alternatives: tuple[Estimate, ...] = ()
     still: bool = False
+    doubt: str = ""
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,7 @@ class Method(ABC):
             inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
             result = self._finish(tracks, found, size, known, time.perf_counter() - begin)
-        self._warn(result)
+        self._warn(result, found.doubt)
         return result
 
     def many(self, tracks: Sequence[Tracks]) -> list[Reconstruction]:
@@ -144,8 +146,8 @@ class Method(ABC):
             each = (time.perf_counter() - begin) / max(len(tracks), 1)
             rows = zip(tracks, found, parts, strict=True)
             results = [self._finish(one, estimate, size, known, each) for one, estimate, (_, size, known) in rows]
-        for result in results:
-            self._warn(result)
+        for result, estimate in zip(results, found, strict=True):
+            self._warn(result, estimate.doubt)
         return results
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
@@ -165,9 +167,11 @@ class Method(ABC):
         inner = dataclasses.replace(tracks, points=centred / size, weights=tracks.weights.clone())
         return inner, size, tracks.seen.any(-1)
 
-    def _warn(self, result: Reconstruction) -> None:
+    def _warn(self, result: Reconstruction, doubt: str) -> None:
         """Tell what the user should not miss."""
         tracks, found = result.tracks, result.diagnostics
+        if doubt:
+            warnings.warn(f"{tracks.source}: {doubt}", KcsWarning, stacklevel=users_level())
         if not found.converged:
             message = f"{tracks.source}: {self._unsettled(found.iterations)}"
             warnings.warn(message, ConvergenceWarning, stacklevel=users_level())
@@ -202,9 +206,10 @@ class Method(ABC):
         turn = float(viewpoint_turn(found.cameras))
         notes = list(found.notes)
         if turn < WEAK_TURN:
-            notes.append(
-                f"the viewpoint turned by {turn:.0f} degrees only: depth rests on the skeleton's template and lengths"
-            )
+            rest = "the skeleton's template and lengths" if body.template is not None else "constant lengths alone"
+            notes.append(f"the viewpoint turned by {turn:.0f} degrees only: depth rests on {rest}")
+        if found.doubt:
+            notes.append(found.doubt)
         if not found.converged:
             notes.append(self._unsettled(found.iterations))
         percent = float(100 * variation[rigid].median()) if rigid else math.nan

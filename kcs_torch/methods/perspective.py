@@ -47,6 +47,7 @@ class _Found:
         energy: (H,).
         lifted: the method's solutions that they came from, perhaps mirrored.
         unit: the length that 1 stands for in a body of 1.75, in units of the distance.
+        notes: of the method on the tracks, whichever of its solutions is best here.
     """
 
     rays: Tensor
@@ -55,6 +56,7 @@ class _Found:
     energy: Tensor
     lifted: tuple[Reconstruction, ...]
     unit: float
+    notes: tuple[str, ...] = ()
 
 
 def reconstruct_perspective(
@@ -124,7 +126,7 @@ def reconstruct_perspective(
     assert best is not None
     result = _assemble(tracks, intrinsics, look, best)
     result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
-    method._warn(result)
+    method._warn(result, "")
     return result
 
 
@@ -188,7 +190,7 @@ def _refine(
     exact = distance / lifted.scales
     parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / unit
     if parallax < FLAT or not lifted.skeleton.num_bones:
-        return _Found(rays, exact.expand(len(start), -1), start, energy, others, unit)
+        return _Found(rays, exact.expand(len(start), -1), start, energy, others, unit, lifted.diagnostics.notes)
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
     distance = _slow(exact.log()[:, None], rate)[:, 0].exp()
@@ -201,7 +203,7 @@ def _refine(
     z, _, shares = pinhole.unpack(solution.value[order])
     z = z - z.mean(-1, keepdim=True)
     found = tuple(others[i] for i in order.tolist())
-    return _Found(rays, pinhole.path(shares) * unit, z * unit, energy[order], found, unit)
+    return _Found(rays, pinhole.path(shares) * unit, z * unit, energy[order], found, unit, lifted.diagnostics.notes)
 
 
 def _unit(lifted: Reconstruction) -> float:
@@ -240,7 +242,8 @@ def _in_camera(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Fou
     bones = bone_lengths(points, body.bone_index(device=points.device))
     ratio = bones[:, list(body.rigid)] / bones.mean(0).clamp_min(torch.finfo(bones.dtype).tiny)[list(body.rigid)]
     spread = (ratio - 1).square().mean(0).sqrt()
-    notes = [n for n in lifted.diagnostics.notes if "root depth" not in n and "weak perspective" not in n]
+    told = () if k else found.notes  # the best solution's; "the mirror image", say, is true of none any more
+    notes = [n for n in told if "root depth" not in n and "weak perspective" not in n]
     notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
     facts = replace(
         lifted.diagnostics,

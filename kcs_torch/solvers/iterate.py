@@ -26,13 +26,13 @@ class Solution(Generic[State]):
         value: the last state.
         converged: whether the stopping rule was met (True where there was none).
         iterations: steps made.
-        drop: (H,) by how much the last ten steps lowered the energies, where the solver has energies.
+        before: the value ten steps earlier, where the solver keeps it.
     """
 
     value: State
     converged: bool
     iterations: int
-    drop: Tensor | None = None
+    before: State | None = None
 
 
 def iterate(

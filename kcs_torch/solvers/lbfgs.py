@@ -37,7 +37,7 @@ def lbfgs(
         first_step: length of the first step, a share of the start's root mean square (of 1 where that is 0).
 
     Returns:
-        The minimisers (H, D); whether all settled within ``num_steps``; by how much the last ten steps lowered each.
+        The minimisers (H, D); whether all settled within ``num_steps``; where they were ten steps earlier.
 
     >>> goal = torch.tensor([[1.0, 2.0], [3.0, -1.0]], dtype=torch.float64)
     >>> lbfgs(lambda x: ((x - goal) ** 2).sum(-1), torch.zeros_like(goal)).value.round(decimals=4).tolist()
@@ -55,16 +55,17 @@ def lbfgs(
     x = start.detach()
     value, gradient = evaluate(x)
     tiny = torch.finfo(x.dtype).tiny ** 0.5
-    size = x.square().mean(-1, keepdim=True).sqrt()
+    count = (gradient != 0).sum(-1, keepdim=True).clamp_min(1)  # what the energy does not depend on is padding
+    size = (x.square().sum(-1, keepdim=True) / count).sqrt()
     size = torch.where(size > 0, size, torch.ones_like(size))
-    steepest = first_step * size / gradient.square().mean(-1, keepdim=True).sqrt().clamp_min(tiny)
+    steepest = first_step * size / (gradient.square().sum(-1, keepdim=True) / count).sqrt().clamp_min(tiny)
     moves: list[Tensor] = []
     turns: list[Tensor] = []
     inverses: list[Tensor] = []
     scale = steepest
     resting = torch.zeros_like(value, dtype=torch.bool)
     failed = torch.zeros_like(resting)
-    past = [value]
+    past, places = [value], [x]
     least = torch.where(value.isfinite(), torch.finfo(x.dtype).eps * value.abs(), 0).clamp_min(tiny)  # if it falls to 0
     settled, made = False, 0
     for made in range(1, num_steps + 1):
@@ -109,9 +110,10 @@ def lbfgs(
         scale = torch.where(kept, curve / dot(y, y).clamp_min(tiny), scale)
         x, value, gradient = new_x, new_value, new_gradient
         past.append(value)
+        places = [*places[-10:], x]
         if made >= 10:
             resting = resting | (past[-11] - value <= (tolerance * value.abs()).maximum(least))
         if bool(resting.all()):
             settled = True
             break
-    return Solution(x, settled, made, past[-11:][0] - value)
+    return Solution(x, settled, made, places[0])

@@ -84,17 +84,17 @@ class Pose:
         points: (H, T, N, 3) in the camera frame.
         rotations: (H, T, 3, 3), world to camera: ``points @ rotations`` are the aligned poses.
         objective: (H,) at the last stage's scales; the lowest is best.
-        drop: (H,) by how much the last ten steps lowered it.
+        moved: (H,) root mean square change of the points in the last ten steps.
     """
 
     points: Tensor
     rotations: Tensor
     objective: Tensor
-    drop: Tensor
+    moved: Tensor
 
     def __getitem__(self, index: Tensor | slice) -> Pose:
         """Some of the hypotheses."""
-        return Pose(self.points[index], self.rotations[index], self.objective[index], self.drop[index])
+        return Pose(self.points[index], self.rotations[index], self.objective[index], self.moved[index])
 
 
 def procrustean(
@@ -137,7 +137,7 @@ def procrustean(
     stiff = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device).expand(len(rigid))
     free = 3 if noise > 0 else 1
     share = tracks.new_ones(frames, joints) if weights is None else weights
-    value = drop = points.new_zeros(hypotheses)
+    value = moved = points.new_zeros(hypotheses)
     for stage in stages:
         precision = _precision(points, tracks, share, noise)
         levels = aligned_levels(points, rotations, bones, stage)
@@ -165,13 +165,13 @@ def procrustean(
         start = points.new_zeros(hypotheses, frames * (free * joints + 3))
         solution = lbfgs(energy, start, num_steps=stage.num_steps, first_step=1.0, tolerance=1e-8)
         found = solution.value
-        assert solution.drop is not None
-        drop = solution.drop
         points, rotations = move(found)
+        assert solution.before is not None
+        moved = (points - move(solution.before)[0]).square().sum(-1).mean((-2, -1)).sqrt()
         rotations = nearest_rotation(rotations)  # rounding would add up
         with torch.no_grad():
             value = energy(found)
-    return Pose(points, rotations, value, drop)
+    return Pose(points, rotations, value, moved)
 
 
 def depth_deviation(

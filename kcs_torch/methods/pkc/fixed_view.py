@@ -52,25 +52,25 @@ class Hypotheses:
         lengths: (H, B).
         energy: (H,) of the objective.
         steps: L-BFGS steps made for them.
-        drop: (H,) by how much the last ten steps lowered the energies; None before any.
+        moved: (H,) root mean square change of the depths in the last ten steps; None before any.
     """
 
     depth: Tensor
     lengths: Tensor
     energy: Tensor
     steps: int = 0
-    drop: Tensor | None = None
+    moved: Tensor | None = None
 
     def __getitem__(self, index: slice | Tensor) -> Hypotheses:
-        drop = None if self.drop is None else self.drop[index]
-        return Hypotheses(self.depth[index], self.lengths[index], self.energy[index], self.steps, drop)
+        moved = None if self.moved is None else self.moved[index]
+        return Hypotheses(self.depth[index], self.lengths[index], self.energy[index], self.steps, moved)
 
     def joined(self, other: Hypotheses) -> Hypotheses:
         """Both together, best first."""
         parts = zip(*((h.depth, h.lengths, h.energy) for h in (self, other)), strict=True)
         depth, lengths, energy = (torch.cat(part) for part in parts)
-        drop = None if self.drop is None or other.drop is None else torch.cat([self.drop, other.drop])
-        return Hypotheses(depth, lengths, energy, self.steps + other.steps, drop)[energy.argsort()]
+        moved = None if self.moved is None or other.moved is None else torch.cat([self.moved, other.moved])
+        return Hypotheses(depth, lengths, energy, self.steps + other.steps, moved)[energy.argsort()]
 
 
 def distinct(found: Hypotheses, count: int, apart: float) -> Hypotheses:
@@ -161,8 +161,8 @@ def searching(
 
 def refined(objective: Objective, found: Hypotheses, steps: int, loose: float = 1.0) -> lockstep.Search[Hypotheses]:
     """Hypotheses refined on the objective, best first."""
-    ((z, lengths, energy, solution),) = yield [Task(objective, found.depth, found.lengths, steps, loose)]
-    return Hypotheses(z, lengths, energy, found.steps + solution.iterations, solution.drop)
+    (new,) = yield [Task(objective, found.depth, found.lengths, steps, loose)]
+    return Hypotheses(new.depth, new.lengths, new.energy, found.steps + new.steps, new.moved)
 
 
 @dataclass(frozen=True)

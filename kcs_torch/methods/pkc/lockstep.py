@@ -9,21 +9,17 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from typing import TypeVar
 
-from torch import Tensor
+from kcs_torch.methods.pkc.objective import Refined, Task, minimise_all
 
-from kcs_torch.methods.pkc.objective import Task, minimise_all
-from kcs_torch.solvers.iterate import Solution
-
-__all__ = ["Answer", "Search", "run", "together"]
+__all__ = ["Search", "run", "together"]
 
 Result = TypeVar("Result")
-Answer = tuple[Tensor, Tensor, Tensor, Solution[Tensor]]
-Search = Generator[list[Task], list[Answer], Result]
+Search = Generator[list[Task], list[Refined], Result]
 
 
 def run(search: Search[Result]) -> Result:
     """Run a search and return what it finds."""
-    answers: list[Answer] | None = None
+    answers: list[Refined] | None = None
     while True:
         try:
             tasks = next(search) if answers is None else search.send(answers)
@@ -37,7 +33,7 @@ def together(searches: Sequence[Search[Result]]) -> Search[list[Result]]:
     found: dict[int, Result] = {}
     asked: dict[int, list[Task]] = {}
 
-    def advance(i: int, answers: list[Answer] | None) -> None:
+    def advance(i: int, answers: list[Refined] | None) -> None:
         try:
             asked[i] = next(searches[i]) if answers is None else searches[i].send(answers)
         except StopIteration as end:

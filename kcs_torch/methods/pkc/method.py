@@ -39,15 +39,23 @@ LEFT = 0.45
 FILLED = 0.015
 """Standard deviation of a joint that is filled in, a share of the body's size."""
 
+HELD = 0.1
+"""The same in frames before the body is first seen, and after it was last seen."""
+
 MOVING_STEPS = sum(stage.num_steps for stage in (*COARSE, *FINE))
 """L-BFGS steps of the moving viewpoint's solver, at most."""
 
 TURNING = 90.0
 """Degrees of the trunk's turn, as the template tells it, from which on the viewpoint's turn is asked as well."""
 
-NATS, STILL = 0.01, 1e-3
-"""A solution has settled where the last ten steps lowered the fixed viewpoint's objective by no more than so much a
-frame (and by 1 in all), and the moving viewpoint's by no more than this share."""
+STILL = 0.01
+"""A solution has settled where the last ten steps (fewer tell nothing) moved depths by no more than so much, root mean
+square: a share of the body's size."""
+
+SURE, DOUBT = 0.8, 0.6
+"""Correlation with SfAM's depths from which on those of the moving viewpoint are sure, and below which they are a
+guess. Before cameras that turn by 180 degrees it is above .95 for people, dogs and hands, by 60 about .8, by none
+.3 and less; robots, whose joints turn about fixed axes, are below .3 everywhere."""
 
 LEAST_FRAMES = 12
 """Frames from which on the viewpoint may have turned."""
@@ -126,8 +134,9 @@ class PKC(Method):
         if body is None:
             moving, first = self._moving(tracks, image, cameras, enough)
             if moving is None:
-                return replace(first, notes=(*notes, *first.notes))
-            return self._from_moving(moving, image, cameras, notes)
+                why = "so few frames or joints are" if not enough else "with known cameras, bones that are no tree are"
+                return replace(first, notes=(*notes, f"{why} solved by sfam", *first.notes))
+            return self._from_moving(moving, first, cameras, notes)
         found = None
         moves = enough and self.viewpoint != "fixed"
         # Cameras that turn tell the sign of depth: what the template says might contradict them.
@@ -166,6 +175,11 @@ class PKC(Method):
             points = place_unseen(flat, known, tracks.skeleton)[..., :2]
         left = LEFT * level if level > CLEAN else 0.0
         noise = torch.where(keep, points.new_full((), left), points.new_full((), math.hypot(left, FILLED)))
+        held = _nearest_shown(keep)
+        away = held != torch.arange(len(held), device=held.device)
+        if bool(away.any()):  # nothing tells what goes on there, and a model of motion would run off
+            points, noise = points[held], torch.where(away[:, None], points.new_full((), HELD), noise)
+            notes.append(f"{int(away.sum())} frames at the clip's ends show nobody: the nearest pose is held")
         return points - points.mean(-2, keepdim=True), noise, tuple(notes)
 
     def _moving(
@@ -189,19 +203,35 @@ class PKC(Method):
         return MovingView(pose, bones, bones, 1.0), first
 
     def _from_moving(
-        self, moving: MovingView, image: Tensor, cameras: Tensor | None, notes: tuple[str, ...]
+        self, moving: MovingView, first: Estimate, cameras: Tensor | None, notes: tuple[str, ...]
     ) -> Estimate:
-        """The estimate and its mirror image, which nothing but known cameras tells apart."""
+        """The estimate and its mirror image, which nothing but known cameras tells apart.
+
+        Where the viewpoint hardly turns the objective has many minima. SfAM, which looks for depth in another way, then
+        finds other depths: how far both agree is how far depth is to be believed.
+        """
         points = moving.pose.points[0]
         path = moving.cameras()[0] if cameras is None else complete_rotation(cameras)
         one = torch.ones_like(points[:, 0, 0])
         value = float(moving.pose.objective[0])
-        settled = bool(moving.pose.drop[0] <= STILL * moving.pose.objective[0].abs())
-        main = Estimate(points, path[:, :2], one, settled, MOVING_STEPS, notes, moving.deviation(path), value)
+        settled = bool(moving.pose.moved[0] <= STILL)
+        spread, doubt = moving.deviation(path), ""
+        if cameras is None:
+            agree = _agreement(points[..., 2], first.points[..., 2])
+            size = points[..., 2].square().mean().sqrt()
+            spread = (spread.square() + (size * max(0.0, 1 - agree / SURE)).square()).sqrt()
+            if agree < DOUBT:
+                doubt = (
+                    "depth is little more than a guess: two methods find depths that hardly agree "
+                    f"(correlation {agree:.2f}). The viewpoint should turn about the body by 60 degrees or more, or "
+                    "the skeleton have a template"
+                )
+        main = Estimate(points, path[:, :2], one, settled, MOVING_STEPS, notes, spread, value, doubt=doubt)
         if cameras is not None or not self.alternatives:
             return main
         flip = points.new_tensor([1.0, 1.0, -1.0])
-        other = replace(main, points=points * flip, cameras=path[:, :2] * flip, notes=("the mirror image in depth",))
+        said = ("the mirror image in depth",)
+        other = replace(main, points=points * flip, cameras=path[:, :2] * flip, notes=said, doubt="")
         return replace(main, alternatives=(other,))
 
     def _ranked(
@@ -229,11 +259,24 @@ class PKC(Method):
             spread = depth_deviation(found[k:] if k else found, body.noise, body.skeleton) / body.factor
             value = float(found.energy[k])
             path = body.frames(depth)[:, :2] if cameras is None else cameras
-            settled = found.drop is None or bool(found.drop[k] <= max(1.0, NATS * len(points)))
+            settled = self.steps >= 10 and found.moved is not None and bool(found.moved[k] <= STILL)
             made.append(
                 Estimate(points, path, one, settled, found.steps, () if k else notes, spread, value, still=True)
             )
         return replace(made[0], alternatives=tuple(made[1:]))
+
+
+def _agreement(depth: Tensor, other: Tensor) -> float:
+    """Correlation of two solutions' depths (T, N), whichever mirror images they are."""
+    a, b = (z - z.mean(-1, keepdim=True) for z in (depth, other))
+    return float((a * b).sum().abs() / (a.norm() * b.norm()).clamp_min(torch.finfo(a.dtype).tiny))
+
+
+def _nearest_shown(seen: Tensor) -> Tensor:
+    """Each frame's own index (T,), but that of the nearest frame that shows something at the clip's ends."""
+    shown = (seen.sum(-1) > 1).nonzero().flatten()
+    index = torch.arange(len(seen), device=seen.device)
+    return index if not len(shown) else index.clamp(int(shown[0]), int(shown[-1]))
 
 
 def _with_size(found: Estimate, size: Tensor) -> Estimate:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,10 +14,9 @@ from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.nn.anatomy import HingeEnergy
 from kcs_torch.nn.posture import ForeshorteningEnergy, PostureEnergy, ProportionEnergy, free_bones
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.solvers.iterate import Solution
 from kcs_torch.solvers.lbfgs import lbfgs
 
-__all__ = ["Objective", "Task", "Weights", "at_pace", "bone_noise", "minimise_all", "pace_of"]
+__all__ = ["Objective", "Refined", "Task", "Weights", "at_pace", "bone_noise", "minimise_all", "pace_of"]
 
 NOISE, CORNER = 0.8, 0.3
 """Share of the noise's variance that is not to be explained, and how gently its cost sets in."""
@@ -97,6 +97,29 @@ def pace_of(image: Tensor, skeleton: Skeleton, rate: float) -> float:
 def bone_noise(noise: Tensor, bones: Tensor) -> Tensor:
     """Standard deviation (T, B) of bones' images from that of their joints (T, N)."""
     return (noise[:, bones[:, 0]].square() + noise[:, bones[:, 1]].square()).sqrt()
+
+
+class Refined(NamedTuple):
+    """Hypotheses after their refinement.
+
+    Attributes:
+        depth: (H, T, N).
+        lengths: (H, B).
+        energy: (H,).
+        moved: (H,) root mean square change of the depths in the last ten steps.
+        steps: made.
+    """
+
+    depth: Tensor
+    lengths: Tensor
+    energy: Tensor
+    moved: Tensor
+    steps: int
+
+    def sorted(self) -> Refined:
+        """The same, best first."""
+        order = self.energy.argsort()
+        return Refined(self.depth[order], self.lengths[order], self.energy[order], self.moved[order], self.steps)
 
 
 class Objective:
@@ -195,20 +218,15 @@ class Objective:
         """The energy (H,) of depths (H, T, N) and lengths (H, B)."""
         return torch.stack(list(self.terms(depth, lengths).values())).sum(0)
 
-    def minimise(
-        self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0
-    ) -> tuple[Tensor, Tensor, Tensor, Solution[Tensor]]:
-        """Refine hypotheses (H, T, N) and (H, B): depths, lengths and energies (H,), best first.
+    def minimise(self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0) -> Refined:
+        """Refine hypotheses (H, T, N) and (H, B), best first.
 
         A start whose bones are far from constant is best refined with lengths ``loose`` times less certain first; the
         energies are then those of the loose objective.
         """
-        depth, lengths, energy, solution = self.refined(depth, lengths, num_steps, loose)
-        return _sorted(depth, lengths, energy, solution)
+        return self.refined(depth, lengths, num_steps, loose).sorted()
 
-    def refined(
-        self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0
-    ) -> tuple[Tensor, Tensor, Tensor, Solution[Tensor]]:
+    def refined(self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0) -> Refined:
         """As :meth:`minimise`, in the order of the hypotheses."""
         goal = copy(self)
         goal.weights = replace(self.weights, length=loose * self.weights.length)
@@ -218,7 +236,10 @@ class Objective:
         with torch.no_grad():
             depth, lengths = unknowns(solution.value)
             energy = goal(depth, lengths)
-        return depth, lengths, energy, solution
+            assert solution.before is not None
+            shift = (depth - unknowns(solution.before)[0]).square().sum((1, 2))
+            moved = (shift / (self.count * depth.shape[-1])).sqrt()
+        return Refined(depth, lengths, energy, moved, solution.iterations)
 
     @classmethod
     def joined(cls, parts: Sequence[Objective], counts: Sequence[int]) -> Objective:
@@ -277,12 +298,12 @@ TOGETHER = 16384
 """Frames of hypotheses that are refined as one batch; more would only fall out of the processor's cache."""
 
 
-def minimise_all(tasks: Sequence[Task]) -> list[tuple[Tensor, Tensor, Tensor, Solution[Tensor]]]:
+def minimise_all(tasks: Sequence[Task]) -> list[Refined]:
     """:meth:`Objective.minimise` of each task; those of one skeleton and equal settings are refined together."""
     groups: dict[object, list[int]] = {}
     for i, task in enumerate(tasks):
         groups.setdefault((task.objective.skeleton, task.num_steps, task.loose, task.depth.dtype), []).append(i)
-    out: dict[int, tuple[Tensor, Tensor, Tensor, Solution[Tensor]]] = {}
+    out: dict[int, Refined] = {}
     for group in groups.values():
         for run in _runs(sorted(group, key=lambda i: tasks[i].depth.shape[1]), tasks):
             out |= zip(run, _minimise_joined([tasks[i] for i in run]), strict=True)
@@ -303,7 +324,7 @@ def _runs(order: list[int], tasks: Sequence[Task]) -> list[list[int]]:
     return runs
 
 
-def _minimise_joined(tasks: list[Task]) -> list[tuple[Tensor, Tensor, Tensor, Solution[Tensor]]]:
+def _minimise_joined(tasks: list[Task]) -> list[Refined]:
     """Tasks of one skeleton and equal settings, padded to the longest."""
     if len(tasks) == 1:
         (task,) = tasks
@@ -313,22 +334,12 @@ def _minimise_joined(tasks: list[Task]) -> list[tuple[Tensor, Tensor, Tensor, So
     pad = lambda z: torch.nn.functional.pad(z, (0, 0, 0, most - z.shape[1]))  # noqa: E731
     joined = Objective.joined([task.objective for task in tasks], counts)
     depth, lengths = torch.cat([pad(task.depth) for task in tasks]), torch.cat([task.lengths for task in tasks])
-    depth, lengths, energy, solution = joined.refined(depth, lengths, tasks[0].num_steps, tasks[0].loose)
+    found = joined.refined(depth, lengths, tasks[0].num_steps, tasks[0].loose)
     out = []
-    assert solution.drop is not None
-    for task, *part in zip(tasks, *(x.split(counts) for x in (depth, lengths, energy, solution.drop)), strict=True):
-        z, size, value, drop = part
-        out.append(_sorted(z[:, : task.depth.shape[1]], size, value, replace(solution, drop=drop)))
+    for task, *part in zip(tasks, *(x.split(counts) for x in found[:4]), strict=True):
+        z, size, energy, moved = part
+        out.append(Refined(z[:, : task.depth.shape[1]], size, energy, moved, found.steps).sorted())
     return out
-
-
-def _sorted(
-    depth: Tensor, lengths: Tensor, energy: Tensor, solution: Solution[Tensor]
-) -> tuple[Tensor, Tensor, Tensor, Solution[Tensor]]:
-    """Hypotheses by energy, and by how much each was lowered last."""
-    order = energy.argsort()
-    assert solution.drop is not None
-    return depth[order], lengths[order], energy[order], replace(solution, drop=solution.drop[order])
 
 
 class _Unknowns:
