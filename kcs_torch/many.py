@@ -1,0 +1,283 @@
+"""Thousands of clips: a folder of tracks to a folder of motion, in parts that can be stopped and taken up again."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+import traceback
+import warnings
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from kcs_torch.errors import KcsError, KcsWarning, OptionError
+from kcs_torch.io.atomic import atomic_path
+from kcs_torch.io.folders import natural_key
+from kcs_torch.io.load import load_people
+from kcs_torch.io.write import save, writer_for
+from kcs_torch.methods.base import Method
+from kcs_torch.reconstruct import reconstruct_all
+from kcs_torch.types import Tracks
+
+__all__ = ["Clip", "Outcome", "clips_of", "reconstruct_folder"]
+
+FAILED = ".failed.txt"
+"""Suffix of the file that stands in for the results of a clip that failed, and says why."""
+
+STALE = 3600.0
+"""Seconds after which a temporary file was left by a process that was killed."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One clip's tracks, and where its results go.
+
+    Attributes:
+        source: a file, or a folder of files that make one clip.
+        target: of the results, without their suffixes.
+    """
+
+    source: Path
+    target: Path
+
+    def outputs(self, suffixes: Sequence[str]) -> list[Path]:
+        """The files of its results."""
+        return [self.target.with_name(self.target.name + suffix) for suffix in suffixes]
+
+    @property
+    def failure(self) -> Path:
+        """The file that says why it failed."""
+        return self.target.with_name(self.target.name + FAILED)
+
+    def share_of(self, shards: int) -> int:
+        """Which of so many parts of the work it belongs to: the same one whatever other clips there are."""
+        return zlib.crc32(str(self.target).encode("utf-8", "surrogateescape")) % shards
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How the clips of one part of the work ended.
+
+    Attributes:
+        clips: how many there are.
+        done: made now.
+        skipped: made before.
+        failed: each clip that failed, now or before, and why.
+        frames: of the clips made now.
+        seconds: that it took.
+    """
+
+    clips: int
+    done: int
+    skipped: int
+    failed: tuple[tuple[Path, str], ...]
+    frames: int
+    seconds: float
+
+
+def clips_of(source: str | Path, output: str | Path, pattern: str = "*") -> list[Clip]:
+    """List the clips of a folder in natural order.
+
+    Args:
+        source: the folder.
+        output: of the results: a clip ``a/b.json`` becomes ``OUTPUT/a/b.json.npz``, or ``OUTPUT/a/b.npz`` where that is
+            no other clip's.
+        pattern: of clips within the folder; ``**/*.json`` looks into folders, ``*`` takes files, and folders as clips.
+
+    Raises:
+        OptionError: the folder is none, lies in the output, or holds nothing of the pattern.
+    """
+    folder, output = Path(source), Path(output)
+    if not folder.is_dir():
+        raise OptionError(f"{folder}: expected a folder of tracks, got {'a file' if folder.exists() else 'nothing'}")
+    inside = output.resolve()
+    try:
+        found = [
+            p for p in folder.glob(pattern) if not any(part.startswith(".") for part in p.relative_to(folder).parts)
+        ]
+    except (ValueError, NotImplementedError) as error:
+        raise OptionError(f"pattern: expected one such as *.json or **/*.npz, got {pattern!r} ({error})") from None
+    found = [p for p in found if p.resolve() != inside and inside not in p.resolve().parents]
+    if not found:
+        raise OptionError(f"{folder}: expected tracks that match {pattern!r}, found none")
+    found.sort(key=lambda p: natural_key(str(p)))
+    names = [p.relative_to(folder) for p in found]
+    short = [n.with_suffix("") for n in names]
+    counts: dict[Path, int] = {}
+    for name in short:
+        counts[name] = counts.get(name, 0) + 1
+    pairs = zip(found, names, short, strict=True)
+    return [Clip(path, output / (brief if counts[brief] == 1 else name)) for path, name, brief in pairs]
+
+
+def reconstruct_folder(
+    source: str | Path,
+    output: str | Path,
+    *,
+    method: str | Method = "auto",
+    suffixes: Sequence[str] = (".npz",),
+    pattern: str = "*",
+    shard: int = 0,
+    shards: int = 1,
+    batch: int = 16,
+    everybody: bool = False,
+    retry: bool = False,
+    progress: Callable[[str], None] | None = None,
+    **reading: object,
+) -> Outcome:
+    """Reconstruct every clip of a folder; what is done already is left alone.
+
+    A clip is done when all its results are there, and each appears whole or not at all: however often the work is
+    killed and begun again, nothing is lost or made twice. A clip that fails leaves ``NAME.failed.txt`` with the
+    reason and is not tried again.
+
+    Args:
+        source: folder of tracks in any format that is read; a folder in it is a clip of many files.
+        output: folder of the results.
+        method: as of :func:`kcs_torch.reconstruct`.
+        suffixes: of the results, such as .npz and .bvh.
+        pattern: as of :func:`clips_of`.
+        shard: which part of the work to do, from 0: a process, or a machine, each.
+        shards: how many parts there are.
+        batch: clips that are reconstructed together (:func:`kcs_torch.reconstruct_all`).
+        everybody: reconstruct all people of a clip, to NAME_0, NAME_1, ..., not the most seen one alone.
+        retry: try clips again that failed.
+        progress: gets a line every few seconds.
+        **reading: options of :func:`kcs_torch.load_tracks`, such as ``fps`` and ``skeleton``.
+
+    Returns:
+        What became of the clips of this part.
+
+    Raises:
+        OptionError: an option is out of range, or there is nothing to do.
+        OutputError: the results cannot be written.
+    """
+    if not 0 <= shard < shards:
+        raise OptionError(f"shard: expected a number from 0 to {shards - 1} of shards={shards}, got {shard}")
+    if batch < 1:
+        raise OptionError(f"batch: expected at least 1 clip, got {batch}")
+    suffixes = [s if s.startswith(".") else f".{s}" for s in suffixes]
+    for suffix in suffixes:
+        writer_for(Path(f"x{suffix}"))
+    begin = time.monotonic()
+    clips = [clip for clip in clips_of(source, output, pattern) if clip.share_of(shards) == shard]
+    _sweep(Path(output))
+    work = _Work(method, suffixes, everybody, reading)
+    todo, skipped, failed = [], 0, []
+    for clip in clips:
+        if clip.failure.exists() and not retry:
+            failed.append((clip.source, clip.failure.read_text("utf-8", "replace").partition("\n")[0]))
+        elif work.is_done(clip):
+            skipped += 1
+        else:
+            todo.append(clip)
+    done = frames = 0
+    told = begin
+    for start in range(0, len(todo), batch):
+        made, count, wrong = work.reconstruct(todo[start : start + batch])
+        done, frames, failed = done + made, frames + count, failed + wrong
+        now = time.monotonic()
+        if progress is not None and (now - told > 5 or start + batch >= len(todo)):
+            told, rate = now, (done + len(failed)) / max(now - begin, 1e-9)
+            left = (len(todo) - start - batch) / rate if rate else 0.0
+            progress(
+                f"{skipped + done + len(failed)} of {len(clips)} clips, {len(failed)} failed, "
+                f"{rate:.1f} clips a second, {max(left, 0) / 60:.1f} minutes left"
+            )
+    return Outcome(len(clips), done, skipped, tuple(failed), frames, time.monotonic() - begin)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What is done to every clip."""
+
+    method: str | Method
+    suffixes: Sequence[str]
+    everybody: bool
+    reading: dict[str, object]
+
+    def is_done(self, clip: Clip) -> bool:
+        """Whether all results are there; of everybody's the last written says so."""
+        if self.everybody:
+            return _people_list(clip).exists()
+        return all(path.exists() for path in clip.outputs(self.suffixes))
+
+    def reconstruct(self, clips: Sequence[Clip]) -> tuple[int, int, list[tuple[Path, str]]]:
+        """Reconstruct a batch: clips and frames that were made, and what failed."""
+        failed: list[tuple[Path, str]] = []
+        read: list[tuple[Clip, list[Tracks]]] = []
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", KcsWarning)  # the results' notes tell them
+            for clip in clips:
+                for people in self._tried(clip, failed, lambda clip=clip: self._people(clip)):
+                    read.append((clip, people))
+            read.sort(key=lambda pair: pair[1][0].num_frames)
+            try:
+                found = reconstruct_all([one for _, people in read for one in people], method=self.method)
+            except OptionError:
+                raise
+            except Exception:  # one of them is to blame: each for itself
+                found = None
+            made = frames = 0
+            results = iter(found or ())
+            for clip, people in read:
+
+                def finish(clip: Clip = clip, people: list[Tracks] = people) -> None:
+                    own = (
+                        reconstruct_all(people, method=self.method)
+                        if found is None
+                        else [next(results) for _ in people]
+                    )
+                    for number, result in enumerate(own):
+                        target = clip if not self.everybody else Clip(clip.source, _numbered(clip.target, number))
+                        for path in target.outputs(self.suffixes):
+                            save(result, path)
+                    if self.everybody:
+                        with atomic_path(_people_list(clip)) as temporary:
+                            temporary.write_text(f"{len(own)}\n", encoding="utf-8")
+                    clip.failure.unlink(missing_ok=True)
+
+                for _ in self._tried(clip, failed, finish):
+                    made, frames = made + 1, frames + people[0].num_frames
+        return made, frames, failed
+
+    def _people(self, clip: Clip) -> list[Tracks]:
+        people = load_people(clip.source, **self.reading)  # type: ignore[arg-type]
+        return people if self.everybody else people[:1]
+
+    @staticmethod
+    def _tried(clip: Clip, failed: list[tuple[Path, str]], work: Callable) -> Iterator:
+        """What the work returns; nothing where it fails, which is written down instead."""
+        try:
+            yield work()
+        except OptionError:
+            raise  # true of every clip
+        except Exception as error:  # of one clip among thousands: the others go on
+            reason = f"{type(error).__name__}: {error}"
+            text = reason if isinstance(error, KcsError) else f"{reason}\n{traceback.format_exc()}"
+            with atomic_path(clip.failure) as temporary:
+                temporary.write_text(f"{text}\n", encoding="utf-8", errors="replace")
+            failed.append((clip.source, reason.partition("\n")[0]))
+
+
+def _numbered(path: Path, number: int) -> Path:
+    return path.with_name(f"{path.name}_{number}")
+
+
+def _people_list(clip: Clip) -> Path:
+    """Written last of all people's results; holds how many there are."""
+    return clip.target.with_name(f"{clip.target.name}.people.txt")
+
+
+def _sweep(output: Path) -> None:
+    """Remove temporary files that processes left when they were killed."""
+    if not output.is_dir():
+        return
+    for path in output.rglob(".*"):
+        try:
+            if re.fullmatch(r"\.[0-9a-f]{8}(\.\w+)?", path.name) and time.time() - path.stat().st_mtime > STALE:
+                path.unlink()
+        except OSError as error:  # another process was quicker
+            print(f"{path}: {error}", file=sys.stderr)

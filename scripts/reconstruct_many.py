@@ -1,0 +1,62 @@
+"""Reconstruct a folder of thousands of track files; stop it whenever you like, and run it again to go on.
+
+    python scripts/reconstruct_many.py input=tracks output=motion
+    python scripts/reconstruct_many.py input=videos output=motion pattern='*_json' 'suffixes=[.npz,.bvh]'
+    python scripts/reconstruct_many.py -m input=tracks output=motion shards=8 'shard=range(0,8)' hydra/launcher=joblib
+    python scripts/reconstruct_many.py -m input=tracks output=motion shards=200 'shard=range(0,200)' \
+        hydra/launcher=submitit_slurm hydra.launcher.cpus_per_task=1 hydra.launcher.timeout_min=240
+
+Finished results are skipped, failures are listed and leave NAME.failed.txt beside the results, and no file is ever half
+written. The shards of a multirun share nothing but the two folders, so that they may run on any machines that see
+these: hydra/launcher is joblib (processes), submitit_slurm or submitit_local, or ray: pip install
+"kcs-torch[launchers]".
+Exit code 1 where a clip failed.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import hydra
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from kcs_torch import KcsError
+from kcs_torch.many import reconstruct_folder
+
+failed = 0  # clips of all jobs run in this process; Hydra hands no exit code through
+
+
+@hydra.main(version_base="1.3", config_path="../configs", config_name="reconstruct_many")
+def main(config: DictConfig) -> int:
+    """Do one shard of the work; returns how many clips failed."""
+    global failed
+    torch.set_num_threads(config.threads)
+    names = ("pattern", "suffixes", "everybody", "shard", "shards", "batch", "retry")
+    options = OmegaConf.to_container(config, resolve=True)
+    try:
+        outcome = reconstruct_folder(
+            config.input,
+            config.output,
+            method=instantiate(config.method, _convert_="all"),
+            progress=lambda line: print(f"shard {config.shard}: {line}", file=sys.stderr, flush=True),
+            **{name: options[name] for name in names},
+            **options["reading"],
+        )
+    except KcsError as error:
+        raise SystemExit(f"error: {error}") from None
+    for path, reason in outcome.failed:
+        print(f"failed: {path}: {reason}")
+    rate = outcome.done / outcome.seconds if outcome.seconds else 0.0
+    print(
+        f"shard {config.shard} of {config.shards}: {outcome.clips} clips, {outcome.done} made "
+        f"({outcome.frames} frames) in {outcome.seconds:.1f} s, {rate:.1f} a second; {outcome.skipped} were there, {len(outcome.failed)} failed"
+    )
+    failed += len(outcome.failed)
+    return len(outcome.failed)
+
+
+if __name__ == "__main__":
+    main()
+    sys.exit(1 if failed else 0)
