@@ -103,6 +103,27 @@ class Evil:
         return self.call
 
 
+@pytest.mark.parametrize(
+    ("raw", "message"),
+    [
+        (b"\x80\x02})" + b"\x85" * 10**6 + b"K\x01s.", "no texts"),  # a key whose hash would take all of the stack
+        (b"\x80\x02})" + b"\x85" * 10**6 + b"K\x01d.", "is damaged"),
+        (b"(" + b")" + b"\x85" * 10**6 + b"I1\nd.", "no texts"),
+        (b"\x80\x04\x8f.", "a set"),
+        (b"\x80\x04(K\x01\x91.", "a set"),
+        (b"\x80\x02K\x01r\xff\xff\xff\xff.", "got int"),  # a memo of 2**32 places
+        (b"K\x01p4294967295\n.", "got int"),
+    ],
+)
+def test_pickles_that_crash_or_fill_the_memory_do_not(tmp_path, raw, message):
+    header = b"{'descr': '|O', 'fortran_order': False, 'shape': (), }".ljust(117) + b"\n"
+    array = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + raw
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
+        file.writestr("positions_2d.npy", array)
+    with pytest.raises(FormatError, match=message):
+        load_people(tmp_path / "a.npz", trust=True)
+
+
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 @pytest.mark.parametrize("function", [os.system, os.mkdir, eval, getattr, subprocess.call, np.load], ids=str)
 def test_nothing_is_run(tmp_path, protocol, function):

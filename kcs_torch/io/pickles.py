@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pickle
 import re
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from kcs_torch.io.jsonfile import as_text
 __all__ = ["load_arrays", "opened"]
 
 _CODE = re.compile(r"[<>=|]?([fiub][1248]|f16|[SU][0-9]{1,4})\Z")
+
+_KEYS = (str, bytes, int, float, np.generic)  # what a mapping may have as keys
 
 
 class _Type:
@@ -78,14 +80,50 @@ for _core in ("numpy.core", "numpy._core"):
     _STAND_INS[f"{_core}.numeric", "_frombuffer"] = _frombuffer
 
 
-class _Unpickler(pickle.Unpickler):
-    """Knows the stand-ins, and refuses every other class and function."""
+class _Unpickler(pickle._Unpickler):
+    """Knows the stand-ins, and refuses every other class and function.
+
+    In plain Python: the one in C makes room for any number of a memo, and crashes on keys that are nested too deeply.
+    """
+
+    dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _STAND_INS:
             raise FormatError(f"asks for {as_text(module)}.{as_text(name)}, which is no array: refused")
         make = _STAND_INS[module, name]
         return lambda *arguments: make(*arguments)  # a new one each time: a pickle may change what it was given
+
+    def load_setitems(self) -> None:
+        """Fill a mapping, with keys that are texts or numbers only."""
+        items = self.pop_mark()  # type: ignore[attr-defined]
+        self._fill(items)
+
+    def load_setitem(self) -> None:
+        """As ``load_setitems``, of one key."""
+        value = self.stack.pop()  # type: ignore[attr-defined]
+        self._fill([self.stack.pop(), value])  # type: ignore[attr-defined]
+
+    def load_dict(self) -> None:
+        """Make a mapping of keys and values."""
+        items = self.pop_mark()  # type: ignore[attr-defined]
+        self.append({})  # type: ignore[attr-defined]
+        self._fill(items)
+
+    def _fill(self, items: list[Any]) -> None:
+        mapping = self.stack[-1]  # type: ignore[attr-defined]
+        if not isinstance(mapping, dict) or not all(isinstance(k, _KEYS) for k in items[::2]):
+            raise FormatError("keeps values under keys that are no texts: refused")
+        mapping.update(zip(items[::2], items[1::2], strict=True))
+
+    def refuse(self) -> None:
+        """Sets: they hash what is in them."""
+        raise FormatError("holds a set, which is no array: refused")
+
+    dispatch[pickle.SETITEM[0]] = load_setitem
+    dispatch[pickle.SETITEMS[0]] = load_setitems
+    dispatch[pickle.DICT[0]] = load_dict
+    dispatch[pickle.EMPTY_SET[0]] = dispatch[pickle.ADDITEMS[0]] = dispatch[pickle.FROZENSET[0]] = refuse
 
 
 def load_arrays(file: BinaryIO, what: str) -> Any:
