@@ -141,6 +141,9 @@ def test_no_code_of_a_file_is_run(tmp_path, format):
         (tmp_path / file).write_bytes(raw)
         with pytest.raises(KcsError):
             read(tmp_path / file, format=name)
+        if read is load_people:
+            with pytest.raises(KcsError):
+                read(tmp_path / file, format=name, trust=True)
         if name is None:
             with pytest.raises(KcsError):
                 load_motion(tmp_path / file)

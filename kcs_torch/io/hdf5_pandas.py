@@ -1,7 +1,8 @@
-"""Tables that pandas wrote to HDF5, with columns of several levels, read without pandas and without unpickling."""
+"""Tables that pandas wrote to HDF5, with columns of several levels, read without pandas."""
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.hdf5 import Tree, read_tree
-from kcs_torch.io.literals import read_literals
+from kcs_torch.io.pickles import load_arrays
 
 __all__ = ["Table", "has_column", "pandas_group", "read_pandas"]
 
@@ -100,7 +101,8 @@ def _table(tree: Tree, group: str) -> tuple[Blocks, list[tuple[str | float, ...]
 
 def _names(tree: Tree, group: str, block: str) -> list[tuple[str, ...]]:
     """The names of the columns of a block of the "table" layout."""
-    return _columns(read_literals(tree.attributes[f"{group}/table"][f"{block}_kind"].encode("latin-1")))
+    pickled = tree.attributes[f"{group}/table"][f"{block}_kind"].encode("latin-1")
+    return _columns(load_arrays(io.BytesIO(pickled), "names of columns"))
 
 
 def _fixed(tree: Tree, group: str) -> tuple[Blocks, list[tuple[str | float, ...]]]:
