@@ -1,5 +1,6 @@
 """Wild inputs made of tame ones: files of bytes, text, JSON and arrays, changed as accident and malice change them."""
 
+import copy
 import io
 import json
 import math
@@ -126,6 +127,12 @@ def _json(raw, rng, others):
         data = json.loads(raw)
     except (ValueError, RecursionError):
         return _flip(raw, rng, others)
+    changed = _nest(data, rng, lambda value: rng.choice(ODD_VALUES))
+    return json.dumps(changed).encode("utf-8", "surrogatepass")
+
+
+def _nest(data, rng, odd):
+    """One value of a nest of lists and mappings is gone, doubled, or an odd one."""
     whole = holder = [data]
     key = 0
     while isinstance(holder[key], (dict, list)) and holder[key] and rng.random() < 0.8:
@@ -142,8 +149,18 @@ def _json(raw, rng, others):
         case 3:
             holder[key] = {rng.choice(["0", rng.choice(ODD_TEXT)]): value}
         case _:
-            holder[key] = rng.choice(ODD_VALUES)
-    return json.dumps(whole[0]).encode("utf-8", "surrogatepass")
+            holder[key] = odd(value)
+    return whole[0]
+
+
+def mutate_objects(arrays: dict, rng: Random, canary) -> dict:
+    """Arrays of objects, with one value in one of them odd."""
+
+    def odd(value):
+        return odd_array(value, rng, canary) if isinstance(value, np.ndarray) else rng.choice(ODD_VALUES)
+
+    key = rng.choice(list(arrays))
+    return {**arrays, key: np.array(_nest(copy.deepcopy(arrays[key].item()), rng, odd), object)}
 
 
 class Canary:
