@@ -334,6 +334,7 @@ def test_results_are_tracks_again(tmp_path):
         ("points3d_all", np.zeros((12, 3, 3)), "'points3d_all': expected"),
         ("points3d_all", np.full((12, 19, 3), np.inf), "'points3d_all': expected finite numbers"),
         ("confidence", np.full((12, 17), 2.0), "'points2d': expected finite"),
+        ("fps", np.array(-1.0), "'fps': expected a positive number"),
         ("cameras", np.zeros((12, 2, 3), int), "'cameras': expected floating-point"),
         ("confidence", np.full((12, 17), np.nan), "'points2d': expected finite"),
         ("skeleton", np.array("{"), "'skeleton': expected JSON"),

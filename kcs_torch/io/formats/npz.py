@@ -207,6 +207,8 @@ def _tracks_in(file: Archive) -> Tracks:
     if not (torch.isfinite(points).all() and (weights >= 0).all() and (weights <= 1).all()):
         raise FormatError(f"{file.path}: 'points2d': expected finite numbers wherever the confidence is above 0")
     fps = file.number("fps") if "fps" in file else math.nan
+    if not (math.isnan(fps) or 0 < fps < math.inf):
+        raise FormatError(f"{file.path}: 'fps': expected a positive number or NaN, got {fps:g}")
     return Tracks(
         points,
         weights,
