@@ -1,4 +1,4 @@
-"""Sphinx: the site of the documentation. ``pip install -e ".[docs]"``, then ``sphinx-build -W -b html docs docs/_build``."""
+"""Sphinx settings: ``pip install -e ".[docs]"``, then ``sphinx-build -W -b html docs docs/_build``."""
 
 import sys
 from pathlib import Path
@@ -9,9 +9,10 @@ import kcs_torch
 
 project = "kcs_torch"
 author = "The kcs_torch contributors"
-copyright = author  # noqa: A001 (Sphinx's name)
+copyright = author
 release = version = kcs_torch.__version__
 language = "en"
+smartquotes = False  # --option stays as it is
 
 extensions = [
     "myst_parser",
@@ -29,6 +30,7 @@ myst_heading_anchors = 3
 
 autosummary_generate = False
 autodoc_member_order = "bysource"
+autodoc_inherit_docstrings = False  # those of torch say nothing of ours
 autodoc_typehints_format = "short"
 autodoc_class_signature = "mixed"
 python_use_unqualified_type_names = True

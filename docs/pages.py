@@ -13,6 +13,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -139,16 +140,18 @@ def said_of(name: str) -> str:
     """The words below the assignment of a public name."""
     for path in sorted((ROOT / "kcs_torch").rglob("*.py")):
         body = ast.parse(path.read_text(encoding="utf-8")).body
-        for line, following in zip(body, body[1:], strict=False):
-            targets = line.targets if isinstance(line, ast.Assign) else [getattr(line, "target", None)]
-            if any(isinstance(t, ast.Name) and t.id == name for t in targets):
+        for line, following in pairwise(body):
+            one = [line.target] if isinstance(line, ast.AnnAssign) else []
+            targets = line.targets if isinstance(line, ast.Assign) else one
+            if any(isinstance(part, ast.Name) and part.id == name for t in targets for part in ast.walk(t)):
                 value = getattr(following, "value", None)
                 if isinstance(following, ast.Expr) and isinstance(value, ast.Constant):
-                    return str(value.value).replace("\n", " ")
+                    return " ".join(str(value.value).split())
     return ""
 
 
 def yes(value: object) -> str:
+    """A cell of a table."""
     return "yes" if value is not None else ""
 
 

@@ -230,6 +230,19 @@ def test_smooth_of_a_result(walk):
     assert (smoothed.root_depth is None) == (result.root_depth is None)
 
 
+@pytest.mark.parametrize("method", sorted(kt.clean.SMOOTHERS))
+def test_smooth_of_a_result_smooths_its_path(walk, method):
+    result = kt.reconstruct(walk, method="kcs")
+    time = torch.arange(len(result.points), dtype=torch.float64)
+    path = 3 * time + torch.where(time % 2 > 0, 1.0, -1.0)
+    moving = replace(result, root_depth=path, distance=1000 + path)
+    smoothed = kt.clean.smooth(moving, method, 1.0)
+    for got in (smoothed.root_depth, smoothed.distance - 1000):
+        assert got.diff()[20:-20].std() < 0.3 * path.diff()[20:-20].std()
+        assert (got - path)[20:-20].abs().max() < 15
+    assert smoothed.in_space().isfinite().all()
+
+
 def test_smooth_of_a_short_result_leaves_it(walk):
     short = kt.reconstruct(walk.frames(0, 6), method="kcs")
     smoothed = kt.clean.smooth(short)

@@ -116,7 +116,7 @@ def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: flo
         if values is None:
             return None
         one = values.detach().double().cpu().numpy()[:, None]
-        return torch.from_numpy(chosen.apply(one, np.ones(len(one)))[:, 0]).to(values)
+        return torch.from_numpy(chosen.apply(one, np.ones(len(one)))[:, 0].copy()).to(values)  # no negative strides
 
     return replace(
         result,

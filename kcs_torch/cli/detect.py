@@ -68,7 +68,7 @@ def detect(
     threshold: Threshold = 0.3,
     as_json: AsJson = False,
 ) -> None:
-    """Find the joints of the people in a video (an extra: pip install "kcs-torch[detect]")."""
+    """Find the joints of the people in a video; a detector is an extra (see `kcs-torch doctor`)."""
     with answer(as_json):
         from kcs_torch.errors import OutputError
         from kcs_torch.io import save

@@ -23,6 +23,7 @@ __all__ = ["PURPOSES", "doctor"]
 PURPOSES = {
     "benchmark": "Hydra, for the scripts of measurements",
     "detect": "kcs-torch detect and lift of videos, by MediaPipe, which brings its models (needs numpy below 2)",
+    "docs": "building the pages of docs/",
     "hdf5": "reading HDF5: MATLAB 7.3, DeepLabCut, SLEAP",
     "mocap": "reading and writing C3D files",
     "onnx": "kcs-torch detect and lift of videos, by RTMPose and RTMO models of your own",

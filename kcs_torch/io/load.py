@@ -17,6 +17,7 @@ from kcs_torch.types import Tracks
 __all__ = ["READERS", "WRITERS", "detect_format", "load_people", "load_tracks"]
 
 READERS, WRITERS = discover()
+"""The formats that tracks come in, by name, and those that can be written, by suffix."""
 
 
 def detect_format(path: str | Path) -> str:

@@ -13,6 +13,7 @@ from kcs_torch.types.axes import AXES
 __all__ = ["MOTION_READERS", "detect_motion_format", "load_motion"]
 
 MOTION_READERS = discover_motion()
+"""The formats that 3D motion comes in, by name."""
 
 
 def detect_motion_format(path: str | Path) -> str:
