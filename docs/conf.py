@@ -12,7 +12,6 @@ author = "The kcs_torch contributors"
 copyright = author
 release = version = kcs_torch.__version__
 language = "en"
-smartquotes = False  # --option stays as it is
 
 extensions = [
     "myst_parser",

@@ -96,6 +96,7 @@ def command_line() -> str:
     text = re.sub(r"\A# .*\n", "", text)
     text = re.sub(r"^(#+) `(.*)`$", r"\1 \2", text, flags=re.M)
     text = re.sub(r"^(\*\*Usage\*\*:)\n\n```console\n\$ (.*)\n```", r"```text\n\2\n```", text, flags=re.M)
+    text = re.sub(r"(?<![`\w-])(--[a-z][\w-]*)(?![^`\n]*`:)", r"`\1`", text)
     text = re.sub(r"\*\*Commands\*\*:\n\n(\* .*\n)+\n?", "", text)
     return re.sub(r"^\* `(--help|-h, --help)`: Show this message and exit.\n", "", text, flags=re.M)
 
@@ -169,7 +170,7 @@ def write(path: Path, text: str) -> None:
         path.write_text(text, encoding="utf-8")
 
 
-def generate(app: Any = None) -> None:
+def generate(app: Any = None, config: Any = None) -> None:
     """Write everything that pages include."""
     from kcs_torch import METHODS
 
@@ -196,13 +197,29 @@ def mathml(text: str, block: bool) -> str:
 
 
 def plain(app: Any, what: str, name: str, obj: object, options: Any, lines: list[str]) -> None:
-    """Docstrings are plain text: bars and stars in their formulas are no markup."""
+    """Docstrings are plain text: bars and stars in their formulas are no markup, and returns begin with no type."""
+    returned = False
     for i, line in enumerate(lines):
         if line.lstrip().startswith((">>>", "...")):
             continue
         parts = re.split(r"(``.*?``)", line)
         parts[::2] = [re.sub(r"([|*])", r"\\\1", part) for part in parts[::2]]
         lines[i] = "".join(parts)
+        if returned and line.strip():  # the first line of the section, which napoleon would split at a colon
+            lines[i - 1], lines[i] = "", f":returns: {lines[i].strip()}"
+        returned = line == "Returns:"
+
+
+def find(app: Any, env: Any, node: Any, text: Any) -> Any:
+    """Docstrings name what the package has by its short name."""
+    name = node.get("reftarget", "")
+    objects = env.get_domain("py").objects
+    if node.get("refdomain") != "py" or f"kcs_torch.{name}" not in objects:
+        return None
+    from sphinx.util.nodes import make_refnode
+
+    place = objects[f"kcs_torch.{name}"]
+    return make_refnode(app.builder, node["refdoc"], place.docname, place.node_id, text, name)
 
 
 def setup(app: Any) -> dict[str, bool]:
@@ -221,6 +238,7 @@ def setup(app: Any) -> dict[str, bool]:
         raise SkipNode
 
     app.add_html_math_renderer("mathml", inline_renderers=(inline, None), block_renderers=(display, None))
-    app.connect("builder-inited", generate)
+    app.connect("config-inited", generate, priority=100)  # before Sphinx looks for the players
+    app.connect("missing-reference", find)
     app.connect("autodoc-process-docstring", plain, priority=400)  # before napoleon
     return {"parallel_read_safe": True, "parallel_write_safe": True}
