@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
 import time
@@ -12,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from kcs_torch.errors import KcsError, KcsWarning, OptionError
+from kcs_torch.errors import KcsError, KcsWarning, OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.folders import natural_key
 from kcs_torch.io.load import load_people
@@ -25,6 +26,8 @@ __all__ = ["Clip", "Outcome", "clips_of", "reconstruct_folder"]
 
 FAILED = ".failed.txt"
 """Suffix of the file that stands in for the results of a clip that failed, and says why."""
+
+_READING = [name for name in inspect.signature(load_people).parameters if name != "path"]
 
 STALE = 3600.0
 """Seconds after which a temporary file was left by a process that was killed."""
@@ -161,6 +164,9 @@ def reconstruct_folder(
     suffixes = [s if s.startswith(".") else f".{s}" for s in suffixes]
     for suffix in suffixes:
         writer_for(Path(f"x{suffix}"))
+    for name in reading:
+        if name not in _READING:
+            raise unknown("reading option", name, _READING)
     begin = time.monotonic()
     clips = [clip for clip in clips_of(source, output, pattern) if clip.share_of(shards) == shard]
     _sweep(Path(output))

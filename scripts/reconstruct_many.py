@@ -49,10 +49,9 @@ def main(config: DictConfig) -> int:
     for path, reason in outcome.failed:
         print(f"failed: {path}: {reason}")
     rate = outcome.done / outcome.seconds if outcome.seconds else 0.0
-    print(
-        f"shard {config.shard} of {config.shards}: {outcome.clips} clips, {outcome.done} made "
-        f"({outcome.frames} frames) in {outcome.seconds:.1f} s, {rate:.1f} a second; {outcome.skipped} were there, {len(outcome.failed)} failed"
-    )
+    made = f"{outcome.done} made ({outcome.frames} frames) in {outcome.seconds:.1f} s, {rate:.1f} a second"
+    rest = f"{outcome.skipped} were there, {len(outcome.failed)} failed"
+    print(f"shard {config.shard} of {config.shards}: {outcome.clips} clips, {made}; {rest}")
     failed += len(outcome.failed)
     return len(outcome.failed)
 

@@ -34,6 +34,7 @@ ALLOWED = {
     "live": {"functional", "solvers", "nn", "methods"} | BASE,
     "training": {"functional", "solvers", "nn", "methods", "metrics", "data"} | BASE,
     "cli": {"", "functional", "methods", "reconstruct", "io", "data", "viewer", "metrics", "clean", "detect"} | BASE,
+    "many": {"io", "methods", "reconstruct"} | BASE,
     "": {"functional", "solvers", "nn", "methods", "reconstruct", "live", "io", "metrics"} | BASE,
 }
 # Imports made only when called, against the direction: a convenience of the object that the user holds.

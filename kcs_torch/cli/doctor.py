@@ -25,6 +25,7 @@ PURPOSES = {
     "detect": "kcs-torch detect and lift of videos, by MediaPipe, which brings its models (needs numpy below 2)",
     "docs": "building the pages of docs/",
     "hdf5": "reading HDF5: MATLAB 7.3, DeepLabCut, SLEAP",
+    "launchers": "scripts on many processes, a Slurm cluster or a ray cluster",
     "mocap": "reading and writing C3D files",
     "onnx": "kcs-torch detect and lift of videos, by RTMPose and RTMO models of your own",
     "rerun": "recordings for the rerun viewer",

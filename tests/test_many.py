@@ -1,0 +1,186 @@
+"""A folder of clips to a folder of motion: stopped, taken up again, with clips that fail."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+import kcs_torch as kt
+from kcs_torch.data import walking_person
+from kcs_torch.io import load_reconstruction
+from kcs_torch.many import clips_of, reconstruct_folder
+
+
+def make_clips(folder, count, frames=8):
+    """Small clips of different lengths in one folder and another within it."""
+    (folder / "more").mkdir(parents=True)
+    for i in range(count):
+        tracks = walking_person(frames + i % 3, skeleton="coco17", yaw=40.0 * i).tracks
+        kt.save(tracks, folder / ("more" if i % 4 == 3 else "") / f"clip{i}.npz")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    return make_clips(tmp_path_factory.mktemp("many") / "tracks", 6)
+
+
+def run(source, output, **options):
+    return reconstruct_folder(source, output, **{"method": "kcs", "pattern": "**/*.npz", **options})
+
+
+def test_every_clip_once(clips, tmp_path):
+    said = []
+    outcome = run(clips, tmp_path / "out", suffixes=("npz", ".csv"), batch=4, progress=said.append)
+    assert (outcome.clips, outcome.done, outcome.skipped, outcome.failed) == (6, 6, 0, ())
+    assert outcome.frames == sum(8 + i % 3 for i in range(6))
+    made = sorted(p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out").rglob("*") if p.is_file())
+    assert made == sorted(f"{'more/' if i == 3 else ''}clip{i}.{s}" for i in range(6) for s in ("csv", "npz"))
+    alone = kt.reconstruct(kt.load_tracks(clips / "clip4.npz"), method="kcs")
+    torch.testing.assert_close(
+        load_reconstruction(tmp_path / "out" / "clip4.npz").points, alone.points, rtol=1e-6, atol=1e-3
+    )
+    assert said[-1].startswith("6 of 6 clips, 0 failed")
+    again = run(clips, tmp_path / "out", suffixes=("npz", ".csv"))
+    assert (again.done, again.skipped) == (0, 6)
+    (tmp_path / "out" / "clip1.csv").unlink()
+    assert run(clips, tmp_path / "out", suffixes=("npz", ".csv")).done == 1
+
+
+def test_shards_share_the_work(clips, tmp_path):
+    parts = [run(clips, tmp_path, shard=k, shards=3) for k in range(3)]
+    assert sum(part.clips for part in parts) == sum(part.done for part in parts) == 6
+    assert len(list(tmp_path.rglob("*.npz"))) == 6
+    with pytest.raises(kt.OptionError, match="shard"):
+        run(clips, tmp_path, shard=3, shards=3)
+
+
+def test_clips_that_fail_are_listed_and_stop_nobody(tmp_path):
+    source = make_clips(tmp_path / "in", 3)
+    (source / "bad.json").write_text("{")
+    np.savez(source / "empty.npz", points2d=np.full((4, 17, 2), np.nan))
+    outcome = run(source, tmp_path / "out", pattern="*.*", batch=5)
+    assert outcome.done == 3 and {path.name for path, _ in outcome.failed} == {"bad.json", "empty.npz"}
+    why = (tmp_path / "out" / "bad.failed.txt").read_text()
+    assert why.startswith("FormatError") and "bad.json" in why
+    again = run(source, tmp_path / "out", pattern="*.*")
+    assert (again.done, again.skipped) == (0, 3) and {p.name for p, _ in again.failed} == {"bad.json", "empty.npz"}
+    kt.save(walking_person(8, skeleton="coco17").tracks, source / "empty.npz")
+    mended = run(source, tmp_path / "out", pattern="*.*", retry=True)
+    assert mended.done == 1 and len(mended.failed) == 1
+    assert not (tmp_path / "out" / "empty.failed.txt").exists()
+
+
+def test_a_clip_that_breaks_the_batch_is_found(clips, tmp_path, monkeypatch):
+    """An error that no check foresaw costs one clip, and its traceback is kept."""
+    real = kt.KCS.solve
+
+    def solve(self, tracks, cameras):
+        if "clip2" in tracks.source:
+            raise ZeroDivisionError("planted")
+        return real(self, tracks, cameras)
+
+    monkeypatch.setattr(kt.KCS, "solve", solve)
+    outcome = run(clips, tmp_path)
+    assert outcome.done == 5 and outcome.failed[0][1] == "ZeroDivisionError: planted"
+    assert "Traceback" in (tmp_path / "clip2.failed.txt").read_text()
+
+
+def test_everybody(tmp_path):
+    shared = walking_person(8, skeleton="coco17").tracks
+    lists = []
+    for frame, xy in enumerate(shared.points):
+        for shift in (0, 500):
+            keypoints = [v for n in range(17) for v in (*(xy[n] + shift).tolist(), 0.9)]
+            lists.append({"image_id": frame, "keypoints": keypoints, "category_id": 1, "score": 1.0})
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "two.json").write_text(json.dumps(lists))
+    outcome = run(tmp_path / "in", tmp_path / "out", pattern="*", everybody=True)
+    assert outcome.done == 1 and {p.name for p in (tmp_path / "out").glob("*.npz")} == {"two_0.npz", "two_1.npz"}
+    assert run(tmp_path / "in", tmp_path / "out", pattern="*", everybody=True).skipped == 1
+
+
+def test_names_that_would_meet_keep_their_suffix(tmp_path):
+    for name in ("a.json", "a.csv", "b.npz"):
+        (tmp_path / name).touch()
+    targets = {clip.target.name for clip in clips_of(tmp_path, tmp_path / "out")}
+    assert targets == {"a.json", "a.csv", "b"}
+
+
+def test_results_in_the_input_are_no_clips(tmp_path):
+    source = make_clips(tmp_path / "in", 2)
+    run(source, source / "out")
+    assert run(source, source / "out").clips == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"batch": 0}, "batch"),
+        ({"pattern": "*.xyz"}, "found none"),
+        ({"suffixes": [".doc"]}, "suffix"),
+        ({"beta": 1}, "beta"),
+    ],
+)
+def test_wrong_options_are_told_at_once(clips, tmp_path, options, words):
+    with pytest.raises((kt.KcsError, TypeError), match=words):
+        run(clips, tmp_path, **options)
+    with pytest.raises(kt.OptionError, match="expected a folder"):
+        run(tmp_path / "none", tmp_path)
+
+
+def test_temporary_files_of_the_killed_are_removed(clips, tmp_path):
+    old, new = tmp_path / ".0123abcd.npz", tmp_path / ".89abcdef.npz"
+    for path in (old, new):
+        path.touch()
+    os.utime(old, (0, 0))
+    run(clips, tmp_path)
+    assert not old.exists() and new.exists()  # another process may be writing the new one
+
+
+def test_killed_and_taken_up_again(tmp_path, root):
+    """SIGKILL in the middle: nothing is lost, nothing made twice, nothing half written."""
+    pytest.importorskip("hydra")
+    source, output = make_clips(tmp_path / "in", 30), tmp_path / "out"
+    command = [
+        sys.executable, str(root / "scripts" / "reconstruct_many.py"), f"input={source}", f"output={output}",
+        "method=kcs", "pattern='**/*.npz'", "batch=2", f"hydra.run.dir={tmp_path / 'run'}",
+    ]  # fmt: skip
+    started = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while len(list(output.rglob("clip*.npz"))) < 4 and time.monotonic() < deadline and started.poll() is None:
+        time.sleep(0.02)
+    started.send_signal(signal.SIGKILL)
+    started.wait()
+    first = {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in output.rglob("clip*.npz")}
+    assert 4 <= len(first) < 30
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert f"{30 - len(first)} made" in done.stdout and f"{len(first)} were there, 0 failed" in done.stdout
+    made = list(output.rglob("clip*.npz"))
+    assert len(made) == 30
+    assert all((p.stat().st_mtime_ns, p.stat().st_ino) == stamp for p, stamp in first.items())
+    for path in made:
+        assert torch.isfinite(load_reconstruction(path).points).all()
+
+
+@pytest.mark.parametrize(
+    ("launcher", "package"), [("joblib", "hydra_joblib_launcher"), ("submitit_local", "hydra_submitit_launcher")]
+)
+def test_launchers(clips, tmp_path, root, launcher, package):
+    """The jobs of a multirun do a shard each, in processes of their own."""
+    pytest.importorskip(f"hydra_plugins.{package}")
+    command = [
+        sys.executable, str(root / "scripts" / "reconstruct_many.py"), "-m", f"input={clips}",
+        f"output={tmp_path / 'out'}", "method=kcs", "pattern='**/*.npz'", "shards=2", "shard=range(0,2)",
+        f"hydra/launcher={launcher}", f"hydra.sweep.dir={tmp_path / 'sweep'}",
+    ]  # fmt: skip
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert len(list((tmp_path / "out").rglob("*.npz"))) == 6
