@@ -191,6 +191,7 @@ def mathml(text: str, block: bool) -> str:
     single = r"\s*([0-9A-Za-z]|\\[A-Za-z]+)"  # TeX takes one sign for an argument, and the converter a whole number
     text = re.sub(r"\\(t?frac)" + single + single, r"\\\1{\2}{\3}", text)
     text = re.sub(r"\\(t?frac)" + single + r"(?=\s*{)", r"\\\1{\2}", text)
+    text = re.sub(r"\\(log|det)\b(?=\s*[\\A-Z|])(?!\s*\\(left|[bB]ig|!))", r"\\\1\\,", text)  # no function is set apart
     text = re.sub(r"\\([bB])ig(?=[(\[])", r"\\\1igl", text)
     text = re.sub(r"\\([bB])ig(?=[)\]])", r"\\\1igr", text)
     return str(tex2mathml(text, as_block=block))
