@@ -122,6 +122,17 @@ def test_lift_says_which_folders_it_makes(openpose_folder, tmp_path):
     assert json.loads(done.stdout)["people"][0]["new_folders"] == [str(path.parent)]
 
 
+def test_lift_finds_the_skeleton(tmp_path):
+    """Tracks without bones get those that their motion shows."""
+    clip = kt.data.walking_person(60, skeleton="h36m17", turn=150)
+    np.savez(tmp_path / "points.npz", points2d=clip.tracks.points.numpy())
+    run("lift", tmp_path / "points.npz", "--skeleton", "auto", "-m", "sfam", "-o", tmp_path / "found.npz")
+    found = kt.io.load_reconstruction(tmp_path / "found.npz").skeleton
+    assert len(found.bones) >= 10
+    run("lift", tmp_path / "points.npz", "-m", "sfam", "-o", tmp_path / "bare.npz")
+    assert not kt.io.load_reconstruction(tmp_path / "bare.npz").skeleton.bones
+
+
 @pytest.mark.parametrize("method", kt.METHODS)
 def test_lift_by_each_method(openpose_folder, tmp_path, method):
     done = run("lift", openpose_folder, "-o", tmp_path / "a.npz", "--method", method, "--json")
@@ -219,13 +230,13 @@ def test_lift_refuses_to_replace_the_tracks(lifted, tmp_path):
 def test_warnings_are_one_line_on_standard_error(openpose_folder, tmp_path, monkeypatch):
     import warnings
 
-    plain = kt.reconstruct
+    plain = kt.reconstruct_all
 
     def warned(*args, **options):
         warnings.warn("stopped at its limit\nafter 3 steps", kt.ConvergenceWarning, stacklevel=2)
         return plain(*args, **options)
 
-    monkeypatch.setattr(kt, "reconstruct", warned)
+    monkeypatch.setattr(kt, "reconstruct_all", warned)
     done = run("lift", openpose_folder, "-o", tmp_path / "a.npz", "-m", "sfam", "--json")
     assert "warning: stopped at its limit after 3 steps\n" in done.stderr
     assert json.loads(done.stdout)["people"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,7 +17,6 @@ from kcs_torch.cli.options import (
     Threshold,
     TracksPath,
     Trust,
-    UseSkeleton,
     check_outputs,
     image_size,
     new_folders,
@@ -27,8 +27,6 @@ from kcs_torch.cli.outputs import Scale, Units, Up, check_up, parse_scale, sized
 from kcs_torch.cli.report import answer, describe, print_json, progress, summary
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 
 __all__ = ["MethodName", "Settings", "lift", "method_fields"]
@@ -60,7 +58,15 @@ def lift(
     ],
     method: MethodName = "auto",
     settings: Settings = [],  # noqa: B006 (typer reads it and never changes it)
-    skeleton: UseSkeleton = None,
+    skeleton: Annotated[
+        str | None,
+        typer.Option(
+            "--skeleton",
+            metavar="NAME|FILE|auto",
+            help="A built-in skeleton (see `kcs-torch skeletons`), a YAML or JSON file, or auto: found from motion. "
+            "As TRACKS says if not given.",
+        ),
+    ] = None,
     format: FormatName = None,
     person: Annotated[
         str | None,
@@ -123,6 +129,7 @@ def lift(
         finish = finisher(smooth_3d)
         size_of = parse_scale(scale)
         check_up(up, output)
+        find, skeleton = skeleton == "auto", None if skeleton == "auto" else skeleton
         if format is None and _is_video(tracks):
             clean = cleaner(SEEN if frames == SEEN else None, gate, fill, smooth, resample)
             people = people_of(
@@ -155,18 +162,20 @@ def lift(
         if together and frames == "seen":  # each has a first frame of their own then
             typer.echo(f"note: {', '.join(map(str, together))} not written: people begin at different frames", err=True)
             together = []
-        for number, one in people:
+        for number, _ in people:
+            check_outputs([numbered(path, number) for path in output] if person == "all" else [], source=tracks)
+        cleaned = [clean(one) for _, one in people]
+        for (number, one), neat, lifted in zip(people, cleaned, _lifted(cleaned, method, fields, find), strict=True):
             names = [numbered(path, number) if person == "all" else path for path in output]
-            check_outputs(names, source=tracks)
-            cleaned = clean(one)
-            result = sized(_lift_one(cleaned, method, fields, solution, mirror, finish), size_of)
+            result = lifted.solution(solution)
+            result = sized(finish(result.mirrored() if mirror else result), size_of)
             made = new_folders(names)
             told = write_files(result, names, up, units)
             if together:
                 results.append(result)
             reports.append(summary(result, solution))
             reports[-1]["notes"] += told
-            reports[-1]["cleaning"] = list(cleaned.notes[len(one.notes) :])
+            reports[-1]["cleaning"] = list(neat.notes[len(one.notes) :])
             if not as_json:
                 typer.echo(describe(reports[-1]))
                 folders = f", in new folders: {', '.join(map(str, made))}" if made else ""
@@ -228,19 +237,14 @@ def _is_video(path: str) -> bool:
     return is_video(path)
 
 
-def _lift_one(
-    tracks: Tracks,
-    method: str,
-    fields: dict[str, Any],
-    solution: int,
-    mirror: bool,
-    finish: Callable[[Reconstruction], Reconstruction],
-) -> Reconstruction:
-    """Reconstruct one person."""
+def _lifted(people: list[Tracks], method: str, fields: dict[str, Any], find: bool) -> list[Reconstruction]:
+    """Reconstruct everybody, with the skeleton that their motion shows where it is to be found."""
     import kcs_torch as kt
 
-    with progress(f"reconstructing {tracks.num_frames} frames of {tracks.num_joints} joints"):
-        result = kt.reconstruct(tracks, method=method, **fields).solution(solution)
-    if mirror:
-        result = result.mirrored()
-    return finish(result)
+    frames = sum(one.num_frames for one in people)
+    joints = people[0].num_joints
+    who = f"{len(people)} people, " if len(people) > 1 else ""
+    with progress(f"reconstructing {who}{frames} frames of {joints} joints"):
+        if find:
+            people = [replace(one, skeleton=kt.find_skeleton(one)) for one in people]
+        return kt.reconstruct_all(people, method=method, **fields)
