@@ -125,7 +125,9 @@ def test_pickles_that_crash_or_fill_the_memory_do_not(tmp_path, raw, message):
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-@pytest.mark.parametrize("function", [os.system, os.mkdir, eval, getattr, subprocess.call, np.load], ids=lambda f: f.__name__)
+@pytest.mark.parametrize(
+    "function", [os.system, os.mkdir, eval, getattr, subprocess.call, np.load], ids=lambda function: function.__name__
+)
 def test_nothing_is_run(tmp_path, protocol, function):
     canary = tmp_path / "canary"
     positions = {"S1": {"Walk": [A]}, "S2": Evil(function, f"touch {canary}")}
