@@ -74,7 +74,7 @@ def written_and_read(data, motion, folder, suffix):
 
 
 def same(found, motion, close):
-    """Names, frames and places agree; a file may put joints in another order, and leave out those that are never seen."""
+    """Names, frames and places agree; a file may put joints in another order, and leave out those never seen."""
     names = [name for name, there in zip(motion.skeleton.joints, motion.seen.any(0).tolist(), strict=True) if there]
     assert set(names) <= set(found.skeleton.joints) <= set(motion.skeleton.joints)
     assert found.num_frames == motion.num_frames
