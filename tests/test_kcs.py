@@ -255,3 +255,16 @@ def test_known_cameras_tell_where_the_template_stands(turn):
     if turn:
         rotation, _ = procrustes(centred(known.points[30]), centred(clip.points[30]))
         assert (rotation.trace() - 1) / 2 > math.cos(math.radians(12))  # and it faces the right way
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")
+def test_several_clips_at_once():
+    """Cameras are fitted together, over clips of different lengths and skeletons; all give what each gives alone."""
+    clips = [
+        walking_person(n, skeleton=k, yaw=30.0 * n).tracks for n, k in ((20, "coco17"), (9, "body25"), (31, "coco17"))
+    ]
+    method = KCS(num_weights=3, steps_per_weight=5)
+    for one, other in zip(method.many(clips), map(method, clips), strict=True):
+        assert_close(one.points, other.points, rtol=1e-6, atol=1e-3)
+        assert_close(one.cameras, other.cameras, rtol=0, atol=1e-6)
+        assert one.diagnostics.iterations == other.diagnostics.iterations

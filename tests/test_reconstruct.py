@@ -12,6 +12,9 @@ from kcs_torch import KCS, METHODS, PKC, OptionError, SfAM, ShapeError, Skeleton
 from kcs_torch.data import walking_person
 from kcs_torch.skeleton import SKELETONS
 
+# Few steps are made here, after which little has settled.
+pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")
+
 CLIP = walking_person(20, turn=90.0)
 TRACKS, POINTS = CLIP.tracks, CLIP.tracks.points
 QUICK = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,13 +17,14 @@ from kcs_torch.functional.chain import bone_lengths, chain_inverse, incidence
 from kcs_torch.functional.spectral import singular_values, svt
 from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.base import Estimate, Method
+from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.template import clip_scale, rigid_shape
 from kcs_torch.nn.energies import centred_residual
 from kcs_torch.nn.steps import continuation
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.iterate import iterate, relative_change
 from kcs_torch.solvers.lm import fit_bones
-from kcs_torch.solvers.pose import fit_cameras
+from kcs_torch.solvers.pose import CameraFit, fit_cameras
 from kcs_torch.types import Tracks, as_floats
 
 __all__ = ["KCS"]
@@ -91,6 +92,13 @@ class KCS(Method):
 
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Alternate cameras and shape until the cameras stand still."""
+        return run(self._steps(tracks, cameras), self._fits)
+
+    def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
+        """Several clips, whose cameras are fitted together: each frame is a problem of its own."""
+        return run(together([self._steps(one, None) for one in tracks]), self._fits)
+
+    def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[_Fit, CameraFit, Estimate]:
         body = tracks.skeleton.with_links(self.links) if self.links else tracks.skeleton
         body = body.connected()
         bones = body.bone_index(device=tracks.points.device)
@@ -103,7 +111,9 @@ class KCS(Method):
             low, high = torch.zeros_like(scale), torch.full_like(scale, math.inf)
         if cameras is not None and not (self.template is None and tracks.skeleton.template is None):
             # A template has a frame of its own: turn it into the world, as it is seen over the whole clip.
-            seen_from, _ = self._cameras(tracks, rest.expand(tracks.num_frames, -1, 3), low, high, None, None)
+            seen_from, _ = yield from self._cameras(
+                tracks, rest.expand(tracks.num_frames, -1, 3), low, high, None, None
+            )
             rest = rest @ nearest_rotation((complete_rotation(cameras).mT @ seen_from).sum(0)).mT
         shape = rest.expand(tracks.num_frames, -1, 3)
         rotations: Tensor | None = None
@@ -111,7 +121,7 @@ class KCS(Method):
         converged, made = False, 0
         for _ in range(self.rounds):
             last = rotations
-            rotations, scales = self._cameras(tracks, shape, low, high, last, cameras)
+            rotations, scales = yield from self._cameras(tracks, shape, low, high, last, cameras)
             deviation, settled, steps = self._deviation(
                 tracks, rest, deviation, rotations[:, :2], scales, matrix, inverse
             )
@@ -150,7 +160,7 @@ class KCS(Method):
 
     def _cameras(
         self, tracks: Tracks, shape: Tensor, low: Tensor, high: Tensor, last: Tensor | None, known: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    ) -> Search[_Fit, CameraFit, tuple[Tensor, Tensor]]:
         """Rotations (T, 3, 3) and scales (T,) of the camera step (eq. 22-25), consistent over time."""
         if known is not None:
             flat = project(shape, known)
@@ -158,13 +168,31 @@ class KCS(Method):
             size = (flat.square() * tracks.weights[..., None]).sum((-2, -1))
             free = match / torch.where(size > 0, size, torch.ones_like(size))
             return complete_rotation(known), torch.minimum(torch.maximum(free, low), high)
-        fit = fit_cameras(tracks.points, shape, tracks.weights, low, high, robust=self.robust, start=last)
+        (fit,) = yield [_Fit(tracks.points, shape, tracks.weights, low, high, last)]
         rotations, scales, cost = fit.rotations, fit.scales, fit.cost.mT  # cost (T, C)
         trace = torch.einsum("atij,btij->tab", rotations[:, :-1], rotations[:, 1:])
         turn = torch.arccos(((trace - 1) / 2).clamp(-1, 1)).square()
         choice = best_path(cost, self.continuity * turn) if self.continuity > 0 else cost.argmin(-1)
         frame = torch.arange(tracks.num_frames, device=choice.device)
         return rotations[choice, frame], scales[choice, frame]
+
+    def _fits(self, asked: list[_Fit]) -> list[CameraFit]:
+        """Fit the cameras of several clips: those of one number of joints, and with or without a start, together."""
+        groups: dict[object, list[int]] = {}
+        for i, one in enumerate(asked):
+            groups.setdefault((one.start is None, one.points.shape[1], one.points.dtype), []).append(i)
+        out: dict[int, CameraFit] = {}
+        for group in groups.values():
+            tracks, points, weights, low, high = (
+                torch.cat(parts) for parts in zip(*(asked[i][:5] for i in group), strict=True)
+            )
+            starts = [start for i in group if (start := asked[i].start) is not None]
+            start = torch.cat(starts) if starts else None
+            fit = fit_cameras(tracks, points, weights, low, high, robust=self.robust, start=start)
+            counts = [len(asked[i].tracks) for i in group]
+            parts = zip(*(x.split(counts, 1) for x in (fit.rotations, fit.scales, fit.cost)), strict=True)
+            out |= {i: CameraFit(*part) for i, part in zip(group, parts, strict=True)}
+        return [out[i] for i in range(len(asked))]
 
     def _constant_bones(self, points: Tensor, body: Skeleton, seen: Tensor) -> Tensor:
         """Alternate the bone-length step with the image positions of seen joints."""
@@ -213,6 +241,17 @@ class KCS(Method):
             )
             state, settled, made = solution.value, solution.converged, made + solution.iterations
         return state, settled, made
+
+
+class _Fit(NamedTuple):
+    """Arguments of :func:`fit_cameras` for one clip."""
+
+    tracks: Tensor
+    points: Tensor
+    weights: Tensor
+    low: Tensor
+    high: Tensor
+    start: Tensor | None
 
 
 Folded = tuple[Tensor, Callable[[Tensor], Tensor]]

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
-from kcs_torch.methods.pkc import lockstep
+from kcs_torch.methods.lockstep import Search, run
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limb_paths, limbs_of, waves
-from kcs_torch.methods.pkc.objective import Objective, Task, Weights, at_pace, pace_of
+from kcs_torch.methods.pkc.objective import Objective, Refined, Task, Weights, at_pace, minimise_all, pace_of
 from kcs_torch.methods.pkc.trunk import TURN, Trunk, longest_image, siblings, trunk_misfit, trunk_path, trunk_turns
 from kcs_torch.nn.posture import free_bones
 from kcs_torch.skeleton import Skeleton
@@ -121,7 +121,7 @@ def fixed_view(
         The hypotheses, best first.
     """
     settings = {"rate": rate, "noise": noise, "rounds": rounds, "steps": steps, "weights": weights, "anchor": anchor}
-    return lockstep.run(searching(skeleton, image, **settings))  # type: ignore[arg-type]
+    return run(searching(skeleton, image, **settings), minimise_all)  # type: ignore[arg-type]
 
 
 def searching(
@@ -134,7 +134,7 @@ def searching(
     steps: int = 30,
     weights: Weights | None = None,
     anchor: Tensor | None = None,
-) -> lockstep.Search[Hypotheses]:
+) -> Search[Task, Refined, Hypotheses]:
     """:func:`fixed_view` as a search, which may run beside others."""
     slow = 30.0 / rate
     pace = pace_of(image, skeleton, rate)
@@ -159,7 +159,9 @@ def searching(
     return found
 
 
-def refined(objective: Objective, found: Hypotheses, steps: int, loose: float = 1.0) -> lockstep.Search[Hypotheses]:
+def refined(
+    objective: Objective, found: Hypotheses, steps: int, loose: float = 1.0
+) -> Search[Task, Refined, Hypotheses]:
     """Hypotheses refined on the objective, best first."""
     (new,) = yield [Task(objective, found.depth, found.lengths, steps, loose)]
     return Hypotheses(new.depth, new.lengths, new.energy, found.steps + new.steps, new.moved)
@@ -194,7 +196,7 @@ class _Search:
         z, length = torch.stack(depths), torch.stack(lengths)
         return Hypotheses(z, length, z.new_full((len(z),), torch.inf))
 
-    def refine(self, found: Hypotheses, steps: int, loose: float = 1.0) -> lockstep.Search[Hypotheses]:
+    def refine(self, found: Hypotheses, steps: int, loose: float = 1.0) -> Search[Task, Refined, Hypotheses]:
         """All a little, with loose lengths first where the start is rough, then the best few that differ."""
         few = max(steps // 3, 1)
         if loose > 1:

@@ -14,12 +14,13 @@ from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import WEAK_TURN, Estimate, Method
+from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.fixed_view import Hypotheses, distinct
 from kcs_torch.methods.pkc.gate import plausible
-from kcs_torch.methods.pkc.lockstep import Search, run, together
 from kcs_torch.methods.pkc.moving_view import MovingView, moving_view
+from kcs_torch.methods.pkc.objective import Refined, Task, minimise_all
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import weak_perspective
 from kcs_torch.methods.unseen import place_unseen
@@ -103,13 +104,13 @@ class PKC(Method):
 
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Clean the tracks, try both viewpoints, rank what they give."""
-        return run(self._steps(tracks, cameras))
+        return run(self._steps(tracks, cameras), minimise_all)
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
         """Several clips, whose hypotheses are refined together."""
-        return run(together([self._steps(one, None) for one in tracks]))
+        return run(together([self._steps(one, None) for one in tracks]), minimise_all)
 
-    def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Estimate]:
+    def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Task, Refined, Estimate]:
         image, noise, notes = self._clean(tracks)
         size = weak_perspective(image, tracks.seen, tracks.skeleton, tracks.fps or 30.0)
         if size is None:
@@ -121,7 +122,7 @@ class PKC(Method):
 
     def _solve(
         self, tracks: Tracks, image: Tensor, noise: Tensor, cameras: Tensor | None, notes: tuple[str, ...]
-    ) -> Search[Estimate]:
+    ) -> Search[Task, Refined, Estimate]:
         """Solve complete tracks (T, N, 2) of a body whose size in the image does not change."""
         skeleton = tracks.skeleton
         has_trunk = len(trunk_joints(skeleton)) >= 3
@@ -236,7 +237,7 @@ class PKC(Method):
 
     def _ranked(
         self, body: Body, moving: MovingView | None, cameras: Tensor | None, found: Hypotheses | None
-    ) -> Search[Hypotheses]:
+    ) -> Search[Task, Refined, Hypotheses]:
         """All hypotheses of a body with a template, best first."""
         assert moving is not None
         depth = moving.pose.points[:1, ..., 2] * body.factor
