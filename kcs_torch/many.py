@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import inspect
-import re
-import sys
+import os
+import shutil
 import time
 import traceback
 import warnings
@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from kcs_torch.errors import KcsError, KcsWarning, OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
@@ -20,7 +21,8 @@ from kcs_torch.io.load import load_people
 from kcs_torch.io.write import save, writer_for
 from kcs_torch.methods.base import Method
 from kcs_torch.reconstruct import reconstruct_all
-from kcs_torch.types import Tracks
+from kcs_torch.types import Reconstruction, Tracks
+from kcs_torch.types.size import parse_size
 
 __all__ = ["Clip", "Outcome", "clips_of", "reconstruct_folder"]
 
@@ -30,7 +32,7 @@ FAILED = ".failed.txt"
 _READING = [name for name in inspect.signature(load_people).parameters if name != "path"]
 
 STALE = 3600.0
-"""Seconds after which a temporary file was left by a process that was killed."""
+"""Seconds after which another part's folder was left by a process that was killed."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,10 @@ def reconstruct_folder(
     batch: int = 16,
     everybody: bool = False,
     retry: bool = False,
+    scale: str | None = None,
+    up: str | None = None,
+    units: str | None = None,
+    intrinsics: Any = None,
     progress: Callable[[str], None] | None = None,
     **reading: object,
 ) -> Outcome:
@@ -147,6 +153,10 @@ def reconstruct_folder(
         batch: clips that are reconstructed together (:func:`kcs_torch.reconstruct_all`).
         everybody: reconstruct all people of a clip, to NAME_0, NAME_1, ..., not the most seen one alone.
         retry: try clips again that failed.
+        scale: the true size of every body, ``height=1.75m`` or a bone's; else results are in the unit of the tracks.
+        up: as of :func:`kcs_torch.save`.
+        units: as of :func:`kcs_torch.save`.
+        intrinsics: of the camera that saw them all, as of :func:`kcs_torch.reconstruct`.
         progress: gets a line every few seconds.
         **reading: options of :func:`kcs_torch.load_tracks`, such as ``fps`` and ``skeleton``.
 
@@ -169,8 +179,10 @@ def reconstruct_folder(
             raise unknown("reading option", name, _READING)
     begin = time.monotonic()
     clips = [clip for clip in clips_of(source, output, pattern) if clip.share_of(shards) == shard]
-    _sweep(Path(output))
-    work = _Work(method, suffixes, everybody, reading)
+    workplace = Path(output) / f".part_{shard}_of_{shards}"
+    _sweep(Path(output), workplace)
+    size = None if scale is None else parse_size(scale)
+    work = _Work(method, suffixes, everybody, workplace, size, {"up": up, "units": units}, intrinsics, reading)
     todo, skipped, failed = [], 0, []
     for clip in clips:
         if clip.failure.exists() and not retry:
@@ -192,6 +204,7 @@ def reconstruct_folder(
                 f"{skipped + done + len(failed)} of {len(clips)} clips, {len(failed)} failed, "
                 f"{rate:.1f} clips a second, {max(left, 0) / 60:.1f} minutes left"
             )
+    _sweep(Path(output), workplace)
     return Outcome(len(clips), done, skipped, tuple(failed), frames, time.monotonic() - begin)
 
 
@@ -202,6 +215,10 @@ class _Work:
     method: str | Method
     suffixes: Sequence[str]
     everybody: bool
+    workplace: Path
+    size: dict[str, Any] | None
+    saving: dict[str, Any]
+    intrinsics: Any
     reading: dict[str, object]
 
     def is_done(self, clip: Clip) -> bool:
@@ -221,7 +238,9 @@ class _Work:
                     read.append((clip, people))
             read.sort(key=lambda pair: pair[1][0].num_frames)
             try:
-                found = reconstruct_all([one for _, people in read for one in people], method=self.method)
+                found = reconstruct_all(
+                    [one for _, people in read for one in people], method=self.method, intrinsics=self.intrinsics
+                )
             except OptionError:
                 raise
             except Exception:  # one of them is to blame: each for itself
@@ -238,8 +257,7 @@ class _Work:
                     )
                     for number, result in enumerate(own):
                         target = clip if not self.everybody else Clip(clip.source, _numbered(clip.target, number))
-                        for path in target.outputs(self.suffixes):
-                            save(result, path)
+                        self._save(result if self.size is None else result.scaled(**self.size), target)
                     if self.everybody:
                         with atomic_path(_people_list(clip)) as temporary:
                             temporary.write_text(f"{len(own)}\n", encoding="utf-8")
@@ -248,6 +266,16 @@ class _Work:
                 for _ in self._tried(clip, failed, finish):
                     made, frames = made + 1, frames + people[0].num_frames
         return made, frames, failed
+
+    def _save(self, result: Reconstruction, clip: Clip) -> None:
+        """Write all files of a result to this part's own folder, then move them to their place.
+
+        What a killed process leaves lies in that folder, and the next one that does this part clears it.
+        """
+        clip.target.parent.mkdir(parents=True, exist_ok=True)
+        for path in clip.outputs(self.suffixes):
+            save(result, self.workplace / path.name, notes=[], **self.saving)
+            os.replace(self.workplace / path.name, path)
 
     def _people(self, clip: Clip) -> list[Tracks]:
         people = load_people(clip.source, **self.reading)  # type: ignore[arg-type]
@@ -277,13 +305,8 @@ def _people_list(clip: Clip) -> Path:
     return clip.target.with_name(f"{clip.target.name}.people.txt")
 
 
-def _sweep(output: Path) -> None:
-    """Remove temporary files that processes left when they were killed."""
-    if not output.is_dir():
-        return
-    for path in output.rglob(".*"):
-        try:
-            if re.fullmatch(r"\.[0-9a-f]{8}(\.\w+)?", path.name) and time.time() - path.stat().st_mtime > STALE:
-                path.unlink()
-        except OSError as error:  # another process was quicker
-            print(f"{path}: {error}", file=sys.stderr)
+def _sweep(output: Path, workplace: Path) -> None:
+    """Remove what a killed process left: of this part, and of other divisions into parts an hour ago."""
+    old = [p for p in output.glob(".part_*_of_*") if time.time() - p.stat().st_mtime > STALE]
+    for folder in (workplace, *old):
+        shutil.rmtree(folder, ignore_errors=True)

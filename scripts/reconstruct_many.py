@@ -1,7 +1,8 @@
-"""Reconstruct a folder of thousands of track files; stop it whenever you like, and run it again to go on.
+r"""Reconstruct a folder of thousands of track files; stop it whenever you like, and run it again to go on.
 
     python scripts/reconstruct_many.py input=tracks output=motion
-    python scripts/reconstruct_many.py input=videos output=motion pattern='*_json' 'suffixes=[.npz,.bvh]'
+    python scripts/reconstruct_many.py input=videos output=motion pattern='*_json' 'suffixes=[.npz,.bvh]' \
+        scale=\'height=1.75m\'
     python scripts/reconstruct_many.py -m input=tracks output=motion shards=8 'shard=range(0,8)' hydra/launcher=joblib
     python scripts/reconstruct_many.py -m input=tracks output=motion shards=200 'shard=range(0,200)' \
         hydra/launcher=submitit_slurm hydra.launcher.cpus_per_task=1 hydra.launcher.timeout_min=240
@@ -19,21 +20,30 @@ import sys
 
 import hydra
 import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from kcs_torch import KcsError
 from kcs_torch.many import reconstruct_folder
 
+
+class ClipsFailed(Exception):
+    """Some clips of a shard failed; the others are done."""
+
+
 failed = 0  # clips of all jobs run in this process; Hydra hands no exit code through
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="reconstruct_many")
-def main(config: DictConfig) -> int:
-    """Do one shard of the work; returns how many clips failed."""
+def main(config: DictConfig) -> None:
+    """Do one shard of the work."""
     global failed
     torch.set_num_threads(config.threads)
-    names = ("pattern", "suffixes", "everybody", "shard", "shards", "batch", "retry")
+    names = (
+        "pattern", "suffixes", "everybody", "shard", "shards", "batch", "retry", "scale", "up", "units", "intrinsics",
+    )  # fmt: skip
     options = OmegaConf.to_container(config, resolve=True)
     try:
         outcome = reconstruct_folder(
@@ -53,7 +63,8 @@ def main(config: DictConfig) -> int:
     rest = f"{outcome.skipped} were there, {len(outcome.failed)} failed"
     print(f"shard {config.shard} of {config.shards}: {outcome.clips} clips, {made}; {rest}")
     failed += len(outcome.failed)
-    return len(outcome.failed)
+    if outcome.failed and HydraConfig.get().mode == RunMode.MULTIRUN:
+        raise ClipsFailed(f"{len(outcome.failed)} clips failed")  # of another process only an error is heard
 
 
 if __name__ == "__main__":

@@ -99,6 +99,7 @@ def test_memory_is_bounded_by_the_window(clip):
     assert tracker.tracks().num_frames == 20
 
 
+@pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")
 def test_result_is_the_window(clip):
     tracker = kt.Tracker("coco17", fps=30, window=20, units="mm", method=kt.METHODS["pkc"](viewpoint="fixed", steps=3))
     frames = observed(clip)[:30]

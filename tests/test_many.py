@@ -79,14 +79,14 @@ def test_clips_that_fail_are_listed_and_stop_nobody(tmp_path):
 
 def test_a_clip_that_breaks_the_batch_is_found(clips, tmp_path, monkeypatch):
     """An error that no check foresaw costs one clip, and its traceback is kept."""
-    real = kt.KCS.solve
+    real = kt.KCS._steps
 
-    def solve(self, tracks, cameras):
+    def steps(self, tracks, cameras):
         if "clip2" in tracks.source:
             raise ZeroDivisionError("planted")
         return real(self, tracks, cameras)
 
-    monkeypatch.setattr(kt.KCS, "solve", solve)
+    monkeypatch.setattr(kt.KCS, "_steps", steps)
     outcome = run(clips, tmp_path)
     assert outcome.done == 5 and outcome.failed[0][1] == "ZeroDivisionError: planted"
     assert "Traceback" in (tmp_path / "clip2.failed.txt").read_text()
@@ -135,13 +135,21 @@ def test_wrong_options_are_told_at_once(clips, tmp_path, options, words):
         run(tmp_path / "none", tmp_path)
 
 
-def test_temporary_files_of_the_killed_are_removed(clips, tmp_path):
-    old, new = tmp_path / ".0123abcd.npz", tmp_path / ".89abcdef.npz"
-    for path in (old, new):
-        path.touch()
-    os.utime(old, (0, 0))
+def test_what_the_killed_left_is_removed(clips, tmp_path):
+    """A part clears its own folder, and others' that are old: they may be at work."""
+    for name in (".part_0_of_1", ".part_1_of_4", ".part_2_of_4"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "clip9.npz").touch()
+    os.utime(tmp_path / ".part_1_of_4", (0, 0))
     run(clips, tmp_path)
-    assert not old.exists() and new.exists()  # another process may be writing the new one
+    assert [p.name for p in tmp_path.glob(".part*")] == [".part_2_of_4"]
+
+
+def test_true_size(clips, tmp_path):
+    run(clips, tmp_path, scale="height=1.75m", suffixes=["npz", "trc"])
+    result = load_reconstruction(tmp_path / "clip0.npz")
+    assert result.units == "m" and 0.5 < float(result.points[..., 1].max() - result.points[..., 1].min()) < 2.5
+    assert kt.load_motion(tmp_path / "clip0.trc").units == "m"
 
 
 def test_killed_and_taken_up_again(tmp_path, root):
@@ -154,7 +162,7 @@ def test_killed_and_taken_up_again(tmp_path, root):
     ]  # fmt: skip
     started = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
-    while len(list(output.rglob("clip*.npz"))) < 4 and time.monotonic() < deadline and started.poll() is None:
+    while len(list(output.glob("**/[!.]*.npz"))) < 4 and time.monotonic() < deadline and started.poll() is None:
         time.sleep(0.02)
     started.send_signal(signal.SIGKILL)
     started.wait()
@@ -163,8 +171,8 @@ def test_killed_and_taken_up_again(tmp_path, root):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert f"{30 - len(first)} made" in done.stdout and f"{len(first)} were there, 0 failed" in done.stdout
-    made = list(output.rglob("clip*.npz"))
-    assert len(made) == 30
+    made = list(output.rglob("*.npz"))
+    assert len(made) == 30 and not list(output.glob(".*"))
     assert all((p.stat().st_mtime_ns, p.stat().st_ino) == stamp for p, stamp in first.items())
     for path in made:
         assert torch.isfinite(load_reconstruction(path).points).all()
@@ -184,3 +192,18 @@ def test_launchers(clips, tmp_path, root, launcher, package):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert len(list((tmp_path / "out").rglob("*.npz"))) == 6
+
+
+def test_a_multirun_says_that_clips_failed(clips, tmp_path, root):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "bad.json").write_text("{")
+    kt.save(walking_person(8, skeleton="coco17").tracks, tmp_path / "in" / "good.npz")
+    command = [
+        sys.executable, str(root / "scripts" / "reconstruct_many.py"), "-m", f"input={tmp_path / 'in'}",
+        f"output={tmp_path / 'out'}", "method=kcs", "shards=2", "shard=range(0,2)", "hydra/launcher=joblib",
+        f"hydra.sweep.dir={tmp_path / 'sweep'}",
+    ]  # fmt: skip
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1 and "1 clips failed" in done.stderr
+    assert (tmp_path / "out" / "good.npz").exists() and (tmp_path / "out" / "bad.failed.txt").exists()

@@ -15,6 +15,7 @@ from kcs_torch import KcsError, OptionError, ShapeError, SkeletonError, Tracks
 from kcs_torch.errors import FormatError
 from kcs_torch.functional import bone_lengths
 from kcs_torch.skeleton import SKELETONS, Skeleton
+from kcs_torch.types.size import check_size, size_factor
 
 NAN, INF = math.nan, math.inf
 
@@ -460,3 +461,16 @@ def test_anything_gives_tracks_or_an_error_of_our_own(points, confidence, edges,
     assert ((tracks.weights >= 0) & (tracks.weights <= 1)).all()
     assert (tracks.points[~tracks.seen] == 0).all()
     assert tracks.fps is None or tracks.fps > 0
+
+
+def test_bones_are_named_in_any_spelling():
+    """Detectors and people spell joints in their own ways, and name a bone from either end."""
+    body = SKELETONS["body25b"]
+    lengths = torch.arange(1.0, body.num_bones + 1)
+    own = float(lengths[body.bone_names.index("LKnee-LAnkle")])
+    for name in ("LKnee-LAnkle", "left_knee-left_ankle", "left_ankle-left_knee", "l_knee-LAnkle"):
+        assert size_factor(body, lengths, None, {name: 430.0}) == pytest.approx(430 / own)
+        check_size(body, name)
+    for name in ("left_knee-right_ankle", "left_knee", "horn-tail"):
+        with pytest.raises(OptionError, match="LKnee-LAnkle"):
+            check_size(body, name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -94,6 +95,7 @@ def cleaner(
         if frames == SEEN:
             seen = tracks.seen.any(1).nonzero().flatten()
             tracks = step.trim(tracks, int(seen[0]), int(seen[-1]) + 1)
+            tracks = replace(tracks, notes=tuple(note for note in tracks.notes if "--frames seen" not in note))
         elif frames is not None:
             tracks = step.trim(tracks, start, stop)
         if gate:

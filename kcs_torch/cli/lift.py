@@ -43,6 +43,10 @@ Settings = Annotated[
 ]
 
 
+FEW = 0.1
+"""Share of the frames; of everybody, those in sight for less are warned of."""
+
+
 def lift(
     tracks: TracksPath,
     output: Annotated[
@@ -120,6 +124,7 @@ def lift(
     """Turn 2D joint tracks, or a video where a detector is installed, into 3D motion."""
     with answer(as_json):
         from kcs_torch.io import save_people, writer_for
+        from kcs_torch.types.size import check_size
 
         check_outputs(output, source=tracks)
         fields = method_fields(method, settings)
@@ -162,8 +167,14 @@ def lift(
         if together and frames == "seen":  # each has a first frame of their own then
             typer.echo(f"note: {', '.join(map(str, together))} not written: people begin at different frames", err=True)
             together = []
-        for number, _ in people:
+        for number, one in people:
             check_outputs([numbered(path, number) for path in output] if person == "all" else [], source=tracks)
+            if size_of is not None and not find:
+                check_size(one.skeleton, next(name for name in size_of if name != "units"), "--scale")
+            share = float(one.seen.any(1).double().mean())
+            if person == "all" and share < FEW:
+                say = f"person {number} is in sight in {100 * share:.0f} % of the frames only: the rest is made up"
+                typer.echo(f"warning: {say}", err=True)
         cleaned = [clean(one) for _, one in people]
         for (number, one), neat, lifted in zip(people, cleaned, _lifted(cleaned, method, fields, find), strict=True):
             names = [numbered(path, number) if person == "all" else path for path in output]

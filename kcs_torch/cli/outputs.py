@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -57,18 +56,9 @@ def parse_scale(text: str | None) -> dict[str, Any] | None:
     >>> parse_scale("height=1.75m")
     {'units': 'm', 'height': 1.75}
     """
-    from kcs_torch.errors import OptionError
-    from kcs_torch.types.size import METRES
+    from kcs_torch.types.size import parse_size
 
-    if text is None:
-        return None
-    found = re.fullmatch(r"(.+)=\s*([0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*([a-z]+)", text.strip())
-    if found is None or found[3] not in METRES or not 0 < float(found[2]) < float("inf"):
-        raise OptionError(
-            "--scale: expected height=1.75m, a bone such as left_knee-left_ankle=430mm, or factor=2mm, with one of the "
-            f"units {', '.join(METRES)}; got {text!r}"
-        )
-    return {"units": found[3], found[1].strip(): float(found[2])}
+    return None if text is None else parse_size(text, "--scale")
 
 
 def sized(data: _Sized, scale: dict[str, Any] | None) -> _Sized:

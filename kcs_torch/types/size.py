@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
-from kcs_torch.skeleton import Skeleton, stature_weights
+from kcs_torch.skeleton import Skeleton, map_joints, stature_weights
 from kcs_torch.types.intake import as_number
 
-__all__ = ["METRES", "size_factor", "unit_ratio"]
+__all__ = ["METRES", "check_size", "parse_size", "size_factor", "unit_ratio"]
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Units of length in metres."""
@@ -51,12 +53,8 @@ def size_factor(
         size = _number(given, f"{what}: {name}")
         if name == "height":
             own = _height(body, lengths, what)
-        elif name in body.bone_names:
-            own = float(lengths[body.bone_names.index(name)])
         else:
-            raise OptionError(
-                f"{what}: unknown size {name!r}: expected 'height' or a bone, one of {', '.join(body.bone_names)}"
-            )
+            own = float(lengths[_bone(body, name, what)])
         if not own > 0:
             raise OptionError(f"{what}: {name} is zero or unknown in this motion")
         factor = size / own
@@ -64,6 +62,32 @@ def size_factor(
     if not (factor > 0 and math.isfinite(factor)):
         raise OptionError(f"{what}: expected a positive factor, got {factor}")
     return factor
+
+
+def check_size(body: Skeleton, name: str, what: str = "scaled") -> None:
+    """Make sure that a body has a size of this name: ``height``, ``factor`` or a bone.
+
+    Raises:
+        OptionError: it has none.
+    """
+    if name == "height":
+        _stature(body, what)
+    elif name != "factor":
+        _bone(body, name, what)
+
+
+def _bone(body: Skeleton, name: str, what: str) -> int:
+    """Index of the bone of a name, however its joints are spelled and in either order."""
+    if name in body.bone_names:
+        return body.bone_names.index(name)
+    for cut in (i for i, letter in enumerate(name) if letter == "-"):
+        ends = map_joints(body.joints, [name[:cut], name[cut + 1 :]])
+        for i, bone in enumerate(body.bones):
+            if None not in ends and set(bone) == set(ends):
+                return i
+    raise OptionError(
+        f"{what}: unknown size {name!r}: expected 'height' or a bone, one of {', '.join(body.bone_names)}"
+    )
 
 
 def _number(value: object, what: str) -> float:
@@ -80,11 +104,34 @@ def _number(value: object, what: str) -> float:
 
 def _height(body: Skeleton, lengths: Tensor, what: str) -> float:
     """The person's stature; the mean over those legs whose bones are known."""
+    weights = _stature(body, what).to(lengths)
+    rows = torch.where(weights != 0, weights * lengths, torch.zeros_like(weights)).sum(-1)
+    return float(rows.nanmean())
+
+
+def _stature(body: Skeleton, what: str) -> Tensor:
+    """The weights of :func:`stature_weights`."""
     weights = stature_weights(body)
     if weights is None:
         raise OptionError(
             f"{what}: height needs a head and a foot among the joints; skeleton '{body.name}' has none: give a bone"
         )
-    weights = weights.to(lengths)
-    rows = torch.where(weights != 0, weights * lengths, torch.zeros_like(weights)).sum(-1)
-    return float(rows.nanmean())
+    return weights
+
+
+def parse_size(text: str, what: str = "scale") -> dict[str, Any]:
+    """Read a size with its unit as arguments of ``scaled``.
+
+    Raises:
+        OptionError: it is of another form.
+
+    >>> parse_size("height=1.75m"), parse_size("left_knee-left_ankle=430mm")
+    ({'units': 'm', 'height': 1.75}, {'units': 'mm', 'left_knee-left_ankle': 430.0})
+    """
+    found = re.fullmatch(r"(.+)=\s*([0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*([a-z]+)", text.strip())
+    if found is None or found[3] not in METRES or not 0 < float(found[2]) < float("inf"):
+        raise OptionError(
+            f"{what}: expected height=1.75m, a bone such as left_knee-left_ankle=430mm, or factor=2mm, with one of the "
+            f"units {', '.join(METRES)}; got {text!r}"
+        )
+    return {"units": found[3], found[1].strip(): float(found[2])}
