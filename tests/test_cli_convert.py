@@ -115,7 +115,7 @@ def test_scale_is_read():
         (["t.npz", "o.npz", "--scale", "height=1m"], "2D tracks have no true size"),
         (["t.npz", "o.npz", "--from-up", "z"], "are for 3D motion, got 2D tracks"),
         (["t.npz", "o.npz", "--up", "z"], "are for 3D motion|--up"),
-        (["m.trc", "o.html"], "got motion, which goes to"),
+        (["m.trc", "o.json"], "got motion, which goes to"),
         (["text", "o.npz"], "expected tracks or motion in one of"),
         (["absent", "o.npz"], "no such file"),
     ],

@@ -125,6 +125,8 @@ def test_motion(raw, tmp_path, name):
     same(load_motion(tmp_path / "m.npz"), motion, 1e-9)
     same(written_and_read(motion, motion, tmp_path, ".trc"), motion, 1e-5)
     same(written_and_read(motion, motion, tmp_path, ".c3d"), motion, 1e-5)
+    kt.save(motion, tmp_path / "x.html")
+    assert all(joint in (tmp_path / "x.html").read_text(encoding="utf-8") for joint in motion.skeleton.joints)
 
 
 def test_the_table_of_a_folder(raw, root):

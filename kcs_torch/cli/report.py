@@ -113,6 +113,7 @@ def summary(result: Reconstruction, solution: int = 1) -> dict[str, Any]:
         "viewpoint_turn": facts.viewpoint_turn,
         "bone_variation": facts.bone_variation,
         "reprojection_rms": facts.reprojection_rms,
+        "track_units": tracks.units,
         "converged": facts.converged,
         "iterations": facts.iterations,
         "seconds": facts.seconds,
@@ -134,7 +135,7 @@ def describe(facts: dict[str, Any]) -> str:
         "method": f"{facts['method']}: {ended}, {facts['iterations']} iterations{took}",
         "viewpoint turn": f"{facts['viewpoint_turn']:.0f} degrees",
         "bone variation": f"{facts['bone_variation']:.2f} %",
-        "reprojection": f"{facts['reprojection_rms']:.3g} {facts['units']} (root mean square)",
+        "reprojection": f"{facts['reprojection_rms']:.3g} {facts['track_units']} (root mean square)",
     }
     head = f"{facts['source']}: {facts['frames']} frames, {facts['joints']} joints ({facts['skeleton']}){rate}"
     lines = [head, *(f"  {name:<15} {text}" for name, text in rows.items())]

@@ -71,9 +71,13 @@ def show_skeleton(
 ) -> None:
     """Show a skeleton's joints, bones, mirror pairs, hinges and contacts; a file is checked."""
     with answer(as_json):
+        from kcs_torch.errors import OutputError
         from kcs_torch.skeleton import get_skeleton
 
         body = get_skeleton(name)
+        for path in output:
+            if not is_picture(path) and path.suffix.lower() != ".html":
+                raise OutputError(f"{path}: expected a file with one of the suffixes .png, .svg, .pdf and .html")
         check_outputs([path for path in output if not is_picture(path)])
         for path in output:
             if is_picture(path):

@@ -113,7 +113,9 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
         notes.append(f"joints matched by name with skeleton '{body.name}'" + (f"; {spare} left out" if spare else ""))
         return [i for i in found if i is not None]
     if len(names) == len(wanted) and all(i in (None, j) for j, i in enumerate(found)):
-        notes.append(f"joints taken in their order as those of skeleton '{body.name}': their names differ")
+        pairs = [f"{names[wanted.index(n)]} for {n}" for n in missing]
+        said = f"{', '.join(pairs[:4])}{', ...' if len(pairs) > 4 else ''}"
+        notes.append(f"joints taken in their order as those of skeleton '{body.name}', where names differ: {said}")
         return None
     listed = ", ".join(names)
     raise SkeletonError(

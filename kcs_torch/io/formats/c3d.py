@@ -51,6 +51,9 @@ def read(path: Path, options: MotionOptions) -> Motion:
         gone = [name for name, seen in zip(names, there, strict=True) if not seen]
         notes.append(f"never seen, left out: {', '.join(gone[:8])}{', ...' if len(gone) > 8 else ''}")
     rate = float(answer["rate"])
+    first, last = (int.from_bytes(Probe(path).head[at : at + 2], "little") for at in (6, 8))
+    if len(points) < last - first + 1 < 0xFFFF:
+        notes.append(f"the header tells {last - first + 1} frames, the file has {len(points)}: it is cut short")
     return build_motion(
         torch.from_numpy(points[:, there].copy()),
         options,

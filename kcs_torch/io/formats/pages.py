@@ -1,15 +1,20 @@
-"""Results to look at: pages, pictures, films and recordings, of one person or of several."""
+"""Results, and 3D motion, to look at: pages, pictures, films and recordings, of one person or of several."""
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-from kcs_torch.io.registry import Writer
-from kcs_torch.types import Reconstruction
+import torch
 
-__all__ = ["WRITERS"]
+from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.io.registry import Saving, Writer
+from kcs_torch.types import Diagnostics, Motion, Reconstruction
+
+__all__ = ["WRITERS", "as_result"]
 
 Results = Reconstruction | Sequence[Reconstruction]
 
@@ -55,19 +60,66 @@ def write_rrd(results: Results, path: Path) -> None:
     save_recording(results, path)
 
 
+def as_result(motion: Motion) -> Reconstruction:
+    """Motion as a camera sees it that stands a little to the side and above: what pages and films show."""
+    points = motion.in_camera(yaw=20.0, pitch=8.0)
+    frames = len(points)
+    size = bone_lengths(points, motion.skeleton.bone_index(device=points.device))
+    mean = motion.lengths
+    rigid = list(motion.skeleton.rigid)
+    spread = (size / mean - 1).square().nanmean(0).sqrt()[rigid]
+    return Reconstruction(
+        points,
+        torch.eye(3).to(points)[:2].expand(frames, 2, 3),
+        torch.ones_like(points[:, 0, 0]),
+        mean.nan_to_num(0.0),
+        motion.tracks(yaw=20.0, pitch=8.0),
+        "3D motion",
+        Diagnostics(
+            viewpoint_turn=0.0,
+            unseen_share=float((~motion.seen).double().mean()),
+            bone_variation=float(100 * spread.nanmedian()) if len(spread) else math.nan,
+            reprojection_rms=0.0,
+            converged=True,
+            iterations=0,
+            notes=("3D motion of a file, filmed from the side: no method made it",),
+        ),
+        units=motion.units or "units",
+    )
+
+
+def _shown(write: Callable[[Any, Path], None]) -> Callable[[Motion, Path, Saving], None]:
+    """The same for motion."""
+    return lambda motion, path, _: write(as_result(motion), path)
+
+
 WRITERS = (
     Writer(
         ".html",
         "a page with a 3D player, the tracks beside it, lengths and uncertainty over time; works offline",
         write_html,
+        _shown(write_html),
         write_people=write_html,
     ),
-    Writer(".png", "a sheet of key frames: the tracks, the motion from the camera and from the side", write_png),
     Writer(
-        ".gif", "a film of at most 200 frames: the tracks and the turning motion", write_gif, write_people=write_gif
+        ".png",
+        "a sheet of key frames: the tracks, the motion from the camera and from the side",
+        write_png,
+        _shown(write_png),
     ),
     Writer(
-        ".mp4", "a film of at most 900 frames: the tracks and the turning motion", write_mp4, write_people=write_mp4
+        ".gif",
+        "a film of at most 200 frames: the tracks and the turning motion",
+        write_gif,
+        _shown(write_gif),
+        write_people=write_gif,
     ),
-    Writer(".rrd", "a recording for the rerun viewer", write_rrd, write_people=write_rrd),
+    Writer(
+        ".mp4",
+        "a film of at most 900 frames: the tracks and the turning motion",
+        write_mp4,
+        _shown(write_mp4),
+        write_people=write_mp4,
+    ),
+    Writer(".rrd", "a recording for the rerun viewer", write_rrd, _shown(write_rrd), write_people=write_rrd),
 )
