@@ -88,8 +88,8 @@ def test_other_lengths_name_the_skeletons_that_fit(tmp_path):
     with pytest.raises(FormatError, match=r"75 \(body25.*got 51; 17 joints fit skeleton=.*'coco17'"):
         load_tracks(folder)
     assert load_tracks(folder, skeleton="coco17").skeleton.name == "coco17"
-    with pytest.raises(SkeletonError, match="expected the 17 joints"):
-        load_tracks(write_openpose(tmp_path / "other", alone()), skeleton="h36m17")
+    with pytest.raises(SkeletonError, match="expected the 21 joints"):
+        load_tracks(write_openpose(tmp_path / "other", alone()), skeleton="hand21")
 
 
 def test_another_skeleton_takes_the_joints_by_name(tmp_path):

@@ -13,6 +13,7 @@ from samples import walking_motion as walk
 import kcs_torch as kt
 from kcs_torch.errors import FormatError, OptionError, OutputError, ShapeError, SkeletonError
 from kcs_torch.io import MOTION_READERS, detect_motion_format, load_any, load_motion, save
+from kcs_torch.io.formats.pages import as_result
 from kcs_torch.types import Motion
 from kcs_torch.types.axes import AXES, from_y_up, to_y_up
 
@@ -293,10 +294,21 @@ def test_an_unknown_rate_is_told(tmp_path):
         assert load_motion(tmp_path / f"m{suffix}").fps == pytest.approx(30)
 
 
-@pytest.mark.parametrize("suffix", [".html", ".png", ".json"])
-def test_motion_is_no_result(tmp_path, suffix):
-    with pytest.raises(OutputError, match=r"got motion, which goes to .bvh, .c3d, .csv, .npz, .trc"):
-        walk().save(tmp_path / f"m{suffix}")
+def test_motion_is_no_result(tmp_path):
+    with pytest.raises(OutputError, match=r"got motion, which goes to .bvh, .c3d, .csv"):
+        walk().save(tmp_path / "m.json")
+
+
+def test_motion_can_be_looked_at(tmp_path):
+    """Pages and pictures show motion as a camera beside it sees it."""
+    motion = walk()
+    shown = as_result(motion)
+    assert shown.skeleton == motion.skeleton and shown.units == motion.units
+    assert torch.allclose(shown.points, motion.in_camera(yaw=20.0, pitch=8.0))
+    assert torch.allclose(shown.tracks.points, shown.points[..., :2], atol=1e-6 * float(shown.points.abs().max()))
+    assert shown.diagnostics.bone_variation == pytest.approx(0, abs=0.1)
+    for suffix in (".html", ".png"):
+        assert motion.save(tmp_path / f"m{suffix}").stat().st_size > 5000
 
 
 def test_csv_holds_results_as_they_are_or_with_an_axis_up(tmp_path):

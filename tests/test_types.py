@@ -12,6 +12,7 @@ from samples import walk_result
 from torch.testing import assert_close
 
 from kcs_torch import KcsError, OptionError, ShapeError, SkeletonError, Tracks
+from kcs_torch.data import walking_person
 from kcs_torch.errors import FormatError
 from kcs_torch.functional import bone_lengths
 from kcs_torch.skeleton import SKELETONS, Skeleton
@@ -474,3 +475,18 @@ def test_bones_are_named_in_any_spelling():
     for name in ("left_knee-right_ankle", "left_knee", "horn-tail"):
         with pytest.raises(OptionError, match="LKnee-LAnkle"):
             check_size(body, name)
+
+
+def test_joints_of_another_body_are_those_in_common():
+    """What the other body lacks is unseen, and told; where it lacks too much nothing is taken."""
+    walk = walking_person(10, skeleton="body25").tracks
+    names = list(walk.skeleton.joints)
+    tracks = Tracks.from_arrays(walk.points, joint_names=names, skeleton="h36m17")
+    there = dict(zip(tracks.skeleton.joints, tracks.weights.gt(0).all(0).tolist(), strict=True))
+    assert there["pelvis"] and there["left_knee"] and not there["spine"] and sum(there.values()) >= 14
+    knee = tracks.points[:, tracks.skeleton.joints.index("left_knee")]
+    assert torch.equal(knee, walk.points[:, names.index("LKnee")])
+    assert any("unseen" in note and "spine" in note for note in tracks.notes)
+    few = [n for n in names if "Knee" in n or "Hip" in n or "Ankle" in n]
+    with pytest.raises(SkeletonError, match="none of them named"):
+        Tracks.from_arrays(walk.points[:, [names.index(n) for n in few]], joint_names=few, skeleton="h36m17")

@@ -96,11 +96,17 @@ def choose_skeleton(
     return graph
 
 
+MOST_LACKING = 3
+"""One joint in so many may be missing where those of another body are matched by name."""
+
+
 def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[str]) -> list[int] | None:
     """Return where each joint of ``body`` stands among ``names``, in any spelling; None: take them in their order.
 
+    Of another body's joints those in common are taken, and -1 stands for those that it lacks, a third at most.
+
     Raises:
-        SkeletonError: some joints are not among the names, and these are more or fewer, or in another order.
+        SkeletonError: too many joints are not among the names, or equally many names stand in another order.
     """
     wanted = body.joints[: body.num_observed]
     if tuple(names) == wanted:
@@ -117,6 +123,11 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
         said = f"{', '.join(pairs[:4])}{', ...' if len(pairs) > 4 else ''}"
         notes.append(f"joints taken in their order as those of skeleton '{body.name}', where names differ: {said}")
         return None
+    if len(names) != len(wanted) and MOST_LACKING * len(missing) <= len(wanted):
+        notes.append(
+            f"joints matched by name with skeleton '{body.name}'; not among them, so unseen: {', '.join(missing)}"
+        )
+        return [-1 if i is None else i for i in found]
     listed = ", ".join(names)
     raise SkeletonError(
         f"{source}: expected the {len(wanted)} joints of skeleton '{body.name}', got {len(names)} joints, none of them "
@@ -173,9 +184,9 @@ def take_in(
         raise ShapeError(f"{source}: joint_names: expected {num_joints} names, got {len(names)}")
     if skeleton is not None and names is not None:
         order = joint_order(names, get_skeleton(skeleton), source, remarks)
-        if order is not None:
-            xy = xy[:, order]
-            confidence = confidence if confidence is None else confidence[:, order]
+        if order is not None:  # -1 is the column of a joint that is not there
+            xy = torch.nn.functional.pad(xy, (0, 0, 0, 1), value=math.nan)[:, order]
+            confidence = confidence if confidence is None else torch.nn.functional.pad(confidence, (0, 1))[:, order]
     body = choose_skeleton(skeleton, names, edges, xy.shape[1], source, remarks)
     label = lambda t, n: f"frame {int(t)}, joint '{body.joints[int(n)]}'"  # noqa: E731
     infinite = torch.isinf(xy).any(-1)
