@@ -186,7 +186,7 @@ def lift(
                 results.append(result)
             reports.append(summary(result, solution))
             reports[-1]["notes"] += told
-            reports[-1]["cleaning"] = list(neat.notes[len(one.notes) :])
+            reports[-1]["cleaning"] = [note for note in neat.notes if note not in one.notes]
             if not as_json:
                 typer.echo(describe(reports[-1]))
                 folders = f", in new folders: {', '.join(map(str, made))}" if made else ""

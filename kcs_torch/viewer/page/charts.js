@@ -41,12 +41,13 @@ class Chart {
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.font = "11px system-ui, sans-serif";
     pen.textAlign = "right";
+    const tight = height - MARGIN.top - MARGIN.bottom < 36;  // no room for three labels
     for (const value of this.both ? [-this.top, 0, this.top] : [0, this.top / 2, this.top]) {
-      const y = this.y(value, height);
+      const y = this.y(value, height), silent = tight && value < this.top;
       stroke(pen, [MARGIN.left, y], [width - MARGIN.right, y], value ? "#ececec" : "#c9c9c9", 1);
       pen.fillStyle = "#666";
       pen.textBaseline = y < 12 ? "top" : y > height - 12 ? "bottom" : "middle";
-      pen.fillText(`${this.both && value > 0 ? "+" : ""}${Number(value.toPrecision(3))}${this.unit === "%" ? " %" : ""}`, MARGIN.left - 5, y);
+      if (!silent) pen.fillText(`${this.both && value > 0 ? "+" : ""}${Number(value.toPrecision(3))}${this.unit === "%" ? " %" : ""}`, MARGIN.left - 5, y);
     }
     for (const line of this.lines) this.trace(pen, line, width, height, line.color + (this.lines.length > 12 ? "80" : "c0"), 1);
     this.stale = false;

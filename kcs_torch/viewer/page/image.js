@@ -22,7 +22,10 @@ const drawImage = bodies => {
   const projections = bodies.map(({ person, joints, middle }) =>
     project(person, state.frame, middle ? joints.map((v, i) => v + middle[i % 3]) : joints));
   if (state.follow && sight.body > 0) {
-    const [x, y] = [0, 1].map(a => quantile(projections.flatMap(p => [...p].filter((_, i) => i % 2 === a)), 0.5));
+    const [x, y] = [0, 1].map(a => {
+      const all = projections.flatMap(p => [...p].filter((_, i) => i % 2 === a));
+      return (quantile(all, 0.02) + quantile(all, 0.98)) / 2;
+    });
     const half = 0.62 * sight.body * (people.length > 1 ? 2 : 1);
     [low, high] = [[x - half, y - half], [x + half, y + half]];
   }
