@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import warnings
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from typer.testing import CliRunner
 import kcs_torch as kt
 from kcs_torch.cli import app
 from kcs_torch.io import load_reconstruction
+from kcs_torch.methods import perspective
 from kcs_torch.types import Intrinsics
 
 LENS = (1500.0, 1480.0, 960.0, 540.0)
@@ -275,3 +277,36 @@ def test_command_line(tmp_path):
         done = CliRunner().invoke(app, [*words, "--intrinsics", wrong])
         assert done.exit_code == 2
         assert "--intrinsics: expected FX,FY,CX,CY" in done.output
+
+
+@dataclass(frozen=True)
+class Noted(kt.KCS):
+    """KCS with a note on the tracks, and a solution beside it that has another one."""
+
+    def solve(self, tracks, cameras):
+        found = replace(super().solve(tracks, cameras), notes=("tracks smoothed",))
+        return replace(
+            found, alternatives=(replace(found, points=-found.points, notes=("the mirror image in depth",)),)
+        )
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+def test_what_was_done_to_the_tracks_is_told_whichever_solution_wins(monkeypatch):
+    """The method's notes on the tracks are the best solution's, although it was an alternative; its own are of none."""
+    real = perspective._refine
+
+    def others_first(*arguments, **options):
+        found = real(*arguments, **options)
+        back = list(range(len(found.depth)))[::-1]
+        rows = {name: getattr(found, name)[back] for name in ("distance", "depth", "energy")}
+        return replace(found, lifted=tuple(found.lifted[i] for i in back), **rows)
+
+    clip = kt.data.walking_person(20, skeleton="coco17", turn=0.0, yaw=50.0)
+    lens = Intrinsics.of((1500.0, 1500.0, 0.0, 0.0))
+    image = lens.project(clip.points + clip.points.new_tensor([0.0, 0.0, 3000.0]))
+    tracks = kt.Tracks.from_arrays(image[:, :17], skeleton="coco17", fps=30.0)
+    for order in (real, others_first):
+        monkeypatch.setattr(perspective, "_refine", order)
+        found = kt.reconstruct(tracks, method=Noted(), intrinsics=lens)
+        assert "tracks smoothed" in found.diagnostics.notes
+        assert not any("mirror image" in note for one in (found, *found.alternatives) for note in one.diagnostics.notes)
