@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 import os
 import shutil
 import time
 import traceback
 import warnings
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +21,7 @@ from kcs_torch.errors import KcsError, KcsWarning, OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.folders import natural_key
 from kcs_torch.io.load import load_people
-from kcs_torch.io.write import save, writer_for
+from kcs_torch.io.write import save, takes_up, writer_for
 from kcs_torch.methods.base import Method
 from kcs_torch.reconstruct import reconstruct_all
 from kcs_torch.types import Reconstruction, Tracks
@@ -42,10 +45,12 @@ class Clip:
     Attributes:
         source: a file, or a folder of files that make one clip.
         target: of the results, without their suffixes.
+        name: of the source within the folder of all clips.
     """
 
     source: Path
     target: Path
+    name: str
 
     def outputs(self, suffixes: Sequence[str]) -> list[Path]:
         """The files of its results."""
@@ -57,8 +62,8 @@ class Clip:
         return self.target.with_name(self.target.name + FAILED)
 
     def share_of(self, shards: int) -> int:
-        """Which of so many parts of the work it belongs to: the same one whatever other clips there are."""
-        return zlib.crc32(str(self.target).encode("utf-8", "surrogateescape")) % shards
+        """Which of so many parts of the work it belongs to: told by its name alone, the same on every machine."""
+        return zlib.crc32(self.name.encode("utf-8", "surrogateescape")) % shards
 
 
 @dataclass(frozen=True)
@@ -110,11 +115,11 @@ def clips_of(source: str | Path, output: str | Path, pattern: str = "*") -> list
     found.sort(key=lambda p: natural_key(str(p)))
     names = [p.relative_to(folder) for p in found]
     short = [n.with_suffix("") for n in names]
-    counts: dict[Path, int] = {}
-    for name in short:
-        counts[name] = counts.get(name, 0) + 1
+    counts = Counter(short)
     pairs = zip(found, names, short, strict=True)
-    return [Clip(path, output / (brief if counts[brief] == 1 else name)) for path, name, brief in pairs]
+    return [
+        Clip(path, output / (brief if counts[brief] == 1 else name), name.as_posix()) for path, name, brief in pairs
+    ]
 
 
 def reconstruct_folder(
@@ -140,7 +145,7 @@ def reconstruct_folder(
 
     A clip is done when all its results are there, and each appears whole or not at all: however often the work is
     killed and begun again, nothing is lost or made twice. A clip that fails leaves ``NAME.failed.txt`` with the
-    reason and is not tried again.
+    reason and is not tried again, unless ``retry`` says so.
 
     Args:
         source: folder of tracks in any format that is read; a folder in it is a clip of many files.
@@ -154,7 +159,7 @@ def reconstruct_folder(
         everybody: reconstruct all people of a clip, to NAME_0, NAME_1, ..., not the most seen one alone.
         retry: try clips again that failed.
         scale: the true size of every body, ``height=1.75m`` or a bone's; else results are in the unit of the tracks.
-        up: as of :func:`kcs_torch.save`.
+        up: the axis that points up in those files that hold results so: y or z.
         units: as of :func:`kcs_torch.save`.
         intrinsics: of the camera that saw them all, as of :func:`kcs_torch.reconstruct`.
         progress: gets a line every few seconds.
@@ -177,12 +182,15 @@ def reconstruct_folder(
     for name in reading:
         if name not in _READING:
             raise unknown("reading option", name, _READING)
+    if up is not None and not any(takes_up(Path(f"x{suffix}")) for suffix in suffixes):
+        raise OptionError(f"up: none of {', '.join(suffixes)} holds results with y or z up")
+    size = None if scale is None else parse_size(scale)
+    reconstruct_all([], method=method, intrinsics=intrinsics)  # what is wrong with these is so for every clip
     begin = time.monotonic()
     clips = [clip for clip in clips_of(source, output, pattern) if clip.share_of(shards) == shard]
     workplace = Path(output) / f".part_{shard}_of_{shards}"
     _sweep(Path(output), workplace)
-    size = None if scale is None else parse_size(scale)
-    work = _Work(method, suffixes, everybody, workplace, size, {"up": up, "units": units}, intrinsics, reading)
+    work = _Work(method, suffixes, everybody, workplace, size, up, units, intrinsics, reading)
     todo, skipped, failed = [], 0, []
     for clip in clips:
         if clip.failure.exists() and not retry:
@@ -196,13 +204,12 @@ def reconstruct_folder(
     for start in range(0, len(todo), batch):
         made, count, wrong = work.reconstruct(todo[start : start + batch])
         done, frames, failed = done + made, frames + count, failed + wrong
-        now = time.monotonic()
-        if progress is not None and (now - told > 5 or start + batch >= len(todo)):
-            told, rate = now, (done + len(failed)) / max(now - begin, 1e-9)
-            left = (len(todo) - start - batch) / rate if rate else 0.0
+        now, tried = time.monotonic(), min(start + batch, len(todo))
+        if progress is not None and (now - told > 5 or tried == len(todo)):
+            told, rate = now, tried / max(now - begin, 1e-9)
             progress(
                 f"{skipped + done + len(failed)} of {len(clips)} clips, {len(failed)} failed, "
-                f"{rate:.1f} clips a second, {max(left, 0) / 60:.1f} minutes left"
+                f"{rate:.1f} clips a second, {(len(todo) - tried) / rate / 60:.1f} minutes left"
             )
     _sweep(Path(output), workplace)
     return Outcome(len(clips), done, skipped, tuple(failed), frames, time.monotonic() - begin)
@@ -217,7 +224,8 @@ class _Work:
     everybody: bool
     workplace: Path
     size: dict[str, Any] | None
-    saving: dict[str, Any]
+    up: str | None
+    units: str | None
     intrinsics: Any
     reading: dict[str, object]
 
@@ -231,41 +239,39 @@ class _Work:
         """Reconstruct a batch: clips and frames that were made, and what failed."""
         failed: list[tuple[Path, str]] = []
         read: list[tuple[Clip, list[Tracks]]] = []
+        made = frames = 0
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)  # the results' notes tell them
             for clip in clips:
-                for people in self._tried(clip, failed, lambda clip=clip: self._people(clip)):
-                    read.append((clip, people))
-            read.sort(key=lambda pair: pair[1][0].num_frames)
+                with _listing(clip, failed):
+                    read.append((clip, self._people(clip)))
             try:
-                found = reconstruct_all(
-                    [one for _, people in read for one in people], method=self.method, intrinsics=self.intrinsics
-                )
-            except OptionError:
-                raise
+                found = iter(self._lift([one for _, people in read for one in people]))
             except Exception:  # one of them is to blame: each for itself
                 found = None
-            made = frames = 0
-            results = iter(found or ())
             for clip, people in read:
-
-                def finish(clip: Clip = clip, people: list[Tracks] = people) -> None:
-                    own = (
-                        reconstruct_all(people, method=self.method)
-                        if found is None
-                        else [next(results) for _ in people]
-                    )
-                    for number, result in enumerate(own):
-                        target = clip if not self.everybody else Clip(clip.source, _numbered(clip.target, number))
-                        self._save(result if self.size is None else result.scaled(**self.size), target)
-                    if self.everybody:
-                        with atomic_path(_people_list(clip)) as temporary:
-                            temporary.write_text(f"{len(own)}\n", encoding="utf-8")
-                    clip.failure.unlink(missing_ok=True)
-
-                for _ in self._tried(clip, failed, finish):
+                own = None if found is None else list(itertools.islice(found, len(people)))
+                with _listing(clip, failed):
+                    self._write(clip, self._lift(people) if own is None else own)
                     made, frames = made + 1, frames + people[0].num_frames
         return made, frames, failed
+
+    def _people(self, clip: Clip) -> list[Tracks]:
+        people = load_people(clip.source, **self.reading)  # type: ignore[arg-type]
+        return people if self.everybody else people[:1]
+
+    def _lift(self, people: list[Tracks]) -> list[Reconstruction]:
+        return reconstruct_all(people, method=self.method, intrinsics=self.intrinsics)
+
+    def _write(self, clip: Clip, results: list[Reconstruction]) -> None:
+        """Write all results of a clip, and that they are all."""
+        for number, result in enumerate(results):
+            target = clip if not self.everybody else replace(clip, target=_numbered(clip.target, number))
+            self._save(result if self.size is None else result.scaled(**self.size), target)
+        if self.everybody:
+            with atomic_path(_people_list(clip)) as temporary:
+                temporary.write_text(f"{len(results)}\n", encoding="utf-8")
+        clip.failure.unlink(missing_ok=True)
 
     def _save(self, result: Reconstruction, clip: Clip) -> None:
         """Write all files of a result to this part's own folder, then move them to their place.
@@ -274,26 +280,22 @@ class _Work:
         """
         clip.target.parent.mkdir(parents=True, exist_ok=True)
         for path in clip.outputs(self.suffixes):
-            save(result, self.workplace / path.name, notes=[], **self.saving)
-            os.replace(self.workplace / path.name, path)
+            part = self.workplace / path.name
+            save(result, part, up=self.up if takes_up(path) else None, units=self.units, notes=[])
+            os.replace(part, path)
 
-    def _people(self, clip: Clip) -> list[Tracks]:
-        people = load_people(clip.source, **self.reading)  # type: ignore[arg-type]
-        return people if self.everybody else people[:1]
 
-    @staticmethod
-    def _tried(clip: Clip, failed: list[tuple[Path, str]], work: Callable) -> Iterator:
-        """What the work returns; nothing where it fails, which is written down instead."""
-        try:
-            yield work()
-        except OptionError:
-            raise  # true of every clip
-        except Exception as error:  # of one clip among thousands: the others go on
-            reason = f"{type(error).__name__}: {error}"
-            text = reason if isinstance(error, KcsError) else f"{reason}\n{traceback.format_exc()}"
-            with atomic_path(clip.failure) as temporary:
-                temporary.write_text(f"{text}\n", encoding="utf-8", errors="replace")
-            failed.append((clip.source, reason.partition("\n")[0]))
+@contextmanager
+def _listing(clip: Clip, failed: list[tuple[Path, str]]) -> Iterator[None]:
+    """Write down what fails of one clip among thousands; the others go on."""
+    try:
+        yield
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        text = reason if isinstance(error, KcsError) else f"{reason}\n{traceback.format_exc()}"
+        with atomic_path(clip.failure) as temporary:
+            temporary.write_text(f"{text}\n", encoding="utf-8", errors="replace")
+        failed.append((clip.source, reason.partition("\n")[0]))
 
 
 def _numbered(path: Path, number: int) -> Path:

@@ -77,15 +77,15 @@ def test_damaged_files_end_in_our_errors(tmp_path):
 
 
 def test_a_crash_of_the_library_is_an_error_of_the_file(tmp_path, monkeypatch):
-    from kcs_torch.io.formats import c3d
+    from kcs_torch.io import worker
 
     path = save(walk(4), tmp_path / "w.c3d")
-    worker = tmp_path / "c3d_worker.py"
-    worker.write_text("import os; os.abort()")
-    monkeypatch.setattr(c3d, "__file__", str(tmp_path / "formats" / "c3d.py"))
+    script = tmp_path / "c3d_worker.py"
+    script.write_text("import os; os.abort()")
+    monkeypatch.setattr(worker, "__file__", str(tmp_path / "worker.py"))
     with pytest.raises(FormatError, match="ezc3d failed on it: it ended with status -6"):
         load_motion(path)
-    worker.write_text("import time; time.sleep(60)")
-    monkeypatch.setattr(c3d, "PATIENCE", 0.3)
+    script.write_text("import time; time.sleep(60)")
+    monkeypatch.setattr(worker, "PATIENCE", 0.3)
     with pytest.raises(FormatError, match="gave no answer"):
         load_motion(path)

@@ -12,7 +12,8 @@ import pytest
 import torch
 
 import kcs_torch as kt
-from kcs_torch.data import walking_person
+from kcs_torch import many
+from kcs_torch.data import random_motion, walking_person
 from kcs_torch.io import load_reconstruction
 from kcs_torch.many import clips_of, reconstruct_folder
 
@@ -90,6 +91,43 @@ def test_a_clip_that_breaks_the_batch_is_found(clips, tmp_path, monkeypatch):
     outcome = run(clips, tmp_path)
     assert outcome.done == 5 and outcome.failed[0][1] == "ZeroDivisionError: planted"
     assert "Traceback" in (tmp_path / "clip2.failed.txt").read_text()
+
+
+def test_the_camera_is_kept_where_a_clip_breaks_the_batch(tmp_path, monkeypatch):
+    """Each for itself is still each with its intrinsics."""
+    source = make_clips(tmp_path / "in", 3)
+    real, asked = many.reconstruct_all, []
+
+    def spied(tracks, **options):
+        asked.append((len(tracks), options["intrinsics"]))
+        if len(tracks) > 1:
+            raise ZeroDivisionError("planted")
+        return real(tracks, **options)
+
+    monkeypatch.setattr(many, "reconstruct_all", spied)
+    camera = (1500.0, 1500.0, 960.0, 540.0)
+    outcome = run(source, tmp_path / "out", intrinsics=camera)
+    assert outcome.done == 3 and asked == [(0, camera), (3, camera)] + 3 * [(1, camera)]
+
+
+def test_an_option_that_fits_some_clips_only_costs_the_others_alone(tmp_path):
+    """A clip that is no number of a size, say, is listed; what fits no clip is told before anything is done."""
+    source = make_clips(tmp_path / "in", 2)
+    kt.save(random_motion("hand21", 8).tracks, source / "hand.npz")
+    outcome = run(source, tmp_path / "out", scale="height=1.75m")
+    assert outcome.done == 2 and [path.name for path, _ in outcome.failed] == ["hand.npz"]
+    with pytest.raises(kt.KcsError, match="height"):
+        run(source, tmp_path / "other", scale="height=-1m")
+
+
+def test_up_goes_to_the_files_that_hold_it(tmp_path):
+    source = make_clips(tmp_path / "in", 1)
+    assert run(source, tmp_path / "out", suffixes=[".npz", ".bvh"], up="z").failed == ()
+    up = kt.load_motion(tmp_path / "out" / "clip0.bvh").points
+    run(source, tmp_path / "y", suffixes=[".bvh"], up="y")
+    assert not np.allclose(up, kt.load_motion(tmp_path / "y" / "clip0.bvh").points)
+    with pytest.raises(kt.OptionError, match="up"):
+        run(source, tmp_path / "none", up="z")
 
 
 def test_everybody(tmp_path):

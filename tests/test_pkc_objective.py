@@ -12,17 +12,10 @@ from torch.testing import assert_close
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths, bone_vectors
 from kcs_torch.methods.lockstep import run, together
+from kcs_torch.methods.pkc import batch
 from kcs_torch.methods.pkc import objective as module
-from kcs_torch.methods.pkc.objective import (
-    Objective,
-    Task,
-    Weights,
-    _Unknowns,
-    at_pace,
-    bone_noise,
-    minimise_all,
-    pace_of,
-)
+from kcs_torch.methods.pkc.batch import Task, minimise_all
+from kcs_torch.methods.pkc.objective import Objective, Weights, _Unknowns, at_pace, bone_noise, pace_of
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.solvers import lbfgs
 
@@ -443,8 +436,8 @@ def test_clips_are_refined_together_as_alone():
 
 def test_runs_are_not_too_large(monkeypatch):
     tasks = several()
-    monkeypatch.setattr(module, "TOGETHER", 100)
-    runs = module._runs(list(range(3)), tasks)
+    monkeypatch.setattr(batch, "TOGETHER", 100)
+    runs = batch._runs(list(range(3)), tasks)
     assert sorted(i for run in runs for i in run) == [0, 1, 2] and len(runs) == 3
 
 

@@ -73,22 +73,14 @@ def check_up(up: str | None, paths: Sequence[Path]) -> None:
         OptionError: it is none, or results do not go so to any of the files.
     """
     from kcs_torch.errors import OptionError, unknown
-    from kcs_torch.io.write import UP
+    from kcs_torch.io.write import UP, takes_up
 
     if up is None:
         return
     if up not in UP:
         raise unknown("axis for --up", up, UP)
-    if not any(map(_turns, paths)):
+    if not any(map(takes_up, paths)):
         raise OptionError(f"--up: expected a .bvh, .c3d, .csv or .trc file to write, got {', '.join(map(str, paths))}")
-
-
-def _turns(path: Path) -> bool:
-    """Whether a result goes to this file with y or z up."""
-    from kcs_torch.io import writer_for
-
-    writer = writer_for(path)
-    return writer.turns or writer.write is None
 
 
 def write_files(
@@ -100,6 +92,7 @@ def write_files(
         OptionError: an axis is asked for, but no file is of a kind that takes it.
     """
     from kcs_torch.io import save
+    from kcs_torch.io.write import takes_up
     from kcs_torch.types import Reconstruction
 
     if isinstance(data, Reconstruction):
@@ -107,7 +100,7 @@ def write_files(
     told = []
     for path in paths:
         notes: list[str] = []
-        fits = not isinstance(data, Reconstruction) or _turns(path)
+        fits = not isinstance(data, Reconstruction) or takes_up(path)
         with progress(f"writing {path}"):
             save(data, path, up=up if fits else None, units=units, notes=notes)
         told += [f"{path}: {note}" for note in notes]

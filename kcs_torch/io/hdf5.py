@@ -8,9 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import subprocess
-import sys
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,11 +17,10 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.archive import LARGE, RATIO
-from kcs_torch.io.registry import need, read_error
+from kcs_torch.io.registry import need
+from kcs_torch.io.worker import ask_worker
 
 __all__ = ["Tree", "read_hdf5", "read_tree"]
-
-PATIENCE = 60.0  # seconds, and one more for each 16 MiB
 
 
 class Tree(NamedTuple):
@@ -82,40 +78,20 @@ def read_hdf5(
 def _ask(path: Path, kind: str, **request: Any) -> Tree:
     """Let the worker read."""
     need("h5py", f"{path}: {kind}", FormatError)
-    worker = Path(__file__).with_name("hdf5_worker.py")
-    places = os.pathsep.join(p for p in sys.path if p)  # where this process would find h5py
     request |= {"path": str(path), "kind": kind, "matlab": kind != "HDF5", "large": LARGE, "ratio": RATIO}
+    answer, data = ask_worker("hdf5_worker.py", json.dumps(request), path, "the HDF5 library")
     try:
-        done = subprocess.run(
-            [sys.executable or "python3", "-P", str(worker), json.dumps(request)],
-            env=os.environ | {"PYTHONPATH": places, "OPENBLAS_NUM_THREADS": "1"},
-            timeout=PATIENCE + path.stat().st_size / 2**24,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise FormatError(f"{path}: damaged: the HDF5 library gave no answer in {error.timeout:.0f} seconds") from None
-    except OSError as error:
-        raise read_error(path, error) from None
-    try:
-        if done.returncode:
-            raise ValueError(f"it ended with status {done.returncode}")
-        at = done.stdout.index(b"\n") + 1
-        answer = json.loads(done.stdout[:at])
-        if "error" in answer:
-            raise FormatError(f"{path}: {answer['error']}")
         tree = Tree(
             {_printable(k): tuple(map(int, v)) for k, v in answer["shapes"].items()},
             answer.get("attributes", {}),
             {_printable(k): list(map(str, v)) for k, v in answer.get("texts", {}).items()},
             {},
         )
+        at = 0
         for name in map(_printable, answer["read"]):
             count = math.prod(tree.shapes[name])
-            tree.arrays[name] = np.frombuffer(done.stdout, "<f8", count, at).reshape(tree.shapes[name])
+            tree.arrays[name] = np.frombuffer(data, "<f8", count, at).reshape(tree.shapes[name])
             at += 8 * count
-    except FormatError:
-        raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise FormatError(f"{path}: damaged: the HDF5 library failed on it: {error}") from None
     return tree

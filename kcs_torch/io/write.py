@@ -14,7 +14,7 @@ from kcs_torch.io.registry import Saving, Writer
 from kcs_torch.types import Motion, Reconstruction, Tracks
 from kcs_torch.types.size import METRES, unit_ratio
 
-__all__ = ["save", "save_people", "writer_for"]
+__all__ = ["save", "save_people", "takes_up", "writer_for"]
 
 UP = ("y", "z")
 
@@ -100,6 +100,16 @@ def save(
         for warning in saving.warnings:
             warnings.warn(f"{path}: {warning}", KcsWarning, stacklevel=2)
     return Path(path)
+
+
+def takes_up(path: str | Path) -> bool:
+    """Whether a result goes to this file with y or z up, and not in the camera's axes.
+
+    Raises:
+        OutputError: the suffix is unknown.
+    """
+    writer = writer_for(path)
+    return writer.turns or writer.write is None
 
 
 def save_people(results: Sequence[Reconstruction], path: str | Path) -> Path:

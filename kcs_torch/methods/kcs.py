@@ -180,7 +180,9 @@ class KCS(Method):
         """Fit the cameras of several clips: those of one number of joints, and with or without a start, together."""
         groups: dict[object, list[int]] = {}
         for i, one in enumerate(asked):
-            groups.setdefault((one.start is None, one.points.shape[1], one.points.dtype), []).append(i)
+            points = one.points
+            kind = (one.start is None, points.shape[1], points.dtype, points.device)
+            groups.setdefault(kind, []).append(i)
         out: dict[int, CameraFit] = {}
         for group in groups.values():
             tracks, points, weights, low, high = (

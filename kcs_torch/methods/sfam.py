@@ -113,7 +113,8 @@ class SfAM(Method):
         groups: dict[object, list[int]] = {}
         for i, one in enumerate(tracks):
             whole = self.lengths == "shape" and one.num_frames <= (self.window or one.num_frames)
-            groups.setdefault((one.skeleton, one.num_frames, one.points.dtype) if whole else i, []).append(i)
+            kind = (one.skeleton, one.num_frames, one.points.dtype, one.points.device)
+            groups.setdefault(kind if whole else i, []).append(i)
         out: dict[int, Estimate] = {}
         for group in groups.values():
             if len(group) == 1:

@@ -6,10 +6,6 @@ its time and memory; that costs a fraction of a second.
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +15,13 @@ import torch
 from kcs_torch.errors import FormatError, OutputError
 from kcs_torch.io.build_motion import build_motion, distinct
 from kcs_torch.io.plain import plain
-from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer, need, read_error
+from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer, need
+from kcs_torch.io.worker import ask_worker
 from kcs_torch.types import Motion
 from kcs_torch.types.axes import from_y_up
 
 __all__ = ["MOTION_READERS", "WRITERS"]
 
-PATIENCE = 60.0  # seconds, and one more for each 16 MiB
 _SCREEN = {"y": ("+X", "+Y"), "z": ("+X", "+Z")}  # which axes point right and up on a screen
 
 
@@ -71,31 +67,10 @@ def _ask(path: Path) -> tuple[dict[str, Any], np.ndarray[Any, np.dtype[np.float6
     need("ezc3d", f"{path}: C3D", FormatError)
     if not path.is_file():
         raise FormatError(f"{path}: expected a C3D file, got a folder or the beginning of a name")
-    worker = Path(__file__).parents[1] / "c3d_worker.py"
-    places = os.pathsep.join(p for p in sys.path if p)  # where this process would find ezc3d
+    answer, data = ask_worker("c3d_worker.py", str(path), path, "ezc3d")
     try:
-        done = subprocess.run(
-            [sys.executable or "python3", "-P", str(worker), str(path)],
-            env=os.environ | {"PYTHONPATH": places, "OPENBLAS_NUM_THREADS": "1"},
-            timeout=PATIENCE + path.stat().st_size / 2**24,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise FormatError(f"{path}: damaged: ezc3d gave no answer in {error.timeout:.0f} seconds") from None
-    except OSError as error:
-        raise read_error(path, error) from None
-    try:
-        if done.returncode:
-            raise ValueError(f"it ended with status {done.returncode}")
-        at = done.stdout.index(b"\n") + 1
-        answer = json.loads(done.stdout[:at])
-        if "error" in answer:
-            raise FormatError(f"{path}: {answer['error']}")
         frames, markers = map(int, answer["shape"])
-        return answer, np.frombuffer(done.stdout, "<f8", frames * markers * 3, at).reshape(frames, markers, 3)
-    except FormatError:
-        raise
+        return answer, np.frombuffer(data, "<f8", frames * markers * 3).reshape(frames, markers, 3)
     except (ValueError, KeyError, TypeError) as error:
         raise FormatError(f"{path}: damaged: ezc3d failed on it: {error}") from None
 

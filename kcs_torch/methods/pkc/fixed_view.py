@@ -12,8 +12,9 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.lockstep import Search, run
+from kcs_torch.methods.pkc.batch import Task, minimise_all
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limb_paths, limbs_of, waves
-from kcs_torch.methods.pkc.objective import Objective, Refined, Task, Weights, at_pace, minimise_all, pace_of
+from kcs_torch.methods.pkc.objective import Objective, Refined, Weights, at_pace, pace_of
 from kcs_torch.methods.pkc.trunk import TURN, Trunk, longest_image, siblings, trunk_misfit, trunk_path, trunk_turns
 from kcs_torch.nn.posture import free_bones
 from kcs_torch.skeleton import Skeleton
@@ -120,26 +121,25 @@ def fixed_view(
     Returns:
         The hypotheses, best first.
     """
-    settings = {"rate": rate, "noise": noise, "rounds": rounds, "steps": steps, "weights": weights, "anchor": anchor}
-    return run(searching(skeleton, image, **settings), minimise_all)  # type: ignore[arg-type]
+    noise = torch.zeros_like(image[..., 0]) if noise is None else noise
+    search = searching(skeleton, image, rate, noise, rounds, steps, anchor, weights or Weights())
+    return run(search, minimise_all)
 
 
 def searching(
     skeleton: Skeleton,
     image: Tensor,
-    *,
-    rate: float = 30.0,
-    noise: Tensor | None = None,
-    rounds: int = 2,
-    steps: int = 30,
-    weights: Weights | None = None,
+    rate: float,
+    noise: Tensor,
+    rounds: int,
+    steps: int,
     anchor: Tensor | None = None,
+    weights: Weights = Weights(),  # noqa: B008 (frozen)
 ) -> Search[Task, Refined, Hypotheses]:
-    """:func:`fixed_view` as a search, which may run beside others."""
+    """:func:`fixed_view` as a search, which may run beside others; arguments as there."""
     slow = 30.0 / rate
     pace = pace_of(image, skeleton, rate)
-    weights = at_pace(weights or Weights(), rate, pace)
-    noise = torch.zeros_like(image[..., 0]) if noise is None else noise
+    weights = at_pace(weights, rate, pace)
     costs = SignCosts()
     costs = replace(
         costs,

@@ -16,11 +16,12 @@ from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import WEAK_TURN, Estimate, Method
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, depth_deviation, told_by_prior
+from kcs_torch.methods.pkc.batch import Task, minimise_all
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.fixed_view import Hypotheses, distinct
 from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.pkc.moving_view import MovingView, moving_view
-from kcs_torch.methods.pkc.objective import Refined, Task, minimise_all
+from kcs_torch.methods.pkc.objective import Refined
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import weak_perspective
 from kcs_torch.methods.unseen import place_unseen

@@ -16,7 +16,7 @@ from kcs_torch.nn.posture import ForeshorteningEnergy, PostureEnergy, Proportion
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
 
-__all__ = ["Objective", "Refined", "Task", "Weights", "at_pace", "bone_noise", "minimise_all", "pace_of"]
+__all__ = ["Objective", "Refined", "Weights", "at_pace", "bone_noise", "pace_of"]
 
 NOISE, CORNER = 0.8, 0.3
 """Share of the noise's variance that is not to be explained, and how gently its cost sets in."""
@@ -273,73 +273,6 @@ class Objective:
             out.anchor = torch.stack([one if part.anchor is None else part.anchor for part in parts])[each]
             out.held = gather([float(part.anchor is not None) for part in parts])
         return out
-
-
-@dataclass(frozen=True)
-class Task:
-    """Hypotheses that are to be refined, as :meth:`Objective.minimise` does.
-
-    Attributes:
-        objective: of the clip.
-        depth: (H, T, N).
-        lengths: (H, B).
-        num_steps: of L-BFGS.
-        loose: by how much lengths are less certain.
-    """
-
-    objective: Objective
-    depth: Tensor
-    lengths: Tensor
-    num_steps: int
-    loose: float = 1.0
-
-
-TOGETHER = 16384
-"""Frames of hypotheses that are refined as one batch; more would only fall out of the processor's cache."""
-
-
-def minimise_all(tasks: Sequence[Task]) -> list[Refined]:
-    """:meth:`Objective.minimise` of each task; those of one skeleton and equal settings are refined together."""
-    groups: dict[object, list[int]] = {}
-    for i, task in enumerate(tasks):
-        groups.setdefault((task.objective.skeleton, task.num_steps, task.loose, task.depth.dtype), []).append(i)
-    out: dict[int, Refined] = {}
-    for group in groups.values():
-        for run in _runs(sorted(group, key=lambda i: tasks[i].depth.shape[1]), tasks):
-            out |= zip(run, _minimise_joined([tasks[i] for i in run]), strict=True)
-    return [out[i] for i in range(len(tasks))]
-
-
-def _runs(order: list[int], tasks: Sequence[Task]) -> list[list[int]]:
-    """Tasks in order of length, cut into runs that are not too large."""
-    runs: list[list[int]] = []
-    rows = 0
-    for i in order:
-        count, frames = tasks[i].depth.shape[:2]
-        if not runs or (rows + count) * frames > TOGETHER:
-            runs.append([])
-            rows = 0
-        runs[-1].append(i)
-        rows += count
-    return runs
-
-
-def _minimise_joined(tasks: list[Task]) -> list[Refined]:
-    """Tasks of one skeleton and equal settings, padded to the longest."""
-    if len(tasks) == 1:
-        (task,) = tasks
-        return [task.objective.minimise(task.depth, task.lengths, task.num_steps, task.loose)]
-    counts = [len(task.depth) for task in tasks]
-    most = max(task.depth.shape[1] for task in tasks)
-    pad = lambda z: torch.nn.functional.pad(z, (0, 0, 0, most - z.shape[1]))  # noqa: E731
-    joined = Objective.joined([task.objective for task in tasks], counts)
-    depth, lengths = torch.cat([pad(task.depth) for task in tasks]), torch.cat([task.lengths for task in tasks])
-    found = joined.refined(depth, lengths, tasks[0].num_steps, tasks[0].loose)
-    out = []
-    for task, *part in zip(tasks, *(x.split(counts) for x in found[:4]), strict=True):
-        z, size, energy, moved = part
-        out.append(Refined(z[:, : task.depth.shape[1]], size, energy, moved, found.steps).sorted())
-    return out
 
 
 class _Unknowns:
