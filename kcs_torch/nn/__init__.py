@@ -9,6 +9,7 @@ from kcs_torch.nn.energies import (
     SymmetryEnergy,
 )
 from kcs_torch.nn.layers import SVT, BoneLengths, BoneVectors, KCSMatrix
+from kcs_torch.nn.networks import CameraHead, MLPLifter, TemporalLifter
 from kcs_torch.nn.posture import ContactEnergy, ForeshorteningEnergy, PostureEnergy, ProportionEnergy
 from kcs_torch.nn.procrustean import ProcrusteanEnergy
 from kcs_torch.nn.unrolled import UnrolledFPC, UnrolledSfAM
@@ -18,17 +19,20 @@ __all__ = [
     "BoneLengthEnergy",
     "BoneLengths",
     "BoneVectors",
+    "CameraHead",
     "ContactEnergy",
     "ForeshorteningEnergy",
     "HingeEnergy",
     "KCSMatrix",
     "LowRankEnergy",
+    "MLPLifter",
     "PostureEnergy",
     "ProcrusteanEnergy",
     "ProportionEnergy",
     "ReprojectionEnergy",
     "SmoothnessEnergy",
     "SymmetryEnergy",
+    "TemporalLifter",
     "UnrolledFPC",
     "UnrolledSfAM",
 ]
