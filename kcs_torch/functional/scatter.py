@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional.derivatives import batch_first
 
 __all__ = ["inverse_scatter", "scatter_log_det"]
 
@@ -23,7 +24,7 @@ def scatter_log_det(values: Tensor, eps: Tensor | float) -> Tensor:
         eps: positive, a number or a tensor that broadcasts against (...), in squared units of the values.
 
     Returns:
-        (...). Differentiable once, in the values.
+        (...). Differentiable once, in the values; a second derivative raises ``RuntimeError``.
 
     Raises:
         ShapeError: fewer than 2 dimensions.
@@ -33,7 +34,8 @@ def scatter_log_det(values: Tensor, eps: Tensor | float) -> Tensor:
     """
     if values.ndim < 2:
         raise ShapeError(f"scatter_log_det: expected values (..., T, D), got {tuple(values.shape)}")
-    out: Tensor = _ScatterLogDet.apply(values, torch.as_tensor(eps, dtype=values.dtype, device=values.device))
+    level = torch.as_tensor(eps, dtype=values.dtype, device=values.device)
+    out: Tensor = _ScatterLogDet.apply(values, level)[0]
     return out
 
 
@@ -52,14 +54,44 @@ def _factor(values: Tensor, eps: Tensor) -> Tensor:
 
 
 class _ScatterLogDet(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, eps: Tensor) -> Tensor:
-        factor = _factor(values, eps)
-        ctx.save_for_backward(values, factor)
-        return values.shape[-2] * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    """(values (..., T, D), eps (...)) to the log-determinant (...) and the Cholesky factor (..., D, D)."""
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        values, factor = ctx.saved_tensors
-        return grad[..., None, None] * (values @ torch.cholesky_inverse(factor)), None
+    def forward(values: Tensor, eps: Tensor) -> tuple[Tensor, Tensor]:
+        factor = _factor(values, eps)
+        return values.shape[-2] * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1), factor
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(output[1])
+        ctx.save_for_backward(inputs[0], output[1])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor, _: Any) -> tuple[Tensor, None]:
+        return _ScatterAdjoint.apply(grad, *ctx.saved_tensors), None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], values: Tensor, eps: Tensor) -> Any:
+        padded, _ = batch_first(info, in_dims, (values, eps), (2, 0))
+        return _ScatterLogDet.apply(*padded), (0, 0)
+
+
+class _ScatterAdjoint(torch.autograd.Function):
+    """X (X^T X / T + eps I)^-1, weighed by the cotangent; not to be differentiated."""
+
+    @staticmethod
+    def forward(grad: Tensor, values: Tensor, factor: Tensor) -> Tensor:
+        return (grad[..., None, None] * (values @ torch.cholesky_inverse(factor))).sum_to_size(values.shape)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> None:
+        raise RuntimeError("second derivatives of scatter_log_det are not supported")
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *tensors: Tensor) -> Any:
+        padded, shapes = batch_first(info, in_dims, tensors, (0, 2, 2))
+        return _ScatterAdjoint.apply(*padded).reshape(shapes[1]), 0

@@ -7,18 +7,17 @@ padded or unseen tracks. The functions here differentiate the spectral *function
     (f_i - f_j) / (s_i - s_j)    and    (f_i + f_j) / (s_i + s_j),
 
 both in [0, 1], applied to the symmetric and skew part of ``U^T G V``. Repeated and zero singular values are harmless.
+The derivatives are in ``kcs_torch.functional.derivatives``; ``torch.compile``, ``torch.export`` and ``torch.func.vmap``
+take them.
 """
 
 from __future__ import annotations
-
-import functools
-from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional.derivatives import LargestSum, PSDShrink, ShrinkSingularValues
 
 __all__ = ["dct_basis", "log_det", "nuclear_norm", "psd_shrink", "singular_values", "spectral_norm", "svt"]
 
@@ -49,7 +48,7 @@ def svt(matrix: Tensor, threshold: Tensor | float) -> Tensor:
     _check_matrix(matrix, "svt")
     work = _double(matrix)
     level = torch.as_tensor(threshold, dtype=work.dtype, device=matrix.device)
-    out: Tensor = _SVT.apply(work, level)
+    out: Tensor = ShrinkSingularValues.apply(work, level)[0]
     return out.to(matrix.dtype)
 
 
@@ -76,7 +75,7 @@ def psd_shrink(matrix: Tensor, threshold: Tensor | float) -> Tensor:
         raise ShapeError(f"psd_shrink: expected square matrices, got {tuple(matrix.shape)}")
     work = _single(matrix)
     level = torch.as_tensor(threshold, dtype=work.dtype, device=matrix.device)
-    out: Tensor = _PSDShrink.apply((work + work.mT) / 2, level)
+    out: Tensor = PSDShrink.apply((work + work.mT) / 2, level)[0]
     return out.to(matrix.dtype)
 
 
@@ -93,7 +92,7 @@ def nuclear_norm(matrix: Tensor) -> Tensor:
     7.0
     """
     _check_matrix(matrix, "nuclear_norm")
-    out: Tensor = _LargestSum.apply(_double(matrix), min(matrix.shape[-2:]))
+    out: Tensor = LargestSum.apply(_double(matrix), min(matrix.shape[-2:]))[0]
     return out.to(matrix.dtype)
 
 
@@ -110,7 +109,7 @@ def spectral_norm(matrix: Tensor) -> Tensor:
     4.0
     """
     _check_matrix(matrix, "spectral_norm")
-    out: Tensor = _LargestSum.apply(_double(matrix), 1)
+    out: Tensor = LargestSum.apply(_double(matrix), 1)[0]
     return out.to(matrix.dtype)
 
 
@@ -136,9 +135,11 @@ def log_det(matrix: Tensor, eps: Tensor | float) -> Tensor:
     work = _single(matrix)
     level = torch.as_tensor(eps, dtype=work.dtype, device=matrix.device)
     eye = torch.eye(matrix.shape[-1], dtype=work.dtype, device=matrix.device)
-    factor, info = torch.linalg.cholesky_ex(work + level[..., None, None] * eye)
-    if bool((info != 0).any()):
-        raise ShapeError("log_det: matrix + eps I is not positive definite: expected a covariance and eps > 0")
+    try:
+        factor = torch.linalg.cholesky(work + level[..., None, None] * eye)
+    except torch.linalg.LinAlgError:
+        message = "log_det: matrix + eps I is not positive definite: expected a covariance and eps > 0"
+        raise ShapeError(message) from None
     return (2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)).to(matrix.dtype)
 
 
@@ -186,167 +187,6 @@ def dct_basis(
     basis = torch.cos(torch.pi / length * time[:, None] * wave) * (2 / length) ** 0.5
     basis[:, 0] = length**-0.5
     return basis
-
-
-# ---------------------------------------------------------------------- derivatives
-
-
-class _Barrier(torch.autograd.Function):
-    """Passes gradients on, and raises where somebody differentiates them again.
-
-    ``once_differentiable`` alone would cut the graph without a word where the cotangent is a constant.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, value: Tensor, anchor: Tensor) -> Tensor:
-        return value.view_as(value)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[None, None]:
-        raise RuntimeError("second derivatives of svt, psd_shrink and the norms of singular values are not supported")
-
-
-def _first_order(backward: Callable[..., tuple[Tensor | None, ...]]) -> Callable[..., tuple[Tensor | None, ...]]:
-    """Decorate a backward pass that cannot be differentiated itself."""
-
-    @functools.wraps(backward)
-    def guarded(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        with torch.no_grad():
-            grads = backward(ctx, grad)
-        if not torch.is_grad_enabled():
-            return grads
-        anchor = torch.zeros((), requires_grad=True)
-        return tuple(None if g is None else _Barrier.apply(g, anchor) for g in grads)
-
-    return guarded
-
-
-class _SVT(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, matrix: Tensor, threshold: Tensor) -> Tensor:
-        rotated, raw, right, tall = _rotate(matrix)
-        level = threshold[..., None]
-        ctx.save_for_backward(rotated, raw, right, threshold)
-        ctx.tall = tall
-        out = (rotated * _ratio(raw, level)[..., None, :]) @ right.mT
-        return out if tall else out.mT
-
-    @staticmethod
-    @_first_order
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        rotated, raw, right, threshold = ctx.saved_tensors
-        left, s = _left(rotated, raw)
-        f = (s - threshold[..., None]).clamp_min(0)
-        g = grad if ctx.tall else grad.mT
-        gv = g @ right  # (..., M, n)
-        p = left.mT @ gv  # (..., n, n)
-        grad_matrix = grad_threshold = None
-        if ctx.needs_input_grad[0]:
-            ratio = _ratio(s, threshold[..., None])
-            even = _divided(s, threshold[..., None])
-            total = s[..., :, None] + s[..., None, :]
-            odd = (f[..., :, None] + f[..., None, :]) / torch.where(total > 0, total, torch.ones_like(total))
-            odd = torch.where(total > 0, odd, torch.maximum(ratio[..., :, None], ratio[..., None, :]))
-            symmetric, skew = (p + p.mT) / 2, (p - p.mT) / 2
-            inner = even * symmetric + odd * skew
-            outside = (gv - left @ p) * ratio[..., None, :]
-            grad_matrix = (left @ inner + outside) @ right.mT
-            if not ctx.tall:
-                grad_matrix = grad_matrix.mT
-        if ctx.needs_input_grad[1]:
-            active = (f > 0).to(f.dtype)
-            grad_threshold = -(p.diagonal(dim1=-2, dim2=-1) * active).sum(-1)
-            grad_threshold = grad_threshold.sum_to_size(threshold.shape)
-        return grad_matrix, grad_threshold
-
-
-class _PSDShrink(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, matrix: Tensor, threshold: Tensor) -> Tensor:
-        value, vector = torch.linalg.eigh(matrix)
-        f = (value - threshold[..., None]).clamp_min(0)
-        ctx.save_for_backward(value, vector, f, threshold)
-        return (vector * f[..., None, :]) @ vector.mT
-
-    @staticmethod
-    @_first_order
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        value, vector, f, threshold = ctx.saved_tensors
-        p = vector.mT @ ((grad + grad.mT) / 2) @ vector
-        grad_matrix = grad_threshold = None
-        if ctx.needs_input_grad[0]:
-            grad_matrix = vector @ (_divided(value, threshold[..., None]) * p) @ vector.mT
-        if ctx.needs_input_grad[1]:
-            active = (f > 0).to(f.dtype)
-            grad_threshold = -(p.diagonal(dim1=-2, dim2=-1) * active).sum(-1)
-            grad_threshold = grad_threshold.sum_to_size(threshold.shape)
-        return grad_matrix, grad_threshold
-
-
-class _LargestSum(torch.autograd.Function):
-    """Sum of the largest singular values (Ky Fan norm): all of them, or the first."""
-
-    @staticmethod
-    def forward(ctx: Any, matrix: Tensor, count: int) -> Tensor:
-        rotated, s, right, tall = _rotate(matrix)
-        kept = slice(s.shape[-1] - count, None)
-        ctx.save_for_backward(_left(rotated, s)[0][..., kept], right[..., kept])
-        ctx.tall = tall
-        return s[..., kept].sum(-1)
-
-    @staticmethod
-    @_first_order
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None]:
-        left, right = ctx.saved_tensors
-        polar = left @ right.mT
-        return grad[..., None, None] * (polar if ctx.tall else polar.mT), None
-
-
-def _rotate(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, bool]:
-    """Rotate the columns of a tall (or transposed wide) matrix onto its right singular vectors.
-
-    Returns ``matrix @ V`` (M, n), its column norms (n), which are the singular values in rising order, V (n, n),
-    and whether the matrix was tall.
-    """
-    tall = matrix.shape[-2] >= matrix.shape[-1]
-    work = matrix if tall else matrix.mT
-    _, right = torch.linalg.eigh(work.mT @ work)
-    rotated = work @ right
-    return rotated, torch.linalg.vector_norm(rotated, dim=-2), right, tall
-
-
-def _left(rotated: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-    """Left singular vectors, and the singular values, both zero below sqrt(eps) times the largest value.
-
-    There the Gram matrix no longer tells directions apart.
-    """
-    if s.shape[-1] == 0:
-        return rotated, s
-    kept = s > torch.finfo(s.dtype).eps ** 0.5 * s.amax(-1, keepdim=True)
-    inverse = torch.where(kept, 1 / torch.where(kept, s, torch.ones_like(s)), torch.zeros_like(s))
-    return rotated * inverse[..., None, :], torch.where(kept, s, torch.zeros_like(s))
-
-
-def _divided(s: Tensor, level: Tensor) -> Tensor:
-    """Divided differences (f_i - f_j) / (s_i - s_j) of f(s) = max(s - level, 0), f' on equal pairs; in [0, 1].
-
-    It is the share of the interval between the two values that lies above the level: written so, no difference of
-    nearly equal numbers is divided by another.
-    """
-    hi = torch.maximum(s[..., :, None], s[..., None, :])
-    lo = torch.minimum(s[..., :, None], s[..., None, :])
-    edge = level[..., None]
-    split = (lo < edge) & (hi > edge)  # only then is the share neither 0 nor 1; the gap is positive there
-    share = (hi - edge) / torch.where(split, hi - lo, torch.ones_like(hi))
-    above = (lo >= edge) & ((hi > edge) | (edge <= 0))
-    return torch.where(split, share, above.to(s.dtype))
-
-
-def _ratio(s: Tensor, level: Tensor) -> Tensor:
-    """f(s) / s for f(s) = max(s - level, 0), continued to s = 0: 1 where the level is 0, else 0."""
-    positive = s > 0
-    ratio = (1 - level / torch.where(positive, s, torch.ones_like(s))).clamp_min(0)
-    return torch.where(positive, ratio, (level <= 0).to(s.dtype))
 
 
 def _single(matrix: Tensor) -> Tensor:
