@@ -1,8 +1,8 @@
 """Spectral functions as autograd Functions whose derivatives never divide by a gap between singular values.
 
 Each comes as a pair: the function, whose context holds its inputs, and its adjoint, a Function of its own that cannot
-be differentiated again: as it depends on the inputs, a second derivative is noticed and refused even where the cotangent
-is a constant, for which ``once_differentiable`` would cut the graph without a word. Both have a rule for
+be differentiated again. As the adjoint depends on the inputs, a second derivative is noticed and refused even where the
+cotangent is a constant, for which ``once_differentiable`` would cut the graph without a word. Both have a rule for
 ``torch.func.vmap``: a further batch dimension at the front.
 """
 

@@ -47,6 +47,9 @@ def inverse_scatter(values: Tensor, eps: Tensor | float) -> Tensor:
 
 def _factor(values: Tensor, eps: Tensor) -> Tensor:
     scatter = values.mT @ values / max(values.shape[-2], 1)
+    batch = torch.broadcast_shapes(scatter.shape[:-2], eps.shape)
+    if batch != scatter.shape[:-2]:
+        scatter = scatter.expand(*batch, *scatter.shape[-2:]).clone()
     scatter.diagonal(dim1=-2, dim2=-1).add_(eps[..., None])
     factor, info = torch.linalg.cholesky_ex(scatter)
     # A step so far that nothing is left of eps is answered by NaN, which a line search refuses, not by an exception.
