@@ -197,8 +197,8 @@ def test_bones_of_no_weight_may_be_anything():
     gone = WALK[:6].clone()
     gone[:, 6] = math.nan
     gone.requires_grad_()
-    value = energy(gone, lengths, weights)
-    assert_close(value, energy(WALK[:6], lengths, weights))
+    value = energy(gone, lengths, bone_weights=weights)
+    assert_close(value, energy(WALK[:6], lengths, bone_weights=weights))
     (grad,) = torch.autograd.grad(value, gone)
     assert torch.isfinite(grad).all() and not grad[:, 6].any() and grad.any()
 

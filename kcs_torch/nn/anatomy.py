@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.nn.layers import SkeletonModule, known_frames, wide
+from kcs_torch.nn.layers import SkeletonModule, wide
+from kcs_torch.nn.masks import known_points, weighs_joints
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["HingeEnergy"]
@@ -52,7 +53,8 @@ class HingeEnergy(SkeletonModule):
             points: (..., T, N, 3).
             lengths: (..., B) of the bones; None takes each bone's root mean square over the T frames, as is always done
                 for the axes.
-            weights: (..., T) of the frames: 0 for one that pads a shorter clip; all 1 if None.
+            weights: (..., T, N) of the joints: a hinge weighs as much as the least of the five that define it; or
+                (..., T) of the frames: 0 for one that pads a shorter clip; all 1 if None.
 
         Returns:
             (..., T), without unit.
@@ -61,8 +63,10 @@ class HingeEnergy(SkeletonModule):
             ShapeError: the shapes do not fit.
         """
         wrong = (-self.bend(points, lengths, weights)).clamp_min(0)
-        each = 0.5 * (self.firm.to(wrong.dtype) * wrong.square()).sum(-1)
-        return each if weights is None else each * weights
+        each = 0.5 * self.firm.to(wrong.dtype) * wrong.square()
+        if weights is not None:
+            each = each * self._share(points, weights)
+        return each.sum(-1)
 
     def bend(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """The sine s of each hinge, (..., T, H), positive where it bends its way; arguments as in :meth:`forward`."""
@@ -71,16 +75,23 @@ class HingeEnergy(SkeletonModule):
             raise ShapeError(f"HingeEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
         if lengths is not None and lengths.shape[-1:] != (len(self.bones),):
             raise ShapeError(f"HingeEnergy: expected lengths (..., {len(self.bones)}), got {tuple(lengths.shape)}")
-        full = wide(known_frames(points, weights))
+        share = None if weights is None else self._share(points, weights)
+        full = wide(known_points(points, weights, self))
         ends = full.index_select(-2, self.joints.mT.reshape(-1)).unflatten(-2, (5, len(self.joints)))
         parent, joint, child, left, right = ends.unbind(-3)  # each (..., T, H, 3)
         upper, lower, axis = joint - parent, child - joint, left - right
         if lengths is None:
-            upper, lower = _to_size(upper, weights), _to_size(lower, weights)
+            upper, lower = _to_size(upper, share), _to_size(lower, share)
         else:
             above, below = lengths.to(full.dtype)[..., None, self.limbs].unbind(-1)  # each (..., 1, H)
             upper, lower = _divide(upper, above[..., None]), _divide(lower, below[..., None])
-        return (self.sign.to(full.dtype) * _triple(upper, lower, _to_size(axis, weights))).to(points.dtype)
+        return (self.sign.to(full.dtype) * _triple(upper, lower, _to_size(axis, share))).to(points.dtype)
+
+    def _share(self, points: Tensor, weights: Tensor) -> Tensor:
+        """Weights of the hinges, (..., T, H), or of all alike, (..., T, 1)."""
+        if weighs_joints(weights, points, self):
+            return weights[..., self.joints].amin(-1)
+        return weights[..., None]
 
 
 def _triple(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
@@ -89,12 +100,15 @@ def _triple(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 
 def _to_size(vectors: Tensor, weights: Tensor | None) -> Tensor:
-    """Vectors (..., T, H, 3) over their root mean square length in the clip; 0 where they all are."""
+    """Vectors (..., T, H, 3) over their root mean square length in the clip; 0 where they all are.
+
+    Weights are (..., T, H) or (..., T, 1).
+    """
     square = vectors.square().sum(-1, keepdim=True)
     if weights is None:
         square = square.mean(-3, keepdim=True)
     else:
-        share = weights.to(square)[..., None, None]
+        share = weights.to(square)[..., None]
         square = (share * square).sum(-3, keepdim=True) / share.sum(-3, keepdim=True).clamp_min(1e-9)
     return _divide(vectors, torch.where(square > 0, square, torch.ones_like(square)).sqrt())
 

@@ -17,6 +17,7 @@ from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.spectral import log_det, nuclear_norm, svt
 from kcs_torch.nn.layers import SkeletonModule, full_precision, known, narrow, wide
+from kcs_torch.nn.masks import bone_share, safe_root, some
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lm import fit_bones
 
@@ -65,10 +66,9 @@ class BoneLengthEnergy(SkeletonModule):
         size = bone_lengths(known(wide(points), weights), self.bones)  # (..., T, B)
         share = self.rigid.to(size.dtype).expand_as(size)
         if weights is not None:
-            share = share * torch.minimum(weights[..., self.bones[:, 0]], weights[..., self.bones[:, 1]])
+            share = share * bone_share(weights, self.bones)
         if lengths is None:
-            total = share.sum(-2, keepdim=True)
-            lengths = (size * share).sum(-2, keepdim=True) / torch.where(total > 0, total, torch.ones_like(total))
+            lengths = (size * share).sum(-2, keepdim=True) / some(share.sum(-2, keepdim=True))
         else:
             lengths = lengths[..., None, :]
         return narrow(0.5 * (share * (size - lengths).square()).sum(-1), points)
@@ -176,22 +176,48 @@ class LowRankEnergy(nn.Module):
             raise OptionError(f"LowRankEnergy: expected kind 'nuclear' or 'log_det' and eps > 0, got {shown} and {eps}")
         self.kind, self.eps = kind, eps
 
-    def forward(self, points: Tensor) -> Tensor:
-        """Return the energy (...) of clips (..., T, N, D)."""
+    def forward(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return the energy of each clip.
+
+        Args:
+            points: (..., T, N, D).
+            weights: (..., T, N) of the joints. A frame or a joint of weight 0 is out, as if the matrix had no such row
+                or columns. A joint that is unseen in some frames is taken for 0 there by the nuclear norm, and for its
+                mean over time by the log-determinant, whose covariance divides by what each joint was seen.
+
+        Returns:
+            (...): in the unit of the points, or without one.
+
+        Raises:
+            ShapeError: the shapes do not fit.
+        """
         check_clip(points, self)
-        matrix = points.flatten(-2)
+        check_weights(weights, points, self)
+        matrix = known(points, weights).flatten(-2)
+        share = None if weights is None else weights.repeat_interleave(points.shape[-1], -1)  # (..., T, N D)
         if self.kind == "nuclear":
-            return nuclear_norm(matrix)
-        frames = matrix.shape[-2]
+            return nuclear_norm(matrix if share is None else matrix * safe_root(share).to(matrix.dtype))
         with full_precision(points):
-            wide = matrix.to(
-                torch.promote_types(matrix.dtype, torch.float32)
-            )  # in half precision a covariance is not definite
-            centred = wide - wide.mean(-2, keepdim=True)
+            return narrow(self._log_det(wide(matrix), share), points)
+
+    def _log_det(self, matrix: Tensor, share: Tensor | None) -> Tensor:
+        """T/2 log det(Sigma + eps I) of rows (..., T, D); what has no share in any frame adds nothing."""
+        if share is None:
+            frames: Tensor | float = float(matrix.shape[-2])
+            centred = matrix - matrix.mean(-2, keepdim=True)
             covariance = centred.mT @ centred / frames
-            scale = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
-            level = self.eps * torch.where(scale > 0, scale, torch.ones_like(scale))
-            return (frames / 2 * log_det(covariance, level)).to(matrix.dtype)
+            gone = torch.zeros_like(covariance[..., 0])
+            variance = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
+        else:
+            share = share.to(matrix.dtype)
+            frames, count = share.amax(-1).sum(-1), share.sum(-2, keepdim=True)
+            mean = (share * matrix).sum(-2, keepdim=True) / some(count)
+            centred = safe_root(share / some(count)) * (matrix - mean)
+            covariance = centred.mT @ centred
+            gone = (count <= 0).to(matrix.dtype).squeeze(-2)
+            variance = covariance.diagonal(dim1=-2, dim2=-1).sum(-1) / some((1 - gone).sum(-1))
+        level = self.eps * torch.where(variance > 0, variance, torch.ones_like(variance))
+        return frames / 2 * log_det(covariance + torch.diag_embed(gone * (1 - level[..., None])), level)
 
     def prox(self, points: Tensor, threshold: Tensor | float) -> Tensor:
         """Singular value shrinkage of S#, the nuclear norm's proximal map: (..., T, N, D)."""
@@ -229,7 +255,7 @@ class SmoothnessEnergy(nn.Module):
 
 
 class SymmetryEnergy(SkeletonModule):
-    """1/2 sum over mirror bones of (|left| - |right|)^2, per frame.
+    """1/2 sum over mirror bones of w (|left| - |right|)^2, per frame.
 
     Raises:
         SkeletonError: see :class:`Skeleton`; a skeleton without mirror pairs gives 0.
@@ -242,11 +268,16 @@ class SymmetryEnergy(SkeletonModule):
         pairs = torch.tensor(self.skeleton.mirror_bones, dtype=torch.long).reshape(-1, 2)
         self.register_buffer("pairs", pairs, persistent=False)
 
-    def forward(self, points: Tensor) -> Tensor:
-        """Return (..., T) of points (..., T, N, 3)."""
+    def forward(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return (..., T) of points (..., T, N, 3) and weights (..., T, N): twins weigh as the least of their ends."""
         self.check(points, clip=True)
-        size = bone_lengths(wide(points), self.bones)
-        return narrow(0.5 * (size[..., self.pairs[:, 0]] - size[..., self.pairs[:, 1]]).square().sum(-1), points)
+        check_weights(weights, points, self)
+        size = bone_lengths(known(wide(points), weights), self.bones)
+        square = (size[..., self.pairs[:, 0]] - size[..., self.pairs[:, 1]]).square()
+        if weights is not None:
+            share = bone_share(weights, self.bones)
+            square = square * torch.minimum(share[..., self.pairs[:, 0]], share[..., self.pairs[:, 1]])
+        return narrow(0.5 * square.sum(-1), points)
 
 
 def check_clip(points: Tensor, module: nn.Module) -> None:
@@ -269,5 +300,4 @@ def centred_residual(seen: Tensor, tracks: Tensor, weights: Tensor | None) -> Te
         return difference - difference.mean(-2, keepdim=True)
     share = weights[..., None]
     total = share.sum(-2, keepdim=True)
-    mean = (difference * share).sum(-2, keepdim=True) / torch.where(total > 0, total, torch.ones_like(total))
-    return difference - mean
+    return difference - (difference * share).sum(-2, keepdim=True) / some(total)

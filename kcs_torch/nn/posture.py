@@ -9,7 +9,8 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.nn.layers import SkeletonModule, known, known_frames, narrow, wide
+from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
+from kcs_torch.nn.masks import bone_share, known_points, safe_root, some, weighs_joints
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["ContactEnergy", "ForeshorteningEnergy", "PostureEnergy", "ProportionEnergy"]
@@ -110,16 +111,14 @@ class PostureEnergy(SkeletonModule):
         self.check(points, clip=True)
         if points.shape[-1] != 3:
             raise ShapeError(f"PostureEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
-        points = wide(known_frames(points, weights))
+        joints = weights is not None and weighs_joints(weights, points, self)
+        points = wide(known_points(points, weights, self))
         vectors = bone_vectors(points, self.bones)
         if lengths is None:
-            square = vectors.square().sum(-1)
-            if weights is None:
-                square = square.mean(-2)
-            else:
-                seen = (weights > 0).to(square)[..., None]
-                square = (square * seen).sum(-2) / seen.sum(-2).clamp_min(1)
-            lengths = square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
+            share = None
+            if weights is not None:
+                share = bone_share(weights, self.bones) if joints else weights[..., None]
+            lengths = _usual_size(vectors.square().sum(-1), share)
         lengths = lengths.to(vectors.dtype)[..., None, :, None]
         return vectors @ self.frame(points) / torch.where(lengths > 0, lengths, torch.inf)
 
@@ -129,8 +128,9 @@ class PostureEnergy(SkeletonModule):
         Args:
             points: (..., T, N, 3).
             lengths: (..., B); None takes each bone's root mean square over the frames that count.
-            weights: (..., T) how many independent frames each frame counts for, 0 for one that pads a shorter clip;
-                1 / correlation if None.
+            weights: (..., T, N) of the joints: a bone weighs as much as the lesser of its ends, and no more than the
+                least joint of the trunk, which it is seen from; or (..., T) how many independent frames each frame
+                counts for, 0 for one that pads a shorter clip. 1, and 1 / correlation, if None.
 
         Returns:
             (...).
@@ -144,13 +144,22 @@ class PostureEnergy(SkeletonModule):
         if weights is None:
             count, mean = y.shape[-2] / self.correlation, y.mean(-2, keepdim=True)
             scatter = (y - mean).mT @ (y - mean) / self.correlation
+            pull: Tensor | float = count * self.kappa / (count + self.kappa)
+        elif weighs_joints(weights, points, self):
+            firm = torch.minimum(bone_share(weights, self.bones), weights[..., self.trunk].amin(-1, keepdim=True))
+            share = firm.to(local).repeat_interleave(3, -1) / self.correlation  # (..., T, 3B)
+            count, own = share.amax(-1).sum(-1), share.sum(-2, keepdim=True)
+            mean = (share * y).sum(-2, keepdim=True) / some(own)
+            off = safe_root(share) * (y - mean)
+            scatter, pull = off.mT @ off, 1.0
+            mean = mean * safe_root(own * self.kappa / (own + self.kappa))
         else:
             share = weights.to(local)[..., None]
             count = share.sum((-2, -1))
             mean = (share * y).sum(-2, keepdim=True) / torch.where(count > 0, count, 1)[..., None, None]
             scatter = ((y - mean) * share).mT @ (y - mean)
-        pull = torch.as_tensor(count * self.kappa / (count + self.kappa)).to(local)
-        scatter = scatter + pull[..., None, None] * (mean.mT @ mean)
+            pull = (count * self.kappa / (count + self.kappa))[..., None, None]
+        scatter = scatter + pull * (mean.mT @ mean)
         eye = torch.eye(scatter.shape[-1], dtype=local.dtype, device=local.device)
         factor, _ = torch.linalg.cholesky_ex(eye + scatter / self.strength)
         log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -177,12 +186,41 @@ class ForeshorteningEnergy(SkeletonModule):
         self.correlation, self.eps = correlation, eps
         self.register_buffer("free", free_bones(self.skeleton), persistent=False)
 
-    def forward(self, points: Tensor, lengths: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Return (...) of points (..., T, N, 3), lengths (..., B) and the bones' weights (..., T, B) or None."""
+    def forward(
+        self,
+        points: Tensor,
+        lengths: Tensor | None = None,
+        weights: Tensor | None = None,
+        *,
+        bone_weights: Tensor | None = None,
+    ) -> Tensor:
+        """Return the energy of each clip.
+
+        Args:
+            points: (..., T, N, 3).
+            lengths: (..., B); None takes each bone's root mean square over the frames in which it counts.
+            weights: (..., T, N) of the joints: a bone weighs as much as the lesser of its two ends.
+            bone_weights: (..., T, B) in place of ``weights``.
+
+        Returns:
+            (...).
+
+        Raises:
+            ShapeError: the shapes do not fit.
+        """
         self.check(points, clip=True)
-        depth = known(bone_vectors(wide(points), self.bones)[..., 2:], weights)[..., 0]
-        each = self.free.to(depth) * foreshortening(depth, wide(lengths)[..., None, :], self.eps)
-        return narrow((each if weights is None else each * weights).sum((-2, -1)) / self.correlation, points)
+        if weights is not None:
+            if weights.shape[-2:] != points.shape[-3:-1]:
+                expected = f"(..., {points.shape[-3]}, {points.shape[-2]})"
+                raise ShapeError(f"ForeshorteningEnergy: expected weights {expected}, got {tuple(weights.shape)}")
+            bone_weights = bone_share(weights, self.bones)
+        vectors = known(bone_vectors(wide(points), self.bones), bone_weights)
+        if lengths is None:
+            lengths = _usual_size(vectors.square().sum(-1), bone_weights)
+        each = self.free.to(vectors) * foreshortening(vectors[..., 2], wide(lengths)[..., None, :], self.eps)
+        if bone_weights is not None:
+            each = each * bone_weights
+        return narrow(each.sum((-2, -1)) / self.correlation, points)
 
 
 class ProportionEnergy(SkeletonModule):
@@ -213,15 +251,21 @@ class ProportionEnergy(SkeletonModule):
         pairs = torch.tensor(self.skeleton.mirror_bones, dtype=torch.long).reshape(-1, 2)
         self.register_buffer("pairs", pairs, persistent=False)
 
-    def forward(self, lengths: Tensor) -> Tensor:
-        """Return (...) of lengths (..., B), positive, in any unit."""
+    def forward(self, lengths: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return (...) of lengths (..., B), positive, in any unit; weights (..., B), 0 for bones that are not known."""
         if lengths.shape[-1] != len(self.usual):
             raise ShapeError(f"ProportionEnergy: expected lengths (..., {len(self.usual)}), got {tuple(lengths.shape)}")
         tiny = torch.finfo(lengths.dtype).tiny
+        if weights is not None:
+            lengths = torch.where(weights > 0, lengths, self.usual.to(lengths))
         log = (lengths.clamp_min(tiny) / self.usual.to(lengths).clamp_min(tiny)).log()
-        off = log - log.mean(-1, keepdim=True)
-        apart = (log[..., self.pairs[:, 0]] - log[..., self.pairs[:, 1]]) / self.twins
-        return torch.log1p((off / self.spread).square() / 2).sum(-1) + apart.square().sum(-1) / 2
+        apart = ((log[..., self.pairs[:, 0]] - log[..., self.pairs[:, 1]]) / self.twins).square()
+        if weights is None:
+            off = log - log.mean(-1, keepdim=True)
+            return torch.log1p((off / self.spread).square() / 2).sum(-1) + apart.sum(-1) / 2
+        off = log - (weights * log).sum(-1, keepdim=True) / some(weights.sum(-1, keepdim=True))
+        both = torch.minimum(weights[..., self.pairs[:, 0]], weights[..., self.pairs[:, 1]])
+        return (weights * torch.log1p((off / self.spread).square() / 2)).sum(-1) + (both * apart).sum(-1) / 2
 
 
 class ContactEnergy(SkeletonModule):
@@ -245,15 +289,18 @@ class ContactEnergy(SkeletonModule):
         contacts = torch.tensor(self.skeleton.contacts, dtype=torch.long)
         self.register_buffer("contacts", contacts, persistent=False)
 
-    def forward(self, points: Tensor, velocity: Tensor, standing: Tensor) -> Tensor:
+    def forward(self, points: Tensor, velocity: Tensor, standing: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return (...).
 
         Args:
             points: (..., T, N, 3), depth relative to the root or the body's middle.
             velocity: v (..., T), the first frame's does not count.
             standing: c (..., T, C).
+            weights: (..., T, N) of the joints: a foot stands no more than it is seen.
         """
         self.check(points, clip=True)
+        if weights is not None:
+            standing = torch.minimum(standing, weights[..., self.contacts])
         depth, velocity = wide(points)[..., self.contacts, 2], wide(velocity)
         both = torch.minimum(standing[..., 1:, :], standing[..., :-1, :])
         step = known((depth[..., 1:, :] - depth[..., :-1, :])[..., None], both)[..., 0]
@@ -267,6 +314,16 @@ def foreshortening(depth: Tensor, length: Tensor, eps: float) -> Tensor:
     """Log L + 1/2 log(dz^2 + (eps L)^2), elementwise: -log density of an image of an evenly drawn direction."""
     tiny = torch.finfo(depth.dtype).tiny
     return length.clamp_min(tiny).log() + 0.5 * (depth.square() + (eps * length).square()).clamp_min(tiny).log()
+
+
+def _usual_size(square: Tensor, share: Tensor | None) -> Tensor:
+    """Root mean square (..., B) over the frames of squared lengths (..., T, B) that have a share (..., T, B or 1)."""
+    if share is None:
+        square = square.mean(-2)
+    else:
+        seen = (share > 0).to(square)
+        square = (square * seen).sum(-2) / seen.sum(-2).clamp_min(1)
+    return square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
 
 
 def trunk_joints(skeleton: Skeleton) -> list[int]:

@@ -11,7 +11,9 @@ from kcs_torch.errors import OptionError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.scatter import scatter_log_det
-from kcs_torch.nn.layers import SkeletonModule, full_precision
+from kcs_torch.nn.energies import check_weights
+from kcs_torch.nn.layers import SkeletonModule, full_precision, known
+from kcs_torch.nn.masks import bone_share, safe_root, some
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["ProcrusteanEnergy"]
@@ -48,12 +50,14 @@ class ProcrusteanEnergy(SkeletonModule):
             )
         self.eps, self.order, self.num_steps = eps, order, num_steps
 
-    def forward(self, points: Tensor, rotations: Tensor | None = None) -> Tensor:
+    def forward(self, points: Tensor, rotations: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """Return the energy of each clip.
 
         Args:
             points: (..., T, N, 3), finite.
             rotations: (..., T, 3, 3) that bring poses (as rows) together, ``points @ rotations``; found if None.
+            weights: (..., T, N) of the joints: a bone weighs as much as the lesser of its two ends. Where it is unseen
+                in some frames it is taken for its mean over time there.
 
         Returns:
             (...), without a unit: the bones are scaled to a mean square of 1 first. 0 for a clip that does not move.
@@ -62,25 +66,53 @@ class ProcrusteanEnergy(SkeletonModule):
             ShapeError: the shapes do not fit.
         """
         self.check(points, clip=True)
+        check_weights(weights, points, self)
         with full_precision(points):
-            wide = points.to(torch.promote_types(points.dtype, torch.float32))
+            wide = known(points, weights).to(torch.promote_types(points.dtype, torch.float32))
             vectors = bone_vectors(wide, self.bones)
+            share = None if weights is None else bone_share(weights, self.bones).to(vectors.dtype)[..., None]
             if rotations is None:
-                rotations = _align(vectors, self.num_steps)
+                rotations = _align(vectors, self.num_steps, share)
             aligned = (vectors @ rotations).flatten(-2)
-            size = aligned.square().mean((-2, -1), keepdim=True)
-            aligned = aligned / torch.where(size > 0, size, torch.ones_like(size)).sqrt()
-            rows = aligned.diff(dim=-2) if self.order else aligned - aligned.mean(-2, keepdim=True)
+            rows, seen = self._rows(aligned, share)
             floor = rows.new_zeros(rows.shape[:-2]) + self.eps
             least = rows.shape[-2] * rows.shape[-1] / 2 * floor.log()  # what a clip at rest is charged
-            return (scatter_log_det(rows, floor) - least).to(points.dtype)
+            return ((scatter_log_det(rows, floor) - least) * seen).to(points.dtype)
+
+    def _rows(self, aligned: Tensor, share: Tensor | None) -> tuple[Tensor, Tensor | float]:
+        """Scaled deviations or changes (..., T, 3B) of aligned bones, and the share of the rows that counts."""
+        if share is None:
+            size = aligned.square().mean((-2, -1), keepdim=True)
+            aligned = aligned / some(size).sqrt()
+            return (aligned.diff(dim=-2) if self.order else aligned - aligned.mean(-2, keepdim=True)), 1.0
+        share = share.expand(*share.shape[:-1], 3).flatten(-2)  # (..., T, 3B)
+        size = (share * aligned.square()).sum((-2, -1), keepdim=True) / some(share.sum((-2, -1), keepdim=True))
+        aligned = aligned / some(size).sqrt()
+        if self.order:
+            rows, share = aligned.diff(dim=-2), torch.minimum(share[..., 1:, :], share[..., :-1, :])
+            count = share.sum(-2, keepdim=True)
+        else:
+            count = share.sum(-2, keepdim=True)
+            rows = aligned - (share * aligned).sum(-2, keepdim=True) / some(count)
+        frames = max(rows.shape[-2], 1)
+        return rows * safe_root(share * frames / some(count)), share.amax(-1).sum(-1) / frames
 
 
-def _align(vectors: Tensor, num_steps: int) -> Tensor:
-    """Rotations (..., T, 3, 3) of bones (..., T, B, 3) onto their mean, from the first frame's pose."""
-    mean = vectors[..., :1, :, :]
+def _align(vectors: Tensor, num_steps: int, share: Tensor | None = None) -> Tensor:
+    """Rotations (..., T, 3, 3) of bones (..., T, B, 3) onto their mean, from a frame's pose.
+
+    It is the first frame of those that show most; bones count their share (..., T, B, 1).
+    """
     rotations = torch.eye(3, dtype=vectors.dtype, device=vectors.device).expand(*vectors.shape[:-2], 3, 3)
+    if share is None:
+        mean, heavy, count = vectors[..., :1, :, :], vectors, None
+    else:
+        shown = (
+            share.sum((-2, -1)).argmax(-1)[..., None, None, None].expand(*vectors.shape[:-3], 1, *vectors.shape[-2:])
+        )
+        mean, heavy, count = vectors.gather(-3, shown), share * vectors, some(share.sum(-3, keepdim=True))
     for _ in range(num_steps):
-        rotations = nearest_rotation(vectors.mT @ mean)
-        mean = (vectors @ rotations).mean(-3, keepdim=True)
+        rotations = nearest_rotation(heavy.mT @ mean)
+        turned = heavy @ rotations
+        mean = turned.mean(-3, keepdim=True) if count is None else turned.sum(-3, keepdim=True) / count
     return rotations

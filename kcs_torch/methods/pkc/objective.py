@@ -181,7 +181,7 @@ class Objective:
             "smoothness": bend.sum((1, 2)) / (2 * w.acceleration**2),
             "posture": self.posture(points, lengths, self.share),
             "hinges": w.hinge / w.sine**2 * self.hinges(points, lengths, self.time).sum(-1),
-            "foreshortening": self.foreshortening(points, lengths, self.clear),
+            "foreshortening": self.foreshortening(points, lengths, bone_weights=self.clear),
             "proportions": self.proportions(lengths),
         }
         if self.anchor is not None:

@@ -1,0 +1,53 @@
+"""Weights of joints, frames and bones: what counts nothing is taken out, and what it counts is told apart by shape."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from kcs_torch.errors import ShapeError
+from kcs_torch.nn.layers import known, known_frames
+
+__all__ = ["bone_share", "known_points", "safe_root", "some", "weighs_joints"]
+
+
+def weighs_joints(weights: Tensor, points: Tensor, module: nn.Module) -> bool:
+    """Whether weights are those of the joints (..., T, N) of points (..., T, N, D), or of the frames (..., T).
+
+    Where there are as many frames as joints, weights of joints have all dimensions of the points but the last.
+
+    Raises:
+        ShapeError: they are neither.
+    """
+    frames, joints = points.shape[-3:-1]
+    if weights.shape[-2:] == (frames, joints) and (frames != joints or weights.ndim >= points.ndim - 1):
+        return True
+    if weights.shape[-1:] == (frames,):
+        return False
+    raise ShapeError(
+        f"{type(module).__name__}: expected weights (..., {frames}, {joints}) of joints or (..., {frames}) of frames, "
+        f"got {tuple(weights.shape)}"
+    )
+
+
+def known_points(points: Tensor, weights: Tensor | None, module: nn.Module) -> Tensor:
+    """Points (..., T, N, D), 0 where the weights of the joints (..., T, N) or of the frames (..., T) are."""
+    if weights is not None and weighs_joints(weights, points, module):
+        return known(points, weights)
+    return known_frames(points, weights)
+
+
+def bone_share(weights: Tensor, bones: Tensor) -> Tensor:
+    """Weights of the bones (..., B): each weighs as much as the lesser of its two ends (..., N)."""
+    return torch.minimum(weights[..., bones[:, 0]], weights[..., bones[:, 1]])
+
+
+def safe_root(weights: Tensor) -> Tensor:
+    """Square roots, with derivative 0 where a weight is 0."""
+    some = weights > 0
+    return torch.where(some, torch.where(some, weights, torch.ones_like(weights)).sqrt(), torch.zeros_like(weights))
+
+
+def some(total: Tensor) -> Tensor:
+    """A total to divide by: 1 where nothing counts."""
+    return torch.where(total > 0, total, torch.ones_like(total))
