@@ -1,0 +1,28 @@
+"""What a training step is given: :class:`Batch`."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+__all__ = ["Batch"]
+
+
+class Batch(NamedTuple):
+    """Windows of tracks, with the 3D that may be used.
+
+    Attributes:
+        tracks: (B, T, N, 2) in px or mm, virtual joints included; 0 where unseen.
+        weights: (B, T, N) in [0, 1]; 0 where unseen.
+        points: (B, T, N, 3) in the camera frame and the unit of the tracks, depth from the mean of each frame's joints:
+            the truth of labelled windows, the pseudo-labels of others; 0 where there is neither.
+        labelled: (B,) 1 where ``points`` are the truth and may be used, else 0.
+        pseudo: (B, T, N) weight of ``points`` as pseudo-labels in [0, 1]; 0 where they are none.
+    """
+
+    tracks: Tensor
+    weights: Tensor
+    points: Tensor
+    labelled: Tensor
+    pseudo: Tensor

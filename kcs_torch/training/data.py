@@ -1,0 +1,286 @@
+"""Batches of filmed motion, some with their truth and some without: :class:`TracksDataModule`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import lightning
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import OptionError
+from kcs_torch.methods import METHODS, Method
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.training.batch import Batch
+from kcs_torch.training.clips import SYNTHETIC, Clip, file_clips, find_files, synthetic_clips
+from kcs_torch.training.loader import BatchLoader, Deck
+from kcs_torch.training.pseudo import pseudo_labels
+from kcs_torch.training.seeds import generator_of
+from kcs_torch.training.windows import FilmedWindows
+
+__all__ = ["TracksDataModule"]
+
+Patterns = str | Path | Sequence[str | Path]
+
+
+class TracksDataModule(lightning.LightningDataModule):
+    """Windows of 3D motion, filmed by random cameras; a chosen share of them shows its truth.
+
+    A batch depends on the seed, the epoch and its number in it, and on nothing else: training that is resumed from a
+    checkpoint sees what it would have seen. By default the data set is finite: each clip has ``views`` cameras, and
+    their tracks with their noise and hidden joints stay the same. Which windows are labelled is drawn for each view by
+    itself, and those of a smaller share are among those of a greater one.
+
+    Args:
+        train: files of 3D motion (any that :func:`kcs_torch.load_motion` reads), a pattern such as ``cmu/*.npz``, or
+            several; those that begin with ``!`` are left out. Or "synthetic": motion that is made up.
+        val: files for validation, as of ``train``.
+        test: files for the test, as of ``train``. With synthetic motion for training and nothing named here, validation
+            and test have synthetic motion of their own.
+        folder: that patterns are relative to.
+        skeleton: whose joints are found by name in every file; that of the first file if None ("h36m17" of synthetic
+            motion).
+        up: the axis that points up in the files; as they say if None.
+        units: of the tracks.
+        fps: frames per second that all motion is brought to; None takes it as it is.
+        window: frames of a window.
+        stride: frames from one training window to the next; ``window`` if None.
+        views: cameras of each clip.
+        pitch: degrees by which cameras look down, least and most.
+        noise: standard deviation of the tracks, in ``units``.
+        occlusion: expected share of hidden joints, half of them for single frames, half for ten.
+        fresh_cameras: draw cameras, noise and hidden joints anew for every window of every training batch.
+        batch_size: windows.
+        steps_per_epoch: batches of an epoch; as many as show every window about once if None.
+        labelled: share of the training windows (of each view) with their truth.
+        labelled_per_batch: share of a batch that is taken from these, where there are others.
+        unlabelled: False leaves out those without truth: the same steps on labelled windows only.
+        pseudo: a :class:`kcs_torch.Method` or its name, whose reconstructions are the labels of unlabelled windows.
+        pseudo_trust: standard deviation of depth, as a share of the size of the body (root mean square of its tracks),
+            at which a pseudo-label has half weight; used where the method tells its uncertainty.
+        cache: folder to keep reconstructions in; they are made again each time if None.
+        clips: of synthetic motion.
+        seed: of everything.
+
+    Raises:
+        OptionError: an option is out of range.
+
+    >>> data = TracksDataModule(clips=2, batch_size=4, labelled=0.25)
+    >>> data.setup("fit")
+    >>> batch = next(iter(data.train_dataloader()))
+    >>> batch.tracks.shape, batch.labelled.tolist()
+    (torch.Size([4, 27, 17, 2]), [1.0, 1.0, 0.0, 0.0])
+    """
+
+    def __init__(
+        self,
+        train: Patterns = SYNTHETIC,
+        *,
+        val: Patterns = (),
+        test: Patterns = (),
+        folder: str | Path = ".",
+        skeleton: str | Path | Skeleton | None = None,
+        up: str | None = None,
+        units: str = "mm",
+        fps: float | None = 30.0,
+        window: int = 27,
+        stride: int | None = None,
+        views: int = 4,
+        pitch: tuple[float, float] = (0.0, 20.0),
+        noise: float = 0.0,
+        occlusion: float = 0.0,
+        fresh_cameras: bool = False,
+        batch_size: int = 64,
+        steps_per_epoch: int | None = None,
+        labelled: float = 1.0,
+        labelled_per_batch: float = 0.5,
+        unlabelled: bool = True,
+        pseudo: str | Method | None = None,
+        pseudo_trust: float = 0.1,
+        cache: str | Path | None = None,
+        clips: int = 8,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        low, high = (float(p) for p in pitch)
+        rules = {
+            "fps": (fps is None or 0 < fps < math.inf, fps, "a positive number or None"),
+            "window": (window >= 1, window, "at least 1 frame"),
+            "stride": (stride is None or stride >= 1, stride, "at least 1 frame or None"),
+            "views": (views >= 1, views, "at least 1 camera"),
+            "pitch": (-90 <= low <= high <= 90, pitch, "two angles within -90..90 degrees, the smaller one first"),
+            "noise": (0 <= noise < math.inf, noise, "a number not below 0"),
+            "occlusion": (0 <= occlusion < 1, occlusion, "a share of at least 0 and below 1"),
+            "batch_size": (batch_size >= 1, batch_size, "at least 1"),
+            "steps_per_epoch": (
+                steps_per_epoch is None or steps_per_epoch >= 1,
+                steps_per_epoch,
+                "at least 1, or None",
+            ),
+            "labelled": (0 <= labelled <= 1, labelled, "a share within 0..1"),
+            "labelled_per_batch": (0 <= labelled_per_batch <= 1, labelled_per_batch, "a share within 0..1"),
+            "pseudo_trust": (pseudo_trust > 0, pseudo_trust, "a positive number"),
+            "clips": (clips >= 1, clips, "at least 1"),
+        }
+        for name, (rule, value, expected) in rules.items():
+            if not rule:
+                raise OptionError(f"data: {name}: expected {expected}, got {value!r}")
+        if labelled == 0 and not unlabelled:
+            raise OptionError("data: unlabelled: nothing is left to train on without labelled windows (labelled=0)")
+        if isinstance(pseudo, str):
+            if pseudo not in METHODS:
+                from kcs_torch.errors import unknown
+
+                raise unknown("method for pseudo", pseudo, METHODS)
+            pseudo = METHODS[pseudo]()
+        if pseudo is not None and fresh_cameras:
+            raise OptionError("data: pseudo: reconstructions are of tracks that stay the same: not with fresh_cameras")
+        self.files = {"train": train, "val": val, "test": test}
+        self.folder, self.body, self.up, self.units, self.fps = folder, skeleton, up, units, fps
+        self.window, self.stride, self.views, self.pitch = window, stride or window, views, (low, high)
+        self.noise, self.occlusion, self.fresh_cameras = noise, occlusion, fresh_cameras
+        self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
+        self.labelled, self.labelled_per_batch, self.unlabelled = labelled, labelled_per_batch, unlabelled
+        self.pseudo, self.pseudo_trust, self.cache = pseudo, pseudo_trust, cache
+        self.num_clips, self.seed = clips, seed
+        self.sets: dict[str, FilmedWindows] = {}
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """Of all windows; reads the files where that has not been done."""
+        return self._set("train").skeleton
+
+    def setup(self, stage: str | None = None) -> None:
+        """Read, cut and film what a stage needs ("fit", "validate", "test"; all if None).
+
+        Raises:
+            OptionError: no file matches a pattern, or one is in two of train, val and test.
+            FormatError: a file cannot be read as motion.
+            SkeletonError: its joints do not fit.
+            ShapeError: a clip is shorter than a window.
+        """
+        for split in {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}.get(
+            stage or "", ("train", "val", "test")
+        ):
+            if split == "train" or self._named(split):
+                self._set(split)
+        if stage in (None, "fit") and self.pseudo is not None and self.unlabelled and len(self.unlabelled_items):
+            train = self._set("train")
+            if train.pseudo_points is None:
+                wanted = self.unlabelled_items
+                pairs = torch.stack([train.clip_of[wanted // self.views], wanted % self.views], -1).unique(dim=0)
+                train.pseudo_points, train.pseudo_weights = pseudo_labels(
+                    train, pairs, self.pseudo, fps=self.fps, units=self.units, trust=self.pseudo_trust, cache=self.cache
+                )
+
+    @property
+    def labelled_items(self) -> Tensor:
+        """Training items with their truth: the first ones of an order that the seed alone chooses."""
+        return self._order()[: self._num_labelled()]
+
+    @property
+    def unlabelled_items(self) -> Tensor:
+        """Training items without truth."""
+        return self._order()[self._num_labelled() :]
+
+    def train_dataloader(self) -> BatchLoader:
+        """Mixed batches, labelled windows first."""
+        items = self._set("train")
+        seen, blind = self.labelled_items, self.unlabelled_items if self.unlabelled else self._order()[:0]
+        share = 1.0 if not len(blind) else self.labelled_per_batch if len(seen) else 0.0
+        first = round(share * self.batch_size)
+        if len(seen) and len(blind) and self.batch_size > 1 and 0 < share < 1:
+            first = min(max(first, 1), self.batch_size - 1)
+        decks = [
+            (Deck(seen, self.seed, "labelled"), first),
+            (Deck(blind, self.seed, "unlabelled"), self.batch_size - first),
+        ]
+        mark = torch.arange(self.batch_size) < first
+        steps = self.steps_per_epoch or math.ceil(len(items) / self.batch_size)
+
+        def make(epoch: int, step: int) -> Batch:
+            count = epoch * steps + step
+            drawn = torch.cat([deck.draw(count * size, size) for deck, size in decks])
+            fresh = generator_of(self.seed, "fresh", epoch, step) if self.fresh_cameras else None
+            return items.batch(drawn, mark, fresh)
+
+        return BatchLoader(make, steps)
+
+    def val_dataloader(self) -> BatchLoader | list[BatchLoader]:
+        """All windows of the validation files from all views, with their truth, in order; none without files."""
+        return self._in_order("val")
+
+    def test_dataloader(self) -> BatchLoader | list[BatchLoader]:
+        """All windows of the test files from all views, with their truth, in order; none without files."""
+        return self._in_order("test")
+
+    def _in_order(self, split: str) -> BatchLoader | list[BatchLoader]:
+        if not self._named(split):
+            return []
+        items = self._set(split)
+
+        def make(epoch: int, step: int) -> Batch:
+            own = torch.arange(step * self.batch_size, min((step + 1) * self.batch_size, len(items)))
+            return items.batch(own, torch.ones_like(own, dtype=torch.bool))
+
+        return BatchLoader(make, math.ceil(len(items) / self.batch_size), fixed=True)
+
+    def _named(self, split: str) -> Patterns:
+        """The files of a split, or what stands for made-up motion; nothing where there is none."""
+        own = self.files[split]
+        return SYNTHETIC if not own and self.files["train"] == SYNTHETIC else own
+
+    def _set(self, split: str) -> FilmedWindows:
+        if split not in self.sets:
+            train = split == "train"
+            self.sets[split] = FilmedWindows.cut(
+                self._clips(split),
+                window=self.window,
+                stride=self.stride if train else self.window,
+                to_the_end=not train,
+                views=self.views,
+                pitch=self.pitch,
+                noise=self.noise,
+                occlusion=self.occlusion,
+                key=(self.seed, split),
+            )
+        return self.sets[split]
+
+    def _clips(self, split: str) -> list[Clip]:
+        if self._named(split) == SYNTHETIC:
+            count = self.num_clips if split == "train" else max(2, self.num_clips // 4)
+            return synthetic_clips(
+                count,
+                skeleton=self._body(split) or "h36m17",
+                fps=self.fps or 30.0,
+                units=self.units,
+                seed=self.seed,
+                split=split,
+            )
+        files = {name: self._files(name) for name in self.files}
+        for name, others in files.items():
+            twice = set(others) & set(files[split]) if name != split else set()
+            if twice:
+                raise OptionError(
+                    f"data: {min(twice)} is in {split} and in {name}: leave it out of one by a pattern !..."
+                )
+        return file_clips(files[split], skeleton=self._body(split), fps=self.fps, up=self.up, units=self.units)
+
+    def _files(self, split: str) -> list[Path]:
+        named = self._named(split)
+        return find_files(named, self.folder) if named and named != SYNTHETIC else []
+
+    def _body(self, split: str) -> str | Path | Skeleton | None:
+        """The skeleton that was asked for, or that of the training files."""
+        return self.body if self.body is not None or split == "train" else self._set("train").skeleton
+
+    def _order(self) -> Tensor:
+        count = len(self._set("train"))
+        return torch.randperm(count, generator=generator_of(self.seed, "labels"))
+
+    def _num_labelled(self) -> int:
+        """As many as the share says, but one at least of any share."""
+        share = self.labelled * len(self._set("train"))
+        return max(round(share), 1) if share > 0 else 0

@@ -1,0 +1,154 @@
+"""Labels without truth: what a training-free method makes of the tracks."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import warnings
+import zipfile
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import KcsError, KcsWarning
+from kcs_torch.io.atomic import atomic_path
+from kcs_torch.methods import Method
+from kcs_torch.training.windows import FilmedWindows
+from kcs_torch.types import Reconstruction, Tracks
+
+__all__ = ["pseudo_labels"]
+
+TOGETHER = 16
+"""Clips that are reconstructed as one batch, before they are put into the cache."""
+
+
+def pseudo_labels(
+    filmed: FilmedWindows,
+    pairs: Tensor,
+    method: Method,
+    *,
+    fps: float | None,
+    units: str,
+    trust: float,
+    cache: str | Path | None,
+) -> tuple[Tensor, Tensor]:
+    """Reconstruct whole clips from their tracks alone.
+
+    Args:
+        filmed: the tracks.
+        pairs: (P, 2) of (clip, view) to reconstruct.
+        method: that does it.
+        fps: of the tracks.
+        units: of the tracks.
+        trust: standard deviation of depth, over the root mean square of the clip's tracks, that has half weight.
+        cache: folder where reconstructions are kept, or None.
+
+    Returns:
+        points (V, F, N, 3), depth from the mean of each frame's joints, and weights (V, F, N) in [0, 1]: 1 where the
+        method tells no uncertainty; 0 where nothing was reconstructed.
+
+    Warns:
+        KcsWarning: clips could not be reconstructed.
+    """
+    views, frames, joints, _ = filmed.tracks.shape
+    points = torch.zeros(views, frames, joints, 3)
+    weights = torch.zeros(views, frames, joints)
+    folder = None if cache is None else Path(cache)
+    work: list[tuple[int, slice, Tracks, Path | None]] = []
+    failed: list[str] = []
+    for clip, view in pairs.tolist():
+        span = filmed.frames_of(clip)
+        image, seen = filmed.tracks[view, span].double(), filmed.weights[view, span].double()
+        if not bool((seen > 0).any()):
+            failed.append(f"{filmed.clips[clip].source}, view {view}: no joint is seen in any frame")
+            continue
+        one = Tracks(image, seen, filmed.skeleton, fps, units, f"{filmed.clips[clip].source}, view {view}")
+        kept = None if folder is None else folder / f"{_key(one, method)}.npz"
+        found = None if kept is None else _load(kept, image.shape[:2])
+        if found is None:
+            work.append((view, span, one, kept))
+        else:
+            points[view, span], weights[view, span] = _label(one, *found, trust)
+    for start in range(0, len(work), TOGETHER):
+        part = work[start : start + TOGETHER]
+        for (view, span, one, kept), result in zip(part, _lift([w[2] for w in part], method, failed), strict=True):
+            if result is None:
+                continue
+            spread = None if result.uncertainty is None else result.uncertainty.float()
+            found = result.points.float(), spread
+            if kept is not None:
+                _keep(kept, *found)
+            points[view, span], weights[view, span] = _label(one, *found, trust)
+    if failed:
+        shown = "; ".join(failed[:3]) + ("; ..." if len(failed) > 3 else "")
+        warnings.warn(
+            f"pseudo-labels: {len(failed)} of {len(pairs)} clips have none: {shown}", KcsWarning, stacklevel=2
+        )
+    return points, weights
+
+
+def _lift(clips: list[Tracks], method: Method, failed: list[str]) -> list[Reconstruction | None]:
+    """Reconstruct clips together; where that fails, one by one, and None for those to blame."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", KcsWarning)  # weak depth is what the weights are for
+        try:
+            return list(method.many(clips))
+        except KcsError:
+            out: list[Reconstruction | None] = []
+            for one in clips:
+                try:
+                    out.append(method(one))
+                except KcsError as error:
+                    failed.append(str(error))
+                    out.append(None)
+            return out
+
+
+def _label(tracks: Tracks, points: Tensor, spread: Tensor | None, trust: float) -> tuple[Tensor, Tensor]:
+    """Points with their depth from the mean of each frame, and weights 1 / (1 + (spread / (trust size))^2)."""
+    depth = points[..., 2:]
+    points = torch.cat([points[..., :2], depth - depth.mean(-2, keepdim=True)], -1)
+    sound = torch.isfinite(points).all(-1)
+    if spread is None:
+        weights = torch.ones_like(points[..., 0])
+    else:
+        seen = tracks.seen[..., None]
+        middle = (tracks.points * seen).sum(-2, keepdim=True) / seen.sum(-2, keepdim=True).clamp_min(1)
+        size = (((tracks.points - middle) * seen).square().sum() / seen.sum()).sqrt().clamp_min(1e-12)
+        weights = 1 / (1 + (spread / (trust * float(size))).square())
+        sound = sound & torch.isfinite(weights)
+    zero = torch.zeros_like(weights)
+    return torch.where(sound[..., None], points, zero[..., None]), torch.where(sound, weights, zero)
+
+
+def _key(tracks: Tracks, method: Method) -> str:
+    """What a reconstruction depends on, as a file name."""
+    fields = {field.name: repr(getattr(method, field.name)) for field in dataclasses.fields(method)}
+    facts = [version("kcs-torch"), type(method).__name__, fields, tracks.skeleton.to_dict(), tracks.fps, tracks.units]
+    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+    for array in (tracks.points, tracks.weights):
+        digest.update(array.contiguous().numpy().tobytes())
+    return digest.hexdigest()[:32]
+
+
+def _load(path: Path, shape: torch.Size) -> tuple[Tensor, Tensor | None] | None:
+    """A reconstruction that was kept; None where there is none, or the file is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            points = torch.from_numpy(file["points"])
+            spread = torch.from_numpy(file["spread"]) if "spread" in file.files else None
+    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile):
+        return None
+    if points.shape != (*shape, 3) or (spread is not None and spread.shape != shape):
+        return None
+    return points.float(), None if spread is None else spread.float()
+
+
+def _keep(path: Path, points: Tensor, spread: Tensor | None) -> None:
+    arrays = {"points": points.numpy()} | ({} if spread is None else {"spread": spread.numpy()})
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
