@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch import functional, solvers
-from kcs_torch.nn import unrolled
+from kcs_torch.nn import steps
 from kcs_torch.solvers import pose
 
 __all__ = ["fit_bones", "fit_bones_frame_by_frame", "fit_cameras_frame_by_frame", "naive", "svt", "window_by_window"]
@@ -112,7 +112,7 @@ def naive(*, frame_by_frame: bool = False) -> Iterator[None]:
 
         swap(functional.svt, svt)
         swap(solvers.fit_bones, fit_bones_frame_by_frame if frame_by_frame else fit_bones)
-        swap(unrolled.shape_step, window_by_window(unrolled.shape_step))
+        swap(steps.shape_step, window_by_window(steps.shape_step))
         if frame_by_frame:
             swap(pose.fit_cameras, fit_cameras_frame_by_frame)
         yield

@@ -13,7 +13,7 @@ from kcs_torch.functional.temporal import interpolate
 from kcs_torch.nn.energies import centred_residual
 from kcs_torch.solvers.lm import fit_bones
 
-__all__ = ["continuation", "data_scale", "estimate_lengths", "shape_step", "start_shape"]
+__all__ = ["continuation", "data_scale", "estimate_lengths", "shape_step", "start_shape", "to_scale"]
 
 
 def continuation(num_weights: int, mu: float = 0.5, final: float = 1e-5) -> list[float]:
@@ -77,6 +77,13 @@ def estimate_lengths(
         steady = variation.quantile(0.25, -1, keepdim=True)
         ratio = variation / torch.where(steady > 0, steady, torch.ones_like(steady))
         return lengths, 1 / (1 + ratio.square()).square()
+
+
+def to_scale(proportions: Tensor, lengths: Tensor) -> Tensor:
+    """Relative lengths (..., B), brought to the scale of measured ones (..., B): the median bone of both agrees."""
+    there = proportions > 0
+    ratio = lengths / torch.where(there, proportions, torch.ones_like(proportions))
+    return proportions * ratio.median(-1, keepdim=True).values
 
 
 def shape_step(

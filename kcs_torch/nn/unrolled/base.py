@@ -1,0 +1,186 @@
+"""What all unrolled solvers share: positive parameters, the loop over steps, and how it is differentiated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from kcs_torch.errors import OptionError, ShapeError, SkeletonError
+from kcs_torch.nn.energies import check_weights
+from kcs_torch.nn.layers import inverse_softplus
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.solvers.implicit import Implicit, fixed_point
+from kcs_torch.solvers.iterate import Solution, iterate, relative_change
+
+__all__ = ["Gradient", "Unrolled"]
+
+Gradient = Literal["unrolled", "implicit"] | Implicit
+"""How an unrolled solver is differentiated."""
+
+SETTLED = 5e-3
+"""A shape stands still where a step changes it by no more than this share."""
+
+
+class Unrolled(nn.Module):
+    """Base of the unrolled solvers: ``num_steps`` steps, each with parameters of its own.
+
+    Args:
+        num_steps: steps.
+        momentum: share of the last change that the next step starts ahead by.
+        learnable: what belongs to a step is a parameter (positive through a softplus); else a constant.
+        grad_steps: record only the last so many steps for autograd; None all.
+        gradient: "unrolled" differentiates the recorded steps; "implicit" goes on with the last step until the shape
+            stands still, and differentiates that fixed point; an :class:`kcs_torch.solvers.Implicit` says how exactly.
+
+    Raises:
+        OptionError: a number is out of range, or ``grad_steps`` is given with the implicit gradient.
+    """
+
+    def __init__(
+        self, num_steps: int, *, momentum: float, learnable: bool, grad_steps: int | None, gradient: Gradient
+    ) -> None:
+        super().__init__()
+        if num_steps < 1 or not 0 <= momentum < 1 or (grad_steps is not None and grad_steps < 0):
+            raise OptionError(
+                f"{type(self).__name__}: expected num_steps >= 1, momentum within [0, 1) and grad_steps >= 0 or None, "
+                f"got {num_steps}, {momentum} and {grad_steps}"
+            )
+        if not isinstance(gradient, Implicit) and gradient not in ("unrolled", "implicit"):
+            raise OptionError(
+                f"{type(self).__name__}: gradient: expected 'unrolled', 'implicit' or an Implicit, got {gradient!r}"
+            )
+        if gradient != "unrolled" and grad_steps is not None:
+            raise OptionError(
+                f"{type(self).__name__}: grad_steps: the implicit gradient records one step: expected None, "
+                f"got {grad_steps}"
+            )
+        self.num_steps, self.learnable, self.grad_steps, self.momentum = num_steps, learnable, grad_steps, momentum
+        self.implicit = Implicit() if gradient == "implicit" else gradient if isinstance(gradient, Implicit) else None
+
+    def extra_repr(self) -> str:
+        shown = [f"num_steps={self.num_steps}", f"momentum={self.momentum:g}"]
+        if self.grad_steps is not None:
+            shown.append(f"grad_steps={self.grad_steps}")
+        if self.implicit is not None:
+            shown.append(f"gradient={self.implicit}")
+        return ", ".join(shown)
+
+    def _run(
+        self,
+        step: Callable[[Tensor, int], Tensor],
+        start: Tensor,
+        *,
+        inner: int = 3,
+        measure: bool = True,
+        depends_on: Sequence[Tensor | None] = (),
+    ) -> Solution[Tensor]:
+        """Make all steps, each from a point ahead of the last shape; the state is (shape, point ahead).
+
+        Args:
+            step: (point ahead, number of the step) to the next shape.
+            start: (..., *).
+            inner: trailing dimensions of one problem.
+            measure: tell whether the last step stood still, which waits for the device.
+            depends_on: what the step depends on beside the parameters.
+        """
+
+        def advance(state: tuple[Tensor, Tensor], k: int) -> tuple[Tensor, Tensor]:
+            shape = step(state[1], min(k, self.num_steps - 1))
+            return shape, shape + self.momentum * (shape - state[0])
+
+        def change(old: tuple[Tensor, Tensor], new: tuple[Tensor, Tensor]) -> Tensor:
+            return relative_change(old[0].flatten(-2), new[0].flatten(-2))
+
+        if self.implicit is None:
+            solution = iterate(
+                advance,
+                (start, start),
+                num_steps=self.num_steps,
+                change=change if measure else None,
+                tolerance=SETTLED,
+                check_every=self.num_steps,
+                grad_steps=self.grad_steps,
+            )
+            return Solution(solution.value[0], solution.converged, solution.iterations)
+        how, last = self.implicit, self.num_steps - 1
+        with torch.no_grad():
+            first = iterate(advance, (start, start), num_steps=self.num_steps)
+            rest = iterate(
+                lambda state, _: advance(state, last),
+                first.value,
+                num_steps=how.settle,
+                change=change,
+                tolerance=how.tolerance,
+            )
+        learned = any(x is not None and x.requires_grad for x in (*depends_on, *self.parameters()))
+        with torch.set_grad_enabled(torch.is_grad_enabled() and learned):
+            value = fixed_point(
+                lambda shape: step(shape, last),
+                rest.value[0],
+                inner=inner,
+                num_steps=how.adjoint_steps,
+                tolerance=how.adjoint_tolerance,
+                name=type(self).__name__,
+            )
+        return Solution(value, rest.converged, self.num_steps + rest.iterations)
+
+    def _positive(self, name: str, values: Sequence[float] | Tensor, *, learnable: bool | None = None) -> None:
+        """Hold positive numbers, in double precision until the module is cast, as softplus of what is learned."""
+        raw = inverse_softplus(torch.as_tensor(values, dtype=torch.float64))
+        if self.learnable if learnable is None else learnable:
+            setattr(self, f"raw_{name}", nn.Parameter(raw))
+        else:
+            self.register_buffer(f"raw_{name}", raw)
+
+    def _values(self, name: str, like: Tensor) -> Tensor:
+        return nn.functional.softplus(getattr(self, f"raw_{name}")).to(like)
+
+    def _hold_lengths(self, skeleton: Skeleton, lengths: Sequence[float] | None, learnable: bool) -> None:
+        """Hold relative bone lengths with mean 1: those given, or the skeleton's where they are to be learned."""
+        self.has_lengths = learnable or lengths is not None
+        if not self.has_lengths:
+            return
+        if lengths is None:
+            known = skeleton.relative_lengths(dtype=torch.float64)
+            if known is None:
+                raise SkeletonError(
+                    f"{type(self).__name__}: learnable_lengths: skeleton '{skeleton.name}' has neither proportions nor "
+                    "a template: expected lengths=..., one number per bone, to start from"
+                )
+        else:
+            known = torch.as_tensor(list(lengths), dtype=torch.float64)
+            if known.shape != (skeleton.num_bones,) or not bool(((known > 0) & known.isfinite()).all()):
+                raise OptionError(
+                    f"{type(self).__name__}: lengths: expected {skeleton.num_bones} positive numbers, one per bone of "
+                    f"skeleton '{skeleton.name}', got {list(lengths)}"
+                )
+        known = (known / known.mean()).clamp_min(1e-3)  # a bone without length in the template may grow
+        self._positive("length", known, learnable=learnable)
+
+    def _check(
+        self, tracks: Tensor, cameras: Tensor | None, weights: Tensor | None, start: Tensor | None, **others: Any
+    ) -> None:
+        """Raise a ShapeError unless the arguments fit; ``others`` are (tensor or None, expected trailing shape)."""
+        name = type(self).__name__
+        if tracks.ndim < 3 or tracks.shape[-1] != 2 or (
+            cameras is not None and cameras.shape[-3:] != (tracks.shape[-3], 2, 3)
+        ):  # fmt: skip
+            got = f"{tuple(tracks.shape)} and {None if cameras is None else tuple(cameras.shape)}"
+            raise ShapeError(f"{name}: expected tracks (..., T, N, 2) and cameras (..., T, 2, 3), got {got}")
+        if cameras is not None and (cameras.dtype != tracks.dtype or cameras.device != tracks.device):
+            raise ShapeError(
+                f"{name}: expected cameras of the tracks' dtype and device, got {cameras.dtype} on "
+                f"{cameras.device} for {tracks.dtype} on {tracks.device}: use cameras.to(tracks)"
+            )
+        check_weights(weights, tracks, self)
+        if start is not None and start.shape[-3:] != (*tracks.shape[-3:-1], 3):
+            expected = f"(..., {tracks.shape[-3]}, {tracks.shape[-2]}, 3)"
+            raise ShapeError(f"{name}: expected start {expected}, got {tuple(start.shape)}")
+        for other, (value, shape) in others.items():
+            if value is not None and tuple(value.shape[value.ndim - len(shape) :]) != tuple(shape):
+                raise ShapeError(
+                    f"{name}: expected {other} (..., {', '.join(map(str, shape))}), got {tuple(value.shape)}"
+                )

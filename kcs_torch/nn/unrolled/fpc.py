@@ -1,0 +1,101 @@
+"""Fixed-point continuation as a layer."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from kcs_torch.errors import OptionError
+from kcs_torch.nn.layers import full_precision, known
+from kcs_torch.nn.steps import continuation, data_scale, shape_step, start_shape
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled
+from kcs_torch.solvers.iterate import Solution
+
+__all__ = ["UnrolledFPC"]
+
+
+class UnrolledFPC(Unrolled):
+    """``num_steps`` steps of fixed-point continuation from 2D tracks and cameras to 3D shape.
+
+    Args:
+        num_steps: steps; each has its own step size and threshold.
+        mu: first threshold, a share of the data's largest singular value.
+        final: last threshold; between them they fall geometrically.
+        tau: step size.
+        momentum: share of the last change that the next step starts ahead by.
+        learnable: step sizes and thresholds are parameters (positive through a softplus); else constants.
+        grad_steps: record only the last so many steps for autograd; None all.
+        gradient: "unrolled", or "implicit": go on with the last step until the shape stands still, and differentiate
+            that fixed point, in the memory of one step; an :class:`kcs_torch.solvers.Implicit` sets tolerances.
+
+    Raises:
+        OptionError: a number is out of range.
+
+    >>> import torch
+    >>> cameras = torch.eye(3)[:2].expand(50, 2, 3)
+    >>> UnrolledFPC(num_steps=5)(torch.randn(50, 17, 2), cameras).shape
+    torch.Size([50, 17, 3])
+    """
+
+    raw_threshold: Tensor
+    raw_step: Tensor
+
+    def __init__(
+        self,
+        num_steps: int = 10,
+        *,
+        mu: float = 0.5,
+        final: float = 1e-5,
+        tau: float = 1.0,
+        momentum: float = 0.8,
+        learnable: bool = True,
+        grad_steps: int | None = None,
+        gradient: Gradient = "unrolled",
+    ) -> None:
+        super().__init__(num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
+        if not tau > 0:
+            raise OptionError(f"{type(self).__name__}: expected tau > 0, got {tau}")
+        self._positive("threshold", continuation(num_steps, mu, final))
+        self._positive("step", [tau] * num_steps)
+
+    def forward(
+        self, tracks: Tensor, cameras: Tensor, *, weights: Tensor | None = None, start: Tensor | None = None
+    ) -> Tensor:
+        """Return the shape in the world frame of the cameras.
+
+        Args:
+            tracks: (..., T, N, 2).
+            cameras: (..., T, 2, 3).
+            weights: (..., T, N), 0 where unseen.
+            start: (..., T, N, 3), a network's output, say, in any precision; the back-projected tracks if None.
+
+        Returns:
+            (..., T, N, 3).
+
+        Raises:
+            ShapeError: the shapes do not fit.
+
+        Warns:
+            ConvergenceWarning: with the implicit gradient, in the backward pass.
+        """
+        return self._solve(tracks, cameras, weights, start, measure=False).value
+
+    def solve(
+        self, tracks: Tensor, cameras: Tensor, *, weights: Tensor | None = None, start: Tensor | None = None
+    ) -> Solution[Tensor]:
+        """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still."""
+        return self._solve(tracks, cameras, weights, start, measure=True)
+
+    def _solve(
+        self, tracks: Tensor, cameras: Tensor, weights: Tensor | None, start: Tensor | None, *, measure: bool
+    ) -> Solution[Tensor]:
+        self._check(tracks, cameras, weights, start)
+        tracks = known(tracks, weights)
+        threshold, step = self._values("threshold", tracks), self._values("step", tracks)
+        with full_precision(tracks):
+            scale = data_scale(tracks, cameras, weights)
+            return self._run(
+                lambda shape, k: shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k]),
+                start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype),
+                measure=measure,
+                depends_on=(tracks, cameras, weights),
+            )

@@ -1,0 +1,180 @@
+"""SfAM as a layer: :class:`kcs_torch.SfAM` runs it over its windows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from torch import Tensor
+
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.nn.layers import full_precision, known
+from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape, to_scale
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled
+from kcs_torch.skeleton import Skeleton, get_skeleton
+from kcs_torch.solvers.iterate import Solution
+
+__all__ = ["UnrolledSfAM"]
+
+
+class UnrolledSfAM(Unrolled):
+    """``num_steps`` steps of SfAM: FPC with the articulated term in the last of them.
+
+    Args:
+        skeleton: a :class:`Skeleton`, a built-in name or a file.
+        num_steps: steps; each has its own step size, threshold and stiffness.
+        mu: first threshold, a share of the data's largest singular value.
+        final: last threshold.
+        tau: step size of the articulated steps, below 1; the others take twice that.
+        momentum: as in :class:`UnrolledFPC`.
+        beta: stiffness of the bones.
+        articulate_from: share of the steps after which the articulated term joins; 0 is all of them, as printed.
+        lengths: relative bone lengths, one per bone, brought to the scale of each clip; lengths estimated from the
+            shape at every step if None.
+        learnable: as in :class:`UnrolledFPC`.
+        learnable_lengths: the relative lengths are parameters, too; they start from the skeleton's if none are given.
+        grad_steps: as in :class:`UnrolledFPC`.
+        gradient: as in :class:`UnrolledFPC`.
+
+    Raises:
+        OptionError: a number is out of range.
+        SkeletonError: the skeleton is unknown, or has no lengths where they are to be learned.
+
+    Kovalenko et al. 2019, Algorithm 1.
+    """
+
+    bones: Tensor
+    raw_threshold: Tensor
+    raw_step: Tensor
+    raw_stiffness: Tensor
+
+    def __init__(
+        self,
+        skeleton: str | Path | Skeleton,
+        num_steps: int = 10,
+        *,
+        mu: float = 0.5,
+        final: float = 1e-5,
+        tau: float = 0.5,
+        momentum: float = 0.8,
+        beta: float = 1.5,
+        articulate_from: float = 0.6,
+        lengths: Sequence[float] | None = None,
+        learnable: bool = True,
+        learnable_lengths: bool = False,
+        grad_steps: int | None = None,
+        gradient: Gradient = "unrolled",
+    ) -> None:
+        super().__init__(num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
+        if not (tau > 0 and beta > 0) or not 0 <= articulate_from <= 1:
+            raise OptionError(
+                f"UnrolledSfAM: expected tau > 0, beta > 0 and articulate_from in 0..1, got {tau}, {beta} and "
+                f"{articulate_from}"
+            )
+        self.skeleton = get_skeleton(skeleton)
+        self.rigid = list(self.skeleton.rigid)
+        self.register_buffer("bones", self.skeleton.bone_index()[self.rigid], persistent=False)
+        self.first = round(articulate_from * num_steps) if self.rigid else num_steps
+        self._positive("threshold", continuation(num_steps, mu, final))
+        self._positive("step", [2 * tau] * self.first + [tau] * (num_steps - self.first))
+        self._positive("stiffness", [beta] * num_steps)
+        self._hold_lengths(self.skeleton, lengths, learnable_lengths)
+
+    def forward(
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        *,
+        weights: Tensor | None = None,
+        start: Tensor | None = None,
+        lengths: Tensor | None = None,
+    ) -> Tensor:
+        """Return the shape in the world frame of the cameras.
+
+        Args:
+            tracks: (..., T, N, 2).
+            cameras: (..., T, 2, 3).
+            weights: (..., T, N), 0 where unseen.
+            start: (..., T, N, 3); the back-projected tracks if None.
+            lengths: (..., B) bone lengths in the unit of the tracks, instead of the module's.
+
+        Returns:
+            (..., T, N, 3).
+
+        Raises:
+            ShapeError: the shapes do not fit.
+
+        Warns:
+            ConvergenceWarning: with the implicit gradient, in the backward pass.
+        """
+        return self._solve(tracks, cameras, weights, start, lengths, one_body=False, measure=False).value
+
+    def solve(
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        *,
+        weights: Tensor | None = None,
+        start: Tensor | None = None,
+        lengths: Tensor | None = None,
+        one_body: bool = False,
+    ) -> Solution[Tensor]:
+        """As :meth:`forward`, with a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still.
+
+        ``one_body`` takes the batch (W, T, N, ...) for windows of one body, which share their bone lengths;
+        ``lengths`` are then proportions (B,), brought to the scale of the shape.
+        """
+        return self._solve(tracks, cameras, weights, start, lengths, one_body=one_body, measure=True)
+
+    def _solve(
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        weights: Tensor | None,
+        start: Tensor | None,
+        lengths: Tensor | None,
+        *,
+        one_body: bool,
+        measure: bool,
+    ) -> Solution[Tensor]:
+        self._check(tracks, cameras, weights, start)
+        joints, count = self.skeleton.num_joints, self.skeleton.num_bones
+        given = None if lengths is None else tuple(lengths.shape)
+        if tracks.shape[-2] != joints or (given is not None and given[-1:] != (count,)):
+            raise ShapeError(
+                f"UnrolledSfAM: expected tracks (..., T, {joints}, 2) and lengths (..., {count}) for skeleton "
+                f"'{self.skeleton.name}', got {tuple(tracks.shape)} and {given}"
+            )
+        tracks = known(tracks, weights)
+        threshold, step = self._values("threshold", tracks), self._values("step", tracks)
+        stiffness = self._values("stiffness", tracks)
+        relative = one_body or lengths is None
+        if lengths is None and self.has_lengths:
+            lengths = self._values("length", tracks)
+        fixed = None if lengths is None else lengths[..., self.rigid]
+        pooled = weights.flatten(0, 1) if weights is not None and one_body else weights
+        graded = not self.skeleton.tree
+
+        def advance(shape: Tensor, k: int) -> Tensor:
+            if k < self.first:
+                return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k])
+            target, rigidity = estimate_lengths(
+                shape.flatten(0, 1) if one_body else shape, self.bones, pooled, graded=graded
+            )
+            if fixed is not None:
+                target = to_scale(fixed, target) if relative else fixed
+            return shape_step(
+                shape, tracks, cameras, weights, threshold[k] * scale, step[k],
+                bones=self.bones, lengths=target, stiffness=stiffness[k] * rigidity,
+            )  # fmt: skip
+
+        with full_precision(tracks):
+            scale = data_scale(tracks, cameras, weights)
+            begin = start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype)
+            return self._run(
+                advance,
+                begin,
+                inner=begin.ndim if one_body else 3,
+                measure=measure,
+                depends_on=(tracks, cameras, weights, lengths),
+            )
