@@ -32,7 +32,7 @@ ALLOWED = {
     "io": {"functional", "viewer"} | BASE,
     "reconstruct": {"functional", "solvers", "nn", "methods"} | BASE,
     "live": {"functional", "solvers", "nn", "methods"} | BASE,
-    "training": {"functional", "solvers", "nn", "methods", "metrics", "data"} | BASE,
+    "training": {"functional", "solvers", "nn", "methods", "metrics", "data", "io"} | BASE,
     "cli": {"", "functional", "methods", "reconstruct", "io", "data", "viewer", "metrics", "clean", "detect"} | BASE,
     "many": {"io", "methods", "reconstruct"} | BASE,
     "": {"functional", "solvers", "nn", "methods", "reconstruct", "live", "io", "metrics"} | BASE,

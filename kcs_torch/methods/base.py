@@ -86,6 +86,8 @@ class Method(ABC):
     """Whether :meth:`solve` takes tracks about the body's middle in each frame; else about its mean over time."""
     keeps_lengths: ClassVar[bool] = True
     """Whether bones keep their length as far as the tracks admit; else lengths that vary say nothing of the tracks."""
+    learned: ClassVar[bool] = False
+    """Whether depth comes from examples: then it does not rest on the viewpoint's turn."""
     reckons_in_seconds: ClassVar[bool] = False
     """Whether the frame rate matters; 30 frames a second are assumed where it is unknown."""
 
@@ -205,7 +207,7 @@ class Method(ABC):
         variation = (ratio - 1).square().mean(0).sqrt()
         turn = float(viewpoint_turn(found.cameras))
         notes = list(found.notes)
-        if turn < WEAK_TURN:
+        if turn < WEAK_TURN and not self.learned:
             rest = "the skeleton's template and lengths" if body.template is not None else "constant lengths alone"
             notes.append(f"the viewpoint turned by {turn:.0f} degrees only: depth rests on {rest}")
         if found.doubt:

@@ -8,13 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from kcs_torch.training.batch import Batch
+    from kcs_torch.training.checkpoint import load_lifter, save_lifter
     from kcs_torch.training.data import TracksDataModule
+    from kcs_torch.training.lifter import Lifter
 
-__all__ = ["Batch", "TracksDataModule"]
+__all__ = ["Batch", "Lifter", "TracksDataModule", "load_lifter", "save_lifter"]
 
 _HOME = {
     "Batch": "batch",
+    "Lifter": "lifter",
     "TracksDataModule": "data",
+    "load_lifter": "checkpoint",
+    "save_lifter": "checkpoint",
 }
 
 

@@ -1,0 +1,149 @@
+"""Trained networks on disk: safetensors files that say what network they are of, and hold no code."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kcs_torch.errors import FormatError, KcsError, OptionError, OutputError, unknown
+from kcs_torch.io.atomic import atomic_path
+from kcs_torch.io.registry import need, read_error
+from kcs_torch.nn import MLPLifter, TemporalLifter
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.training.lifter import Lifter
+
+__all__ = ["NETWORKS", "load_lifter", "save_lifter"]
+
+NETWORKS: dict[str, type[MLPLifter] | type[TemporalLifter]] = {"MLPLifter": MLPLifter, "TemporalLifter": TemporalLifter}
+"""The networks that files may name."""
+
+KEY = "kcs_torch"
+"""Under which the file's metadata says, as JSON, what it is."""
+
+LARGEST = 2**20
+"""No option of a network is larger; a file that says so is damaged."""
+
+
+def save_lifter(
+    path: str | Path, network: nn.Module, *, fps: float | None = None, notes: Mapping[str, Any] | None = None
+) -> Path:
+    """Write a lifting network to a safetensors file.
+
+    Args:
+        path: of the file; the suffix .safetensors is usual.
+        network: one of :data:`NETWORKS`.
+        fps: frames per second of the tracks that it was trained on, which results then warn by.
+        notes: more to keep in the file, such as what it was trained on: whatever JSON can hold.
+
+    Returns:
+        The path.
+
+    Raises:
+        OptionError: the network is none of these, or the notes are no JSON.
+        OutputError: the file cannot be written.
+
+    >>> import tempfile
+    >>> path = save_lifter(Path(tempfile.mkdtemp()) / "lifter.safetensors", MLPLifter("h36m17", width=8))
+    >>> load_lifter(path).network.options
+    {'dropout': 0.1, 'num_blocks': 2, 'width': 8, 'window': 1}
+    """
+    kind = type(network).__name__
+    if NETWORKS.get(kind) is not type(network) or not isinstance(network, (MLPLifter, TemporalLifter)):
+        raise unknown("network to save", kind, NETWORKS)
+    tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
+    facts = {
+        "version": version("kcs-torch"),
+        "network": kind,
+        "options": network.options,
+        "skeleton": network.skeleton.to_dict(),
+        "fps": fps,
+        "notes": dict(notes or {}),
+    }
+    try:
+        text = json.dumps(facts, sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise OptionError(f"save_lifter: notes and fps: expected what JSON can hold, got {error}") from None
+    data = need("safetensors.torch", str(path), OutputError).save(tensors, {KEY: text})
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+    return Path(path)
+
+
+def load_lifter(path: str | Path, *, device: torch.device | str = "cpu") -> Lifter:
+    """Read a network that :func:`save_lifter` wrote, as a method: ``kt.reconstruct(tracks, method=load_lifter(path))``.
+
+    Only networks of this package are made, and no code of the file is run.
+
+    Args:
+        path: the file.
+        device: where the network is to run.
+
+    Raises:
+        FormatError: the file cannot be read, is damaged, or is something else.
+    """
+    path = Path(path)
+    data = _bytes(path)
+    library = need("safetensors.torch", str(path), FormatError)
+    try:
+        tensors: dict[str, Tensor] = library.load(data)
+        size = int.from_bytes(data[:8], "little")
+        text = json.loads(data[8 : 8 + size])["__metadata__"][KEY]
+        facts = json.loads(text)
+    except (KeyError, TypeError):
+        raise FormatError(f"{path}: expected a network that save_lifter wrote, got another safetensors file") from None
+    except Exception as error:  # the package raises its own kind, which it does not derive from ValueError
+        raise FormatError(f"{path}: expected a network that save_lifter wrote, got {error}") from None
+    network = _build(path, facts, tensors)
+    fps = facts.get("fps")
+    if fps is not None and not (isinstance(fps, (int, float)) and 0 < fps < float("inf")):
+        raise FormatError(f"{path}: fps: expected a positive number, got {fps!r}")
+    return Lifter(network.to(device).eval(), fps=None if fps is None else float(fps))
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise read_error(path, error) from None
+
+
+def _build(path: Path, facts: Any, tensors: Mapping[str, Tensor]) -> nn.Module:
+    """The network of a file's facts, with its weights."""
+    what = f"{path}: expected a network that save_lifter wrote"
+    if not isinstance(facts, dict) or not isinstance(facts.get("options"), dict):
+        raise FormatError(f"{what}, got metadata of another kind")
+    kind, options = facts.get("network"), facts["options"]
+    if kind not in NETWORKS:
+        raise unknown(f"network in {path}", kind, NETWORKS, FormatError)
+    flat = [v for value in options.values() for v in (value if isinstance(value, list) else [value])]
+    if not all(isinstance(v, (int, float)) and abs(v) <= LARGEST for v in flat):
+        raise FormatError(f"{what}, got options out of range: {str(options)[:200]}")
+    if options.get("num_blocks", 0) > len(tensors) or len(flat) > len(tensors) + 8:
+        raise FormatError(f"{what}, got fewer weights than its options ask for")
+    try:
+        skeleton = Skeleton.from_dict(facts.get("skeleton") or {}, source=str(path))
+        with torch.device("meta"):  # costs nothing, however large a damaged file says it is
+            plan = NETWORKS[kind](skeleton, **options).state_dict()
+    except KcsError as error:
+        raise FormatError(f"{path}: {error}") from None
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise FormatError(f"{what}, got options {str(options)[:200]} ({error})") from None
+    wrong = [n for n in {*plan, *tensors} if n not in plan or n not in tensors or plan[n].shape != tensors[n].shape]
+    if wrong:
+        raise FormatError(f"{what}, got weights that do not fit its options: {min(wrong)}")
+    kinds = {value.dtype for value in tensors.values()}
+    if len(kinds) != 1 or not (dtype := kinds.pop()).is_floating_point:
+        raise FormatError(f"{what}, got weights that are not of one floating-point type")
+    bad = [n for n, value in tensors.items() if not bool(torch.isfinite(value).all())]
+    if bad:
+        raise FormatError(f"{path}: weights that are not finite: {min(bad)}")
+    with torch.random.fork_rng(devices=[]):  # reading draws no random numbers of the caller's
+        network = NETWORKS[kind](skeleton, **options).to(dtype)
+    network.load_state_dict(dict(tensors))
+    return network
