@@ -1,9 +1,11 @@
 """What the tests of the mathematics share: seeded numbers, small bodies, and the checks that every function gets."""
 
 import math
+from collections import Counter
 
 import torch
 from torch.testing import assert_close
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from kcs_torch.functional import bone_lengths
 from kcs_torch.skeleton import Skeleton
@@ -113,3 +115,33 @@ def dense_fit_bones(points, lengths, bones, stiffness, num_steps, damping=0.0, s
         normal_matrix = jacobian.mT @ jacobian + damping * torch.eye(len(current), dtype=points.dtype)
         current = current - torch.linalg.solve(normal_matrix, jacobian.mT @ residuals(current))
     return current.reshape(points.shape)
+
+
+class Operations(TorchDispatchMode):
+    """Counts what runs under it: operations, and the numbers that they write. Views are free and do not count."""
+
+    VIEWS = frozenset(
+        "_reshape_alias _unsafe_view alias as_strided detach diagonal expand permute select slice split "
+        "split_with_sizes squeeze t transpose unbind unfold unsqueeze view".split()
+    )
+
+    def __init__(self):
+        super().__init__()
+        self.total, self.elements, self.names = 0, 0, Counter()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        out = function(*args, **(kwargs or {}))
+        name = function.overloadpacket.__name__
+        if name not in self.VIEWS:
+            self.total += 1
+            self.names[name] += 1
+            tensors = out if isinstance(out, (tuple, list)) else [out]
+            self.elements += sum(t.numel() for t in tensors if isinstance(t, torch.Tensor))
+        return out
+
+
+def count_operations(function):
+    """Run a function and return the :class:`Operations` that it made."""
+    with Operations() as made:
+        function()
+    return made

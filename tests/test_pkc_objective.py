@@ -15,7 +15,7 @@ from kcs_torch.methods.lockstep import run, together
 from kcs_torch.methods.pkc import batch
 from kcs_torch.methods.pkc import objective as module
 from kcs_torch.methods.pkc.batch import Task, minimise_all
-from kcs_torch.methods.pkc.objective import Objective, Weights, _Unknowns, at_pace, bone_noise, pace_of
+from kcs_torch.methods.pkc.objective import Objective, Weights, Unknowns, at_pace, bone_noise, pace_of
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.solvers import lbfgs
 
@@ -172,7 +172,7 @@ def test_unknowns_start_where_they_are_told_to(skeleton, noise):
     found = objective(points, skeleton, noise=noise)
     depth = torch.stack([points[..., 2], -0.5 * points[..., 2]])
     lengths = lengths_of(found, points) * torch.tensor([[1.0], [1.1]])
-    unknowns = _Unknowns(found, depth, lengths)
+    unknowns = Unknowns(found, depth, lengths)
     bones = found.skeleton.num_bones
     assert unknowns.scale.shape == (2, 6 * bones) and (unknowns.scale > 0).all()
     again, same = unknowns(torch.zeros(2, 6 * bones).double())
@@ -186,7 +186,7 @@ def test_unknowns_give_bodies_wherever_they_are(skeleton):
     points = walk(5, skeleton)
     found = objective(points, skeleton)
     body = SKELETONS[skeleton]
-    unknowns = _Unknowns(found, points[None, ..., 2], lengths_of(found, points)[None])
+    unknowns = Unknowns(found, points[None, ..., 2], lengths_of(found, points)[None])
     depth, lengths = unknowns(30 * normal(1, 6 * body.num_bones))
     assert (depth - points[..., 2]).abs().max() > 0.1
     assert depth.mean(-1).abs().max() < 1e-12 and (lengths > 0).all()
@@ -199,7 +199,7 @@ def test_a_length_takes_its_bone_s_depths_along():
     points = walk(5)
     found = objective(points)
     lengths = lengths_of(found, points)[None]
-    unknowns = _Unknowns(found, points[None, ..., 2], lengths)
+    unknowns = Unknowns(found, points[None, ..., 2], lengths)
     state = torch.zeros(1, 6 * 16).double()
     state[:, -16:] = 1e-4 / unknowns.scale[:, -16:]
     depth, grown = unknowns(state)
@@ -216,7 +216,7 @@ def test_a_length_takes_its_bone_s_depths_along():
 def test_gradient_over_unknowns(frames, noise):
     points = walk(5)[:frames]
     found = objective(points, noise=noise)
-    unknowns = _Unknowns(found, *of_length(found, points, 1.05))
+    unknowns = Unknowns(found, *of_length(found, points, 1.05))
     start = torch.zeros_like(unknowns.scale)
     for state in (start, 2 * normal(*start.shape)):
         assert gradcheck(lambda s: found(*unknowns(s)), state, fast=True)
@@ -228,7 +228,7 @@ def test_unknowns_make_the_objective_round(noise):
     points = walk(6, yaw=20.0)
     found = objective(points, noise=noise)
     z, sizes, *_ = found.minimise(points[None, ..., 2], lengths_of(found, points)[None], 100)
-    unknowns = _Unknowns(found, z, sizes)
+    unknowns = Unknowns(found, z, sizes)
     plain = torch.cat([z.flatten(), sizes.flatten().log()])
     curves = []
     for energy, state in (

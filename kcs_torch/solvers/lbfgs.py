@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ __all__ = ["lbfgs"]
 
 
 def lbfgs(
-    energy: Callable[[Tensor], Tensor],
+    energy: Callable[[Tensor], Any],
     start: Tensor,
     *,
     num_steps: int = 100,
@@ -21,6 +22,7 @@ def lbfgs(
     tolerance: float = 1e-6,
     max_trials: int = 12,
     first_step: float = 1e-2,
+    slopes: bool = False,
 ) -> Solution[Tensor]:
     """Minimise ``energy`` of each row of ``start`` by L-BFGS with a backtracking line search (Nocedal 1980).
 
@@ -35,6 +37,7 @@ def lbfgs(
         tolerance: a problem rests once ten steps lower its energy by less than this share of its size.
         max_trials: halvings of a step; a problem whose step fails restarts from steepest descent, then rests.
         first_step: length of the first step, a share of the start's root mean square (of 1 where that is 0).
+        slopes: ``energy`` returns its gradient, too: (H,) and (H, D). Else autograd tells it.
 
     Returns:
         The minimisers (H, D); whether all settled within ``num_steps``; where they were ten steps earlier.
@@ -45,6 +48,10 @@ def lbfgs(
     """
 
     def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
+        if slopes:
+            with torch.no_grad():
+                pair: tuple[Tensor, Tensor] = energy(x)
+            return pair
         with torch.enable_grad():
             x = x.detach().requires_grad_()
             value = energy(x)

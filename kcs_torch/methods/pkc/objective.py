@@ -11,19 +11,13 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
+from kcs_torch.methods.pkc.descent import ANCHOR, CORNER, HEAVY, NOISE, Descent, wide
 from kcs_torch.nn.anatomy import HingeEnergy
 from kcs_torch.nn.posture import ForeshorteningEnergy, PostureEnergy, ProportionEnergy, free_bones
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
 
-__all__ = ["Objective", "Refined", "Weights", "at_pace", "bone_noise", "pace_of"]
-
-NOISE, CORNER = 0.8, 0.3
-"""Share of the noise's variance that is not to be explained, and how gently its cost sets in."""
-
-HEAVY = 4.0
-"""Squared deviations of a length from here on count like an outlier's, in variances."""
-
+__all__ = ["Objective", "Refined", "Unknowns", "Weights", "at_pace", "bone_noise", "pace_of"]
 
 WALK = 4.3
 """Frames in which a walking person's bones change in the image by as much as they stray, at 30 frames a second."""
@@ -185,7 +179,7 @@ class Objective:
             "proportions": self.proportions(lengths),
         }
         if self.anchor is not None:
-            out["anchor"] = self.held * ((lengths / self.anchor).log() / 0.01).square().sum(-1) / 2
+            out["anchor"] = self.held * ((lengths / self.anchor).log() / ANCHOR).square().sum(-1) / 2
         return out
 
     def _length(self, off: Tensor, lengths: Tensor) -> Tensor:
@@ -197,18 +191,18 @@ class Objective:
         precision = self.precision(lengths)
         spread = self._mean(HEAVY * torch.log1p(precision * off.square() / HEAVY))  # (H, B)
         if self.noisy:
-            noise = NOISE * self._mean(self.rigid - _wide(self.weights.length, 2) ** 2 * precision)
+            noise = NOISE * self._mean(self.rigid - wide(self.weights.length, 2) ** 2 * precision)
             over = spread - noise
             spread = (over + (over.square() + (CORNER * noise).square() + 1e-12).sqrt()) / 2
         return self.count / 2 * torch.log1p(spread).sum(-1)
 
     def _mean(self, values: Tensor) -> Tensor:
         """Mean over time (H, B) of (H, T, B), which is 0 in frames that pad a clip."""
-        return values.mean(1) if self.time is None else values.sum(1) / _wide(self.count, 1)
+        return values.mean(1) if self.time is None else values.sum(1) / wide(self.count, 1)
 
     def precision(self, lengths: Tensor) -> Tensor:
         """1 / s^2 (H, T, B): an image's noise counts less the more the bone points at the camera."""
-        least = _wide(self.weights.length, 2) ** 2
+        least = wide(self.weights.length, 2) ** 2
         if not self.noisy:
             return (self.rigid / least).expand(*lengths.shape[:1], *self.flat.shape[-2:])
         share = (self.flat / lengths[:, None].square()).clamp_max(1)
@@ -230,9 +224,9 @@ class Objective:
         """As :meth:`minimise`, in the order of the hypotheses."""
         goal = copy(self)
         goal.weights = replace(self.weights, length=loose * self.weights.length)
-        unknowns = _Unknowns(goal, depth, lengths)
+        unknowns = Unknowns(goal, depth, lengths)
         start = depth.new_zeros(len(depth), unknowns.scale.shape[-1])
-        solution = lbfgs(lambda state: goal(*unknowns(state)), start, num_steps=num_steps, tolerance=1e-5)
+        solution = lbfgs(Descent(goal, unknowns), start, num_steps=num_steps, tolerance=1e-5, slopes=True)
         with torch.no_grad():
             depth, lengths = unknowns(solution.value)
             energy = goal(depth, lengths)
@@ -275,7 +269,7 @@ class Objective:
         return out
 
 
-class _Unknowns:
+class Unknowns:
     """Depths and lengths about a start, in coordinates in which the objective is nearly a sphere.
 
     A length is known so well that it can hardly move on its own: dz (dL/dz) = L dL moves a bone's depths with it. What
@@ -289,36 +283,32 @@ class _Unknowns:
 
     def __init__(self, objective: Objective, depth: Tensor, lengths: Tensor) -> None:
         w, posture = objective.weights, objective.posture
+        early = lambda values: values.mT.contiguous()  # noqa: E731
         self.objective, self.lengths = objective, lengths
-        self.dz = bone_vectors(depth[..., None], objective.bones)[..., 0]
-        size = lengths[:, None]
-        off = (objective.flat + self.dz.square() - size.square()) / (2 * size)
-        precision = objective.precision(lengths)
+        self.dz = early(bone_vectors(depth[..., None], objective.bones)[..., 0])
+        size = lengths[..., None]
+        off = (early(objective.flat) + self.dz.square() - size.square()) / (2 * size)
+        precision = early(objective.precision(lengths))
         each = precision * off.square()
-        spread = objective._mean(HEAVY * torch.log1p(each / HEAVY))[:, None]
+        spread = objective._mean(HEAVY * torch.log1p(each / HEAVY).mT)[..., None]
         pull = precision / (1 + spread.clamp_max(1))
-        shape = _wide(w.posture, 2) * (posture.deviation.square().mean(-1) * size.square()).clamp_min(1e-3)
-        curve = pull * (self.dz / size).square() + 6 / _wide(w.acceleration, 2) ** 2 + 5 / shape  # (H, T, B)
+        shape = wide(w.posture, 2) * (posture.deviation.square().mean(-1)[:, None] * size.square()).clamp_min(1e-3)
+        curve = pull * (self.dz / size).square() + 6 / wide(w.acceleration, 2) ** 2 + 5 / shape  # (H, B, T)
         self.shear = size.square() * self.dz / (self.dz.square() + (0.5 * size).square())
         left = size - self.dz * self.shear / size
-        bend = self.shear.diff(n=2, dim=1).square()
+        bend = self.shear.diff(n=2).square()
         if objective.time is not None:
-            bend = bend * objective.time[:, 2:, None]
-        bend = bend.sum(1) / _wide(w.acceleration, 1) ** 2
-        along = (pull * left.square()).sum(1) + 1 / _wide(w.proportions, 1) ** 2 + bend  # (H, B)
+            bend = bend * objective.time[:, None, 2:]
+        bend = bend.sum(-1) / wide(w.acceleration, 1) ** 2
+        along = (pull * left.square()).sum(-1) + 1 / wide(w.proportions, 1) ** 2 + bend  # (H, B)
         self.scale = torch.cat([curve.flatten(1), along], 1).rsqrt()
 
     def __call__(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Depths (H, T, N), centred, virtual joints among them, and lengths (H, B), of unknowns (H, T B + B)."""
+        """Depths (H, T, N), centred, virtual joints among them, and lengths (H, B), of unknowns (H, B T + B)."""
         obj = self.objective
-        _, frames, bones = self.dz.shape
-        part, grown = (state * self.scale).split([frames * bones, bones], 1)
-        dz = self.dz + part.unflatten(1, (frames, bones)) + self.shear * grown[:, None]
-        own = dz @ obj.tree[: obj.skeleton.num_observed].mT
+        _, bones, frames = self.dz.shape
+        part, grown = (state * self.scale).split([bones * frames, bones], 1)
+        dz = self.dz + part.unflatten(1, (bones, frames)) + self.shear * grown[..., None]
+        own = dz.mT @ obj.tree[: obj.skeleton.num_observed].mT
         depth = own @ obj.complete
         return depth - depth.mean(-1, keepdim=True), self.lengths * grown.exp()
-
-
-def _wide(value: Tensor | float, dims: int) -> Tensor | float:
-    """A number, or one for each hypothesis (H,), with further dimensions of one."""
-    return value[(..., *[None] * dims)] if isinstance(value, Tensor) else value

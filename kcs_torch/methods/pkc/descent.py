@@ -1,0 +1,265 @@
+"""The objective's value and gradient in one pass, written out: PKC spends most of its time here."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.chain import bone_vectors, incidence
+
+if TYPE_CHECKING:
+    from kcs_torch.methods.pkc.objective import Objective, Unknowns
+
+__all__ = ["ANCHOR", "CORNER", "HEAVY", "NOISE", "Descent", "wide"]
+
+NOISE, CORNER = 0.8, 0.3
+"""Share of the noise's variance that is not to be explained, and how gently its cost sets in."""
+
+HEAVY = 4.0
+"""Squared deviations of a length from here on count like an outlier's, in variances."""
+
+ANCHOR = 0.01
+"""Standard deviation of a length that is known from elsewhere in the clip, as a share."""
+
+
+class Descent:
+    """Energy (H,) and gradient (H, B T + B) over the unknowns, equal to autograd's of :meth:`Objective.terms`.
+
+    All terms are functions of the bones' depths dz and of the logarithms of their lengths: joints are never formed,
+    and what the image alone decides is made once. Time comes last, so that what belongs to a bone or to a frame is
+    spread over long rows.
+
+    Args:
+        objective: what is minimised.
+        unknowns: its coordinates.
+    """
+
+    def __init__(self, objective: Objective, unknowns: Unknowns) -> None:
+        self.objective, self.unknowns, self.weights = objective, unknowns, objective.weights
+        obj, body, like = objective, objective.skeleton, objective.image
+        self.x, self.y = (_early(v) for v in bone_vectors(obj.image, obj.bones).unbind(-1))  # (1 or H, B, T) each
+        self.flat = _early(obj.flat)
+        self.noise = _early(obj.noise).square() if obj.noisy else None
+        self.rigid = obj.rigid[None, :, None] if obj.rigid.ndim == 1 else _early(obj.rigid)
+        self.time = None if obj.time is None else obj.time[:, None]  # (H, 1, T)
+        ends = incidence(obj.bones, body.num_joints, dtype=like.dtype).mT
+        mix = ends @ obj.complete.mT @ obj.tree[: body.num_observed]  # virtual joints move bones with others
+        eye = torch.eye(len(mix), dtype=like.dtype, device=like.device)
+        self.mix = None if bool((mix - eye).abs().amax() < 1e-9) else mix
+        posture = obj.posture
+        affine = posture.affine.to(like)
+        part = obj.image.index_select(-2, posture.trunk)
+        plane = (affine @ (part - part.mean(-2, keepdim=True))).movedim(-3, -1)  # (..., long axes, xy, T)
+        self.plane = plane if plane.ndim == 4 else plane[None]
+        lines = [(affine - affine.mean(-1, keepdim=True)) @ obj.tree[posture.trunk]]  # (2, B): the axes' depths
+        self.axes = posture.axes.to(like)
+        self.spread = posture.deviation.to(like).mT[..., None]  # (3, B, 1)
+        self.mean = posture.mean.to(like).mT[..., None] / self.spread
+        hinges = obj.hinges
+        if len(hinges.joints):
+            parent, joint, child, left, right = hinges.joints.unbind(1)
+            pairs = ((joint, parent), (child, joint), (left, right))
+            edges = [obj.image.index_select(-2, a) - obj.image.index_select(-2, b) for a, b in pairs]
+            (ux, uy), (vx, vy), (ax, ay) = ((_early(v) for v in edge.unbind(-1)) for edge in edges)
+            # (u x v) . a = a_z k_0 + v_z k_1 - u_z k_2
+            self.turns = ux * vy - uy * vx, ax * uy - ay * ux, ax * vy - ay * vx
+            self.across = ax.square() + ay.square()
+            self.firm, self.sign = hinges.firm.to(like), hinges.sign.to(like)
+            lines += [obj.tree[a] - obj.tree[b] for a, b in pairs]
+        self.lines = torch.cat(lines)  # (2 + 3 hinges, B)
+        free = obj.foreshortening
+        self.limbs = free.free.nonzero().flatten()
+        clear = _early(obj.clear).index_select(1, self.limbs)
+        self.clear = clear * (free.free.to(like)[self.limbs, None] / free.correlation)
+
+    def __call__(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Value (H,) and gradient (H, B T + B) of unknowns (H, B T + B)."""
+        u = self.unknowns
+        count, bones, frames = u.dz.shape
+        part, grown = (state * u.scale).split([bones * frames, bones], 1)
+        own = torch.addcmul(part.view(count, bones, frames), u.shear, grown[..., None]).add_(u.dz)
+        lengths = u.lengths * grown.exp()
+        dz = own if self.mix is None else self.mix @ own
+        value, slope, growth = self._lengths(dz, lengths)
+        lines = self.lines @ dz
+        back = torch.zeros_like(lines)
+        value = value + self._smoothness(dz, slope)
+        value = value + self._posture(dz, lengths, lines[:, :2], slope, growth, back[:, :2])
+        if len(self.lines) > 2:
+            value = value + self._hinges(lengths, lines[:, 2:], growth, back[:, 2:])
+        value = value + self._foreshortening(dz, lengths, slope, growth)
+        value = value + self._sizes(lengths, growth)
+        slope.baddbmm_(self.lines.mT.expand(count, -1, -1), back)
+        if self.mix is not None:
+            slope = self.mix.mT @ slope
+        growth += (slope * u.shear).sum(-1)
+        return value, torch.cat([slope.flatten(1), growth], 1).mul_(u.scale)
+
+    # Each term returns its value (H,) and adds its derivative in dz to slope (H, B, T), that in the logarithms of the
+    # lengths to growth (H, B).
+
+    def _lengths(self, dz: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        obj, size = self.objective, lengths[..., None]
+        least = wide(self.weights.length, 2) ** 2
+        off = torch.addcmul(self.flat, dz, dz).sub_(size.square()).mul_(0.5 / size)
+        if self.noise is None:
+            precision = self.rigid / least
+        else:
+            ratio = self.flat / size.square()
+            variance = ratio.clamp_max(1).mul_(self.noise)
+            total = variance + least
+            precision = self.rigid / total
+        each = off.square().mul_(precision / HEAVY)
+        count = wide(obj.count, 1)
+        spread = each.log1p().sum(-1) * HEAVY / count
+        if self.noise is None:
+            value, pull = spread, torch.ones_like(spread)
+        else:
+            noise = NOISE / count * (self.rigid - least * precision).sum(-1)
+            over = spread - noise
+            root = (over.square() + (CORNER * noise).square() + 1e-12).sqrt()
+            value, pull = (over + root) / 2, (1 + over / root) / 2
+            push = -pull + CORNER**2 * noise / root / 2
+        outer = 1 / (2 + 2 * value)  # times count: d value / d spread
+        pull = pull * outer
+        inverse = each.add_(1).reciprocal_()  # 1 / (1 + p off^2 / 4)
+        bent = precision * off * inverse  # p off / (1 + p off^2 / 4)
+        growth = -2 * pull * (HEAVY * (dz.shape[-1] - inverse.sum(-1)) + lengths * bent.sum(-1))
+        if self.noise is not None:
+            steep = 2 * variance / total * (ratio <= 1)  # d log p / d log L
+            drift = pull[..., None] * HEAVY * (1 - inverse) - (push * outer)[..., None] * (NOISE * least) * precision
+            growth = growth + (steep * drift).sum(-1)
+        slope = bent.mul_((2 * pull / lengths)[..., None]).mul_(dz)
+        return obj.count / 2 * value.log1p().sum(-1), slope, growth
+
+    def _smoothness(self, dz: Tensor, slope: Tensor) -> Tensor:
+        if dz.shape[-1] < 3:
+            return dz.new_zeros(len(dz))
+        bend = (dz[..., 2:] + dz[..., :-2]).sub_(dz[..., 1:-1], alpha=2)
+        if self.time is not None:
+            bend = bend * self.time[..., 2:]
+        weight = 1 / wide(self.weights.acceleration, 2) ** 2
+        pull = bend * weight
+        slope[..., 2:] += pull
+        slope[..., :-2] += pull
+        slope[..., 1:-1].sub_(pull, alpha=2)
+        return (bend * pull).sum((1, 2)) / 2
+
+    def _posture(
+        self, dz: Tensor, lengths: Tensor, depths: Tensor, slope: Tensor, growth: Tensor, back: Tensor
+    ) -> Tensor:
+        posture, share = self.objective.posture, self.objective.share
+        count, bones, frames = dz.shape
+        first, second = torch.cat([self.plane.expand(count, -1, -1, -1), depths[:, :, None]], 2).unbind(1)  # (H, 3, T)
+        over = (first.square().sum(1, keepdim=True) + 1e-18).rsqrt()
+        first = first * over
+        along = (second * first).sum(1, keepdim=True)
+        square = second - along * first
+        down = (square.square().sum(1, keepdim=True) + 1e-18).rsqrt()
+        up = square * down
+        frame = torch.stack([first, up, torch.linalg.cross(first, up, dim=1)], 1).flatten(2)  # (H, 3, 3 T)
+        turn = (self.axes @ frame).view(count, 3, 3, 1, frames)  # [k, j]: how much of coordinate j is in direction k
+        scale = (lengths[:, None, :, None] * self.spread).reciprocal_()  # (H, 3, B, 1)
+        y = turn[:, :, 0] * self.x[:, None]
+        y.addcmul_(turn[:, :, 1], self.y[:, None]).addcmul_(turn[:, :, 2], dz[:, None])
+        y = y.mul_(scale).sub_(self.mean).view(count, 3 * bones, frames)
+        if share is None:
+            amount: Tensor | float = frames / posture.correlation
+            mean = y.mean(-1, keepdim=True)
+            scatter = torch.bmm(y, y.mT).mul_(1 / (posture.correlation * posture.strength))
+        else:
+            amount = share.sum(-1)[:, None, None]
+            weighed = y * share[:, None]
+            mean = weighed.sum(-1, keepdim=True) / torch.where(amount > 0, amount, 1)
+            scatter = torch.bmm(weighed, y.mT).div_(posture.strength)
+        near = amount / (amount + posture.kappa)
+        scatter.baddbmm_(mean * (-amount * near / posture.strength), mean.mT)
+        scatter.diagonal(dim1=-2, dim2=-1).add_(1)
+        factor, _ = torch.linalg.cholesky_ex(scatter)
+        inverse = torch.cholesky_inverse(factor)
+        gain = (amount + posture.strength) / posture.strength
+        towards = inverse @ mean  # (H, 3B, 1)
+        # The sums over time of slope times y, and of the slope, are those of small matrices.
+        moved = posture.strength * gain * (1 - inverse.diagonal(dim1=-2, dim2=-1)).view(count, 3, bones)
+        pulled = (gain * posture.kappa * near * towards).view(count, 3, bones) * self.mean[..., 0]
+        growth -= (moved + pulled).sum(1)
+        steep = torch.baddbmm(towards * -near, inverse, y).view(count, 3, bones, frames)
+        steep = steep.mul_(gain[..., None] * scale if isinstance(gain, Tensor) else gain * scale)
+        steep = steep.mul_(1 / posture.correlation if share is None else share[:, None, None])
+        slope += (steep * turn[:, :, 2]).sum(1)
+        turned = [(steep * v[:, None]).sum(2) for v in (self.x, self.y, dz)]  # (H, 3, T): of k, for each j
+        into = self.axes.mT @ torch.stack(turned, 2).flatten(2)  # (H, 3, 3 T)
+        a, b, c = into.view(count, 3, 3, frames).unbind(1)
+        a = a + torch.linalg.cross(up, c, dim=1)
+        b = b + torch.linalg.cross(c, first, dim=1)
+        b = (b - up * (up * b).sum(1, keepdim=True)) * down
+        slant = (b * first).sum(1, keepdim=True)
+        a = a - along * b - slant * second
+        back[:, 1] = (b - slant * first)[:, 2]
+        back[:, 0] = ((a - first * (first * a).sum(1, keepdim=True)) * over)[:, 2]
+        log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        held = amount if isinstance(amount, float) else amount[:, 0, 0]
+        return (held + posture.strength) / 2 * log_det
+
+    def _hinges(self, lengths: Tensor, depths: Tensor, growth: Tensor, back: Tensor) -> Tensor:
+        w, limbs = self.weights, self.objective.hinges.limbs
+        upper, lower, axis = depths.unflatten(1, (3, -1)).unbind(1)  # (H, hinges, T) each
+        share = 1.0 if self.time is None else self.time
+        total = ((axis.square() + self.across) * share).sum(-1)
+        known = total > 0
+        counted = axis.shape[-1] if self.time is None else self.time.sum(-1).clamp_min(1e-9)
+        size = torch.where(known, total / counted, torch.ones_like(total)).sqrt()
+        above, below = lengths[:, limbs].unbind(-1)  # (H, hinges)
+        scale = (self.sign / (above * below * size))[..., None]
+        tilt, lean, rise = self.turns
+        wrong = (upper * rise).addcmul_(lower, lean, value=-1).addcmul_(axis, tilt, value=-1).mul_(scale).clamp_min_(0)
+        pull = wrong * (wide(w.hinge / w.sine**2, 2) * self.firm[:, None] * share)
+        energy = (pull * wrong).sum(-1)  # twice that of each hinge
+        pull = pull.mul_(scale)
+        shrink = torch.where(known, energy / total, 0)[..., None] * share
+        back[:] = torch.cat([pull * rise, -pull * lean, -pull * tilt - shrink * axis], 1)
+        growth.index_add_(1, limbs.flatten(), -energy.repeat_interleave(2, 1))
+        return energy.sum(-1) / 2
+
+    def _foreshortening(self, dz: Tensor, lengths: Tensor, slope: Tensor, growth: Tensor) -> Tensor:
+        depth, size = dz.index_select(1, self.limbs), lengths[:, self.limbs]
+        least = (self.objective.foreshortening.eps * size).square()
+        square = depth.square().add_(least[..., None])
+        each = self.clear / square
+        held = self.clear.sum(-1)
+        value = held * size.log() + (self.clear * square.log()).sum(-1) / 2
+        growth.index_add_(1, self.limbs, held + least * each.sum(-1))
+        slope.index_add_(1, self.limbs, each * depth)
+        return value.sum(-1)
+
+    def _sizes(self, lengths: Tensor, growth: Tensor) -> Tensor:
+        obj = self.objective
+        prior, tiny = obj.proportions, torch.finfo(lengths.dtype).tiny
+        log = (lengths.clamp_min(tiny) / prior.usual.to(lengths).clamp_min(tiny)).log()
+        off = (log - log.mean(-1, keepdim=True)) / prior.spread
+        half = 1 + off.square() / 2
+        pull = off / (half * prior.spread)
+        growth += pull - pull.mean(-1, keepdim=True)
+        left, right = prior.pairs.unbind(1)
+        apart = (log[:, left] - log[:, right]) / prior.twins
+        growth.index_add_(1, left, apart / prior.twins)
+        growth.index_add_(1, right, apart / -prior.twins)
+        value = half.log().sum(-1) + apart.square().sum(-1) / 2
+        if obj.anchor is not None:
+            away = (lengths / obj.anchor).log() / ANCHOR
+            growth += wide(obj.held, 1) * away / ANCHOR
+            value = value + obj.held * away.square().sum(-1) / 2
+        return value
+
+
+def wide(value: Tensor | float, dims: int) -> Tensor | float:
+    """A number, or one for each hypothesis (H,), with further dimensions of one."""
+    return value[(..., *[None] * dims)] if isinstance(value, Tensor) else value
+
+
+def _early(values: Tensor) -> Tensor:
+    """(..., T, B) as (1 or H, B, T)."""
+    early = values.mT.contiguous()
+    return early if early.ndim == 3 else early[None]
