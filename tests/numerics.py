@@ -121,8 +121,27 @@ class Operations(TorchDispatchMode):
     """Counts what runs under it: operations, and the numbers that they write. Views are free and do not count."""
 
     VIEWS = frozenset(
-        "_reshape_alias _unsafe_view alias as_strided detach diagonal expand permute select slice split "
-        "split_with_sizes squeeze t transpose unbind unfold unsqueeze view".split()
+        [
+            "_reshape_alias",
+            "_unsafe_view",
+            "alias",
+            "as_strided",
+            "detach",
+            "diagonal",
+            "expand",
+            "permute",
+            "select",
+            "slice",
+            "split",
+            "split_with_sizes",
+            "squeeze",
+            "t",
+            "transpose",
+            "unbind",
+            "unfold",
+            "unsqueeze",
+            "view",
+        ]
     )
 
     def __init__(self):

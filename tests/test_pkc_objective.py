@@ -15,7 +15,7 @@ from kcs_torch.methods.lockstep import run, together
 from kcs_torch.methods.pkc import batch
 from kcs_torch.methods.pkc import objective as module
 from kcs_torch.methods.pkc.batch import Task, minimise_all
-from kcs_torch.methods.pkc.objective import Objective, Weights, Unknowns, at_pace, bone_noise, pace_of
+from kcs_torch.methods.pkc.objective import Objective, Unknowns, Weights, at_pace, bone_noise, pace_of
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.solvers import lbfgs
 
