@@ -17,8 +17,8 @@ from kcs_torch.functional.spectral import dct_basis
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.cameras import orthographic_cameras
+from kcs_torch.methods.mirror import mirror_sign
 from kcs_torch.methods.unseen import place_unseen
-from kcs_torch.nn.anatomy import HingeEnergy
 from kcs_torch.nn.unrolled import UnrolledSfAM
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.camera_path import constant_path
@@ -159,7 +159,7 @@ class SfAM(Method):
         notes: tuple[str, ...] = ()
         if cameras is None:
             assert path is not None
-            sign = points.new_tensor([1.0, 1.0, _mirror(points, tracks.skeleton)])
+            sign = points.new_tensor([1.0, 1.0, mirror_sign(points, tracks.skeleton)])
             points = points * sign
             cameras, notes = self._path(complete_rotation(path[:, :2] * sign))
         points = place_unseen(points, tracks.seen.any(0), tracks.skeleton)
@@ -244,20 +244,6 @@ def _fill_blank_frames(tracks: Tracks) -> Tracks:
         points=torch.where(made[..., None], filled, tracks.points),
         weights=torch.where(made, torch.ones_like(tracks.weights), tracks.weights),
     )
-
-
-def _mirror(points: Tensor, skeleton: Skeleton) -> float:
-    """1, or -1 where the mirror image in depth is the one to report: nothing but the joints' hinges can tell.
-
-    Without hinges it is the image that leans to the right or down as it goes away: any rule will do, as long as it does
-    not depend on a search's start.
-    """
-    flip = points.new_tensor([1.0, 1.0, -1.0])
-    wrong = HingeEnergy(skeleton).to(points.device)(torch.stack([points, points * flip])).sum(-1)
-    if bool((wrong[0] - wrong[1]).abs() > 1e-3 * wrong.sum()):
-        return 1.0 if bool(wrong[0] < wrong[1]) else -1.0
-    lean = (points[..., 2:] * points[..., :2]).sum((0, 1))
-    return 1.0 if bool(lean[lean.abs().argmax()] >= 0) else -1.0
 
 
 def _mirror_signs(parts: Tensor, starts: list[int]) -> Tensor:

@@ -7,6 +7,7 @@ from kcs_torch.solvers.ist import ist, metric_upgrade
 from kcs_torch.solvers.iterate import Solution, fpc, iterate, svt
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.lm import fit_bones
+from kcs_torch.solvers.nullspace import null_space_upgrade
 from kcs_torch.solvers.procrustean import procrustean
 from kcs_torch.solvers.sign_filter import SignFilter
 from kcs_torch.solvers.signs import SignPath, sign_table, smooth_signs
@@ -26,6 +27,7 @@ __all__ = [
     "iterate",
     "lbfgs",
     "metric_upgrade",
+    "null_space_upgrade",
     "procrustean",
     "settle_path",
     "sign_table",

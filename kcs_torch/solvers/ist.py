@@ -71,18 +71,26 @@ def ist(motion: Tensor, *, weight: float = 1e-3, num_steps: int = 60) -> Tensor:
 
 
 def metric_upgrade(
-    motion: Tensor, start: Tensor, *, smoothness: float = 0.0, num_steps: int = 150, tolerance: float = 1e-4
+    motion: Tensor,
+    start: Tensor,
+    *,
+    smoothness: float = 0.0,
+    evenness: float = 0.0,
+    num_steps: int = 150,
+    tolerance: float = 1e-4,
 ) -> tuple[Tensor, Tensor]:
     """Refine Q by Levenberg-Marquardt on the orthonormality defect of the rows ``motion @ Q``.
 
-    Minimises mean_t [((a.a - b.b)/2)^2 + (a.b)^2] + smoothness mean_t |second difference of the rows|^2 over Q of
-    mean squared row length 1. Where the viewpoint turns little many Q have small defects; the one whose camera moves
-    smoothly is the right one.
+    Minimises mean_t [((a.a - b.b)/2)^2 + (a.b)^2] + smoothness mean_t |second difference of the rows|^2
+    + evenness mean_t ((a.a + b.b)/2 - 1)^2 over Q of mean squared row length 1. Where the viewpoint turns little many Q
+    have small defects; the one whose camera moves smoothly is the right one. An orthographic camera has one scale in all
+    frames: with an evenness of 1 the sum is (a.b)^2 and half of (a.a - 1)^2 + (b.b - 1)^2, as Tomasi and Kanade have it.
 
     Args:
         motion: (..., T, 2, R).
         start: Q (..., R, 3) to start from; further batch dimensions try several starts at once.
         smoothness: weight of the second differences.
+        evenness: weight of the variance of the frames' scales: 0 for weak perspective, 1 for orthographic cameras.
         num_steps: steps, at most; each is kept only where it lowers the cost.
         tolerance: stop where steps lower the cost by less than this share.
 
@@ -98,7 +106,7 @@ def metric_upgrade(
     a, b = motion[..., 0, :], motion[..., 1, :]
     frames, rank = motion.shape[-3], motion.shape[-1]
     gram = (a.mT @ a + b.mT @ b) / (2 * frames)  # mean squared row length is tr(Q^T gram Q)
-    forms = _quadratic_forms(a, b) / frames**0.5  # (..., M, R, R): residuals are <form, Q Q^T>
+    forms = _quadratic_forms(a, b, evenness) / frames**0.5  # (..., M, R, R): residuals are <form, Q Q^T>
     bend = motion.diff(n=2, dim=-3).flatten(-3, -2) if smoothness > 0 and frames > 2 else motion[..., :0, 0, :]
     bending = smoothness / frames * (bend.mT @ bend)  # (..., R, R)
     eye = torch.eye(3 * rank, dtype=motion.dtype, device=motion.device)
@@ -152,21 +160,26 @@ def metric_upgrade(
     return q, orthonormality_defect(motion @ q[..., None, :, :]).mean(-1)
 
 
-def _quadratic_forms(a: Tensor, b: Tensor) -> Tensor:
+def _quadratic_forms(a: Tensor, b: Tensor, evenness: float = 0.0) -> Tensor:
     """Symmetric forms P (..., M, R, R) with sum_m <P_m, F>^2 = sum_t ((a.Fa - b.Fb)/2)^2 + (a.Fb)^2 for symmetric F.
 
-    A clip has two a frame, but no more than R (R + 1) / 2 of them are independent: the triangle of their QR
-    decomposition stands for all, so that the work of an iteration does not grow with the number of frames.
+    With an evenness there is that times the variance of (a.Fa + b.Fb)/2, too. A clip has two or three a frame, but no
+    more than R (R + 1) / 2 of them are independent: the triangle of their QR decomposition stands for all, so that the
+    work of an iteration does not grow with the number of frames.
 
     Args:
         a: (..., T, R) first motion rows.
         b: (..., T, R) second motion rows.
+        evenness: weight of the variance.
     """
     rank = a.shape[-1]
     row, column = torch.triu_indices(rank, rank, device=a.device)
     along = (a[..., row] * a[..., column] - b[..., row] * b[..., column]) / 2
     across = (a[..., row] * b[..., column] + b[..., row] * a[..., column]) / 2
     forms = torch.cat([along, across], -2)  # (..., 2T, R (R + 1) / 2)
+    if evenness > 0:
+        size = (a[..., row] * a[..., column] + b[..., row] * b[..., column]) / 2
+        forms = torch.cat([forms, evenness**0.5 * (size - size.mean(-2, keepdim=True))], -2)
     if forms.shape[-2] > forms.shape[-1] and not forms.requires_grad:  # QR without its Q has no derivative
         forms = torch.linalg.qr(forms, mode="r").R
     place = torch.zeros(rank, rank, dtype=torch.long, device=a.device)
