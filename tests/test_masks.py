@@ -14,7 +14,10 @@ from kcs_torch.nn import (
     ContactEnergy,
     ForeshorteningEnergy,
     HingeEnergy,
+    JointDistance,
+    KCSDistance,
     LowRankEnergy,
+    PerspectiveEnergy,
     PostureEnergy,
     ProcrusteanEnergy,
     ProportionEnergy,
@@ -33,6 +36,7 @@ LENGTHS = bone_lengths(WALK, BONES).mean(0)
 TARGET = WALK + 0.1 * normal(FRAMES, 17, 3, seed=8)
 TRACKS = WALK[..., :2] + 0.1 * normal(FRAMES, 17, 2, seed=5)
 CAMERAS = normal(FRAMES, 2, 3, seed=6)
+LENS = (3.0, 3.1, 0.2, 0.1)
 STAND = torch.rand(FRAMES, len(MAN.contacts), generator=torch.Generator().manual_seed(1)).double()
 
 
@@ -53,8 +57,18 @@ WEIGHTED = {
     "ForeshorteningEnergy, own": lambda x, w, t: ForeshorteningEnergy(MAN)(x, None, w),
     "HingeEnergy": lambda x, w, t: HingeEnergy(MAN)(-x, None, w),
     "HingeEnergy, given": lambda x, w, t: HingeEnergy(MAN)(-x, LENGTHS, w),
+    "JointDistance": lambda x, w, t: JointDistance()(x, TARGET[t], w),
+    **{
+        f"JointDistance, {how}": lambda x, w, t, how=how: JointDistance(how, root=8)(x, TARGET[t], w)
+        for how in ("root", "scale", "rigid", "similarity", "sequence")
+    },
+    "KCSDistance": lambda x, w, t: KCSDistance(MAN)(x, TARGET[t], w),
+    "KCSDistance, absolute": lambda x, w, t: KCSDistance(MAN, squared=False)(x, TARGET[t], w),
+    "KCSDistance, free of scale": lambda x, w, t: KCSDistance(MAN, scale_free=True)(x, TARGET[t], w),
     "LowRankEnergy": lambda x, w, t: LowRankEnergy()(x, w),
     "LowRankEnergy, log_det": lambda x, w, t: LowRankEnergy("log_det")(x, w),
+    "PerspectiveEnergy": lambda x, w, t: PerspectiveEnergy()(x, TRACKS[t], LENS, w),
+    "PerspectiveEnergy, huber": lambda x, w, t: PerspectiveEnergy(huber=0.05)(x, TRACKS[t], LENS, w),
     "PostureEnergy": lambda x, w, t: PostureEnergy(MAN)(x, None, w),
     "PostureEnergy, given": lambda x, w, t: PostureEnergy(MAN)(x, LENGTHS, w),
     "ProcrusteanEnergy": lambda x, w, t: ProcrusteanEnergy(MAN)(x, None, w),

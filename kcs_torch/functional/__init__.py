@@ -1,6 +1,14 @@
 """The mathematics: plain functions of tensors with any leading batch dimensions."""
 
-from kcs_torch.functional.align import centre, minimal_turn, nearest_rotation, procrustes, similarity
+from kcs_torch.functional.align import (
+    ALIGNMENTS,
+    centre,
+    minimal_turn,
+    nearest_rotation,
+    procrustes,
+    similarity,
+    superpose,
+)
 from kcs_torch.functional.camera import (
     back_project,
     camera_disagreement,
@@ -8,6 +16,8 @@ from kcs_torch.functional.camera import (
     factorize,
     orbit,
     orthonormality_defect,
+    perspective,
+    pinhole_translation,
     project,
     rows_to_cameras,
     viewpoint_turn,
@@ -34,6 +44,7 @@ from kcs_torch.functional.spectral import (
 from kcs_torch.functional.temporal import best_path, blend_windows, interpolate, jitter, standing, window_starts
 
 __all__ = [
+    "ALIGNMENTS",
     "back_project",
     "best_path",
     "blend_windows",
@@ -56,6 +67,8 @@ __all__ = [
     "nuclear_norm",
     "orbit",
     "orthonormality_defect",
+    "perspective",
+    "pinhole_translation",
     "points_from_bones",
     "procrustes",
     "project",
@@ -67,6 +80,7 @@ __all__ = [
     "singular_values",
     "spectral_norm",
     "standing",
+    "superpose",
     "svt",
     "viewpoint_turn",
     "window_starts",

@@ -9,7 +9,17 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 
-__all__ = ["centre", "minimal_turn", "nearest_rotation", "procrustes", "similarity"]
+__all__ = ["ALIGNMENTS", "centre", "minimal_turn", "nearest_rotation", "procrustes", "similarity", "superpose"]
+
+ALIGNMENTS = {
+    "none": "as it stands",
+    "root": "the root joint of each frame moved onto the true one",
+    "scale": "the root joint of each frame moved onto the true one, and each frame scaled about it",
+    "rigid": "each frame moved and turned, not scaled",
+    "similarity": "each frame moved, turned and scaled (Procrustes)",
+    "sequence": "each frame moved; all frames turned and scaled by the same (Procrustes over the clip)",
+}
+"""What each alignment of a motion with the truth does, by name."""
 
 
 def centre(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -130,6 +140,48 @@ def similarity(
         rotation, factor = rotation[..., None, :, :], factor[..., None]
     moved = a @ rotation
     return (moved * factor[..., None, None] if scale else moved) + mean
+
+
+def superpose(
+    source: Tensor, target: Tensor, how: str, weights: Tensor | None = None, *, root: int | None = None
+) -> Tensor:
+    """Move a motion onto another in the way named, by least squares; never mirrored.
+
+    Args:
+        source: (..., T, N, 3), finite.
+        target: (..., T, N, 3), finite.
+        how: a name in :data:`ALIGNMENTS`.
+        weights: (..., T, N), 0 where a joint does not count; all 1 if None.
+        root: index of the root joint for ``root`` and ``scale``; the middle of all joints if None.
+
+    Returns:
+        (..., T, N, 3), where the target is. Differentiable in both.
+    """
+    if how == "none":
+        return source
+    mass = torch.ones_like(target[..., 0]) if weights is None else weights.to(target)
+    if how in ("root", "scale") and root is not None:
+        mean = target[..., root, None, :]
+        source, target = source - source[..., root, None, :], target - mean
+    else:
+        source = centre(source, mass)[0]
+        target, mean = centre(target, mass)
+    if how == "root":
+        return source + mean
+    left = source * mass[..., None]
+    if how == "sequence":
+        left, whole = left.flatten(-3, -2)[..., None, :, :], lambda x: x.flatten(-3, -2)[..., None, :, :]
+    else:
+        whole = lambda x: x  # noqa: E731
+    if how != "scale":
+        source = source @ nearest_rotation(left.mT @ whole(target))
+    if how == "rigid":
+        return source + mean
+    heavy = source * mass[..., None]
+    size = whole(heavy * source).sum((-2, -1))
+    overlap = whole(heavy * target).sum((-2, -1))
+    factor = overlap / torch.where(size > 0, size, torch.ones_like(size))
+    return source * factor[..., None, None] + mean
 
 
 class _Polar(torch.autograd.Function):

@@ -17,6 +17,8 @@ __all__ = [
     "factorize",
     "orbit",
     "orthonormality_defect",
+    "perspective",
+    "pinhole_translation",
     "project",
     "rows_to_cameras",
     "viewpoint_turn",
@@ -30,6 +32,55 @@ def project(points: Tensor, cameras: Tensor) -> Tensor:
     [[[1.0, 2.0]]]
     """
     return points @ cameras.mT
+
+
+def perspective(points: Tensor, intrinsics: Tensor) -> Tensor:
+    """Return (fx X/Z + cx, fy Y/Z + cy), the image of points through a pinhole.
+
+    Args:
+        points: (..., 3) in the camera frame, Z not 0.
+        intrinsics: (..., 4) fx, fy, cx, cy, which broadcast against the points.
+
+    Returns:
+        (..., 2), in the unit of the intrinsics.
+
+    >>> perspective(torch.tensor([1.0, 2.0, 4.0]), torch.tensor([100.0, 100.0, 50.0, 0.0])).tolist()
+    [75.0, 50.0]
+    """
+    return intrinsics[..., :2] * points[..., :2] / points[..., 2:] + intrinsics[..., 2:]
+
+
+def pinhole_translation(points: Tensor, rays: Tensor, weights: Tensor) -> Tensor:
+    """Return the t that minimises sum_n w_n |(x + t_x, y + t_y) - ray (z + t_z)|^2: where a body stands.
+
+    Args:
+        points: (..., N, 3), about any origin.
+        rays: (..., N, 2) where the joints are seen, as X/Z and Y/Z.
+        weights: (..., N), 0 where unseen.
+
+    Returns:
+        (..., 3). Where all rays are the same one, the distance is arbitrary: ten times the body's size.
+
+    >>> X = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 1]])
+    >>> t = torch.tensor([1.0, 2, 5])
+    >>> pinhole_translation(X, (X + t)[:, :2] / (X + t)[:, 2:], torch.ones(3)).round(decimals=4).tolist()
+    [1.0, 2.0, 5.0]
+    """
+    share = weights[..., None]
+    total = share.sum(-2, keepdim=True)
+    total = torch.where(total > 0, total, torch.ones_like(total))
+    mean = lambda values: (share * values).sum(-2, keepdim=True) / total  # noqa: E731
+    off = points[..., :2] - rays * points[..., 2:]  # + t_xy - ray t_z is to vanish
+    middle, rest = mean(rays), mean(off)
+    apart = rays - middle
+    spread = (mean(apart.square())).sum(-1, keepdim=True)
+    firm = spread > (16 * torch.finfo(rays.dtype).eps) ** 2 * (1 + mean(rays.square()).sum(-1, keepdim=True))
+    found = mean(apart * (off - rest)).sum(-1, keepdim=True) / torch.where(firm, spread, torch.ones_like(spread))
+    heart = mean(points)
+    with torch.no_grad():
+        size = mean((points - heart).square()).sum(-1, keepdim=True).sqrt()
+    depth = torch.where(firm, found, 10 * torch.where(size > 0, size, torch.ones_like(size)) - heart[..., 2:])
+    return torch.cat([middle * depth - rest, depth], -1).squeeze(-2)
 
 
 def back_project(tracks: Tensor, cameras: Tensor) -> Tensor:

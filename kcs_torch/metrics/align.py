@@ -6,19 +6,9 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, unknown
-from kcs_torch.functional import centre, nearest_rotation
+from kcs_torch.functional import ALIGNMENTS, superpose
 
 __all__ = ["ALIGNMENTS", "align"]
-
-ALIGNMENTS = {
-    "none": "as it stands",
-    "root": "the root joint of each frame moved onto the true one",
-    "scale": "the root joint of each frame moved onto the true one, and each frame scaled about it",
-    "rigid": "each frame moved and turned, not scaled",
-    "similarity": "each frame moved, turned and scaled (Procrustes)",
-    "sequence": "each frame moved; all frames turned and scaled by the same (Procrustes over the clip)",
-}
-"""What each alignment does, by name."""
 
 
 def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = None, root: int | None = None) -> Tensor:
@@ -52,30 +42,6 @@ def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = Non
         raise ShapeError("align: expected finite points; write 0 where a joint is unknown, and 0 into its weight")
     if weights is not None and weights.shape != truth.shape[:-1]:
         raise ShapeError(f"weights: expected shape {tuple(truth.shape[:-1])}, got {tuple(weights.shape)}")
-    if how == "none":
-        return pred
-    mass = torch.ones_like(truth[..., 0]) if weights is None else weights.to(truth)
-    if how in ("root", "scale") and root is not None:
-        if not -truth.shape[-2] <= root < truth.shape[-2]:
-            raise OptionError(f"root: expected a joint index below {truth.shape[-2]}, got {root}")
-        mean = truth[..., root, None, :]
-        source, target = pred - pred[..., root, None, :], truth - mean
-    else:
-        source = centre(pred, mass)[0]
-        target, mean = centre(truth, mass)
-    if how == "root":
-        return source + mean
-    left = source * mass[..., None]
-    if how == "sequence":
-        left, whole = left.flatten(-3, -2)[..., None, :, :], lambda x: x.flatten(-3, -2)[..., None, :, :]
-    else:
-        whole = lambda x: x  # noqa: E731
-    if how != "scale":
-        source = source @ nearest_rotation(left.mT @ whole(target))
-    if how == "rigid":
-        return source + mean
-    heavy = source * mass[..., None]
-    size = whole(heavy * source).sum((-2, -1))
-    overlap = whole(heavy * target).sum((-2, -1))
-    factor = overlap / torch.where(size > 0, size, torch.ones_like(size))
-    return source * factor[..., None, None] + mean
+    if how in ("root", "scale") and root is not None and not -truth.shape[-2] <= root < truth.shape[-2]:
+        raise OptionError(f"root: expected a joint index below {truth.shape[-2]}, got {root}")
+    return superpose(pred, truth, how, weights, root=root)

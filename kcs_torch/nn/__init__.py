@@ -1,6 +1,7 @@
 """Modules: layers, energies that are losses and solver terms at once, and unrolled solvers."""
 
 from kcs_torch.nn.anatomy import HingeEnergy
+from kcs_torch.nn.distances import JointDistance, KCSDistance
 from kcs_torch.nn.energies import (
     BoneLengthEnergy,
     LowRankEnergy,
@@ -10,6 +11,7 @@ from kcs_torch.nn.energies import (
 )
 from kcs_torch.nn.layers import SVT, BoneLengths, BoneVectors, KCSMatrix
 from kcs_torch.nn.networks import CameraHead, MLPLifter, TemporalLifter
+from kcs_torch.nn.perspective import PerspectiveEnergy
 from kcs_torch.nn.posture import ContactEnergy, ForeshorteningEnergy, PostureEnergy, ProportionEnergy
 from kcs_torch.nn.procrustean import ProcrusteanEnergy
 from kcs_torch.nn.unrolled import UnrolledFPC, UnrolledSfAM
@@ -23,9 +25,12 @@ __all__ = [
     "ContactEnergy",
     "ForeshorteningEnergy",
     "HingeEnergy",
+    "JointDistance",
+    "KCSDistance",
     "KCSMatrix",
     "LowRankEnergy",
     "MLPLifter",
+    "PerspectiveEnergy",
     "PostureEnergy",
     "ProcrusteanEnergy",
     "ProportionEnergy",

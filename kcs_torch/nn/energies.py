@@ -126,11 +126,7 @@ class ReprojectionEnergy(nn.Module):
             ShapeError: the shapes do not fit.
         """
         residual = self.residual(points, tracks, cameras, weights)
-        square = wide(residual).square().sum(-1)
-        if self.huber is not None:
-            far = square > self.huber**2
-            root = torch.where(far, square, torch.ones_like(square)).sqrt()
-            square = torch.where(far, 2 * self.huber * root - self.huber**2, square)
+        square = huber_square(wide(residual).square().sum(-1), self.huber)
         return narrow(0.5 * (square if weights is None else square * weights).sum(-1), residual)
 
     def residual(
@@ -291,6 +287,15 @@ def check_weights(weights: Tensor | None, points: Tensor, module: nn.Module) -> 
     if weights is not None and weights.shape[-2:] != points.shape[-3:-1]:
         expected = f"(..., {points.shape[-3]}, {points.shape[-2]})"
         raise ShapeError(f"{type(module).__name__}: expected weights {expected}, got {tuple(weights.shape)}")
+
+
+def huber_square(square: Tensor, huber: float | None) -> Tensor:
+    """Squared lengths, beyond ``huber`` growing with the length only."""
+    if huber is None:
+        return square
+    far = square > huber**2
+    root = torch.where(far, square, torch.ones_like(square)).sqrt()
+    return torch.where(far, 2 * huber * root - huber**2, square)
 
 
 def centred_residual(seen: Tensor, tracks: Tensor, weights: Tensor | None) -> Tensor:

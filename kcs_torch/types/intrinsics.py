@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.camera import perspective
 
 __all__ = ["Intrinsics"]
 
@@ -87,5 +88,8 @@ class Intrinsics:
 
     def project(self, points: Tensor) -> Tensor:
         """Images (..., 2) of points (..., 3) in the camera frame."""
-        scale = points.new_tensor([self.fx, self.fy])
-        return scale * points[..., :2] / points[..., 2:] + points.new_tensor([self.cx, self.cy])
+        return perspective(points, self.tensor(points))
+
+    def tensor(self, like: Tensor) -> Tensor:
+        """(4,) fx, fy, cx, cy in the dtype and on the device of another tensor."""
+        return like.new_tensor([self.fx, self.fy, self.cx, self.cy])

@@ -1,0 +1,144 @@
+"""How far a pose is from a given one: distance of joints, and of KCS matrices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from kcs_torch.errors import OptionError, ShapeError, unknown
+from kcs_torch.functional.align import ALIGNMENTS, superpose
+from kcs_torch.functional.chain import bone_vectors, kcs_matrix, safe_norm
+from kcs_torch.nn.energies import check_clip, check_weights
+from kcs_torch.nn.layers import SkeletonModule, full_precision, known, narrow, wide
+from kcs_torch.nn.masks import bone_share, some
+from kcs_torch.skeleton import Skeleton
+
+__all__ = ["JointDistance", "KCSDistance"]
+
+
+class JointDistance(nn.Module):
+    """sum_n w_n |x_n - y_n| / sum_n w_n of each frame, after the alignment named: the supervised loss.
+
+    It is :func:`kcs_torch.metrics.mpjpe` frame by frame, with the derivative 0 where a joint is on its target.
+
+    Args:
+        align: a name in :data:`kcs_torch.metrics.ALIGNMENTS`; never mirrored.
+        root: index of the root joint for ``root`` and ``scale``; the middle of all joints if None.
+
+    Raises:
+        OptionError: there is no such alignment.
+
+    >>> JointDistance()(torch.zeros(1, 2, 3), torch.tensor([[[0.0, 3, 4], [0, 0, 0]]])).tolist()
+    [2.5]
+    """
+
+    def __init__(self, align: str = "none", *, root: int | None = None) -> None:
+        super().__init__()
+        if align not in ALIGNMENTS:
+            raise unknown("alignment", align, ALIGNMENTS)
+        self.align, self.root = align, root
+
+    def forward(self, points: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return the mean distance of each frame.
+
+        Args:
+            points: (..., T, N, 3).
+            target: (..., T, N, 3).
+            weights: (..., T, N), 0 where a joint of the target is unknown. A frame without its root does not count.
+
+        Returns:
+            (..., T), in the unit of the points; 0 where nothing counts.
+
+        Raises:
+            ShapeError: the shapes do not fit.
+            OptionError: there is no such root joint.
+        """
+        check_clip(points, self)
+        check_weights(weights, points, self)
+        joints = points.shape[-2]
+        if target.shape[-3:] != points.shape[-3:] or points.shape[-1] != 3:
+            expected = f"points (..., T, N, 3) and target (..., {points.shape[-3]}, {joints}, 3)"
+            raise ShapeError(f"JointDistance: expected {expected}, got {tuple(points.shape)} and {tuple(target.shape)}")
+        if self.root is not None and not -joints <= self.root < joints:
+            raise OptionError(f"root: expected a joint index below {joints}, got {self.root}")
+        with full_precision(points):
+            source, goal = wide(known(points, weights)), known(wide(target), weights)
+            source, goal = torch.broadcast_tensors(source, goal)
+            share = torch.ones_like(goal[..., 0]) if weights is None else weights.to(goal).expand(goal.shape[:-1])
+            distance = safe_norm(superpose(source, goal, self.align, share, root=self.root) - goal)
+            if self.root is not None and self.align in ("root", "scale"):
+                share = share * (share[..., self.root, None] > 0)
+            return narrow((share * distance).sum(-1) / some(share.sum(-1)), points)
+
+
+class KCSDistance(SkeletonModule):
+    """1/2 sum_bc w_bc (Psi_bc - Psi'_bc)^2 of each pose, Psi = B B^T: lengths of bones and angles between them.
+
+    It does not see how a pose is placed, turned or mirrored.
+
+    Args:
+        skeleton: a :class:`Skeleton`, a built-in name or a file.
+        squared: False takes sum_bc w_bc |Psi_bc - Psi'_bc|, which outliers pull less.
+        scale_free: divide each Psi by the mean squared bone length of its pose.
+
+    >>> loss = KCSDistance("h36m17", scale_free=True)
+    >>> pose = torch.randn(4, 17, 3)
+    >>> bool(loss(2 * pose + 1, pose).max() < 1e-6)
+    True
+    """
+
+    def __init__(self, skeleton: str | Path | Skeleton, *, squared: bool = True, scale_free: bool = False) -> None:
+        super().__init__(skeleton)
+        self.squared, self.scale_free = squared, scale_free
+
+    def forward(self, points: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return the distance of each pose.
+
+        Args:
+            points: (..., N, 3).
+            target: (..., N, 3).
+            weights: (..., N) of the joints: a bone weighs as much as the lesser of its two ends, a pair of bones as
+                much as the lesser of them.
+
+        Returns:
+            (...), in units of length to the fourth power (to the second if not ``squared``); none if ``scale_free``.
+
+        Raises:
+            ShapeError: the shapes do not fit.
+        """
+        self.check(points)
+        self.check(target)
+        check_pose_weights(weights, points, self)
+        with full_precision(points):
+            share = None if weights is None else bone_share(weights, self.bones)
+            apart = self._matrix(points, weights, share) - self._matrix(target, weights, share)
+            each = 0.5 * apart.square() if self.squared else apart.abs()
+            if share is not None:
+                each = each * torch.minimum(share[..., :, None], share[..., None, :])
+            return narrow(each.sum((-2, -1)), points)
+
+    def _matrix(self, points: Tensor, weights: Tensor | None, share: Tensor | None) -> Tensor:
+        matrix = kcs_matrix(bone_vectors(wide(known(points, weights)), self.bones))
+        return matrix / mean_square(matrix, share)[..., None, None] if self.scale_free else matrix
+
+
+def check_pose_weights(weights: Tensor | None, points: Tensor, module: nn.Module) -> None:
+    """Raise a ShapeError unless ``weights`` are (..., N) for poses (..., N, D), or broadcast to that."""
+    if weights is None:
+        return
+    fits = weights.shape[-1:] == points.shape[-2:-1] and all(
+        a == b or 1 in (a, b) for a, b in zip(weights.shape[::-1], points.shape[-2::-1], strict=False)
+    )
+    if not fits:
+        expected = ", ".join(map(str, points.shape[:-1]))
+        raise ShapeError(f"{type(module).__name__}: expected weights ({expected}), got {tuple(weights.shape)}")
+
+
+def mean_square(matrix: Tensor, share: Tensor | None) -> Tensor:
+    """Mean squared bone length (...) of KCS matrices (..., B, B) over bones of shares (..., B); 1 where it is 0."""
+    square = matrix.diagonal(dim1=-2, dim2=-1)
+    if share is None:
+        return some(square.mean(-1))
+    return some((share * square).sum(-1) / some(share.sum(-1)))

@@ -1,0 +1,99 @@
+"""Reprojection through a pinhole, as an energy of relative or of absolute points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.camera import perspective, pinhole_translation
+from kcs_torch.nn.energies import check_clip, check_weights, huber_square
+from kcs_torch.nn.layers import full_precision, known, narrow, wide
+from kcs_torch.nn.masks import some
+from kcs_torch.types.intrinsics import Intrinsics
+
+__all__ = ["PerspectiveEnergy"]
+
+
+class PerspectiveEnergy(nn.Module):
+    """1/2 sum_n w_n |pi(x_n + t) - y_n|^2 of each frame, pi(X) = (fx X/Z + cx, fy Y/Z + cy).
+
+    The translation t, where the body stands, is found from the rays by linear least squares
+    (:func:`kcs_torch.functional.pinhole_translation`), so that points may be about any origin and in any unit.
+    Gradients run through it. What would lie behind the camera, or too close, is seen as if it were at the nearest
+    depth, and charged 1/2 w fx fy (how far behind, in nearest depths)^2 on top.
+
+    Args:
+        translation: False leaves t at 0: points are where they are before the camera.
+        huber: residuals above this length count linearly, in the unit of the tracks; None is plain least squares.
+        nearest: share of the body's distance (or of its size, where that is more) that joints keep from the camera.
+
+    Raises:
+        OptionError: ``huber`` or ``nearest`` is not positive.
+
+    >>> energy = PerspectiveEnergy()
+    >>> energy(torch.randn(4, 30, 17, 3), torch.randn(4, 30, 17, 2), (1000, 1000, 0, 0)).shape
+    torch.Size([4, 30])
+    """
+
+    def __init__(self, *, translation: bool = True, huber: float | None = None, nearest: float = 0.15) -> None:
+        super().__init__()
+        if not nearest > 0 or (huber is not None and not huber > 0):
+            raise OptionError(
+                "PerspectiveEnergy: expected a positive huber length or None, and a positive nearest depth, "
+                f"got {huber} and {nearest}"
+            )
+        self.translation, self.huber, self.nearest = translation, huber, nearest
+
+    def forward(self, points: Tensor, tracks: Tensor, intrinsics: Any, weights: Tensor | None = None) -> Tensor:
+        """Return the energy of each frame.
+
+        Args:
+            points: (..., T, N, 3) in the camera's axes.
+            tracks: (..., T, N, 2).
+            intrinsics: of all clips: (fx, fy, cx, cy), K (3, 3) or :class:`kcs_torch.types.Intrinsics`; of each clip: a
+                tensor (..., 4). In the unit of the tracks.
+            weights: (..., T, N) confidences; 0 where unseen.
+
+        Returns:
+            (..., T), in squared units of the tracks. 0 where one joint is seen, which can be anywhere on its ray.
+
+        Raises:
+            ShapeError: the shapes do not fit.
+            OptionError: the intrinsics make no sense.
+        """
+        check_clip(points, self)
+        check_weights(weights, points, self)
+        if tracks.shape[-3:] != (*points.shape[-3:-1], 2) or points.shape[-1] != 3:
+            expected = f"points (..., T, N, 3) and tracks (..., {points.shape[-3]}, {points.shape[-2]}, 2)"
+            got = f"{tuple(points.shape)} and {tuple(tracks.shape)}"
+            raise ShapeError(f"PerspectiveEnergy: expected {expected}, got {got}")
+        with full_precision(points):
+            lens = lens_tensor(intrinsics, wide(points))[..., None, None, :]  # (..., 1, 1, 4)
+            at, seen = wide(known(points, weights)), known(wide(tracks), weights)
+            share = torch.ones_like(at[..., 0]) if weights is None else weights.to(at.dtype).expand(at.shape[:-1])
+            if self.translation:
+                at = at + pinhole_translation(at, (seen - lens[..., 2:]) / lens[..., :2], share)[..., None, :]
+            near = self.nearest * _reach(at.detach(), share.detach())[..., None]
+            behind = (near - at[..., 2]).clamp_min(0) / near
+            ahead = torch.cat([at[..., :2], torch.maximum(at[..., 2], near)[..., None]], -1)
+            square = huber_square((perspective(ahead, lens) - seen).square().sum(-1), self.huber)
+            square = square + lens[..., 0] * lens[..., 1] * behind.square()
+            return narrow(0.5 * (square * share).sum(-1), points)
+
+
+def lens_tensor(intrinsics: Any, like: Tensor) -> Tensor:
+    """Intrinsics as a tensor (..., 4) of fx, fy, cx, cy."""
+    if isinstance(intrinsics, Tensor) and intrinsics.shape[-1:] == (4,):
+        return intrinsics.to(like)
+    return Intrinsics.of(intrinsics).tensor(like)
+
+
+def _reach(points: Tensor, share: Tensor) -> Tensor:
+    """Distance of a body (..., N, 3) along z, or its size, where that is more, (...)."""
+    total = some(share.sum(-1, keepdim=True))[..., None]
+    middle = (share[..., None] * points).sum(-2, keepdim=True) / total
+    size = (share[..., None] * (points - middle).square() / total).sum((-2, -1)).sqrt()
+    return some(torch.maximum(middle[..., 0, 2].abs(), size))

@@ -1,0 +1,175 @@
+"""Distances of poses: by hand, against the metrics and Psi itself, with gradients where poses coincide."""
+
+import pytest
+import torch
+from numerics import BODY, FLOATS, HALVES, finite, gradcheck, leaves_arguments_alone, normal, rotations, same_as_loop
+from torch.testing import assert_close
+
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional import bone_vectors, kcs_matrix
+from kcs_torch.metrics import ALIGNMENTS, mpjpe
+from kcs_torch.nn import JointDistance, KCSDistance, KCSMatrix
+
+BONES = BODY.bone_index()
+each_alignment = pytest.mark.parametrize("how", ALIGNMENTS)
+KINDS = {
+    "squared": KCSDistance(BODY),
+    "absolute": KCSDistance(BODY, squared=False),
+    "scale free": KCSDistance(BODY, scale_free=True),
+    "absolute, scale free": KCSDistance(BODY, squared=False, scale_free=True),
+}
+each_kind = pytest.mark.parametrize("name", KINDS)
+
+
+def pair(*batch, frames=5, dtype=torch.float64):
+    return normal(*batch, frames, 7, 3, dtype=dtype), normal(*batch, frames, 7, 3, seed=1, dtype=dtype)
+
+
+# ---------------------------------------------------------------------- joints
+
+
+@each_alignment
+@pytest.mark.parametrize("root", [None, 2])
+def test_joint_distance_is_the_metric_of_each_frame(how, root):
+    points, target = pair(3)
+    weights = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(0)).double()
+    loss = JointDistance(how, root=root)
+    assert_close(loss(points, target).mean(-1), mpjpe(points, target, align=how, root=root))
+    each = loss(points, target, weights)
+    total = weights.sum(-1)
+    whole = (each * total).sum(-1) / total.sum(-1)
+    assert_close(whole, mpjpe(points, target, align=how, weights=weights, root=root))
+
+
+@each_alignment
+def test_joint_distance_gradient(how):
+    points, target = pair(frames=3)
+    weights = torch.rand(3, 7, generator=torch.Generator().manual_seed(0)).double() + 0.1
+    assert gradcheck(JointDistance(how, root=1), points, target, weights, fast=True)
+    assert gradcheck(JointDistance(how), points, target, fast=True)
+
+
+@each_alignment
+@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize("kind", ["same", "one joint on it", "static", "zero"])
+def test_joint_distance_is_finite_where_poses_coincide(how, dtype, kind):
+    points, target = pair(dtype=dtype)
+    if kind == "same":
+        target = points.clone()
+    if kind == "one joint on it":
+        target[:, 3] = points[:, 3]
+    if kind == "static":
+        points = points[:1].expand(5, 7, 3).clone()
+    if kind == "zero":
+        points = torch.zeros_like(points)
+    finite(JointDistance(how), points, target)
+    if kind == "same" and how == "none":
+        leaf = points.requires_grad_()
+        (grad,) = torch.autograd.grad(JointDistance(how)(leaf, target).sum(), leaf)
+        assert not grad.any()
+
+
+def test_joint_distance_lowers_and_needs_no_mirror():
+    points, target = pair()
+    mirrored = target * torch.tensor([1.0, 1.0, -1.0])
+    assert all(JointDistance(how)(mirrored, target).mean() > 0.1 for how in ALIGNMENTS)
+    points.requires_grad_()
+    optimiser = torch.optim.Adam([points], 0.05)
+    loss = JointDistance("similarity")
+    first = loss(points, target).mean().item()
+    for _ in range(60):
+        optimiser.zero_grad()
+        loss(points, target).mean().backward()
+        optimiser.step()
+    assert loss(points, target).mean() < 0.3 * first
+
+
+def test_joint_distance_in_half_precision_and_batches():
+    for dtype in HALVES:
+        points, target = (500 * x.to(dtype) for x in pair())
+        value = leaves_arguments_alone(JointDistance("root"), points, target)
+        assert value.dtype == dtype
+        assert_close(
+            value.double(), JointDistance("root")(points.double(), target.double()).double(), rtol=0.01, atol=0
+        )
+    same_as_loop(JointDistance("sequence"), (5, 7, 3), (5, 7, 3))
+    same_as_loop(lambda x, y, w: JointDistance("scale")(x, y, w.abs()), (5, 7, 3), (5, 7, 3), (5, 7))
+
+
+def test_joint_distance_that_does_not_fit():
+    points, target = pair()
+    with pytest.raises(OptionError, match="did you mean 'similarity'"):
+        JointDistance("similarty")
+    with pytest.raises(OptionError, match="root: expected a joint index below 7, got 7"):
+        JointDistance("root", root=7)(points, target)
+    for wrong in (target[:4], target[..., :2], target[:, :6]):
+        with pytest.raises(ShapeError, match=r"target \(\.\.\., 5, 7, 3\)"):
+            JointDistance()(points, wrong)
+    with pytest.raises(ShapeError, match="weights"):
+        JointDistance()(points, target, torch.ones(5, 6))
+    with pytest.raises(ShapeError, match=r"\(\.\.\., T, N, D\)"):
+        JointDistance()(points[0], target[0])
+
+
+# ---------------------------------------------------------------------- KCS matrices
+
+
+def test_kcs_distance_by_hand():
+    points, target = pair()
+    ours, theirs = (kcs_matrix(bone_vectors(x, BONES)) for x in (points, target))
+    assert_close(KINDS["squared"](points, target), 0.5 * (ours - theirs).square().sum((-2, -1)))
+    assert_close(KINDS["absolute"](points, target), (ours - theirs).abs().sum((-2, -1)))
+    free = KCSMatrix(BODY, normalise=True)
+    apart = free(points) - free(target)
+    assert_close(KINDS["scale free"](points, target), 0.5 * apart.square().sum((-2, -1)))
+    weights = torch.rand(5, 7, generator=torch.Generator().manual_seed(0)).double()
+    share = torch.minimum(weights[:, BONES[:, 0]], weights[:, BONES[:, 1]])
+    both = torch.minimum(share[:, :, None], share[:, None, :])
+    assert_close(KINDS["squared"](points, target, weights), 0.5 * (both * (ours - theirs).square()).sum((-2, -1)))
+
+
+def test_kcs_distance_of_single_poses():
+    points, target = pair()
+    assert_close(KINDS["squared"](points[2], target[2]), KINDS["squared"](points, target)[2])
+
+
+@each_kind
+def test_kcs_distance_does_not_see_turn_place_or_mirror(name):
+    points, target = pair()
+    moved = points @ rotations(5) * torch.tensor([1.0, 1.0, -1.0]) + normal(5, 1, 3, seed=4)
+    assert_close(KINDS[name](moved, target), KINDS[name](points, target))
+    assert (KINDS[name](points, moved) < 1e-9).all()
+    if "free" in name:
+        assert_close(KINDS[name](0.01 * points, target), KINDS[name](points, target))
+
+
+@each_kind
+def test_kcs_distance_gradient(name):
+    points, target = pair(frames=2)
+    weights = torch.rand(2, 7, generator=torch.Generator().manual_seed(0)).double() + 0.1
+    assert gradcheck(KINDS[name], points, target, weights, fast=True)
+    still = points[:, :1].expand(2, 7, 3)  # all joints at one point
+    finite(KINDS[name], points, points)
+    finite(KINDS[name], still, target)
+    finite(KINDS[name], 0 * points, 0 * target, torch.zeros(2, 7).double())
+
+
+@each_kind
+@pytest.mark.parametrize("dtype", FLOATS + HALVES)
+def test_kcs_distance_dtypes_and_batches(name, dtype):
+    points, target = (0.3 * x for x in pair(dtype=dtype))
+    value = leaves_arguments_alone(KINDS[name], points, target)
+    assert value.dtype == dtype and value.shape == (5,)
+    assert_close(value.double(), KINDS[name](points.double(), target.double()), rtol=0.03, atol=1e-3)
+    same_as_loop(lambda x, y, w: KINDS[name](x, y, w.abs()), (7, 3), (7, 3), (7,))
+
+
+def test_kcs_distance_that_does_not_fit():
+    points, target = pair()
+    with pytest.raises(ShapeError, match="skeleton 'body7'"):
+        KINDS["squared"](points[:, :6], target)
+    with pytest.raises(ShapeError, match="skeleton 'body7'"):
+        KINDS["squared"](points, target[:, :6])
+    for wrong in ((5, 6), (4, 7)):
+        with pytest.raises(ShapeError, match=r"KCSDistance: expected weights \(5, 7\)"):
+            KINDS["squared"](points, target, torch.ones(wrong))
