@@ -51,7 +51,7 @@ def save_lifter(
     >>> import tempfile
     >>> path = save_lifter(Path(tempfile.mkdtemp()) / "lifter.safetensors", MLPLifter("h36m17", width=8))
     >>> load_lifter(path).network.options
-    {'dropout': 0.1, 'num_blocks': 2, 'width': 8, 'window': 1}
+    {'width': 8, 'num_blocks': 2, 'dropout': 0.1, 'window': 1}
     """
     kind = type(network).__name__
     if NETWORKS.get(kind) is not type(network) or not isinstance(network, (MLPLifter, TemporalLifter)):
