@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import centre, nearest_rotation
-from kcs_torch.functional.camera import back_project, complete_rotation, project
+from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.chain import bone_lengths, chain_inverse, incidence
-from kcs_torch.functional.spectral import singular_values, svt
-from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.template import clip_scale, rigid_shape
-from kcs_torch.nn.energies import centred_residual
+from kcs_torch.nn.deviation import Arrangement, deviation_scale, deviation_step, frame_scales
 from kcs_torch.nn.steps import continuation
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.iterate import iterate, relative_change
 from kcs_torch.solvers.lm import fit_bones
-from kcs_torch.solvers.pose import CameraFit, fit_cameras
+from kcs_torch.solvers.pose import CameraFit, fit_cameras, steady_cameras
 from kcs_torch.types import Tracks, as_floats
 
 __all__ = ["KCS"]
@@ -65,7 +63,7 @@ class KCS(Method):
     keeps_lengths: ClassVar[bool] = False
     template: Sequence[Sequence[float]] | None = None
     links: tuple[tuple[str, str], ...] = ()
-    arrangement: Literal["stacked", "frames"] = "stacked"
+    arrangement: Arrangement = "stacked"
     rounds: int = 3
     tolerance: float = 1e-2
     mu: float = 0.5
@@ -163,18 +161,9 @@ class KCS(Method):
     ) -> Search[_Fit, CameraFit, tuple[Tensor, Tensor]]:
         """Rotations (T, 3, 3) and scales (T,) of the camera step (eq. 22-25), consistent over time."""
         if known is not None:
-            flat = project(shape, known)
-            match = (flat * tracks.points * tracks.weights[..., None]).sum((-2, -1))
-            size = (flat.square() * tracks.weights[..., None]).sum((-2, -1))
-            free = match / torch.where(size > 0, size, torch.ones_like(size))
-            return complete_rotation(known), torch.minimum(torch.maximum(free, low), high)
+            return complete_rotation(known), frame_scales(shape, tracks.points, known, tracks.weights, low, high)
         (fit,) = yield [_Fit(tracks.points, shape, tracks.weights, low, high, last)]
-        rotations, scales, cost = fit.rotations, fit.scales, fit.cost.mT  # cost (T, C)
-        trace = torch.einsum("atij,btij->tab", rotations[:, :-1], rotations[:, 1:])
-        turn = torch.arccos(((trace - 1) / 2).clamp(-1, 1)).square()
-        choice = best_path(cost, self.continuity * turn) if self.continuity > 0 else cost.argmin(-1)
-        frame = torch.arange(tracks.num_frames, device=choice.device)
-        return rotations[choice, frame], scales[choice, frame]
+        return steady_cameras(fit, self.continuity)
 
     def _fits(self, asked: list[_Fit]) -> list[CameraFit]:
         """Fit the cameras of several clips: those of one number of joints, and with or without a start, together."""
@@ -216,21 +205,15 @@ class KCS(Method):
         matrix: Tensor,
         inverse: Tensor,
     ) -> tuple[Tensor, bool, int]:
-        """Shape step (eq. 21): deviations (T, B, 3) of least nuclear norm that meet the tracks, by SVT continuation.
-
-        Unseen joints take their current projection, and joints seen with low confidence go part of the way:
-        the majorisation of the weighted data term.
-        """
+        """Shape step (eq. 21): deviations (T, B, 3) of least nuclear norm that meet the tracks, by SVT continuation."""
         goal = tracks.points / scales[:, None, None]
-        folded = _stack if self.arrangement == "stacked" else _frames
-        first = -centred_residual(project(rest, cameras), goal, tracks.weights) * tracks.weights[..., None]
-        top = singular_values(folded(back_project(matrix.mT @ first, cameras))[0])[0]
+        given = (rest, goal, cameras, tracks.weights)
+        top = deviation_scale(*given, matrix=matrix, arrangement=self.arrangement)
 
         def step(state: Tensor, threshold: Tensor) -> Tensor:
-            residual = centred_residual(project(rest + inverse @ state, cameras), goal, tracks.weights)
-            move = back_project(matrix.mT @ (residual * tracks.weights[..., None]), cameras)
-            folded_state, unfold = folded(state - move)
-            return unfold(svt(folded_state, threshold))
+            return deviation_step(
+                state, *given, threshold, matrix=matrix, inverse=inverse, arrangement=self.arrangement
+            )
 
         state, settled, made = start, False, 0
         for mu in continuation(self.num_weights, self.mu, self.mu * self.rho ** (self.num_weights - 1)):
@@ -254,17 +237,3 @@ class _Fit(NamedTuple):
     low: Tensor
     high: Tensor
     start: Tensor | None
-
-
-Folded = tuple[Tensor, Callable[[Tensor], Tensor]]
-
-
-def _stack(deviation: Tensor) -> Folded:
-    """(T, B, 3) as 3T x B, and the way back."""
-    frames = len(deviation)
-    return deviation.mT.flatten(0, 1), lambda m: m.unflatten(0, (frames, 3)).mT
-
-
-def _frames(deviation: Tensor) -> Folded:
-    """(T, B, 3) as T x 3B, and the way back."""
-    return deviation.flatten(1), lambda m: m.unflatten(1, (-1, 3))

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import itertools
-
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.camera import back_project
-from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.cameras import orthographic_cameras
+from kcs_torch.nn.deviation import template_scale
 from kcs_torch.types import Tracks
 
 __all__ = ["clip_scale", "rigid_shape"]
 
 
 def clip_scale(tracks: Tracks, rest: Tensor, *, span: int = 60, quantile: float = 0.95) -> Tensor:
-    """Weak-perspective scale of each frame, from the longest projections of the bones around it.
-
-    A bone's projection is at most scale times its length, and reaches it where the bone lies in the image plane. In
-    spans of frames, each bone's high quantile of |projection| / length votes, and the median bone wins: an arm held out
-    does not enlarge the body.
+    """Weak-perspective scale of each frame, by :func:`kcs_torch.nn.deviation.template_scale`.
 
     Args:
         tracks: the tracks.
@@ -32,30 +26,8 @@ def clip_scale(tracks: Tracks, rest: Tensor, *, span: int = 60, quantile: float 
     Returns:
         (T,), positive.
     """
-    body = tracks.skeleton
-    frames, device = tracks.num_frames, tracks.points.device
-    index = body.bone_index(device=device)[list(body.rigid)]
-    fallback = tracks.points.square().sum(-1).mean().sqrt() / rest.square().sum(-1).mean().sqrt().clamp_min(1e-12)
-    if len(index) == 0:
-        return fallback.clamp_min(1e-12).expand(frames)
-    length = bone_lengths(rest, index)
-    seen = (tracks.weights[:, index[:, 0]] > 0) & (tracks.weights[:, index[:, 1]] > 0) & (length > 0)
-    ratio = bone_vectors(tracks.points, index).norm(dim=-1) / torch.where(length > 0, length, torch.ones_like(length))
-    ratio = torch.where(seen, ratio, torch.nan)
-    count = max(1, round(frames / span))
-    edges = [round(i * frames / count) for i in range(count + 1)]
-    spans = list(itertools.pairwise(edges))
-    votes = torch.stack([ratio[a:b].nanquantile(quantile, 0).nanmedian() for a, b in spans])
-    overall = ratio.nanquantile(quantile, 0).nanmedian()
-    overall = torch.where(torch.isfinite(overall) & (overall > 0), overall, fallback.clamp_min(1e-12))
-    votes = torch.where(torch.isfinite(votes) & (votes > 0), votes, overall)
-    at = torch.tensor([(a + b - 1) / 2 for a, b in spans], dtype=votes.dtype, device=device)
-    time = torch.arange(frames, dtype=votes.dtype, device=device)
-    right = torch.bucketize(time, at).clamp(1, max(count - 1, 1)).clamp_max(count - 1)
-    left = (right - 1).clamp_min(0)
-    gap = (at[right] - at[left]).clamp_min(1e-12)
-    share = ((time - at[left]) / gap).clamp(0, 1)
-    return votes[left] * (1 - share) + votes[right] * share
+    index = tracks.skeleton.bone_index(device=tracks.points.device)[list(tracks.skeleton.rigid)]
+    return template_scale(tracks.points, tracks.weights, rest, index, span=span, quantile=quantile)
 
 
 def rigid_shape(tracks: Tracks, cameras: Tensor | None = None) -> Tensor:

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.align import centre
+from kcs_torch.functional.temporal import best_path
 
-__all__ = ["CameraFit", "fit_cameras"]
+__all__ = ["CameraFit", "fit_cameras", "steady_cameras"]
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,27 @@ def fit_cameras(
     runs = zip(starts.split(RUN, 1), *(x.split(RUN) for x in (tracks, points, weights, low, high)), strict=True)
     fits = [_fit(*run, robust=robust, num_steps=num_steps) for run in runs]
     return CameraFit(*(torch.cat(parts, 1) for parts in zip(*fits, strict=True)))
+
+
+def steady_cameras(fit: CameraFit, continuity: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Choose one start's camera in each frame: of low cost, and without jumps in time.
+
+    Args:
+        fit: from :func:`fit_cameras`.
+        continuity: weight of the turn between frames (radians squared); 0 takes each frame's best.
+
+    Returns:
+        rotations (T, 3, 3) and scales (T,).
+    """
+    cost = fit.cost.mT  # (T, C)
+    if continuity > 0:
+        trace = torch.einsum("atij,btij->tab", fit.rotations[:, :-1], fit.rotations[:, 1:])
+        turn = torch.arccos(((trace - 1) / 2).clamp(-1, 1)).square()
+        choice = best_path(cost, continuity * turn)
+    else:
+        choice = cost.argmin(-1)
+    frame = torch.arange(len(cost), device=choice.device)
+    return fit.rotations[choice, frame], fit.scales[choice, frame]
 
 
 RUN = 2000

@@ -1,0 +1,144 @@
+"""The step that KCS and its unrolled layer share: a template's bones plus a deviation of least nuclear norm.
+
+Pose = B0 + A in bone space, B0 the template's bones, A (T, B, 3) the deviation.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.camera import back_project, project
+from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.spectral import spectral_norm, svt
+from kcs_torch.nn.energies import centred_residual
+
+__all__ = ["Arrangement", "deviation_scale", "deviation_step", "frame_scales", "template_scale"]
+
+Arrangement = Literal["stacked", "frames"]
+"""How deviations form one matrix: 3T x B as printed, or T x 3B."""
+
+
+def deviation_step(
+    deviation: Tensor,
+    rest: Tensor,
+    goal: Tensor,
+    cameras: Tensor,
+    weights: Tensor,
+    threshold: Tensor,
+    step: Tensor | float = 1.0,
+    *,
+    matrix: Tensor,
+    inverse: Tensor,
+    arrangement: Arrangement,
+) -> Tensor:
+    """One step of KCS's shape (eq. 21): A <- shrink(A - tau C^T R^T w (R (X0 + D A) - W), tau mu).
+
+    Unseen joints take their current projection, and joints seen with low confidence go part of the way: the
+    majorisation of the weighted data term.
+
+    Args:
+        deviation: A (..., T, B, 3).
+        rest: X0 (..., 1 or T, N, 3), the template in the world frame.
+        goal: W (..., T, N, 2), tracks in the unit of the template.
+        cameras: R (..., T, 2, 3).
+        weights: w (..., T, N).
+        threshold: mu (...).
+        step: tau.
+        matrix: C (N, B), the incidence matrix.
+        inverse: D (N, B), its right inverse.
+        arrangement: of the matrix whose singular values are shrunk.
+
+    Returns:
+        (..., T, B, 3).
+    """
+    residual = centred_residual(project(rest + inverse @ deviation, cameras), goal, weights)
+    move = back_project(matrix.mT @ (residual * weights[..., None]), cameras)
+    return _unfold(svt(_fold(deviation - step * move, arrangement), step * threshold), deviation, arrangement)
+
+
+def deviation_scale(
+    rest: Tensor, goal: Tensor, cameras: Tensor, weights: Tensor, *, matrix: Tensor, arrangement: Arrangement
+) -> Tensor:
+    """Largest singular value (...) of what the tracks ask of the template: the unit of the shrinkage."""
+    asked = -centred_residual(project(rest, cameras), goal, weights) * weights[..., None]
+    return spectral_norm(_fold(back_project(matrix.mT @ asked, cameras), arrangement))
+
+
+def frame_scales(rest: Tensor, tracks: Tensor, cameras: Tensor, weights: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Weak-perspective scale (..., T) by least squares, within bounds (..., T).
+
+    Args:
+        rest: (..., 1 or T, N, 3).
+        tracks: (..., T, N, 2), centred.
+        cameras: (..., T, 2, 3).
+        weights: (..., T, N).
+        low: (..., T), or what broadcasts to it.
+        high: (..., T).
+    """
+    flat = project(rest, cameras)
+    match = (flat * tracks * weights[..., None]).sum((-2, -1))
+    size = (flat.square() * weights[..., None]).sum((-2, -1))
+    free = match / torch.where(size > 0, size, torch.ones_like(size))
+    return torch.minimum(torch.maximum(free, low), high)
+
+
+def template_scale(
+    tracks: Tensor, weights: Tensor, rest: Tensor, bones: Tensor, *, span: int = 60, quantile: float = 0.95
+) -> Tensor:
+    """Weak-perspective scale of each frame, from the longest projections of the bones around it.
+
+    A bone's projection is at most scale times its length, and reaches it where the bone lies in the image plane. In
+    spans of frames, each bone's high quantile of |projection| / length votes, and the median bone wins: an arm held out
+    does not enlarge the body.
+
+    Args:
+        tracks: (..., T, N, 2), finite, 0 where unseen, about the body's middle.
+        weights: (..., T, N).
+        rest: (N, 3) template.
+        bones: (B, 2) that keep their length.
+        span: frames of a span; scales between spans are interpolated.
+        quantile: of a bone's projections within a span.
+
+    Returns:
+        (..., T), positive.
+    """
+    frames, device = tracks.shape[-3], tracks.device
+    size = rest.square().sum(-1).mean().sqrt().clamp_min(1e-12)
+    fallback = (tracks.square().sum(-1).mean((-2, -1)).sqrt() / size).clamp_min(1e-12)
+    if len(bones) == 0:
+        return fallback[..., None].expand(*fallback.shape, frames)
+    length = bone_lengths(rest, bones)
+    seen = (weights[..., bones[:, 0]] > 0) & (weights[..., bones[:, 1]] > 0) & (length > 0)
+    ratio = bone_vectors(tracks, bones).norm(dim=-1) / torch.where(length > 0, length, torch.ones_like(length))
+    ratio = torch.where(seen, ratio, torch.nan)
+    count = max(1, round(frames / span))
+    edges = [round(i * frames / count) for i in range(count + 1)]
+    spans = list(itertools.pairwise(edges))
+    vote = lambda part: part.nanquantile(quantile, -2).nanmedian(-1).values  # noqa: E731
+    overall = vote(ratio)
+    overall = torch.where(torch.isfinite(overall) & (overall > 0), overall, fallback)[..., None]
+    votes = torch.stack([vote(ratio[..., a:b, :]) for a, b in spans], -1)
+    votes = torch.where(torch.isfinite(votes) & (votes > 0), votes, overall)
+    at = torch.tensor([(a + b - 1) / 2 for a, b in spans], dtype=votes.dtype, device=device)
+    time = torch.arange(frames, dtype=votes.dtype, device=device)
+    right = torch.bucketize(time, at).clamp(1, max(count - 1, 1)).clamp_max(count - 1)
+    left = (right - 1).clamp_min(0)
+    gap = (at[right] - at[left]).clamp_min(1e-12)
+    share = ((time - at[left]) / gap).clamp(0, 1)
+    return votes[..., left] * (1 - share) + votes[..., right] * share
+
+
+def _fold(deviation: Tensor, arrangement: Arrangement) -> Tensor:
+    """(..., T, B, 3) as (..., 3T, B) or (..., T, 3B)."""
+    return deviation.mT.flatten(-3, -2) if arrangement == "stacked" else deviation.flatten(-2)
+
+
+def _unfold(matrix: Tensor, like: Tensor, arrangement: Arrangement) -> Tensor:
+    """The way back, to (..., T, B, 3)."""
+    if arrangement == "stacked":
+        return matrix.unflatten(-2, (like.shape[-3], 3)).mT
+    return matrix.unflatten(-1, like.shape[-2:])
