@@ -6,6 +6,7 @@ its fixed point.
 
 from kcs_torch.nn.unrolled.base import Unrolled
 from kcs_torch.nn.unrolled.fpc import UnrolledFPC
+from kcs_torch.nn.unrolled.kcs import UnrolledKCS
 from kcs_torch.nn.unrolled.sfam import UnrolledSfAM
 
-__all__ = ["Unrolled", "UnrolledFPC", "UnrolledSfAM"]
+__all__ = ["Unrolled", "UnrolledFPC", "UnrolledKCS", "UnrolledSfAM"]

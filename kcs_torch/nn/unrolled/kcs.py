@@ -1,0 +1,267 @@
+"""KCS's shape step as a layer: the same functions as :class:`kcs_torch.KCS`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.chain import bone_lengths, bone_vectors, chain_inverse, incidence
+from kcs_torch.nn.deviation import Arrangement, deviation_scale, deviation_step, frame_scales, template_scale
+from kcs_torch.nn.energies import centred_residual
+from kcs_torch.nn.layers import full_precision, known
+from kcs_torch.nn.steps import continuation
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled
+from kcs_torch.skeleton import Skeleton, get_skeleton
+from kcs_torch.solvers.iterate import Solution
+from kcs_torch.solvers.pose import fit_cameras, steady_cameras
+
+__all__ = ["UnrolledKCS"]
+
+
+class UnrolledKCS(Unrolled):
+    """``num_steps`` steps of KCS's shape: a template's bones plus a deviation of least nuclear norm.
+
+    Args:
+        skeleton: a :class:`Skeleton`, a built-in name or a file.
+        num_steps: steps; each has its own step size and threshold.
+        template: rest pose, N positions (x right, y down, z away), any unit; the skeleton's if None.
+        links: extra rigid links as pairs of joint names; they may close chains.
+        arrangement: "stacked" (3T x B, as printed) or "frames" (T x 3B), as in :class:`kcs_torch.KCS`.
+        mu: first threshold, a share of the data's largest singular value.
+        final: last threshold; between them they fall geometrically.
+        tau: step size.
+        momentum: as in :class:`UnrolledFPC`; the method has none.
+        scale_range: factor by which a frame's scale may leave the clip's, where scales are not given.
+        lengths: relative bone lengths that the template's bones are brought to; the template's own if None.
+        learnable: as in :class:`UnrolledFPC`.
+        learnable_lengths: the relative lengths of the template's bones are parameters, too.
+        grad_steps: as in :class:`UnrolledFPC`.
+        gradient: as in :class:`UnrolledFPC`.
+
+    Raises:
+        OptionError: a number is out of range.
+        ShapeError: the template does not fit the skeleton.
+        SkeletonError: the skeleton is unknown, or there is no template.
+
+    Wandt, Ackermann, Rosenhahn 2018, Algorithm 1.
+
+    >>> layer = UnrolledKCS("h36m17", num_steps=5)
+    >>> tracks = torch.randn(20, 17, 2)
+    >>> cameras, scales = layer.find_cameras(tracks)
+    >>> layer(tracks, cameras, scales=scales).shape
+    torch.Size([20, 17, 3])
+    """
+
+    raw_threshold: Tensor
+    raw_step: Tensor
+    rest: Tensor
+    bones: Tensor
+    rigid: Tensor
+    matrix: Tensor
+    inverse: Tensor
+
+    def __init__(
+        self,
+        skeleton: str | Path | Skeleton,
+        num_steps: int = 10,
+        *,
+        template: Sequence[Sequence[float]] | Tensor | None = None,
+        links: Iterable[tuple[str, str]] = (),
+        arrangement: Arrangement = "stacked",
+        mu: float = 0.5,
+        final: float = 3e-5,
+        tau: float = 1.0,
+        momentum: float = 0.0,
+        scale_range: float = 1.1,
+        lengths: Sequence[float] | None = None,
+        learnable: bool = True,
+        learnable_lengths: bool = False,
+        grad_steps: int | None = None,
+        gradient: Gradient = "unrolled",
+    ) -> None:
+        super().__init__(num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
+        if not tau > 0 or not scale_range >= 1 or arrangement not in ("stacked", "frames"):
+            raise OptionError(
+                "UnrolledKCS: expected tau > 0, scale_range >= 1 and arrangement 'stacked' or 'frames', "
+                f"got {tau}, {scale_range} and {arrangement!r}"
+            )
+        self.skeleton = get_skeleton(skeleton)
+        body = self.skeleton.with_links(tuple(links)) if links else self.skeleton
+        body = body.connected()
+        self.arrangement, self.scale_range = arrangement, scale_range
+        rest = (
+            self.skeleton.template_points(dtype=torch.float64)
+            if template is None
+            else torch.as_tensor(template, dtype=torch.float64)
+        )
+        if rest.shape != (body.num_joints, 3) or not bool(rest.isfinite().all()):
+            raise ShapeError(
+                f"UnrolledKCS: template: expected {body.num_joints} finite positions (x, y, z) for skeleton "
+                f"'{self.skeleton.name}', got shape {tuple(rest.shape)}"
+            )
+        bones = body.bone_index()
+        matrix = incidence(bones, body.num_joints, dtype=torch.float64)
+        buffers = {
+            "rest": rest - rest.mean(0),
+            "bones": bones,
+            "rigid": self.skeleton.bone_index()[list(self.skeleton.rigid)],
+            "matrix": matrix,
+            "inverse": chain_inverse(matrix),
+        }
+        for name, value in buffers.items():
+            self.register_buffer(name, value, persistent=False)
+        self._positive("threshold", continuation(num_steps, mu, final))
+        self._positive("step", [tau] * num_steps)
+        own = bone_lengths(rest, bones).clamp_min(1e-12).tolist()
+        self._hold_lengths(body, own if lengths is None and learnable_lengths else lengths, learnable_lengths)
+
+    def template(self, like: Tensor) -> Tensor:
+        """The rest pose (N, 3), centred, with the module's bone lengths, in the dtype of ``like``."""
+        rest = self.rest.to(like)
+        if not self.has_lengths:
+            return rest
+        vectors = bone_vectors(rest, self.bones)
+        own = vectors.norm(dim=-1)
+        factor = self._values("length", like) * own.mean() / torch.where(own > 0, own, torch.ones_like(own))
+        return self.inverse.to(like) @ (factor[:, None] * vectors)
+
+    def find_cameras(
+        self, tracks: Tensor, *, weights: Tensor | None = None, continuity: float = 1.0, robust: float | None = 0.4
+    ) -> tuple[Tensor, Tensor]:
+        """Fit cameras to the template seen in each frame, as :class:`kcs_torch.KCS` does in its first round.
+
+        Args:
+            tracks: (..., T, N, 2).
+            weights: (..., T, N), 0 where unseen.
+            continuity: weight of the turn between frames in choosing among a frame's cameras.
+            robust: residuals of this share of the body's size count half; None is least squares.
+
+        Returns:
+            Camera rows (..., T, 2, 3) and scales (..., T), constants for autograd.
+
+        Raises:
+            ShapeError: the shapes do not fit.
+        """
+        self._check(tracks, None, weights, None)
+        self._check_joints(tracks)
+        with torch.no_grad(), full_precision(tracks):
+            points, share = self._centred(tracks, weights)
+            rest = self.template(tracks)
+            low, high = self._bounds(points, share, rest)
+            rows, sizes = [], []
+            clips = (x.reshape(-1, *x.shape[tracks.ndim - 3 :]) for x in (points, share, low, high))
+            for one, seen, least, most in zip(*clips, strict=True):
+                shape = rest.expand(len(one), -1, -1)
+                fit = fit_cameras(one, shape, seen, least, most, robust=robust)
+                rotations, scales = steady_cameras(fit, continuity)
+                rows.append(rotations[:, :2])
+                sizes.append(scales)
+            return torch.stack(rows).reshape(*tracks.shape[:-2], 2, 3), torch.stack(sizes).reshape(tracks.shape[:-2])
+
+    def forward(
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        *,
+        scales: Tensor | None = None,
+        weights: Tensor | None = None,
+        start: Tensor | None = None,
+    ) -> Tensor:
+        """Return the shape in the world frame of the cameras, which is the template's.
+
+        Args:
+            tracks: (..., T, N, 2).
+            cameras: (..., T, 2, 3), from :meth:`find_cameras`, say.
+            scales: (..., T) image length of the template's unit; by least squares if None.
+            weights: (..., T, N), 0 where unseen.
+            start: (..., T, N, 3), in the unit of the tracks; the template if None.
+
+        Returns:
+            (..., T, N, 3), in the unit of the tracks at the clip's mean scale.
+
+        Raises:
+            ShapeError: the shapes do not fit.
+
+        Warns:
+            ConvergenceWarning: with the implicit gradient, in the backward pass.
+        """
+        return self._solve(tracks, cameras, scales, weights, start, measure=False).value
+
+    def solve(
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        *,
+        scales: Tensor | None = None,
+        weights: Tensor | None = None,
+        start: Tensor | None = None,
+    ) -> Solution[Tensor]:
+        """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still."""
+        return self._solve(tracks, cameras, scales, weights, start, measure=True)
+
+    def _solve(
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        scales: Tensor | None,
+        weights: Tensor | None,
+        start: Tensor | None,
+        *,
+        measure: bool,
+    ) -> Solution[Tensor]:
+        self._check(tracks, cameras, weights, start, scales=(scales, tracks.shape[-3:-2]))
+        self._check_joints(tracks)
+        threshold, step = self._values("threshold", tracks), self._values("step", tracks)
+        with full_precision(tracks):
+            points, share = self._centred(tracks, weights)
+            rest = self.template(tracks)
+            matrix, inverse = self.matrix.to(tracks), self.inverse.to(tracks)
+            if scales is None:
+                with torch.no_grad():
+                    low, high = self._bounds(points, share, rest)
+                scales = frame_scales(rest, points, cameras, share, low, high)
+            size = scales.mean(-1)[..., None, None, None]
+            given = (rest, points / scales[..., None, None], cameras, share)
+            top = deviation_scale(*given, matrix=matrix, arrangement=self.arrangement)
+            if start is None:
+                batch = torch.broadcast_shapes(points.shape[:-3], cameras.shape[:-3], scales.shape[:-1])
+                begin = points.new_zeros(*batch, points.shape[-3], len(self.bones), 3)
+            else:
+                begin = bone_vectors(start.to(tracks.dtype) / size - rest, self.bones)
+            solution = self._run(
+                lambda state, k: deviation_step(
+                    state, *given, threshold[k] * top, step[k],
+                    matrix=matrix, inverse=inverse, arrangement=self.arrangement,
+                ),
+                begin,
+                measure=measure,
+                depends_on=(tracks, cameras, weights, scales),
+            )  # fmt: skip
+            value = size * (rest + inverse @ solution.value)
+        return Solution(value, solution.converged, solution.iterations)
+
+    def _centred(self, tracks: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Tracks about the seen joints' middle, 0 where unseen, and weights (..., T, N)."""
+        points = known(tracks, weights)
+        points = known(-centred_residual(torch.zeros_like(points), points, weights), weights)
+        return points, torch.ones_like(points[..., 0]) if weights is None else weights.expand(points.shape[:-1])
+
+    def _bounds(self, points: Tensor, weights: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+        """Least and greatest scale (..., T)."""
+        scale = template_scale(points, weights, rest, self.rigid)
+        if math.isinf(self.scale_range):
+            return torch.zeros_like(scale), torch.full_like(scale, math.inf)
+        return scale / self.scale_range, scale * self.scale_range
+
+    def _check_joints(self, tracks: Tensor) -> None:
+        joints = self.skeleton.num_joints
+        if tracks.shape[-2] != joints:
+            raise ShapeError(
+                f"UnrolledKCS: expected tracks (..., T, {joints}, 2) for skeleton '{self.skeleton.name}', "
+                f"got {tuple(tracks.shape)}"
+            )
