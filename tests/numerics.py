@@ -120,29 +120,8 @@ def dense_fit_bones(points, lengths, bones, stiffness, num_steps, damping=0.0, s
 class Operations(TorchDispatchMode):
     """Counts what runs under it: operations, and the numbers that they write. Views are free and do not count."""
 
-    VIEWS = frozenset(
-        [
-            "_reshape_alias",
-            "_unsafe_view",
-            "alias",
-            "as_strided",
-            "detach",
-            "diagonal",
-            "expand",
-            "permute",
-            "select",
-            "slice",
-            "split",
-            "split_with_sizes",
-            "squeeze",
-            "t",
-            "transpose",
-            "unbind",
-            "unfold",
-            "unsqueeze",
-            "view",
-        ]
-    )
+    VIEWS = {"_reshape_alias", "_unsafe_view", "alias", "as_strided", "detach", "diagonal", "expand", "permute", "select"}
+    VIEWS |= {"slice", "split", "split_with_sizes", "squeeze", "t", "transpose", "unbind", "unfold", "unsqueeze", "view"}
 
     def __init__(self):
         super().__init__()

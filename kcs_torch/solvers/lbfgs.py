@@ -74,31 +74,38 @@ def lbfgs(
     failed = torch.zeros_like(resting)
     past, places = [value], [x]
     least = torch.where(value.isfinite(), torch.finfo(x.dtype).eps * value.abs(), 0).clamp_min(tiny)  # if it falls to 0
-    settled, made = False, 0
+    settled, rest, made = False, False, 0
     for made in range(1, num_steps + 1):
-        q = gradient
+        q = gradient.clone()
         shares = []
         for s, y, r in zip(reversed(moves), reversed(turns), reversed(inverses), strict=True):
             shares.append(r * dot(s, q))
-            q = q - shares[-1] * y
-        q = q * scale
+            q.addcmul_(y, shares[-1], value=-1)
+        q.mul_(scale)
         for (s, y, r), a in zip(zip(moves, turns, inverses, strict=True), reversed(shares), strict=True):
-            q = q + s * (a - r * dot(y, q))
+            q.addcmul_(s, a - r * dot(y, q))
         downhill = dot(q, gradient) > 0
         direction = -torch.where(downhill & ~failed[:, None], q, steepest * gradient)
         slope = dot(direction, gradient)[:, 0]
         length = torch.ones_like(value)
         done = resting
         new_x, new_value, new_gradient = x, value, gradient
+        some = rest
         for _ in range(max_trials):
-            trial = x + length[:, None] * direction
-            v, g = evaluate(torch.where(done[:, None], new_x, trial))
-            good = ~done & (v <= value + 1e-4 * length * slope) & torch.isfinite(g).all(-1)
-            new_x = torch.where(good[:, None], trial, new_x)
-            new_value = torch.where(good, v, new_value)
-            new_gradient = torch.where(good[:, None], g, new_gradient)
+            trial = torch.addcmul(x, direction, length[:, None])
+            if some:
+                trial = torch.where(done[:, None], new_x, trial)
+            v, g = evaluate(trial)
+            good = ~done & (v <= value + 1e-4 * length * slope) & torch.isfinite(g.sum(-1))
             done = done | good
-            if bool(done.all()):
+            straight, some, every = torch.stack([good.all(), done.any(), done.all()]).tolist()
+            if straight:  # most often
+                new_x, new_value, new_gradient = trial, v, g
+            else:
+                new_x = torch.where(good[:, None], trial, new_x)
+                new_value = torch.where(good, v, new_value)
+                new_gradient = torch.where(good[:, None], g, new_gradient)
+            if every:
                 break
             # the parabola through value, slope and trial, kept within a tenth and a half
             bend = 2 * (v - value - length * slope)
@@ -108,19 +115,20 @@ def lbfgs(
         failed = ~done
         s, y = new_x - x, new_gradient - gradient
         curve = dot(s, y)
-        kept = curve > 1e-10 * dot(y, y) * scale.clamp_min(tiny)
-        moves.append(torch.where(kept, s, torch.zeros_like(s)))
-        turns.append(torch.where(kept, y, torch.zeros_like(y)))
+        square = dot(y, y)
+        kept = curve > 1e-10 * square * scale.clamp_min(tiny)
+        moves.append(s.masked_fill_(~kept, 0))
+        turns.append(y.masked_fill_(~kept, 0))
         inverse = 1 / torch.where(kept, curve, torch.ones_like(curve))
         inverses.append(torch.where(kept, inverse, torch.zeros_like(curve)))
         del moves[:-memory], turns[:-memory], inverses[:-memory]
-        scale = torch.where(kept, curve / dot(y, y).clamp_min(tiny), scale)
+        scale = torch.where(kept, curve / square.clamp_min(tiny), scale)
         x, value, gradient = new_x, new_value, new_gradient
         past.append(value)
         places = [*places[-10:], x]
         if made >= 10:
             resting = resting | (past[-11] - value <= (tolerance * value.abs()).maximum(least))
-        if bool(resting.all()):
-            settled = True
+        rest, settled = torch.stack([resting.any(), resting.all()]).tolist()
+        if settled:
             break
     return Solution(x, settled, made, places[0])
