@@ -221,7 +221,7 @@ class MLPLifter(_Lifter):
 class TemporalLifter(_Lifter):
     """Residual temporal convolutions of three frames each, ever farther apart; for clips of any length.
 
-    The first and the last frame are held beyond the ends, so every frame has an answer.
+    Every frame has an answer: beyond the ends of a clip each layer sees the first or the last frame again.
 
     Args:
         skeleton: a :class:`Skeleton`, a built-in name or a file.
