@@ -1,6 +1,7 @@
 """Modules: layers, energies that are losses and solver terms at once, and unrolled solvers."""
 
 from kcs_torch.nn.anatomy import HingeEnergy
+from kcs_torch.nn.critic import KCSCritic, critic_loss, generator_loss
 from kcs_torch.nn.distances import JointDistance, KCSDistance
 from kcs_torch.nn.energies import (
     BoneLengthEnergy,
@@ -26,6 +27,7 @@ __all__ = [
     "ForeshorteningEnergy",
     "HingeEnergy",
     "JointDistance",
+    "KCSCritic",
     "KCSDistance",
     "KCSMatrix",
     "LowRankEnergy",
@@ -40,4 +42,6 @@ __all__ = [
     "TemporalLifter",
     "UnrolledFPC",
     "UnrolledSfAM",
+    "critic_loss",
+    "generator_loss",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-__all__ = ["find_cycle", "find_pieces"]
+__all__ = ["find_cycle", "find_parts", "find_pieces"]
 
 Pair = tuple[int, int]
 
@@ -45,6 +45,56 @@ def find_cycle(num_joints: int, bones: Sequence[Pair]) -> list[int] | None:
         neighbours[a].append(b)
         neighbours[b].append(a)
     return None
+
+
+def find_parts(num_joints: int, bones: Sequence[Pair], least: int = 3) -> list[list[int]]:
+    """Return the parts of a body, limbs and trunk, as lists of bone indices: what is left when it is cut at its hubs.
+
+    A hub is a joint from which three or more branches lead on for at least ``least`` bones: pelvis and neck, the wrist
+    of a hand. Where there is none, shorter branches will do; a body without any is one part. Bones that close a chain
+    join the parts that they link.
+
+    >>> find_parts(7, [(0, 1), (1, 2), (0, 3), (3, 4), (0, 5), (5, 6)])  # three arms
+    [[0, 1], [2, 3], [4, 5]]
+    """
+    reach = _reach(num_joints, bones)
+    for length in range(least, 0, -1):
+        hubs = {i for i in range(num_joints) if sum(far >= length for far in reach[i].values()) >= 3}
+        if hubs:
+            break
+    else:
+        hubs = set()
+    group = list(range(len(bones)))
+    owner: dict[int, int] = {}  # a joint that is no hub belongs to one part
+    for index, bone in enumerate(bones):
+        for joint in bone:
+            if joint not in hubs:
+                first = owner.setdefault(joint, index)
+                old, new = group[index], group[first]
+                group = [new if g == old else g for g in group]
+    parts: dict[int, list[int]] = {}
+    for index, g in enumerate(group):
+        parts.setdefault(g, []).append(index)
+    return sorted(parts.values())
+
+
+def _reach(num_joints: int, bones: Sequence[Pair]) -> list[dict[int, int]]:
+    """How many bones lead on at most from each joint over each neighbour; bones that close a chain do not count."""
+    neighbours: dict[int, list[int]] = {i: [] for i in range(num_joints)}
+    for a, b in bones:
+        if _path(neighbours, a, b) is None:
+            neighbours[a].append(b)
+            neighbours[b].append(a)
+
+    def depth(start: int, came: int) -> int:
+        most, stack = 0, [(start, came, 1)]
+        while stack:
+            node, last, far = stack.pop()
+            most = max(most, far)
+            stack += [(other, node, far + 1) for other in neighbours[node] if other != last]
+        return most
+
+    return [{other: depth(other, i) for other in neighbours[i]} for i in range(num_joints)]
 
 
 def _path(neighbours: Mapping[int, list[int]], start: int, goal: int) -> list[int] | None:
