@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import roma
 import torch
 from torch import Tensor
 
@@ -26,6 +25,7 @@ from kcs_torch.functional.chain import bone_vectors, safe_norm
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.solvers.curvature import Levels, block_roots, frame_curvature
 from kcs_torch.solvers.lbfgs import lbfgs
+from kcs_torch.solvers.procrustean_descent import Descent
 
 __all__ = [
     "COARSE",
@@ -145,32 +145,17 @@ def procrustean(
         curvature.add_lengths(points, rigid, stiff, stage.slack, REACH)
         if noise > 0:
             curvature.add_tracks(precision)
-        roots = block_roots(curvature)
-        base, turn = points, rotations
-
-        def move(u: Tensor) -> tuple[Tensor, Tensor]:
-            step = (roots @ u.view(hypotheses, frames, -1, 1)).squeeze(-1)  # noqa: B023
-            shift = step[..., :-3].unflatten(-1, (free, joints)).mT
-            if free == 1:
-                shift = torch.nn.functional.pad(shift, (2, 0))
-            return base + shift, roma.rotvec_to_rotmat(step[..., -3:]) @ turn  # noqa: B023
-
-        def energy(u: Tensor) -> Tensor:
-            x, r = move(u)
-            total = motion_energy(x, r, bones, stage) + length_energy(x, rigid, stiff, stage.slack)  # noqa: B023
-            if noise > 0:
-                total = total + track_energy(x, tracks, share, noise)
-            return total if extra is None else total + extra(x)
-
+        descent = Descent(
+            points, rotations, block_roots(curvature), bones, rigid, stiff, stage,
+            change=CHANGE, reach=REACH, tracks=tracks, weights=share, noise=noise, extra=extra,
+        )  # fmt: skip
         start = points.new_zeros(hypotheses, frames * (free * joints + 3))
-        solution = lbfgs(energy, start, num_steps=stage.num_steps, first_step=1.0, tolerance=1e-8)
-        found = solution.value
-        points, rotations = move(found)
+        solution = lbfgs(descent, start, num_steps=stage.num_steps, first_step=1.0, tolerance=1e-8, slopes=True)
+        points, rotations = descent.moved(solution.value)
         assert solution.before is not None
-        moved = (points - move(solution.before)[0]).square().sum(-1).mean((-2, -1)).sqrt()
+        moved = (points - descent.moved(solution.before)[0]).square().sum(-1).mean((-2, -1)).sqrt()
         rotations = nearest_rotation(rotations)  # rounding would add up
-        with torch.no_grad():
-            value = energy(found)
+        value = descent(solution.value)[0]
     return Pose(points, rotations, value, moved)
 
 

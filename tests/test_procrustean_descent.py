@@ -1,0 +1,168 @@
+"""The Procrustean objective's gradient written out, against autograd through its energies; rotations from vectors."""
+
+import math
+
+import pytest
+import roma
+import torch
+from numerics import BODY, CHAIN, RING, count_operations, gradcheck, normal, rotations
+from torch.testing import assert_close
+
+from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.solvers.procrustean import CHANGE, REACH, Stage, length_energy, motion_energy, track_energy
+from kcs_torch.solvers.procrustean_descent import Descent, turn_by, turn_slopes
+
+STAGES = {
+    "poses": Stage(1e-2, 1, 1.0, 0.0, 0.1),
+    "changes": Stage(1e-4, 1, 0.01, 1.0, 0.01),
+    "changes alone": Stage(1e-3, 1, 0.0, 1.0, 0.03),
+}
+
+
+def problem(
+    body=BODY, frames=12, count=2, noise=0.0, stage=STAGES["changes"], rigid=None, extra=None, dtype=torch.float64
+):
+    """A descent, and the same energy as a function that autograd differentiates."""
+    joints = body.num_joints
+    base, turn = normal(count, frames, joints, 3, dtype=dtype), rotations(count, frames, dtype=dtype)
+    bones = body.bone_index()
+    rigid = bones if rigid is None else rigid
+    stiff = 0.5 + normal(len(rigid), seed=1, dtype=dtype).abs()
+    tracks, weights = normal(frames, joints, 2, seed=2, dtype=dtype), normal(frames, joints, seed=3, dtype=dtype).abs()
+    free = 3 if noise else 1
+    size = free * joints + 3
+    roots = 0.2 * normal(count, frames, size, size, seed=4, dtype=dtype)
+    descent = Descent(
+        base, turn, roots, bones, rigid, stiff, stage,
+        change=CHANGE, reach=REACH, tracks=tracks, weights=weights, noise=noise, extra=extra,
+    )  # fmt: skip
+
+    def move(u):
+        step = (roots @ u.view(count, frames, -1, 1)).squeeze(-1)
+        shift = step[..., :-3].unflatten(-1, (free, joints)).mT
+        shift = torch.nn.functional.pad(shift, (2, 0)) if free == 1 else shift
+        return base + shift, roma.rotvec_to_rotmat(step[..., -3:]) @ turn
+
+    def energy(u):
+        x, r = move(u)
+        total = motion_energy(x, r, bones, stage) + length_energy(x, rigid, stiff, stage.slack)
+        total = total if not noise else total + track_energy(x, tracks, weights, noise)
+        return total if extra is None else total + extra(x)
+
+    return descent, move, energy, torch.zeros(count, frames * size, dtype=dtype)
+
+
+def by_autograd(energy, u):
+    u = u.clone().requires_grad_()
+    value = energy(u)
+    return value.detach(), *torch.autograd.grad(value.sum(), u)
+
+
+def agree(descent, move, energy, u):
+    for one, other in zip(descent(u), by_autograd(energy, u), strict=True):
+        assert_close(one, other, rtol=1e-9, atol=1e-7 * float(other.abs().amax()))  # few frames, small eps
+    for one, other in zip(descent.moved(u), move(u), strict=True):
+        assert_close(one, other)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("frames", [1, 2, 3, 12])
+def test_as_autograd(frames, stage, noise):
+    descent, move, energy, start = problem(frames=frames, stage=STAGES[stage], noise=noise)
+    for size in (0.0, 1.0, 10.0):
+        agree(descent, move, energy, size * normal(*start.shape))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+@pytest.mark.parametrize("pairs", [[], [(0, 2)], [(0, 1), (1, 3), (0, 3), (2, 3)]])
+@pytest.mark.parametrize("body", [CHAIN, RING], ids=["chain", "ring"])
+def test_pairs_that_are_no_bones(body, pairs, noise):
+    rigid = torch.tensor(pairs, dtype=torch.long).reshape(-1, 2)
+    descent, move, energy, start = problem(body, rigid=rigid, noise=noise)
+    agree(descent, move, energy, normal(*start.shape))
+
+
+def test_further_energies():
+    extra = lambda x: (x[..., 3, 2] - 2).square().sum(-1) + x[..., 0].sum((-2, -1))  # noqa: E731
+    for noise in (0.0, 0.1):
+        descent, _, energy, start = problem(noise=noise, extra=extra)
+        with torch.no_grad():
+            found = descent(normal(*start.shape))
+        for one, other in zip(found, by_autograd(energy, normal(*start.shape)), strict=True):
+            assert_close(one, other)
+
+
+def test_bones_that_are_points():
+    """Joints at one place, all frames alike: nothing of it is NaN."""
+    descent, *_ = problem()
+    descent.points.zero_()
+    value, slope = descent(torch.zeros(2, 12 * 10).double())
+    assert value.isfinite().all() and (slope == 0).all()
+    descent, _, _, start = problem()
+    descent.points[:, :, 1] = descent.points[:, :, 0]  # one bone
+    assert all(x.isfinite().all() for x in descent(start))
+
+
+def test_a_step_too_far_is_no_number_and_no_error():
+    descent, *_, start = problem()
+    value, slope = descent(torch.full_like(start, torch.nan))
+    assert value.isnan().all() and slope.isnan().any(-1).all()
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-6, 1e-3, 0.0547, 0.0548, 0.3, 3.0, math.pi, 7.0])
+def test_rotations_from_vectors(size):
+    """As roma has them, and gradients as autograd has them: at none, at small and at large angles."""
+    unit = normal(5, 3)
+    vector = (size * unit / unit.norm(dim=-1, keepdim=True)).mT
+    made = turn_by(vector)
+    assert_close(made.permute(2, 0, 1), roma.rotvec_to_rotmat(vector.mT), rtol=0, atol=1e-14)
+    slopes = normal(3, 3, 5, seed=1)
+    found = turn_slopes(vector, slopes)
+    if size:
+        leaf = vector.mT.clone().requires_grad_()
+        made = roma.rotvec_to_rotmat(leaf).permute(1, 2, 0)
+        assert_close(found, torch.autograd.grad((made * slopes).sum(), leaf)[0].mT, rtol=0, atol=1e-9)
+    for i in range(3):  # against differences
+        step = torch.zeros(3, 1).double()
+        step[i] = 1e-5
+        rise = ((turn_by(vector + step) - turn_by(vector - step)) * slopes).sum((0, 1)) / 2e-5
+        assert_close(found[i], rise, rtol=0, atol=1e-8)
+
+
+def test_gradient_by_differences():
+    descent, _, _, start = problem(frames=4, noise=0.1, count=1)
+
+    class Wrapped(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, u):
+            value, slope = descent(u)
+            ctx.save_for_backward(slope)
+            return value
+
+        @staticmethod
+        def backward(ctx, grad):
+            return grad[:, None] * ctx.saved_tensors[0]
+
+    assert gradcheck(Wrapped.apply, 0.5 * normal(*start.shape), fast=True)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_follows_dtype_and_leaves_its_arguments_alone(dtype):
+    descent, *_, start = problem(dtype=dtype, noise=0.1)
+    u = normal(*start.shape, dtype=dtype)
+    before = u.clone()
+    first, again = descent(u), descent(u)
+    assert all(x.dtype == dtype for x in first) and torch.equal(u, before)
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert bone_vectors(descent.moved(u)[0], BODY.bone_index()).dtype == dtype
+
+
+def test_fewer_operations_than_autograd_takes():
+    """Counts, which no busy machine changes: of operations, and of numbers written."""
+    for noise, most in ((0.0, 160), (0.1, 180)):
+        descent, _, energy, start = problem(frames=60, noise=noise)
+        ours = count_operations(lambda d=descent, u=start: d(u))
+        naive = count_operations(lambda e=energy, u=start: by_autograd(e, u))
+        assert ours.total < most and ours.total < naive.total / 1.6
+        assert ours.elements < naive.elements / 1.5
