@@ -11,7 +11,7 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.functional import bone_lengths, centre, nearest_rotation
 from kcs_torch.metrics.align import align as aligned
 
-__all__ = ["bone_deviation", "e3d", "mpjpe", "pck"]
+__all__ = ["bone_deviation", "distances", "e3d", "mpjpe", "pck"]
 
 
 def mpjpe(
@@ -38,7 +38,7 @@ def mpjpe(
     >>> mpjpe(truth + torch.tensor([3.0, 4, 0]), truth, align="none").item()
     5.0
     """
-    return _mean(*_distances(pred, truth, align, weights, root))
+    return _mean(*distances(pred, truth, align, weights, root))
 
 
 def pck(
@@ -67,7 +67,7 @@ def pck(
         ShapeError: the shapes differ.
         OptionError: there is no such alignment.
     """
-    distance, mass = _distances(pred, truth, align, weights, root)
+    distance, mass = distances(pred, truth, align, weights, root)
     return _mean((distance <= threshold).to(truth), mass)
 
 
@@ -133,7 +133,7 @@ def bone_deviation(
     return (spread / mean).nanmedian(-1).values
 
 
-def _distances(
+def distances(
     pred: Tensor, truth: Tensor, align: str, weights: Tensor | None, root: int | None
 ) -> tuple[Tensor, Tensor | None]:
     """Distances (..., T, N) after alignment, and how much each counts: nothing where the root is needed and unknown."""

@@ -1,0 +1,178 @@
+"""The figures as ``torchmetrics.Metric`` classes: summed over batches and processes, then divided once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import OptionError, ShapeError, unknown
+from kcs_torch.functional import ALIGNMENTS
+from kcs_torch.metrics.errors import bone_deviation, distances, e3d
+from kcs_torch.skeleton import Skeleton, get_skeleton
+
+try:
+    from torchmetrics import Metric
+except ModuleNotFoundError as reason:
+    if reason.name != "torchmetrics":
+        raise
+    raise ModuleNotFoundError(
+        "kcs_torch.metrics: MPJPE, PCK, E3D and BoneDeviation need the package torchmetrics, which the extra "
+        "'train' brings: pip install 'kcs-torch[train]'. The functions mpjpe, pck, e3d, bone_deviation do without.",
+        name="torchmetrics",
+    ) from None
+
+__all__ = ["E3D", "MPJPE", "PCK", "BoneDeviation"]
+
+
+class _Mean(Metric):
+    """A weighted mean, whose sums are states."""
+
+    is_differentiable = False
+    full_state_update = False
+    plot_lower_bound = 0.0
+
+    total: Tensor
+    count: Tensor
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        for name in ("total", "count"):
+            self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+
+    def _add(self, values: Tensor, mass: Tensor) -> None:
+        mass = mass.to(values).expand(values.shape)
+        values = torch.where(mass > 0, values, torch.zeros_like(values))  # NaN where nothing counts
+        self.total += (values.detach().double() * mass).sum()
+        self.count += mass.double().sum()
+
+    def compute(self) -> Tensor:
+        """Return the mean over all that has been added; NaN where nothing counted."""
+        return (self.total / self.count).float()
+
+
+class MPJPE(_Mean):
+    """Mean distance of the joints after the alignment named: :func:`kcs_torch.metrics.mpjpe` over all batches.
+
+    Args:
+        align: a name in :data:`~kcs_torch.metrics.ALIGNMENTS`: ``similarity`` gives PA-MPJPE, ``scale`` N-MPJPE;
+            ``sequence`` turns and scales each clip as one. Never mirrored.
+        root: index of the root joint for ``root`` and ``scale``; the middle of all joints if None.
+        options: of ``torchmetrics.Metric``.
+
+    Raises:
+        OptionError: there is no such alignment.
+
+    >>> metric = MPJPE(align="none")
+    >>> truth = torch.zeros(2, 1, 2, 3)
+    >>> metric.update(truth + torch.tensor([3.0, 4, 0]), truth)
+    >>> metric.compute()
+    tensor(5.)
+    """
+
+    higher_is_better = False
+
+    def __init__(self, align: str = "root", *, root: int | None = None, **options: Any) -> None:
+        super().__init__(**options)
+        if align not in ALIGNMENTS:
+            raise unknown("alignment", align, ALIGNMENTS)
+        self.align, self.root = align, root
+
+    def update(self, pred: Tensor, truth: Tensor, weights: Tensor | None = None) -> None:
+        """Add a batch of clips.
+
+        Args:
+            pred: (..., T, N, 3).
+            truth: (..., T, N, 3).
+            weights: (..., T, N), 0 where a joint of the truth is unknown, whatever stands there; all 1 if None.
+
+        Raises:
+            ShapeError: the shapes differ, or a number that counts is not finite.
+        """
+        self._add(*self._measure(pred, truth, weights))
+
+    def _measure(self, pred: Tensor, truth: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+        pred, truth = _known(pred, weights), _known(truth, weights)
+        distance, mass = distances(pred, truth, self.align, weights, self.root)
+        return distance, torch.ones_like(distance) if mass is None else mass
+
+
+class PCK(MPJPE):
+    """Share of joints that are near the truth: :func:`kcs_torch.metrics.pck` over all batches.
+
+    Args:
+        threshold: in the unit of the truth; 150 mm is usual.
+        align: as of :class:`MPJPE`.
+        root: as of :class:`MPJPE`.
+        options: of ``torchmetrics.Metric``.
+
+    Raises:
+        OptionError: there is no such alignment, or the threshold is negative.
+    """
+
+    higher_is_better = True
+    plot_upper_bound = 1.0
+
+    def __init__(self, threshold: float, align: str = "root", *, root: int | None = None, **options: Any) -> None:
+        super().__init__(align, root=root, **options)
+        if not threshold >= 0:
+            raise OptionError(f"PCK: expected a threshold of at least 0, got {threshold}")
+        self.threshold = threshold
+
+    def _measure(self, pred: Tensor, truth: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+        distance, mass = super()._measure(pred, truth, weights)
+        return (distance <= self.threshold).to(distance), mass
+
+
+class E3D(_Mean):
+    """Mean over the clips of the normalised error of non-rigid structure from motion, :func:`kcs_torch.metrics.e3d`.
+
+    One orthogonal matrix for a clip, which may mirror, as papers have it. Clips without any known joint do not count.
+    """
+
+    higher_is_better = False
+
+    def update(self, pred: Tensor, truth: Tensor, weights: Tensor | None = None) -> None:
+        """Add a batch of clips, as :meth:`MPJPE.update`."""
+        value = e3d(_known(pred, weights), _known(truth, weights), weights=weights)
+        some = torch.ones_like(value) if weights is None else (weights > 0).flatten(-2).any(-1)
+        self._add(value, some)
+
+
+class BoneDeviation(_Mean):
+    """Mean over the clips of how far bones are from rigid, :func:`kcs_torch.metrics.bone_deviation`; needs no truth.
+
+    Args:
+        bones: (B, 2) joint indices, or a :class:`~kcs_torch.Skeleton` (a name, a file), whose rigid bones are taken.
+        options: of ``torchmetrics.Metric``.
+
+    Raises:
+        ShapeError: there are no bones.
+    """
+
+    higher_is_better = False
+
+    def __init__(self, bones: Any, **options: Any) -> None:
+        super().__init__(**options)
+        if isinstance(bones, (str, Path, Skeleton)):
+            body = get_skeleton(bones)
+            bones = body.bone_index()[list(body.rigid)]
+        self.bones = torch.as_tensor(bones)
+        if self.bones.ndim != 2 or not len(self.bones):
+            raise ShapeError(f"BoneDeviation: expected pairs of joints, got shape {tuple(self.bones.shape)}")
+
+    def update(self, points: Tensor, weights: Tensor | None = None) -> None:
+        """Add a batch of clips (..., T, N, 3) with weights (..., T, N), 0 where a joint is unknown."""
+        value = bone_deviation(_known(points, weights), self.bones, weights=weights)
+        self._add(value, ~torch.isnan(value))
+
+
+def _known(points: Tensor, weights: Tensor | None) -> Tensor:
+    """Points, 0 where they do not count."""
+    if weights is None:
+        return points
+    if weights.shape != points.shape[:-1]:
+        raise ShapeError(f"weights: expected shape {tuple(points.shape[:-1])}, got {tuple(weights.shape)}")
+    return torch.where(weights[..., None] > 0, points, torch.zeros_like(points))
