@@ -42,7 +42,7 @@ def resolve(name: str) -> object:
     raise ModuleNotFoundError(name)
 
 
-@pytest.mark.parametrize("page", ["pkc", "kcs", "sfam"])
+@pytest.mark.parametrize("page", ["pkc", "kcs", "sfam", "baselines"])
 def test_method_pages_name_what_exists(page):
     names = set(re.findall(r"`((?:[a-z_0-9]+\.)+\w+)`", text_of(DOCS / f"{page}.md")))
     assert len(names) > 4
@@ -124,8 +124,9 @@ def test_tables_of_formats_are_the_registries():
 @pytest.mark.parametrize("method", sorted(kt.METHODS))
 def test_every_field_of_a_method_is_described(method):
     rows = MADE["options"](method).splitlines()[2:]
-    assert len(rows) > 3 and all(len(row.split(" | ")[2]) > 10 for row in rows), rows
-    assert f"_generated/options_{method}.md" in text_of(DOCS / f"{method}.md")
+    assert len(rows) > 1 and all(len(row.split(" | ")[2]) > 10 for row in rows), rows
+    page = DOCS / f"{method}.md"
+    assert f"_generated/options_{method}.md" in text_of(page if page.exists() else DOCS / "baselines.md")
 
 
 def test_command_reference_has_all_commands():

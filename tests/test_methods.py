@@ -231,7 +231,7 @@ def test_gradients_are_neither_needed_nor_kept():
 # ---------------------------------------------------------------------- invariances
 
 
-ROUNDING = {"kcs": 1e-3, "sfam": 1e-3, "pkc": 5e-3}
+ROUNDING = dict.fromkeys(METHODS, 1e-3) | {"pkc": 5e-3}
 """What rounding may change, a share of the body: PKC's quasi-Newton steps, cut off at a number, make 1e-3 of 1e-14."""
 
 
@@ -345,7 +345,8 @@ def test_a_joint_never_seen_is_placed_and_told_of(method):
     assert (result.points[:, 6, 1] > result.points[:, 5, 1]).all()
 
 
-@pytest.mark.parametrize("method", METHODS)
+# The cosines of a walk are quicker than the camera's turn: PTA cannot tell its depth with all joints seen either.
+@pytest.mark.parametrize("method", [name for name in METHODS if name != "pta"])
 def test_half_of_the_joints_suffice(method):
     clip = walking_person(80, turn=180.0, yaw=0.0, generator=torch.Generator().manual_seed(1))
     gone = torch.rand(80, 17, generator=torch.Generator().manual_seed(4)) < 0.5

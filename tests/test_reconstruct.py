@@ -21,6 +21,10 @@ QUICK = {
     "kcs": {"rounds": 2, "arrangement": "frames"},
     "sfam": {"beta": 2.5, "num_steps": 30},
     "pkc": {"viewpoint": "fixed", "rounds": 0, "steps": 3},
+    "rigid": {"num_steps": 1},
+    "pta": {"rank": 2},
+    "csf": {"rank": 2},
+    "bmm": {"num_steps": 30},
 }
 """Fields with which each method is fast."""
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MethodName", "Settings", "lift", "method_fields"]
 
-MethodName = Annotated[str, typer.Option("--method", "-m", metavar="NAME", help="kcs, pkc or sfam; auto is pkc.")]
+MethodName = Annotated[str, typer.Option("--method", "-m", metavar="NAME", help="pkc, which is auto, sfam, kcs, rigid, pta, csf or bmm.")]
 Settings = Annotated[
     list[str],
     typer.Option(

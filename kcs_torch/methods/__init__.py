@@ -1,12 +1,24 @@
 """Methods: one file a paper."""
 
 from kcs_torch.methods.base import Method
+from kcs_torch.methods.bmm import BMM
+from kcs_torch.methods.csf import CSF
 from kcs_torch.methods.found import find_skeleton
 from kcs_torch.methods.kcs import KCS
 from kcs_torch.methods.pkc import PKC
+from kcs_torch.methods.pta import PTA
+from kcs_torch.methods.rigid import Rigid
 from kcs_torch.methods.sfam import SfAM
 
-__all__ = ["KCS", "METHODS", "PKC", "Method", "SfAM", "find_skeleton"]
+__all__ = ["BMM", "CSF", "KCS", "METHODS", "PKC", "PTA", "Method", "Rigid", "SfAM", "find_skeleton"]
 
-METHODS: dict[str, type[Method]] = {"pkc": PKC, "sfam": SfAM, "kcs": KCS}
+METHODS: dict[str, type[Method]] = {
+    "pkc": PKC,
+    "sfam": SfAM,
+    "kcs": KCS,
+    "rigid": Rigid,
+    "pta": PTA,
+    "csf": CSF,
+    "bmm": BMM,
+}
 """The methods by name."""

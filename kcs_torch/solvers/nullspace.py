@@ -12,24 +12,24 @@ from kcs_torch.solvers.iterate import iterate
 __all__ = ["null_space_upgrade"]
 
 PULL = 0.05
-"""Threshold of the eigenvalues in each step, a share of the first estimate's largest: it sets the pace, not the goal."""
+"""p, the trace's weight: a share of the largest eigenvalue of the first F."""
 
 
 def null_space_upgrade(motion: Tensor, *, softness: float = 1e-3, num_steps: int = 100) -> Tensor:
     """Return Q of min tr F over F = Q Q^T >= 0 in the null space of the orthonormality constraints, cut to rank 3.
 
-    With A(F) = (a.Fa - b.Fb)/2 and a.Fb of each frame's motion rows a, b, the paper's null space is A(F) = 0, and its
+    With A(F) = ((a.Fa - b.Fb)/2, a.Fb) of each frame's motion rows a, b, the paper's null space is A(F) = 0, and its
     scale one condition: here that rows have mean squared length 1. Tracks of bodies are only roughly of rank 3K, so the
-    null space is soft: the objective is tr F + c |A(F)|^2, with c such that eigenvectors of A^T A whose eigenvalue is
-    ``softness`` times the largest count half. Solved by alternating directions: shrinkage on the semi-definite cone, and
-    the quadratic in the eigenvectors of A^T A.
+    null space is soft: the objective is p tr F + |A(F)|^2 / 2e, with e a share of the largest eigenvalue of A^T A and p
+    of that of the first F. Solved by alternating directions: shrinkage on the semi-definite cone, and the quadratic in
+    the eigenvectors of A^T A.
 
     The trace depends on how the tracks are split into motion and shape: as the paper does, columns of motion are taken
     to carry the root of the singular values.
 
     Args:
         motion: (..., T, 2, R) from :func:`kcs_torch.functional.factorize`, R >= 3.
-        softness: 0 or more; 0 is the exact null space, which only noise-free tracks of rank 3K have.
+        softness: the share that makes e; 0 is the exact null space, which only noise-free tracks of rank 3K have.
         num_steps: of alternating directions.
 
     Returns:
