@@ -61,7 +61,8 @@ class BatchLoader:
     def __init__(self, make: Callable[[int, int], Batch], steps: int, *, fixed: bool = False) -> None:
         self.make, self.steps, self.fixed = make, steps, fixed
         self.epoch = self._first = self._place = 0
-        self.sampler = self  # where Lightning looks for set_epoch
+        if not fixed:
+            self.sampler, self.batch_sampler = self, None  # where Lightning looks for set_epoch
 
     def __len__(self) -> int:
         return self.steps
