@@ -70,6 +70,7 @@ def file_clips(
     fps: float | None,
     up: str | None,
     units: str,
+    file_units: str | None = None,
 ) -> list[Clip]:
     """Read motion files, all onto one skeleton, frame rate and unit.
 
@@ -79,15 +80,16 @@ def file_clips(
         fps: frames per second that they are brought to; as they are if None.
         up: the axis that points up in the files; as they say if None.
         units: of the clips.
+        file_units: of the files' numbers, where they do not say.
 
     Raises:
-        FormatError: a file is no motion, or its frame rate is unknown.
+        FormatError: a file is no motion, or its frame rate or unit is unknown.
         SkeletonError: a file has other joints than the first one, or none for a joint of the skeleton.
     """
     body = None if skeleton is None else get_skeleton(skeleton)
     out = []
     for path in files:
-        motion = load_motion(path, skeleton=body if skeleton is not None else None, up=up)
+        motion = load_motion(path, skeleton=body if skeleton is not None else None, up=up, units=file_units)
         if body is None:
             body = motion.skeleton
         elif motion.skeleton != body and motion.skeleton.joints != body.joints:
@@ -107,9 +109,12 @@ def file_clips(
             points, known = resampled(motion.points, motion.seen, motion.fps, fps)
         else:
             points, known = motion.points, motion.seen
-        ratio = unit_ratio(motion.units, units) if motion.units else 1.0
+        ratio = unit_ratio(motion.units, units)
         if ratio is None:
-            raise FormatError(f"{path}: expected a unit of length that converts to {units}, got {motion.units}")
+            raise FormatError(
+                f"{path}: expected a unit of length that converts to {units}, got {motion.units or 'none'}: give "
+                "file_units=..., one of m, cm, mm"
+            )
         out.append(_placed(from_y_up(points, "-y") * ratio, known, str(path), body))
     return out
 

@@ -43,7 +43,8 @@ class TracksDataModule(lightning.LightningDataModule):
         skeleton: whose joints are found by name in every file; that of the first file if None ("h36m17" of synthetic
             motion).
         up: the axis that points up in the files; as they say if None.
-        units: of the tracks.
+        units: of the tracks: mm, cm or m.
+        file_units: of the files, where they do not say (BVH).
         fps: frames per second that all motion is brought to; None takes it as it is.
         window: frames of a window.
         stride: frames from one training window to the next; ``window`` if None.
@@ -84,6 +85,7 @@ class TracksDataModule(lightning.LightningDataModule):
         skeleton: str | Path | Skeleton | None = None,
         up: str | None = None,
         units: str = "mm",
+        file_units: str | None = None,
         fps: float | None = 30.0,
         window: int = 27,
         stride: int | None = None,
@@ -139,6 +141,7 @@ class TracksDataModule(lightning.LightningDataModule):
             raise OptionError("data: pseudo: reconstructions are of tracks that stay the same: not with fresh_cameras")
         self.files = {"train": train, "val": val, "test": test}
         self.folder, self.body, self.up, self.units, self.fps = folder, skeleton, up, units, fps
+        self.file_units = file_units
         self.window, self.stride, self.views, self.pitch = window, stride or window, views, (low, high)
         self.noise, self.occlusion, self.fresh_cameras = noise, occlusion, fresh_cameras
         self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
@@ -266,7 +269,14 @@ class TracksDataModule(lightning.LightningDataModule):
                 raise OptionError(
                     f"data: {min(twice)} is in {split} and in {name}: leave it out of one by a pattern !..."
                 )
-        return file_clips(files[split], skeleton=self._body(split), fps=self.fps, up=self.up, units=self.units)
+        return file_clips(
+            files[split],
+            skeleton=self._body(split),
+            fps=self.fps,
+            up=self.up,
+            units=self.units,
+            file_units=self.file_units,
+        )
 
     def _files(self, split: str) -> list[Path]:
         named = self._named(split)

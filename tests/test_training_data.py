@@ -1,0 +1,493 @@
+import itertools
+import math
+from pathlib import Path
+
+import lightning
+import pytest
+import torch
+
+import kcs_torch as kt
+from kcs_torch.data import random_motion, walking_person
+from kcs_torch.errors import FormatError, OptionError, ShapeError, SkeletonError
+from kcs_torch.functional import bone_lengths, orbit
+from kcs_torch.skeleton import SKELETONS
+from kcs_torch.training import Batch, TracksDataModule
+from kcs_torch.training.clips import file_clips, find_files, resampled, synthetic_clips
+from kcs_torch.training.film import RUN, film, hidden, random_cameras
+from kcs_torch.training.loader import BatchLoader, Deck
+from kcs_torch.training.seeds import generator_of
+
+CMU = Path(__file__).parents[2] / "shared" / "data" / "cmu"
+
+
+def motion(frames=60, seed=0, fps=30.0, skeleton="h36m17"):
+    clip = random_motion(skeleton, frames, fps=fps, generator=torch.Generator().manual_seed(seed), size=4000.0)
+    return kt.Motion.from_arrays(clip.points, up="-y", skeleton=skeleton, fps=fps, units="mm")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Eight clips of 60 frames, as subjects s1 to s4 with takes a and b, in formats by turns."""
+    for i in range(8):
+        motion(60, seed=i).save(tmp_path / f"s{i // 2 + 1}_{'ab'[i % 2]}.npz")
+    return tmp_path
+
+
+def module(folder, train=("*.npz",), **options):
+    options = {"window": 10, "views": 3, "batch_size": 8, "up": "y", **options}
+    return TracksDataModule(list(train), folder=folder, **options)
+
+
+def same(a, b):
+    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+# ---------------------------------------------------------------- clips
+
+
+def test_files_by_patterns(folder):
+    names = lambda patterns: [p.name for p in find_files(patterns, folder)]  # noqa: E731
+    assert names("s1_*.npz") == ["s1_a.npz", "s1_b.npz"]
+    assert names(["*.npz", "!s[1-3]_*"]) == ["s4_a.npz", "s4_b.npz"]
+    assert names(["s2_a.npz", "s1_a.npz", "s2_*"]) == ["s1_a.npz", "s2_a.npz", "s2_b.npz"]
+    for patterns in ("none*.npz", ["*.npz", "!*"], []):
+        with pytest.raises(OptionError, match="found none"):
+            find_files(patterns, folder)
+
+
+def test_a_clip_is_what_the_motion_is_from_the_front(folder):
+    (clip,) = file_clips([folder / "s1_a.npz"], skeleton=None, fps=30, up="y", units="mm")
+    torch.testing.assert_close(clip.points, motion(60).in_camera().float(), atol=1e-2, rtol=0)
+    assert clip.known.all() and clip.skeleton == SKELETONS["h36m17"]
+
+
+def test_files_of_another_rate_unit_and_order(tmp_path):
+    fast = motion(61, fps=60.0)
+    fast.scaled(units="m", factor=0.001).save(tmp_path / "a.npz")
+    (clip,) = file_clips([tmp_path / "a.npz"], skeleton="h36m17", fps=30, up="y", units="mm")
+    assert clip.points.shape == (31, 17, 3)
+    expected = fast.in_camera()[::2].float()
+    far = (clip.points - clip.points.mean((0, 1))) - (expected - expected.mean((0, 1)))
+    assert far.abs().max() < 0.02
+
+
+def test_bvh_files_of_one_skeleton(tmp_path):
+    walk = kt.Motion.from_arrays(walking_person(40).points, up="-y", skeleton="h36m17", fps=30, units="mm")
+    walk.save(tmp_path / "a.bvh")
+    options = {"skeleton": "h36m17", "fps": 30, "up": None, "units": "mm"}
+    with pytest.raises(FormatError, match=r"a\.bvh: expected a unit of length.*file_units"):
+        file_clips([tmp_path / "a.bvh"], **options)
+    (clip,) = file_clips([tmp_path / "a.bvh"], **options, file_units="cm")
+    length = bone_lengths(clip.points, clip.skeleton.bones).mean(0)
+    true = bone_lengths(walk.points, clip.skeleton.bones).mean(0).float()
+    torch.testing.assert_close(length, true, rtol=0.02, atol=2)
+
+
+def test_resampling_keeps_what_a_parabola_has():
+    time = torch.arange(13.0, dtype=torch.float64)
+    values = torch.stack([time, time**2, 3 - time + 0.5 * time**2], -1)[:, None]
+    known = torch.ones(13, 1, dtype=torch.bool)
+    for rate in (30.0, 20.0, 45.0, 60.0, 7.3):
+        out, seen = resampled(values, known, 30.0, rate)
+        at = torch.arange(len(out), dtype=torch.float64) * 30.0 / rate
+        assert len(out) == math.floor(12 * rate / 30 + 1e-6) + 1 and seen.all()
+        exact = torch.stack([at, at**2, 3 - at + 0.5 * at**2], -1)[:, None]
+        inside = (at >= 1) & (at <= 11)  # cubic between four frames
+        torch.testing.assert_close(out[inside], exact[inside])
+        assert (out - exact).abs().max() <= 0.25  # linear at the ends: a quarter of what a parabola bends
+    out, _ = resampled(values, known, 30.0, 30.0)
+    assert torch.equal(out, values)
+
+
+def test_resampling_keeps_gaps():
+    values, known = torch.rand(9, 1, 3), torch.ones(9, 1, dtype=torch.bool)
+    known[4] = False
+    values[4] = math.nan
+    out, seen = resampled(values, known, 30.0, 60.0)
+    assert seen[:, 0].tolist() == [i not in (7, 8, 9) for i in range(17)]
+    assert torch.isfinite(out).all() and (out[~seen] == 0).all()
+    for i in (5, 6, 10, 11):
+        low, high = values[i // 2], values[(i + 1) // 2]
+        assert ((out[i] - (low + high) / 2).abs() < 0.5).all()
+
+
+def test_made_up_motion_has_rigid_bones_and_the_seed_alone_makes_it():
+    for name in ("h36m17", "coco17", "hand21"):
+        first = synthetic_clips(4, skeleton=name, fps=30, units="mm", seed=3, split="train", num_frames=40)
+        again = synthetic_clips(4, skeleton=name, fps=30, units="mm", seed=3, split="train", num_frames=40)
+        other = synthetic_clips(4, skeleton=name, fps=30, units="mm", seed=4, split="train", num_frames=40)
+        for a, b, c in zip(first, again, other, strict=True):
+            assert torch.equal(a.points, b.points) and not torch.equal(a.points, c.points)
+            length = bone_lengths(a.points, a.skeleton.bones)[:, list(a.skeleton.rigid)]
+            real = length.mean(0) > 1
+            assert ((length.std(0) / length.mean(0))[real] < 0.01).float().mean() > 0.8  # but for virtual joints'
+    heights = [c.points[..., 1].max() - c.points[..., 1].min() for c in first[::2]]
+    assert heights[0] != heights[1]
+
+
+# ---------------------------------------------------------------- film
+
+
+def test_cameras_stand_on_all_sides_and_look_down_as_asked():
+    cameras = random_cameras((4000,), (5.0, 25.0), generator_of(0))
+    eye = torch.eye(3).expand(4000, 3, 3)
+    torch.testing.assert_close(cameras @ cameras.mT, eye, atol=1e-5, rtol=0)
+    assert (torch.linalg.det(cameras) > 0).all()
+    down = torch.rad2deg(torch.asin(cameras[:, 2, 1]))  # the vertical as seen along the line of sight
+    assert 5 <= down.min() < 5.1 and 24.9 < down.max() <= 25
+    assert (cameras[:, 0, 1].abs() < 1e-6).all()  # no roll
+    yaw = torch.atan2(cameras[:, 0, 2], cameras[:, 0, 0])
+    assert abs(yaw.cos().mean()) < 0.05 and abs(yaw.sin().mean()) < 0.05 and abs((2 * yaw).cos().mean()) < 0.05
+    one = random_cameras((1,), (12.0, 12.0), generator_of(1))[0]
+    yaw = torch.rad2deg(torch.atan2(-one[0, 2], one[0, 0]))
+    torch.testing.assert_close(one, orbit(yaw, 12.0))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4])
+def test_hidden_joints_are_as_many_as_asked_from_the_first_frame_on(share):
+    gone = hidden((300, 40, 20), share, generator_of(0)).float()
+    assert abs(gone.mean() - share) < 0.01
+    assert (gone.mean((0, 2)) - share).abs().max() < 0.03  # in every frame
+    assert (gone.mean((0, 1)) - share).abs().max() < 0.03  # of every joint
+    alone = (gone[:, 1:-1] * (1 - gone[:, :-2]) * (1 - gone[:, 2:])).mean() / share
+    long = gone.unfold(1, RUN, 1).amin(-1).mean() / share
+    assert alone > 0.15 and long > 0.03  # single frames and runs
+    assert long > 20 * share ** (RUN - 1)  # which independent frames would hardly give
+
+
+def test_film_projects_adds_noise_and_hides():
+    body = SKELETONS["coco17"]
+    points = 100 * torch.randn(50, 30, body.num_joints, 3)
+    cameras = random_cameras((50,), (0, 20), generator_of(0))
+    clean, weights = film(points, cameras, body, noise=0, occlusion=0, generator=generator_of(1))
+    assert (weights == 1).all()
+    exact = torch.einsum("bij,btnj->btni", cameras, points)[..., :2]
+    seen = body.num_observed
+    torch.testing.assert_close(clean[..., :seen, :], exact[..., :seen, :], atol=1e-3, rtol=1e-5)
+    for joint, sources in body.virtual:  # as of tracks, whatever the motion says
+        torch.testing.assert_close(clean[..., joint, :], clean[..., list(sources), :].mean(-2), atol=1e-3, rtol=0)
+    noisy, weights = film(points, cameras, body, noise=7.0, occlusion=0.2, generator=generator_of(1))
+    error = (noisy - clean)[..., :seen, :][weights[..., :seen] > 0]
+    assert abs(error.std() - 7) < 0.1 and abs(error.mean()) < 0.1
+    assert (noisy[weights == 0] == 0).all() and abs((weights[..., :seen] == 0).float().mean() - 0.2) < 0.01
+    for joint, sources in body.virtual:
+        assert torch.equal(weights[..., joint], weights[..., list(sources)].amin(-1))
+
+
+# ---------------------------------------------------------------- order
+
+
+def test_a_deck_shows_every_card_once_before_any_twice():
+    deck = Deck(torch.arange(7) + 10, "key")
+    long = deck.draw(0, 70)
+    for turn in long.split(7):
+        assert sorted(turn.tolist()) == list(range(10, 17))
+    assert len({tuple(turn.tolist()) for turn in long.split(7)}) > 5
+    parts = torch.cat([deck.draw(start, 5) for start in range(0, 70, 5)])
+    assert torch.equal(parts, long)
+    assert torch.equal(Deck(torch.arange(7) + 10, "key").draw(31, 20), long[31:51])
+    assert not torch.equal(Deck(torch.arange(7) + 10, "other").draw(0, 70), long)
+    assert len(deck.draw(3, 0)) == 0
+
+
+def numbered(steps, **options):
+    return BatchLoader(lambda epoch, step: (epoch, step), steps, **options)  # type: ignore[arg-type,return-value]
+
+
+def test_a_loader_goes_from_epoch_to_epoch():
+    loader = numbered(3)
+    assert list(loader) == [(0, 0), (0, 1), (0, 2)] and list(loader) == [(1, 0), (1, 1), (1, 2)]
+    for batch in loader:
+        if batch == (2, 1):
+            break
+    assert list(loader) == [(2, 0), (2, 1), (2, 2)]  # an epoch that was left begins anew
+    loader.set_epoch(9)
+    assert next(iter(loader)) == (9, 0)
+    assert list(numbered(2, fixed=True)) * 2 == [*(f := numbered(2, fixed=True)), *f]
+
+
+def test_a_loader_goes_on_where_it_was():
+    loader = numbered(3)
+    every = [*loader, *loader, *loader]
+    for done in range(9):
+        first, second = numbered(3), numbered(3)
+        got, left = [], done
+        while left > 0:
+            for batch in first:
+                got.append(batch)
+                left -= 1
+                if left == 0:
+                    break
+        second.load_state_dict(first.state_dict())
+        rest = [*second, *second, *second]
+        assert (got + rest)[:9] == every
+
+
+def test_generators_differ_by_their_key():
+    draw = lambda *key: torch.rand(4, generator=generator_of(*key)).tolist()  # noqa: E731
+    assert draw(1, "a") == draw(1, "a")
+    assert len({tuple(draw(*key)) for key in [(1, "a"), (1, "b"), (2, "a"), (1, "a", 0), (11, "a"), (1, "1a")]}) == 6
+
+
+# ---------------------------------------------------------------- module
+
+
+def test_a_batch_holds_windows_of_one_clip_each_and_their_truth(folder):
+    data = module(folder, batch_size=5)
+    data.setup("fit")
+    items = data.sets["train"]
+    assert len(items) == 8 * 6 * 3  # clips, windows, views
+    drawn = torch.tensor([0, 4, 50, 100, 143])
+    batch = items.batch(drawn, torch.ones(5, dtype=torch.bool))
+    assert isinstance(batch, Batch) and batch.tracks.dtype == torch.float32
+    assert batch.tracks.shape == (5, 10, 17, 2) and batch.points.shape == (5, 10, 17, 3)
+    for k, item in enumerate(drawn.tolist()):
+        window, view = divmod(item, 3)
+        clip, place = divmod(window, 6)
+        world = items.clips[clip].points[place * 10 : place * 10 + 10]
+        torch.testing.assert_close(
+            bone_lengths(batch.points[k], SKELETONS["h36m17"].bones), bone_lengths(world, SKELETONS["h36m17"].bones)
+        )
+        seen = world @ items.cameras[clip, view].mT
+        torch.testing.assert_close(batch.points[k, ..., :2], seen[..., :2], atol=1e-2, rtol=0)
+        torch.testing.assert_close(batch.points[k].diff(dim=1), seen.diff(dim=1), atol=1e-2, rtol=0)
+    torch.testing.assert_close(batch.tracks, batch.points[..., :2], atol=1e-2, rtol=0)
+    assert batch.points[..., 2].mean(-1).abs().max() < 1e-2
+    assert (batch.labelled == 1).all() and (batch.pseudo == 0).all() and (batch.weights == 1).all()
+
+
+def test_the_seed_makes_the_batches_and_nothing_else(folder):
+    options = {"noise": 5.0, "occlusion": 0.2, "labelled": 0.25}
+    data, twin, other = (module(folder, seed=seed, **options) for seed in (0, 0, 1))
+    loaders = [one.train_dataloader() for one in (data, twin, other)]
+    torch.manual_seed(123)  # the global generator has no say
+    first = [list(loader) for loader in loaders]
+    assert all(same(a, b) for a, b in zip(first[0], first[1], strict=True))
+    assert not any(same(a, b) for a, b in zip(first[0], first[2], strict=True))
+    second = list(loaders[0])
+    assert not any(same(a, b) for a in first[0] for b in second)
+    assert same(loaders[1].make(1, 7), second[7])  # reached at once
+    state = torch.get_rng_state()
+    next(iter(loaders[0]))
+    assert torch.equal(state, torch.get_rng_state())
+
+
+def test_a_finite_set_stays_the_same_and_fresh_cameras_do_not(folder):
+    for fresh in (False, True):
+        data = module(folder, noise=5.0, occlusion=0.2, fresh_cameras=fresh)
+        loader = data.train_dataloader()
+        windows = [{}, {}]
+        for epoch in (0, 1):
+            for batch in loader:
+                for tracks, points in zip(batch.tracks, batch.points, strict=True):
+                    key = tuple(bone_lengths(points[:1], [(0, 10), (3, 6)]).round().flatten().int().tolist())
+                    windows[epoch].setdefault(key, set()).add(tuple(tracks[0, :2].flatten().tolist()))
+        shared = set(windows[0]) & set(windows[1])
+        assert len(shared) > 20
+        kept = sum(bool(windows[0][key] & windows[1][key]) for key in shared)
+        assert kept > 20 if not fresh else kept == 0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.05, 0.25, 0.5, 1.0])
+def test_the_labelled_share_is_exact(folder, share):
+    data = module(folder, labelled=share, steps_per_epoch=60)
+    total = 144
+    expected = max(1, round(share * total)) if share else 0
+    seen, blind = data.labelled_items, data.unlabelled_items
+    assert len(seen) == expected and len(blind) == total - expected
+    assert sorted([*seen.tolist(), *blind.tolist()]) == list(range(total))
+    count = 0
+    truths = set()
+    for batch in data.train_dataloader():
+        count += int(batch.labelled.sum())
+        assert (batch.points[batch.labelled == 0] == 0).all()
+        truths |= {tuple(p[0, :3].flatten().tolist()) for p in batch.points[batch.labelled == 1]}
+    assert len(truths) == expected  # so many and no more truths were shown in 480 windows
+    assert count == {0.0: 0, 1.0: 480}.get(share, 240)
+
+
+def test_smaller_shares_are_among_greater_ones(folder):
+    chosen = [set(module(folder, labelled=s).labelled_items.tolist()) for s in (0.01, 0.05, 0.25, 1.0)]
+    assert all(a < b for a, b in itertools.pairwise(chosen))
+    other = set(module(folder, labelled=0.25, seed=1).labelled_items.tolist())
+    assert other != chosen[2]
+    views = {item % 3 for item in chosen[2]}
+    assert views == {0, 1, 2}  # of each view by itself
+
+
+def test_batches_mix_as_asked(folder):
+    for per, expected in ((0.25, 2), (0.5, 4), (0.01, 1), (0.999, 7), (0.0, 0), (1.0, 8)):
+        batch = next(iter(module(folder, labelled=0.1, labelled_per_batch=per).train_dataloader()))
+        assert batch.labelled.tolist() == [1.0] * expected + [0.0] * (8 - expected)
+
+
+def test_few_labelled_windows_come_equally_often(folder):
+    data = module(folder, labelled=0.02, steps_per_epoch=9)  # 3 of them, 4 in each batch
+    assert len(data.labelled_items) == 3
+    drawn = [tuple(p[0, 0].tolist()) for batch in data.train_dataloader() for p in batch.points[batch.labelled == 1]]
+    assert sorted(drawn.count(key) for key in set(drawn)) == [12, 12, 12]
+
+
+def test_without_unlabelled_windows_the_steps_stay(folder):
+    both, alone = module(folder, labelled=0.1), module(folder, labelled=0.1, unlabelled=False)
+    assert torch.equal(both.labelled_items, alone.labelled_items)
+    assert len(both.train_dataloader()) == len(alone.train_dataloader()) == 18
+    assert all((batch.labelled == 1).all() for batch in alone.train_dataloader())
+
+
+def test_validation_and_test_show_everything_once_to_the_end(folder):
+    data = module(folder, ["s[12]_*.npz"], val="s3_*.npz", test="s4_*.npz", window=25, labelled=0.1, noise=3.0)
+    for loader in (data.val_dataloader(), data.test_dataloader()):
+        batches = list(loader)
+        again = list(loader)
+        assert all(same(a, b) for a, b in zip(batches, again, strict=True))
+        assert sum(len(b.tracks) for b in batches) == 2 * 3 * 3  # two clips, windows from 0, 25 and 35, three views
+        assert all((b.labelled == 1).all() for b in batches) and len(batches) == len(loader) == 3
+    last = data.sets["val"]
+    assert last.starts.tolist() == [0, 25, 35, 60, 85, 95]
+    assert data.sets["train"].starts.tolist() == [60 * c + s for c in range(4) for s in (0, 25)]
+    sources = {split: {c.source for c in data.sets[split].clips} for split in ("train", "val", "test")}
+    assert not sources["train"] & sources["val"] and not sources["test"] & (sources["train"] | sources["val"])
+
+
+def test_splits_do_not_share_files(folder):
+    data = module(folder, ["s1_*.npz"], test=["*.npz"])
+    with pytest.raises(OptionError, match=r"s1_a\.npz is in train and in test"):
+        data.setup("fit")
+
+
+def test_setup_reads_what_a_stage_needs(folder):
+    data = module(folder, ["s1_*.npz"], val="s2_*.npz", test="s3_*.npz", skeleton="h36m17")
+    data.setup("test")
+    assert set(data.sets) == {"test"}
+    data.setup("fit")
+    before = data.sets["train"]
+    data.setup(None)
+    assert set(data.sets) == {"train", "val", "test"} and data.sets["train"] is before
+    assert module(folder).val_dataloader() == []
+
+
+def test_made_up_motion_needs_no_files():
+    data = TracksDataModule(clips=2, window=27, batch_size=16, skeleton="coco17", noise=2.0)
+    data.setup()
+    batch = next(iter(data.train_dataloader()))
+    assert batch.tracks.shape == (16, 27, 19, 2) and data.skeleton.name == "coco17"
+    body = batch.points.flatten(1, 2)
+    tall = body[..., 1].amax(1) - body[..., 1].amin(1)
+    assert tall.min() > 800 and tall.max() < 4500  # mm
+    assert len(data.val_dataloader()) and len(data.test_dataloader())
+    splits = [data.sets[s].clips[0].points for s in ("train", "val", "test")]
+    assert not torch.equal(splits[0], splits[1]) and not torch.equal(splits[1], splits[2])
+    assert TracksDataModule(clips=2, units="m", window=9).train_dataloader().make(0, 0).points.abs().max() < 5
+
+
+def test_windows_without_truth_are_left_out(tmp_path):
+    whole = motion(60)
+    points = whole.points.clone()
+    points[22, 3] = math.nan
+    kt.Motion.from_arrays(points, skeleton="h36m17", fps=30, units="mm").save(tmp_path / "a.npz")
+    data = module(tmp_path)
+    data.setup("fit")
+    assert data.sets["train"].starts.tolist() == [0, 10, 30, 40, 50]
+    with pytest.raises(FormatError, match=r"none of its windows of 45 frames has all joints; gaps in left_hip|right_"):
+        module(tmp_path, window=45).setup("fit")
+
+
+def test_what_files_may_not_be(folder, tmp_path):
+    with pytest.raises(OptionError, match=r"match none\*\.npz"):
+        module(folder, ["none*.npz"]).setup("fit")
+    with pytest.raises(ShapeError, match=r"s1_a\.npz: expected at least a window of 61 frames, got 60.*!"):
+        module(folder, window=61).setup("fit")
+    with pytest.raises(SkeletonError, match="h36m71"):
+        module(folder, skeleton="h36m71").setup("fit")
+    with pytest.raises(SkeletonError, match="hand21"):
+        module(folder, skeleton="hand21").setup("fit")
+    other = tmp_path / "other"
+    motion(60, skeleton="hand21").save(other / "a.npz")
+    motion(60).save(other / "b.npz")
+    with pytest.raises(SkeletonError, match=r"b\.npz: expected the joints of .*a\.npz"):
+        module(other).setup("fit")
+    (other / "c.npz").write_bytes(b"no motion at all")
+    with pytest.raises(FormatError, match=r"c\.npz"):
+        module(other, ["c.npz"]).setup("fit")
+    silent = motion(60)
+    kt.Motion.from_arrays(silent.points, skeleton="h36m17", units="mm").save(other / "d.npz")
+    with pytest.raises(FormatError, match=r"d\.npz: its frame rate is unknown: give fps=None"):
+        module(other, ["d.npz"]).setup("fit")
+    module(other, ["d.npz"], fps=None).setup("fit")
+
+
+@pytest.mark.parametrize("options", [
+    {"window": 0}, {"stride": 0}, {"views": 0}, {"noise": -1.0}, {"noise": math.nan}, {"occlusion": 1.0},
+    {"labelled": 1.5}, {"labelled": -0.1}, {"labelled_per_batch": 2.0}, {"pitch": (20, 0)}, {"fps": 0.0},
+    {"batch_size": 0}, {"steps_per_epoch": 0}, {"pseudo_trust": 0.0}, {"clips": 0},
+    {"labelled": 0.0, "unlabelled": False}, {"pseudo": "pck"}, {"pseudo": "pkc", "fresh_cameras": True},
+], ids=str)  # fmt: skip
+def test_options_out_of_range(options):
+    with pytest.raises(OptionError, match=next(iter(reversed(options)))):
+        TracksDataModule(**options)
+
+
+class Counting(lightning.LightningModule):
+    """A linear network that notes which batches it saw."""
+
+    def __init__(self, joints=17):
+        super().__init__()
+        self.layer = torch.nn.Linear(2, 1)
+        self.seen = []
+
+    def training_step(self, batch, index):
+        self.seen.append(float(batch.tracks.double().sum()))
+        size = batch.tracks.abs().amax()
+        return ((self.layer(batch.tracks / size)[..., 0] - batch.points[..., 2] / size).square()).mean()
+
+    def validation_step(self, batch, index):
+        self.log("val", batch.points.std())
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def trainer(folder, **options):
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
+    return lightning.Trainer(default_root_dir=folder, **quiet, **options)
+
+
+@pytest.mark.filterwarnings("ignore:.*does not have many workers", "ignore:.*LeafSpec", "ignore:.*exists and is not")
+@pytest.mark.parametrize("every", [3, 5, 6], ids=["within an epoch", "within the second", "at its end"])
+def test_training_goes_on_from_a_checkpoint_as_if_it_had_not_stopped(folder, tmp_path, every):
+    make = lambda: module(folder, ["s[1-3]*"], val="s4*", noise=5.0, labelled=0.5, batch_size=18)  # noqa: E731
+    torch.manual_seed(0)
+    whole, part = Counting(), Counting()
+    part.load_state_dict(whole.state_dict())
+    trainer(tmp_path, max_steps=14, enable_checkpointing=False).fit(whole, datamodule=make())
+    saver = lambda: lightning.pytorch.callbacks.ModelCheckpoint(  # noqa: E731
+        tmp_path / "kept", "{step}", every_n_train_steps=every, save_top_k=-1
+    )
+    trainer(tmp_path, max_steps=every, callbacks=[saver()]).fit(part, datamodule=make())
+    resumed = Counting()
+    (path,) = (tmp_path / "kept").glob("*.ckpt")
+    trainer(tmp_path, max_steps=14, callbacks=[saver()]).fit(resumed, datamodule=make(), ckpt_path=path)
+    assert part.seen == whole.seen[:every] and resumed.seen == whole.seen[every:]
+    assert torch.equal(resumed.layer.weight, whole.layer.weight)
+    assert len(set(whole.seen)) == 14
+
+
+@pytest.mark.skipif(not CMU.is_dir(), reason="needs the CMU motion files beside the project")
+def test_cmu_motion_by_subjects():
+    data = TracksDataModule(
+        ["cmu/*.npz", "cmu_cs2s/*.npz", "!cmu/cmu_35*"],
+        test="cmu/cmu_35*.npz",
+        folder=CMU.parent,
+        skeleton="cmu17",
+        up="y",
+        noise=5.0,
+    )
+    data.setup()
+    assert len(data.sets["train"].clips) == 21 and len(data.sets["test"].clips) == 13
+    batch = next(iter(data.train_dataloader()))
+    head, ankle = data.skeleton.index("head_top"), data.skeleton.index("l_ankle")
+    upright = batch.points[:, :, head, 1] < batch.points[:, :, ankle, 1]  # y down
+    assert upright.float().mean() > 0.9
+    length = bone_lengths(batch.points, data.skeleton.bones)
+    assert (length.std(1) / length.mean(1)).max() < 0.05
