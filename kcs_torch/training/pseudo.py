@@ -7,6 +7,7 @@ import hashlib
 import json
 import warnings
 import zipfile
+import zlib
 from importlib.metadata import version
 from pathlib import Path
 
@@ -127,21 +128,25 @@ def _label(tracks: Tracks, points: Tensor, spread: Tensor | None, trust: float) 
 
 def _key(tracks: Tracks, method: Method) -> str:
     """What a reconstruction depends on, as a file name."""
-    fields = {field.name: repr(getattr(method, field.name)) for field in dataclasses.fields(method)}
-    facts = [version("kcs-torch"), type(method).__name__, fields, tracks.skeleton.to_dict(), tracks.fps, tracks.units]
+    fields = {field.name: getattr(method, field.name) for field in dataclasses.fields(method)}
+    said = {name: repr(value) for name, value in fields.items()}
+    facts = [version("kcs-torch"), type(method).__name__, said, tracks.skeleton.to_dict(), tracks.fps, tracks.units]
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
-    for array in (tracks.points, tracks.weights):
-        digest.update(array.contiguous().numpy().tobytes())
+    weights = [
+        v for value in fields.values() if isinstance(value, torch.nn.Module) for v in value.state_dict().values()
+    ]
+    for array in (tracks.points, tracks.weights, *weights):
+        digest.update(array.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:32]
 
 
 def _load(path: Path, shape: torch.Size) -> tuple[Tensor, Tensor | None] | None:
     """A reconstruction that was kept; None where there is none, or the file is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             points = torch.from_numpy(file["points"])
             spread = torch.from_numpy(file["spread"]) if "spread" in file.files else None
-    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zlib.error, zipfile.BadZipFile):
         return None
     if points.shape != (*shape, 3) or (spread is not None and spread.shape != shape):
         return None
