@@ -15,7 +15,7 @@ from kcs_torch.nn.networks import CameraHead, MLPLifter, TemporalLifter
 from kcs_torch.nn.perspective import PerspectiveEnergy
 from kcs_torch.nn.posture import ContactEnergy, ForeshorteningEnergy, PostureEnergy, ProportionEnergy
 from kcs_torch.nn.procrustean import ProcrusteanEnergy
-from kcs_torch.nn.unrolled import UnrolledFPC, UnrolledSfAM
+from kcs_torch.nn.unrolled import UnrolledFPC, UnrolledKCS, UnrolledPKC, UnrolledSfAM
 
 __all__ = [
     "SVT",
@@ -41,6 +41,8 @@ __all__ = [
     "SymmetryEnergy",
     "TemporalLifter",
     "UnrolledFPC",
+    "UnrolledKCS",
+    "UnrolledPKC",
     "UnrolledSfAM",
     "critic_loss",
     "generator_loss",

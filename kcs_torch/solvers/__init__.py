@@ -3,6 +3,7 @@
 from kcs_torch.solvers.camera_path import choose_path, constant_path, settle_path, smooth_path
 from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.denoise import Denoised, denoise_tracks
+from kcs_torch.solvers.implicit import Implicit, fixed_point, gmres
 from kcs_torch.solvers.ist import ist, metric_upgrade
 from kcs_torch.solvers.iterate import Solution, fpc, iterate, svt
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -10,10 +11,11 @@ from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.nullspace import null_space_upgrade
 from kcs_torch.solvers.procrustean import procrustean
 from kcs_torch.solvers.sign_filter import SignFilter
-from kcs_torch.solvers.signs import SignPath, sign_table, smooth_signs
+from kcs_torch.solvers.signs import SignPath, sign_costs, sign_table, smooth_signs
 
 __all__ = [
     "Denoised",
+    "Implicit",
     "SignFilter",
     "SignPath",
     "Solution",
@@ -22,7 +24,9 @@ __all__ = [
     "constant_path",
     "denoise_tracks",
     "fit_bones",
+    "fixed_point",
     "fpc",
+    "gmres",
     "ist",
     "iterate",
     "lbfgs",
@@ -30,6 +34,7 @@ __all__ = [
     "null_space_upgrade",
     "procrustean",
     "settle_path",
+    "sign_costs",
     "sign_table",
     "smooth_path",
     "smooth_signs",

@@ -7,6 +7,7 @@ its fixed point.
 from kcs_torch.nn.unrolled.base import Unrolled
 from kcs_torch.nn.unrolled.fpc import UnrolledFPC
 from kcs_torch.nn.unrolled.kcs import UnrolledKCS
+from kcs_torch.nn.unrolled.pkc import UnrolledPKC
 from kcs_torch.nn.unrolled.sfam import UnrolledSfAM
 
-__all__ = ["Unrolled", "UnrolledFPC", "UnrolledKCS", "UnrolledSfAM"]
+__all__ = ["Unrolled", "UnrolledFPC", "UnrolledKCS", "UnrolledPKC", "UnrolledSfAM"]

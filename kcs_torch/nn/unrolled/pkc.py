@@ -1,0 +1,203 @@
+"""PKC's energy of a moving viewpoint as a layer: majorise-minimise steps from given cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.nn.energies import centred_residual
+from kcs_torch.nn.layers import full_precision, known
+from kcs_torch.nn.majorise import majorise_step, turn_onto_mean
+from kcs_torch.nn.steps import continuation, estimate_lengths, start_shape, to_scale
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled
+from kcs_torch.skeleton import Skeleton, get_skeleton
+from kcs_torch.solvers.iterate import Solution
+
+__all__ = ["UnrolledPKC"]
+
+
+class UnrolledPKC(Unrolled):
+    """``num_steps`` steps down PKC's energy: low-rank motion of aligned bones of constant length.
+
+    :class:`kcs_torch.PKC` descends by L-BFGS with line searches, from many starts, which no layer can unroll. This one
+    descends the same kind of energy from one start by majorise-minimise steps, one linear solve a frame each
+    (:func:`kcs_torch.nn.majorise.majorise_step`), so it is not that method step by step; it needs cameras or a start
+    that are roughly right.
+
+    Args:
+        skeleton: a :class:`Skeleton`, a built-in name or a file.
+        num_steps: steps; each has its own scales.
+        eps: first variance that the log-determinant does not look below, relative to tracks of root mean square 1.
+        final: last variance; between them they fall geometrically.
+        slack: standard deviation of a rigid bone's length, a share of the root of each step's ``eps``.
+        noise: standard deviation of the tracks, relative to their root mean square.
+        realign_from: share of the steps after which each frame, and its camera with it, is turned onto the mean pose,
+            so that a body that turns costs nothing; 1 is none.
+        lengths: as in :class:`UnrolledSfAM`.
+        learnable: the scales of each step are parameters (positive through a softplus); else constants.
+        learnable_lengths: as in :class:`UnrolledSfAM`.
+        grad_steps: as in :class:`UnrolledFPC`.
+        gradient: as in :class:`UnrolledFPC`.
+
+    Raises:
+        OptionError: a number is out of range.
+        SkeletonError: the skeleton is unknown, or has no lengths where they are to be learned.
+
+    >>> layer = UnrolledPKC("h36m17", num_steps=3)
+    >>> cameras = torch.eye(3)[:2].expand(20, 2, 3)
+    >>> layer(torch.randn(20, 17, 2), cameras, start=torch.randn(20, 17, 3)).shape
+    torch.Size([20, 17, 3])
+    """
+
+    bones: Tensor
+    rigid: Tensor
+    raw_eps: Tensor
+    raw_slack: Tensor
+    raw_noise: Tensor
+
+    def __init__(
+        self,
+        skeleton: str | Path | Skeleton,
+        num_steps: int = 10,
+        *,
+        eps: float = 1e-1,
+        final: float = 1e-5,
+        slack: float = 1.0,
+        noise: float = 0.01,
+        realign_from: float = 0.5,
+        lengths: Sequence[float] | None = None,
+        learnable: bool = True,
+        learnable_lengths: bool = False,
+        grad_steps: int | None = None,
+        gradient: Gradient = "unrolled",
+    ) -> None:
+        super().__init__(num_steps, momentum=0.0, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
+        if not (slack > 0 and noise > 0) or not 0 <= realign_from <= 1:
+            raise OptionError(
+                f"UnrolledPKC: expected slack and noise > 0 and realign_from in 0..1, got {slack}, {noise} and "
+                f"{realign_from}"
+            )
+        self.skeleton = get_skeleton(skeleton)
+        self.indices = list(self.skeleton.rigid)
+        bones = self.skeleton.bone_index()
+        self.register_buffer("bones", bones, persistent=False)
+        self.register_buffer("rigid", bones[self.indices], persistent=False)
+        self.first = round(realign_from * num_steps)
+        levels = continuation(num_steps, eps, final)
+        self._positive("eps", levels)
+        self._positive("slack", [slack * level**0.5 for level in levels])
+        self._positive("noise", [noise] * num_steps)
+        self._hold_lengths(self.skeleton, lengths, learnable_lengths)
+
+    def forward(
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        *,
+        weights: Tensor | None = None,
+        start: Tensor | None = None,
+        lengths: Tensor | None = None,
+    ) -> Tensor:
+        """Return the shape in the world frame of the cameras, which are held but for what :attr:`realign_from` says.
+
+        Args:
+            tracks: (..., T, N, 2).
+            cameras: (..., T, 2, 3).
+            weights: (..., T, N), 0 where unseen.
+            start: (..., T, N, 3), a network's output, say; the back-projected tracks if None.
+            lengths: (..., B) bone lengths in the unit of the tracks, instead of the module's.
+
+        Returns:
+            (..., T, N, 3).
+
+        Raises:
+            ShapeError: the shapes do not fit.
+
+        Warns:
+            ConvergenceWarning: with the implicit gradient, in the backward pass.
+        """
+        return self._solve(tracks, cameras, weights, start, lengths, measure=False).value
+
+    def solve(
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        *,
+        weights: Tensor | None = None,
+        start: Tensor | None = None,
+        lengths: Tensor | None = None,
+    ) -> Solution[Tensor]:
+        """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still."""
+        return self._solve(tracks, cameras, weights, start, lengths, measure=True)
+
+    def _solve(
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        weights: Tensor | None,
+        start: Tensor | None,
+        lengths: Tensor | None,
+        *,
+        measure: bool,
+    ) -> Solution[Tensor]:
+        joints, count = self.skeleton.num_joints, self.skeleton.num_bones
+        self._check(tracks, cameras, weights, start, lengths=(lengths, (count,)))
+        if tracks.shape[-2] != joints:
+            raise ShapeError(
+                f"UnrolledPKC: expected tracks (..., T, {joints}, 2) for skeleton '{self.skeleton.name}', "
+                f"got {tuple(tracks.shape)}"
+            )
+        depends_on = (tracks, cameras, weights, start, lengths)
+        with full_precision(tracks):
+            # Factorisations of covariances: in double precision, as for singular values.
+            wide = torch.float32 if tracks.device.type == "mps" else torch.float64
+            flat, rows = known(tracks, weights).to(wide), cameras.to(wide)
+            share = torch.ones_like(flat[..., 0]) if weights is None else weights.to(wide).expand(flat.shape[:-1])
+            flat = known(-centred_residual(torch.zeros_like(flat), flat, share), share)
+            size = _root_mean_square(flat, share)[..., None, None, None]
+            flat = flat / size
+            begin = start_shape(flat, rows, share) if start is None else start.to(wide) / size
+            begin = begin - begin.mean(-2, keepdim=True)
+            fixed, relative = (None if lengths is None else lengths.to(wide) / size[..., 0, 0]), lengths is None
+            if lengths is None and self.has_lengths:
+                fixed = self._values("length", flat)
+            # Floors far below any useful value: what is learned may run away, the factorisations must not fail.
+            eps, slack, noise = (
+                self._values(name, flat).clamp_min(least)
+                for name, least in (("eps", 1e-7), ("slack", 1e-3), ("noise", 1e-3))
+            )
+            graded = not self.skeleton.tree
+            begin = begin.expand(*torch.broadcast_shapes(begin.shape[:-3], rows.shape[:-3]), *begin.shape[-3:])
+            world = complete_rotation(rows).expand(*begin.shape[:-2], 3, 3)
+
+            def advance(state: Tensor, k: int) -> Tensor:
+                points, turned = state[..., :joints, :], state[..., joints:, :]
+                measured, rigidity = estimate_lengths(points, self.rigid, share, graded=graded)
+                if fixed is not None:
+                    part = fixed[..., self.indices]
+                    measured = to_scale(part, measured) if relative else part
+                points = majorise_step(
+                    points, flat, turned[..., :2, :], share, measured, bones=self.bones, rigid=self.rigid,
+                    eps=eps[k], slack=slack[k] * rigidity.clamp_min(1e-4).rsqrt()[..., None, :], noise=noise[k],
+                )  # fmt: skip
+                if k >= self.first:
+                    points, turned = turn_onto_mean(points, turned, self.bones)
+                return torch.cat([points, turned], -2)
+
+            solution = self._run(advance, torch.cat([begin, world], -2), measure=measure, depends_on=depends_on)
+            points, turned = solution.value[..., :joints, :], solution.value[..., joints:, :]
+            value = size * (points @ turned.mT @ world)
+        return Solution(value.to(tracks.dtype), solution.converged, solution.iterations)
+
+
+def _root_mean_square(values: Tensor, weights: Tensor) -> Tensor:
+    """Of the seen joints' distance from the middle, (...); 1 where it is 0."""
+    seen = (weights > 0).to(values.dtype)
+    square = (values.square().sum(-1) * seen).sum((-2, -1)) / seen.sum((-2, -1)).clamp_min(1)
+    there = square > 0
+    return torch.where(there, torch.where(there, square, torch.ones_like(square)).sqrt(), torch.ones_like(square))
