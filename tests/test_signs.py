@@ -8,7 +8,7 @@ from numerics import FLOATS, leaves_arguments_alone, normal
 from torch.testing import assert_close
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.solvers import sign_table, smooth_signs
+from kcs_torch.solvers import sign_costs, sign_table, smooth_signs
 
 SIZES = [(4, 2, 1), (5, 1, 2), (3, 2, 2), (2, 2, 1), (2, 1, 2), (1, 2, 1), (1, 1, 2), (3, 3, 1), (6, 1, 1)]  # T, C, M
 
@@ -44,6 +44,7 @@ def test_cheapest_of_all_paths(size, cap):
         paths = list(every_path(unary[k], depths[k], cap, transition[k]))
         cost, pose, state = min(paths)
         assert found.cost[k].item() == pytest.approx(cost, abs=1e-9)
+        assert sign_costs(unary, depths, cap=cap, transition=transition)[k].item() == pytest.approx(cost, abs=1e-9)
         assert found.poses[k].tolist() == pose
         assert torch.equal(found.signs[k], table[state])
         through = torch.full_like(unary[k], torch.inf)
@@ -121,5 +122,6 @@ def test_follows_dtype_and_leaves_arguments_alone(dtype):
 
 def test_shapes_that_do_not_fit():
     for depths in (torch.ones(2, 5, 1), torch.ones(2, 4, 2), torch.ones(1, 5, 2)):
-        with pytest.raises(ShapeError, match="smooth_signs: expected"):
-            smooth_signs(torch.ones(2, 5, 1, 4), depths, cap=1.0)
+        for function in (smooth_signs, sign_costs):
+            with pytest.raises(ShapeError, match="smooth_signs: expected"):
+                function(torch.ones(2, 5, 1, 4), depths, cap=1.0)

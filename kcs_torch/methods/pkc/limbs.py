@@ -12,7 +12,7 @@ from torch import Tensor
 from kcs_torch.functional.temporal import window_starts
 from kcs_torch.nn.posture import PostureEnergy, foreshortening
 from kcs_torch.skeleton import Hinge, Skeleton
-from kcs_torch.solvers.signs import SignPath, sign_table, smooth_signs
+from kcs_torch.solvers.signs import sign_costs, smooth_signs
 
 __all__ = ["Limb", "LimbPaths", "SignCosts", "limb_paths", "limbs_of", "waves"]
 
@@ -138,7 +138,7 @@ def limb_paths(
     Args:
         image: bones' images (T, B, 2), in units of the lengths.
         limbs: J limbs of M bones each.
-        rotations: (C, T, 3, 3) of the trunk.
+        rotations: (C, T, 3, 3) of the trunk, or (J, C, T, 3, 3) of the trunk that each limb belongs to.
         posture: mean directions and spreads.
         free: (B,) 1 for bones that point anywhere.
         costs: weights.
@@ -154,20 +154,24 @@ def limb_paths(
     count, tried, _ = candidates.shape
     before = [None] * count if before is None else before
 
-    def solve(lengths: Tensor, begin: list[int], margins: bool) -> tuple[SignPath, Tensor]:
-        """Signs in W windows for J limbs of K lengths: window w of length k of limb j is problem (j K + k) W + w."""
+    each_trunk = rotations if rotations.ndim == 5 else rotations.expand(count, *rotations.shape)
+
+    def problems(lengths: Tensor, begin: list[int]) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+        """W windows of J limbs of K lengths: window w of length k of limb j is problem (j K + k) W + w."""
         parts = [
-            _unary(image, limb, rotations, posture, free, costs, noise, length, near)
-            for limb, length, near in zip(limbs, lengths, before, strict=True)
+            _unary(image, limb, turned, posture, free, costs, noise, length, near)
+            for limb, turned, length, near in zip(limbs, each_trunk, lengths, before, strict=True)
         ]
-        unary, depth = (torch.cat(part) for part in zip(*parts, strict=True))  # (J K, T, ...)
-        at = torch.tensor(begin, device=image.device)[:, None] + torch.arange(size, device=image.device)  # (W, T_w)
-        moves = None if transition is None else transition[at[:, :-1]].repeat(len(unary), 1, 1, 1)
+        unary, depth = (torch.cat(part, -1) for part in zip(*parts, strict=True))  # (T, ..., J K)
+        at = torch.tensor(begin, device=image.device) + torch.arange(size, device=image.device)[:, None]  # (T_w, W)
+
+        def cut(values: Tensor) -> Tensor:
+            """(T, ..., J K) as (J K W, T_w, ...), in memory with the problems last."""
+            return values[at].movedim(1, -1).flatten(-2).movedim(-1, 0)
+
+        moves = None if transition is None else transition.float()[at[:-1].mT].repeat(unary.shape[-1], 1, 1, 1)
         # Single precision is plenty to compare costs, and twice as fast.
-        scaled = (depth[:, at].flatten(0, 1) / costs.acceleration).float()
-        each = unary[:, at].flatten(0, 1).float()
-        moves = None if moves is None else moves.float()
-        return smooth_signs(each, scaled, cap=costs.cap, transition=moves, margins=margins), depth
+        return cut(unary.float()), cut((depth / costs.acceleration).float()), moves, depth
 
     usual = torch.stack([posture.rest_lengths[list(limb.bones)] for limb in limbs]).to(image)  # (J, M)
     prior = 0.5 * ((candidates / usual[:, None]).log() / costs.proportions).square().sum(-1)  # (J, K)
@@ -176,14 +180,17 @@ def limb_paths(
         sample = starts
         if len(starts) > SAMPLE:
             sample = [starts[round(i * (len(starts) - 1) / (SAMPLE - 1))] for i in range(SAMPLE)]
-        path, _ = solve(candidates, sample, False)
-        best = (path.cost.view(count, tried, -1).sum(-1) * (len(starts) / len(sample)) + prior).argmin(-1)
+        unary, deep, moves, _ = problems(candidates, sample)
+        cost = sign_costs(unary, deep, cap=costs.cap, transition=moves).view(count, tried, -1).sum(-1)
+        best = (cost * (len(starts) / len(sample)) + prior).argmin(-1)
     limb_index = torch.arange(count, device=image.device)
     lengths = candidates[limb_index, best]  # (J, M)
-    path, depth = solve(lengths[:, None], starts, margins)
+    unary, deep, moves, depth = problems(lengths[:, None], starts)
+    path = smooth_signs(unary, deep, cap=costs.cap, transition=moves, margins=margins)
+    depth = depth.movedim(-1, 0)  # (J, T, M)
     signs = torch.empty_like(depth)
     windows = path.signs.unflatten(0, (count, len(starts)))
-    spread = image.new_empty(count, frames, len(rotations)) if margins else None
+    spread = image.new_empty(count, frames, each_trunk.shape[1]) if margins else None
     for i, begin in enumerate(starts):
         first = 0 if i == 0 else (starts[i - 1] + size - begin) // 2
         signs[:, begin + first : begin + size] = windows[:, i, first:]
@@ -204,45 +211,66 @@ def _unary(
     lengths: Tensor,
     before: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Costs (K, T, C, 2^M) of each frame's signs, and the depths |dz| (K, T, M)."""
+    """Costs (T, C, 2^M, K) of each frame's signs, and the depths |dz| (T, M, K)."""
     chain = list(limb.bones)
-    flat = image[:, chain]
-    square = lengths[:, None].square() - flat.square().sum(-1)  # (K, T, M)
+    flat, size = image[:, chain], lengths.mT  # (T, M, 2), (M, K)
+    square = size.square() - flat.square().sum(-1)[..., None]  # (T, M, K)
     depth = square.clamp_min(0).sqrt()
-    over = (-square).clamp_min(0) / (2 * lengths[:, None])
-    each = (over.square() / (costs.over**2 + noise[:, chain].square())).clamp_max(20) / 2
-    density = foreshortening(depth, lengths[:, None], 0.1) - 2 * posture.rest_lengths[chain].to(image).log()
-    base = (each + free[chain].to(image) / costs.foreshortening * density).sum(-1)  # (K, T)
-    signs = sign_table(len(chain), image)  # (S, M)
-    unit = flat[None] / lengths[:, None, :, None]  # (K, T, M, 2)
-    deep = depth / lengths[:, None]
-    # Seen from the trunk a direction is R_xy^T (x, y) + R_z^T z: two parts that every state shares but for a sign.
-    across = torch.einsum("ktmj,ctji->ktcmi", unit, rotations[..., :2, :])
-    along = deep[:, :, None, :, None] * rotations[None, ..., None, 2, :].movedim(1, 2).expand(
-        -1, -1, -1, len(chain), -1
-    )  # (1->K, T, C, M, 3)
-    mean, deviation = posture.mean[chain].to(image), posture.deviation[chain].to(image)
-    a, b = (across - mean) / deviation, along / deviation
-    still = (a.square() + b.square()).sum(-1)  # (K, T, C, M)
-    swing = 2 * (a * b).sum(-1)
-    fit = still.sum(-1)[..., None] + torch.einsum("ktcm,sm->ktcs", swing, signs)
-    unary = base[:, :, None, None] + fit / (2 * costs.posture)
-    full = lambda m: torch.cat(  # noqa: E731
-        [unit[:, :, None, m].expand(-1, -1, len(signs), -1), (deep[..., m, None] * signs[:, m])[..., None]], -1
-    )  # (K, T, S, 3)
+    over = (-square).clamp_min_(0) / (2 * size)
+    each = (over.square_() / (costs.over**2 + noise[:, chain].square())[..., None]).clamp_max_(20) / 2
+    density = foreshortening(depth, size, 0.1) - 2 * posture.rest_lengths[chain].to(image).log()[:, None]
+    base = (each + (free[chain].to(image) / costs.foreshortening)[:, None] * density).sum(1)  # (T, K)
+    over_size = 1 / size
+    deep = depth * over_size
+    # Seen from the trunk a direction is a/L + s b z/L, with the image's part a = R_xy^T (x, y) and b = R_z. Its squared
+    # distance from the mean, in deviations, takes sums over the three coordinates that no length changes.
+    turned = rotations.movedim(1, 0)  # (T, C, 3, 3)
+    across = flat[:, None] @ turned[..., :2, :]  # (T, C, M, 3)
+    along = turned[..., 2:, :]  # (T, C, 1, 3)
+    mean, weight = posture.mean[chain].to(image), posture.deviation[chain].to(image).square().reciprocal()
+    pull = across * weight
+    still = (pull * across).sum(-1) @ over_size.square() - 2 * ((pull * mean).sum(-1) @ over_size)
+    still = still + (mean.square() * weight).sum() + (along.square() * weight).sum(-1) @ deep.square()  # (T, C, K)
+    swing = (pull * along).sum(-1)[..., None] * over_size - (mean * along * weight).sum(-1)[..., None]
+    fit = _signed((2 * swing * deep[:, None]).unbind(2))
+    unary = base[:, None, None] + (still[:, :, None] + fit) / (2 * costs.posture)
     if limb.inner is not None:
-        bend = torch.linalg.cross(full(0), full(1))
-        unary = unary + _hinge_cost(bend, rotations, posture, limb.inner, costs)
+        lateral = _lateral(turned, posture, limb.inner)
+        inner = over_size[0] * over_size[1]
+        level, tip, root = _triple_parts(flat[:, None, 0], flat[:, None, 1], lateral)
+        sines = _signed((tip * (deep[:, 0] * over_size[1])[:, None], root * (deep[:, 1] * over_size[0])[:, None]))
+        unary = unary + _hinge_cost(sines + (level * inner)[:, :, None], limb.inner, costs)
     if limb.entry is not None and before is not None:
-        first = full(0)
-        bend = torch.linalg.cross(before[None, :, None].expand_as(first), first)
-        unary = unary + _hinge_cost(bend, rotations, posture, limb.entry, costs)
+        lateral = _lateral(turned, posture, limb.entry)
+        level, tip, root = _triple_parts(before[:, None, :2], flat[:, None, 0], lateral)
+        level = (level + before[:, None, 2:] * tip) * over_size[0]
+        none = [torch.zeros_like(level)] * (len(chain) - 1)
+        sines = _signed((root * deep[:, None, 0], *none)) + level[:, :, None]
+        unary = unary + _hinge_cost(sines, limb.entry, costs)
     return unary, depth
 
 
-def _hinge_cost(bend: Tensor, rotations: Tensor, posture: PostureEnergy, hinge: Hinge, costs: SignCosts) -> Tensor:
-    """Cost (K, T, C, S) of bends u x v (K, T, S, 3) about the hinge's axis, which turns with the trunk."""
+def _signed(parts: Sequence[Tensor]) -> Tensor:
+    """Sums of s_1 p_1 + .. + s_M p_M over all signs, (T, C, 2^M, K), in the order of sign_table."""
+    total = torch.stack([parts[0], -parts[0]], 2)
+    for part in parts[1:]:
+        total = (total[:, :, :, None] + torch.stack([part, -part], 2)[:, :, None]).flatten(2, 3)
+    return total
+
+
+def _lateral(turned: Tensor, posture: PostureEnergy, hinge: Hinge) -> Tensor:
+    """The hinge's axis (T, C, 3), which turns with the trunk."""
     axis = posture.rest[hinge.left] - posture.rest[hinge.right]
-    lateral = rotations @ (axis / axis.norm()).to(rotations)  # (C, T, 3)
-    wrong = (-hinge.sign * torch.einsum("ktsj,ctj->ktcs", bend, lateral)).clamp_min(0)
+    return turned @ (axis / axis.norm()).to(turned)
+
+
+def _triple_parts(first: Tensor, second: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """k, p, q of (u x v) . a = k + u_z p + v_z q, (..., 1) each, of images u, v (..., 2) and axes a (..., 3)."""
+    (ux, uy), (vx, vy), (ax, ay, az) = (v.split(1, -1) for v in (first, second, axis))
+    return az * (ux * vy - uy * vx), vx * ay - vy * ax, uy * ax - ux * ay
+
+
+def _hinge_cost(sines: Tensor, hinge: Hinge, costs: SignCosts) -> Tensor:
+    """Cost of the sines of a hinge's bends, elementwise."""
+    wrong = (-hinge.sign * sines).clamp_min(0)
     return costs.hinge * hinge.firm / 2 * (wrong / costs.sine).square()
