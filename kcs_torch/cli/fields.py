@@ -18,7 +18,8 @@ def parse_settings(settings: Iterable[str], methods: Sequence[type]) -> dict[str
 
     Args:
         settings: texts such as ``"beta=1.5"``, ``"rank=none"`` or ``"links=[[left_wrist, right_wrist]]"``.
-        methods: dataclasses whose fields may be set; the first that has a field gives its type.
+        methods: dataclasses whose fields may be set, those without ``repr`` excepted; the first that has a field gives
+            its type.
 
     Returns:
         values by name.
@@ -29,7 +30,7 @@ def parse_settings(settings: Iterable[str], methods: Sequence[type]) -> dict[str
     hints: dict[str, Any] = {}
     for method in reversed(methods):
         named = typing.get_type_hints(method)
-        hints |= {f.name: named[f.name] for f in dataclasses.fields(method) if f.init}
+        hints |= {f.name: named[f.name] for f in dataclasses.fields(method) if f.init and f.repr}
     values: dict[str, Any] = {}
     for text in settings:
         name, equals, value = text.partition("=")

@@ -27,11 +27,23 @@ from kcs_torch.cli.outputs import Scale, Units, Up, check_up, parse_scale, sized
 from kcs_torch.cli.report import answer, describe, print_json, progress, summary
 
 if TYPE_CHECKING:
+    from kcs_torch.methods import Method
     from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 
 __all__ = ["MethodName", "Settings", "lift", "method_fields"]
 
-MethodName = Annotated[str, typer.Option("--method", "-m", metavar="NAME", help="pkc, which is auto, sfam, kcs, rigid, pta, csf or bmm.")]
+LEARNED = ".safetensors"
+"""Suffix of trained networks, which stand for a method."""
+
+MethodName = Annotated[
+    str,
+    typer.Option(
+        "--method",
+        "-m",
+        metavar="NAME",
+        help="pkc, which is auto, sfam, kcs, rigid, pta, csf or bmm; lift also takes a trained network (.safetensors).",
+    ),
+]
 Settings = Annotated[
     list[str],
     typer.Option(
@@ -127,7 +139,8 @@ def lift(
         from kcs_torch.types.size import check_size
 
         check_outputs(output, source=tracks)
-        fields = method_fields(method, settings)
+        learned = _learned(method, settings) if method.endswith(LEARNED) else None
+        fields = {} if learned is not None else method_fields(method, settings)
         if intrinsics is not None:
             fields["intrinsics"] = _lens(intrinsics)
         person_number(person)
@@ -176,7 +189,8 @@ def lift(
                 say = f"person {number} is in sight in {100 * share:.0f} % of the frames only: the rest is made up"
                 typer.echo(f"warning: {say}", err=True)
         cleaned = [clean(one) for _, one in people]
-        for (number, one), neat, lifted in zip(people, cleaned, _lifted(cleaned, method, fields, find), strict=True):
+        found = _lifted(cleaned, learned or method, fields, find)
+        for (number, one), neat, lifted in zip(people, cleaned, found, strict=True):
             names = [numbered(path, number) if person == "all" else path for path in output]
             result = lifted.solution(solution)
             result = sized(finish(result.mirrored() if mirror else result), size_of)
@@ -218,6 +232,19 @@ def method_fields(method: str, settings: list[str]) -> dict[str, Any]:
     return parse_settings(settings, [METHODS[method]])
 
 
+def _learned(path: str, settings: list[str]) -> Method:
+    """The trained network of a file, with its settings.
+
+    Raises:
+        FormatError: the file holds none.
+        OptionError: a setting is wrong.
+    """
+    from kcs_torch.cli.fields import parse_settings
+    from kcs_torch.training import Lifter, load_lifter
+
+    return replace(load_lifter(path), **parse_settings(settings, [Lifter]))
+
+
 def _lens(text: str) -> Intrinsics:
     """The camera that ``--intrinsics`` names."""
     from kcs_torch.errors import KcsError, OptionError
@@ -248,7 +275,7 @@ def _is_video(path: str) -> bool:
     return is_video(path)
 
 
-def _lifted(people: list[Tracks], method: str, fields: dict[str, Any], find: bool) -> list[Reconstruction]:
+def _lifted(people: list[Tracks], method: str | Method, fields: dict[str, Any], find: bool) -> list[Reconstruction]:
     """Reconstruct everybody, with the skeleton that their motion shows where it is to be found."""
     import kcs_torch as kt
 

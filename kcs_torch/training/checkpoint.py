@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from kcs_torch.errors import FormatError, KcsError, OptionError, OutputError, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.registry import need, read_error
-from kcs_torch.nn import MLPLifter, TemporalLifter
+from kcs_torch.nn import MLPLifter, RefinedLifter, TemporalLifter, UnrolledFPC, UnrolledSfAM
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.training.lifter import Lifter
 
@@ -23,11 +23,17 @@ __all__ = ["NETWORKS", "load_lifter", "save_lifter"]
 NETWORKS: dict[str, type[MLPLifter] | type[TemporalLifter]] = {"MLPLifter": MLPLifter, "TemporalLifter": TemporalLifter}
 """The networks that files may name."""
 
+SOLVERS: dict[str, type[UnrolledFPC] | type[UnrolledSfAM]] = {"UnrolledFPC": UnrolledFPC, "UnrolledSfAM": UnrolledSfAM}
+"""The solvers that files may name behind a network (:class:`kcs_torch.nn.RefinedLifter`)."""
+
 KEY = "kcs_torch"
 """Under which the file's metadata says, as JSON, what it is."""
 
 LARGEST = 2**20
 """No option of a network is larger; a file that says so is damaged."""
+
+LISTED = 256
+"""Options have no more numbers than there are weights, and so many (bone lengths)."""
 
 
 def save_lifter(
@@ -37,7 +43,8 @@ def save_lifter(
 
     Args:
         path: of the file; the suffix .safetensors is usual.
-        network: one of :data:`NETWORKS`.
+        network: one of :data:`NETWORKS`, alone or in a :class:`kcs_torch.nn.RefinedLifter` with one of
+            :data:`SOLVERS`.
         fps: frames per second of the tracks that it was trained on, which results then warn by.
         notes: more to keep in the file, such as what it was trained on: whatever JSON can hold.
 
@@ -53,20 +60,21 @@ def save_lifter(
     >>> load_lifter(path).network.options
     {'width': 8, 'num_blocks': 2, 'dropout': 0.1, 'window': 1}
     """
-    kind = type(network).__name__
-    if NETWORKS.get(kind) is not type(network) or not isinstance(network, (MLPLifter, TemporalLifter)):
-        raise unknown("network to save", kind, NETWORKS)
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
-    facts = {
-        "version": version("kcs-torch"),
-        "network": kind,
-        "options": network.options,
-        "skeleton": network.skeleton.to_dict(),
-        "fps": fps,
-        "notes": dict(notes or {}),
-    }
+    facts: dict[str, Any] = {"version": version("kcs-torch"), "fps": fps, "notes": dict(notes or {})}
+    inner = network
+    if isinstance(network, RefinedLifter):
+        inner, solver = network.network, network.solver
+        kind = type(solver).__name__
+        if SOLVERS.get(kind) is not type(solver) or not isinstance(solver, (UnrolledFPC, UnrolledSfAM)):
+            raise unknown("solver to save", kind, SOLVERS)
+        facts |= {"solver": kind, "solver_options": _solver_options(solver)}
+    kind = type(inner).__name__
+    if NETWORKS.get(kind) is not type(inner) or not isinstance(inner, (MLPLifter, TemporalLifter)):
+        raise unknown("network to save", kind, NETWORKS)
+    facts |= {"network": kind, "options": inner.options, "skeleton": inner.skeleton.to_dict()}
     try:
-        text = json.dumps(facts, sort_keys=True, allow_nan=False)
+        text = json.dumps(facts, allow_nan=False)  # in this order: that of virtual joints counts
     except (TypeError, ValueError) as error:
         raise OptionError(f"save_lifter: notes and fps: expected what JSON can hold, got {error}") from None
     data = need("safetensors.torch", str(path), OutputError).save(tensors, {KEY: text})
@@ -116,34 +124,66 @@ def _bytes(path: Path) -> bytes:
 def _build(path: Path, facts: Any, tensors: Mapping[str, Tensor]) -> nn.Module:
     """The network of a file's facts, with its weights."""
     what = f"{path}: expected a network that save_lifter wrote"
-    if not isinstance(facts, dict) or not isinstance(facts.get("options"), dict):
+    if not isinstance(facts, dict):
         raise FormatError(f"{what}, got metadata of another kind")
-    kind, options = facts.get("network"), facts["options"]
-    if kind not in NETWORKS:
+    kind, options = facts.get("network"), _checked(facts.get("options"), len(tensors), what)
+    if not isinstance(kind, str) or kind not in NETWORKS:
         raise unknown(f"network in {path}", kind, NETWORKS, FormatError)
-    flat = [v for value in options.values() for v in (value if isinstance(value, list) else [value])]
-    if not all(isinstance(v, (int, float)) and abs(v) <= LARGEST for v in flat):
-        raise FormatError(f"{what}, got options out of range: {str(options)[:200]}")
-    if options.get("num_blocks", 0) > len(tensors) or len(flat) > len(tensors) + 8:
-        raise FormatError(f"{what}, got fewer weights than its options ask for")
+    solver = facts.get("solver")
+    more: dict[str, Any] = {}
+    if solver is not None:
+        if solver not in SOLVERS:
+            raise unknown(f"solver in {path}", solver, SOLVERS, FormatError)
+        more = _checked(facts.get("solver_options"), len(tensors), what)
+
+    def make() -> nn.Module:
+        network = NETWORKS[kind](skeleton, **options)
+        if solver is None:
+            return network
+        own: dict[str, Any] = {} if solver == "UnrolledFPC" else {"skeleton": skeleton}
+        return RefinedLifter(network, SOLVERS[solver](**own, **more))
+
     try:
         skeleton = Skeleton.from_dict(facts.get("skeleton") or {}, source=str(path))
         with torch.device("meta"):  # costs nothing, however large a damaged file says it is
-            plan = NETWORKS[kind](skeleton, **options).state_dict()
+            plan = make().state_dict()
     except KcsError as error:
         raise FormatError(f"{path}: {error}") from None
     except (TypeError, ValueError, RuntimeError) as error:
-        raise FormatError(f"{what}, got options {str(options)[:200]} ({error})") from None
+        raise FormatError(f"{what}, got options {str(options)[:200]} {str(more)[:200]} ({error})") from None
     wrong = [n for n in {*plan, *tensors} if n not in plan or n not in tensors or plan[n].shape != tensors[n].shape]
     if wrong:
         raise FormatError(f"{what}, got weights that do not fit its options: {min(wrong)}")
-    kinds = {value.dtype for value in tensors.values()}
-    if len(kinds) != 1 or not (dtype := kinds.pop()).is_floating_point:
+    kinds = {value.dtype for name, value in tensors.items() if not name.startswith("solver.")}
+    if len(kinds) != 1 or not all(value.is_floating_point() for value in tensors.values()):
         raise FormatError(f"{what}, got weights that are not of one floating-point type")
     bad = [n for n, value in tensors.items() if not bool(torch.isfinite(value).all())]
     if bad:
         raise FormatError(f"{path}: weights that are not finite: {min(bad)}")
     with torch.random.fork_rng(devices=[]):  # reading draws no random numbers of the caller's
-        network = NETWORKS[kind](skeleton, **options).to(dtype)
+        network = make()
+    (network.network if isinstance(network, RefinedLifter) else network).to(kinds.pop())
     network.load_state_dict(dict(tensors))
     return network
+
+
+def _checked(options: Any, count: int, what: str) -> dict[str, Any]:
+    """Options of a file with ``count`` weights, if they can be those of a network of its size."""
+    if not isinstance(options, dict):
+        raise FormatError(f"{what}, got metadata of another kind")
+    flat = [v for value in options.values() for v in (value if isinstance(value, list) else [value])]
+    if not all(isinstance(v, (int, float)) and abs(v) <= LARGEST for v in flat):
+        raise FormatError(f"{what}, got options out of range: {str(options)[:200]}")
+    if options.get("num_blocks", 0) > count or len(flat) > count + LISTED:
+        raise FormatError(f"{what}, got fewer weights than its options ask for")
+    return options
+
+
+def _solver_options(solver: UnrolledFPC | UnrolledSfAM) -> dict[str, Any]:
+    """What its constructor takes that its weights do not tell."""
+    options: dict[str, Any] = {"num_steps": solver.num_steps, "momentum": solver.momentum}
+    if isinstance(solver, UnrolledSfAM):
+        options["articulate_from"] = solver.first / solver.num_steps
+        if solver.has_lengths:
+            options["lengths"] = [1.0] * solver.skeleton.num_bones
+    return options

@@ -131,7 +131,7 @@ def _key(tracks: Tracks, method: Method) -> str:
     fields = {field.name: getattr(method, field.name) for field in dataclasses.fields(method)}
     said = {name: repr(value) for name, value in fields.items()}
     facts = [version("kcs-torch"), type(method).__name__, said, tracks.skeleton.to_dict(), tracks.fps, tracks.units]
-    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps(facts).encode())
     weights = [
         v for value in fields.values() if isinstance(value, torch.nn.Module) for v in value.state_dict().values()
     ]
