@@ -23,7 +23,7 @@ GENERATED, GALLERY = DOCS / "_generated", DOCS / "_gallery"
 
 MODULES = (
     *("clean", "data", "detect", "functional", "io", "live"),
-    *("many", "methods", "metrics", "nn", "solvers", "types", "viewer"),
+    *("many", "methods", "metrics", "nn", "solvers", "training", "types", "viewer"),
 )
 """Public modules below kcs_torch, each a page of the API reference."""
 

@@ -95,6 +95,7 @@ _MODULES = (
     "nn",
     "skeleton",
     "solvers",
+    "training",
     "types",
     "viewer",
 )

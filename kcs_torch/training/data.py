@@ -52,7 +52,8 @@ class TracksDataModule(lightning.LightningDataModule):
         pitch: degrees by which cameras look down, least and most.
         noise: standard deviation of the tracks, in ``units``.
         occlusion: expected share of hidden joints, half of them for single frames, half for ten.
-        fresh_cameras: draw cameras, noise and hidden joints anew for every window of every training batch.
+        fresh_cameras: draw cameras, noise and hidden joints anew for every window of every training batch. A labelled
+            window then shows its truth from every side.
         batch_size: windows.
         steps_per_epoch: batches of an epoch; as many as show every window about once if None.
         labelled: share of the training windows (of each view) with their truth.
@@ -129,6 +130,8 @@ class TracksDataModule(lightning.LightningDataModule):
         for name, (rule, value, expected) in rules.items():
             if not rule:
                 raise OptionError(f"data: {name}: expected {expected}, got {value!r}")
+        if batch_size == 1 and 0 < labelled < 1 and 0 < labelled_per_batch < 1 and unlabelled:
+            raise OptionError("data: batch_size: expected at least 2, so that a batch has windows of both kinds, got 1")
         if labelled == 0 and not unlabelled:
             raise OptionError("data: unlabelled: nothing is left to train on without labelled windows (labelled=0)")
         if isinstance(pseudo, str):
