@@ -15,6 +15,7 @@ from kcs_torch.nn.networks import CameraHead, MLPLifter, TemporalLifter
 from kcs_torch.nn.perspective import PerspectiveEnergy
 from kcs_torch.nn.posture import ContactEnergy, ForeshorteningEnergy, PostureEnergy, ProportionEnergy
 from kcs_torch.nn.procrustean import ProcrusteanEnergy
+from kcs_torch.nn.refined import RefinedLifter
 from kcs_torch.nn.unrolled import UnrolledFPC, UnrolledKCS, UnrolledPKC, UnrolledSfAM
 
 __all__ = [
@@ -36,6 +37,7 @@ __all__ = [
     "PostureEnergy",
     "ProcrusteanEnergy",
     "ProportionEnergy",
+    "RefinedLifter",
     "ReprojectionEnergy",
     "SmoothnessEnergy",
     "SymmetryEnergy",

@@ -11,12 +11,26 @@ if TYPE_CHECKING:
     from kcs_torch.training.checkpoint import load_lifter, save_lifter
     from kcs_torch.training.data import TracksDataModule
     from kcs_torch.training.lifter import Lifter
+    from kcs_torch.training.losses import CycleConsistency, LossTerm
+    from kcs_torch.training.module import LiftingModule
 
-__all__ = ["Batch", "Lifter", "TracksDataModule", "load_lifter", "save_lifter"]
+__all__ = [
+    "Batch",
+    "CycleConsistency",
+    "Lifter",
+    "LiftingModule",
+    "LossTerm",
+    "TracksDataModule",
+    "load_lifter",
+    "save_lifter",
+]
 
 _HOME = {
     "Batch": "batch",
+    "CycleConsistency": "losses",
     "Lifter": "lifter",
+    "LiftingModule": "module",
+    "LossTerm": "losses",
     "TracksDataModule": "data",
     "load_lifter": "checkpoint",
     "save_lifter": "checkpoint",

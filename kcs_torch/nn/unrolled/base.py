@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -151,8 +152,9 @@ class Unrolled(nn.Module):
                     "a template: expected lengths=..., one number per bone, to start from"
                 )
         else:
-            known = torch.as_tensor(list(lengths), dtype=torch.float64)
-            if known.shape != (skeleton.num_bones,) or not bool(((known > 0) & known.isfinite()).all()):
+            listed = [float(value) for value in lengths]
+            known = torch.tensor(listed, dtype=torch.float64)
+            if len(listed) != skeleton.num_bones or not all(0 < value < math.inf for value in listed):
                 raise OptionError(
                     f"{type(self).__name__}: lengths: expected {skeleton.num_bones} positive numbers, one per bone of "
                     f"skeleton '{skeleton.name}', got {list(lengths)}"

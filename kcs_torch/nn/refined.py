@@ -1,0 +1,55 @@
+"""A network with a solver at its end: :class:`RefinedLifter`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kcs_torch.functional import centre
+from kcs_torch.skeleton import Skeleton
+
+__all__ = ["RefinedLifter"]
+
+
+class RefinedLifter(nn.Module):
+    """A lifting network whose answer is the start of an unrolled solver, in the camera frame.
+
+    The solver brings what the network cannot promise: points that project to the tracks, bones of one length. It
+    centres every frame; the points are put back to where the tracks are.
+
+    Args:
+        network: (tracks, weights) to points, such as :class:`TemporalLifter`.
+        solver: called as ``solver(tracks, cameras, weights=..., start=points)``, such as :class:`UnrolledSfAM`.
+
+    >>> network = RefinedLifter(TemporalLifter("h36m17"), UnrolledSfAM("h36m17", num_steps=3))
+    >>> network(torch.rand(2, 27, 17, 2)).shape
+    torch.Size([2, 27, 17, 3])
+    """
+
+    def __init__(self, network: nn.Module, solver: nn.Module) -> None:
+        super().__init__()
+        self.network, self.solver = network, solver
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """Of the network."""
+        own: Any = self.network.skeleton
+        assert isinstance(own, Skeleton)
+        return own
+
+    def forward(self, tracks: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Lift tracks (..., T, N, 2) with weights (..., T, N) to points (..., T, N, 3).
+
+        Raises:
+            ShapeError: the tracks are not of the network's skeleton.
+        """
+        points, middle = centre(self.network(tracks, weights))
+        if weights is not None:
+            tracks = torch.where(weights[..., None] > 0, tracks, points[..., :2] + middle[..., :2])
+        size = points[..., :2].square().mean((-3, -2, -1), keepdim=True).sqrt().detach()
+        size = torch.where(size > 0, size, torch.ones_like(size))
+        cameras = torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(*tracks.shape[:-2], 2, 3)
+        refined: Tensor = self.solver((tracks - middle[..., :2]) / size, cameras, weights=weights, start=points / size)
+        return refined * size + middle

@@ -1,0 +1,60 @@
+"""More clips out of those at hand: mirrored, and seen from another side."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional import centre, orbit
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.training.batch import Batch
+
+__all__ = ["mirrored", "turned", "unit_size"]
+
+
+def mirrored(batch: Batch, skeleton: Skeleton, share: float = 0.5) -> Batch:
+    """Mirror clips left to right, each with the probability ``share``; twins change places."""
+    order = list(range(skeleton.num_joints))
+    for a, b in skeleton.mirror:
+        order[a], order[b] = b, a
+    flip = torch.rand(len(batch.tracks), device=batch.tracks.device) < share
+
+    def mix(values: Tensor, joints: int, sign: Tensor | None = None) -> Tensor:
+        """Values with the joints along dimension ``joints``, mirrored where wanted."""
+        other = values.index_select(joints, torch.tensor(order, device=values.device))
+        if sign is not None:
+            other = other * sign.to(other)
+        return torch.where(flip.reshape(-1, *[1] * (values.ndim - 1)), other, values)
+
+    left = torch.tensor([-1.0, 1.0, 1.0])
+    return batch._replace(
+        tracks=mix(batch.tracks, 2, left[:2]),
+        weights=mix(batch.weights, 2),
+        points=mix(batch.points, 2, left),
+        pseudo=mix(batch.pseudo, 2),
+    )
+
+
+def turned(batch: Batch, share: float = 0.5) -> Batch:
+    """Show clips from another side, each with the probability ``share``, where their 3D is known or reconstructed.
+
+    The body is turned about the image's vertical by any angle; how far the tracks were from its projection (noise) and
+    which joints are hidden stay as they are.
+    """
+    known = (batch.labelled > 0) | (batch.pseudo > 0).any(-1).all(-1)
+    chosen = known & (torch.rand(len(batch.tracks), device=batch.tracks.device) < share)
+    angle = 360 * torch.rand(len(batch.tracks), dtype=batch.points.dtype, device=batch.tracks.device)
+    points = centre(batch.points)[0]
+    anew = points @ orbit(angle).mT[:, None]
+    tracks = batch.tracks + (anew - points)[..., :2] * (batch.weights > 0)[..., None]
+    pick = chosen[:, None, None, None]
+    return batch._replace(tracks=torch.where(pick, tracks, batch.tracks), points=torch.where(pick, anew, batch.points))
+
+
+def unit_size(batch: Batch) -> Batch:
+    """Bring every clip to root mean square 1, so that losses do not depend on units."""
+    seen = (batch.weights > 0).to(batch.tracks)
+    about = centre(batch.tracks, seen)[0] * seen[..., None]
+    size = (about.square().sum((-3, -2, -1)) / seen.sum((-2, -1)).clamp_min(1)).sqrt()
+    size = torch.where(size > 0, size, torch.ones_like(size))[:, None, None, None]
+    return batch._replace(tracks=batch.tracks / size, points=batch.points / size)

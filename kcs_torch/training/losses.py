@@ -1,0 +1,91 @@
+"""What a training run minimises: :class:`LossTerm`, and losses that need the network itself."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor, nn
+
+from kcs_torch.errors import OptionError
+from kcs_torch.functional import centre, orbit
+from kcs_torch.functional.chain import safe_norm
+from kcs_torch.training.batch import Batch
+
+__all__ = ["CycleConsistency", "LossTerm"]
+
+On = Literal["all", "labelled", "unlabelled"]
+
+_GIVEN = ("points", "tracks", "weights", "target", "network")
+
+
+@dataclass(frozen=True)
+class LossTerm:
+    """One loss of a training run.
+
+    Attributes:
+        loss: a module whose ``forward`` takes, by these names, what it needs of: ``points`` (B, T, N, 3), found;
+            ``tracks`` (B, T, N, 2); ``target`` (B, T, N, 3), labels and pseudo-labels; ``weights`` (B, T, N), of the
+            target where it takes one, else of the tracks, and only where it takes those, as a network places unseen
+            joints as well; ``network``, to be called again. It returns (B, T) or (B,). Energies of :mod:`kcs_torch.nn`
+            that need no more than these will do.
+        weight: factor. Losses see every clip at root mean square 1, so it does not depend on units.
+        on: the clips that count: "all", those whose truth may be used ("labelled"), or the others. Where a loss takes a
+            target, frames count by its weights.
+
+    Raises:
+        OptionError: the loss needs something else, or ``on`` is none of these.
+    """
+
+    loss: nn.Module
+    weight: float = 1.0
+    on: On = "all"
+
+    def __post_init__(self) -> None:
+        if self.on not in get_args(On):
+            raise OptionError(f"LossTerm: on: expected one of {', '.join(get_args(On))}, got {self.on!r}")
+        if not isinstance(self.loss, nn.Module):
+            raise OptionError(f"LossTerm: loss: expected a torch.nn.Module, got {type(self.loss).__name__}")
+        other = [name for name, p in self._wanted().items() if p.default is p.empty and name not in _GIVEN]
+        if other:
+            raise OptionError(
+                f"LossTerm: expected a loss that needs nothing but {', '.join(_GIVEN)}; "
+                f"{type(self.loss).__name__} needs {', '.join(other)}"
+            )
+
+    def _wanted(self) -> dict[str, inspect.Parameter]:
+        return dict(inspect.signature(self.loss.forward).parameters)
+
+    def value(self, points: Tensor, batch: Batch, network: nn.Module) -> Tensor:
+        """The mean of the loss over the clips, or frames, that count: a number, 0 where none does."""
+        wanted = self._wanted()
+        labelled = batch.labelled.to(points)[:, None]  # (B, 1)
+        share = {"all": torch.ones_like(labelled), "labelled": labelled, "unlabelled": 1 - labelled}[self.on]
+        given: dict[str, Any] = {"points": points, "tracks": batch.tracks, "target": batch.points, "network": network}
+        if "target" in wanted:
+            given["weights"] = torch.where(labelled[..., None] > 0, torch.ones_like(batch.pseudo), batch.pseudo)
+            share = share * given["weights"].mean(-1)
+        elif "tracks" in wanted:
+            given["weights"] = batch.weights
+        value: Tensor = self.loss(**{name: given[name] for name in given if name in wanted})
+        if value.ndim == 1:
+            value, share = value[:, None], share.mean(-1, keepdim=True)
+        share = share.expand(value.shape)
+        return (value * share).sum() / share.sum().clamp_min(1e-6)
+
+
+class CycleConsistency(nn.Module):
+    """|R x - f(P R x)| of each frame: what is lifted, turned and seen from there is lifted to the same body.
+
+    R is drawn for each clip: a turn about the image's vertical, by any angle. It costs a second pass through the
+    network, and gives no depth by itself: it makes the network say the same of a body from all sides.
+    """
+
+    def forward(self, points: Tensor, network: nn.Module) -> Tensor:
+        """Return (B, T) of points (B, T, N, 3), in their unit."""
+        yaw = 360 * torch.rand(points.shape[:-3], dtype=points.dtype, device=points.device)
+        turned = centre(points)[0] @ orbit(yaw).mT[..., None, :, :]
+        again: Tensor = network(turned[..., :2], None)
+        return safe_norm(centre(again)[0] - turned).mean(-1)

@@ -1,0 +1,187 @@
+"""The Lightning module: a lifting network, losses with and without 3D labels, and what is measured of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor, nn
+
+from kcs_torch.errors import OptionError
+from kcs_torch.functional import centre
+from kcs_torch.metrics.torch_metrics import MPJPE, BoneDeviation
+from kcs_torch.nn import RefinedLifter, critic_loss, generator_loss
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.training.augment import mirrored, turned, unit_size
+from kcs_torch.training.batch import Batch
+from kcs_torch.training.losses import LossTerm
+
+__all__ = ["LiftingModule"]
+
+ALIGNED = {"mpjpe": "root", "n_mpjpe": "scale", "pa_mpjpe": "similarity", "rigid": "rigid"}
+"""What is logged in validation and tests (as ``val/mpjpe``, ...), in the unit of the truth, and how it is aligned."""
+
+
+class LiftingModule(lightning.LightningModule):
+    """Train a network that lifts tracks to 3D, on clips with 3D labels and on clips without.
+
+    Args:
+        network: (tracks (..., T, N, 2), weights (..., T, N)) to points (..., T, N, 3) in the camera frame, such as
+            :class:`kcs_torch.nn.TemporalLifter`.
+        losses: by name; each is logged as ``train/NAME``.
+        refine: an unrolled solver at the end (:class:`kcs_torch.nn.RefinedLifter`), which is trained, too.
+        critic: tells poses of labelled clips from the network's, such as :class:`kcs_torch.nn.KCSCritic`; the network
+            learns to please it, and both take steps in turn.
+        critic_weight: factor of what the network pays.
+        flip: share of the clips that are mirrored left to right.
+        turn: share of the clips with labels, or pseudo-labels, that are shown from another side.
+        lr: step size of AdamW at its highest; it rises over the first twentieth of the steps and falls like a cosine.
+        weight_decay: of AdamW.
+        clip: gradients are cut to this norm.
+        seed: of what is drawn in training (dropout, mirrored clips, turns): a step depends on it and on its number
+            alone, so that a run which is resumed ends as it would have.
+
+    Raises:
+        OptionError: there is no loss, or a number is out of range.
+    """
+
+    step: Tensor
+
+    def __init__(
+        self,
+        network: nn.Module,
+        losses: Mapping[str, LossTerm],
+        *,
+        refine: nn.Module | None = None,
+        critic: nn.Module | None = None,
+        critic_weight: float = 0.01,
+        flip: float = 0.5,
+        turn: float = 0.5,
+        lr: float = 2e-3,
+        weight_decay: float = 1e-3,
+        clip: float = 1.0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        rules = {
+            "losses": (len(losses) > 0, losses, "at least one LossTerm"),
+            "critic_weight": (critic_weight >= 0, critic_weight, "a number not below 0"),
+            "flip": (0 <= flip <= 1, flip, "a share within 0..1"),
+            "turn": (0 <= turn <= 1, turn, "a share within 0..1"),
+            "lr": (lr > 0, lr, "a positive number"),
+            "weight_decay": (weight_decay >= 0, weight_decay, "a number not below 0"),
+            "clip": (clip > 0, clip, "a positive number"),
+        }
+        for name, (rule, value, expected) in rules.items():
+            if not rule:
+                raise OptionError(f"LiftingModule: {name}: expected {expected}, got {value!r}")
+        skeleton = getattr(network, "skeleton", None)
+        if flip and not isinstance(skeleton, Skeleton):
+            raise OptionError(
+                f"LiftingModule: flip: expected a network that says its skeleton, got {type(network).__name__}; flip=0 "
+                "mirrors nothing"
+            )
+        self.automatic_optimization = False  # network and critic take steps in turn
+        self.network = network if refine is None else RefinedLifter(network, refine)
+        self.critic, self.critic_weight = critic, critic_weight
+        self.losses = dict(losses)
+        self.terms = nn.ModuleDict({name: term.loss for name, term in losses.items()})  # so that they move along
+        self.flip, self.turn = flip, turn
+        self.lr, self.weight_decay, self.clip, self.seed = lr, weight_decay, clip, seed
+        self.register_buffer("step", torch.zeros((), dtype=torch.long))
+        bones = isinstance(skeleton, Skeleton) and bool(skeleton.rigid)
+        self.measured = nn.ModuleDict()
+        for stage in ("val", "test"):
+            metrics: dict[str, nn.Module] = {name: MPJPE(align=align) for name, align in ALIGNED.items()}
+            if bones:
+                metrics["bone_deviation"] = BoneDeviation(skeleton)
+            self.measured[stage] = nn.ModuleDict(metrics)
+
+    def forward(self, tracks: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Lift tracks (..., T, N, 2) with weights (..., T, N) to points (..., T, N, 3)."""
+        points: Tensor = self.network(tracks, weights)
+        return points
+
+    def training_step(self, batch: Batch, batch_idx: int) -> None:
+        """Make one step of the network, and one of the critic."""
+        number = int(self.step)
+        with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
+            torch.manual_seed((self.seed * 1_000_003 + number) % 2**63)
+            batch = unit_size(batch)
+            if self.flip:
+                batch = mirrored(batch, self.network.skeleton, self.flip)  # type: ignore[arg-type]
+            if self.turn:
+                batch = turned(batch, self.turn)
+            self._train(batch)
+        self.step += 1
+
+    def _train(self, batch: Batch) -> None:
+        optimisers, schedules = _listed(self.optimizers()), _listed(self.lr_schedulers())
+        points = self(batch.tracks, batch.weights)
+        values = {name: term.value(points, batch, self.network) for name, term in self.losses.items()}
+        total = sum((self.losses[name].weight * value for name, value in values.items()), points.new_zeros(()))
+        if self.critic is not None:
+            values["critic"] = generator_loss(self.critic(centre(points)[0])).mean()
+            total = total + self.critic_weight * values["critic"]
+        self._advance(optimisers[0], schedules[0], total, self.network)
+        if self.critic is not None and bool((batch.labelled > 0).any()):
+            true = centre(batch.points[batch.labelled > 0])[0]
+            rows = torch.randint(len(points), (len(true),), device=true.device)
+            cost = critic_loss(self.critic(true), self.critic(centre(points.detach()[rows])[0])).mean()
+            values["critic_own"] = cost
+            self._advance(optimisers[1], schedules[1], cost, self.critic)
+        self.log_dict({f"train/{name}": value.detach() for name, value in values.items()}, batch_size=len(points))
+        self.log("train/loss", total.detach(), prog_bar=True, batch_size=len(points))
+
+    def _advance(self, optimiser: Any, schedule: Any, cost: Tensor, trained: nn.Module) -> None:
+        optimiser.zero_grad()
+        self.manual_backward(cost)
+        nn.utils.clip_grad_norm_(trained.parameters(), self.clip)
+        optimiser.step()
+        schedule.step()
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Measure the network on clips with labels."""
+        self._measure("val", batch)
+
+    def test_step(self, batch: Batch, batch_idx: int) -> None:
+        """Measure the network on clips with labels."""
+        self._measure("test", batch)
+
+    def _measure(self, stage: str, batch: Batch) -> None:
+        points = self(batch.tracks, batch.weights)
+        metrics: Any = self.measured[stage]
+        for name, metric in metrics.items():
+            if name == "bone_deviation":
+                metric.update(points)
+            else:
+                metric.update(points, batch.points)
+            self.log(f"{stage}/{name}", metric, on_step=False, on_epoch=True, batch_size=len(points))
+
+    def configure_optimizers(self) -> Any:
+        """AdamW for the network, another for the critic; one schedule for both."""
+        trained = [self.network] + ([] if self.critic is None else [self.critic])
+        optimisers = [torch.optim.AdamW(m.parameters(), lr=self.lr, weight_decay=self.weight_decay) for m in trained]
+        total = max(int(self.trainer.estimated_stepping_batches), 1)
+        return optimisers, [torch.optim.lr_scheduler.LambdaLR(o, _Schedule(total)) for o in optimisers]
+
+
+@dataclass(frozen=True)
+class _Schedule:
+    """Share of the highest step size at a step: up over the first twentieth, then down like a cosine."""
+
+    total: int
+
+    def __call__(self, step: int) -> float:
+        rise = max(self.total // 20, 1)
+        if step < rise:
+            return (step + 1) / rise
+        phase = torch.tensor(min((step - rise) / max(self.total - rise, 1), 1.0))
+        return float(0.01 + 0.99 * 0.5 * (1 + torch.cos(torch.pi * phase)))
+
+
+def _listed(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, (list, tuple)) else [] if value is None else [value]

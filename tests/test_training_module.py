@@ -1,0 +1,316 @@
+"""Training: what each loss is given, what one step does, and that it is the same whenever it is done."""
+
+import copy
+
+import lightning
+import pytest
+import torch
+from torch import nn
+
+import kcs_torch as kt
+from kcs_torch.functional import centre
+from kcs_torch.metrics import mpjpe
+from kcs_torch.training import (
+    Batch,
+    CycleConsistency,
+    LiftingModule,
+    LossTerm,
+    TracksDataModule,
+    load_lifter,
+    save_lifter,
+)
+from kcs_torch.training.augment import mirrored, turned, unit_size
+
+BODY = kt.SKELETONS["h36m17"]
+QUIET = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "enable_model_summary": False}
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*does not have many workers"),
+    pytest.mark.filterwarnings("ignore:.*smaller than the logging interval"),
+    pytest.mark.filterwarnings("ignore:.*LeafSpec"),
+    pytest.mark.filterwarnings("ignore:.*Checkpoint directory"),
+]
+
+
+def batch_of(count=6, frames=5, labelled=2, pseudo=2, seed=0):
+    """Clips of which the first have labels, the next pseudo-labels, and the rest nothing."""
+    draw = torch.Generator().manual_seed(seed)
+    points = 100 * torch.randn(count, frames, 17, 3, generator=draw)
+    points = centre(points)[0]
+    weights = (torch.rand(count, frames, 17, generator=draw) < 0.8).float()
+    tracks = (points[..., :2] + 3 * torch.randn(count, frames, 17, 2, generator=draw)) * weights[..., None]
+    number = torch.arange(count)
+    trusted = ((number >= labelled) & (number < labelled + pseudo)).float()[:, None, None]
+    share = torch.rand(count, frames, 17, generator=draw) * trusted
+    blind = number >= labelled + pseudo
+    return Batch(tracks, weights, points * ~blind[:, None, None, None], (number < labelled).float(), share)
+
+
+class Asks(nn.Module):
+    """A loss that remembers what it was given."""
+
+    def __init__(self, value):
+        super().__init__()
+        self.result = value
+
+
+class AsksForTracks(Asks):
+    def forward(self, points, tracks, weights):
+        self.given = (points, tracks, weights)
+        return self.result
+
+
+class AsksForTarget(Asks):
+    def forward(self, points, target, weights=None):
+        self.given = (points, target, weights)
+        return self.result
+
+
+class AsksForPoints(Asks):
+    def forward(self, points, weights=None):
+        self.given = (points, weights)
+        return self.result
+
+
+def test_losses_are_given_what_they_ask_for():
+    batch, points = batch_of(), torch.randn(6, 5, 17, 3)
+    value = torch.arange(30.0).reshape(6, 5)
+    loss = AsksForTracks(value)
+    assert LossTerm(loss).value(points, batch, nn.Identity()) == pytest.approx(value.mean().item())
+    assert loss.given[1] is batch.tracks and loss.given[2] is batch.weights
+    loss = AsksForPoints(value)
+    assert LossTerm(loss, on="unlabelled").value(points, batch, nn.Identity()) == pytest.approx(value[2:].mean().item())
+    assert loss.given[1] is None  # a network places joints that are unseen: they count
+    loss = AsksForTarget(value)
+    found = LossTerm(loss).value(points, batch, nn.Identity())
+    weights = batch.pseudo.clone()
+    weights[:2] = 1
+    torch.testing.assert_close(loss.given[2], weights)
+    share = weights.mean(-1)
+    torch.testing.assert_close(found, (value * share).sum() / share.sum())
+    clips = AsksForTarget(value[:, 0])
+    found = LossTerm(clips, on="labelled").value(points, batch, nn.Identity())
+    torch.testing.assert_close(found, value[:2, 0].mean())
+
+
+def test_a_loss_over_nothing_is_0():
+    batch = batch_of(labelled=0, pseudo=0)
+    points = torch.randn(6, 5, 17, 3, requires_grad=True)
+    for on in ("all", "labelled"):
+        value = LossTerm(kt.nn.JointDistance(), on=on).value(points, batch, nn.Identity())
+        assert value == 0
+        assert torch.isfinite(torch.autograd.grad(value, points)[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: LossTerm(nn.MSELoss()), "MSELoss needs input"),
+        (lambda: LossTerm(kt.nn.JointDistance(), on="some"), "expected one of all, labelled, unlabelled"),
+        (lambda: LossTerm("JointDistance"), "expected a torch.nn.Module, got str"),
+        (lambda: LiftingModule(kt.nn.MLPLifter(BODY), {}), "losses: expected at least one"),
+        (lambda: LiftingModule(nn.Identity(), {"a": LossTerm(CycleConsistency())}), "flip: expected a network"),
+        (lambda: LiftingModule(kt.nn.MLPLifter(BODY), {"a": LossTerm(CycleConsistency())}, lr=0), "lr: expected"),
+    ],
+)
+def test_wrong_options(make, words):
+    with pytest.raises(kt.OptionError, match=words):
+        make()
+
+
+def test_mirrored_clips_are_clips_of_a_mirrored_body():
+    batch = batch_of()
+    torch.manual_seed(0)
+    every = mirrored(batch, BODY, 1.0)
+    torch.testing.assert_close(mirrored(every, BODY, 1.0), batch)
+    a, b = BODY.mirror[0]
+    torch.testing.assert_close(every.points[:, :, a], batch.points[:, :, b] * torch.tensor([-1.0, 1, 1]))
+    torch.testing.assert_close(every.weights[:, :, b], batch.weights[:, :, a])
+    for row, (x, y) in zip(every.pseudo, zip(batch.pseudo, batch.weights, strict=True), strict=True):
+        assert row.shape == x.shape == y.shape
+    bones = kt.nn.BoneLengths(BODY)
+    left, right = zip(*BODY.mirror_bones, strict=True)
+    torch.testing.assert_close(bones(every.points)[..., list(left)], bones(batch.points)[..., list(right)])
+    some = mirrored(batch, BODY, 0.5).points[:, 0, 0, 0] == batch.points[:, 0, 0, 0]
+    assert some.any() and not some.all()
+
+
+def test_turned_clips_show_the_same_body_with_the_same_noise():
+    batch = batch_of()
+    torch.manual_seed(0)
+    other = turned(batch, 1.0)
+    known = 4
+    torch.testing.assert_close(other.tracks[known:], batch.tracks[known:])
+    seen = batch.weights[..., None] > 0
+    was = torch.where(seen, batch.tracks - batch.points[..., :2], torch.zeros(()))
+    now = torch.where(seen, other.tracks - other.points[..., :2], torch.zeros(()))
+    torch.testing.assert_close(now[:known], was[:known], atol=1e-3, rtol=1e-4)
+    assert (other.tracks[~(batch.weights > 0)] == 0).all()
+    psi = kt.nn.KCSMatrix(BODY)
+    torch.testing.assert_close(psi(other.points), psi(batch.points), rtol=1e-4, atol=1.0)
+    assert ((other.points - batch.points)[:known].abs().amax((1, 2, 3)) > 1).all()
+    torch.testing.assert_close(other.points[..., 1], batch.points[..., 1], atol=1e-3, rtol=1e-4)
+
+
+def test_losses_see_clips_of_one_size():
+    batch = batch_of()
+    small, large = unit_size(batch), unit_size(batch._replace(tracks=50 * batch.tracks, points=50 * batch.points))
+    torch.testing.assert_close(small.tracks, large.tracks)
+    torch.testing.assert_close(small.points, large.points)
+    blank = unit_size(batch._replace(tracks=0 * batch.tracks, weights=0 * batch.weights))
+    assert torch.isfinite(blank.points).all()
+
+
+def test_cycle_consistency_is_0_for_a_network_that_is_right():
+    truth = centre(torch.randn(4, 3, 17, 3, dtype=torch.float64))[0]
+    loss = CycleConsistency()
+    seen = []
+
+    class Oracle(nn.Module):
+        """Knows the depth of what was turned, as it saw how."""
+
+        def forward(self, tracks, weights):
+            seen.append(tracks)
+            return self.answer
+
+    oracle = Oracle()
+    torch.manual_seed(3)
+    from kcs_torch.functional import orbit
+
+    yaw = 360 * torch.rand(4, dtype=torch.float64)
+    oracle.answer = truth @ orbit(yaw).mT[:, None] + 5
+    torch.manual_seed(3)
+    assert loss(truth, oracle).abs().max() < 1e-6
+    torch.testing.assert_close(seen[0] + 5, oracle.answer[..., :2])
+    oracle.answer = oracle.answer * torch.tensor([1.0, 1, -1])
+    torch.manual_seed(3)
+    assert loss(truth, oracle).min() > 0.3
+
+
+TERMS = {
+    "joints": lambda: LossTerm(kt.nn.JointDistance(align="root")),
+    "bones": lambda: LossTerm(kt.nn.BoneLengthEnergy(BODY), 0.1),
+    "tracks": lambda: LossTerm(kt.nn.ReprojectionEnergy(), 0.1),
+    "cycle": lambda: LossTerm(CycleConsistency(), 0.1, on="unlabelled"),
+}
+
+
+def module_of(seed=0, **options):
+    torch.manual_seed(seed)
+    network = kt.nn.TemporalLifter(BODY, channels=16, dilations=(1, 2))
+    return LiftingModule(network, {name: make() for name, make in TERMS.items()}, seed=seed, **options)
+
+
+def data_of(**options):
+    defaults = {"clips": 2, "window": 9, "views": 2, "batch_size": 8, "labelled": 0.25, "seed": 0, "noise": 2.0}
+    return TracksDataModule(**{**defaults, "occlusion": 0.1, "skeleton": "h36m17", "steps_per_epoch": 4, **options})
+
+
+def fit(module, epochs, **options):
+    trainer = lightning.Trainer(
+        max_epochs=epochs, accelerator="cpu", **{**QUIET, **{k: v for k, v in options.items() if k != "ckpt_path"}}
+    )
+    trainer.fit(module, datamodule=data_of(), ckpt_path=options.get("ckpt_path"), weights_only=True)
+    return trainer
+
+
+@pytest.mark.parametrize("options", [{}, {"critic": True}, {"refine": True}], ids=["plain", "critic", "refine"])
+def test_the_same_seed_gives_the_same_weights(options):
+    def train():
+        made = {}
+        torch.manual_seed(1)
+        if "critic" in options:
+            made["critic"] = kt.nn.KCSCritic(BODY, width=8)
+        if "refine" in options:
+            made["refine"] = kt.nn.UnrolledSfAM(BODY, num_steps=2)
+        module = module_of(**made)
+        before = copy.deepcopy(module.state_dict())
+        fit(module, 2)
+        torch.rand(7)  # what the caller draws in between does not matter
+        return before, module.state_dict()
+
+    (before, first), (_, second) = train(), train()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    moved = [name for name in first if not torch.equal(first[name], before[name])]
+    assert any(name.startswith("network.") for name in moved) and first["step"] == 8
+    for part in options:
+        inside = "network.solver." if part == "refine" else "critic."
+        assert any(name.startswith(inside) for name in moved)
+
+
+def test_a_run_that_is_resumed_ends_as_it_would_have(tmp_path):
+    whole = module_of()
+    fit(whole, 4)
+    half = module_of()
+    trainer = lightning.Trainer(max_epochs=4, accelerator="cpu", **QUIET)
+
+    class Stop(lightning.Callback):
+        def on_train_epoch_end(self, trainer, pl_module):
+            if trainer.current_epoch == 1:
+                trainer.save_checkpoint(tmp_path / "half.ckpt")
+                trainer.should_stop = True
+
+    trainer.callbacks = [Stop()]
+    trainer.fit(half, datamodule=data_of())
+    assert int(half.step) == 8
+    taken = module_of(seed=5)
+    taken.seed = 0
+    fit(taken, 4, ckpt_path=tmp_path / "half.ckpt")
+    end, other = whole.state_dict(), taken.state_dict()
+    assert all(torch.equal(end[name], other[name]) for name in end if name.startswith("network."))
+
+
+def test_training_brings_the_error_down():
+    torch.manual_seed(0)
+    network = kt.nn.TemporalLifter(BODY, channels=32, dilations=(1,), dropout=0.0)
+    module = LiftingModule(network, {"joints": LossTerm(kt.nn.JointDistance())}, lr=1e-2)
+    data = data_of(labelled=1.0, occlusion=0.0, steps_per_epoch=60, batch_size=32, clips=8, views=4)
+    data.setup("validate")
+    batches = list(data.val_dataloader())
+
+    def error():
+        network.eval()
+        with torch.no_grad():
+            each = [mpjpe(network(b.tracks, b.weights), b.points) for b in batches]
+        network.train()
+        return float(torch.cat(each).mean())
+
+    before = error()
+    trainer = lightning.Trainer(max_epochs=4, accelerator="cpu", **QUIET)
+    trainer.fit(module, datamodule=data)
+    after = error()
+    assert after < 0.7 * before
+    logged = trainer.callback_metrics
+    assert float(logged["val/mpjpe"]) == pytest.approx(after, rel=1e-4)
+    assert logged["val/pa_mpjpe"] <= logged["val/rigid"] <= logged["val/mpjpe"]
+    assert 0 < logged["val/bone_deviation"] < 1
+
+
+def test_the_critic_learns_from_labelled_clips_alone():
+    module = module_of(critic=kt.nn.KCSCritic(BODY, width=8))
+    before = copy.deepcopy(module.critic.state_dict())
+    trainer = lightning.Trainer(max_epochs=1, accelerator="cpu", **QUIET)
+    trainer.fit(module, datamodule=data_of(labelled=0.0))
+    assert all(torch.equal(before[name], value) for name, value in module.critic.state_dict().items())
+
+
+def test_a_refined_network_keeps_to_the_tracks_and_can_be_saved(tmp_path):
+    torch.manual_seed(0)
+    solver = kt.nn.UnrolledSfAM(BODY, num_steps=4, mu=0.01, articulate_from=0, learnable_lengths=True)
+    network = kt.nn.RefinedLifter(kt.nn.TemporalLifter(BODY, channels=16), solver).eval()
+    clip = kt.data.walking_person(30, skeleton=BODY, dtype=torch.float32, noise=1)
+    tracks, weights = clip.tracks.points[None], clip.tracks.weights[None]
+    points = network(tracks, weights)
+    moved = network(2 * tracks + 70, weights)
+    torch.testing.assert_close(moved[..., :2], 2 * points[..., :2] + 70, rtol=1e-3, atol=0.5)
+    alone = network.network(tracks, weights)
+    error, before = ((p[..., :2] - tracks).norm(dim=-1).mean() for p in (points, alone))
+    assert error < 20 and torch.isfinite(points).all() and before > 0
+    path = save_lifter(tmp_path / "refined.safetensors", network, fps=30)
+    again = load_lifter(path)
+    assert torch.equal(again.network.eval()(tracks, weights), points)
+    assert kt.reconstruct(clip.tracks, method=again).points.shape == (30, 17, 3)
+    hidden = torch.zeros_like(weights)
+    blank = network(tracks * torch.nan, hidden)
+    assert torch.isfinite(blank).all()
+    with pytest.raises(kt.OptionError, match="solver to save"):
+        save_lifter(tmp_path / "other.safetensors", kt.nn.RefinedLifter(network.network, nn.Identity()))
