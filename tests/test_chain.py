@@ -21,7 +21,15 @@ from numerics import (
 from torch.testing import assert_close
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.functional import bone_lengths, bone_vectors, chain_inverse, incidence, kcs_matrix, points_from_bones
+from kcs_torch.functional import (
+    bone_lengths,
+    bone_vectors,
+    chain_inverse,
+    incidence,
+    kcs_matrix,
+    points_from_bones,
+    pose_matrix,
+)
 from kcs_torch.functional.chain import safe_norm
 
 BONES = BODY.bone_index()
@@ -146,7 +154,27 @@ def test_kcs_matrix_is_free_of_rotation_reflection_and_translation():
     assert (eigenvalues[..., :3].abs() < 1e-12).all() and (eigenvalues[..., 3:] > 1e-6).all()  # rank 3
 
 
+@pytest.mark.parametrize("shape", [(7, 3), (4, 7, 3), (2, 4, 7, 3), (4, 7, 2), (0, 7, 3)])
+def test_matrix_of_points_is_that_of_their_bones(shape):
+    points = normal(*shape)
+    assert_close(pose_matrix(points, BONES), kcs_matrix(bone_vectors(points, BONES)))
+    assert_close(pose_matrix(points, BODY.bones), pose_matrix(points, BONES))
+    assert gradcheck(lambda x: pose_matrix(x, BONES), points)
+    assert torch.autograd.gradgradcheck(lambda x: pose_matrix(x, BONES), points.requires_grad_())
+
+
+def test_matrix_of_points_is_exact_far_from_the_origin_and_keeps_nan_to_its_bones():
+    points = normal(3, 7, 3, dtype=torch.float32).mul(64).round() / 64  # so that sums with 4096 are exact
+    assert torch.equal(pose_matrix(points + 4096, BONES), pose_matrix(points, BONES))
+    points[1, 5] = torch.nan
+    spoilt = torch.isnan(pose_matrix(points, BONES))
+    one = (BONES == 5).any(-1)
+    assert torch.equal(spoilt[1], one[:, None] | one[None]) and not spoilt[[0, 2]].any()
+    assert_close(torch.vmap(lambda x: pose_matrix(x, BONES))(points[::2]), pose_matrix(points[::2], BONES))
+
+
 def test_batches_equal_loops():
+    same_as_loop(lambda x: pose_matrix(x, BONES), (7, 3))
     same_as_loop(lambda x: bone_vectors(x, BONES), (7, 3))
     same_as_loop(lambda x: bone_lengths(x, BONES), (7, 2))
     same_as_loop(kcs_matrix, (6, 3))
@@ -162,6 +190,7 @@ def test_results_follow_dtype_and_device(dtype, device):
         leaves_arguments_alone(lambda x: bone_vectors(x, BONES), points),
         leaves_arguments_alone(lambda x: bone_lengths(x, BODY.bones), points),
         leaves_arguments_alone(kcs_matrix, points),
+        leaves_arguments_alone(lambda x: pose_matrix(x, BONES), points),
         incidence(BONES.to(device), 7, dtype=dtype),
     ]
     assert {(v.dtype, v.device.type) for v in values} == {(dtype, device)}

@@ -29,6 +29,7 @@ from kcs_torch.functional.chain import (
     incidence,
     kcs_matrix,
     points_from_bones,
+    pose_matrix,
 )
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.functional.scatter import scatter_log_det
@@ -70,6 +71,7 @@ __all__ = [
     "perspective",
     "pinhole_translation",
     "points_from_bones",
+    "pose_matrix",
     "procrustes",
     "project",
     "psd_shrink",

@@ -9,7 +9,15 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 
-__all__ = ["bone_lengths", "bone_vectors", "chain_inverse", "incidence", "kcs_matrix", "points_from_bones"]
+__all__ = [
+    "bone_lengths",
+    "bone_vectors",
+    "chain_inverse",
+    "incidence",
+    "kcs_matrix",
+    "points_from_bones",
+    "pose_matrix",
+]
 
 
 def incidence(bones: Tensor | Sequence[Sequence[int]], num_joints: int, *, dtype: torch.dtype | None = None) -> Tensor:
@@ -121,6 +129,31 @@ def kcs_matrix(vectors: Tensor) -> Tensor:
     [[9.0, 3.0], [3.0, 5.0]]
     """
     return vectors @ vectors.mT
+
+
+def pose_matrix(points: Tensor, bones: Tensor | Sequence[Sequence[int]]) -> Tensor:
+    """Return the KCS matrix of points, ``kcs_matrix(bone_vectors(points, bones))``, in less time.
+
+    Bones are taken as differences, not as the product with C that defines them: exact in any matmul precision, and a
+    joint that is not finite spoils its own bones only. They run along the last dimension, as products want it.
+
+    Args:
+        points: (..., N, D).
+        bones: (B, 2) integer (parent, child) pairs.
+
+    Returns:
+        (..., B, B), in squared units.
+
+    Raises:
+        ShapeError: ``bones`` is not (B, 2).
+
+    >>> pose_matrix(torch.tensor([[0.0, 0], [3, 0], [4, 2]]), [(0, 1), (1, 2)]).tolist()
+    [[9.0, 3.0], [3.0, 5.0]]
+    """
+    parents, children = _pairs(bones).to(points.device).unbind(-1)
+    rows = points.mT
+    across = rows.index_select(-1, children) - rows.index_select(-1, parents)  # (..., D, B)
+    return torch.bmm(across.mT, across) if across.ndim == 3 else across.mT @ across
 
 
 def safe_norm(vectors: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.functional.align import ALIGNMENTS, superpose
-from kcs_torch.functional.chain import bone_vectors, kcs_matrix, safe_norm
+from kcs_torch.functional.chain import pose_matrix, safe_norm
 from kcs_torch.nn.energies import check_clip, check_weights
 from kcs_torch.nn.layers import SkeletonModule, full_precision, known, narrow, wide
 from kcs_torch.nn.masks import bone_share, some
@@ -120,7 +120,7 @@ class KCSDistance(SkeletonModule):
             return narrow(each.sum((-2, -1)), points)
 
     def _matrix(self, points: Tensor, weights: Tensor | None, share: Tensor | None) -> Tensor:
-        matrix = kcs_matrix(bone_vectors(wide(known(points, weights)), self.bones))
+        matrix = pose_matrix(wide(known(points, weights)), self.bones)
         return matrix / mean_square(matrix, share)[..., None, None] if self.scale_free else matrix
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.functional.chain import bone_lengths, bone_vectors, kcs_matrix
+from kcs_torch.functional.chain import bone_lengths, bone_vectors, pose_matrix
 from kcs_torch.functional.spectral import svt
 from kcs_torch.skeleton import Skeleton, get_skeleton
 
@@ -24,11 +24,12 @@ class SkeletonModule(nn.Module):
     def __init__(self, skeleton: str | Path | Skeleton) -> None:
         super().__init__()
         self.skeleton = get_skeleton(skeleton)
-        self.register_buffer("bones", self.skeleton.bone_index(), persistent=False)
+        columns = self.skeleton.bone_index().mT.contiguous()  # so that parents and children are, each, in one piece
+        self.register_buffer("bones", columns.mT, persistent=False)
 
     def check(self, points: Tensor, *, clip: bool = False) -> None:
         """Raise a ShapeError unless ``points`` are (..., N, D), or a clip (..., T, N, D), with this skeleton's N."""
-        joints = self.skeleton.num_joints
+        joints = len(self.skeleton.joints)
         if not isinstance(points, Tensor):
             raise ShapeError(f"{type(self).__name__}: expected a tensor of points, got {type(points).__name__}")
         if points.ndim < 2 + clip or points.shape[-2] != joints:
@@ -66,7 +67,7 @@ class BoneLengths(SkeletonModule):
 
 
 class KCSMatrix(SkeletonModule):
-    """The KCS matrix Psi = B B^T: (..., N, D) to (..., B, B). See :func:`kcs_torch.functional.kcs_matrix`.
+    """The KCS matrix Psi = B B^T: (..., N, D) to (..., B, B). See :func:`kcs_torch.functional.pose_matrix`.
 
     Args:
         skeleton: a :class:`Skeleton`, a built-in name or a file.
@@ -82,7 +83,7 @@ class KCSMatrix(SkeletonModule):
 
     def forward(self, points: Tensor) -> Tensor:
         self.check(points)
-        matrix = kcs_matrix(bone_vectors(points, self.bones))
+        matrix = pose_matrix(points, self.bones)
         if not self.normalise:
             return matrix
         size = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
