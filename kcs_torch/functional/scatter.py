@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.functional.derivatives import batch_first
+from kcs_torch.functional.derivatives import applied, batch_first
 
 __all__ = ["inverse_scatter", "scatter_log_det"]
 
@@ -35,7 +35,7 @@ def scatter_log_det(values: Tensor, eps: Tensor | float) -> Tensor:
     if values.ndim < 2:
         raise ShapeError(f"scatter_log_det: expected values (..., T, D), got {tuple(values.shape)}")
     level = torch.as_tensor(eps, dtype=values.dtype, device=values.device)
-    out: Tensor = _ScatterLogDet.apply(values, level)[0]
+    out: Tensor = applied(_ScatterLogDet, values, level)[0]
     return out
 
 

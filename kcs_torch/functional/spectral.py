@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.functional.derivatives import LargestSum, PSDShrink, ShrinkSingularValues
+from kcs_torch.functional.derivatives import LargestSum, PSDShrink, ShrinkSingularValues, applied
 
 __all__ = ["dct_basis", "log_det", "nuclear_norm", "psd_shrink", "singular_values", "spectral_norm", "svt"]
 
@@ -48,7 +48,7 @@ def svt(matrix: Tensor, threshold: Tensor | float) -> Tensor:
     _check_matrix(matrix, "svt")
     work = _double(matrix)
     level = torch.as_tensor(threshold, dtype=work.dtype, device=matrix.device)
-    out: Tensor = ShrinkSingularValues.apply(work, level)[0]
+    out: Tensor = applied(ShrinkSingularValues, work, level)[0]
     return out.to(matrix.dtype)
 
 
@@ -75,7 +75,7 @@ def psd_shrink(matrix: Tensor, threshold: Tensor | float) -> Tensor:
         raise ShapeError(f"psd_shrink: expected square matrices, got {tuple(matrix.shape)}")
     work = _single(matrix)
     level = torch.as_tensor(threshold, dtype=work.dtype, device=matrix.device)
-    out: Tensor = PSDShrink.apply((work + work.mT) / 2, level)[0]
+    out: Tensor = applied(PSDShrink, (work + work.mT) / 2, level)[0]
     return out.to(matrix.dtype)
 
 
@@ -92,7 +92,7 @@ def nuclear_norm(matrix: Tensor) -> Tensor:
     7.0
     """
     _check_matrix(matrix, "nuclear_norm")
-    out: Tensor = LargestSum.apply(_double(matrix), min(matrix.shape[-2:]))[0]
+    out: Tensor = applied(LargestSum, _double(matrix), min(matrix.shape[-2:]))[0]
     return out.to(matrix.dtype)
 
 
@@ -109,7 +109,7 @@ def spectral_norm(matrix: Tensor) -> Tensor:
     4.0
     """
     _check_matrix(matrix, "spectral_norm")
-    out: Tensor = LargestSum.apply(_double(matrix), 1)[0]
+    out: Tensor = applied(LargestSum, _double(matrix), 1)[0]
     return out.to(matrix.dtype)
 
 
