@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional.derivatives import batch_first
 
 __all__ = ["ALIGNMENTS", "centre", "minimal_turn", "nearest_rotation", "procrustes", "similarity", "superpose"]
 
@@ -81,7 +82,7 @@ def nearest_rotation(matrix: Tensor, *, reflect: bool = False) -> Tensor:
         (..., D, D), orthogonal. Differentiable once, by the sums of singular values, not their gaps: repeated singular
         values are safe, and directions in which the rotation is arbitrary have the derivative 0.
     """
-    out: Tensor = _Polar.apply(matrix, reflect)
+    out: Tensor = _Polar.apply(matrix, reflect)[0]
     return out
 
 
@@ -185,22 +186,51 @@ def superpose(
 
 
 class _Polar(torch.autograd.Function):
+    """(matrix (..., D, D), reflect) to its polar factor, and two intermediates."""
+
     @staticmethod
-    def forward(ctx: Any, matrix: Tensor, reflect: bool) -> Tensor:
+    def forward(matrix: Tensor, reflect: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         u, size, vt = torch.linalg.svd(matrix)
         if not reflect:
             sign = torch.linalg.det(u @ vt).sign()[..., None]
             u = torch.cat([u[..., :-1], u[..., -1:] * sign[..., None]], -1)
             size = torch.cat([size[..., :-1], size[..., -1:] * sign], -1)
-        ctx.save_for_backward(u, size, vt)
-        return u @ vt
+        return u @ vt, u, size, vt
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        u, size, vt = ctx.saved_tensors
+    def setup_context(ctx: Any, inputs: tuple[Tensor, bool], output: tuple[Tensor, ...]) -> None:
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.save_for_backward(inputs[0], *output[1:])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor, None]:
+        return _PolarAdjoint.apply(grad, *ctx.saved_tensors), None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], matrix: Tensor, reflect: bool) -> Any:
+        return _Polar.apply(matrix.movedim(in_dims[0] or 0, 0), reflect), (0, 0, 0, 0)
+
+
+class _PolarAdjoint(torch.autograd.Function):
+    """The derivative, not to be differentiated again: it takes the matrix so that autograd notices who tries."""
+
+    @staticmethod
+    def forward(grad: Tensor, matrix: Tensor, u: Tensor, size: Tensor, vt: Tensor) -> Tensor:
         inner = u.mT @ grad @ vt.mT
         total = size[..., :, None] + size[..., None, :]
         firm = total > 1e-6 * size.abs().amax(-1)[..., None, None]  # else any turn in this plane would do
         spin = torch.where(firm, (inner - inner.mT) / torch.where(firm, total, torch.ones_like(total)), 0)
-        return u @ spin @ vt, None
+        return u @ spin @ vt
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> None:
+        raise RuntimeError("second derivatives of nearest_rotation are not supported")
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *tensors: Tensor) -> Any:
+        padded, _ = batch_first(info, in_dims, tensors, (2, 2, 2, 1, 2))
+        return _PolarAdjoint.apply(*padded), 0

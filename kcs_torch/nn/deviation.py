@@ -118,7 +118,7 @@ def template_scale(
     count = max(1, round(frames / span))
     edges = [round(i * frames / count) for i in range(count + 1)]
     spans = list(itertools.pairwise(edges))
-    vote = lambda part: part.nanquantile(quantile, -2).nanmedian(-1).values  # noqa: E731
+    vote = lambda part: _quantile_of_known(part, quantile).nanmedian(-1).values  # noqa: E731
     overall = vote(ratio)
     overall = torch.where(torch.isfinite(overall) & (overall > 0), overall, fallback)[..., None]
     votes = torch.stack([vote(ratio[..., a:b, :]) for a, b in spans], -1)
@@ -130,6 +130,16 @@ def template_scale(
     gap = (at[right] - at[left]).clamp_min(1e-12)
     share = ((time - at[left]) / gap).clamp(0, 1)
     return votes[..., left] * (1 - share) + votes[..., right] * share
+
+
+def _quantile_of_known(values: Tensor, quantile: float) -> Tensor:
+    """``values.nanquantile(quantile, -2)``, for which torch.func.vmap has no rule."""
+    known = ~values.isnan()
+    ordered = torch.where(known, values, torch.inf).sort(-2).values
+    place = quantile * (known.sum(-2, keepdim=True) - 1).clamp_min(0).to(values.dtype)
+    low, high = (ordered.gather(-2, x.long()) for x in (place.floor(), place.ceil()))
+    between = torch.where(low.isfinite(), low + (place - place.floor()) * (high - low), torch.nan)
+    return between.squeeze(-2)
 
 
 def _fold(deviation: Tensor, arrangement: Arrangement) -> Tensor:
