@@ -17,7 +17,7 @@ __all__ = ["LargestSum", "PSDShrink", "ShrinkSingularValues", "applied", "batch_
 
 
 def applied(function: type[torch.autograd.Function], *inputs: Any) -> Any:
-    """``function.apply``, or its plain forward where nothing is recorded: a Function costs as much as ten operations."""
+    """``function.apply``, or its plain forward where nothing is recorded: a Function costs as much as ten steps."""
     call: Any = function.apply if torch.is_grad_enabled() else function.forward
     return call(*inputs)
 
