@@ -34,6 +34,16 @@ def test_exact_paths(frames, degrees):
     assert angle.shape == (frames,) and angle.max() < 1e-5
 
 
+def test_paths_together_as_one_by_one():
+    noisy = torch.stack([path(20, degrees, seed=i) for i, degrees in enumerate((0.0, 60.0, 170.0, 700.0))])
+    noisy = roma.rotvec_to_rotmat(0.02 * normal(4, 20, 3)) @ noisy
+    together, angles = constant_path(noisy.view(2, 2, 20, 3, 3))
+    assert together.shape == (2, 2, 20, 3, 3) and angles.shape == (2, 2, 20)
+    for one, found, angle in zip(noisy, together.flatten(0, 1), angles.flatten(0, 1), strict=True):
+        for value, expected in zip((found, angle), constant_path(one), strict=True):
+            assert_close(value, expected, rtol=0, atol=1e-7)
+
+
 @pytest.mark.parametrize("degrees", [400.0, 1500.0])
 def test_several_turns(degrees):
     true = path(200, degrees)
@@ -94,7 +104,7 @@ def test_left_jacobian_is_the_derivative_of_the_exponential():
             assert_close(matrix[:, axis], difference, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("shape", [(1, 3, 3), (5, 2, 3), (3, 3), (2, 5, 3, 3)])
+@pytest.mark.parametrize("shape", [(1, 3, 3), (5, 2, 3), (3, 3), (2, 1, 3, 3)])
 def test_shapes_that_do_not_fit(shape):
     with pytest.raises(ShapeError, match="constant_path: expected"):
         constant_path(torch.zeros(shape))

@@ -106,7 +106,8 @@ class SfAM(Method):
         path = None
         if cameras is None:
             path = _join_rotations(complete_rotation(rows * flip[:, None, None]), starts, frames)
-        return self._estimate(tracks, joined, path, cameras, solution)
+        known = None if cameras is None else cameras[None]
+        return self._estimates([tracks], joined[None], None if path is None else path[None], known, solution)[0]
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
         """Solve clips of one skeleton and equally many frames as one batch of windows."""
@@ -125,9 +126,7 @@ class SfAM(Method):
             points = torch.stack([one.points for one in filled])
             seen, weights = torch.stack([one.seen for one in filled]), torch.stack([one.weights for one in filled])
             local, rows, solution = self._windows(points, seen, weights, clips[0].skeleton, None, one_body=False)
-            turned = complete_rotation(rows)
-            for i, one, shape, path in zip(group, clips, local, turned, strict=True):
-                out[i] = self._estimate(one, shape, path, None, solution)
+            out |= zip(group, self._estimates(clips, local, complete_rotation(rows), None, solution), strict=True)
         return [out[i] for i in range(len(tracks))]
 
     def _windows(
@@ -152,19 +151,28 @@ class SfAM(Method):
         solution = self.shape(points, rows, weights, skeleton, one_body=one_body)
         return solution.value @ complete_rotation(rows).mT, rows, solution
 
-    def _estimate(
-        self, tracks: Tracks, points: Tensor, path: Tensor | None, cameras: Tensor | None, solution: Solution[Tensor]
-    ) -> Estimate:
-        """What is found of one clip: points (T, N, 3), with its own camera path (T, 3, 3) or the known cameras."""
-        notes: tuple[str, ...] = ()
+    def _estimates(
+        self,
+        tracks: Sequence[Tracks],
+        points: Tensor,
+        path: Tensor | None,
+        cameras: Tensor | None,
+        solution: Solution[Tensor],
+    ) -> list[Estimate]:
+        """What is found of K clips: points (K, T, N, 3), with their own camera paths (K, T, 3, 3) or known cameras."""
+        notes: list[tuple[str, ...]] = [()] * len(tracks)
         if cameras is None:
             assert path is not None
-            sign = points.new_tensor([1.0, 1.0, mirror_sign(points, tracks.skeleton)])
-            points = points * sign
-            cameras, notes = self._path(complete_rotation(path[:, :2] * sign))
-        points = place_unseen(points, tracks.seen.any(0), tracks.skeleton)
-        one = torch.ones_like(points[:, 0, 0])
-        return Estimate(points, cameras, one, solution.converged, solution.iterations, notes)
+            sign = points.new_ones(len(tracks), 3)
+            sign[:, 2] = points.new_tensor([mirror_sign(x, t.skeleton) for x, t in zip(points, tracks, strict=True)])
+            points = points * sign[:, None, None]
+            cameras, notes = self._paths(complete_rotation(path[..., :2, :] * sign[:, None, None]))
+        ones = points.new_ones(points.shape[1])
+        placed = [place_unseen(x, t.seen.any(0), t.skeleton) for x, t in zip(points, tracks, strict=True)]
+        return [
+            Estimate(x, rows, ones, solution.converged, solution.iterations, note)
+            for x, rows, note in zip(placed, cameras, notes, strict=True)
+        ]
 
     def shape(
         self, tracks: Tensor, cameras: Tensor, weights: Tensor, skeleton: Skeleton, *, one_body: bool = True
@@ -209,19 +217,22 @@ class SfAM(Method):
         ).to(tracks.device)
         return solver.solve(tracks, cameras, weights=weights, lengths=lengths, one_body=one_body)
 
-    def _path(self, rotations: Tensor) -> tuple[Tensor, tuple[str, ...]]:
-        """Reported cameras (T, 2, 3): free, or of constant angular velocity where that explains them."""
-        if self.camera_path == "free" or len(rotations) < 10:
-            return rotations[:, :2], ()
+    def _paths(self, rotations: Tensor) -> tuple[Tensor, list[tuple[str, ...]]]:
+        """Reported cameras (K, T, 2, 3): free, or of constant angular velocity where that explains them."""
+        rows = rotations[..., :2, :]
+        notes: list[tuple[str, ...]] = [()] * len(rotations)
+        if self.camera_path == "free" or rotations.shape[1] < 10:
+            return rows, notes
         path, angle = constant_path(rotations)
-        first = path[1] @ path[0].mT
-        turn = torch.arccos(((first.trace() - 1) / 2).clamp(-1, 1)) * (len(path) - 1)
-        if self.camera_path == "auto" and not bool(angle.median() < EVEN * turn):
-            return rotations[:, :2], ()
-        degrees = float(torch.rad2deg(angle.median()))
-        return path[:, :2], (
-            f"cameras follow a path of constant angular velocity (median deviation {degrees:.1f} degrees)",
-        )
+        first = path[:, 1] @ path[:, 0].mT
+        trace = first.diagonal(dim1=-2, dim2=-1).sum(-1)
+        turn = torch.arccos(((trace - 1) / 2).clamp(-1, 1)) * (path.shape[1] - 1)
+        off = angle.median(-1).values
+        even = off < EVEN * turn if self.camera_path == "auto" else torch.ones_like(off, dtype=torch.bool)
+        for k in even.nonzero().flatten().tolist():
+            degrees = float(torch.rad2deg(off[k]))
+            notes[k] = (f"cameras follow a path of constant angular velocity (median deviation {degrees:.1f} degrees)",)
+        return torch.where(even[:, None, None, None], path[..., :2, :], rows), notes
 
 
 CHUNK = 32
