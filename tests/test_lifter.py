@@ -343,6 +343,20 @@ def test_standing_feet_tell_the_depth_of_the_body_if_the_camera_stands_still():
     assert replace(lifter, still=False)(clip.tracks).root_depth is None
 
 
+def test_a_body_that_comes_nearer_is_lifted_at_one_size():
+    clip = walking_person(120, yaw=30, turn=60)
+    grows = torch.linspace(0.5, 1.5, 120, dtype=torch.float64)
+    near = replace(clip.tracks, points=clip.tracks.points * grows[:, None, None])
+    lifter = Lifter(networks()["temporal"].double())
+    plain, zoomed = lifter(clip.tracks), lifter(near)
+    assert any(note.startswith("weak perspective") for note in zoomed.diagnostics.notes)
+    torch.testing.assert_close(zoomed.scales, grows / grows.mean(), rtol=0.1, atol=0)
+    depth, other = plain.points[..., 2], zoomed.points[..., 2]
+    off = other * ((depth * other).sum() / other.square().sum()) - depth
+    assert off.std() < 0.1 * depth.std()
+    assert torch.equal(plain.scales, torch.ones(120, dtype=torch.float64))
+
+
 @pytest.mark.parametrize("case", ["blank frames", "one frame", "one joint", "one point", "never seen"])
 def test_degenerate_tracks(case):
     clip = walking_person(20).tracks

@@ -277,6 +277,24 @@ def test_vmap_over_clips(lifter):
     torch.testing.assert_close(torch.func.vmap(lifter)(tracks, weights), lifter(tracks, weights))
 
 
+@pytest.mark.parametrize("kind", sorted(LIFTERS))
+def test_compiles_as_one_graph(kind):
+    network = LIFTERS[kind]("h36m17").eval()
+    tracks, weights = clip(2, 12, dtype=torch.float32)
+    compiled = torch.compile(network, backend="aot_eager", fullgraph=True)
+    torch.testing.assert_close(compiled(tracks, weights), network(tracks, weights))
+
+
+def test_half_precision_inside_autocast_is_for_the_layers_only():
+    network = TemporalLifter("h36m17", channels=32).eval()
+    tracks, weights = clip(20, dtype=torch.float32)
+    tracks = 100 * tracks + 4000
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        rough = network(tracks, weights)
+    assert rough.dtype == torch.float32  # the place in the image does not suffer
+    torch.testing.assert_close(rough, network(tracks, weights), atol=0.5, rtol=0)
+
+
 def test_export_gives_a_program_of_any_length():
     network = TemporalLifter("h36m17", channels=8).eval()
     tracks, weights = clip(2, 30, dtype=torch.float32)

@@ -158,6 +158,11 @@ class TracksDataModule(lightning.LightningDataModule):
         """Of all windows; reads the files where that has not been done."""
         return self._set("train").skeleton
 
+    def prepare_data(self) -> None:
+        """Fill the cache, where there is one, before several processes would."""
+        if self.pseudo is not None and self.cache is not None:
+            self.setup("fit")
+
     def setup(self, stage: str | None = None) -> None:
         """Read, cut and film what a stage needs ("fit", "validate", "test"; all if None).
 

@@ -11,8 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, SkeletonError
+from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods import Method
 from kcs_torch.methods.base import Estimate
+from kcs_torch.methods.size import weak_perspective
 from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.nn.networks import MLPLifter, TemporalLifter, normalise_tracks
 from kcs_torch.skeleton import Skeleton, map_joints
@@ -33,7 +35,7 @@ class Lifter(Method):
 
     Tracks of another skeleton are matched by the joints' names. The network's joints that they lack, a third at most,
     are unseen to it; joints that it does not know keep their place in the image, and the skeleton's template gives
-    their depth.
+    their depth. A body that comes nearer or goes away is brought to one size before it is lifted.
 
     Args:
         network: (tracks (..., T, N, 2), weights (..., T, N)) to points (..., T, N, 3) in the camera frame.
@@ -99,18 +101,21 @@ class Lifter(Method):
         """Lift clips of one skeleton and equally many frames."""
         first = clips[0]
         match = _match(first.skeleton, self.body, first.source)
-        points, weights = torch.stack([c.points for c in clips]), torch.stack([c.weights for c in clips])
-        lifted = self._lift(*match.take(points, weights, self.body))
+        sizes = [_size(one) for one in clips]
+        points = torch.stack([one.points / size[:, None, None] for one, size in zip(clips, sizes, strict=True)])
+        lifted = self._lift(*match.take(points, torch.stack([one.weights for one in clips]), self.body))
         out = []
         eye = torch.eye(3, dtype=points.dtype, device=points.device)[:2].expand(first.num_frames, 2, 3)
-        for one, answer in zip(clips, lifted, strict=True):
+        for one, answer, image, size in zip(clips, lifted, points, sizes, strict=True):
             notes = [*match.notes, *self._tempo(one)]
-            body = match.give(answer, one)
+            share = float(size.amax() / size.amin())
+            if share > 1:
+                notes.append(f"weak perspective: the body's size in the image varies by a factor of {share:.2f}")
+            body = match.give(answer, image, one)
             depth = body[..., 2:]
             body = torch.cat([body[..., :2], depth - depth.mean(-2, keepdim=True)], -1)
-            ones = torch.ones_like(body[:, 0, 0])
             out.append(
-                Estimate(body, eye if cameras is None else cameras, ones, True, 1, tuple(notes), still=self.still)
+                Estimate(body, eye if cameras is None else cameras, size, True, 1, tuple(notes), still=self.still)
             )
         return out
 
@@ -168,8 +173,8 @@ class _Match(NamedTuple):
         points = nn.functional.pad(points, (0, 0, 0, 1))[..., self.column, :]
         return body.complete(points, nn.functional.pad(weights, (0, 1))[..., self.column])
 
-    def give(self, answer: Tensor, tracks: Tracks) -> Tensor:
-        """The network's points (T, N, 3) as points of the tracks' joints."""
+    def give(self, answer: Tensor, image: Tensor, tracks: Tracks) -> Tensor:
+        """The network's points (T, N, 3) as points of the joints of ``tracks``, which lie at ``image`` (T, N, 2)."""
         if self.same:
             return answer
         known = torch.tensor([i >= 0 for i in self.back], device=answer.device)
@@ -178,11 +183,18 @@ class _Match(NamedTuple):
             return points
         placed = place_unseen(points, known, tracks.skeleton)
         # Of a joint that the network does not know the tracks still show where it is in the image.
-        middle = (points[..., :2] - tracks.points) * (known & tracks.seen)[..., None]
+        middle = (points[..., :2] - image) * (known & tracks.seen)[..., None]
         count = (known & tracks.seen).sum(-1)[..., None, None].clamp_min(1)
-        image = tracks.points + middle.sum(-2, keepdim=True) / count
+        image = image + middle.sum(-2, keepdim=True) / count
         shown = (~known & tracks.seen)[..., None]
         return torch.cat([torch.where(shown, image, placed[..., :2]), placed[..., 2:]], -1)
+
+
+def _size(tracks: Tracks) -> Tensor:
+    """Size (T,) of the body in the image, of mean 1, where it clearly changes: networks know bodies of one size."""
+    image = interpolate(tracks.points, tracks.seen)
+    size = weak_perspective(image, tracks.seen, tracks.skeleton, tracks.fps or 30.0)
+    return torch.ones_like(image[:, 0, 0]) if size is None else size
 
 
 def _match(own: Skeleton, body: Skeleton, source: str) -> _Match:

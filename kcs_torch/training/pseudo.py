@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import logging
 import warnings
 import zipfile
 import zlib
@@ -22,6 +23,8 @@ from kcs_torch.training.windows import FilmedWindows
 from kcs_torch.types import Reconstruction, Tracks
 
 __all__ = ["pseudo_labels"]
+
+_LOG = logging.getLogger(__name__)
 
 TOGETHER = 16
 """Clips that are reconstructed as one batch, before they are put into the cache."""
@@ -75,6 +78,7 @@ def pseudo_labels(
         else:
             points[view, span], weights[view, span] = _label(one, *found, trust)
     for start in range(0, len(work), TOGETHER):
+        _LOG.info("pseudo-labels: %d of %d clips reconstructed by %s", start, len(work), method.name)
         part = work[start : start + TOGETHER]
         for (view, span, one, kept), result in zip(part, _lift([w[2] for w in part], method, failed), strict=True):
             if result is None:
