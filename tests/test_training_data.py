@@ -8,7 +8,7 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.data import random_motion, walking_person
-from kcs_torch.errors import FormatError, OptionError, ShapeError, SkeletonError
+from kcs_torch.errors import FormatError, KcsWarning, OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths, orbit
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.training import Batch, TracksDataModule
@@ -69,6 +69,19 @@ def test_files_of_another_rate_unit_and_order(tmp_path):
     expected = fast.in_camera()[::2].float()
     far = (clip.points - clip.points.mean((0, 1))) - (expected - expected.mean((0, 1)))
     assert far.abs().max() < 0.02
+
+
+def test_bodies_on_their_heads_are_told(tmp_path):
+    walk = kt.Motion.from_arrays(walking_person(40).points, up="-y", skeleton="h36m17", fps=30, units="mm")
+    for name, up in (("right", "y"), ("wrong", "-y")):
+        kt.Motion.from_arrays(walk.points, up=up, skeleton="h36m17", fps=30, units="mm").save(tmp_path / f"{name}.npz")
+    read = lambda name, up: file_clips(  # noqa: E731
+        [tmp_path / f"{name}.npz"], skeleton=None, fps=30, up=up, units="mm"
+    )
+    read("right", None)
+    with pytest.warns(KcsWarning, match=r"wrong\.npz: the body stands on its head: say which axis"):
+        read("wrong", None)
+    read("wrong", "y")  # as was asked for
 
 
 def test_bvh_files_of_one_skeleton(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.data import random_motion, walking_person
-from kcs_torch.errors import FormatError, OptionError, SkeletonError
+from kcs_torch.errors import FormatError, KcsWarning, OptionError, SkeletonError
 from kcs_torch.io import load_motion
 from kcs_torch.io.folders import natural_key
 from kcs_torch.skeleton import Skeleton, get_skeleton
@@ -85,6 +86,9 @@ def file_clips(
     Raises:
         FormatError: a file is no motion, or its frame rate or unit is unknown.
         SkeletonError: a file has other joints than the first one, or none for a joint of the skeleton.
+
+    Warns:
+        KcsWarning: a body stands on its head, as the file does not say which axis is up.
     """
     body = None if skeleton is None else get_skeleton(skeleton)
     out = []
@@ -115,7 +119,14 @@ def file_clips(
                 f"{path}: expected a unit of length that converts to {units}, got {motion.units or 'none'}: give "
                 "file_units=..., one of m, cm, mm"
             )
-        out.append(_placed(from_y_up(points, "-y") * ratio, known, str(path), body))
+        clip = _placed(from_y_up(points, "-y") * ratio, known, str(path), body)
+        if up is None and _upside_down(clip):
+            warnings.warn(
+                f"{path}: the body stands on its head: say which axis points up in the file, up='y' or 'z'",
+                KcsWarning,
+                stacklevel=2,
+            )
+        out.append(clip)
     return out
 
 
@@ -195,6 +206,16 @@ def resampled(points: Tensor, known: Tensor, old: float, new: float) -> tuple[Te
     out = torch.where((every.all(1) & inside)[..., None], cubic, linear)
     out = torch.where(exact[..., None], b, out)
     return torch.where(both[..., None], out, torch.zeros_like(out)), both
+
+
+def _upside_down(clip: Clip) -> bool:
+    """Whether the joints that touch the ground are above the others in most frames."""
+    below = list(clip.skeleton.contacts)
+    if not below:
+        return False
+    others = [n for n in range(clip.skeleton.num_joints) if n not in below]
+    lower = clip.points[:, below, 1].mean(1) > clip.points[:, others, 1].mean(1)  # y down
+    return bool(lower[clip.known.all(1)].float().mean() < 0.5)
 
 
 def _placed(points: Tensor, known: Tensor, source: str, body: Skeleton) -> Clip:
