@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import numbers
@@ -120,7 +121,8 @@ class Method(ABC):
         begin = time.perf_counter()
         if cameras is not None:
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
-        with torch.inference_mode(False), torch.no_grad():  # solvers differentiate, which inference mode forbids
+        # Solvers differentiate, which inference mode forbids.
+        with torch.inference_mode(False), torch.no_grad(), _home([tracks]):
             inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
             result = self._finish(tracks, found, size, known, time.perf_counter() - begin)
@@ -142,7 +144,7 @@ class Method(ABC):
             ConvergenceWarning: as a call does.
         """
         begin = time.perf_counter()
-        with torch.inference_mode(False), torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad(), _home(tracks):
             parts = [self._normalised(one) for one in tracks]
             found = self.solve_all([inner for inner, _, _ in parts])
             each = (time.perf_counter() - begin) / max(len(tracks), 1)
@@ -272,6 +274,14 @@ class Method(ABC):
         """Raise an OptionError for ``field`` unless the rule holds."""
         if not rule:
             raise OptionError(f"{self.name}: {field}: expected {expected}, got {getattr(self, field)!r}")
+
+
+def _home(tracks: Sequence[Tracks]) -> contextlib.AbstractContextManager[object]:
+    """Make on the tracks' device what is made anew; a context costs each operation, so there is none without need."""
+    devices = {one.points.device for one in tracks}
+    if len(devices) != 1 or devices == {torch.get_default_device()}:
+        return contextlib.nullcontext()
+    return devices.pop()
 
 
 def users_level() -> int:

@@ -59,7 +59,7 @@ def orthographic_cameras(
     cameras, defects = [], []
     for k in ranks:
         part = motion[..., : 3 * k]
-        random = torch.randn(num_starts, 1, 3 * k, 3, generator=generator, dtype=torch.float64).to(motion)
+        random = torch.randn(num_starts, 1, 3 * k, 3, generator=generator, dtype=torch.float64, device="cpu").to(motion)
         starts = torch.nn.functional.pad(relaxed, (0, 0, 0, 3 * k - relaxed.shape[-2]))
         starts = torch.cat([starts[None], random.expand(-1, windows, -1, -1)])
         q, defect = metric_upgrade(part, starts, smoothness=smoothness, tolerance=0, num_steps=12)

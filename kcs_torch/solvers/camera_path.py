@@ -53,7 +53,7 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Te
     turn = roma.rotmat_to_rotvec(rotations[:, 1:] @ rotations[:, :-1].mT).median(1).values  # (K, 3)
     factors = torch.linspace(0.8, 1.2, 161, dtype=turn.dtype, device=turn.device)
     means = _mean_unturned(rotations, factors[:, None] * time, turn)  # (K, 161, 3, 3)
-    starts = roma.special_procrustes(means)
+    starts = nearest_rotation(means)
     best = (starts * means).sum((-2, -1)).argmax(-1)  # the mean agreement of path and rotations
     row = torch.arange(len(best), device=best.device)
     speed, start = turn * factors[best][:, None], starts[row, best]

@@ -258,7 +258,8 @@ def _apart(quick: Tensor) -> Tensor:
     count, size = quick.shape[1:]
     if count < _ENOUGH or size < 8:
         return torch.full_like(quick[:, 0, 0], math.inf)
-    noise = torch.randn(count, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(quick)
+    noise = torch.randn(count, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64, device="cpu")
+    noise = noise.to(quick)
     rank = min(size, count)
     low = slice(size - rank + rank // 8, size - rank + rank // 2)  # virtual joints are no measurements
     usual = torch.linalg.eigvalsh(noise.mT @ noise)[..., low].mean(-1)

@@ -48,7 +48,7 @@ def random_lifts(
     time = torch.linspace(0, 1, frames, dtype=tracks.dtype, device=tracks.device)
     order = torch.arange(waves + 1, dtype=tracks.dtype, device=tracks.device)
     basis = (math.pi * order * time[:, None]).cos()  # (T, waves + 1)
-    draw = torch.randn(count, waves + 1, len(bones), generator=generator, dtype=torch.float64).to(tracks)
+    draw = torch.randn(count, waves + 1, len(bones), generator=generator, dtype=torch.float64, device="cpu").to(tracks)
     signed = depth * (3 * (basis @ draw)).tanh()  # (count, T, B)
     inverse = chain_inverse(incidence(bones, joints, dtype=tracks.dtype))
     return torch.cat([tracks.expand(count, -1, -1, -1), (signed @ inverse.mT)[..., None]], -1)

@@ -34,10 +34,9 @@ def plausible(points: Tensor, seen: Tensor, skeleton: Skeleton) -> Tensor:
     often = seen.sum(0) >= SELDOM
     if bool(often.any()):
         seen = seen & often
-    usual = skeleton.relative_lengths(dtype=points.dtype)
+    usual = skeleton.relative_lengths(dtype=points.dtype, device=points.device)
     if usual is None:
         return seen
-    usual = usual.to(points.device)
     bones = skeleton.bone_index(device=points.device)
     both = seen[:, bones[:, 0]] & seen[:, bones[:, 1]]  # (T, B)
     rigid = torch.zeros(len(bones), dtype=torch.bool, device=points.device)

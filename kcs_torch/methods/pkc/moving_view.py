@@ -199,7 +199,7 @@ def _starts(
     if lifts > 0:
         generator = torch.Generator().manual_seed(seed)
         flips = random_lifts(image, bones, lifts, generator=generator)
-        degrees = 360 * torch.rand(lifts, generator=generator, dtype=torch.float64)
+        degrees = 360 * torch.rand(lifts, generator=generator, dtype=torch.float64, device="cpu")
         starts.append((flips, turning_cameras(degrees, len(image), dtype=image.dtype, device=image.device)))
     return starts
 

@@ -77,7 +77,7 @@ def pace_of(image: Tensor, skeleton: Skeleton, rate: float) -> float:
         rate: frames a second.
     """
     least = rate / 30
-    usual = skeleton.relative_lengths(dtype=image.dtype)
+    usual = skeleton.relative_lengths(dtype=image.dtype, device=image.device)
     if len(image) < 3 or usual is None:
         return least
     vectors = bone_vectors(image, skeleton.bone_index(device=image.device))
