@@ -33,7 +33,20 @@ ALLOWED = {
     "reconstruct": {"functional", "solvers", "nn", "methods"} | BASE,
     "live": {"functional", "solvers", "nn", "methods"} | BASE,
     "training": {"functional", "solvers", "nn", "methods", "metrics", "data", "io"} | BASE,
-    "cli": {"", "functional", "methods", "reconstruct", "io", "data", "viewer", "metrics", "clean", "detect"} | BASE,
+    "cli": {
+        "",
+        "functional",
+        "methods",
+        "reconstruct",
+        "io",
+        "data",
+        "viewer",
+        "metrics",
+        "clean",
+        "detect",
+        "training",
+    }
+    | BASE,
     "many": {"io", "methods", "reconstruct"} | BASE,
     "": {"functional", "solvers", "nn", "methods", "reconstruct", "live", "io", "metrics"} | BASE,
 }
@@ -43,8 +56,8 @@ LATE = {("types", "io")}
 # Who may import a package that is slow to load or not part of the core installation.
 OUTSIDE = {
     "lightning": {"training"},
-    "hydra": set(),
-    "omegaconf": set(),
+    "hydra": {"training"},
+    "omegaconf": {"training"},
     "torchmetrics": {"metrics", "training"},
     "matplotlib": {"viewer"},
     "PIL": {"viewer"},
@@ -124,7 +137,7 @@ def test_every_outside_package_is_declared():
     needs = [*project["dependencies"], *(n for extra in project["optional-dependencies"].values() for n in extra)]
     declared = {re.match(r"[\w-]+", need).group(0).lower() for need in needs}
     named = {"yaml": "pyyaml", "hydra": "hydra-core", "mpl_toolkits": "matplotlib", "PIL": "pillow"}
-    named |= {"imageio_ffmpeg": "imageio-ffmpeg", "rerun": "rerun-sdk"}
+    named |= {"imageio_ffmpeg": "imageio-ffmpeg", "rerun": "rerun-sdk", "omegaconf": "hydra-core"}
     for path in FILES:
         outside = {name.split(".")[0] for name, _, _ in imports(path)} - sys.stdlib_module_names - {"kcs_torch"}
         assert {named.get(n, n) for n in outside} <= declared, path

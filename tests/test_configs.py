@@ -1,54 +1,149 @@
-"""Every configuration composes and makes what it names."""
+"""Every configuration composes and makes what it names. Files are found by themselves: a new one is tested, too."""
 
 import dataclasses
+import inspect
+import itertools
+from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
+from hydra.utils import get_object, instantiate
+from omegaconf import DictConfig, OmegaConf
 
 import kcs_torch as kt
 
-
-@pytest.fixture
-def composed(root):
-    with initialize_config_dir(version_base="1.3", config_dir=str(root / "configs")):
-        yield lambda *overrides: compose("benchmark", overrides=list(overrides))
-
-
-def names(root):
-    return sorted(p.stem for p in (root / "configs" / "method").glob("*.yaml"))
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+PROGRAMS = sorted(path.stem for path in CONFIGS.glob("*.yaml"))
+GROUPS = sorted(path.name for path in CONFIGS.iterdir() if path.is_dir() and any(path.glob("*.yaml")))
+CHOICES = [f"{group}={path.stem}" for group in GROUPS for path in sorted((CONFIGS / group).glob("*.yaml"))]
 
 
-def test_there_is_a_config_for_every_method(root):
-    assert names(root) == sorted(kt.METHODS)
+def composed(program: str, *overrides: str, **options: Any) -> DictConfig:
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONFIGS)):
+        return compose(program, overrides=list(overrides), **options)
 
 
-@pytest.mark.parametrize("name", kt.METHODS)
-def test_method_configs_make_the_method_with_its_own_defaults(composed, name):
-    config = composed(f"method={name}")
-    assert set(config.method) == {"_target_"}  # defaults live in Python only
-    method = instantiate(config.method)
-    assert type(method) is kt.METHODS[name]
-    assert method == kt.METHODS[name]()
+def groups_of(program: str) -> set[str]:
+    """The groups that a program chooses from."""
+    return set(composed(program, return_hydra_config=True).hydra.runtime.choices) & set(GROUPS)
 
 
-@pytest.mark.parametrize("name", kt.METHODS)
-def test_fields_can_be_set_on_the_command_line(composed, name):
+def made(config: DictConfig) -> Any:
+    """All that a configuration names; what the user has to say is said, what this machine lacks is not asked for."""
+    for key in OmegaConf.missing_keys(config):
+        OmegaConf.update(config, key, "somewhere")
+    if OmegaConf.select(config, "trainer.accelerator") == "gpu" and not torch.cuda.is_available():
+        config.trainer.accelerator = "cpu"
+    return instantiate(config, _convert_="all")
+
+
+def nodes(config: Any, key: str = ""):
+    """Yield (place, node) of everything in a configuration that names a class."""
+    if isinstance(config, dict):
+        if "_target_" in config:
+            yield key, config
+        for name, value in config.items():
+            yield from nodes(value, f"{key}.{name}".lstrip("."))
+
+
+def test_programs_are_the_scripts():
+    assert {"benchmark", "reconstruct_many", "train"} <= set(PROGRAMS)
+    for program in PROGRAMS:
+        assert (CONFIGS.parent / "scripts" / f"{program}.py").is_file()
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_programs_have_settings_that_make_something(program):
+    result = made(composed(program))
+    assert result and not list(nodes(result))
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_file_of_every_group_makes_what_it_names(choice):
+    group = choice.partition("=")[0]
+    users = [program for program in PROGRAMS if group in groups_of(program)]
+    assert users, f"no program chooses from configs/{group}"
+    for program in users:
+        config = composed(program, choice)
+        named = {node["_target_"] for _, node in nodes(OmegaConf.to_container(config))}
+        result = made(config)
+        assert named and not list(nodes(result))
+        if group in ("data", "model", "trainer", "method"):
+            kind = get_object(config[group]._target_)
+            assert type(result[group]) is kind
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_defaults_live_in_python_only(choice):
+    for program in PROGRAMS:
+        if choice.partition("=")[0] not in groups_of(program):
+            continue
+        for place, node in nodes(OmegaConf.to_container(composed(program, choice))):
+            fields = inspect.signature(get_object(node["_target_"])).parameters
+            for name, value in node.items():
+                default = fields[name].default if name in fields else inspect.Parameter.empty
+                said = isinstance(value, str) and value.startswith("${")
+                assert said or type(value) is not type(default) or value != default, f"{place}.{name} is the default"
+
+
+@pytest.mark.parametrize("choice", [choice for choice in CHOICES if choice.startswith("experiment=")])
+def test_every_run_of_a_sweep_makes_what_it_names(choice):
+    params = composed("train", choice, return_hydra_config=True).hydra.sweeper.params or {}
+    for values in itertools.zip_longest(*(str(value).split(",") for value in params.values())):
+        pairs = [f"{key}={value}" for key, value in zip(params, values, strict=True) if value is not None]
+        assert made(composed("train", choice, *pairs))
+
+
+@pytest.mark.parametrize("solver", ["none", "sfam"])
+def test_the_module_is_made_of_the_chosen_parts(solver):
+    module = made(composed("train", "model=mlp", "loss=hybrid", f"solver={solver}", "seed=3", "skeleton=h36m17")).get(
+        "module"
+    )
+    network = module.network if solver == "none" else module.network.network
+    assert isinstance(network, kt.nn.MLPLifter) and network.skeleton == kt.SKELETONS["h36m17"]
+    assert (solver == "sfam") == isinstance(module.network, kt.nn.RefinedLifter)
+    assert set(module.losses) >= {"joints", "tracks", "bones"} and module.seed == 3
+
+
+def test_the_motion_capture_of_cmu_has_nobody_in_two_sets(shared):
+    from kcs_torch.training.clips import find_files
+
+    data = composed("train", "data=cmu", f"shared={shared}").data
+    people = {
+        split: {path.name.split("_")[1] for path in find_files(list(data[split]), data.folder)}
+        for split in ("train", "val", "test")
+    }
+    assert all(len(names) >= 3 for names in people.values())
+    for one, other in itertools.combinations(people.values(), 2):
+        assert not one & other
+
+
+def test_there_is_a_config_for_every_method():
+    assert [choice for choice in CHOICES if choice.startswith("method=")] == [f"method={m}" for m in sorted(kt.METHODS)]
+
+
+@pytest.mark.parametrize("name", sorted(kt.METHODS))
+def test_method_configs_make_the_method_with_its_own_defaults(name):
+    config = composed("benchmark", f"method={name}")
+    assert set(config.method) == {"_target_"}
+    assert instantiate(config.method) == kt.METHODS[name]()
+
+
+@pytest.mark.parametrize("name", sorted(kt.METHODS))
+def test_fields_can_be_set_on_the_command_line(name):
     kind = kt.METHODS[name]
     field = next(f for f in dataclasses.fields(kind) if type(f.default) in (int, float))
     value = field.default + 1 if type(field.default) is int else 0.125
-    method = instantiate(composed(f"method={name}", f"+method.{field.name}={value}").method)
+    method = instantiate(composed("benchmark", f"method={name}", f"+method.{field.name}={value}").method)
     assert method == kind(**{field.name: value})
 
 
-def test_every_yaml_file_is_reached(root):
-    scripts = {root / "configs" / f"{name}.yaml" for name in ("benchmark", "reconstruct_many")}
-    reached = scripts | {root / "configs" / "method" / f"{name}.yaml" for name in names(root)}
-    assert set((root / "configs").rglob("*.yaml")) == reached
-
-
-def test_benchmark_settings_are_those_that_the_script_reads(composed, root):
-    text = (root / "scripts" / "benchmark.py").read_text(encoding="utf-8")
-    for key in OmegaConf.to_container(composed()):
-        assert f"config.{key}" in text
+@pytest.mark.parametrize("program", ["benchmark", "train"])
+def test_settings_are_those_that_the_program_reads(program):
+    path = "scripts/benchmark.py" if program == "benchmark" else "kcs_torch/training/run.py"
+    text = (CONFIGS.parent / path).read_text(encoding="utf-8")
+    used = {"model", "loss", "solver", "shared", "skeleton"} if program == "train" else set()  # by other settings
+    for key in set(composed(program)) - used:
+        assert f"config.{key}" in text, key

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from kcs_torch.cli import convert, demo, detect, doctor, inspect, lift, score, skeletons
+from kcs_torch.cli import convert, demo, detect, doctor, inspect, lift, score, skeletons, train
 
 __all__ = ["app", "main"]
 
@@ -26,6 +26,7 @@ app.command()(doctor.doctor)
 app.command()(inspect.view)
 app.command()(convert.convert)
 app.command()(score.score)
+app.command(context_settings=train.CONTEXT)(train.train)
 app.add_typer(skeletons.app, name="skeletons")
 
 

@@ -1,0 +1,299 @@
+"""Training as Hydra configures it: what ``scripts/train.py`` and ``kcs-torch train`` run."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import re
+import shutil
+import sys
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import hydra
+import lightning
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import CompactHydraException, HydraException, InstantiationException
+from hydra.types import RunMode
+from hydra.utils import instantiate
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from kcs_torch.errors import KcsError, KcsWarning, OptionError, unknown
+from kcs_torch.io.atomic import atomic_path
+from kcs_torch.training.checkpoint import save_lifter
+from kcs_torch.training.sweep import RESULT, tabulate
+
+__all__ = ["Outcome", "configs", "job", "main", "train"]
+
+QUIET = (
+    r".*does not have many workers.*",  # batches are made faster than they are used
+    r".*number of training batches .* is smaller than the logging interval.*",
+    r".*`isinstance\(treespec, LeafSpec\)` is deprecated.*",
+    r".*Checkpoint directory .* exists and is not empty.*",
+    r".*could not find the monitored key.*",  # there was no validation, which is told in other words
+)
+"""Beginnings of warnings of packages that say nothing to whoever trains."""
+
+
+class WrongConfiguration(CompactHydraException):
+    """What is wrong with the configuration of a run; Hydra prints it without a traceback."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a training run came to.
+
+    Attributes:
+        value: what a sweep optimises: the metric named by ``optimise``, at the epoch where it was best. Infinite,
+            and worse than any other, where it never was a number.
+        metrics: the figures of the test clips, by the weights of that epoch.
+        lifter: the file of these weights, for :func:`kcs_torch.training.load_lifter`; None where they are no good.
+    """
+
+    value: float
+    metrics: Mapping[str, float]
+    lifter: Path | None
+
+
+class _Best(ModelCheckpoint):
+    """The checkpoint of the best epoch. A resumed run takes over the best one so far into its own folder."""
+
+    def __init__(self, folder: Path, monitor: str, mode: str, resumed: Path | None) -> None:
+        super().__init__(folder, "best", monitor, mode=mode, enable_version_counter=False)
+        self.resumed = resumed
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Look for the metric, before the first epoch is spent."""
+        if self.monitor not in trainer.callback_metrics:
+            known = [name for name in trainer.callback_metrics if name.startswith("val/")]
+            raise unknown("metric for optimise", self.monitor, known)
+        super().on_validation_end(trainer, pl_module)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over what was best, from where it was or from beside the checkpoint, should the folder have moved."""
+        old = Path(state_dict["best_model_path"])
+        if state_dict["best_model_path"]:
+            moved = Path(self.resumed or "").parent / old.name
+            new = Path(str(self.dirpath)) / old.name
+            found = old if old.is_file() else moved
+            if not found.is_file():
+                raise OptionError(
+                    f"resume={self.resumed}: expected its best checkpoint {old} or {moved}, found neither"
+                )
+            with atomic_path(new) as temporary:
+                shutil.copyfile(found, temporary)
+            score = state_dict["best_model_score"]
+            state_dict = state_dict | {
+                "best_model_path": str(new), "kth_best_model_path": str(new), "best_k_models": {str(new): score}
+            }  # fmt: skip
+        super().load_state_dict(state_dict | {"dirpath": self.dirpath})
+
+
+class _Last(ModelCheckpoint):
+    """The checkpoint of the last epoch, which knows of no other."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, "last", enable_version_counter=False, save_on_train_epoch_end=True)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Begin anew, in another folder."""
+
+
+class _Diverged(Exception):
+    """Weights are not numbers any more."""
+
+
+class _Watch(Callback):
+    """Keeps the configuration in every checkpoint, and ends training that came to nothing."""
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        self.config = config
+
+    def on_save_checkpoint(self, trainer: Any, pl_module: Any, checkpoint: dict[str, Any]) -> None:
+        """Add the configuration."""
+        checkpoint["config"] = self.config
+
+    def on_validation_start(self, trainer: Any, pl_module: lightning.LightningModule) -> None:
+        """Look at the weights."""
+        if not all(bool(torch.isfinite(p).all()) for p in pl_module.parameters()):
+            raise _Diverged
+
+
+def configs() -> Path:
+    """The folder of the configurations: in a wheel it is a part of the package, in a clone it is beside it."""
+    package = Path(__file__).resolve().parents[1]
+    inside = package / "configs"
+    return inside if inside.is_dir() else package.parent / "configs"
+
+
+def train(config: DictConfig, folder: Path) -> Outcome:
+    """Train, test and save a lifting network.
+
+    Args:
+        config: configs/train.yaml, composed.
+        folder: of the logs (``csv``, ``tensorboard``), the ``checkpoints`` and ``lifter.safetensors``.
+
+    Raises:
+        KcsError: the configuration is wrong, or files are missing or unreadable.
+    """
+    plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    _check(plain)
+    torch.set_num_threads(config.threads)
+    resumed = None if config.resume is None else _checkpoint(Path(config.resume), plain)
+    with _quiet():
+        lightning.seed_everything(config.seed, verbose=False)
+        data = instantiate(config.data, _convert_="all")
+        module = instantiate(config.module, _convert_="all")
+        best = _Best(folder / "checkpoints", config.optimise, config.mode, resumed)
+        made: dict[str, Any] = {
+            "callbacks": [_Watch(plain), best, _Last(folder / "checkpoints")],
+            "default_root_dir": folder,
+        }
+        if "logger" not in config.trainer:
+            made["logger"] = [
+                kind(folder, name, "") for kind, name in ((CSVLogger, "csv"), (TensorBoardLogger, "tensorboard"))
+            ]
+        if "enable_progress_bar" not in config.trainer:
+            made["enable_progress_bar"] = sys.stderr.isatty()
+        trainer = instantiate(config.trainer, **made, _convert_="all")
+        try:
+            trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
+        except RuntimeError as error:
+            if resumed is None or "loading state_dict" not in str(error):
+                raise
+            raise OptionError(f"resume={resumed}: does not fit this configuration: {error}") from None
+        except _Diverged:
+            text = "training diverged: what was best before that counts; try a smaller module.lr"
+            warnings.warn(text, KcsWarning, stacklevel=2)
+            if best.best_model_score is None:
+                return Outcome(math.inf if config.mode == "min" else -math.inf, {}, None)
+        if best.best_model_score is None:
+            raise OptionError("train: expected at least one epoch with validation, got none: see the group trainer")
+        tested = trainer.test(module, datamodule=data, ckpt_path=best.best_model_path, verbose=False, weights_only=True)
+    metrics = {name: float(figure) for figures in tested for name, figure in figures.items()}
+    notes = {"config": plain, "metrics": {name: f for name, f in metrics.items() if math.isfinite(f)}}
+    lifter = save_lifter(folder / "lifter.safetensors", module.network, fps=data.fps, notes=notes)
+    return Outcome(float(best.best_model_score), metrics, lifter)
+
+
+def _check(config: Mapping[str, Any]) -> None:
+    """Look at the settings that no constructor looks at."""
+    for name, least, most in (("seed", 0, 2**32 - 1), ("threads", 1, 1024)):
+        if type(config[name]) is not int or not least <= config[name] <= most:
+            raise OptionError(f"{name}: expected a whole number within {least}..{most}, got {config[name]!r}")
+    if config["mode"] not in ("min", "max"):
+        raise OptionError(f"mode: expected min or max, got {config['mode']!r}")
+
+
+def _checkpoint(path: Path, config: Mapping[str, Any]) -> Path:
+    """The checkpoint that ``resume`` means; it says where its run was configured otherwise."""
+    found = path / "checkpoints" / "last.ckpt" if path.is_dir() else path
+    if not found.is_file():
+        raise OptionError(
+            f"resume={path}: expected a run's folder, with checkpoints/last.ckpt, or a checkpoint, got none"
+        )
+    try:
+        then = torch.load(found, map_location="cpu", weights_only=True)["config"]
+    except Exception:  # whatever torch, zipfile and pickle make of a file that is something else
+        raise OptionError(f"resume={found}: expected a checkpoint of a training run, got something else") from None
+    before, now = _flat(then), _flat(config)
+    differing = [key for key in sorted({*before, *now} - {"resume"}) if before.get(key) != now.get(key)]
+    for key in differing:
+        warnings.warn(f"resume: {key} was {before.get(key)}, is {now.get(key)}", KcsWarning, stacklevel=2)
+    return found.resolve()
+
+
+def _flat(config: Any, key: str = "") -> dict[str, Any]:
+    """A nested configuration with dotted keys."""
+    if not isinstance(config, Mapping):
+        return {key: config}
+    return {name: leaf for k, v in config.items() for name, leaf in _flat(v, f"{key}.{k}".lstrip(".")).items()}
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep packages from saying what nobody has to know."""
+    levels = {name: logging.getLogger(name).level for name in ("lightning.pytorch", "lightning.fabric")}
+    with warnings.catch_warnings():
+        for pattern in QUIET:
+            warnings.filterwarnings("ignore", pattern)
+        for name in levels:
+            logging.getLogger(name).setLevel(logging.WARNING)
+        try:
+            yield
+        finally:
+            for name, level in levels.items():
+                logging.getLogger(name).setLevel(level)
+
+
+@contextmanager
+def _said() -> Iterator[None]:
+    """Print warnings of this library as one line each, in every run of a sweep."""
+    usual = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
+        if issubclass(category, KcsWarning):
+            print(f"warning: {message}", file=sys.stderr)
+        else:
+            usual(message, category, *rest)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", KcsWarning)
+        warnings.showwarning = show  # type: ignore[assignment]
+        yield
+
+
+def job(config: DictConfig) -> float:
+    """Train in the folder that Hydra gives a run, tell what it came to, and return what a sweep optimises."""
+    settings = HydraConfig.get()
+    folder = Path(settings.runtime.output_dir)
+    try:
+        with _said():
+            outcome = train(config, folder)
+    except Exception as error:
+        if (text := _told(error)) is None or os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        raise WrongConfiguration(f"error: {text}") from None
+    figures = {config.optimise: outcome.value} | dict(outcome.metrics)
+    result = {name: figure if math.isfinite(figure) else None for name, figure in figures.items()}
+    with atomic_path(folder / RESULT) as temporary:
+        temporary.write_text(json.dumps(result, indent=2), encoding="utf-8")
+    print("  ".join(f"{name} {value:.4g}" for name, value in figures.items()), outcome.lifter or folder, sep="\n")
+    if settings.mode == RunMode.MULTIRUN:
+        tabulate(Path(settings.sweep.dir))
+    return outcome.value
+
+
+def _told(error: Exception) -> str | None:
+    """What is wrong with the configuration, or None if the program is wrong."""
+    told = (KcsError, HydraException, OmegaConfBaseException, MisconfigurationException)
+    if isinstance(error, InstantiationException):
+        cause, place = error.__cause__, re.search(r"full_key: (\S+)", str(error))
+        if isinstance(cause, (TypeError, ValueError, *told)):
+            return str(cause) if isinstance(cause, KcsError) or place is None else f"{place.group(1)}: {cause}"
+        if cause is not None and "Error locating target" not in str(error):
+            return None
+    return str(error) if isinstance(error, told) else None
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Train as a command line says, by default that of this process; Hydra exits with 1 where it is wrong."""
+    entry = hydra.main(version_base="1.3", config_path=str(configs()), config_name="train")(job)
+    before = sys.argv
+    if arguments is not None:
+        sys.argv = [before[0], *arguments]  # Hydra looks nowhere else
+    try:
+        entry()
+    finally:
+        sys.argv = before

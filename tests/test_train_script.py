@@ -1,0 +1,382 @@
+"""Training as it is configured: what a run leaves, that it can be repeated and resumed; sweeps by the launchers."""
+
+import csv
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import kcs_torch as kt
+
+lightning = pytest.importorskip("lightning", reason="training needs the extra: pip install -e '.[train]'")
+hydra = pytest.importorskip("hydra")
+
+from omegaconf import OmegaConf  # noqa: E402
+
+from kcs_torch.training import LiftingModule, load_lifter  # noqa: E402
+from kcs_torch.training.run import configs, main, train  # noqa: E402
+from kcs_torch.training.sweep import tabulate  # noqa: E402
+
+SMALL = ("experiment=smoke", "+model.channels=8")
+
+
+def composed(*overrides: str):
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(configs())):
+        return hydra.compose("train", overrides=[*SMALL, *overrides])
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def logged(folder: Path, name: str) -> list[float]:
+    return [float(row[name]) for row in rows(folder / "csv" / "metrics.csv") if row.get(name)]
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return torch.load(path / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+
+
+def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """One short run, and its folder."""
+    folder = tmp_path_factory.mktemp("run")
+    return train(composed("trainer.max_epochs=4"), folder), folder
+
+
+class TestARun:
+    def test_logs_to_csv(self, run):
+        _, folder = run
+        assert len(logged(folder, "val/mpjpe")) == 4
+        assert len(logged(folder, "train/loss")) == 12
+        assert len(logged(folder, "test/mpjpe")) == 1
+
+    def test_logs_to_tensorboard(self, run):
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+        _, folder = run
+        events = EventAccumulator(str(folder / "tensorboard"))
+        events.Reload()
+        values = [event.value for event in events.Scalars("val/mpjpe")]
+        assert values == pytest.approx(logged(folder, "val/mpjpe"))
+
+    def test_its_value_is_the_best_that_was_logged(self, run):
+        outcome, folder = run
+        assert outcome.value == min(logged(folder, "val/mpjpe"))
+        assert outcome.metrics["test/mpjpe"] == pytest.approx(logged(folder, "test/mpjpe")[0])
+
+    def test_the_lifter_has_the_weights_of_the_best_epoch(self, run):
+        outcome, folder = run
+        lifter = load_lifter(outcome.lifter)
+        best = torch.load(folder / "checkpoints" / "best.ckpt", weights_only=True)
+        for name, value in lifter.network.state_dict().items():
+            assert torch.equal(value, best["state_dict"][f"network.{name}"])
+        assert lifter.fps == 30
+        tracks = kt.data.walking_person(12, skeleton="cmu21").tracks
+        assert kt.reconstruct(tracks, method=lifter).points.isfinite().all()
+
+    def test_checkpoint_and_lifter_tell_the_configuration(self, run):
+        outcome, folder = run
+        config = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["config"]
+        assert config["trainer"]["max_epochs"] == 4 and config["model"]["channels"] == 8
+        data = outcome.lifter.read_bytes()
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["kcs_torch"]
+        assert json.loads(header)["notes"]["config"] == config
+
+    def test_a_solver_behind_the_network_is_a_part_of_the_lifter(self, tmp_path):
+        outcome = train(composed("solver=sfam", "+solver.num_steps=2", "trainer.max_epochs=1"), tmp_path)
+        network = load_lifter(outcome.lifter).network
+        assert isinstance(network, kt.nn.RefinedLifter) and network.solver.num_steps == 2
+
+    def test_the_same_seed_gives_the_same_run(self, run, tmp_path):
+        outcome, folder = run
+        again = train(composed("trainer.max_epochs=4"), tmp_path)
+        assert (again.value, again.metrics) == (outcome.value, outcome.metrics)
+        assert same(weights(folder), weights(tmp_path))
+        assert rows(tmp_path / "csv" / "metrics.csv") == rows(folder / "csv" / "metrics.csv")
+
+    def test_another_seed_gives_another_run(self, run, tmp_path):
+        train(composed("trainer.max_epochs=1", "seed=1"), tmp_path)
+        assert not same(weights(run[1]), weights(tmp_path))
+
+
+class Killed(RuntimeError):
+    pass
+
+
+def killed(monkeypatch, at: int, folder: Path, *overrides: str) -> None:
+    """Train until a step, and die there."""
+    step = LiftingModule.training_step
+
+    def dies(self, batch, batch_idx):
+        if int(self.step) == at:
+            raise Killed
+        step(self, batch, batch_idx)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LiftingModule, "training_step", dies)
+        with pytest.raises(Killed):
+            train(composed(*overrides), folder)
+
+
+class TestResuming:
+    @pytest.mark.parametrize("at", [6, 10])
+    def test_a_killed_run_goes_on_as_if_nothing_had_happened(self, run, tmp_path, monkeypatch, at):
+        outcome, folder = run
+        killed(monkeypatch, at, tmp_path / "first", "trainer.max_epochs=4")
+        again = train(composed("trainer.max_epochs=4", f"resume={tmp_path / 'first'}"), tmp_path / "second")
+        assert (again.value, again.metrics) == (outcome.value, outcome.metrics)
+        assert same(weights(folder), weights(tmp_path / "second"))
+        epochs = at // 3
+        assert logged(tmp_path / "second", "val/mpjpe") == logged(folder, "val/mpjpe")[epochs:]
+        assert logged(tmp_path / "second", "train/loss") == logged(folder, "train/loss")[3 * epochs :]
+
+    def test_what_was_best_before_stays_best_though_the_folder_has_moved(self, tmp_path, monkeypatch):
+        options = ("trainer.max_epochs=3", "mode=max")  # the error falls: the first epoch is the "best"
+        outcome = train(composed(*options), tmp_path / "whole")
+        killed(monkeypatch, 6, tmp_path / "first", *options)
+        moved = (tmp_path / "first").rename(tmp_path / "moved")
+        again = train(composed(*options, f"resume={moved}"), tmp_path / "second")
+        assert (
+            again.value == outcome.value == logged(moved, "val/mpjpe")[0] > logged(tmp_path / "second", "val/mpjpe")[0]
+        )
+        assert again.metrics == outcome.metrics
+        assert again.lifter.parent == tmp_path / "second"
+        old, new = (load_lifter(one.lifter).network.state_dict() for one in (outcome, again))
+        assert same(old, new)
+
+    def test_the_best_checkpoint_is_missed(self, tmp_path, monkeypatch):
+        killed(monkeypatch, 4, tmp_path / "first")
+        (tmp_path / "first" / "checkpoints" / "best.ckpt").unlink()
+        with pytest.raises(kt.OptionError, match=r"best checkpoint .*best\.ckpt"):
+            train(composed(f"resume={tmp_path / 'first'}"), tmp_path / "second")
+
+    def test_another_configuration_is_told(self, run, tmp_path):
+        with pytest.warns(kt.KcsWarning, match=r"resume: data\.batch_size was 4, is 3"):
+            train(composed(f"resume={run[1]}", "trainer.max_epochs=4", "data.batch_size=3"), tmp_path)
+
+    @pytest.mark.parametrize("kind", ["absent", "empty", "text", "other"])
+    def test_what_is_no_checkpoint_is_told(self, tmp_path, kind):
+        path = tmp_path / "last.ckpt"
+        if kind == "other":
+            torch.save({"state_dict": {}}, path)
+        elif kind != "absent":
+            path.write_text("" if kind == "empty" else "nothing that torch reads")
+        with pytest.raises(kt.OptionError, match=r"^resume="):
+            train(composed(f"resume={path}"), tmp_path / "out")
+
+    def test_a_network_of_another_size_is_told(self, run, tmp_path):
+        with pytest.warns(kt.KcsWarning), pytest.raises(kt.OptionError, match="resume=.*does not fit"):
+            train(composed(f"resume={run[1]}", "model.channels=4"), tmp_path)
+
+
+class TestWrongConfigurations:
+    """Each is told in a line, by what the user wrote."""
+
+    @pytest.mark.parametrize(
+        ("override", "told"),
+        [
+            ("optimise=val/mpje", "unknown metric for optimise 'val/mpje': did you mean 'val/mpjpe'"),
+            ("optimise=test/mpjpe", "choices are val/|did you mean"),
+            ("mode=least", "mode: expected min or max"),
+            ("seed=-1", "seed: expected a whole number"),
+            ("seed=one", "seed: expected a whole number"),
+            ("threads=0", "threads: expected a whole number"),
+            ("skeleton=dragon", "unknown skeleton 'dragon'"),
+            ("data.window=0", "window: expected at least 1"),
+            ("trainer.max_epochs=0", "at least one epoch with validation"),
+            ("+trainer.limit_val_batches=0", "at least one epoch with validation"),
+        ],
+    )
+    def test_in_values(self, tmp_path, override, told):
+        with pytest.raises(kt.KcsError, match=told):
+            try:
+                train(composed(override), tmp_path)
+            except hydra.errors.InstantiationException as error:
+                raise error.__cause__ from None
+
+    def test_divergence_is_the_worst_value(self, tmp_path):
+        with pytest.warns(kt.KcsWarning, match="diverged"):
+            outcome = train(composed("+module.lr=1e30"), tmp_path)
+        assert outcome.value == float("inf") and outcome.lifter is None and not outcome.metrics
+
+    def test_divergence_later_leaves_the_best_epoch(self, tmp_path, monkeypatch):
+        step = LiftingModule.training_step
+
+        def breaks(self, batch, batch_idx):
+            step(self, batch, batch_idx)
+            if int(self.step) == 5:
+                next(self.network.parameters()).data.fill_(float("nan"))
+
+        monkeypatch.setattr(LiftingModule, "training_step", breaks)
+        with pytest.warns(kt.KcsWarning, match="diverged"):
+            outcome = train(composed(), tmp_path)
+        assert outcome.value == logged(tmp_path, "val/mpjpe")[0]
+        assert load_lifter(outcome.lifter).network is not None
+
+
+def called(capsys, *arguments: str) -> tuple[int, str, str]:
+    """Exit code, output and errors of a command line, in this process."""
+    code = 0
+    try:
+        main(arguments)
+    except SystemExit as end:
+        code = end.code
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+class TestCommandLine:
+    def test_one_run(self, tmp_path, capsys):
+        code, out, err = called(capsys, *SMALL, "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}")
+        assert code == 0 and "val/mpjpe" in out and "test/mpjpe" in out, err
+        assert out.splitlines()[-1] == str(tmp_path / "lifter.safetensors")
+        assert "Traceback" not in err and "Warning" not in err
+        assert json.loads((tmp_path / "result.json").read_text())["val/mpjpe"] == logged(tmp_path, "val/mpjpe")[0]
+
+    @pytest.mark.parametrize(
+        ("argument", "told"),
+        [
+            ("model=transformer", "mlp\n\ttemporal"),
+            ("modle=mlp", "Could not override 'modle'"),
+            ("+data.noisy=1", "data: .*unexpected keyword argument 'noisy'"),
+            ("+module.lr=-1", "lr: expected a positive number"),
+            ("+trainer.acelerator=cpu", "trainer: .*unexpected keyword argument 'acelerator'"),
+            ("trainer.accelerator=abacus", "abacus"),
+            ("data=cmu shared=/nowhere", "/nowhere/data/cmu, found none"),
+            ("resume=/nowhere", "resume=/nowhere: expected a run's folder"),
+            ("model._target_=kcs_torch.nn.Nothing", "kcs_torch.nn.Nothing"),
+            ("skeleton=dragon loss=bones", "unknown skeleton 'dragon'"),
+        ],
+    )
+    def test_wrong_arguments(self, tmp_path, capsys, argument, told):
+        code, _, err = called(capsys, *SMALL, *argument.split(), f"hydra.run.dir={tmp_path}")
+        assert code == 1 and re.search(told, err), err
+        assert "Traceback" not in err
+
+    def test_errors_of_the_program_keep_their_traceback(self, tmp_path, capsys, monkeypatch):
+        monkeypatch.setattr("kcs_torch.training.run.save_lifter", lambda *a, **k: 1 / 0)
+        code, _, err = called(capsys, *SMALL, "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}")
+        assert code == 1 and "ZeroDivisionError" in err and "Traceback" in err
+
+    def test_arguments_of_the_process_are_left_alone(self, capsys):
+        before = list(sys.argv)
+        assert called(capsys, "--help")[0] == 0
+        assert sys.argv == before
+
+
+SWEEP = ("-m", *SMALL, "trainer.max_epochs=1", "data.steps_per_epoch=2", "hydra.sweep.dir=sweep")
+
+
+def swept(folder: Path) -> list[dict[str, str]]:
+    """The table of a sweep, after a look at the folders of its runs."""
+    table = rows(folder / "sweep" / "results.csv")
+    assert [row["run"] for row in table] == [str(k) for k in range(len(table))]
+    for row in table:
+        run = folder / "sweep" / row["run"]
+        assert float(row["val/mpjpe"]) == min(logged(run, "val/mpjpe"))
+        assert load_lifter(run / "lifter.safetensors").network is not None
+    return table
+
+
+class TestSweeps:
+    def test_basic(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.chdir(tmp_path)
+        code, out, err = called(capsys, *SWEEP, "+module.lr=1e-3,1e-4", "seed=0,1")
+        assert code == 0, err
+        given = [(row["module.lr"], row["seed"]) for row in swept(tmp_path)]
+        assert given == [("0.001", "0"), ("0.001", "1"), ("0.0001", "0"), ("0.0001", "1")]
+        printed = out.splitlines()[-6:]
+        assert printed[0].split()[:3] == ["run", "module.lr", "seed"] and printed[-1] == "sweep/results.csv"
+        assert [line.split()[0] for line in printed[1:5]] == ["0", "1", "2", "3"]
+
+    @pytest.mark.filterwarnings("ignore")  # of what the launchers are made of
+    @pytest.mark.parametrize(
+        ("launcher", "package"), [("joblib", "hydra_joblib_launcher"), ("submitit_local", "hydra_submitit_launcher")]
+    )
+    def test_processes_come_to_the_same_figures(self, tmp_path, monkeypatch, capsys, launcher, package):
+        pytest.importorskip(f"hydra_plugins.{package}")
+        for name, options in (("here", ()), ("there", (f"hydra/launcher={launcher}",))):
+            (tmp_path / name).mkdir()
+            monkeypatch.chdir(tmp_path / name)
+            code, _, err = called(capsys, *SWEEP, "seed=0,1", *options)
+            assert code == 0, err
+        assert len(swept(tmp_path / "here")) == 2
+        assert swept(tmp_path / "here") == swept(tmp_path / "there")
+
+    @pytest.mark.filterwarnings("ignore")  # of what Optuna is made of
+    def test_optuna(self, tmp_path, monkeypatch, capsys):
+        pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+        monkeypatch.chdir(tmp_path)
+        search = ("optuna", "n_trials=4", "n_jobs=1", "sampler.seed=0")
+        options = [f"hydra{'.' if '=' in word else '/'}sweeper{'.' if '=' in word else '='}{word}" for word in search]
+        code, _, err = called(capsys, *SWEEP, *options, "+module.lr=tag(log,interval(1e-4,1e-2))")
+        assert code == 0, err
+        tried = {float(row["module.lr"]): float(row["val/mpjpe"]) for row in swept(tmp_path)}
+        assert len(tried) == 4 and all(1e-4 <= lr <= 1e-2 for lr in tried)
+        best = OmegaConf.load(tmp_path / "sweep" / "optimization_results.yaml")
+        assert best.best_value == min(tried.values())
+        assert tried[best.best_params["+module.lr"]] == best.best_value
+
+    def test_a_run_that_fails_does_not_take_the_others_along(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.chdir(tmp_path)
+        code, _, err = called(capsys, *SWEEP, "+module.lr=1e-3,-1,1e-4")
+        assert code == 1 and "lr: expected a positive number" in err and "Traceback" not in err
+        assert [row["run"] for row in rows(tmp_path / "sweep" / "results.csv")] == ["0", "2"]
+
+    def test_the_table_is_that_of_all_who_have_ended(self, tmp_path):
+        for number in (10, 2):
+            run = tmp_path / str(number)
+            (run / ".hydra").mkdir(parents=True)
+            (run / ".hydra" / "overrides.yaml").write_text(f"- +module.lr={number}\n- model=mlp\n")
+            (run / "result.json").write_text(json.dumps({"val/mpjpe": 7.5 if number == 2 else None}))
+        tabulate(tmp_path)
+        assert rows(tmp_path / "results.csv") == [
+            {"run": "2", "module.lr": "2", "model": "mlp", "val/mpjpe": "7.5"},
+            {"run": "10", "module.lr": "10", "model": "mlp", "val/mpjpe": ""},
+        ]
+
+
+def started(*command: str, folder: Path) -> subprocess.CompletedProcess:
+    """What a user's shell would start, in an empty folder."""
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+
+
+class TestKcsTorchTrain:
+    def test_help_lists_groups_and_settings(self, tmp_path):
+        done = started("kcs-torch", "train", "--help", folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        for word in ("data: cmu, files, synthetic", "model: mlp, temporal", "optimise: val/mpjpe", "data=cmu"):
+            assert word in done.stdout
+        assert "reconstruct_many" not in done.stdout
+
+    def test_trains(self, tmp_path):
+        words = (*SMALL, "trainer.max_epochs=1", "hydra.run.dir=out")
+        done = started("kcs-torch", "train", *words, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+        assert load_lifter(tmp_path / "out" / "lifter.safetensors").fps == 30
+
+    @pytest.mark.parametrize("missing", ["hydra", "lightning", "tensorboard", "safetensors"])
+    def test_names_the_extra_that_is_missing(self, monkeypatch, missing):
+        from typer.testing import CliRunner
+
+        from kcs_torch.cli import app
+
+        find = importlib.util.find_spec
+        monkeypatch.setattr(
+            importlib.util, "find_spec", lambda name, *rest: None if name == missing else find(name, *rest)
+        )
+        done = CliRunner().invoke(app, ["train", "trainer.max_epochs=1"])
+        assert done.exit_code == 2
+        assert done.stderr == f'error: train: {missing} is missing: pip install "kcs-torch[train]"\n'
