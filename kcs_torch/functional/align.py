@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional.chain import unit_size
 from kcs_torch.functional.derivatives import batch_first
 
 __all__ = ["ALIGNMENTS", "centre", "minimal_turn", "nearest_rotation", "procrustes", "similarity", "superpose"]
@@ -169,20 +170,21 @@ def superpose(
         target, mean = centre(target, mass)
     if how == "root":
         return source + mean
-    left = source * mass[..., None]
-    if how == "sequence":
-        left, whole = left.flatten(-3, -2)[..., None, :, :], lambda x: x.flatten(-3, -2)[..., None, :, :]
-    else:
-        whole = lambda x: x  # noqa: E731
+    sequence = how == "sequence"
+    whole = (lambda x: x.flatten(-3, -2)[..., None, :, :]) if sequence else (lambda x: x)
+    over, counts = 3 if sequence else 2, mass[..., None] > 0
+    unit = unit_size(source, over, counts)  # neither turn nor fitted scale depend on it
     if how != "scale":
-        source = source @ nearest_rotation(left.mT @ whole(target))
+        goal = unit_size(target, over, counts)
+        turn = nearest_rotation(whole(unit * mass[..., None]).mT @ whole(goal))
+        source, unit = source @ turn, unit @ turn
     if how == "rigid":
         return source + mean
-    heavy = source * mass[..., None]
-    size = whole(heavy * source).sum((-2, -1))
+    heavy = unit * mass[..., None]
+    size = whole(heavy * unit).sum((-2, -1))
     overlap = whole(heavy * target).sum((-2, -1))
     factor = overlap / torch.where(size > 0, size, torch.ones_like(size))
-    return source * factor[..., None, None] + mean
+    return unit * factor[..., None, None] + mean
 
 
 class _Polar(torch.autograd.Function):

@@ -133,7 +133,13 @@ def kcs_matrix(vectors: Tensor) -> Tensor:
     return vectors @ vectors.mT
 
 
-def pose_matrix(points: Tensor, bones: Tensor | Sequence[Sequence[int]]) -> Tensor:
+def pose_matrix(
+    points: Tensor,
+    bones: Tensor | Sequence[Sequence[int]],
+    *,
+    normalise: bool = False,
+    weights: Tensor | None = None,
+) -> Tensor:
     """Return the KCS matrix of points, ``kcs_matrix(bone_vectors(points, bones))``, in less time.
 
     Bones are taken as differences, not as the product with C that defines them: exact in any matmul precision, and a
@@ -142,9 +148,12 @@ def pose_matrix(points: Tensor, bones: Tensor | Sequence[Sequence[int]]) -> Tens
     Args:
         points: (..., N, D).
         bones: (B, 2) integer (parent, child) pairs.
+        normalise: divide by the mean squared bone length, which frees the matrix of scale. A pose that is one point
+            gives 0, with the derivative 0.
+        weights: (..., B) of the bones in that mean; those of weight 0 are taken for 0 in the normalised matrix.
 
     Returns:
-        (..., B, B), in squared units.
+        (..., B, B), in squared units, or without one.
 
     Raises:
         ShapeError: ``bones`` is not (B, 2).
@@ -155,7 +164,36 @@ def pose_matrix(points: Tensor, bones: Tensor | Sequence[Sequence[int]]) -> Tens
     parents, children = _pairs(bones).to(points.device).unbind(-1)
     rows = points.mT
     across = rows.index_select(-1, children) - rows.index_select(-1, parents)  # (..., D, B)
-    return torch.bmm(across.mT, across) if across.ndim == 3 else across.mT @ across
+    if normalise:
+        if weights is not None:  # a bone to an unseen joint says nothing of the body's size
+            across = torch.where(weights[..., None, :] > 0, across, torch.zeros_like(across))
+        across = unit_size(across, 2)
+    matrix = torch.bmm(across.mT, across) if across.ndim == 3 else across.mT @ across
+    if not normalise:
+        return matrix
+    square = matrix.diagonal(dim1=-2, dim2=-1)
+    if weights is None:
+        size = square.mean(-1)
+    else:
+        total = weights.sum(-1)
+        size = (weights * square).sum(-1) / torch.where(total > 0, total, torch.ones_like(total))
+    return matrix / torch.where(size > 0, size, torch.ones_like(size))[..., None, None]
+
+
+def unit_size(values: Tensor, dimensions: int, counts: Tensor | None = None) -> Tensor:
+    """Divide by the largest magnitude over the last so many dimensions, which is a constant for autograd.
+
+    For what does not depend on scale: squares of the result neither under- nor overflow, nor do their inverses. What is
+    smaller than any unit would have it counts as 0, so that its derivative is bounded. The largest is sought where
+    ``counts``, which broadcasts against the values, is True.
+    """
+    over = tuple(range(-dimensions, 0))
+    size = values.detach().abs()
+    if counts is not None:
+        size = torch.where(counts, size, torch.zeros_like(size))
+    top = size.amax(over, keepdim=True) if size.numel() else size.sum(over, keepdim=True)
+    firm = top > torch.finfo(values.dtype).tiny ** 0.25
+    return torch.where(firm, values / torch.where(firm, top, torch.ones_like(top)), torch.zeros_like(values))
 
 
 def safe_norm(vectors: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.functional.chain import pose_matrix, safe_norm
-from kcs_torch.nn.distances import check_pose_weights, mean_square
+from kcs_torch.nn.distances import check_pose_weights
 from kcs_torch.nn.layers import SkeletonModule, full_precision, known, wide
 from kcs_torch.nn.masks import bone_share, some
 from kcs_torch.skeleton import Skeleton
@@ -104,8 +104,7 @@ class KCSCritic(SkeletonModule):
         check_pose_weights(weights, points, self)
         share = None if weights is None else bone_share(weights, self.bones)
         with full_precision(points):
-            psi = pose_matrix(wide(known(points, weights)), self.bones)
-            psi = psi / mean_square(psi, share)[..., None, None]
+            psi = pose_matrix(wide(known(points, weights)), self.bones, normalise=True, weights=share)
             if share is not None:
                 psi = psi * torch.minimum(share[..., :, None], share[..., None, :])
         return psi[..., self.first, self.second]

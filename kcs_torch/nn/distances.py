@@ -120,8 +120,7 @@ class KCSDistance(SkeletonModule):
             return narrow(each.sum((-2, -1)), points)
 
     def _matrix(self, points: Tensor, weights: Tensor | None, share: Tensor | None) -> Tensor:
-        matrix = pose_matrix(wide(known(points, weights)), self.bones)
-        return matrix / mean_square(matrix, share)[..., None, None] if self.scale_free else matrix
+        return pose_matrix(wide(known(points, weights)), self.bones, normalise=self.scale_free, weights=share)
 
 
 def check_pose_weights(weights: Tensor | None, points: Tensor, module: nn.Module) -> None:
@@ -134,11 +133,3 @@ def check_pose_weights(weights: Tensor | None, points: Tensor, module: nn.Module
     if not fits:
         expected = ", ".join(map(str, points.shape[:-1]))
         raise ShapeError(f"{type(module).__name__}: expected weights ({expected}), got {tuple(weights.shape)}")
-
-
-def mean_square(matrix: Tensor, share: Tensor | None) -> Tensor:
-    """Mean squared bone length (...) of KCS matrices (..., B, B) over bones of shares (..., B); 1 where it is 0."""
-    square = matrix.diagonal(dim1=-2, dim2=-1)
-    if share is None:
-        return some(square.mean(-1))
-    return some((share * square).sum(-1) / some(share.sum(-1)))

@@ -83,11 +83,7 @@ class KCSMatrix(SkeletonModule):
 
     def forward(self, points: Tensor) -> Tensor:
         self.check(points)
-        matrix = pose_matrix(points, self.bones)
-        if not self.normalise:
-            return matrix
-        size = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
-        return matrix / torch.where(size > 0, size, torch.ones_like(size))
+        return pose_matrix(points, self.bones, normalise=self.normalise)
 
 
 class SVT(nn.Module):
