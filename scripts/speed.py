@@ -5,8 +5,12 @@
 
 Parts: ``memory`` (peak of a run above what importing takes, in a process of its own), ``methods`` (each method beside
 its twin), ``kernels`` (the same for single steps), ``growth`` (with the number of frames), ``joints`` (with their
-number). Times are in double precision; variants take turns, so that a busy machine slows all of them, and the best run
-is told beside the median. The twins are those of tests/naive.py.
+number), ``batch`` (many short clips together beside one by one). Times are in double precision; variants take turns,
+so that a busy machine slows all of them, and the best run is told beside the median. The twins are those of
+tests/naive.py.
+
+Two parts are left out unless asked for: ``scale`` (memory and time of very long clips, minutes) and ``gpu`` (clips a
+second in batches of up to 4096, single precision on the GPU beside double on the CPU, methods and SfAM's layer alone).
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -32,9 +36,11 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.data import SyntheticClip, random_motion, walking_person
+from kcs_torch.methods.cameras import orthographic_cameras
 
 TESTS = Path(__file__).resolve().parents[1] / "tests"
 FRAMES, TURN = 300, 180.0
+FAST = ("kcs", "sfam", "pkc")  # methods that are measured unless others are asked for
 TWINS = ("kcs", "sfam")  # methods that tests/naive.py slows down
 KERNELS = (
     ("17 joints", (200, 51)),
@@ -90,7 +96,7 @@ def clip_of(frames: int) -> SyntheticClip:
     return walking_person(frames, turn=TURN * frames / FRAMES)
 
 
-def compare_methods(frames: int, runs: int) -> Iterator[Row]:
+def compare_methods(names: Sequence[str], frames: int, runs: int) -> Iterator[Row]:
     """Milliseconds a frame of each method and of the twins that it has."""
     twins = load_naive()
     clip = walking_person(frames, turn=TURN)
@@ -99,7 +105,8 @@ def compare_methods(frames: int, runs: int) -> Iterator[Row]:
         with twins.naive(frame_by_frame=frame_by_frame):
             run()
 
-    for name, method in kt.METHODS.items():
+    for name in names:
+        method = kt.METHODS[name]
         for cameras in (None, clip.cameras):
             run = partial(method(), clip.tracks, cameras)
             variants: Variants = {"ours": run}
@@ -141,9 +148,10 @@ def compare_kernels(frames: int, runs: int) -> Iterator[Row]:
             yield {"ms": f"bone-length step, {frames} frames of {joints} joints"} | row
 
 
-def grow_frames(counts: list[int], runs: int) -> Iterator[Row]:
+def grow_frames(names: Sequence[str], counts: list[int], runs: int) -> Iterator[Row]:
     """Milliseconds a frame as clips get longer, and their ratio to those at 1000 frames."""
-    for name, method in kt.METHODS.items():
+    for name in names:
+        method = kt.METHODS[name]
         reference = None
         for frames in counts:
             run = partial(method(), clip_of(frames).tracks)
@@ -153,9 +161,10 @@ def grow_frames(counts: list[int], runs: int) -> Iterator[Row]:
             yield {"ms a frame": name, "frames": frames} | row | {"ratio": ratio}
 
 
-def grow_joints(counts: list[int], frames: int, runs: int) -> Iterator[Row]:
+def grow_joints(names: Sequence[str], counts: list[int], frames: int, runs: int) -> Iterator[Row]:
     """Milliseconds a frame, and frames a second, as bodies get more joints."""
-    for name, method in kt.METHODS.items():
+    for name in names:
+        method = kt.METHODS[name]
         for joints in counts:
             clip = random_motion(tree(joints), frames, turn=TURN, generator=torch.Generator().manual_seed(0))
             (row,) = measure({"ours": partial(method(), clip.tracks)}, runs, per=frames)
@@ -163,9 +172,70 @@ def grow_joints(counts: list[int], frames: int, runs: int) -> Iterator[Row]:
             yield {"ms a frame": name, "joints": joints} | row | {"frames a second": 1000 / row["median"]}
 
 
-def peak_memory(counts: list[int]) -> Iterator[Row]:
+def together(names: Sequence[str], frames: list[int], clips: int) -> Iterator[Row]:
+    """Milliseconds a clip one by one and as one batch: people before cameras that turn or stand still."""
+    for name in names:
+        method = kt.METHODS[name]()
+        for length in frames:
+            tracks = [walking_person(length, turn=TURN * (i % 2), yaw=7.0 * i).tracks for i in range(clips)]
+            few = tracks[: min(clips, 16)]
+            method.many(tracks[:2])  # loads what is loaded late
+            times = []
+            for run, count in ((partial(list, map(method, few)), len(few)), (partial(method.many, tracks), clips)):
+                start = time.process_time()
+                run()
+                times.append(1000 * (time.process_time() - start) / count)
+            yield {
+                "ms a clip": name,
+                "frames": length,
+                "clips": clips,
+                "one by one": times[0],
+                "together": times[1],
+            } | {"ratio": times[0] / times[1]}
+
+
+def on_gpu(device: str, batches: list[int], frames: int, names: Sequence[str]) -> Iterator[Row]:
+    """Clips and frames a second of batches on a device, in single precision, and on the CPU in double.
+
+    ``SfAM's layer`` is cameras and shape of a stacked batch, without what a :class:`Reconstruction` tells of each clip.
+    """
+    body = kt.SKELETONS["h36m17"]
+    clips = [walking_person(frames, turn=TURN, yaw=7.0 * i).tracks for i in range(16)]
+    sfam = kt.SfAM()
+
+    def layer(points: torch.Tensor) -> None:
+        rows = torch.cat([orthographic_cameras(part) for part in points.split(256)])
+        sfam.shape(points, rows, torch.ones_like(points[..., 0]), body, one_body=False)
+
+    for where, dtype in ((device, torch.float32), ("cpu", torch.float64)):
+        tracks = [one.to(where).to(dtype) for one in clips]
+        stack = torch.stack([one.points - one.points.mean(1, keepdim=True) for one in tracks])
+        stack = stack / stack.square().mean((1, 2, 3), keepdim=True).sqrt()
+        for batch in batches:
+            if where == "cpu" and batch > 64:
+                continue  # a core gains nothing from more
+            runs: dict[str, Callable[[], object]] = {
+                name: partial(kt.METHODS[name]().many, [tracks[i % 16] for i in range(batch)]) for name in names
+            }
+            runs["SfAM's layer"] = partial(layer, stack[torch.arange(batch, device=stack.device) % 16])
+            for name, run in runs.items():
+                seconds = []
+                with torch.no_grad():
+                    for _ in range(2):
+                        start = time.perf_counter()
+                        run()
+                        if where != "cpu":
+                            torch.cuda.synchronize()
+                        seconds.append(time.perf_counter() - start)
+                rate = batch / seconds[-1]
+                yield {"method": name, "device": where, "batch": batch, "clips a second": rate} | {
+                    "frames a second": rate * frames
+                }
+
+
+def peak_memory(names: Sequence[str], counts: list[int]) -> Iterator[Row]:
     """Peak memory of a run, each in a process of its own."""
-    for name in kt.METHODS:
+    for name in names:
         for frames in counts:
             command = [sys.executable, __file__, "--peak", name, str(frames)]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -187,10 +257,13 @@ def measure_peak(name: str, frames: int) -> Row:
     """Run a method in this process; memory in MB, and KB a frame above what a short run takes."""
     method = kt.METHODS[name]()
     method(walking_person(30, turn=TURN).tracks)  # loads what is loaded late
-    before = resident_mb()
-    method(clip_of(frames).tracks)
-    above = resident_mb() - before
-    return {"import MB": before, "above MB": above, "KB a frame": 1024 * above / frames}
+    tracks = clip_of(frames).tracks
+    before, start = resident_mb(), time.process_time()
+    method(tracks)
+    seconds, above = time.process_time() - start, resident_mb() - before
+    return {"import MB": before, "above MB": above, "KB a frame": 1024 * above / frames} | {
+        "ms a frame": 1000 * seconds / frames
+    }
 
 
 def show(rows: list[Row]) -> str:
@@ -212,8 +285,15 @@ def text(value: Any) -> str:
 
 def arguments(words: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = ("memory", "methods", "kernels", "growth", "joints")
-    parser.add_argument("--parts", nargs="+", choices=parts, default=parts, metavar="PART", help=", ".join(parts))
+    parts = ("memory", "methods", "kernels", "growth", "joints", "batch")
+    every = (*parts, "scale", "gpu")
+    parser.add_argument("--parts", nargs="+", choices=every, default=parts, metavar="PART", help=", ".join(every))
+    parser.add_argument("--which", nargs="+", choices=list(kt.METHODS), default=FAST, metavar="METHOD", help="methods to measure")
+    parser.add_argument("--clips", type=int, default=64, help="of the part batch")
+    parser.add_argument("--short", type=int, nargs="+", default=[30, 100], metavar="FRAMES", help="of its clips")
+    parser.add_argument("--scale", type=int, nargs="+", default=[1000, 100_000], metavar="FRAMES")
+    parser.add_argument("--device", default="cuda", help="of the part gpu")
+    parser.add_argument("--batches", type=int, nargs="+", default=[1, 4, 16, 64, 256, 1024, 4096], metavar="CLIPS")
     parser.add_argument("--frames", type=int, default=FRAMES, help="of methods, kernels and joints")
     parser.add_argument("--growth", type=int, nargs="+", default=[100, 300, 1000, 3000, 10000], metavar="FRAMES")
     parser.add_argument("--memory", type=int, nargs="+", default=[1000, 10000], metavar="FRAMES")
@@ -233,12 +313,19 @@ def main(words: list[str] | None = None) -> None:
         print(json.dumps(measure_peak(options.peak[0], int(options.peak[1]))))
         return
     parts: dict[str, Callable[[], Iterator[Row]]] = {
-        "memory": lambda: peak_memory(options.memory),
-        "methods": lambda: compare_methods(options.frames, options.runs),
+        "memory": lambda: peak_memory(options.which, options.memory),
+        "methods": lambda: compare_methods(options.which, options.frames, options.runs),
         "kernels": lambda: compare_kernels(options.frames, options.runs),
-        "growth": lambda: grow_frames(options.growth, options.runs),
-        "joints": lambda: grow_joints(options.joints, options.frames, options.runs),
+        "growth": lambda: grow_frames(options.which, options.growth, options.runs),
+        "joints": lambda: grow_joints(options.which, options.joints, options.frames, options.runs),
+        "batch": lambda: together(options.which, options.short, options.clips),
+        "scale": lambda: peak_memory(options.which, options.scale),
+        "gpu": lambda: on_gpu(options.device, options.batches, options.frames, options.which),
     }
+    if "gpu" in options.parts and options.device == "cuda" and not torch.cuda.is_available():
+        raise SystemExit(
+            "--parts gpu: expected a GPU that PyTorch can use, found none; --device cpu tries the script out"
+        )
     print(f"torch {torch.__version__}, {platform.machine()}, 1 thread, float64, median of {options.runs} runs")
     everything: list[Row] = []
     for part in parts:

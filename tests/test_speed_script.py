@@ -55,17 +55,57 @@ def test_after_the_context_the_fast_parts_are_back():
     assert (steps.svt, steps.fit_bones) == before
 
 
-@pytest.mark.parametrize("part", ["memory", "methods", "kernels", "growth", "joints"])
+@pytest.mark.parametrize("part", ["memory", "methods", "kernels", "growth", "joints", "batch", "scale", "gpu"])
 def test_script(root, tmp_path, capsys, part):
     script = runpy.run_path(str(root / "scripts" / "speed.py"))
     table = tmp_path / "speed.csv"
     sizes = ["--frames", "12", "--growth", "12", "--memory", "12", "--joints", "5", "--runs", "1"]
+    sizes += [
+        "--which",
+        "kcs",
+        "sfam",
+        "--clips",
+        "2",
+        "--short",
+        "12",
+        "--scale",
+        "12",
+        "--device",
+        "cpu",
+        "--batches",
+        "2",
+    ]
     script["main"](["--parts", part, *sizes, "--csv", str(table)])
     shown = capsys.readouterr().out
     with table.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) >= 2 and {row["part"] for row in rows} == {part}
     for row in rows:
-        what = row.get("ms a frame") or row.get("ms") or row["peak of"]
+        what = row.get("peak of") or row.get("ms a frame") or row.get("ms") or row.get("ms a clip") or row["method"]
         assert what in shown  # the table on the terminal has what the file has
-        assert float(row.get("median") or row["import MB"]) > 0
+        least = ("median", "import MB", "together", "clips a second")
+        assert float(next(row[name] for name in least if row.get(name))) > 0
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is here")
+def test_script_says_that_there_is_no_gpu(root):
+    script = runpy.run_path(str(root / "scripts" / "speed.py"))
+    with pytest.raises(SystemExit, match="expected a GPU"):
+        script["main"](["--parts", "gpu"])
+
+
+def test_counts_of_operations(root, tmp_path, capsys):
+    """By hand for one product and one sum; and a row for each method and camera."""
+    script = runpy.run_path(str(root / "scripts" / "counts.py"))
+    left, right = normal(4, 3, 5), normal(4, 5, 2)
+    with script["Counter"]() as made:
+        (left @ right).mT.add(1)
+    assert (made.calls, made.matrix, made.other) == (2, 2 * 4 * 3 * 5 * 2, 24)
+    assert made.bytes == 8 * (60 + 40 + 24) + 8 * (24 + 24)
+    table = tmp_path / "counts.csv"
+    script["main"](["--methods", "kcs", "sfam", "--frames", "12", "--csv", str(table)])
+    with table.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["method"] for row in rows] == ["kcs", "kcs", "sfam", "sfam"]
+    assert all(float(row["bound"]) > 0 for row in rows)
+    assert "GFLOP/s" in capsys.readouterr().out
