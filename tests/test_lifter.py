@@ -292,6 +292,8 @@ def test_joints_that_only_one_of_them_has():
     assert away.median() < 150
     eye, ear = (clip.skeleton.index(n) for n in ("left_eye", "left_ear"))
     assert (result.points[:, eye] - result.points[:, ear])[..., 2].abs().max() < 300
+    apart = clip.tracks.points[:, eye] - clip.tracks.points[:, ear]
+    torch.testing.assert_close((result.points[:, eye] - result.points[:, ear])[..., :2], apart)
     # What the network knows is what it says of its own joints.
     body = network.skeleton
     back = clip.skeleton.mapping_to(body)
