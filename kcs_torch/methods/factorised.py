@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
@@ -20,6 +21,9 @@ from kcs_torch.solvers.nullspace import null_space_upgrade
 from kcs_torch.types import Tracks
 
 __all__ = ["Factorised", "camera_rows", "fit_basis_shapes", "trajectory_design"]
+
+EMPTY = 1e-6
+"""Singular values of the tracks below this share of the largest are rounding."""
 
 FILLED = 0.1
 """Weight of what completion put in place of an unseen joint, so that no system is singular."""
@@ -87,6 +91,9 @@ def camera_rows(tracks: Tensor, rank: int, *, evenness: float = 1.0, num_steps: 
         return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(frames, 2, 3)
     rank = max(1, min(rank, frames // 3, (joints - 1) // 3))
     motion, _ = factorize(tracks, 3 * rank)
+    size = torch.linalg.vector_norm(motion, dim=(0, 1))
+    told = int((size > EMPTY * size[0]).sum())  # columns of rounding would take part like any other
+    motion = motion[..., : max(3, 3 * math.ceil(told / 3))]
     q, _ = metric_upgrade(motion, null_space_upgrade(motion), evenness=evenness, num_steps=num_steps, tolerance=1e-6)
     return rows_to_cameras(motion @ q)[0]
 

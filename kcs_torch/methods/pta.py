@@ -15,6 +15,9 @@ from kcs_torch.solvers.iterate import Solution
 
 __all__ = ["PTA"]
 
+ROUNDING = 1e-13
+"""Share of the tracks' energy that no fit explains."""
+
 
 @dataclass(frozen=True)
 class PTA(Factorised):
@@ -83,7 +86,7 @@ class PTA(Factorised):
             kept = (value > self.cutoff**2 * value[-1]) & (value > 0)
             told = (vector.mT @ goal[: 3 * rank]).square().sum(-1) / torch.where(kept, value, torch.ones_like(value))
             error = energy - (told * kept).sum()
-            if bool(error <= self.tolerance**2 * energy):
+            if bool(error <= max(self.tolerance**2, ROUNDING) * energy):
                 return rank
             free = max(1 - int(kept.sum()) / (2 * frames), 1e-6)
             errors[rank] = float(error) / free**2
