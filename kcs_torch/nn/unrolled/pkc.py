@@ -175,8 +175,12 @@ class UnrolledPKC(Unrolled):
             begin = begin.expand(*torch.broadcast_shapes(begin.shape[:-3], rows.shape[:-3]), *begin.shape[-3:])
             world = complete_rotation(rows).expand(*begin.shape[:-2], 3, 3)
 
+            # The state: points, and below them the rotations of frames that are turned.
+            turns = self.first < self.num_steps
+            split = lambda state: (state[..., :joints, :], state[..., joints:, :] if turns else world)  # noqa: E731
+
             def advance(state: Tensor, k: int) -> Tensor:
-                points, turned = state[..., :joints, :], state[..., joints:, :]
+                points, turned = split(state)
                 measured, rigidity = estimate_lengths(points, self.rigid, share, graded=graded)
                 if fixed is not None:
                     part = fixed[..., self.indices]
@@ -187,10 +191,11 @@ class UnrolledPKC(Unrolled):
                 )  # fmt: skip
                 if k >= self.first:
                     points, turned = turn_onto_mean(points, turned, self.bones)
-                return torch.cat([points, turned], -2)
+                return torch.cat([points, turned], -2) if turns else points
 
-            solution = self._run(advance, torch.cat([begin, world], -2), measure=measure, depends_on=depends_on)
-            points, turned = solution.value[..., :joints, :], solution.value[..., joints:, :]
+            begin = torch.cat([begin, world], -2) if turns else begin
+            solution = self._run(advance, begin, measure=measure, depends_on=depends_on)
+            points, turned = split(solution.value)
             value = size * (points @ turned.mT @ world)
         return Solution(value.to(tracks.dtype), solution.converged, solution.iterations)
 
