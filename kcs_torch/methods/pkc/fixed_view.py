@@ -181,19 +181,17 @@ class _Search:
 
     def start(self, anchor: Tensor | None) -> Hypotheses:
         """Hypotheses from both templates of the trunk."""
-        depths: list[Tensor] = []
-        lengths: list[Tensor] = []
+        made: list[tuple[Tensor, Tensor]] = []
         for trunk in self._trunks(anchor):
             first = trunk_path(self.image, trunk, self.objective.posture, self.costs.posture, self.turn)
             tried: list[Tensor] = []
             for path in (*self._settled(first, trunk, anchor), first):
                 if not any(bool((path - other).abs().amax() < 1e-6) for other in tried):
-                    # the first path's lengths serve all
-                    z, length = self._place(path, trunk, lengths[-1] if tried else anchor)
                     tried.append(path)
-                    depths.append(z)
-                    lengths.append(length)
-        z, length = torch.stack(depths), torch.stack(lengths)
+            made += self._places(tried[:1], trunk, anchor)
+            if tried[1:]:  # the first path's lengths serve all
+                made += self._places(tried[1:], trunk, made[-1][1])
+        z, length = (torch.stack(part) for part in zip(*made, strict=True))
         return Hypotheses(z, length, z.new_full((len(z),), torch.inf))
 
     def refine(self, found: Hypotheses, steps: int, loose: float = 1.0) -> Search[Task, Refined, Hypotheses]:
@@ -211,8 +209,8 @@ class _Search:
         points = torch.cat([self.image, z[..., None]], -1)
         trunk = Trunk(self.objective.posture.rest, length)
         path, *others = self._settled(self.objective.posture.frame(points), trunk, length)
-        new = [self._place(path, trunk, length, z), self._place(path, trunk, None, z)]
-        new += [self._place(other, trunk, length) for other in others]
+        near, *turned = self._places([path, *others], trunk, length, [z, *[None] * len(others)])
+        new = [near, *self._places([path], trunk, None, [z]), *turned]
         flips = torch.stack(self._flips(z) or [z])
         with torch.no_grad():
             order = self.objective(flips, length.expand(len(flips), -1)).argsort()[:FLIPS]
@@ -272,30 +270,37 @@ class _Search:
         off = trunk_misfit(self.image, trunk, posture.trunk, paths).mT / self.costs.posture
         return best_path(TRUST * votes + off, trunk_turns(paths, self.turn))
 
-    def _place(
-        self, path: Tensor, trunk: Trunk, lengths: Tensor | None, keep: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Depths (T, N), lengths (B,) of a body whose trunk follows a path; ``keep`` gives the trunk's own depths."""
+    def _places(
+        self, paths: Sequence[Tensor], trunk: Trunk, lengths: Tensor | None, keep: Sequence[Tensor | None] = ()
+    ) -> list[tuple[Tensor, Tensor]]:
+        """Depths (T, N), lengths (B,) of bodies whose trunks follow paths, or keep the depths that ``keep`` has."""
         posture, free = self.objective.posture, free_bones(self.skeleton)
-        flat = bone_vectors(self.image, posture.bones)
-        if keep is None:
-            dz = (bone_vectors(trunk.rest, posture.bones) @ path.mT)[..., 2]  # (T, B)
-        else:
-            dz = bone_vectors(keep[..., None], posture.bones)[..., 0]
-        dz = dz.clone()
-        length = trunk.lengths.clone()
+        flat, rest = bone_vectors(self.image, posture.bones), bone_vectors(trunk.rest, posture.bones)
+        kept = keep or [None] * len(paths)
+        depths = [
+            (rest @ path.mT)[..., 2].clone() if z is None else bone_vectors(z[..., None], posture.bones)[..., 0].clone()
+            for path, z in zip(paths, kept, strict=True)
+        ]  # (T, B) each
+        sizes = [trunk.lengths.clone() for _ in paths]
         for wave in waves(self.limbs):
-            chains = [list(limb.bones) for limb in wave]
             candidates = self._candidates(flat, wave, FINE if lengths is None else lengths)
-            near = [self._direction(flat, dz, length, limb.before) if limb.entry else None for limb in wave]
+            near = [
+                self._direction(flat, dz, length, limb.before) if limb.entry else None
+                for dz, length in zip(depths, sizes, strict=True)
+                for limb in wave
+            ]
+            turned = torch.stack([path for path in paths for _ in wave])[:, None]
             found = limb_paths(
-                flat, wave, path[None], posture, free, self.costs, self.objective.noise,
-                candidates=candidates, before=near,
+                flat, wave * len(paths), turned, posture, free, self.costs, self.objective.noise,
+                candidates=candidates.repeat(len(paths), 1, 1), before=near,
             )  # fmt: skip
-            for chain, depth, size in zip(chains, found.depths, found.lengths, strict=True):
-                dz[:, chain], length[chain] = depth, size
-        z = self._chain(dz.mT).mT
-        return z - z.mean(-1, keepdim=True), length
+            parts = iter(zip(found.depths, found.lengths, strict=True))
+            for dz, length in zip(depths, sizes, strict=True):
+                for limb in wave:
+                    chain = list(limb.bones)
+                    dz[:, chain], length[chain] = next(parts)
+        joints = [self._chain(dz.mT).mT for dz in depths]
+        return [(z - z.mean(-1, keepdim=True), length) for z, length in zip(joints, sizes, strict=True)]
 
     def _candidates(self, flat: Tensor, limbs: Sequence[Limb], grid: tuple[float, ...] | Tensor) -> Tensor:
         """Combinations of limbs' lengths (J, K, M): of a grid over their longest images, or the one that is known."""
