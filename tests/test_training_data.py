@@ -236,6 +236,18 @@ def test_a_loader_goes_on_where_it_was():
         assert (got + rest)[:9] == every
 
 
+def test_processes_deal_out_the_batches_of_an_epoch(monkeypatch):
+    dealt = []
+    for rank in (0, 1):
+        monkeypatch.setattr("kcs_torch.training.loader._rank", lambda rank=rank: (rank, 2))
+        loader = numbered(7)
+        assert len(loader) == 3
+        dealt.append([*loader, *loader])
+        assert len(numbered(7, fixed=True)) == 7  # validation is everybody's
+    assert dealt[0] == [(e, s) for e in (0, 1) for s in (0, 2, 4)]
+    assert dealt[1] == [(e, s) for e in (0, 1) for s in (1, 3, 5)]
+
+
 def test_generators_differ_by_their_key():
     draw = lambda *key: torch.rand(4, generator=generator_of(*key)).tolist()  # noqa: E731
     assert draw(1, "a") == draw(1, "a")

@@ -54,7 +54,7 @@ class BatchLoader:
 
     Args:
         make: the batch of an epoch and a step.
-        steps: batches an epoch, of one process.
+        steps: batches of an epoch; processes that train together deal them out, each the same number.
         fixed: whether all epochs are the first one, and all processes get every batch: for validation.
     """
 
@@ -65,7 +65,7 @@ class BatchLoader:
             self.sampler, self.batch_sampler = self, None  # where Lightning looks for set_epoch
 
     def __len__(self) -> int:
-        return self.steps
+        return self.steps if self.fixed else max(1, self.steps // _rank()[1])
 
     def set_epoch(self, epoch: int) -> None:
         """Go to the first batch of an epoch, unless it is this one."""
@@ -76,9 +76,10 @@ class BatchLoader:
         first, self._first = self._first, 0
         epoch = self.epoch
         rank, ranks = (0, 1) if self.fixed else _rank()
-        for step in range(first, self.steps):
+        steps = len(self)
+        for step in range(first, steps):
             batch = self.make(0 if self.fixed else epoch, step * ranks + rank)
-            if step + 1 < self.steps:
+            if step + 1 < steps:
                 self._place = step + 1
             elif self.epoch == epoch:
                 self.epoch, self._place = epoch + 1, 0
