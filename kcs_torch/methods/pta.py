@@ -18,6 +18,9 @@ __all__ = ["PTA"]
 ROUNDING = 1e-13
 """Share of the tracks' energy that no fit explains."""
 
+FREE = 0.1
+"""Share of the measurements that must be left over for cross-validation to tell anything."""
+
 
 @dataclass(frozen=True)
 class PTA(Factorised):
@@ -88,7 +91,9 @@ class PTA(Factorised):
             error = energy - (told * kept).sum()
             if bool(error <= max(self.tolerance**2, ROUNDING) * energy):
                 return rank
-            free = max(1 - int(kept.sum()) / (2 * frames), 1e-6)
+            free = 1 - int(kept.sum()) / (2 * frames)
+            if free < FREE:
+                break
             errors[rank] = float(error) / free**2
             rank += max(1, rank // 8)
-        return min(errors, key=lambda k: errors[k])
+        return min(errors, key=lambda k: errors[k], default=1)
