@@ -1,0 +1,64 @@
+"""What each method makes of small synthetic clips, held to a table: a change that costs accuracy does not pass unseen.
+
+Figures are mm of a person of 1750 mm: mean distance to the truth, each frame moved and turned (KCS's "3D error"). One
+that becomes better by more than its tolerance fails as well: write the better figure down, so that it is kept.
+"""
+
+from dataclasses import replace
+
+import pytest
+import roma
+import torch
+
+import kcs_torch as kt
+from kcs_torch.data import walking_person
+
+CASES = {
+    "still": {"turn": 0.0},
+    "sway": {"turn": 40.0},
+    "orbit": {"turn": 180.0},
+    "noise": {"turn": 180.0, "noise": 10.0},
+    "missing": {"turn": 180.0, "missing": 0.2},
+}
+TABLE = {  # a flat guess is at 92 mm
+    "pkc": {"still": 3.77, "sway": 4.40, "orbit": 3.21, "noise": 20.2, "missing": 15.8},
+    "sfam": {"still": 89.8, "sway": 52.3, "orbit": 15.7, "noise": 46.8, "missing": 35.8},
+    "kcs": {"still": 53.0, "sway": 34.8, "orbit": 43.9, "noise": 47.8, "missing": 55.3},
+}
+SHARE, LEAST = 0.1, 0.3
+"""Tolerance: of the figure, and in mm."""
+
+STIFF, LEANING = 15.0, {"kcs": 55.0, "csf": 75.0}
+"""A stiff body before a camera that goes half around is a riddle to few (mm): KCS leans on its template, and CSF's ranks
+have more freedom than such a body needs."""
+
+pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+
+
+def clip_of(case, frames=60):
+    return walking_person(frames, generator=torch.Generator().manual_seed(0), **CASES[case])
+
+
+def error(points, truth):
+    return float(kt.metrics.mpjpe(points, truth, align="rigid"))
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("name", TABLE)
+def test_as_in_the_table(name, case):
+    clip = clip_of(case)
+    found = error(kt.METHODS[name]()(clip.tracks).points, clip.points)
+    assert found == pytest.approx(TABLE[name][case], rel=SHARE, abs=LEAST)
+
+
+@pytest.mark.parametrize("name", list(kt.METHODS))
+def test_a_stiff_body(name):
+    """Its mirror image is as good where a method knows no hinges."""
+    shape = clip_of("still").points[20]
+    angle = torch.linspace(0, torch.pi, 60, dtype=torch.float64)
+    axis = torch.nn.functional.normalize(torch.tensor([0.1, 1.0, 0.2], dtype=torch.float64), dim=0)
+    truth = (shape - shape.mean(0)) @ roma.rotvec_to_rotmat(angle[:, None] * axis).mT
+    tracks = replace(clip_of("still").tracks, points=truth[..., :2])
+    points = kt.METHODS[name]()(tracks).points
+    flip = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
+    assert min(error(points, truth), error(points * flip, truth)) < LEANING.get(name, STIFF)
