@@ -5,7 +5,8 @@ import torch
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.nn import CameraHead, MLPLifter, TemporalLifter
-from kcs_torch.nn.networks import neighbours, normalise_tracks, orthonormal_rows
+from kcs_torch.nn.networks import orthonormal_rows
+from kcs_torch.nn.normalise import neighbours, normalise_tracks
 from kcs_torch.skeleton import SKELETONS
 
 LIFTERS = {

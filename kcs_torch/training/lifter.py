@@ -16,7 +16,8 @@ from kcs_torch.methods import Method
 from kcs_torch.methods.base import Estimate
 from kcs_torch.methods.size import weak_perspective
 from kcs_torch.methods.unseen import place_unseen
-from kcs_torch.nn.networks import MLPLifter, TemporalLifter, normalise_tracks
+from kcs_torch.nn.networks import MLPLifter, TemporalLifter
+from kcs_torch.nn.normalise import normalise_tracks
 from kcs_torch.skeleton import Skeleton, map_joints
 from kcs_torch.types import Tracks
 
