@@ -137,6 +137,29 @@ def test_smoothness_prefers_the_camera_that_moves_evenly():
     assert total(smooth) < total(plain)
 
 
+def test_evenness_makes_the_rows_of_all_frames_equally_long():
+    """What is minimised is the sum that Tomasi and Kanade have, with the scale held."""
+    tracks, _ = deforming()
+    tracks = tracks + 0.1 * normal(*tracks.shape, seed=4)
+    motion, _ = factorize(tracks, 6)
+
+    def total(q):
+        a, b = (motion @ q).unbind(1)
+        length = (a.square().sum(-1) - 1).square() + (b.square().sum(-1) - 1).square()
+        return (length / 2 + (a * b).sum(-1).square()).mean()
+
+    start = ist(motion)
+    free, defect = metric_upgrade(motion, start)
+    even, price = metric_upgrade(motion, start, evenness=1.0, num_steps=400, tolerance=1e-9)
+    spread = lambda q: (motion @ q).square().sum((-2, -1)).std()  # noqa: E731
+    assert spread(even) < spread(free) and price > defect
+    assert total(even) < total(free)
+    for k in range(40):  # a minimum among Q of the same scale
+        other = even + 1e-2 * even.norm() * normal(6, 3, seed=k)
+        other = other / (motion @ other).square().sum(-1).mean().sqrt()
+        assert total(other) > total(even)
+
+
 def test_several_starts_at_once():
     tracks, _ = deforming()
     motion, _ = factorize(torch.stack([tracks, rigid(60, 25)[0]]), 6)

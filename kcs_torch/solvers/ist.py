@@ -83,8 +83,9 @@ def metric_upgrade(
 
     Minimises mean_t [((a.a - b.b)/2)^2 + (a.b)^2] + smoothness mean_t |second difference of the rows|^2
     + evenness mean_t ((a.a + b.b)/2 - 1)^2 over Q of mean squared row length 1. Where the viewpoint turns little many Q
-    have small defects; the one whose camera moves smoothly is the right one. An orthographic camera has one scale in all
-    frames: with an evenness of 1 the sum is (a.b)^2 and half of (a.a - 1)^2 + (b.b - 1)^2, as Tomasi and Kanade have it.
+    have small defects; the one whose camera moves smoothly is the right one. An orthographic camera has one scale in
+    all frames: with an evenness of 1 the sum is (a.b)^2 and half of (a.a - 1)^2 + (b.b - 1)^2, as Tomasi and Kanade
+    have it.
 
     Args:
         motion: (..., T, 2, R).
