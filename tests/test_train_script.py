@@ -141,6 +141,13 @@ class TestResuming:
         assert logged(tmp_path / "second", "val/mpjpe") == logged(folder, "val/mpjpe")[epochs:]
         assert logged(tmp_path / "second", "train/loss") == logged(folder, "train/loss")[3 * epochs :]
 
+    def test_a_run_that_had_ended_stays_as_it_is(self, run, tmp_path):
+        outcome, folder = run
+        again = train(composed("trainer.max_epochs=4", f"resume={folder / 'checkpoints' / 'last.ckpt'}"), tmp_path)
+        assert (again.value, again.metrics) == (outcome.value, outcome.metrics)
+        old, new = (load_lifter(one.lifter).network.state_dict() for one in (outcome, again))
+        assert same(old, new)
+
     def test_what_was_best_before_stays_best_though_the_folder_has_moved(self, tmp_path, monkeypatch):
         options = ("trainer.max_epochs=3", "mode=max")  # the error falls: the first epoch is the "best"
         outcome = train(composed(*options), tmp_path / "whole")
@@ -154,6 +161,9 @@ class TestResuming:
         assert again.lifter.parent == tmp_path / "second"
         old, new = (load_lifter(one.lifter).network.state_dict() for one in (outcome, again))
         assert same(old, new)
+        first = torch.load(tmp_path / "whole" / "checkpoints" / "best.ckpt", weights_only=True)["state_dict"]
+        assert all(torch.equal(value, first[f"network.{name}"]) for name, value in old.items())
+        assert not same(first, weights(tmp_path / "whole"))
 
     def test_the_best_checkpoint_is_missed(self, tmp_path, monkeypatch):
         killed(monkeypatch, 4, tmp_path / "first")
