@@ -198,8 +198,8 @@ def critic_loss(real: Tensor, fake: Tensor, *, game: str = "least_squares") -> T
     Args:
         real: (...).
         fake: (...), of the same shape, from poses without a gradient.
-        game: a name in :data:`GAMES`: 1/2 (real - 1)^2 + 1/2 fake^2; fake - real; or max(0, 1 - real) +
-            max(0, 1 + fake).
+        game: "least_squares", 1/2 (real - 1)^2 + 1/2 fake^2; "wasserstein", fake - real, which needs a gradient
+            penalty; or "hinge", max(0, 1 - real) + max(0, 1 + fake), which goes with spectral norms.
 
     Returns:
         (...).
