@@ -357,14 +357,15 @@ class TestSweeps:
         ]
 
 
-def started(*command: str, folder: Path) -> subprocess.CompletedProcess:
-    """What a user's shell would start, in an empty folder."""
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+def started(*arguments: str, folder: Path) -> subprocess.CompletedProcess:
+    """``kcs-torch`` as a user's shell would start it, in a folder of theirs."""
+    program = Path(sys.executable).with_name("kcs-torch")
+    return subprocess.run([program, *arguments], cwd=folder, capture_output=True, text=True, timeout=300)
 
 
 class TestKcsTorchTrain:
     def test_help_lists_groups_and_settings(self, tmp_path):
-        done = started("kcs-torch", "train", "--help", folder=tmp_path)
+        done = started("train", "--help", folder=tmp_path)
         assert done.returncode == 0, done.stderr
         for word in ("data: cmu, files, synthetic", "model: mlp, temporal", "optimise: val/mpjpe", "data=cmu"):
             assert word in done.stdout
@@ -372,7 +373,7 @@ class TestKcsTorchTrain:
 
     def test_trains(self, tmp_path):
         words = (*SMALL, "trainer.max_epochs=1", "hydra.run.dir=out")
-        done = started("kcs-torch", "train", *words, folder=tmp_path)
+        done = started("train", *words, folder=tmp_path)
         assert done.returncode == 0, done.stderr
         assert done.stderr == ""
         assert load_lifter(tmp_path / "out" / "lifter.safetensors").fps == 30
