@@ -99,9 +99,10 @@ def majorise_step(
 
     off = centred_residual(project(points, cameras), tracks, weights).square().sum(-1)
     share = weights / (noise**2 * (1 + off / (REACH * noise) ** 2))
-    total = share.sum(-1, keepdim=True)
-    part = share / torch.where(total > 0, total, torch.ones_like(total))
-    held = torch.diag_embed(share) - share[..., :, None] * part[..., None, :]  # the translation at its optimum
+    total = weights.sum(-1, keepdim=True)
+    part = weights / torch.where(total > 0, total, torch.ones_like(total))
+    about = torch.eye(joints, dtype=points.dtype, device=points.device) - part[..., None, :]  # less the weighted mean
+    held = about.mT @ (share[..., None] * about)
     seen = back_project(held @ tracks, cameras)
 
     local = _kron(stiff, axes) + _kron(held, cameras.mT @ cameras)
