@@ -5,12 +5,29 @@ from kcs_torch.methods.bmm import BMM
 from kcs_torch.methods.csf import CSF
 from kcs_torch.methods.found import find_skeleton
 from kcs_torch.methods.kcs import KCS
+from kcs_torch.methods.local_rigidity import LocalRigidity
 from kcs_torch.methods.pkc import PKC
+from kcs_torch.methods.pnd import PND
 from kcs_torch.methods.pta import PTA
 from kcs_torch.methods.rigid import Rigid
 from kcs_torch.methods.sfam import SfAM
+from kcs_torch.methods.smsr import SMSR
 
-__all__ = ["BMM", "CSF", "KCS", "METHODS", "PKC", "PTA", "Method", "Rigid", "SfAM", "find_skeleton"]
+__all__ = [
+    "BMM",
+    "CSF",
+    "KCS",
+    "METHODS",
+    "PKC",
+    "PND",
+    "PTA",
+    "SMSR",
+    "LocalRigidity",
+    "Method",
+    "Rigid",
+    "SfAM",
+    "find_skeleton",
+]
 
 METHODS: dict[str, type[Method]] = {
     "pkc": PKC,
@@ -20,5 +37,8 @@ METHODS: dict[str, type[Method]] = {
     "pta": PTA,
     "csf": CSF,
     "bmm": BMM,
+    "smsr": SMSR,
+    "local_rigidity": LocalRigidity,
+    "pnd": PND,
 }
 """The methods by name."""
