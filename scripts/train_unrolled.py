@@ -17,6 +17,7 @@ import argparse
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,9 +38,8 @@ def motions(data: str, tested: bool) -> tuple[kt.Skeleton, list[Tensor]]:
     """The skeleton, and motion of subjects (T, N, 3) in mm, y down, at about 30 frames a second."""
     if data == "synthetic":
         seeds = range(100, 104) if tested else range(8)
-        clips = [
-            kt.data.random_motion(240, skeleton="h36m17", generator=torch.Generator().manual_seed(s)) for s in seeds
-        ]
+        draw = lambda seed: torch.Generator().manual_seed(seed)  # noqa: E731
+        clips = [kt.data.random_motion("h36m17", 240, turn=0.0, generator=draw(seed)) for seed in seeds]
         return kt.SKELETONS["h36m17"], [clip.points for clip in clips]
     found = []
     for path in sorted(Path(data).glob("cmu_[0-9]*.npz")):
@@ -83,13 +83,13 @@ def error(found: Tensor, truth: Tensor) -> Tensor:
     return safe_norm(centre(found)[0] - truth).mean((-2, -1))
 
 
-def build(kind: str, skeleton: kt.Skeleton, steps: int, *, trained: bool = False, **options: float) -> Unrolled:
+def build(kind: str, skeleton: kt.Skeleton, steps: int, *, trained: bool = False, **options: Any) -> Unrolled:
     """An untrained solver; ``trained``: one whose bone lengths are learned, too, where it has any."""
     if kind == "fpc":
         return kt.nn.UnrolledFPC(steps, **options)
     kinds = {"sfam": kt.nn.UnrolledSfAM, "pkc": kt.nn.UnrolledPKC, "kcs": kt.nn.UnrolledKCS}
     if kind == "kcs":
-        options = {"arrangement": "frames", **options}  # type: ignore[dict-item]
+        options = {"arrangement": "frames", **options}
     return kinds[kind](skeleton, steps, learnable_lengths=trained, **options)
 
 

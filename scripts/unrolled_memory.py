@@ -14,6 +14,7 @@ import argparse
 import time
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,18 +23,18 @@ import kcs_torch as kt
 from kcs_torch.nn.unrolled import Unrolled
 from kcs_torch.solvers import Implicit
 
-MODES: dict[str, Callable[[int], dict[str, object]]] = {
+MODES: dict[str, Callable[[int], dict[str, Any]]] = {
     "unrolled": lambda steps: {},
     "grad_steps=5": lambda steps: {"grad_steps": 5},
     "implicit": lambda steps: {"gradient": Implicit(settle=0)},
 }
 
 
-def build(kind: str, skeleton: kt.Skeleton, steps: int, **options: object) -> Unrolled:
+def build(kind: str, skeleton: kt.Skeleton, steps: int, **options: Any) -> Unrolled:
     if kind == "fpc":
-        return kt.nn.UnrolledFPC(steps, **options)  # type: ignore[arg-type]
+        return kt.nn.UnrolledFPC(steps, **options)
     kinds = {"sfam": kt.nn.UnrolledSfAM, "kcs": kt.nn.UnrolledKCS, "pkc": kt.nn.UnrolledPKC}
-    return kinds[kind](skeleton, steps, **options)  # type: ignore[arg-type]
+    return kinds[kind](skeleton, steps, **options)
 
 
 def measure(layer: Unrolled, tracks: Tensor, cameras: Tensor) -> tuple[float, float]:
