@@ -109,6 +109,17 @@ def test_a_rigid_shape_is_one_shape():
     assert_close(world, world[:1].expand_as(world))
 
 
+@quiet
+@pytest.mark.parametrize("noise", [0.0, 1e-4])
+@pytest.mark.parametrize("method", [PTA(), CSF(), BMM()], ids=lambda method: method.name)
+def test_a_stiff_body_stays_stiff(method, noise):
+    """Models with room for more do not make use of it."""
+    cameras = (turning(60, 180.0, tilt=0.3) @ rotations(seed=2))[:, :2]
+    tracks, truth = seen_from(rigid_body(60, 17), cameras)
+    points = tracks.points + noise * tracks.points.std() * normal(60, 17, 2)
+    assert error(method(kt.Tracks.from_arrays(points)).points, truth) < 0.02
+
+
 def test_the_default_number_of_cosines_is_what_the_tracks_need():
     cameras = rotations(70, seed=7)[:, :2]
     counts = []

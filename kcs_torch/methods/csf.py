@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.spectral import dct_basis
+from kcs_torch.functional.spectral import dct_basis, singular_values
 from kcs_torch.methods.factorised import Factorised, camera_rows, fit_basis_shapes, trajectory_design
 from kcs_torch.solvers.iterate import Solution, iterate
 
 __all__ = ["CSF"]
+
+FAINT = 2e-4
+"""Singular values of the tracks below this share of the largest do not count for their rank."""
 
 RIDGE = 1e-9
 """Of the shapes' normal matrix, a share of its mean diagonal: before a camera that stands still it is singular."""
@@ -28,7 +32,8 @@ class CSF(Factorised):
     skeleton is not looked at.
 
     Args:
-        rank: K basis shapes; at most a fifth of the joints, as 3K columns explain the tracks of as many joints anyway.
+        rank: K basis shapes; at most a fifth of the joints, as 3K columns explain the tracks of as many joints anyway,
+            and no more than a third of the tracks' rank.
         cosines: d, the share of the number of frames.
         num_steps: Gauss-Newton steps, at most.
         tolerance: stop where steps lower the cost by less than this share.
@@ -63,7 +68,9 @@ class CSF(Factorised):
     def find_shape(self, tracks: Tensor, weights: Tensor, cameras: Tensor) -> Solution[Tensor]:
         """Weights of the shapes by Gauss-Newton, then the shapes by least squares."""
         frames, joints = tracks.shape[:2]
-        rank = max(1, min(self.rank, frames, (joints - 1) // 5))
+        size = singular_values(tracks.mT.flatten(0, 1))
+        told = int((size > FAINT * size[0]).sum())  # a stiff body has one shape: weights of others would be arbitrary
+        rank = max(1, min(self.rank, frames, (joints - 1) // 5, math.ceil(told / 3)))
         count = min(max(round(self.cosines * frames), rank), MOST, frames)
         basis = dct_basis(frames, count, dtype=tracks.dtype, device=tracks.device)
         fitted = fit_column_space(
