@@ -39,6 +39,13 @@ def null_space_upgrade(motion: Tensor, *, softness: float = 1e-3, num_steps: int
         ShapeError: R is below 3.
 
     Dai, Li, He 2012; Xiao, Chai, Kanade 2004 and Akhter et al. 2009 on the null space's dimension, 2K^2 - K.
+
+    >>> from kcs_torch.functional import factorize, orbit, orthonormality_defect
+    >>> cameras = orbit(torch.linspace(0, 200, 30, dtype=torch.float64), pitch=20)[:, :2]
+    >>> body = torch.randn(9, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    >>> motion, _ = factorize((body - body.mean(0)) @ cameras.mT, 3)
+    >>> bool(orthonormality_defect(motion @ null_space_upgrade(motion)).max() < 1e-6)
+    True
     """
     if motion.ndim < 3 or motion.shape[-2] != 2 or motion.shape[-1] < 3:
         raise ShapeError(f"null_space_upgrade: expected motion (..., T, 2, R) with R >= 3, got {tuple(motion.shape)}")
