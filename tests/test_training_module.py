@@ -78,7 +78,9 @@ def test_losses_are_given_what_they_ask_for():
     assert LossTerm(loss).value(points, batch, nn.Identity()) == pytest.approx(value.mean().item())
     assert loss.given[1] is batch.tracks and loss.given[2] is batch.weights
     loss = AsksForPoints(value)
-    assert LossTerm(loss, on="unlabelled").value(points, batch, nn.Identity()) == pytest.approx(value[2:].mean().item())
+    assert LossTerm(loss, clips="unlabelled").value(points, batch, nn.Identity()) == pytest.approx(
+        value[2:].mean().item()
+    )
     assert loss.given[1] is None  # a network places joints that are unseen: they count
     loss = AsksForTarget(value)
     found = LossTerm(loss).value(points, batch, nn.Identity())
@@ -88,15 +90,15 @@ def test_losses_are_given_what_they_ask_for():
     share = weights.mean(-1)
     torch.testing.assert_close(found, (value * share).sum() / share.sum())
     clips = AsksForTarget(value[:, 0])
-    found = LossTerm(clips, on="labelled").value(points, batch, nn.Identity())
+    found = LossTerm(clips, clips="labelled").value(points, batch, nn.Identity())
     torch.testing.assert_close(found, value[:2, 0].mean())
 
 
 def test_a_loss_over_nothing_is_0():
     batch = batch_of(labelled=0, pseudo=0)
     points = torch.randn(6, 5, 17, 3, requires_grad=True)
-    for on in ("all", "labelled"):
-        value = LossTerm(kt.nn.JointDistance(), on=on).value(points, batch, nn.Identity())
+    for chosen in ("all", "labelled"):
+        value = LossTerm(kt.nn.JointDistance(), clips=chosen).value(points, batch, nn.Identity())
         assert value == 0
         assert torch.isfinite(torch.autograd.grad(value, points)[0]).all()
 
@@ -105,7 +107,7 @@ def test_a_loss_over_nothing_is_0():
     ("make", "words"),
     [
         (lambda: LossTerm(nn.MSELoss()), "MSELoss needs input"),
-        (lambda: LossTerm(kt.nn.JointDistance(), on="some"), "expected one of all, labelled, unlabelled"),
+        (lambda: LossTerm(kt.nn.JointDistance(), clips="some"), "expected one of all, labelled, unlabelled"),
         (lambda: LossTerm("JointDistance"), "expected a torch.nn.Module, got str"),
         (lambda: LiftingModule(kt.nn.MLPLifter(BODY), {}), "losses: expected at least one"),
         (lambda: LiftingModule(nn.Identity(), {"a": LossTerm(CycleConsistency())}), "flip: expected a network"),
@@ -190,7 +192,7 @@ TERMS = {
     "joints": lambda: LossTerm(kt.nn.JointDistance(align="root")),
     "bones": lambda: LossTerm(kt.nn.BoneLengthEnergy(BODY), 0.1),
     "tracks": lambda: LossTerm(kt.nn.ReprojectionEnergy(), 0.1),
-    "cycle": lambda: LossTerm(CycleConsistency(), 0.1, on="unlabelled"),
+    "cycle": lambda: LossTerm(CycleConsistency(), 0.1, clips="unlabelled"),
 }
 
 

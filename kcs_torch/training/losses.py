@@ -16,7 +16,7 @@ from kcs_torch.training.batch import Batch
 
 __all__ = ["CycleConsistency", "LossTerm"]
 
-On = Literal["all", "labelled", "unlabelled"]
+Clips = Literal["all", "labelled", "unlabelled"]
 
 _GIVEN = ("points", "tracks", "weights", "target", "network")
 
@@ -32,20 +32,20 @@ class LossTerm:
             joints as well; ``network``, to be called again. It returns (B, T) or (B,). Energies of :mod:`kcs_torch.nn`
             that need no more than these will do.
         weight: factor. Losses see every clip at root mean square 1, so it does not depend on units.
-        on: the clips that count: "all", those whose truth may be used ("labelled"), or the others. Where a loss takes a
+        clips: those that count: "all", those whose truth may be used ("labelled"), or the others. Where a loss takes a
             target, frames count by its weights.
 
     Raises:
-        OptionError: the loss needs something else, or ``on`` is none of these.
+        OptionError: the loss needs something else, or ``clips`` is none of these.
     """
 
     loss: nn.Module
     weight: float = 1.0
-    on: On = "all"
+    clips: Clips = "all"
 
     def __post_init__(self) -> None:
-        if self.on not in get_args(On):
-            raise OptionError(f"LossTerm: on: expected one of {', '.join(get_args(On))}, got {self.on!r}")
+        if self.clips not in get_args(Clips):
+            raise OptionError(f"LossTerm: clips: expected one of {', '.join(get_args(Clips))}, got {self.clips!r}")
         if not isinstance(self.loss, nn.Module):
             raise OptionError(f"LossTerm: loss: expected a torch.nn.Module, got {type(self.loss).__name__}")
         other = [name for name, p in self._wanted().items() if p.default is p.empty and name not in _GIVEN]
@@ -62,7 +62,7 @@ class LossTerm:
         """The mean of the loss over the clips, or frames, that count: a number, 0 where none does."""
         wanted = self._wanted()
         labelled = batch.labelled.to(points)[:, None]  # (B, 1)
-        share = {"all": torch.ones_like(labelled), "labelled": labelled, "unlabelled": 1 - labelled}[self.on]
+        share = {"all": torch.ones_like(labelled), "labelled": labelled, "unlabelled": 1 - labelled}[self.clips]
         given: dict[str, Any] = {"points": points, "tracks": batch.tracks, "target": batch.points, "network": network}
         if "target" in wanted:
             given["weights"] = torch.where(labelled[..., None] > 0, torch.ones_like(batch.pseudo), batch.pseudo)
