@@ -207,7 +207,7 @@ def _solve(normal: Tensor, goal: Tensor) -> Tensor:
     return torch.cholesky_solve(goal[..., None], factor)[..., 0]
 
 
-RIDGE = 1e-5
+RIDGE = 1e-3
 """Of a triangulation, a share of its trace: depth that the window does not show is taken for small."""
 
 
