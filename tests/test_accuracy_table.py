@@ -29,8 +29,8 @@ SHARE, LEAST = 0.1, 0.3
 """Tolerance: of the figure, and in mm."""
 
 STIFF, LEANING = 15.0, {"kcs": 55.0, "csf": 75.0}
-"""A stiff body before a camera that goes half around is a riddle to few (mm): KCS leans on its template, and CSF's ranks
-have more freedom than such a body needs."""
+"""A stiff body before a camera that goes half around is a riddle to few (mm): KCS leans on its template, and CSF's
+ranks have more freedom than such a body needs."""
 
 pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
 

@@ -5,8 +5,10 @@ import torch
 
 from kcs_torch.data.synthetic import walking_person
 from kcs_torch.functional import complete_rotation, viewpoint_turn
+from kcs_torch.methods.pkc import moving_view as module
 from kcs_torch.methods.pkc.moving_view import moving_view
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.solvers.procrustean import Stage
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +83,25 @@ def test_needs_no_further_start_where_the_first_is_good(film):
     cameras = complete_rotation(clip.cameras)
     found = moving_view(points[..., :2], clip.skeleton, points, cameras, turns=(), lifts=0)
     assert depth_error(found.pose.points[0], points) < 0.05
+
+
+def test_descents_of_several_clips_together_as_alone(monkeypatch):
+    """Those of one length as one batch, in runs that are not too large, each with its own answer."""
+    stages = (Stage(1e-2, 4, 1.0, 0.0, 0.1), Stage(1e-3, 4, 0.01, 1.0, 0.03))
+    tasks = []
+    for i, (frames, count) in enumerate(((12, 2), (15, 1), (12, 3), (12, 1))):
+        clip = walking_person(frames, turn=120.0, yaw=30.0 * i)
+        points = clip.points - clip.points.mean(1, keepdim=True)
+        points = points / points.square().sum(-1).mean().sqrt()
+        start = points.repeat(count, 1, 1, 1)
+        start[..., 2] *= torch.linspace(0.2, 0.8, count, dtype=torch.float64)[:, None, None]
+        bones = clip.tracks.skeleton.bone_index()
+        turned = module.align_rotations(start, torch.eye(3).double().expand(count, frames, 3, 3), bones)
+        tasks.append(module.Descent(points[..., :2], start, turned, bones, None, bones, 1.0, 0.0, stages))
+    for most in (8192, 40):
+        monkeypatch.setattr(module, "TOGETHER", most)
+        for task, found in zip(tasks, module.descend_all(tasks), strict=True):
+            (alone,) = module.descend_all([task])
+            assert found.points.shape == task.points.shape
+            torch.testing.assert_close(found.points, alone.points, rtol=0, atol=1e-6)
+            torch.testing.assert_close(found.objective, alone.objective, rtol=1e-6, atol=1e-6)

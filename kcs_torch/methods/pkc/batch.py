@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from kcs_torch.methods.pkc.moving_view import Descent, descend_all
 from kcs_torch.methods.pkc.objective import Objective, Refined
+from kcs_torch.methods.sfam import SfAM
+from kcs_torch.types import Tracks
 
-__all__ = ["Task", "minimise_all"]
+__all__ = ["Task", "minimise_all", "serve"]
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,21 @@ class Task:
 
 TOGETHER = 16384
 """Frames of hypotheses that are refined as one batch; more would only fall out of the processor's cache."""
+
+
+def serve(requests: Sequence[Task | Descent | Tracks]) -> list[Any]:
+    """Answer what searches of several clips ask for: hypotheses refined, starts descended from, SfAM's solutions."""
+    answers: dict[type, Callable[[list[Any]], list[Any]]] = {
+        Task: minimise_all,
+        Descent: descend_all,
+        Tracks: SfAM().solve_all,
+    }
+    out: dict[int, Any] = {}
+    for kind, answer in answers.items():
+        asked = [i for i, one in enumerate(requests) if isinstance(one, kind)]
+        if asked:
+            out |= zip(asked, answer([requests[i] for i in asked]), strict=True)
+    return [out[i] for i in range(len(requests))]
 
 
 def minimise_all(tasks: Sequence[Task]) -> list[Refined]:

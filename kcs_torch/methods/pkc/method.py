@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -16,18 +16,18 @@ from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import WEAK_TURN, Estimate, Method
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, depth_deviation, told_by_prior
-from kcs_torch.methods.pkc.batch import Task, minimise_all
+from kcs_torch.methods.pkc.batch import serve
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.fixed_view import Hypotheses, distinct
 from kcs_torch.methods.pkc.gate import plausible
-from kcs_torch.methods.pkc.moving_view import MovingView, moving_view
-from kcs_torch.methods.pkc.objective import Refined
+from kcs_torch.methods.pkc.moving_view import Descent, MovingView
+from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import weak_perspective
 from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.denoise import denoise_tracks
-from kcs_torch.solvers.procrustean import COARSE, FINE, align_rotations, procrustean
+from kcs_torch.solvers.procrustean import COARSE, FINE, align_rotations
 from kcs_torch.types import Tracks
 
 __all__ = ["PKC"]
@@ -105,13 +105,13 @@ class PKC(Method):
 
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Clean the tracks, try both viewpoints, rank what they give."""
-        return run(self._steps(tracks, cameras), minimise_all)
+        return run(self._steps(tracks, cameras), serve)
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
         """Several clips, whose hypotheses are refined together."""
-        return run(together([self._steps(one, None) for one in tracks]), minimise_all)
+        return run(together([self._steps(one, None) for one in tracks]), serve)
 
-    def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Task, Refined, Estimate]:
+    def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
         image, noise, notes = self._clean(tracks)
         size = weak_perspective(image, tracks.seen, tracks.skeleton, tracks.fps or 30.0)
         if size is None:
@@ -123,7 +123,7 @@ class PKC(Method):
 
     def _solve(
         self, tracks: Tracks, image: Tensor, noise: Tensor, cameras: Tensor | None, notes: tuple[str, ...]
-    ) -> Search[Task, Refined, Estimate]:
+    ) -> Search[Any, Any, Estimate]:
         """Solve complete tracks (T, N, 2) of a body whose size in the image does not change."""
         skeleton = tracks.skeleton
         has_trunk = len(trunk_joints(skeleton)) >= 3
@@ -134,7 +134,7 @@ class PKC(Method):
         body = Body(skeleton, image, tracks.fps or 30.0, noise) if has_trunk else None
         enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
         if body is None:
-            moving, first = self._moving(tracks, image, cameras, enough)
+            moving, first = yield from self._moving(tracks, image, cameras, enough)
             if moving is None:
                 why = "so few frames or joints are" if not enough else "with known cameras, bones that are no tree are"
                 return replace(first, notes=(*notes, f"{why} solved by sfam", *first.notes))
@@ -148,7 +148,8 @@ class PKC(Method):
             turn = float(viewpoint_turn(body.frames(found.depth[0])[:, :2]))
             moves = moves and (cameras is not None or turn >= TURNING)
         if moves:
-            found = yield from self._ranked(body, self._moving(tracks, image, cameras, enough)[0], cameras, found)
+            moving, _ = yield from self._moving(tracks, image, cameras, enough)
+            found = yield from self._ranked(body, moving, cameras, found)
         assert found is not None
         return self._from_hypotheses(found, body, image, cameras, notes)
 
@@ -186,22 +187,23 @@ class PKC(Method):
 
     def _moving(
         self, tracks: Tracks, image: Tensor, cameras: Tensor | None, enough: bool
-    ) -> tuple[MovingView | None, Estimate]:
+    ) -> Search[Any, Any, tuple[MovingView | None, Estimate]]:
         """Solutions of the moving viewpoint, and SfAM's first guess; the guess alone where there is too little."""
         seen = replace(tracks, points=image, weights=torch.ones_like(tracks.weights))
-        first = SfAM().solve(seen, cameras)
+        (first,) = (yield [seen]) if cameras is None else [SfAM().solve(seen, cameras)]
         if not enough:
             return None, first
         rotations = complete_rotation(first.cameras)
         if cameras is None:
             lifts = 0 if self.viewpoint == "auto" and len(trunk_joints(tracks.skeleton)) >= 3 else self.lifts
-            return moving_view(image, tracks.skeleton, first.points, rotations, lifts=lifts, seed=self.seed), first
+            search = turning(image, tracks.skeleton, first.points, rotations, lifts=lifts, seed=self.seed)
+            return (yield from search), first
         bones = tracks.skeleton.bone_index(device=image.device)
         if not tracks.skeleton.is_tree:
             return None, first
         start = torch.cat([image, first.points[..., 2:] - first.points[..., 2:].mean(1, keepdim=True)], -1)[None]
         turned = align_rotations(start, rotations[None], bones)
-        pose = procrustean(image, start, turned, bones, stages=(*COARSE[-1:], *FINE))
+        (pose,) = yield [Descent(image, start, turned, bones, None, bones, 1.0, 0.0, (*COARSE[-1:], *FINE))]
         return MovingView(pose, bones, bones, 1.0), first
 
     def _from_moving(
@@ -238,7 +240,7 @@ class PKC(Method):
 
     def _ranked(
         self, body: Body, moving: MovingView | None, cameras: Tensor | None, found: Hypotheses | None
-    ) -> Search[Task, Refined, Hypotheses]:
+    ) -> Search[Any, Any, Hypotheses]:
         """All hypotheses of a body with a template, best first."""
         assert moving is not None
         depth = moving.pose.points[:1, ..., 2] * body.factor

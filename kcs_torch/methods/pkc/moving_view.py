@@ -12,6 +12,7 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.functional.temporal import interpolate
+from kcs_torch.methods.lockstep import Search, run
 from kcs_torch.nn.unrolled import UnrolledSfAM
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.camera_path import CameraPath, choose_path, settle_path
@@ -28,7 +29,7 @@ from kcs_torch.solvers.procrustean import (
     procrustean,
 )
 
-__all__ = ["MovingView", "moving_view"]
+__all__ = ["Descent", "MovingView", "descend_all", "moving_view", "searching"]
 
 TURNS = (30.0, 60.0, 90.0, 120.0, 180.0, 360.0)
 """Degrees that the cameras of the starts turn, evenly, about the image's vertical."""
@@ -44,6 +45,9 @@ TIGHT = 10.0
 
 LOOSE, LOOSER = 0.3, 0.1
 """Weight of each length where the links are no tree (markers, say), in the coarse stages and in the fine ones."""
+
+TOGETHER = 8192
+"""Frames of starts that are descended from as one batch; more would only fall out of the processor's cache."""
 
 ROBOT = 10
 """Up to as many joints, twenty times the random starts are tried: they are cheap, and little else decides."""
@@ -86,6 +90,58 @@ class MovingView:
         )[0]
 
 
+@dataclass(frozen=True)
+class Descent:
+    """Starts that are to be descended from, as :func:`procrustean` does; its arguments."""
+
+    tracks: Tensor
+    points: Tensor
+    rotations: Tensor
+    bones: Tensor
+    weights: Tensor | None
+    rigid: Tensor
+    stiffness: float
+    noise: float
+    stages: tuple[Stage, ...]
+
+    @property
+    def kind(self) -> object:
+        """What descents must share to be made as one: exact tracks of one length, and all settings."""
+        if self.noise > 0 or self.weights is not None:
+            return id(self)
+        links = tuple(self.bones.flatten().tolist()), tuple(self.rigid.flatten().tolist())
+        return self.points.shape[1:], self.points.dtype, self.points.device, links, self.stiffness, self.stages
+
+
+def descend_all(tasks: Sequence[Descent]) -> list[Pose]:
+    """:func:`procrustean` from each task's starts; those of one kind are descended from together."""
+    groups: dict[object, list[int]] = {}
+    for i, task in enumerate(tasks):
+        groups.setdefault(task.kind, []).append(i)
+    out: dict[int, Pose] = {}
+    for group in groups.values():
+        frames = tasks[group[0]].points.shape[1]
+        while group:
+            run, rows = [group.pop(0)], 0
+            rows = len(tasks[run[0]].points)
+            while group and (rows + len(tasks[group[0]].points)) * frames <= TOGETHER:
+                run.append(group.pop(0))
+                rows += len(tasks[run[-1]].points)
+            out |= zip(run, _descend([tasks[i] for i in run]), strict=True)
+    return [out[i] for i in range(len(tasks))]
+
+
+def _descend(tasks: list[Descent]) -> list[Pose]:
+    first = tasks[0]
+    points, rotations = torch.cat([t.points for t in tasks]), torch.cat([t.rotations for t in tasks])
+    pose = procrustean(
+        first.tracks, points, rotations, first.bones, weights=first.weights, rigid=first.rigid,
+        stiffness=first.stiffness, noise=first.noise, stages=first.stages,
+    )  # fmt: skip
+    parts = (x.split([len(t.points) for t in tasks]) for x in (pose.points, pose.rotations, pose.objective, pose.moved))
+    return [Pose(*part) for part in zip(*parts, strict=True)]
+
+
 def moving_view(
     image: Tensor,
     skeleton: Skeleton,
@@ -119,6 +175,28 @@ def moving_view(
     Returns:
         The solutions, ranked.
     """
+    search = searching(
+        image, skeleton, start, rotations, weights=weights, noise=noise, turns=turns, lifts=lifts,
+        coarse_frames=coarse_frames, alternatives=alternatives, seed=seed,
+    )  # fmt: skip
+    return run(search, descend_all)
+
+
+def searching(
+    image: Tensor,
+    skeleton: Skeleton,
+    start: Tensor,
+    rotations: Tensor,
+    *,
+    weights: Tensor | None = None,
+    noise: float = 0.0,
+    turns: Sequence[float] = TURNS,
+    lifts: int = 6,
+    coarse_frames: int = 100,
+    alternatives: int = 1,
+    seed: int = 0,
+) -> Search[Descent, Pose, MovingView]:
+    """:func:`moving_view` as a search, which may run beside others; arguments as there."""
     frames, joints, _ = image.shape
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
@@ -127,6 +205,12 @@ def moving_view(
     bones = skeleton.bone_index(device=image.device) if is_tree else spread(first[0])
     coarse, fine = (tuple(_soften(s, noise) for s in stages) for stages in (COARSE, FINE))
     tight = (1.0, TIGHT) if is_tree else (LOOSE, LOOSER)
+
+    def descend(
+        tracks: Tensor, pose: Pose, pull: float, stages: tuple[Stage, ...], weights: Tensor | None
+    ) -> Search[Descent, Pose, Pose]:
+        (found,) = yield [Descent(tracks, pose.points, pose.rotations, bones, weights, rigid, pull, noise, stages)]
+        return found
 
     pick = torch.arange(0, frames, max(1, -(-frames // coarse_frames)), device=image.device)
     few, few_weights = image[pick], None if weights is None else weights[pick]
@@ -137,16 +221,10 @@ def moving_view(
     pose = Pose(points, turned, zero, zero)
     order = torch.arange(len(points))
     for stage, kept in zip(coarse, KEPT, strict=True):
-        pose = procrustean(
-            few, pose.points, pose.rotations, bones,
-            weights=few_weights, rigid=rigid, stiffness=tight[0], noise=noise, stages=[stage],
-        )  # fmt: skip
+        pose = yield from descend(few, pose, tight[0], (stage,), few_weights)
         best = pose.objective.argsort()[: kept if joints > ROBOT else 3 * kept]
         pose, order = pose[best], order[best.cpu()]
-    pose = procrustean(
-        few, pose.points, pose.rotations, bones,
-        weights=few_weights, rigid=rigid, stiffness=tight[1], noise=noise, stages=fine,
-    )  # fmt: skip
+    pose = yield from descend(few, pose, tight[1], fine, few_weights)
     best = _rank(pose, bones, rigid, tight[0], noise)[:alternatives]
     pose, order = pose[best], order[best.cpu()]
 
@@ -156,18 +234,12 @@ def moving_view(
         points = torch.where(own[:, None, None, None], first, points)
         turned = torch.where(own[:, None, None, None], align_rotations(first, rotations[None], bones), turned)
         stages = coarse if bool(own.any()) else coarse[-1:]
-        pose = procrustean(
-            image, points, turned, bones,
-            weights=weights, rigid=rigid, stiffness=tight[0], noise=noise, stages=stages,
-        )  # fmt: skip
+        pose = yield from descend(image, replace(pose, points=points, rotations=turned), tight[0], stages, weights)
     if len(pick) == frames and is_tree:  # the finest stages have seen all frames
         return MovingView(pose, bones, rigid, tight[0])
     if not is_tree:
         bones = spread(pose.points[0])
-    pose = procrustean(
-        image, pose.points, pose.rotations, bones,
-        weights=weights, rigid=rigid, stiffness=tight[1], noise=noise, stages=fine,
-    )  # fmt: skip
+    pose = yield from descend(image, pose, tight[1], fine, weights)
     return MovingView(pose[_rank(pose, bones, rigid, tight[0], noise)], bones, rigid, tight[0])
 
 
