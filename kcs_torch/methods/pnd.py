@@ -56,8 +56,8 @@ class PND(Method):
 
     name: ClassVar[str] = "pnd"
     keeps_lengths: ClassVar[bool] = False
-    num_steps: int = 52
-    noise: float = 0.02
+    num_steps: int = 50
+    noise: float = 0.015
     final: float = 1e-6
     fall: float = 0.88
     spread: float = 3e-3
