@@ -99,7 +99,10 @@ def pivot(rows: list[Row], figure: str) -> tuple[list[Any], dict[str, list[float
 def slope(top: list[float], values: list[float]) -> float:
     """The exponent of growth: slope of log(value) over log(point), by least squares."""
     points = [(x, y) for x, y in zip(top, values, strict=True) if x > 0 and y > 0]
-    return float(np.polyfit(*np.log(np.array(points)).T, 1)[0]) if len(points) > 1 else math.nan
+    if len(points) < 2:
+        return math.nan
+    along, up = np.log(np.array(points)).T
+    return float(np.polyfit(along, up, 1)[0])
 
 
 def markdown(part: Part, rows: list[Row]) -> str:

@@ -138,7 +138,7 @@ def why(settings: Settings) -> Iterator[Row]:
     """What would bring KCS to the published figure: camera motion, template, arrangement, the printed camera step."""
     walks = {name: load_walk(settings, name) for name in WALKS}
     strangers = mean_pose([load_walk(settings, name) for name in OTHERS])
-    printed = {"scale_range": math.inf, "robust": None, "continuity": 0.0}
+    printed: dict[str, Any] = {"scale_range": math.inf, "robust": None, "continuity": 0.0}
     for i, name in enumerate(WALKS[: settings.walks]):
         walk = walks[name]
         others = mean_pose([other for key, other in walks.items() if key != name])
