@@ -1,14 +1,15 @@
 """PKC's half for viewpoints that turn: from a clip to ranked poses, cameras and uncertainty."""
 
+import sys
+
 import pytest
 import torch
 
 from kcs_torch.data.synthetic import walking_person
 from kcs_torch.functional import complete_rotation, viewpoint_turn
-from kcs_torch.methods.pkc import moving_view as module
-from kcs_torch.methods.pkc.moving_view import moving_view
+from kcs_torch.methods.pkc.moving_view import Descent, descend_all, moving_view
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.solvers.procrustean import Stage
+from kcs_torch.solvers.procrustean import Stage, align_rotations
 
 
 @pytest.fixture(scope="module")
@@ -96,12 +97,12 @@ def test_descents_of_several_clips_together_as_alone(monkeypatch):
         start = points.repeat(count, 1, 1, 1)
         start[..., 2] *= torch.linspace(0.2, 0.8, count, dtype=torch.float64)[:, None, None]
         bones = clip.tracks.skeleton.bone_index()
-        turned = module.align_rotations(start, torch.eye(3).double().expand(count, frames, 3, 3), bones)
-        tasks.append(module.Descent(points[..., :2], start, turned, bones, None, bones, 1.0, 0.0, stages))
+        turned = align_rotations(start, torch.eye(3).double().expand(count, frames, 3, 3), bones)
+        tasks.append(Descent(points[..., :2], start, turned, bones, None, bones, 1.0, 0.0, stages))
     for most in (8192, 40):
-        monkeypatch.setattr(module, "TOGETHER", most)
-        for task, found in zip(tasks, module.descend_all(tasks), strict=True):
-            (alone,) = module.descend_all([task])
+        monkeypatch.setattr(sys.modules[Descent.__module__], "TOGETHER", most)
+        for task, found in zip(tasks, descend_all(tasks), strict=True):
+            (alone,) = descend_all([task])
             assert found.points.shape == task.points.shape
             torch.testing.assert_close(found.points, alone.points, rtol=0, atol=1e-6)
             torch.testing.assert_close(found.objective, alone.objective, rtol=1e-6, atol=1e-6)
