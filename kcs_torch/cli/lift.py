@@ -41,8 +41,8 @@ MethodName = Annotated[
         "--method",
         "-m",
         metavar="NAME",
-        help="pkc, which is auto, sfam, kcs, pnd, smsr, local_rigidity, rigid, pta, csf or bmm; lift also takes a trained "
-        "network (.safetensors).",
+        help="pkc, which is auto, sfam, kcs, pnd, smsr, local_rigidity, rigid, pta, csf or bmm; lift also takes a "
+        "trained network (.safetensors).",
     ),
 ]
 Settings = Annotated[
