@@ -136,26 +136,30 @@ def plot(part: Part, rows: list[Row], path: Path) -> None:
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    shown, panels = plt.subplots(1, len(part.figures), figsize=(6 * len(part.figures), 4.5), squeeze=False)
+    shown, panels = plt.subplots(1, len(part.figures), figsize=(6 * len(part.figures) + 2, 4.5), squeeze=False)
+    settings = list(dict.fromkeys(row["setting"] for row in rows))
+    colours = {setting: plt.get_cmap("tab20")(i % 20) for i, setting in enumerate(settings)}
     for axes, figure in zip(panels[0], part.figures, strict=True):
         top, mean = pivot(rows, figure)
         names = any(isinstance(x, str) for x in top)
         place = np.arange(len(top)) if names else np.array(top, dtype=float)
         for i, (setting, (*values, _)) in enumerate(mean.items()):
+            style: dict[str, Any] = {"label": setting, "color": colours[setting]}
             if names:
-                axes.bar(place + 0.8 * (i / len(mean) - 0.5), values, 0.8 / len(mean), align="edge", label=setting)
+                axes.bar(place + 0.8 * (i / len(mean) - 0.5), values, 0.8 / len(mean), align="edge", **style)
             else:
-                axes.plot(place, values, marker="o", label=setting)
+                axes.plot(place, values, marker="o", **style)
         if names:
             axes.set_xticks(place, top, rotation=30, ha="right")
+            axes.set_yscale("log")
         if part.log:
             axes.set(xscale="log", yscale="log")
         axes.set(xlabel=part.at, ylabel=figure)
-        if mean:
-            axes.legend(fontsize=7)
+    lines = {name: line for axes in panels[0] for line, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     shown.suptitle(part.title, fontsize=10)
     shown.tight_layout()
-    shown.savefig(path, dpi=80)
+    shown.legend(lines.values(), lines.keys(), loc="center left", bbox_to_anchor=(1, 0.5), fontsize=7)
+    shown.savefig(path, dpi=80, bbox_inches="tight")
     plt.close(shown)
 
 

@@ -13,10 +13,9 @@ import torch
 from benchmark import load_input
 from papers import Part, Row, Settings
 from robustness import generator
-from torch import Tensor
 
 import kcs_torch as kt
-from kcs_torch.functional import centre, procrustes
+from kcs_torch.functional import procrustes
 from kcs_torch.methods import METHODS
 
 WALKS = tuple(f"35_{i:02d}" for i in range(1, 11))
@@ -27,6 +26,7 @@ JOINTS = {
     14: [1, 2, 3, 5, 6, 7, 13, 14, 15, 16, 17, 18, 19, 20],  # limbs, neck and head: what detectors give
     21: list(range(21)),
 }
+TRUNK = ("pelvis", "hip", "spine", "thorax", "neck", "shoulder")  # joints that tell where a body faces
 EDGES14 = [(0, 1), (1, 2), (3, 4), (4, 5), (6, 7), (6, 8), (8, 9), (9, 10), (6, 11), (11, 12), (12, 13), (6, 0), (6, 3)]
 FEW = 2  # paths a walk where many variants are compared
 LENGTHS = (100, 200, 400, 800, 1600, 3200)
@@ -119,19 +119,15 @@ def sides(settings: Settings) -> Iterator[Row]:
 
 
 def mean_pose(walks: Sequence[Walk]) -> list[list[float]]:
-    """The mean of all their frames, each turned onto it: (N, 3), x right, y down, z away."""
-    flip = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-    poses = centre(torch.cat([torch.from_numpy(walk.points) for walk in walks]))[0] * flip
+    """The mean of all their frames, trunks turned onto each other: (N, 3), x right, y down, z away."""
+    trunk = [any(part in name for part in TRUNK) for name in walks[0].names.tolist()]
+    poses = torch.cat([torch.from_numpy(walk.points) for walk in walks]) * torch.tensor([1.0, -1.0, -1.0])
+    poses = poses - poses[:, trunk].mean(1, keepdim=True)
     mean = poses[0]
-    for _ in range(3):
-        mean = turned_onto(poses, mean).mean(0)
+    for _ in range(5):
+        rotation, _ = procrustes(poses[:, trunk], mean[trunk].expand(len(poses), -1, 3))
+        mean = (poses @ rotation).mean(0)
     return mean.tolist()
-
-
-def turned_onto(poses: Tensor, mean: Tensor) -> Tensor:
-    """Centred poses (T, N, 3), each turned onto one (N, 3)."""
-    rotation, _ = procrustes(poses, mean.expand_as(poses))
-    return poses @ rotation
 
 
 def why(settings: Settings) -> Iterator[Row]:

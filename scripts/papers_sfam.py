@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,7 +31,10 @@ PRINTED = {
         "e3d": (0.0224, 0.0503, 0.0400, 0.0346),
         "e3d_world": (0.0266, 0.1692, 0.1034, 0.1377),
     },
-    "authors' code: PND2": {"e3d": (0.0048, 0.0193, 0.0222, 0.0169)},
+    "authors' code: PND2": {
+        "e3d": (0.0048, 0.0193, 0.0222, 0.0169),
+        "e3d_world": (math.nan, 0.1142, math.nan, 0.1046),
+    },
 }
 """What the papers print, and what their authors' public code gives by the same measure."""
 
