@@ -146,6 +146,9 @@ def why(settings: Settings) -> Iterator[Row]:
             "mean of the subject's other walks": kt.KCS(template=others),
             "mean of the subject's other walks, cameras as printed": kt.KCS(template=others, **printed),
             "mean of the subject's other walks, T x 3B": kt.KCS(template=others, arrangement="frames"),
+            "mean of the subject's other walks, T x 3B, cameras as printed": kt.KCS(
+                template=others, arrangement="frames", **printed
+            ),
             "mean of the very walk": kt.KCS(template=mean_pose([walk])),
         }
         for sway in (0, 10, 30, 90, 180):

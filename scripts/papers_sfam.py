@@ -93,11 +93,14 @@ def lengths(settings: Settings) -> Iterator[Row]:
 
 
 def variation(settings: Settings) -> Iterator[Row]:
-    """How much the lengths of truly rigid bones vary over time."""
+    """How much the lengths of truly rigid bones vary over time; with the true cameras, too, to tell them apart."""
     for label, tracks, truth in settings.bench.orbits():
         name = label.removeprefix("cmu_").removesuffix("_yaw45_orbit180")
-        for setting, method in rivals(settings).items():
-            yield {"setting": setting, "at": name, "case": label} | settings.bench.score(method(tracks), truth)
+        cameras = {"": None, ", true cameras": settings.bench.orbit_cameras(tracks.num_frames)}
+        for kind, known in cameras.items():
+            for method, recipe in rivals(settings).items():
+                figures = settings.bench.score(recipe(tracks, known), truth)
+                yield {"setting": method + kind, "at": name, "case": label} | figures
 
 
 PARTS = {
