@@ -117,11 +117,33 @@ def dense_fit_bones(points, lengths, bones, stiffness, num_steps, damping=0.0, s
     return current.reshape(points.shape)
 
 
+VIEWS = frozenset(
+    [
+        "_reshape_alias",
+        "_unsafe_view",
+        "alias",
+        "as_strided",
+        "detach",
+        "diagonal",
+        "expand",
+        "permute",
+        "select",
+        "slice",
+        "split",
+        "split_with_sizes",
+        "squeeze",
+        "t",
+        "transpose",
+        "unbind",
+        "unfold",
+        "unsqueeze",
+        "view",
+    ]
+)
+
+
 class Operations(TorchDispatchMode):
     """Counts what runs under it: operations, and the numbers that they write. Views are free and do not count."""
-
-    VIEWS = {"_reshape_alias", "_unsafe_view", "alias", "as_strided", "detach", "diagonal", "expand", "permute", "select"}
-    VIEWS |= {"slice", "split", "split_with_sizes", "squeeze", "t", "transpose", "unbind", "unfold", "unsqueeze", "view"}
 
     def __init__(self):
         super().__init__()
@@ -130,7 +152,7 @@ class Operations(TorchDispatchMode):
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         out = function(*args, **(kwargs or {}))
         name = function.overloadpacket.__name__
-        if name not in self.VIEWS:
+        if name not in VIEWS:
             self.total += 1
             self.names[name] += 1
             tensors = out if isinstance(out, (tuple, list)) else [out]

@@ -258,9 +258,9 @@ class CameraHead(_Network):
             weights: (..., T, N), 0 where unseen; all finite tracks are seen if None.
 
         Returns:
-            rows: (..., T, 2, 3) orthonormal; about the first two of the identity before training.
-            scale: (..., T) positive, in the unit of the tracks: the clip's root mean square before training; 0 where
-                all joints lie at one point.
+            rows (..., T, 2, 3), orthonormal, about the first two of the identity before training; and scale (..., T),
+            positive, in the unit of the tracks, the clip's root mean square before training; 0 where all joints lie at
+            one point.
 
         Raises:
             ShapeError: the tracks are not of this skeleton.
