@@ -124,6 +124,10 @@ def _method(method: str | Method, fields: dict[str, Any]) -> Method:
         return method
     if method == "auto":
         method = DEFAULT
+    if isinstance(method, str) and method.endswith(".safetensors"):
+        raise OptionError(
+            f"method: expected a name or a Method, got the file {method!r}: use kcs_torch.training.load_lifter(file)"
+        )
     if not isinstance(method, str) or method not in METHODS:
         raise unknown("method", method, ["auto", *METHODS])
     return METHODS[method].from_options(**fields)

@@ -190,3 +190,14 @@ def test_points_without_the_virtual_joints_are_told_how_to_get_them():
     assert KCSMatrix(body)(body.complete(points)[0]).shape == (2, body.num_bones, body.num_bones)
     with pytest.raises(ShapeError, match="expected a tensor of points, got ndarray"):
         KCSMatrix(body)(points.numpy())
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16], ids=["half", "bfloat"])
+def test_the_kcs_matrix_of_millimetres_is_finite_in_half_precision(dtype):
+    points = 500 * torch.randn(6, 17, 3, generator=torch.Generator().manual_seed(0))
+    layer, level = KCSMatrix("h36m17"), KCSMatrix("h36m17", normalise=True)
+    exact = layer(points)
+    with torch.autocast("cpu", dtype=dtype):
+        assert_close(layer(points), exact)
+    assert torch.isfinite(layer(points.to(dtype))).all() and exact.max() > torch.finfo(torch.float16).max
+    assert_close(level(points.to(dtype)).float(), level(points), rtol=0.05, atol=0.05)

@@ -256,3 +256,20 @@ def test_metrics_wait_for_torchmetrics_until_they_are_used():
     assert "pip install 'kcs-torch[train]'" in done.stdout and "mpjpe" in done.stdout
     code = "import sys, kcs_torch as kt\nkt.metrics.mpjpe\nassert 'torchmetrics' not in sys.modules\nkt.metrics.MPJPE"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+@pytest.mark.parametrize("align", sorted(kt.metrics.ALIGNMENTS))
+def test_points_in_half_precision(align):
+    points = torch.randn(2, 5, 17, 3, generator=torch.Generator().manual_seed(0))
+    truth = points + 0.1
+    metric, exact = kt.metrics.MPJPE(align), kt.metrics.MPJPE(align)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        metric.update(points.bfloat16(), truth)
+    exact.update(points.bfloat16().float(), truth)
+    torch.testing.assert_close(metric.compute(), exact.compute())
+
+
+@pytest.mark.parametrize("kind", [kt.metrics.MPJPE, kt.nn.JointDistance], ids=["metric", "loss"])
+def test_a_root_is_an_index(kind):
+    with pytest.raises(kt.OptionError, match="root: expected the index of a joint"):
+        kind("root", root="pelvis")

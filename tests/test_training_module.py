@@ -109,7 +109,11 @@ def test_a_loss_over_nothing_is_0():
         (lambda: LossTerm(nn.MSELoss()), "MSELoss needs input"),
         (lambda: LossTerm(kt.nn.JointDistance(), clips="some"), "expected one of all, labelled, unlabelled"),
         (lambda: LossTerm("JointDistance"), "expected a torch.nn.Module, got str"),
-        (lambda: LiftingModule(kt.nn.MLPLifter(BODY), {}), "losses: expected at least one"),
+        (lambda: LiftingModule(kt.nn.MLPLifter(BODY), {}), "losses: expected a mapping"),
+        (lambda: LiftingModule(kt.nn.MLPLifter(BODY), {"a": kt.nn.JointDistance()}), "losses: expected a mapping"),
+        (lambda: LiftingModule(kt.nn.MLPLifter(BODY), [LossTerm(CycleConsistency())]), "losses: expected a mapping"),
+        (lambda: LiftingModule(kt.nn.MLPLifter(BODY), {"loss": LossTerm(CycleConsistency())}), "names of losses"),
+        (lambda: LiftingModule(kt.nn.MLPLifter(BODY), {"a.b": LossTerm(CycleConsistency())}), "names of losses"),
         (lambda: LiftingModule(nn.Identity(), {"a": LossTerm(CycleConsistency())}), "flip: expected a network"),
         (lambda: LiftingModule(kt.nn.MLPLifter(BODY), {"a": LossTerm(CycleConsistency())}, lr=0), "lr: expected"),
     ],
@@ -117,6 +121,40 @@ def test_a_loss_over_nothing_is_0():
 def test_wrong_options(make, words):
     with pytest.raises(kt.OptionError, match=words):
         make()
+
+
+@pytest.mark.parametrize("shape", [(), (6, 5, 17), (5, 6)], ids=str)
+def test_a_loss_of_another_shape_is_told(shape):
+    with pytest.raises(kt.ShapeError, match="AsksForPoints to return a number for every clip"):
+        LossTerm(AsksForPoints(torch.ones(shape))).value(torch.randn(6, 5, 17, 3), batch_of(), nn.Identity())
+
+
+@pytest.mark.parametrize(
+    ("network", "loss"), [("h36m17", "cmu17"), ("cmu17", "h36m17"), ("cmu17", "cmu17")], ids=lambda name: name
+)
+def test_other_skeletons_of_as_many_joints_are_told(network, loss):
+    module = LiftingModule(kt.nn.MLPLifter(network, width=8), {"bones": LossTerm(kt.nn.BoneLengthEnergy(loss))}, seed=0)
+    trainer = lightning.Trainer(max_epochs=1, accelerator="cpu", **QUIET)
+    with pytest.raises(kt.SkeletonError, match="the data has 'h36m17'|has skeleton 'cmu17'"):
+        trainer.fit(module, datamodule=data_of())
+
+
+@pytest.mark.parametrize(("clips", "labelled"), [("labelled", 0.0), ("unlabelled", 1.0)])
+def test_training_on_nothing_is_told(clips, labelled):
+    module = LiftingModule(kt.nn.MLPLifter(BODY, width=8), {"a": LossTerm(kt.nn.SmoothnessEnergy(), clips=clips)})
+    trainer = lightning.Trainer(max_epochs=1, accelerator="cpu", **QUIET)
+    with pytest.raises(kt.OptionError, match="no clip of a whole epoch counted"):
+        trainer.fit(module, datamodule=data_of(labelled=labelled))
+
+
+def test_half_precision_trains_and_predicts():
+    module = module_of()
+    trainer = lightning.Trainer(max_epochs=1, accelerator="cpu", precision="bf16-mixed", **QUIET)
+    data = data_of()
+    trainer.fit(module, datamodule=data)
+    assert torch.isfinite(trainer.callback_metrics["val/pa_mpjpe"])
+    points = trainer.predict(module, dataloaders=data.val_dataloader())
+    assert points[0].shape[1:] == (9, 17, 3) and torch.isfinite(points[0].float()).all()
 
 
 def test_mirrored_clips_are_clips_of_a_mirrored_body():
@@ -316,3 +354,26 @@ def test_a_refined_network_keeps_to_the_tracks_and_can_be_saved(tmp_path):
     assert torch.isfinite(blank).all()
     with pytest.raises(kt.OptionError, match="solver to save"):
         save_lifter(tmp_path / "other.safetensors", kt.nn.RefinedLifter(network.network, nn.Identity()))
+
+
+def test_a_network_of_ones_own_trains_and_is_told_that_it_has_no_file(tmp_path):
+    from hydra import compose, initialize_config_dir
+
+    from kcs_torch.training.run import configs, train
+
+    with initialize_config_dir(version_base="1.3", config_dir=str(configs())):
+        config = compose(
+            "train",
+            overrides=[
+                "experiment=smoke",
+                "solver=sfam",
+                "solver._target_=kcs_torch.nn.UnrolledPKC",
+                "solver.num_steps=1",
+                "~solver.mu",
+                "~solver.articulate_from",
+                "+trainer.logger=false",
+            ],
+        )
+    with pytest.warns(kt.KcsWarning, match="no lifter.safetensors: unknown solver to save"):
+        outcome = train(config, tmp_path)
+    assert outcome.lifter is None and outcome.metrics["test/mpjpe"] > 0

@@ -44,4 +44,6 @@ def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = Non
         raise ShapeError(f"weights: expected shape {tuple(truth.shape[:-1])}, got {tuple(weights.shape)}")
     if how in ("root", "scale") and root is not None and not -truth.shape[-2] <= root < truth.shape[-2]:
         raise OptionError(f"root: expected a joint index below {truth.shape[-2]}, got {root}")
-    return superpose(pred, truth, how, weights, root=root)
+    wide = torch.promote_types(torch.promote_types(pred.dtype, truth.dtype), torch.float32)
+    with torch.autocast(pred.device.type, enabled=False):  # rotations need more than three digits
+        return superpose(pred.to(wide), truth.to(wide), how, None if weights is None else weights.to(wide), root=root)

@@ -78,6 +78,8 @@ class MPJPE(_Mean):
         super().__init__(**options)
         if align not in ALIGNMENTS:
             raise unknown("alignment", align, ALIGNMENTS)
+        if root is not None and (isinstance(root, bool) or not isinstance(root, int)):
+            raise OptionError(f"root: expected the index of a joint, as skeleton.index('pelvis') gives, got {root!r}")
         self.align, self.root = align, root
 
     def update(self, pred: Tensor, truth: Tensor, weights: Tensor | None = None) -> None:

@@ -38,6 +38,8 @@ class JointDistance(nn.Module):
         super().__init__()
         if align not in ALIGNMENTS:
             raise unknown("alignment", align, ALIGNMENTS)
+        if root is not None and (isinstance(root, bool) or not isinstance(root, int)):
+            raise OptionError(f"root: expected the index of a joint, as skeleton.index('pelvis') gives, got {root!r}")
         self.align, self.root = align, root
 
     def forward(self, points: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:

@@ -37,7 +37,7 @@ class SkeletonModule(nn.Module):
                 f"{type(self).__name__}: expected points (..., {'T, ' if clip else ''}{joints}, 3) for skeleton "
                 f"'{self.skeleton.name}', got {tuple(points.shape)}"
             )
-            if points.ndim >= 2 and points.shape[-2] == self.skeleton.num_observed:
+            if points.ndim >= 2 and points.shape[-2] == self.skeleton.num_observed < joints:
                 virtual = ", ".join(self.skeleton.joints[self.skeleton.num_observed :])
                 message += f": without its virtual joints {virtual}, which skeleton.complete(points) appends"
             raise ShapeError(message)
@@ -69,6 +69,9 @@ class BoneLengths(SkeletonModule):
 class KCSMatrix(SkeletonModule):
     """The KCS matrix Psi = B B^T: (..., N, D) to (..., B, B). See :func:`kcs_torch.functional.pose_matrix`.
 
+    Squares of millimetres leave the range of half precision: what it cannot hold comes back as its largest number.
+    Metres, or ``normalise``, fit.
+
     Args:
         skeleton: a :class:`Skeleton`, a built-in name or a file.
         normalise: divide by the mean squared bone length of each pose, which frees Psi of scale.
@@ -83,7 +86,8 @@ class KCSMatrix(SkeletonModule):
 
     def forward(self, points: Tensor) -> Tensor:
         self.check(points)
-        return pose_matrix(points, self.bones, normalise=self.normalise)
+        with full_precision(points):
+            return narrow(pose_matrix(wide(points), self.bones, normalise=self.normalise), points)
 
 
 class SVT(nn.Module):

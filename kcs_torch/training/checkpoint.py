@@ -60,8 +60,25 @@ def save_lifter(
     >>> load_lifter(path).network.options
     {'width': 8, 'num_blocks': 2, 'dropout': 0.1, 'window': 1}
     """
+    facts = {"version": version("kcs-torch"), "fps": fps, "notes": dict(notes or {})} | describe(network)
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
-    facts: dict[str, Any] = {"version": version("kcs-torch"), "fps": fps, "notes": dict(notes or {})}
+    try:
+        text = json.dumps(facts, allow_nan=False)  # in this order: that of virtual joints counts
+    except (TypeError, ValueError) as error:
+        raise OptionError(f"save_lifter: notes and fps: expected what JSON can hold, got {error}") from None
+    data = need("safetensors.torch", str(path), OutputError).save(tensors, {KEY: text})
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+    return Path(path)
+
+
+def describe(network: nn.Module) -> dict[str, Any]:
+    """What a file says of a network besides its weights.
+
+    Raises:
+        OptionError: it is no network that a file can name.
+    """
+    facts: dict[str, Any] = {}
     inner = network
     if isinstance(network, RefinedLifter):
         inner, solver = network.network, network.solver
@@ -72,15 +89,7 @@ def save_lifter(
     kind = type(inner).__name__
     if NETWORKS.get(kind) is not type(inner) or not isinstance(inner, (MLPLifter, TemporalLifter)):
         raise unknown("network to save", kind, NETWORKS)
-    facts |= {"network": kind, "options": inner.options, "skeleton": inner.skeleton.to_dict()}
-    try:
-        text = json.dumps(facts, allow_nan=False)  # in this order: that of virtual joints counts
-    except (TypeError, ValueError) as error:
-        raise OptionError(f"save_lifter: notes and fps: expected what JSON can hold, got {error}") from None
-    data = need("safetensors.torch", str(path), OutputError).save(tensors, {KEY: text})
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
-    return Path(path)
+    return facts | {"network": kind, "options": inner.options, "skeleton": inner.skeleton.to_dict()}
 
 
 def load_lifter(path: str | Path, *, device: torch.device | str = "cpu") -> Lifter:

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from kcs_torch.errors import OptionError
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import centre, orbit
 from kcs_torch.functional.chain import safe_norm
 from kcs_torch.training.batch import Batch
@@ -58,22 +58,37 @@ class LossTerm:
     def _wanted(self) -> dict[str, inspect.Parameter]:
         return dict(inspect.signature(self.loss.forward).parameters)
 
-    def value(self, points: Tensor, batch: Batch, network: nn.Module) -> Tensor:
-        """The mean of the loss over the clips, or frames, that count: a number, 0 where none does."""
-        wanted = self._wanted()
-        labelled = batch.labelled.to(points)[:, None]  # (B, 1)
+    def share(self, batch: Batch) -> Tensor:
+        """How much each frame counts, (B, T)."""
+        labelled = batch.labelled[:, None].expand(batch.weights.shape[:2])
         share = {"all": torch.ones_like(labelled), "labelled": labelled, "unlabelled": 1 - labelled}[self.clips]
+        return share * _trust(batch).mean(-1) if "target" in self._wanted() else share
+
+    def value(self, points: Tensor, batch: Batch, network: nn.Module) -> Tensor:
+        """The mean of the loss over the clips, or frames, that count: a number, 0 where none does.
+
+        Raises:
+            ShapeError: the loss returns something else than a number for every clip or frame.
+        """
+        wanted = self._wanted()
         given: dict[str, Any] = {"points": points, "tracks": batch.tracks, "target": batch.points, "network": network}
-        if "target" in wanted:
-            given["weights"] = torch.where(labelled[..., None] > 0, torch.ones_like(batch.pseudo), batch.pseudo)
-            share = share * given["weights"].mean(-1)
-        elif "tracks" in wanted:
-            given["weights"] = batch.weights
-        value: Tensor = self.loss(**{name: given[name] for name in given if name in wanted})
+        given["weights"] = _trust(batch) if "target" in wanted else batch.weights if "tracks" in wanted else None
+        value: Tensor = self.loss(**{name: x for name, x in given.items() if name in wanted and x is not None})
+        count, frames = points.shape[:2]
+        if value.shape not in ((count,), (count, frames)):
+            raise ShapeError(
+                f"LossTerm: expected {type(self.loss).__name__} to return a number for every clip ({count},) or frame "
+                f"({count}, {frames}), got {tuple(value.shape)}"
+            )
+        share = self.share(batch).to(value)
         if value.ndim == 1:
-            value, share = value[:, None], share.mean(-1, keepdim=True)
-        share = share.expand(value.shape)
+            share = share.mean(-1)
         return (value * share).sum() / share.sum().clamp_min(1e-6)
+
+
+def _trust(batch: Batch) -> Tensor:
+    """Weight of each joint's target (B, T, N): 1 where it is the truth, else that of the pseudo-label."""
+    return torch.where(batch.labelled[:, None, None] > 0, torch.ones_like(batch.pseudo), batch.pseudo)
 
 
 class CycleConsistency(nn.Module):

@@ -10,7 +10,7 @@ import lightning
 import torch
 from torch import Tensor, nn
 
-from kcs_torch.errors import OptionError
+from kcs_torch.errors import OptionError, SkeletonError
 from kcs_torch.functional import centre
 from kcs_torch.metrics.torch_metrics import MPJPE, BoneDeviation
 from kcs_torch.nn import RefinedLifter, critic_loss, generator_loss
@@ -23,6 +23,10 @@ __all__ = ["LiftingModule"]
 
 ALIGNED = {"mpjpe": "root", "n_mpjpe": "scale", "pa_mpjpe": "similarity", "rigid": "rigid"}
 """What is logged in validation and tests (as ``val/mpjpe``, ...), in the unit of the truth, and how it is aligned."""
+
+
+RESERVED = ("loss", "critic", "critic_own")
+"""What is logged under these names is not a single term."""
 
 
 class LiftingModule(lightning.LightningModule):
@@ -66,8 +70,12 @@ class LiftingModule(lightning.LightningModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
+        named = isinstance(losses, Mapping) and all(isinstance(term, LossTerm) for term in losses.values())
+        names = list(losses) if named else []
+        fine = all(isinstance(name, str) and name and "." not in name and name not in RESERVED for name in names)
         rules = {
-            "losses": (len(losses) > 0, losses, "at least one LossTerm"),
+            "losses": (named and len(losses) > 0, losses, "a mapping of names to at least one LossTerm"),
+            "names of losses": (fine, names, f"words without dots, none of them of {', '.join(RESERVED)}"),
             "critic_weight": (critic_weight >= 0, critic_weight, "a number not below 0"),
             "flip": (0 <= flip <= 1, flip, "a share within 0..1"),
             "turn": (0 <= turn <= 1, turn, "a share within 0..1"),
@@ -92,6 +100,7 @@ class LiftingModule(lightning.LightningModule):
         self.flip, self.turn = flip, turn
         self.lr, self.weight_decay, self.clip, self.seed = lr, weight_decay, clip, seed
         self.register_buffer("step", torch.zeros((), dtype=torch.long))
+        self._counted = False  # whether any clip has counted in any loss
         bones = isinstance(skeleton, Skeleton) and bool(skeleton.rigid)
         self.measured = nn.ModuleDict()
         for stage in ("val", "test"):
@@ -104,6 +113,39 @@ class LiftingModule(lightning.LightningModule):
         """Lift tracks (..., T, N, 2) with weights (..., T, N) to points (..., T, N, 3)."""
         points: Tensor = self.network(tracks, weights)
         return points
+
+    def on_fit_start(self) -> None:
+        """Compare the skeletons of all parts and of the data: joints in another order would train, and be wrong.
+
+        Raises:
+            SkeletonError: they differ.
+        """
+        data = getattr(getattr(self.trainer, "datamodule", None), "skeleton", None)
+        found = [("the data", data), *((type(m).__name__, getattr(m, "skeleton", None)) for m in self.modules())]
+        known = [(name, body) for name, body in found if isinstance(body, Skeleton)]
+        for name, body in known[1:]:
+            first, other = known[0]
+            if body.joints != other.joints:
+                raise SkeletonError(
+                    f"{name} has skeleton '{body.name}', {first} has '{other.name}': expected the same joints in the "
+                    "same order in data, network, losses, solver and critic"
+                )
+
+    def on_train_epoch_end(self) -> None:
+        """Stop where nothing was learnt from.
+
+        Raises:
+            OptionError: no clip of an epoch has counted in any loss.
+        """
+        if not self._counted:
+            raise OptionError(
+                "losses: no clip of a whole epoch counted in any of them: they ask for labels (or pseudo-labels), or "
+                "for clips without, and there are none"
+            )
+
+    def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Lift a batch."""
+        return self(batch.tracks, batch.weights)
 
     def training_step(self, batch: Batch, batch_idx: int) -> None:
         """Make one step of the network, and one of the critic."""
@@ -122,6 +164,8 @@ class LiftingModule(lightning.LightningModule):
         optimisers, schedules = _listed(self.optimizers()), _listed(self.lr_schedulers())
         points = self(batch.tracks, batch.weights)
         values = {name: term.value(points, batch, self.network) for name, term in self.losses.items()}
+        if not self._counted:
+            self._counted = any(bool((term.share(batch) > 0).any()) for term in self.losses.values())
         total = sum((self.losses[name].weight * value for name, value in values.items()), points.new_zeros(()))
         if self.critic is not None:
             values["critic"] = generator_loss(self.critic(centre(points)[0])).mean()

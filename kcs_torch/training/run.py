@@ -31,7 +31,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from kcs_torch.errors import KcsError, KcsWarning, OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
-from kcs_torch.training.checkpoint import save_lifter
+from kcs_torch.training.checkpoint import describe, save_lifter
 from kcs_torch.training.sweep import RESULT, tabulate
 
 __all__ = ["Outcome", "configs", "job", "main", "train"]
@@ -155,6 +155,7 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         lightning.seed_everything(config.seed, verbose=False)
         data = instantiate(config.data, _convert_="all")
         module = instantiate(config.module, _convert_="all")
+        savable = _savable(module.network)
         best = _Best(folder / "checkpoints", config.optimise, config.mode, resumed)
         made: dict[str, Any] = {
             "callbacks": [_Watch(plain), best, _Last(folder / "checkpoints")],
@@ -183,8 +184,21 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         tested = trainer.test(module, datamodule=data, ckpt_path=best.best_model_path, verbose=False, weights_only=True)
     metrics = {name: float(figure) for figures in tested for name, figure in figures.items()}
     notes = {"config": plain, "metrics": {name: f for name, f in metrics.items() if math.isfinite(f)}}
-    lifter = save_lifter(folder / "lifter.safetensors", module.network, fps=data.fps, notes=notes)
-    return Outcome(float(best.best_model_score), metrics, lifter)
+    lifter = folder / "lifter.safetensors"
+    if savable:
+        save_lifter(lifter, module.network, fps=data.fps, notes=notes)
+    return Outcome(float(best.best_model_score), metrics, lifter if savable else None)
+
+
+def _savable(network: Any) -> bool:
+    """Whether a trained network can be written to a file of its own; told before it is trained."""
+    try:
+        describe(network)
+    except OptionError as error:
+        text = f"there will be checkpoints, but no lifter.safetensors: {error}"
+        warnings.warn(text, KcsWarning, stacklevel=2)
+        return False
+    return True
 
 
 def _check(config: Mapping[str, Any]) -> None:
@@ -293,6 +307,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     before = sys.argv
     if arguments is not None:
         sys.argv = [before[0], *arguments]  # Hydra looks nowhere else
+    flags = [a for a in sys.argv[1:] if a in ("-m", "--multirun")]  # which Hydra takes before overrides only
+    sys.argv = [sys.argv[0], *flags, *(a for a in sys.argv[1:] if a not in flags)]
     try:
         entry()
     finally:
