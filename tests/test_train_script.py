@@ -94,7 +94,7 @@ class TestARun:
         assert json.loads(header)["notes"]["config"] == config
 
     def test_a_solver_behind_the_network_is_a_part_of_the_lifter(self, tmp_path):
-        outcome = train(composed("solver=sfam", "+solver.num_steps=2", "trainer.max_epochs=1"), tmp_path)
+        outcome = train(composed("solver=sfam", "solver.num_steps=2", "trainer.max_epochs=1"), tmp_path)
         network = load_lifter(outcome.lifter).network
         assert isinstance(network, kt.nn.RefinedLifter) and network.solver.num_steps == 2
 

@@ -23,6 +23,7 @@ class RefinedLifter(nn.Module):
         network: (tracks, weights) to points, such as :class:`TemporalLifter`.
         solver: called as ``solver(tracks, cameras, weights=..., start=points)``, such as :class:`UnrolledSfAM`.
 
+    >>> from kcs_torch.nn import TemporalLifter, UnrolledSfAM
     >>> network = RefinedLifter(TemporalLifter("h36m17"), UnrolledSfAM("h36m17", num_steps=3))
     >>> network(torch.rand(2, 27, 17, 2)).shape
     torch.Size([2, 27, 17, 3])

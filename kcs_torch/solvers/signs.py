@@ -57,8 +57,8 @@ def smooth_signs(
     >>> d = torch.tensor([[2.0, 1.0, 0.0, 1.0, 2.0]])[..., None]
     >>> unary = torch.zeros(1, 5, 1, 2)
     >>> unary[0, 0, 0, 1] = 1  # the first frame prefers +
-    >>> smooth_signs(unary, d, cap=9.0).signs.flatten().tolist()
-    [1.0, 1.0, 1.0, -1.0, -1.0]
+    >>> (smooth_signs(unary, d, cap=9.0).signs * d + 0).flatten().tolist()
+    [2.0, 1.0, 0.0, -1.0, -2.0]
     """
     costs = _Costs(unary, depths, cap, transition)
     frames, _, states, _ = costs.shape
