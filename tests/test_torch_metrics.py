@@ -269,7 +269,11 @@ def test_points_in_half_precision(align):
     torch.testing.assert_close(metric.compute(), exact.compute())
 
 
-@pytest.mark.parametrize("kind", [kt.metrics.MPJPE, kt.nn.JointDistance], ids=["metric", "loss"])
+def plain(align, root):
+    return mpjpe(torch.zeros(1, 2, 3), torch.zeros(1, 2, 3), align=align, root=root)
+
+
+@pytest.mark.parametrize("kind", [kt.metrics.MPJPE, kt.nn.JointDistance, plain], ids=["metric", "loss", "plain"])
 def test_a_root_is_an_index(kind):
     with pytest.raises(kt.OptionError, match="root: expected the index of a joint"):
         kind("root", root="pelvis")

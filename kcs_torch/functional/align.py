@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError
+from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.functional.chain import unit_size
 from kcs_torch.functional.derivatives import batch_first
 
@@ -22,6 +22,14 @@ ALIGNMENTS = {
     "sequence": "each frame moved; all frames turned and scaled by the same (Procrustes over the clip)",
 }
 """What each alignment of a motion with the truth does, by name."""
+
+
+def check_alignment(how: str, root: int | None = None) -> None:
+    """Raise an OptionError unless ``how`` names an alignment, and ``root`` is an index or None."""
+    if how not in ALIGNMENTS:
+        raise unknown("alignment", how, ALIGNMENTS)
+    if root is not None and (isinstance(root, bool) or not isinstance(root, int)):
+        raise OptionError(f"root: expected the index of a joint, as skeleton.index('pelvis') gives, got {root!r}")
 
 
 def centre(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:

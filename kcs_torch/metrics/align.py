@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError, unknown
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import ALIGNMENTS, superpose
+from kcs_torch.functional.align import check_alignment
 
 __all__ = ["ALIGNMENTS", "align"]
 
@@ -32,8 +33,7 @@ def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = Non
     >>> torch.allclose(align(3 * truth + 1, truth, "similarity"), truth, atol=1e-4)
     True
     """
-    if how not in ALIGNMENTS:
-        raise unknown("alignment", how, ALIGNMENTS)
+    check_alignment(how, root)
     if pred.shape != truth.shape or pred.ndim < 3 or pred.shape[-1] != 3:
         raise ShapeError(
             f"align: expected two of shape (..., T, N, 3), got {tuple(pred.shape)} and {tuple(truth.shape)}"

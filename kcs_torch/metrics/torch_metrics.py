@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError, unknown
-from kcs_torch.functional import ALIGNMENTS
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.align import check_alignment
 from kcs_torch.metrics.errors import bone_deviation, distances, e3d
 from kcs_torch.skeleton import Skeleton, get_skeleton
 
@@ -63,7 +63,7 @@ class MPJPE(_Mean):
         options: of ``torchmetrics.Metric``.
 
     Raises:
-        OptionError: there is no such alignment.
+        OptionError: there is no such alignment, or the root is no index.
 
     >>> metric = MPJPE(align="none")
     >>> truth = torch.zeros(2, 1, 2, 3)
@@ -76,10 +76,7 @@ class MPJPE(_Mean):
 
     def __init__(self, align: str = "root", *, root: int | None = None, **options: Any) -> None:
         super().__init__(**options)
-        if align not in ALIGNMENTS:
-            raise unknown("alignment", align, ALIGNMENTS)
-        if root is not None and (isinstance(root, bool) or not isinstance(root, int)):
-            raise OptionError(f"root: expected the index of a joint, as skeleton.index('pelvis') gives, got {root!r}")
+        check_alignment(align, root)
         self.align, self.root = align, root
 
     def update(self, pred: Tensor, truth: Tensor, weights: Tensor | None = None) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from kcs_torch.errors import OptionError, ShapeError, unknown
-from kcs_torch.functional.align import ALIGNMENTS, superpose
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.align import check_alignment, superpose
 from kcs_torch.functional.chain import pose_matrix, safe_norm
 from kcs_torch.nn.energies import check_clip, check_weights
 from kcs_torch.nn.layers import SkeletonModule, full_precision, known, narrow, wide
@@ -28,7 +28,7 @@ class JointDistance(nn.Module):
         root: index of the root joint for ``root`` and ``scale``; the middle of all joints if None.
 
     Raises:
-        OptionError: there is no such alignment.
+        OptionError: there is no such alignment, or the root is no index.
 
     >>> JointDistance()(torch.zeros(1, 2, 3), torch.tensor([[[0.0, 3, 4], [0, 0, 0]]])).tolist()
     [2.5]
@@ -36,10 +36,7 @@ class JointDistance(nn.Module):
 
     def __init__(self, align: str = "none", *, root: int | None = None) -> None:
         super().__init__()
-        if align not in ALIGNMENTS:
-            raise unknown("alignment", align, ALIGNMENTS)
-        if root is not None and (isinstance(root, bool) or not isinstance(root, int)):
-            raise OptionError(f"root: expected the index of a joint, as skeleton.index('pelvis') gives, got {root!r}")
+        check_alignment(align, root)
         self.align, self.root = align, root
 
     def forward(self, points: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:

@@ -10,7 +10,7 @@ import lightning
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError
+from kcs_torch.errors import OptionError, unknown
 from kcs_torch.methods import METHODS, Method
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.training.batch import Batch
@@ -136,8 +136,6 @@ class TracksDataModule(lightning.LightningDataModule):
             raise OptionError("data: unlabelled: nothing is left to train on without labelled windows (labelled=0)")
         if isinstance(pseudo, str):
             if pseudo not in METHODS:
-                from kcs_torch.errors import unknown
-
                 raise unknown("method for pseudo", pseudo, METHODS)
             pseudo = METHODS[pseudo]()
         if pseudo is not None and fresh_cameras:

@@ -26,7 +26,7 @@ class LossTerm:
     """One loss of a training run.
 
     Attributes:
-        loss: a module whose ``forward`` takes, by these names, what it needs of: ``points`` (B, T, N, 3), found;
+        loss: a module whose ``forward`` takes, by these names, what it needs of: ``points`` (B, T, N, 3), lifted;
             ``tracks`` (B, T, N, 2); ``target`` (B, T, N, 3), labels and pseudo-labels; ``weights`` (B, T, N), of the
             target where it takes one, else of the tracks, and only where it takes those, as a network places unseen
             joints as well; ``network``, to be called again. It returns (B, T) or (B,). Energies of :mod:`kcs_torch.nn`
