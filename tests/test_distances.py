@@ -42,6 +42,19 @@ def test_joint_distance_is_the_metric_of_each_frame(how, root):
 
 
 @each_alignment
+def test_points_that_are_nan_do_not_pass_for_near(how):
+    """Divided by the size of the body, NaN became 0, and the distance that of a body of no size."""
+    points, target = pair()
+    points[1, 2] = torch.nan
+    if how in ("rigid", "similarity", "sequence"):
+        with pytest.raises(ShapeError, match=r"finite numbers.*weights of 0"):
+            JointDistance(how)(points, target)
+    else:
+        distance = JointDistance(how)(points, target)
+        assert distance[1].isnan() and distance[[0, 2, 3, 4]].isfinite().all()
+
+
+@each_alignment
 def test_joint_distance_gradient(how):
     points, target = pair(frames=3)
     weights = torch.rand(3, 7, generator=torch.Generator().manual_seed(0)).double() + 0.1

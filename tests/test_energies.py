@@ -432,6 +432,30 @@ def test_the_plain_gradient_knows_no_nan_either():
     expected = ReprojectionEnergy().grad(points, tracks, cameras, weights)
     tracks[1, 2] = torch.nan
     assert_close(ReprojectionEnergy().grad(points, tracks, cameras, weights), expected)
+    assert_close(ReprojectionEnergy().grad(points, tracks, cameras), expected)
+
+
+@pytest.mark.parametrize("name", [name for name in WEIGHTED if name.startswith("reprojection")])
+def test_tracks_that_are_nan_are_unseen(name):
+    """Without weights, too."""
+    points, tracks, cameras = scene()
+    weights = torch.ones(points.shape[:-1]).double()
+    weights[1, 2] = weights[3, 5] = 0
+    weights[4] = 0
+    hidden = torch.where(weights[..., None] > 0, tracks, torch.nan)
+    energy = lambda x: WEIGHTED[name](x, hidden, cameras, None)  # noqa: E731
+    assert_close(energy(points), WEIGHTED[name](points, tracks, cameras, weights))
+    (grad,) = finite(energy, points)
+    assert grad.any() and not grad[weights == 0].any()
+    assert gradcheck(energy, points)
+
+
+@pytest.mark.parametrize("kind", ["nuclear", "log_det"])
+def test_points_that_are_nan_are_an_error_where_a_matrix_is_factorised(kind):
+    points = clip()
+    points[1, 2] = torch.nan
+    with pytest.raises(ShapeError, match="finite"):
+        LowRankEnergy(kind)(points)
 
 
 @pytest.mark.parametrize("dtype", HALVES)

@@ -142,6 +142,17 @@ def test_degenerate_frames_are_finite(kind, dtype):
         assert PerspectiveEnergy()(points, tracks, LENS, weights).max() < 1e-3
 
 
+def test_tracks_that_are_nan_are_unseen():
+    points, _, tracks = scene(noise=2.0)
+    weights = torch.ones(5, 7).double()
+    weights[1, 2] = weights[3, :5] = weights[4] = 0
+    hidden = torch.where(weights[..., None] > 0, tracks, torch.nan)
+    expected = PerspectiveEnergy()(points, tracks, LENS, weights)
+    assert_close(PerspectiveEnergy()(points, hidden, LENS), expected, rtol=0, atol=0)
+    (grad,) = finite(lambda x: PerspectiveEnergy()(x, hidden, LENS), points)
+    assert grad[:4].any() and not grad[weights == 0].any()
+
+
 def test_a_few_steps_lower_it():
     points, _, tracks = scene()
     start = (points + 0.1 * normal(5, 7, 3, seed=7)).requires_grad_()

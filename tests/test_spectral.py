@@ -393,6 +393,15 @@ def test_vectors_are_refused(function):
         function(normal(5))
 
 
+@pytest.mark.parametrize("function", [lambda x: svt(x, 1.0), lambda x: psd_shrink(x, 1.0), nuclear_norm, spectral_norm])
+@pytest.mark.parametrize("recorded", [True, False])
+def test_nan_is_refused_in_our_words(function, recorded):
+    matrix = normal(2, 5, 5)
+    matrix[1, 2, 3] = torch.nan
+    with pytest.raises(ShapeError, match=r"finite numbers, got NaN.*\(2, 5, 5\).*weights of 0"):
+        function(matrix.requires_grad_(recorded))
+
+
 def test_psd_shrink_refuses_what_is_not_square():
     with pytest.raises(ShapeError, match="square"):
         psd_shrink(normal(4, 5), 1.0)

@@ -342,6 +342,10 @@ def test_a_refined_network_keeps_to_the_tracks_and_can_be_saved(tmp_path):
     points = network(tracks, weights)
     moved = network(2 * tracks + 70, weights)
     torch.testing.assert_close(moved[..., :2], 2 * points[..., :2] + 70, rtol=1e-3, atol=0.5)
+    unseen = weights.clone()
+    unseen[0, 4, 3] = unseen[0, 9] = 0
+    hidden = torch.where(unseen[..., None] > 0, tracks, torch.nan)
+    assert torch.equal(network(hidden), network(tracks, unseen))
     alone = network.network(tracks, weights)
     error, before = ((p[..., :2] - tracks).norm(dim=-1).mean() for p in (points, alone))
     assert error < 20 and torch.isfinite(points).all() and before > 0

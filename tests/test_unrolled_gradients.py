@@ -241,6 +241,39 @@ def test_what_lies_under_a_mask_does_not_count(name, options):
 
 
 @each_solver
+@pytest.mark.parametrize("kind", ["gaps", "unseen joint", "unseen frame", "nothing seen"])
+@pytest.mark.parametrize("options", [{}, {"gradient": BRIEF}], ids=["all", "implicit"])
+@pytest.mark.filterwarnings("ignore::kcs_torch.errors.ConvergenceWarning")
+def test_tracks_that_are_nan_are_unseen(name, kind, options):
+    """Without weights as with weights of 0 there, value and gradient; and where the weights know nothing of it."""
+    tracks, cameras, weights = scene(BODY, kind)
+    seen = (weights > 0).to(weights)
+    hidden = torch.where(seen[..., None] > 0, tracks, torch.nan)
+    module = MAKE[name](3, **options)
+    grads = []
+    for given in (seen, None, torch.ones_like(seen)):
+        leaf = hidden.clone().requires_grad_()
+        value = module(leaf, cameras, weights=given)
+        (grad,) = torch.autograd.grad(value.square().sum(), leaf)
+        assert torch.isfinite(value).all() and torch.isfinite(grad).all() and not grad[seen == 0].any()
+        grads.append((value, grad))
+    assert_close(grads[1], grads[0], rtol=0, atol=0)
+    assert_close(grads[2], grads[0], rtol=0, atol=0)
+    if kind != "nothing seen":
+        assert grads[1][1].any()
+
+
+def test_cameras_are_found_where_tracks_are_nan():
+    tracks, _, weights = scene(BODY, "gaps")
+    seen = (weights > 0).to(weights)
+    module = UnrolledKCS(BODY, 2, template=REST)
+    expected = module.find_cameras(tracks, weights=seen)
+    found = module.find_cameras(torch.where(seen[..., None] > 0, tracks, torch.nan))
+    assert_close(found, expected, rtol=0, atol=0)
+    assert torch.isfinite(found[0]).all() and torch.isfinite(found[1]).all()
+
+
+@each_solver
 def test_a_zero_length_bone_is_finite(name):
     tracks, cameras, weights = scene(BODY)
     tracks[:, 2] = tracks[:, 1]

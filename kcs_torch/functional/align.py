@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.functional.chain import unit_size
-from kcs_torch.functional.derivatives import batch_first
+from kcs_torch.functional.derivatives import applied, batch_first
 
 __all__ = ["ALIGNMENTS", "centre", "minimal_turn", "nearest_rotation", "procrustes", "similarity", "superpose"]
 
@@ -90,8 +90,11 @@ def nearest_rotation(matrix: Tensor, *, reflect: bool = False) -> Tensor:
     Returns:
         (..., D, D), orthogonal. Differentiable once, by the sums of singular values, not their gaps: repeated singular
         values are safe, and directions in which the rotation is arbitrary have the derivative 0.
+
+    Raises:
+        ShapeError: it holds NaN.
     """
-    out: Tensor = _Polar.apply(matrix, reflect)[0]
+    out: Tensor = applied(_Polar, matrix, reflect)[0]
     return out
 
 

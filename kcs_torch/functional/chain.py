@@ -184,16 +184,16 @@ def unit_size(values: Tensor, dimensions: int, counts: Tensor | None = None) -> 
     """Divide by the largest magnitude over the last so many dimensions, which is a constant for autograd.
 
     For what does not depend on scale: squares of the result neither under- nor overflow, nor do their inverses. What is
-    smaller than any unit would have it counts as 0, so that its derivative is bounded. The largest is sought where
-    ``counts``, which broadcasts against the values, is True.
+    smaller than any unit would have it counts as 0, so that its derivative is bounded; NaN stays NaN. The largest is
+    sought where ``counts``, which broadcasts against the values, is True.
     """
     over = tuple(range(-dimensions, 0))
     size = values.detach().abs()
     if counts is not None:
         size = torch.where(counts, size, torch.zeros_like(size))
     top = size.amax(over, keepdim=True) if size.numel() else size.sum(over, keepdim=True)
-    firm = top > torch.finfo(values.dtype).tiny ** 0.25
-    return torch.where(firm, values / torch.where(firm, top, torch.ones_like(top)), torch.zeros_like(values))
+    tiny = top <= torch.finfo(values.dtype).tiny ** 0.25
+    return torch.where(tiny, torch.zeros_like(values), values / torch.where(tiny, torch.ones_like(top), top))
 
 
 def safe_norm(vectors: Tensor) -> Tensor:

@@ -38,7 +38,7 @@ def svt(matrix: Tensor, threshold: Tensor | float) -> Tensor:
         (..., M, N). Differentiable once, in both arguments; a second derivative raises ``RuntimeError``.
 
     Raises:
-        ShapeError: fewer than 2 dimensions.
+        ShapeError: fewer than 2 dimensions, or NaN.
 
     Cai, Candes, Shen 2010; Ma, Goldfarb, Chen 2011 (the shrinkage of FPC).
 
@@ -63,7 +63,7 @@ def psd_shrink(matrix: Tensor, threshold: Tensor | float) -> Tensor:
         (..., N, N), positive semi-definite. Differentiable once, in both arguments.
 
     Raises:
-        ShapeError: the matrices are not square.
+        ShapeError: the matrices are not square, or hold NaN.
 
     SfAM section 3.2 (the shrinkage of IST).
 
@@ -88,6 +88,9 @@ def nuclear_norm(matrix: Tensor) -> Tensor:
     Returns:
         (...). Differentiable once.
 
+    Raises:
+        ShapeError: fewer than 2 dimensions, or NaN.
+
     >>> nuclear_norm(torch.diag(torch.tensor([3.0, 4.0]))).round(decimals=5).item()
     7.0
     """
@@ -104,6 +107,9 @@ def spectral_norm(matrix: Tensor) -> Tensor:
 
     Returns:
         (...). Differentiable once; where the largest value is repeated the gradient is one of many.
+
+    Raises:
+        ShapeError: fewer than 2 dimensions, or NaN.
 
     >>> spectral_norm(torch.diag(torch.tensor([3.0, 4.0]))).round(decimals=5).item()
     4.0
@@ -138,7 +144,7 @@ def log_det(matrix: Tensor, eps: Tensor | float) -> Tensor:
     try:
         factor = torch.linalg.cholesky(work + level[..., None, None] * eye)
     except torch.linalg.LinAlgError:
-        message = "log_det: matrix + eps I is not positive definite: expected a covariance and eps > 0"
+        message = "log_det: matrix + eps I is not positive definite: expected a finite covariance and eps > 0"
         raise ShapeError(message) from None
     return (2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)).to(matrix.dtype)
 

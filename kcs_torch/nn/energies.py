@@ -1,8 +1,8 @@
 """Energies: one module is the loss of a network and the term of a solver.
 
 Each returns energies per frame (..., T) or per clip (...); the reduction is left to the caller. Weights of 0 take a
-joint out, whatever its coordinates are, NaN included; an energy over nothing is 0, not NaN. Half precision is widened
-inside; what it cannot hold comes back as its largest number.
+joint out, whatever its coordinates are, NaN included, and tracks that are NaN weigh 0; an energy over nothing is 0, not
+NaN. Half precision is widened inside; what it cannot hold comes back as its largest number.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.spectral import log_det, nuclear_norm, svt
-from kcs_torch.nn.layers import SkeletonModule, full_precision, known, narrow, wide
+from kcs_torch.nn.layers import SkeletonModule, full_precision, known, narrow, seen_weights, wide
 from kcs_torch.nn.masks import bone_share, safe_root, some
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lm import fit_bones
@@ -115,7 +115,7 @@ class ReprojectionEnergy(nn.Module):
 
         Args:
             points: (..., T, N, 3).
-            tracks: (..., T, N, 2).
+            tracks: (..., T, N, 2), NaN where unseen.
             cameras: (..., T, 2, 3), scaled rows allowed; None: points are in the camera frame.
             weights: (..., T, N) confidences; 0 where unseen.
 
@@ -127,12 +127,12 @@ class ReprojectionEnergy(nn.Module):
         """
         residual = self.residual(points, tracks, cameras, weights)
         square = huber_square(wide(residual).square().sum(-1), self.huber)
-        return narrow(0.5 * (square if weights is None else square * weights).sum(-1), residual)
+        return narrow(0.5 * (square * seen_weights(tracks, weights)).sum(-1), residual)
 
     def residual(
         self, points: Tensor, tracks: Tensor, cameras: Tensor | None = None, weights: Tensor | None = None
     ) -> Tensor:
-        """R x + t - y, (..., T, N, 2); of no meaning where the weight is 0."""
+        """R x + t - y, (..., T, N, 2); of no meaning where the weight is 0 or a track NaN."""
         check_clip(points, self)
         if tracks.shape[-3:] != (*points.shape[-3:-1], 2):
             expected = f"(..., {points.shape[-3]}, {points.shape[-2]}, 2)"
@@ -141,6 +141,7 @@ class ReprojectionEnergy(nn.Module):
             expected = f"(..., {points.shape[-3]}, 2, 3)"
             raise ShapeError(f"ReprojectionEnergy: expected cameras {expected}, got {tuple(cameras.shape)}")
         check_weights(weights, points, self)
+        weights = seen_weights(tracks, weights)
         points, tracks = known(points, weights), known(tracks, weights)
         with full_precision(points):
             dtype = torch.promote_types(points.dtype, tracks.dtype)
@@ -150,7 +151,7 @@ class ReprojectionEnergy(nn.Module):
     def grad(self, points: Tensor, tracks: Tensor, cameras: Tensor, weights: Tensor | None = None) -> Tensor:
         """Gradient in ``points`` of the plain least-squares energy, R^T (w o residual): (..., T, N, 3)."""
         residual = self.residual(points, tracks, cameras, weights)
-        return back_project(residual if weights is None else residual * weights[..., None], cameras)
+        return back_project(residual * seen_weights(tracks, weights)[..., None], cameras)
 
 
 class LowRankEnergy(nn.Module):

@@ -147,6 +147,19 @@ def known(values: Tensor, weights: Tensor | None) -> Tensor:
     return torch.where(weights[..., None] > 0, values, torch.zeros((), dtype=values.dtype, device=values.device))
 
 
+def seen_weights(tracks: Tensor, weights: Tensor | None) -> Tensor:
+    """Weights (..., T, N) of tracks (..., T, N, 2), 0 where these are not finite: NaN is unseen, as everywhere.
+
+    Args:
+        tracks: (..., T, N, 2).
+        weights: (..., T, N); 1 if None.
+    """
+    finite = tracks.isfinite().all(-1)
+    if weights is None:
+        return finite.to(tracks.dtype)
+    return torch.where(finite, weights, torch.zeros((), dtype=weights.dtype, device=weights.device))
+
+
 def known_frames(points: Tensor, weights: Tensor | None) -> Tensor:
     """Points (..., T, N, D), 0 in frames whose weight (..., T) is 0."""
     return points if weights is None else known(points.flatten(-2), weights).unflatten(-1, points.shape[-2:])

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.temporal import interpolate
+from kcs_torch.nn.layers import seen_weights
 
 __all__ = ["NormalisedTracks", "neighbours", "normalise_tracks"]
 
@@ -31,9 +32,7 @@ class NormalisedTracks(NamedTuple):
 
 def normalise_tracks(tracks: Tensor, weights: Tensor | None, scale: Tensor | None = None) -> NormalisedTracks:
     """Centre tracks (..., T, N, 2) in each frame and divide them by the size of the clip, or by a given ``scale``."""
-    seen = torch.isfinite(tracks).all(-1)
-    if weights is not None:
-        seen = seen & (weights > 0)
+    seen = seen_weights(tracks, weights) > 0
     mask = seen.to(tracks.dtype)
     tracks = torch.where(seen[..., None], tracks, torch.zeros_like(tracks))
     count = mask.sum(-1)[..., None, None]  # (..., T, 1, 1)

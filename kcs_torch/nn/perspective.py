@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import perspective, pinhole_translation
 from kcs_torch.nn.energies import check_clip, check_weights, huber_square
-from kcs_torch.nn.layers import full_precision, known, narrow, wide
+from kcs_torch.nn.layers import full_precision, known, narrow, seen_weights, wide
 from kcs_torch.nn.masks import some
 from kcs_torch.types.intrinsics import Intrinsics
 
@@ -52,7 +52,7 @@ class PerspectiveEnergy(nn.Module):
 
         Args:
             points: (..., T, N, 3) in the camera's axes.
-            tracks: (..., T, N, 2).
+            tracks: (..., T, N, 2), NaN where unseen.
             intrinsics: of all clips: (fx, fy, cx, cy), K (3, 3) or :class:`kcs_torch.types.Intrinsics`; of each clip: a
                 tensor (..., 4). In the unit of the tracks.
             weights: (..., T, N) confidences; 0 where unseen.
@@ -72,8 +72,9 @@ class PerspectiveEnergy(nn.Module):
             raise ShapeError(f"PerspectiveEnergy: expected {expected}, got {got}")
         with full_precision(points):
             lens = lens_tensor(intrinsics, wide(points))[..., None, None, :]  # (..., 1, 1, 4)
+            weights = seen_weights(tracks, weights)
             at, seen = wide(known(points, weights)), known(wide(tracks), weights)
-            share = torch.ones_like(at[..., 0]) if weights is None else weights.to(at.dtype).expand(at.shape[:-1])
+            share = weights.to(at.dtype).expand(at.shape[:-1])
             if self.translation:
                 at = at + pinhole_translation(at, (seen - lens[..., 2:]) / lens[..., :2], share)[..., None, :]
             near = self.nearest * _reach(at.detach(), share.detach())[..., None]

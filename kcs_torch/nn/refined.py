@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.functional import centre
+from kcs_torch.nn.layers import seen_weights
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["RefinedLifter"]
@@ -47,8 +48,8 @@ class RefinedLifter(nn.Module):
             ShapeError: the tracks are not of the network's skeleton.
         """
         points, middle = centre(self.network(tracks, weights))
-        if weights is not None:
-            tracks = torch.where(weights[..., None] > 0, tracks, points[..., :2] + middle[..., :2])
+        weights = seen_weights(tracks, weights)
+        tracks = torch.where(weights[..., None] > 0, tracks, points[..., :2] + middle[..., :2])
         size = points[..., :2].square().mean((-3, -2, -1), keepdim=True).sqrt().detach()
         size = torch.where(size > 0, size, torch.ones_like(size))
         cameras = torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(*tracks.shape[:-2], 2, 3)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.nn.energies import check_weights
-from kcs_torch.nn.layers import inverse_softplus
+from kcs_torch.nn.layers import inverse_softplus, seen_weights
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.implicit import Implicit, fixed_point
 from kcs_torch.solvers.iterate import Solution, iterate, relative_change
@@ -164,8 +164,12 @@ class Unrolled(nn.Module):
 
     def _check(
         self, tracks: Tensor, cameras: Tensor | None, weights: Tensor | None, start: Tensor | None, **others: Any
-    ) -> None:
-        """Raise a ShapeError unless the arguments fit; ``others`` are (tensor or None, expected trailing shape)."""
+    ) -> Tensor:
+        """Return the weights (..., T, N), 0 where tracks are not finite.
+
+        Raises:
+            ShapeError: the arguments do not fit; ``others`` are (tensor or None, expected trailing shape).
+        """
         name = type(self).__name__
         if tracks.ndim < 3 or tracks.shape[-1] != 2 or (
             cameras is not None and cameras.shape[-3:] != (tracks.shape[-3], 2, 3)
@@ -186,3 +190,4 @@ class Unrolled(nn.Module):
                 raise ShapeError(
                     f"{name}: expected {other} (..., {', '.join(map(str, shape))}), got {tuple(value.shape)}"
                 )
+        return seen_weights(tracks, weights)

@@ -63,7 +63,7 @@ class UnrolledFPC(Unrolled):
         """Return the shape in the world frame of the cameras.
 
         Args:
-            tracks: (..., T, N, 2).
+            tracks: (..., T, N, 2), NaN where unseen.
             cameras: (..., T, 2, 3).
             weights: (..., T, N), 0 where unseen.
             start: (..., T, N, 3), a network's output, say, in any precision; the back-projected tracks if None.
@@ -88,7 +88,7 @@ class UnrolledFPC(Unrolled):
     def _solve(
         self, tracks: Tensor, cameras: Tensor, weights: Tensor | None, start: Tensor | None, *, measure: bool
     ) -> Solution[Tensor]:
-        self._check(tracks, cameras, weights, start)
+        weights = self._check(tracks, cameras, weights, start)
         tracks = known(tracks, weights)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         with full_precision(tracks):

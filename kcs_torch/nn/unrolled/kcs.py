@@ -136,7 +136,7 @@ class UnrolledKCS(Unrolled):
         """Fit cameras to the template seen in each frame, as :class:`kcs_torch.KCS` does in its first round.
 
         Args:
-            tracks: (..., T, N, 2).
+            tracks: (..., T, N, 2), NaN where unseen.
             weights: (..., T, N), 0 where unseen.
             continuity: weight of the turn between frames in choosing among a frame's cameras.
             robust: residuals of this share of the body's size count half; None is least squares.
@@ -147,7 +147,7 @@ class UnrolledKCS(Unrolled):
         Raises:
             ShapeError: the shapes do not fit.
         """
-        self._check(tracks, None, weights, None)
+        weights = self._check(tracks, None, weights, None)
         self._check_joints(tracks)
         with torch.no_grad(), full_precision(tracks):
             points, share = self._centred(tracks, weights)
@@ -175,7 +175,7 @@ class UnrolledKCS(Unrolled):
         """Return the shape in the world frame of the cameras, which is the template's.
 
         Args:
-            tracks: (..., T, N, 2).
+            tracks: (..., T, N, 2), NaN where unseen.
             cameras: (..., T, 2, 3), from :meth:`find_cameras`, say.
             scales: (..., T) image length of the template's unit; by least squares if None.
             weights: (..., T, N), 0 where unseen.
@@ -214,7 +214,7 @@ class UnrolledKCS(Unrolled):
         *,
         measure: bool,
     ) -> Solution[Tensor]:
-        self._check(tracks, cameras, weights, start, scales=(scales, tracks.shape[-3:-2]))
+        weights = self._check(tracks, cameras, weights, start, scales=(scales, tracks.shape[-3:-2]))
         self._check_joints(tracks)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         with full_precision(tracks):
@@ -245,11 +245,11 @@ class UnrolledKCS(Unrolled):
             value = size * (rest + inverse @ solution.value)
         return Solution(value, solution.converged, solution.iterations)
 
-    def _centred(self, tracks: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _centred(self, tracks: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Tracks about the seen joints' middle, 0 where unseen, and weights (..., T, N)."""
         points = known(tracks, weights)
         points = known(-centred_residual(torch.zeros_like(points), points, weights), weights)
-        return points, torch.ones_like(points[..., 0]) if weights is None else weights.expand(points.shape[:-1])
+        return points, weights.expand(points.shape[:-1])
 
     def _bounds(self, points: Tensor, weights: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
         """Least and greatest scale (..., T)."""

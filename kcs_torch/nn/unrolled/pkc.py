@@ -106,7 +106,7 @@ class UnrolledPKC(Unrolled):
         """Return the shape in the world frame of the cameras, which are held but for what :attr:`realign_from` says.
 
         Args:
-            tracks: (..., T, N, 2).
+            tracks: (..., T, N, 2), NaN where unseen.
             cameras: (..., T, 2, 3).
             weights: (..., T, N), 0 where unseen.
             start: (..., T, N, 3), a network's output, say; the back-projected tracks if None.
@@ -146,7 +146,7 @@ class UnrolledPKC(Unrolled):
         measure: bool,
     ) -> Solution[Tensor]:
         joints, count = self.skeleton.num_joints, self.skeleton.num_bones
-        self._check(tracks, cameras, weights, start, lengths=(lengths, (count,)))
+        weights = self._check(tracks, cameras, weights, start, lengths=(lengths, (count,)))
         if tracks.shape[-2] != joints:
             raise ShapeError(
                 f"UnrolledPKC: expected tracks (..., T, {joints}, 2) for skeleton '{self.skeleton.name}', "
@@ -157,7 +157,7 @@ class UnrolledPKC(Unrolled):
             # Factorisations of covariances: in double precision, as for singular values.
             wide = torch.float32 if tracks.device.type == "mps" else torch.float64
             flat, rows = known(tracks, weights).to(wide), cameras.to(wide)
-            share = torch.ones_like(flat[..., 0]) if weights is None else weights.to(wide).expand(flat.shape[:-1])
+            share = weights.to(wide).expand(flat.shape[:-1])
             flat = known(-centred_residual(torch.zeros_like(flat), flat, share), share)
             size = _root_mean_square(flat, share)[..., None, None, None]
             flat = flat / size

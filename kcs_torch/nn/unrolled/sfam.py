@@ -92,7 +92,7 @@ class UnrolledSfAM(Unrolled):
         """Return the shape in the world frame of the cameras.
 
         Args:
-            tracks: (..., T, N, 2).
+            tracks: (..., T, N, 2), NaN where unseen.
             cameras: (..., T, 2, 3).
             weights: (..., T, N), 0 where unseen.
             start: (..., T, N, 3); the back-projected tracks if None.
@@ -137,7 +137,7 @@ class UnrolledSfAM(Unrolled):
         one_body: bool,
         measure: bool,
     ) -> Solution[Tensor]:
-        self._check(tracks, cameras, weights, start)
+        weights = self._check(tracks, cameras, weights, start)
         joints, count = self.skeleton.num_joints, self.skeleton.num_bones
         given = None if lengths is None else tuple(lengths.shape)
         if tracks.shape[-2] != joints or (given is not None and given[-1:] != (count,)):
@@ -152,7 +152,7 @@ class UnrolledSfAM(Unrolled):
         if lengths is None and self.has_lengths:
             lengths = self._values("length", tracks)
         fixed = None if lengths is None else lengths[..., self.rigid]
-        pooled = weights.flatten(0, 1) if weights is not None and one_body else weights
+        pooled = weights.flatten(0, 1) if one_body else weights
         graded = not self.skeleton.tree
 
         def advance(shape: Tensor, k: int) -> Tensor:
