@@ -14,7 +14,7 @@ from kcs_torch.functional.chain import incidence
 if TYPE_CHECKING:
     from kcs_torch.solvers.procrustean import Stage
 
-__all__ = ["Descent", "turn_by", "turn_slopes"]
+__all__ = ["Descent", "Turn", "cross_matrix"]
 
 
 class Descent:
@@ -58,9 +58,8 @@ class Descent:
         extra: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         joints = points.shape[-2]
-        self.stage, self.change, self.reach, self.noise, self.extra = stage, change, reach, noise, extra
+        self.slack, self.reach, self.noise, self.extra = stage.slack, reach, noise, extra
         self.free = 3 if noise > 0 else 1
-        self.base, self.turns = points, rotations
         self.points = points.permute(0, 3, 2, 1).contiguous()  # (H, 3, N, T)
         self.rotations = rotations.permute(0, 2, 3, 1).contiguous()  # (H, 3, 3, T)
         self.roots, self.rows = roots, roots.mT.contiguous()  # a row times a matrix is the faster product
@@ -68,94 +67,104 @@ class Descent:
         self.pairs = None if torch.equal(bones, rigid) else incidence(rigid, joints, dtype=points.dtype).mT
         self.rigid, self.stiffness = len(rigid) > 0, stiffness
         self.tracks, self.weights = tracks.permute(2, 1, 0).contiguous(), weights.mT.contiguous()  # (2, N, T), (N, T)
+        self.bones = self.ends @ self.points  # (H, 3, B, T), of which the first 3 - free never move
+        self.links = self.bones if self.pairs is None else self.pairs @ self.points  # (H, 3, P, T)
+        self.flat = self.links[:, : 3 - self.free].square().sum(1)  # (H, P, T)
+        self.cross = cross_matrix(points)
+        frames = points.shape[1]
+        self.still, self.moving = stage.still > 0, stage.moving > 0 and frames > 2
+        levels = [(stage.still, stage.eps, frames)] if self.still else []
+        levels += [(stage.moving, change * stage.eps, frames - 1)] if self.moving else []
+        # weights, eps and frames of the log-determinants: (levels, 1, 1, 1) each
+        self.levels = points.new_tensor(levels).view(len(levels), 3, 1, 1, 1).unbind(1)
 
     def moved(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Points (H, T, N, 3) and rotations (H, T, 3, 3) of steps u (H, T D)."""
-        points, _, rotations, _ = self._move(u)
-        return points.permute(0, 3, 2, 1).contiguous(), rotations.permute(0, 3, 1, 2).contiguous()
+        shift, turn = self._step(u)
+        rotations = _times(turn.matrices(), self.rotations)
+        return self._placed(shift), rotations.permute(0, 3, 1, 2).contiguous()
 
-    def _move(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Points (H, 3, N, T), rotation vectors (H, 3, T), rotations (H, 3, 3, T) and what they turned by."""
+    def _step(self, u: Tensor) -> tuple[Tensor, Turn]:
+        """Shifts (H, free, N, T) and turns."""
         count, _, joints, frames = self.points.shape
         step = (u.view(count, frames, 1, -1) @ self.rows).squeeze(-2).mT.contiguous()  # (H, D, T)
-        shift = step[:, :-3].view(count, self.free, joints, frames)
-        if self.free == 3:
-            points = self.points + shift
-        else:
-            points = torch.cat([self.points[:, :2], self.points[:, 2:] + shift], 1)
-        vector = step[:, -3:]
-        turned = turn_by(vector)
-        return points, vector, (turned[:, :, :, None] * self.rotations[:, None]).sum(2), turned
+        return step[:, :-3].view(count, self.free, joints, frames), Turn(step[:, -3:], self.cross)
+
+    def _placed(self, shift: Tensor) -> Tensor:
+        """Shifted points (H, T, N, 3)."""
+        points = self.points.clone()
+        points[:, -self.free :] += shift
+        return points.permute(0, 3, 2, 1).contiguous()
 
     def __call__(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Value (H,) and gradient (H, T D) of steps u (H, T D)."""
-        count, _, joints, frames = self.points.shape
-        points, vector, rotations, _ = self._move(u)
-        bones = self.ends @ points  # (H, 3, B, T)
-        aligned = rotations[:, 0, :, None] * bones[:, 0, None]  # (H, 3, B, T)
-        aligned.addcmul_(rotations[:, 1, :, None], bones[:, 1, None])
-        aligned.addcmul_(rotations[:, 2, :, None], bones[:, 2, None])
+        count, _, _, frames = self.points.shape
+        shift, turn = self._step(u)
+        rotations = _times(turn.matrices(), self.rotations)
+        loose = self.bones[:, -self.free :] + self.ends @ shift  # (H, free, B, T)
+        bones = [*self.bones[:, : -self.free].unbind(1), *loose.unbind(1)]  # (H, B, T) each
+        aligned = rotations[:, 0, :, None] * bones[0][:, None]  # (H, 3, B, T)
+        for j in (1, 2):
+            aligned.addcmul_(rotations[:, j, :, None], bones[j][:, None])
         value, pull = self._motion(aligned.view(count, -1, frames))
         pull = pull.view_as(aligned)
-        first = 3 - self.free
-        drawn = torch.stack([(rotations[:, j, :, None] * pull).sum(1) for j in range(first, 3)], 1)  # (H, free, B, T)
-        turned = torch.stack([(pull * bones[:, j, None]).sum(2) for j in range(3)], 1)  # (H, 3, 3, T): of R_jk
-        slope = points.new_zeros(count, self.free, joints, frames)
-        if self.rigid:
-            pairs = bones if self.pairs is None else self.pairs @ points
-            cost, along = self._lengths(pairs)
-            value = value + cost
-            if self.pairs is None:
-                drawn += along
-            else:
-                slope += self.pairs.mT @ along
-        slope += self.ends.mT @ drawn
+        turned = torch.stack([(pull * bone[:, None]).sum(2) for bone in bones], 1)  # (H, 3, 3, T): of R_jk
+        drawn = torch.stack([(rotations[:, j, :, None] * pull).sum(1) for j in range(3 - self.free, 3)], 1)
+        # drawn is the gradient (H, free, B, T) in the bones, slope (H, free, N, T) in the joints
+        if not self.rigid:
+            slope = self.ends.mT @ drawn
+        elif self.pairs is None:
+            cost, along = self._lengths(loose)
+            value, slope = value + cost, self.ends.mT @ drawn.add_(along)
+        else:
+            cost, along = self._lengths(self.links[:, -self.free :] + self.pairs @ shift)
+            value, slope = value + cost, self.ends.mT @ drawn + self.pairs.mT @ along
         if self.noise > 0:
-            value = value + self._tracks(points, slope)
+            value = value + self._tracks(self.points + shift, slope)
         if self.extra is not None:
             with torch.enable_grad():
-                leaf = points.permute(0, 3, 2, 1).requires_grad_()
+                leaf = self._placed(shift).requires_grad_()
                 cost = self.extra(leaf)
                 (more,) = torch.autograd.grad(cost.sum(), leaf)
             value = value + cost.detach()
-            slope += more.permute(0, 3, 2, 1)[:, first:]
-        spun = turn_slopes(vector, (turned[:, :, None] * self.rotations[:, None]).sum(3))
-        step = torch.cat([slope.flatten(1, 2), spun], 1).mT  # (H, T, D)
-        return value, (step.unsqueeze(-2) @ self.roots).reshape(count, -1)
+            slope += more.permute(0, 3, 2, 1)[:, -self.free :]
+        spun = turn.slopes((turned[:, :, None] * self.rotations[:, None]).sum(3))
+        step = torch.cat([slope.flatten(1, 2), spun], 1).mT.contiguous()  # (H, T, D)
+        return value, (step.unsqueeze(-2) @ self.roots).view(count, -1)
 
     def _motion(self, aligned: Tensor) -> tuple[Tensor, Tensor]:
-        """The log-determinants (H,) of aligned bones (H, 3 B, T), and their gradient."""
-        stage, frames = self.stage, aligned.shape[-1]
-        value = aligned.new_zeros(len(aligned))
-        slope = torch.zeros_like(aligned) if stage.still <= 0 else None
-        if stage.still > 0:
-            mean = aligned.mean(-1, keepdim=True)
-            scatter = torch.baddbmm(mean @ mean.mT, aligned, aligned.mT, beta=-1, alpha=1 / frames)
-            log_det, inverse = _determinant(scatter, stage.eps)
-            value = value + stage.still * frames / 2 * log_det
-            inverse = inverse * stage.still
-            slope = torch.baddbmm(inverse @ mean, inverse, aligned, beta=-1)
-        assert slope is not None
-        if stage.moving > 0 and frames > 2:
-            change = aligned.diff()
-            log_det, inverse = _determinant(torch.bmm(change, change.mT) / (frames - 1), self.change * stage.eps)
-            value = value + stage.moving * (frames - 1) / 2 * log_det
-            pull = torch.bmm(inverse * stage.moving, change)
-            slope[..., 1:] += pull
-            slope[..., :-1] -= pull
+        """The log-determinants (H,) of aligned bones (H, 3 B, T), which are centred in place, and their gradient."""
+        weights, eps, frames = self.levels
+        aligned -= aligned.mean(-1, keepdim=True)
+        rows = [aligned] if self.still else []
+        if self.moving:
+            rows.append(aligned.diff())
+        if not rows:
+            return aligned.new_zeros(len(aligned)), torch.zeros_like(aligned)
+        scatter = torch.stack([torch.bmm(y, y.mT) for y in rows]).div_(frames)  # (levels, H, 3 B, 3 B)
+        scatter.diagonal(dim1=-2, dim2=-1).add_(eps[..., 0])
+        factor, info = torch.linalg.cholesky_ex(scatter)
+        factor.masked_fill_((info != 0)[..., None, None], torch.nan)  # where nothing is left of eps
+        half = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        value = ((weights * frames)[..., 0, 0] * half).sum(0)
+        pulls = list(map(torch.bmm, torch.cholesky_inverse(factor).mul_(weights), rows))
+        slope = pulls[0] if self.still else torch.zeros_like(aligned)
+        if self.moving:
+            slope[..., 1:] += pulls[-1]
+            slope[..., :-1] -= pulls[-1]
         return value, slope
 
-    def _lengths(self, pairs: Tensor) -> tuple[Tensor, Tensor]:
-        """The energy (H,) of lengths that vary, and its gradient (H, free, P, T) in the pairs (H, 3, P, T)."""
-        frames, least = pairs.shape[-1], self.stage.slack**2
-        size = pairs.square().sum(1).sqrt()  # (H, P, T)
+    def _lengths(self, loose: Tensor) -> tuple[Tensor, Tensor]:
+        """The energy (H,) of lengths that vary, and its gradient (H, free, P, T) in the pairs' free coordinates."""
+        frames, least = loose.shape[-1], self.slack**2
+        size = (self.flat + loose.square().sum(1)).sqrt_()  # (H, P, T)
         off = size - size.mean(-1, keepdim=True)
         spread = off.square().mean(-1)
         low, high = spread + least, spread + self.reach**2 * least
         pull = self.stiffness * (1 / low - 1 / high)
-        along = off.mul_(pull[..., None]).div_(size.masked_fill_(size == 0, torch.inf))
+        along = off.mul_(pull[..., None]).div_(size.clamp_min_(torch.finfo(size.dtype).tiny ** 0.5))
         value = frames / 2 * (self.stiffness * (low / high).log()).sum(-1)
-        return value, along[:, None] * pairs[:, 3 - self.free :]
+        return value, along[:, None] * loose
 
     def _tracks(self, points: Tensor, slope: Tensor) -> Tensor:
         off = points[:, :2] - self.tracks
@@ -164,40 +173,48 @@ class Descent:
         return self.reach**2 / 2 * (self.weights * square.log1p()).sum((-2, -1))
 
 
-def turn_by(vector: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3, T) of rotation vectors (..., 3, T), by Rodrigues' formula."""
-    square, sine, versine = _rodrigues(vector)
-    x, y, z = (vector * sine).unbind(-2)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -2).unflatten(-2, (3, 3))
-    out = torch.addcmul(cross, (vector * versine).unsqueeze(-2), vector.unsqueeze(-3))
-    out.diagonal(dim1=-3, dim2=-2).add_((1 - versine * square).mT)
-    return out
+class Turn:
+    """Turns by rotation vectors w, exp [w] = (1 - c q) I + s [w] + c w w^T by Rodrigues' formula.
+
+    q is the squared angle, s = sin(angle) / angle and c = (1 - cos(angle)) / q.
+
+    Args:
+        vector: (..., 3, T).
+        cross: :func:`cross_matrix`.
+    """
+
+    def __init__(self, vector: Tensor, cross: Tensor) -> None:
+        self.vector, self.cross, self.square = vector, cross, vector.square().sum(-2, keepdim=True)  # (..., 1, T)
+        half = self.square.sqrt() / (2 * math.pi)
+        self.sine, self.versine = (2 * half).sinc(), half.sinc().square_().div_(2)
+
+    def matrices(self) -> Tensor:
+        """Rotation matrices (..., 3, 3, T)."""
+        out = (self.cross @ (self.vector * self.sine)).unflatten(-2, (3, 3))
+        out.addcmul_((self.vector * self.versine).unsqueeze(-2), self.vector.unsqueeze(-3))
+        out.diagonal(dim1=-3, dim2=-2).add_((1 - self.versine * self.square).mT)
+        return out
+
+    def slopes(self, slopes: Tensor) -> Tensor:
+        """Slopes in the vectors (..., 3, T), of slopes in the matrices (..., 3, 3, T)."""
+        vector, sine, versine = self.vector, self.sine, self.versine
+        twist = self.cross.mT @ slopes.flatten(-3, -2)
+        both = ((slopes + slopes.transpose(-3, -2)) * vector.unsqueeze(-3)).sum(-2)  # (G + G^T) w
+        # Slopes of sine and versine in half the squared angle: what rounding does to them near 0, the vector undoes.
+        safe = self.square.clamp_min(torch.finfo(vector.dtype).tiny)
+        even = 1 - versine * self.square
+        bent = (even - sine) / safe * twist + (sine / 2 - versine) / safe * both
+        trace = slopes.diagonal(dim1=-3, dim2=-2).sum(-1).unsqueeze(-2)
+        along = (vector * bent).sum(-2, keepdim=True) - sine * trace
+        return sine * twist + versine * both + along * vector
 
 
-def turn_slopes(vector: Tensor, slopes: Tensor) -> Tensor:
-    """Slopes in rotation vectors (..., 3, T), of slopes (..., 3, 3, T) in the matrices that :func:`turn_by` gives."""
-    square, sine, versine = _rodrigues(vector)
-    (aa, ab, ac), (ba, bb, bc), (ca, cb, cc) = (row.unbind(-2) for row in slopes.unbind(-3))
-    twist = torch.stack([cb - bc, ac - ca, ba - ab], -2)
-    both = ((slopes + slopes.transpose(-3, -2)) * vector.unsqueeze(-3)).sum(-2)  # (G + G^T) w
-    # Slopes of sine and versine in half the squared angle: what rounding does to them near 0, the vector undoes.
-    safe = square.clamp_min(torch.finfo(square.dtype).tiny)
-    bent = (1 - versine * square - sine) / safe, (sine / 2 - versine) / safe
-    along = bent[0] * (vector * twist).sum(-2, keepdim=True) + bent[1] * (vector * both).sum(-2, keepdim=True)
-    return sine * twist + versine * both + (along - sine * (aa + bb + cc).unsqueeze(-2)) * vector
+def cross_matrix(like: Tensor) -> Tensor:
+    """The matrix (9, 3) that makes [w] of w."""
+    eye = torch.eye(3, dtype=like.dtype, device=like.device)
+    return torch.linalg.cross(eye[None], eye[:, None]).flatten(0, 1)
 
 
-def _rodrigues(vector: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The squared angle q, sin(angle) / angle and (1 - cos(angle)) / q, (..., 1, T) each."""
-    square = vector.square().sum(-2, keepdim=True)
-    turns = square.sqrt() / math.pi
-    return square, turns.sinc(), (turns / 2).sinc().square() / 2
-
-
-def _determinant(scatter: Tensor, eps: float) -> tuple[Tensor, Tensor]:
-    """Log-determinant (H,) and inverse (H, D, D) of scatter + eps I; NaN where nothing is left of eps."""
-    scatter.diagonal(dim1=-2, dim2=-1).add_(eps)
-    factor, info = torch.linalg.cholesky_ex(scatter)
-    factor = torch.where((info == 0)[..., None, None], factor, torch.full_like(factor, torch.nan))
-    return 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1), torch.cholesky_inverse(factor)
+def _times(left: Tensor, right: Tensor) -> Tensor:
+    """Products (H, 3, 3, T) of matrices in each frame."""
+    return (left[:, :, :, None] * right[:, None]).sum(2)
