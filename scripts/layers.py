@@ -152,7 +152,6 @@ def time_import(repeats: int) -> None:
         "`import kcs_torch`": "import kcs_torch",
         "`import kcs_torch.functional`": "import kcs_torch.functional",
         "`import kcs_torch.nn`": "import kcs_torch.nn",
-        "of which `import roma`, which loads torch's compiler": "import roma",
     }
     table(["what", "ms"], ([name, f"{1000 * best(code):.1f}"] for name, code in rows.items()))
 

@@ -129,7 +129,7 @@ def test_imports_run_one_way(path):
 def test_functional_needs_torch_only():
     for path in (PACKAGE / "functional").glob("*.py"):
         outside = {name.split(".")[0] for name, _, _ in imports(path)} - sys.stdlib_module_names
-        assert outside <= {"torch", "roma", "kcs_torch"}, path
+        assert outside <= {"torch", "kcs_torch"}, path
 
 
 def test_every_outside_package_is_declared():
@@ -155,6 +155,12 @@ def test_import_is_light():
     names = loaded(code)
     assert "torch" in names  # the names were really loaded
     assert not names & {"lightning", "hydra", "plotly", "scipy", "matplotlib", "yaml", "typer", "rich", "torchmetrics"}
+
+
+def test_modules_and_methods_do_without_the_compiler_of_torch():
+    """It takes a second to load."""
+    code = "import sys, kcs_torch.nn, kcs_torch.methods, kcs_torch.io"
+    assert "kcs_torch" in loaded(f"{code}\nassert 'torch._dynamo' not in sys.modules")
 
 
 def test_command_line_loads_without_torch():

@@ -32,6 +32,13 @@ from kcs_torch.functional.chain import (
     pose_matrix,
 )
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
+from kcs_torch.functional.rotation import (
+    euler_angles,
+    euler_rotation,
+    rotation_angle,
+    rotation_matrix,
+    rotation_vector,
+)
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.functional.spectral import (
     dct_basis,
@@ -57,6 +64,8 @@ __all__ = [
     "complete_rotation",
     "dct_basis",
     "distance_spread",
+    "euler_angles",
+    "euler_rotation",
     "factorize",
     "incidence",
     "interpolate",
@@ -76,6 +85,9 @@ __all__ = [
     "project",
     "psd_shrink",
     "rigid_tree",
+    "rotation_angle",
+    "rotation_matrix",
+    "rotation_vector",
     "rows_to_cameras",
     "scatter_log_det",
     "similarity",

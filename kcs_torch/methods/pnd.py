@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import roma
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.rotation import rotation_matrix
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.unseen import place_unseen
@@ -302,7 +302,7 @@ def _maximise(now: ProcrusteanNormal, found: _Expectation) -> ProcrusteanNormal:
     return ProcrusteanNormal(
         mean,
         _second_moment(aligned - mean, found.rest, mean),
-        roma.rotvec_to_rotmat(found.steps[:, :3]) @ now.rotations @ turn,
+        rotation_matrix(found.steps[:, :3]) @ now.rotations @ turn,
         now.scales * found.steps[:, 3].exp() / factor,
         aligned,
     )

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-import roma
 import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import nearest_rotation
+from kcs_torch.functional.rotation import rotation_angle, rotation_matrix, rotation_vector
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.functional.spectral import dct_basis
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -50,7 +50,7 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Te
     frames, batch = rotations.shape[-3], rotations.shape[:-3]
     rotations = rotations.reshape(-1, frames, 3, 3)
     time = torch.arange(frames, dtype=rotations.dtype, device=rotations.device) - (frames - 1) / 2
-    turn = roma.rotmat_to_rotvec(rotations[:, 1:] @ rotations[:, :-1].mT).median(1).values  # (K, 3)
+    turn = rotation_vector(rotations[:, 1:] @ rotations[:, :-1].mT).median(1).values  # (K, 3)
     factors = torch.linspace(0.8, 1.2, 161, dtype=turn.dtype, device=turn.device)
     means = _mean_unturned(rotations, factors[:, None] * time, turn)  # (K, 161, 3, 3)
     starts = nearest_rotation(means)
@@ -60,8 +60,8 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Te
     eye = torch.eye(6, dtype=turn.dtype, device=turn.device)
     for _ in range(num_steps):
         turned = time[:, None] * speed[:, None]  # (K, T, 3)
-        spin = roma.rotvec_to_rotmat(turned)
-        error = roma.rotmat_to_rotvec(rotations @ (spin @ start[:, None]).mT)
+        spin = rotation_matrix(turned)
+        error = rotation_vector(rotations @ (spin @ start[:, None]).mT)
         angle = error.norm(dim=-1)
         spread = angle.median(-1, keepdim=True).values.clamp_min(1e-9)
         weight = 1 / (1 + (angle / spread).square())
@@ -70,9 +70,9 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Te
         target = (jacobian.mT @ (error * weight[..., None])[..., None]).sum(1)[..., 0]
         ridge = 1e-12 * normal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] * eye
         move = torch.linalg.solve(normal + ridge, target)
-        speed, start = speed + move[:, :3], roma.rotvec_to_rotmat(move[:, 3:]) @ start
-    path = roma.rotvec_to_rotmat(time[:, None] * speed[:, None]) @ start[:, None]
-    angle = roma.rotmat_geodesic_distance(path, rotations)
+        speed, start = speed + move[:, :3], rotation_matrix(move[:, 3:]) @ start
+    path = rotation_matrix(time[:, None] * speed[:, None]) @ start[:, None]
+    angle = rotation_angle(path, rotations)
     return path.view(*batch, frames, 3, 3), angle.view(*batch, frames)
 
 
@@ -101,7 +101,7 @@ def smooth_path(rotations: Tensor, *, waves: int = 6, num_steps: int = 20) -> tu
         ridge = 1e-9 * normal.diagonal().mean() * torch.eye(len(normal), dtype=base.dtype, device=base.device)
         share = torch.linalg.solve(normal + ridge, basis.mT @ (weight[:, None] * deviation))
         path = nearest_rotation((basis @ share).unflatten(-1, (3, 3))) @ base
-        angle = roma.rotmat_geodesic_distance(path, rotations)
+        angle = rotation_angle(path, rotations)
     return path, angle
 
 
@@ -129,7 +129,7 @@ def choose_path(rotations: Tensor, kind: CameraPath = "auto") -> tuple[Tensor, C
 
 
 def _explains(path: Tensor, angle: Tensor) -> bool:
-    length = roma.rotmat_geodesic_distance(path[1:], path[:-1]).sum()
+    length = rotation_angle(path[1:], path[:-1]).sum()
     return bool(angle.median() < (EVEN * length).clamp_max(NEAR))
 
 
@@ -156,8 +156,8 @@ def settle_path(
     if frames < 3:
         return path
     time = torch.arange(frames, dtype=path.dtype, device=path.device) - (frames - 1) / 2
-    turn = roma.rotmat_to_rotvec(path[1:] @ path[:-1].mT).median(0).values
-    spin = roma.rotvec_to_rotmat(time[:, None] * turn)
+    turn = rotation_vector(path[1:] @ path[:-1].mT).median(0).values
+    spin = rotation_matrix(time[:, None] * turn)
     rest = spin.mT @ path  # one rotation, if the path is of constant angular velocity
     # a radian of tilt moves the axis, a radian of speed the path's ends
     size = turn.norm()
@@ -170,9 +170,9 @@ def settle_path(
 
     def turned(u: Tensor) -> Tensor:
         speed = turn + u[:, :3] @ lean  # (1, 3)
-        out = roma.rotvec_to_rotmat(time[:, None] * speed) @ rest
+        out = rotation_matrix(time[:, None] * speed) @ rest
         if waves:
-            out = roma.rotvec_to_rotmat(basis @ u[0, 3:].view(waves, 3)) @ out
+            out = rotation_matrix(basis @ u[0, 3:].view(waves, 3)) @ out
         return out
 
     def energy(u: Tensor) -> Tensor:

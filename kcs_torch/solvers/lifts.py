@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import roma
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence, safe_norm
+from kcs_torch.functional.rotation import rotation_matrix
 
 __all__ = ["random_lifts", "turning_cameras"]
 
@@ -20,7 +20,7 @@ def turning_cameras(
     """Return rotations (H, T, 3, 3) of cameras that turn evenly about the image's vertical by ``degrees`` in all."""
     angle = torch.deg2rad(torch.as_tensor(degrees, dtype=dtype, device=device))
     time = torch.linspace(-0.5, 0.5, frames, dtype=dtype, device=device) if frames > 1 else angle.new_zeros(1)
-    return roma.rotvec_to_rotmat(torch.nn.functional.pad((angle[:, None] * time)[..., None], (1, 1)))
+    return rotation_matrix(torch.nn.functional.pad((angle[:, None] * time)[..., None], (1, 1)))
 
 
 def random_lifts(

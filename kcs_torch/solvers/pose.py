@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import roma
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.align import centre
+from kcs_torch.functional.rotation import rotation_matrix
 from kcs_torch.functional.temporal import best_path
 
 __all__ = ["CameraFit", "fit_cameras", "steady_cameras"]
@@ -163,7 +163,7 @@ def _refine(
         normal = normal - cross[..., :, None] * cross[..., None, :]
         ridge = (damping + 1e-9) * normal.diagonal(dim1=-2, dim2=-1).amax(-1) + tiny
         move = torch.linalg.solve(normal + ridge[..., None, None] * eye, scales[..., None] * target)
-        trial = roma.rotvec_to_rotmat(move) @ rotations
+        trial = rotation_matrix(move) @ rotations
         new, *others = evaluate(trial)
         better = new < cost
         pick = better[..., None, None]
@@ -180,4 +180,4 @@ def _headings(count: int, like: Tensor) -> Tensor:
     """(count, 3, 3) rotations about the vertical (y) axis."""
     angle = torch.arange(count, dtype=like.dtype, device=like.device) * (2 * math.pi / count)
     axis = torch.tensor([0.0, 1.0, 0.0], dtype=like.dtype, device=like.device)
-    return roma.rotvec_to_rotmat(angle[:, None] * axis)
+    return rotation_matrix(angle[:, None] * axis)

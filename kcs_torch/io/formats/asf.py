@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
 from kcs_torch.errors import FormatError
+from kcs_torch.functional import euler_rotation
 from kcs_torch.io.build_motion import build_motion, numbers, read_lines
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe
 from kcs_torch.types import Motion
@@ -254,7 +254,7 @@ def _positions(body: _Body, order: Sequence[_Bone], angles: dict[str, Tensor]) -
         columns = {k[1].upper(): values[:, i] for i, k in enumerate(kinds) if k[0] == "r"}
         zero = values.new_zeros(len(values))
         stacked = torch.stack([columns.get(axis, zero) for axis in order[::-1]], -1)
-        return roma.euler_to_rotmat(order[::-1], stacked, degrees=body.degrees)
+        return euler_rotation(order[::-1], stacked.deg2rad() if body.degrees else stacked)
 
     def fixed(bone: _Bone) -> Tensor:
         return turn(angles["root"].new_tensor(bone.axis)[None], ("rx", "ry", "rz"), bone.order)

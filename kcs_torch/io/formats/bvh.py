@@ -17,12 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
 from kcs_torch.errors import FormatError, OutputError
-from kcs_torch.functional import interpolate
+from kcs_torch.functional import euler_angles, euler_rotation, interpolate
 from kcs_torch.io.build_motion import build_motion, distinct, numbers, read_lines
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer
@@ -192,7 +191,7 @@ def _positions(nodes: Sequence[_Node], values: Tensor) -> Tensor:
         points[:, i] = (parent @ place[..., None])[..., 0]
         if node.parent >= 0:
             points[:, i] += points[:, node.parent]
-        worlds.append(parent @ roma.euler_to_rotmat(order, torch.stack(angles, 1), degrees=True) if order else parent)
+        worlds.append(parent @ euler_rotation(order, torch.stack(angles, 1).deg2rad()) if order else parent)
     return points
 
 
@@ -251,7 +250,7 @@ def _write_rig(rig: Rig, path: Path, rate: float) -> None:
             lines += [f"{tab}\tEnd Site", f"{tab}\t{{", f"{tab}\t\tOFFSET 0.000000 0.000000 0.000000", f"{tab}\t}}"]
         stack.append((~node, depth))
         stack += [(child, depth + 1) for child in reversed(children[node])]
-    angles = plain(roma.rotmat_to_euler("ZXY", rig.turns[:, order], degrees=True))
+    angles = plain(euler_angles("ZXY", rig.turns[:, order]).rad2deg())
     angles = np.unwrap(angles, axis=0, period=360).reshape(len(angles), -1)
     rows = np.concatenate([plain(rig.root), angles], 1)
     lines += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1 / rate:.8f}"]

@@ -1,0 +1,133 @@
+"""Rotations as matrices, as vectors (axis times angle) and as Euler angles."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import OptionError
+
+__all__ = ["euler_angles", "euler_rotation", "rotation_angle", "rotation_matrix", "rotation_vector"]
+
+AXES = "XYZ"
+
+
+def rotation_matrix(vectors: Tensor) -> Tensor:
+    """Return exp([v]) = cos(a) I + sin(a)/a [v] + (1 - cos(a))/a^2 v v^T, a = |v|: the rotation about v by |v| radians.
+
+    Args:
+        vectors: (..., 3).
+
+    Returns:
+        (..., 3, 3). Differentiable, also where the angle is 0.
+
+    >>> rotation_matrix(torch.tensor([0.0, 0.0, torch.pi / 2])).round(decimals=5).abs().tolist()
+    [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    x, y, z = vectors.unbind(-1)
+    square = x * x + y * y + z * z
+    still = square == 0
+    angle = torch.where(still, square, torch.where(still, 1, square).sqrt())
+    cosine, sine, versine = angle.cos(), (angle / math.pi).sinc(), (angle / math.tau).sinc().square() / 2
+    a, b, c = sine * x, sine * y, sine * z
+    u, v, w = versine * x, versine * y, versine * z
+    xy, yz, zx = u * y, v * z, w * x
+    rows = [u * x + cosine, xy - c, zx + b, xy + c, v * y + cosine, yz - a, zx - b, yz + a, w * z + cosine]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def rotation_vector(matrices: Tensor) -> Tensor:
+    """Return the least v with exp([v]) = R, of length 0 to pi: the inverse of :func:`rotation_matrix`.
+
+    Args:
+        matrices: (..., 3, 3) rotations.
+
+    Returns:
+        (..., 3). Differentiable, also at the identity; where R is a half turn, v and -v are one rotation.
+
+    Through the unit quaternion, whose outer square is linear in R: a row of it far from 0 is the quaternion up to a
+    factor, however large or small the angle is (Markley 2008).
+
+    >>> rotation_vector(rotation_matrix(torch.tensor([0.1, -2.0, 0.5]))).round(decimals=5).tolist()
+    [0.10000000149011612, -2.0, 0.5]
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in matrices.unbind(-2))
+    outer = torch.stack(
+        [
+            *(1 + xx - yy - zz, xy + yx, zx + xz, zy - yz),
+            *(xy + yx, 1 - xx + yy - zz, yz + zy, xz - zx),
+            *(zx + xz, yz + zy, 1 - xx - yy + zz, yx - xy),
+            *(zy - yz, xz - zx, yx - xy, 1 + xx + yy + zz),
+        ],
+        -1,
+    ).unflatten(-1, (4, 4))
+    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
+    row = outer.gather(-2, largest.expand(*largest.shape[:-1], 4)).squeeze(-2)
+    row = torch.where(row[..., 3:] < 0, -row, row)
+    axis, cosine = row[..., :3], row[..., 3:]
+    square = axis.square().sum(-1, keepdim=True)
+    tiny = square <= (torch.finfo(row.dtype).eps * cosine).square()
+    sine = torch.where(tiny, 1, square).sqrt()
+    return 2 * axis * torch.where(tiny, 1 / torch.where(tiny, cosine, 1), torch.atan2(sine, cosine) / sine)
+
+
+def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
+    """Return the angle (...) in radians between rotations (..., 3, 3): |A - B| = 2 sqrt(2) sin(angle / 2)."""
+    apart = torch.linalg.matrix_norm(first - second) / math.sqrt(8)
+    return 2 * apart.clamp_max(1).asin()
+
+
+def euler_rotation(order: str, angles: Tensor) -> Tensor:
+    """Return the product of turns about the axes named, each the one that the turns before have moved.
+
+    Args:
+        order: letters X, Y, Z, any number of them.
+        angles: (..., number of letters), in radians.
+
+    Returns:
+        (..., 3, 3).
+
+    Raises:
+        OptionError: there is another letter.
+
+    >>> torch.allclose(euler_rotation("ZX", torch.tensor([0.3, 0.0])), rotation_matrix(torch.tensor([0, 0, 0.3])))
+    True
+    """
+    if not set(order) <= set(AXES):
+        raise OptionError(f"euler_rotation: expected axes X, Y and Z, got {order!r}")
+    eye = torch.eye(3, dtype=angles.dtype, device=angles.device)
+    total = eye.expand(*angles.shape[:-1], 3, 3)
+    for axis, angle in zip(order, angles.unbind(-1), strict=True):
+        total = total @ rotation_matrix(angle[..., None] * eye[AXES.index(axis)])
+    return total
+
+
+def euler_angles(order: str, matrices: Tensor) -> Tensor:
+    """Return the angles of :func:`euler_rotation` about three different axes.
+
+    Args:
+        order: the letters X, Y, Z in any order.
+        matrices: (..., 3, 3).
+
+    Returns:
+        (..., 3) in radians, the second within a quarter turn. Where that is a quarter turn the third is 0.
+
+    Raises:
+        OptionError: the order is another one.
+    """
+    if sorted(order) != list(AXES):
+        raise OptionError(f"euler_angles: expected X, Y and Z in some order, got {order!r}")
+    i, j, k = (AXES.index(axis) for axis in order)
+    sign = 1 if (j - i) % 3 == 1 else -1
+    r = matrices
+    sine, cosine = sign * r[..., i, k], torch.hypot(r[..., i, i], r[..., i, j])
+    locked = cosine < 1e-7
+    first = torch.where(
+        locked,
+        torch.atan2(sign * r[..., k, j], r[..., j, j]),
+        torch.atan2(-sign * r[..., j, k], r[..., k, k]),
+    )
+    third = torch.where(locked, torch.zeros_like(sine), torch.atan2(-sign * r[..., i, j], r[..., i, i]))
+    return torch.stack([first, torch.atan2(sine, cosine), third], -1)
