@@ -11,7 +11,8 @@ from torch.testing import assert_close
 from kcs_torch.functional import bone_vectors
 from kcs_torch.methods.pkc.limbs import SignCosts, limb_paths, limbs_of, waves
 from kcs_torch.nn import PostureEnergy
-from kcs_torch.nn.posture import free_bones, trunk_joints
+from kcs_torch.nn.lengths import free_bones
+from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import SKELETONS
 
 MAN = SKELETONS["h36m17"]

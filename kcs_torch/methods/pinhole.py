@@ -10,7 +10,8 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.methods.size import slow_waves
 from kcs_torch.nn.anatomy import HingeEnergy
-from kcs_torch.nn.posture import ForeshorteningEnergy, PostureEnergy, ProportionEnergy, trunk_joints
+from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy
+from kcs_torch.nn.posture import PostureEnergy, trunk_joints
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["NEAREST", "PinholeEnergy"]

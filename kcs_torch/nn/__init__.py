@@ -1,6 +1,7 @@
 """Modules: layers, energies that are losses and solver terms at once, and unrolled solvers."""
 
 from kcs_torch.nn.anatomy import HingeEnergy
+from kcs_torch.nn.contact import ContactEnergy
 from kcs_torch.nn.critic import KCSCritic, critic_loss, generator_loss
 from kcs_torch.nn.distances import JointDistance, KCSDistance
 from kcs_torch.nn.energies import (
@@ -11,9 +12,10 @@ from kcs_torch.nn.energies import (
     SymmetryEnergy,
 )
 from kcs_torch.nn.layers import SVT, BoneLengths, BoneVectors, KCSMatrix
+from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy
 from kcs_torch.nn.networks import CameraHead, MLPLifter, TemporalLifter
 from kcs_torch.nn.perspective import PerspectiveEnergy
-from kcs_torch.nn.posture import ContactEnergy, ForeshorteningEnergy, PostureEnergy, ProportionEnergy
+from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.nn.procrustean import ProcrusteanEnergy
 from kcs_torch.nn.refined import RefinedLifter
 from kcs_torch.nn.unrolled import UnrolledFPC, UnrolledKCS, UnrolledPKC, UnrolledSfAM

@@ -1,4 +1,4 @@
-"""What a body usually does: energies of posture, lengths, foreshortening and contact."""
+"""What a body usually does: the directions of its bones, seen from its trunk."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
+from kcs_torch.nn.layers import SkeletonModule, narrow, wide
+from kcs_torch.nn.lengths import usual_size
 from kcs_torch.nn.masks import bone_share, known_points, safe_root, some, weighs_joints
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["ContactEnergy", "ForeshorteningEnergy", "PostureEnergy", "ProportionEnergy"]
+__all__ = ["PostureEnergy", "trunk_joints"]
 
 TRUNK_SPREAD = 18.0
 """Bones that stray from the template by less than this, in degrees, are of the trunk."""
@@ -118,7 +119,7 @@ class PostureEnergy(SkeletonModule):
             share = None
             if weights is not None:
                 share = bone_share(weights, self.bones) if joints else weights[..., None]
-            lengths = _usual_size(vectors.square().sum(-1), share)
+            lengths = usual_size(vectors.square().sum(-1), share)
         lengths = lengths.to(vectors.dtype)[..., None, :, None]
         return vectors @ self.frame(points) / torch.where(lengths > 0, lengths, torch.inf)
 
@@ -166,166 +167,6 @@ class PostureEnergy(SkeletonModule):
         return narrow((count + self.strength) / 2 * log_det, points)
 
 
-class ForeshorteningEnergy(SkeletonModule):
-    """sum_tb w_b/tau [log L_b + 1/2 log(dz_tb^2 + (eps L_b)^2)]: bones point anywhere, and are as often seen long.
-
-    A direction drawn evenly from the sphere has an image of density 1 / (L |dz|): a bone that is longer than any of its
-    images would have to avoid the image plane all the time. This keeps lengths down where smoothness, which prefers
-    long bones that hardly turn, would let them grow.
-
-    Args:
-        skeleton: bones of its trunk, where it has one, do not count.
-        correlation: tau, frames that tell as much as one independent frame.
-        eps: share of the length below which depths are not told apart.
-    """
-
-    free: Tensor
-
-    def __init__(self, skeleton: str | Path | Skeleton, *, correlation: float = 10.0, eps: float = 0.1) -> None:
-        super().__init__(skeleton)
-        self.correlation, self.eps = correlation, eps
-        self.register_buffer("free", free_bones(self.skeleton), persistent=False)
-
-    def forward(
-        self,
-        points: Tensor,
-        lengths: Tensor | None = None,
-        weights: Tensor | None = None,
-        *,
-        bone_weights: Tensor | None = None,
-    ) -> Tensor:
-        """Return the energy of each clip.
-
-        Args:
-            points: (..., T, N, 3).
-            lengths: (..., B); None takes each bone's root mean square over the frames in which it counts.
-            weights: (..., T, N) of the joints: a bone weighs as much as the lesser of its two ends.
-            bone_weights: (..., T, B) in place of ``weights``.
-
-        Returns:
-            (...).
-
-        Raises:
-            ShapeError: the shapes do not fit.
-        """
-        self.check(points, clip=True)
-        if weights is not None:
-            if weights.shape[-2:] != points.shape[-3:-1]:
-                expected = f"(..., {points.shape[-3]}, {points.shape[-2]})"
-                raise ShapeError(f"ForeshorteningEnergy: expected weights {expected}, got {tuple(weights.shape)}")
-            bone_weights = bone_share(weights, self.bones)
-        vectors = known(bone_vectors(wide(points), self.bones), bone_weights)
-        if lengths is None:
-            lengths = _usual_size(vectors.square().sum(-1), bone_weights)
-        each = self.free.to(vectors) * foreshortening(vectors[..., 2], wide(lengths)[..., None, :], self.eps)
-        if bone_weights is not None:
-            each = each * bone_weights
-        return narrow(each.sum((-2, -1)) / self.correlation, points)
-
-
-class ProportionEnergy(SkeletonModule):
-    """How unusual bone lengths are: sum_b log(1 + (l_b/s)^2/2) + 1/2 sum of twins (l_left - l_right)^2/p^2.
-
-    l_b is the log of a length over the skeleton's, less the mean over bones: the size of the body does not count. The
-    heavy tail is for joints that a data set defines in its own way.
-
-    Args:
-        skeleton: with a template or proportions.
-        spread: s, usual deviation of a length, as a share.
-        twins: p, usual difference of left and right, as a share.
-
-    Raises:
-        SkeletonError: the skeleton knows no lengths.
-    """
-
-    usual: Tensor
-    pairs: Tensor
-
-    def __init__(self, skeleton: str | Path | Skeleton, *, spread: float = 0.08, twins: float = 0.03) -> None:
-        super().__init__(skeleton)
-        usual = self.skeleton.relative_lengths(dtype=torch.float64)
-        if usual is None:
-            raise SkeletonError(f"skeleton '{self.skeleton.name}' has neither proportions nor a template")
-        self.spread, self.twins = spread, twins
-        self.register_buffer("usual", usual, persistent=False)
-        pairs = torch.tensor(self.skeleton.mirror_bones, dtype=torch.long).reshape(-1, 2)
-        self.register_buffer("pairs", pairs, persistent=False)
-
-    def forward(self, lengths: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Return (...) of lengths (..., B), positive, in any unit; weights (..., B), 0 for bones that are not known."""
-        if lengths.shape[-1] != len(self.usual):
-            raise ShapeError(f"ProportionEnergy: expected lengths (..., {len(self.usual)}), got {tuple(lengths.shape)}")
-        tiny = torch.finfo(lengths.dtype).tiny
-        if weights is not None:
-            lengths = torch.where(weights > 0, lengths, self.usual.to(lengths))
-        log = (lengths.clamp_min(tiny) / self.usual.to(lengths).clamp_min(tiny)).log()
-        apart = ((log[..., self.pairs[:, 0]] - log[..., self.pairs[:, 1]]) / self.twins).square()
-        if weights is None:
-            off = log - log.mean(-1, keepdim=True)
-            return torch.log1p((off / self.spread).square() / 2).sum(-1) + apart.sum(-1) / 2
-        off = log - (weights * log).sum(-1, keepdim=True) / some(weights.sum(-1, keepdim=True))
-        both = torch.minimum(weights[..., self.pairs[:, 0]], weights[..., self.pairs[:, 1]])
-        return (weights * torch.log1p((off / self.spread).square() / 2)).sum(-1) + (both * apart).sum(-1) / 2
-
-
-class ContactEnergy(SkeletonModule):
-    """Feet that stand still in the image stand still in space: the root's depth has to move against them.
-
-    1/2 sum_tc c_tc log(1 + ((z_c,t - z_c,t-1 + v_t)/s)^2) + 1/2 sum_t ((v_t - v_t-1)/a)^2, with the root's depth
-    velocity v and the weights c of :func:`kcs_torch.functional.standing`. It holds for a camera that does not move. A
-    small multiple of sum_t (v_t/s)^2 settles what no standing foot tells.
-
-    Args:
-        skeleton: with contacts; without them the energy is 0.
-        slip: s, in units of the points per frame.
-        change: a, of the root's velocity from frame to frame.
-    """
-
-    contacts: Tensor
-
-    def __init__(self, skeleton: str | Path | Skeleton, *, slip: float = 0.006, change: float = 0.004) -> None:
-        super().__init__(skeleton)
-        self.slip, self.change = slip, change
-        contacts = torch.tensor(self.skeleton.contacts, dtype=torch.long)
-        self.register_buffer("contacts", contacts, persistent=False)
-
-    def forward(self, points: Tensor, velocity: Tensor, standing: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Return (...).
-
-        Args:
-            points: (..., T, N, 3), depth relative to the root or the body's middle.
-            velocity: v (..., T), the first frame's does not count.
-            standing: c (..., T, C).
-            weights: (..., T, N) of the joints: a foot stands no more than it is seen.
-        """
-        self.check(points, clip=True)
-        if weights is not None:
-            standing = torch.minimum(standing, weights[..., self.contacts])
-        depth, velocity = wide(points)[..., self.contacts, 2], wide(velocity)
-        both = torch.minimum(standing[..., 1:, :], standing[..., :-1, :])
-        step = known((depth[..., 1:, :] - depth[..., :-1, :])[..., None], both)[..., 0]
-        move = step + velocity[..., 1:, None]
-        slip = (both * torch.log1p((move / self.slip).square())).sum((-2, -1)) / 2
-        steady = ((velocity[..., 2:] - velocity[..., 1:-1]) / self.change).square().sum(-1) / 2
-        return narrow(slip + steady + 5e-4 * (velocity[..., 1:] / self.slip).square().sum(-1), points)
-
-
-def foreshortening(depth: Tensor, length: Tensor, eps: float) -> Tensor:
-    """Log L + 1/2 log(dz^2 + (eps L)^2), elementwise: -log density of an image of an evenly drawn direction."""
-    tiny = torch.finfo(depth.dtype).tiny
-    return length.clamp_min(tiny).log() + 0.5 * (depth.square() + (eps * length).square()).clamp_min(tiny).log()
-
-
-def _usual_size(square: Tensor, share: Tensor | None) -> Tensor:
-    """Root mean square (..., B) over the frames of squared lengths (..., T, B) that have a share (..., T, B or 1)."""
-    if share is None:
-        square = square.mean(-2)
-    else:
-        seen = (share > 0).to(square)
-        square = (square * seen).sum(-2) / seen.sum(-2).clamp_min(1)
-    return square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
-
-
 def trunk_joints(skeleton: Skeleton) -> list[int]:
     """Joints that bones of little spread connect to the root; none without a template or spreads."""
     if skeleton.template is None or skeleton.spread is None or not skeleton.is_tree:
@@ -337,13 +178,6 @@ def trunk_joints(skeleton: Skeleton) -> list[int]:
             b for (a, b), s in zip(skeleton.bones, skeleton.spread, strict=True) if a in trunk and s < TRUNK_SPREAD
         }
     return sorted(trunk)
-
-
-def free_bones(skeleton: Skeleton) -> Tensor:
-    """1 for bones of the limbs, which point anywhere, 0 for those of trunk and head, (B,)."""
-    if skeleton.spread is None:
-        return torch.ones(skeleton.num_bones)
-    return torch.tensor([float(s > 26.0) for s in skeleton.spread])
 
 
 def _hinge_facts(body: Skeleton, rest: Tensor) -> tuple[Tensor, set[int]]:

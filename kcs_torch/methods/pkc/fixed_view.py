@@ -16,7 +16,7 @@ from kcs_torch.methods.pkc.batch import Task, minimise_all
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limb_paths, limbs_of, waves
 from kcs_torch.methods.pkc.objective import Objective, Refined, Weights, at_pace, pace_of
 from kcs_torch.methods.pkc.trunk import TURN, Trunk, longest_image, siblings, trunk_misfit, trunk_path, trunk_turns
-from kcs_torch.nn.posture import free_bones
+from kcs_torch.nn.lengths import free_bones
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["Hypotheses", "distinct", "fixed_view", "refined", "searching"]

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.temporal import window_starts
-from kcs_torch.nn.posture import PostureEnergy, foreshortening
+from kcs_torch.nn.lengths import foreshortening
+from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Hinge, Skeleton
 from kcs_torch.solvers.signs import sign_costs, smooth_signs
 

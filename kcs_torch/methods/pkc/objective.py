@@ -13,7 +13,8 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.methods.pkc.descent import ANCHOR, CORNER, HEAVY, NOISE, Descent, wide
 from kcs_torch.nn.anatomy import HingeEnergy
-from kcs_torch.nn.posture import ForeshorteningEnergy, PostureEnergy, ProportionEnergy, free_bones
+from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy, free_bones
+from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
 

@@ -1,0 +1,55 @@
+"""Where a body stands on the ground."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
+from kcs_torch.skeleton import Skeleton
+
+__all__ = ["ContactEnergy"]
+
+
+class ContactEnergy(SkeletonModule):
+    """Feet that stand still in the image stand still in space: the root's depth has to move against them.
+
+    1/2 sum_tc c_tc log(1 + ((z_c,t - z_c,t-1 + v_t)/s)^2) + 1/2 sum_t ((v_t - v_t-1)/a)^2, with the root's depth
+    velocity v and the weights c of :func:`kcs_torch.functional.standing`. It holds for a camera that does not move. A
+    small multiple of sum_t (v_t/s)^2 settles what no standing foot tells.
+
+    Args:
+        skeleton: with contacts; without them the energy is 0.
+        slip: s, in units of the points per frame.
+        change: a, of the root's velocity from frame to frame.
+    """
+
+    contacts: Tensor
+
+    def __init__(self, skeleton: str | Path | Skeleton, *, slip: float = 0.006, change: float = 0.004) -> None:
+        super().__init__(skeleton)
+        self.slip, self.change = slip, change
+        contacts = torch.tensor(self.skeleton.contacts, dtype=torch.long)
+        self.register_buffer("contacts", contacts, persistent=False)
+
+    def forward(self, points: Tensor, velocity: Tensor, standing: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return (...).
+
+        Args:
+            points: (..., T, N, 3), depth relative to the root or the body's middle.
+            velocity: v (..., T), the first frame's does not count.
+            standing: c (..., T, C).
+            weights: (..., T, N) of the joints: a foot stands no more than it is seen.
+        """
+        self.check(points, clip=True)
+        if weights is not None:
+            standing = torch.minimum(standing, weights[..., self.contacts])
+        depth, velocity = wide(points)[..., self.contacts, 2], wide(velocity)
+        both = torch.minimum(standing[..., 1:, :], standing[..., :-1, :])
+        step = known((depth[..., 1:, :] - depth[..., :-1, :])[..., None], both)[..., 0]
+        move = step + velocity[..., 1:, None]
+        slip = (both * torch.log1p((move / self.slip).square())).sum((-2, -1)) / 2
+        steady = ((velocity[..., 2:] - velocity[..., 1:-1]) / self.change).square().sum(-1) / 2
+        return narrow(slip + steady + 5e-4 * (velocity[..., 1:] / self.slip).square().sum(-1), points)

@@ -1,0 +1,144 @@
+"""How long bones usually are: beside their images, and beside each other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ShapeError, SkeletonError
+from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
+from kcs_torch.nn.masks import bone_share, some
+from kcs_torch.skeleton import Skeleton
+
+__all__ = ["ForeshorteningEnergy", "ProportionEnergy", "foreshortening", "free_bones", "usual_size"]
+
+LIMB_SPREAD = 26.0
+"""Bones that stray from the template by more than this, in degrees, are of the limbs."""
+
+
+class ForeshorteningEnergy(SkeletonModule):
+    """sum_tb w_b/tau [log L_b + 1/2 log(dz_tb^2 + (eps L_b)^2)]: bones point anywhere, and are as often seen long.
+
+    A direction drawn evenly from the sphere has an image of density 1 / (L |dz|): a bone that is longer than any of its
+    images would have to avoid the image plane all the time. This keeps lengths down where smoothness, which prefers
+    long bones that hardly turn, would let them grow.
+
+    Args:
+        skeleton: bones of its trunk, where it has one, do not count.
+        correlation: tau, frames that tell as much as one independent frame.
+        eps: share of the length below which depths are not told apart.
+    """
+
+    free: Tensor
+
+    def __init__(self, skeleton: str | Path | Skeleton, *, correlation: float = 10.0, eps: float = 0.1) -> None:
+        super().__init__(skeleton)
+        self.correlation, self.eps = correlation, eps
+        self.register_buffer("free", free_bones(self.skeleton), persistent=False)
+
+    def forward(
+        self,
+        points: Tensor,
+        lengths: Tensor | None = None,
+        weights: Tensor | None = None,
+        *,
+        bone_weights: Tensor | None = None,
+    ) -> Tensor:
+        """Return the energy of each clip.
+
+        Args:
+            points: (..., T, N, 3).
+            lengths: (..., B); None takes each bone's root mean square over the frames in which it counts.
+            weights: (..., T, N) of the joints: a bone weighs as much as the lesser of its two ends.
+            bone_weights: (..., T, B) in place of ``weights``.
+
+        Returns:
+            (...).
+
+        Raises:
+            ShapeError: the shapes do not fit.
+        """
+        self.check(points, clip=True)
+        if weights is not None:
+            if weights.shape[-2:] != points.shape[-3:-1]:
+                expected = f"(..., {points.shape[-3]}, {points.shape[-2]})"
+                raise ShapeError(f"ForeshorteningEnergy: expected weights {expected}, got {tuple(weights.shape)}")
+            bone_weights = bone_share(weights, self.bones)
+        vectors = known(bone_vectors(wide(points), self.bones), bone_weights)
+        if lengths is None:
+            lengths = usual_size(vectors.square().sum(-1), bone_weights)
+        each = self.free.to(vectors) * foreshortening(vectors[..., 2], wide(lengths)[..., None, :], self.eps)
+        if bone_weights is not None:
+            each = each * bone_weights
+        return narrow(each.sum((-2, -1)) / self.correlation, points)
+
+
+class ProportionEnergy(SkeletonModule):
+    """How unusual bone lengths are: sum_b log(1 + (l_b/s)^2/2) + 1/2 sum of twins (l_left - l_right)^2/p^2.
+
+    l_b is the log of a length over the skeleton's, less the mean over bones: the size of the body does not count. The
+    heavy tail is for joints that a data set defines in its own way.
+
+    Args:
+        skeleton: with a template or proportions.
+        spread: s, usual deviation of a length, as a share.
+        twins: p, usual difference of left and right, as a share.
+
+    Raises:
+        SkeletonError: the skeleton knows no lengths.
+    """
+
+    usual: Tensor
+    pairs: Tensor
+
+    def __init__(self, skeleton: str | Path | Skeleton, *, spread: float = 0.08, twins: float = 0.03) -> None:
+        super().__init__(skeleton)
+        usual = self.skeleton.relative_lengths(dtype=torch.float64)
+        if usual is None:
+            raise SkeletonError(f"skeleton '{self.skeleton.name}' has neither proportions nor a template")
+        self.spread, self.twins = spread, twins
+        self.register_buffer("usual", usual, persistent=False)
+        pairs = torch.tensor(self.skeleton.mirror_bones, dtype=torch.long).reshape(-1, 2)
+        self.register_buffer("pairs", pairs, persistent=False)
+
+    def forward(self, lengths: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return (...) of lengths (..., B), positive, in any unit; weights (..., B), 0 for bones that are not known."""
+        if lengths.shape[-1] != len(self.usual):
+            raise ShapeError(f"ProportionEnergy: expected lengths (..., {len(self.usual)}), got {tuple(lengths.shape)}")
+        tiny = torch.finfo(lengths.dtype).tiny
+        if weights is not None:
+            lengths = torch.where(weights > 0, lengths, self.usual.to(lengths))
+        log = (lengths.clamp_min(tiny) / self.usual.to(lengths).clamp_min(tiny)).log()
+        apart = ((log[..., self.pairs[:, 0]] - log[..., self.pairs[:, 1]]) / self.twins).square()
+        if weights is None:
+            off = log - log.mean(-1, keepdim=True)
+            return torch.log1p((off / self.spread).square() / 2).sum(-1) + apart.sum(-1) / 2
+        off = log - (weights * log).sum(-1, keepdim=True) / some(weights.sum(-1, keepdim=True))
+        both = torch.minimum(weights[..., self.pairs[:, 0]], weights[..., self.pairs[:, 1]])
+        return (weights * torch.log1p((off / self.spread).square() / 2)).sum(-1) + (both * apart).sum(-1) / 2
+
+
+def foreshortening(depth: Tensor, length: Tensor, eps: float) -> Tensor:
+    """Log L + 1/2 log(dz^2 + (eps L)^2), elementwise: -log density of an image of an evenly drawn direction."""
+    tiny = torch.finfo(depth.dtype).tiny
+    return length.clamp_min(tiny).log() + 0.5 * (depth.square() + (eps * length).square()).clamp_min(tiny).log()
+
+
+def free_bones(skeleton: Skeleton) -> Tensor:
+    """1 for bones of the limbs, which point anywhere, 0 for those of trunk and head, (B,)."""
+    if skeleton.spread is None:
+        return torch.ones(skeleton.num_bones)
+    return torch.tensor([float(s > LIMB_SPREAD) for s in skeleton.spread])
+
+
+def usual_size(square: Tensor, share: Tensor | None) -> Tensor:
+    """Root mean square (..., B) over the frames of squared lengths (..., T, B) that have a share (..., T, B or 1)."""
+    if share is None:
+        square = square.mean(-2)
+    else:
+        seen = (share > 0).to(square)
+        square = (square * seen).sum(-2) / seen.sum(-2).clamp_min(1)
+    return square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()

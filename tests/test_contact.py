@@ -1,0 +1,81 @@
+"""Energy of contact with the ground: by hand, gradients, and the feet of a walk."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from numerics import finite, gradcheck, normal, same_as_loop
+from torch.testing import assert_close
+
+from kcs_torch.data import walking_person
+from kcs_torch.functional import standing
+from kcs_torch.nn import ContactEnergy
+from kcs_torch.skeleton import SKELETONS
+
+MAN = SKELETONS["h36m17"]
+
+
+def test_a_root_that_moves_against_standing_feet_costs_nothing():
+    energy = ContactEnergy(MAN, slip=0.01, change=0.01)
+    points = normal(1, 17, 3).repeat(6, 1, 1)
+    drift = 0.3 * torch.arange(6).double()
+    points[..., 2] -= drift[:, None]  # all joints go -0.3 a frame, seen from the root
+    stands = torch.ones(6, len(MAN.contacts)).double()
+    right = energy(points, torch.full((6,), 0.3).double(), stands)
+    still = 5 * 5e-4 * (0.3 / 0.01) ** 2
+    assert right.item() == pytest.approx(still)
+    assert energy(points, torch.zeros(6).double(), stands) > 10 * right
+    assert energy(points, torch.zeros(6).double(), 0 * stands) == 0
+
+
+def test_contact_by_hand():
+    energy = ContactEnergy(MAN, slip=0.2, change=0.5)
+    points, velocity, stands = normal(4, 17, 3), normal(4, seed=1), normal(4, 2, seed=2).sigmoid()
+    feet = points[:, list(MAN.contacts), 2]
+    value = torch.zeros(()).double()
+    for t, c in itertools.product(range(1, 4), range(2)):
+        move = feet[t, c] - feet[t - 1, c] + velocity[t]
+        value = value + 0.5 * min(stands[t, c], stands[t - 1, c]) * (1 + (move / 0.2) ** 2).log()
+    value = value + sum((velocity[t] - velocity[t - 1]) ** 2 for t in (2, 3)) / (2 * 0.25)
+    value = value + 5e-4 * velocity[1:].square().sum() / 0.04
+    assert_close(energy(points, velocity, stands), value)
+    other = velocity.clone()
+    other[0] = 9.0  # nothing came before the first frame
+    assert_close(energy(points, other, stands), value)
+
+
+def test_contact_gradient_batches_and_no_contacts():
+    energy = ContactEnergy(MAN)
+    stands = normal(4, 2, seed=2).sigmoid()
+    assert gradcheck(energy, 0.01 * normal(4, 17, 3), 0.01 * normal(4, seed=1), stands, fast=True)
+    for frames in (1, 2):
+        finite(energy, normal(frames, 17, 3), normal(frames), stands[:frames])
+    same_as_loop(lambda p, v, s: energy(p, v, s.sigmoid()), (4, 17, 3), (4,), (4, 2))
+    assert ContactEnergy("hand21")(normal(4, 21, 3), torch.zeros(4).double(), torch.zeros(4, 0).double()) == 0
+
+
+def test_feet_of_a_walk_stand_by_turns():
+    clip = walking_person(90, turn=0.0)
+    feet = list(MAN.contacts)
+    sure = standing(clip.tracks.points[:, feet], clip.tracks.weights[:, feet])
+    moves = clip.points[:, feet].diff(dim=0).norm(dim=-1)
+    moves = torch.cat([moves, moves[-1:]])
+    assert moves[sure > 0.5].max() < 0.3 * moves.max()
+    assert 0.25 < (sure > 0.5).double().mean() < 0.75
+    assert ((sure > 0.5).any(-1)).double().mean() > 0.8  # one of the two nearly always does
+
+
+def test_feet_that_do_not_stand_may_be_anything():
+    body = SKELETONS["body25"]
+    energy, first = ContactEnergy(body), body.contacts[0]
+    points, velocity = normal(5, 25, 3), normal(5, seed=1)
+    stand = torch.ones(5, len(body.contacts)).double()
+    stand[2, 0] = 0
+    gone = points.clone()
+    gone[2, first] = math.nan
+    gone.requires_grad_()
+    value = energy(gone, velocity, stand)
+    assert_close(value, energy(points, velocity, stand))
+    (grad,) = torch.autograd.grad(value, gone)
+    assert torch.isfinite(grad).all() and not grad[2, first].any()
