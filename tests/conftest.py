@@ -1,5 +1,6 @@
 """What every test file shares."""
 
+import importlib.util
 import json
 import os
 from pathlib import Path
@@ -28,6 +29,15 @@ def shared() -> Path:
     if not (folder / "data").is_dir():
         pytest.skip("needs the data folder ../shared, which is not part of the repository")
     return folder
+
+
+@pytest.fixture(scope="session")
+def protocol(shared):
+    """The module that makes the benchmarks' inputs and scores answers."""
+    spec = importlib.util.spec_from_file_location("protocol", shared / "protocol" / "protocol.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def moving_body(skeleton, num_frames: int = 40) -> torch.Tensor:

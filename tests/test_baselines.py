@@ -1,7 +1,5 @@
 """Rigid factorisation, PTA, CSF and BMM: exact where their models hold, as good as their authors' code where not."""
 
-import importlib.util
-
 import numpy as np
 import pytest
 import torch
@@ -333,14 +331,6 @@ AUTHORS = {  # what the authors' own code reaches by this protocol: e3d, e3d_wor
     "csf": ((0.0200, 0.0462, 0.0393, 0.0351), (0.0224, 0.2300, 0.0712, 0.1473)),
     "bmm": ((0.0224, 0.0503, 0.0400, 0.0346), (0.0266, 0.1692, 0.1034, 0.1377)),
 }
-
-
-@pytest.fixture(scope="module")
-def protocol(shared):
-    spec = importlib.util.spec_from_file_location("protocol", shared / "protocol" / "protocol.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")
