@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,16 +14,13 @@ from torch import Tensor
 from kcs_torch.anatomy import UNKNOWN_SPREAD, Hinge
 from kcs_torch.errors import FormatError, SkeletonError, unknown
 from kcs_torch.skeleton.check import check_facts, check_tree
-from kcs_torch.skeleton.graph import find_cycle, find_pieces
+from kcs_torch.skeleton.files import as_mapping, check_mapping, read_mapping
+from kcs_torch.skeleton.graph import find_cycle, find_pieces, find_twins
 from kcs_torch.skeleton.mapping import map_joints
-from kcs_torch.skeleton.parse import arguments, facts_by_names, hinge_to_dict
+from kcs_torch.skeleton.parse import arguments, facts_by_names
 
 __all__ = ["Skeleton"]
 
-KEYS = (
-    *("name", "joints", "bones", "mirror", "virtual", "template", "proportions", "flexible", "tree"),
-    *("hinges", "contacts", "spread"),
-)
 Pair = tuple[int, int]
 Point = tuple[float, float, float]
 
@@ -190,20 +186,9 @@ class Skeleton:
         Raises:
             FormatError: a key is unknown or missing, or a value has the wrong type.
         """
-        if not isinstance(data, Mapping):
-            raise FormatError(f"{source}: expected a mapping with 'joints' and 'bones', got {type(data).__name__}")
-        for key in data:
-            if key not in KEYS:
-                raise unknown(f"key in {source}", key, KEYS, FormatError)
-        for key in ("joints", "bones"):
-            if not isinstance(data.get(key), (list, tuple)):
-                raise FormatError(f"{source}: expected a list under '{key}', got {type(data.get(key)).__name__}")
-        for key, kind in (("name", str), ("tree", bool)):
-            if not isinstance(data.get(key), (kind, type(None))):
-                raise FormatError(f"{source}: {key}: expected a {kind.__name__}, got {data[key]!r}")
-        options = {k: v for k, v in data.items() if k not in ("joints", "bones") and v is not None}
+        given = check_mapping(data, source)
         try:
-            return cls.from_names(data["joints"], data["bones"], **options)
+            return cls.from_names(**given)
         except SkeletonError as error:
             raise SkeletonError(f"{source}: {error}") from None
         except (TypeError, AttributeError, ValueError, IndexError) as error:
@@ -216,21 +201,7 @@ class Skeleton:
         Raises:
             FormatError: the file cannot be read, or is not a skeleton.
         """
-        import yaml
-
-        path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-            loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C is several times faster
-            data = json.loads(text) if path.suffix.lower() == ".json" else yaml.load(text, Loader=loader)
-        except OSError as error:
-            raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
-        except (yaml.YAMLError, ValueError, RecursionError) as error:
-            message = f"{path}: expected a YAML or JSON skeleton, got text that does not parse: {error}"
-            raise FormatError(message) from None
-        if isinstance(data, dict):
-            data.setdefault("name", path.stem)
-        return cls.from_dict(data, source=str(path))
+        return cls.from_dict(read_mapping(Path(path)), source=str(path))
 
     # ------------------------------------------------------------------ facts
 
@@ -259,17 +230,7 @@ class Skeleton:
     @cached_property
     def mirror_bones(self) -> tuple[Pair, ...]:
         """(left, right) pairs of bone indices, twins under ``mirror``."""
-        twin = {i: i for i in range(self.num_joints)}
-        for a, b in self.mirror:
-            twin[a], twin[b] = b, a
-        where = {frozenset(b): i for i, b in enumerate(self.bones)}
-        out = []
-        for i, (a, b) in enumerate(self.bones):
-            j = where.get(frozenset((twin[a], twin[b])))
-            if j is not None and j > i:
-                left = {m[0] for m in self.mirror}
-                out.append((i, j) if a in left or b in left else (j, i))
-        return tuple(out)
+        return tuple(find_twins(self.bones, self.mirror))
 
     def side(self, joint: int) -> str:
         """'left', 'right' or 'centre'."""
@@ -396,21 +357,4 @@ class Skeleton:
 
     def to_dict(self) -> dict[str, Any]:
         """The skeleton as plain lists and mappings: what :meth:`from_dict` and a YAML file take."""
-        out: dict[str, Any] = {"name": self.name, "joints": list(self.joints[: self.num_observed])}
-        if self.virtual:
-            out["virtual"] = {self.joints[v]: [self.joints[s] for s in sources] for v, sources in self.virtual}
-        out["bones"] = [[self.joints[a], self.joints[b]] for a, b in self.bones]
-        out["mirror"] = [[self.joints[a], self.joints[b]] for a, b in self.mirror]
-        if self.flexible:
-            out["flexible"] = [out["bones"][i][:] for i in self.flexible]
-        if self.template is not None:
-            out["template"] = {j: list(p) for j, p in zip(self.joints, self.template, strict=True)}
-        if self.proportions is not None:
-            out["proportions"] = dict(zip(self.bone_names, self.proportions, strict=True))
-        if not self.tree:
-            out["tree"] = False
-        out["hinges"] = [hinge_to_dict(h, self.joints) for h in self.hinges]
-        out["contacts"] = [self.joints[i] for i in self.contacts]
-        if self.template is not None or self.spread is not None:
-            out["spread"] = dict(zip(self.bone_names, self.spread or (), strict=False))
-        return out
+        return as_mapping(self)

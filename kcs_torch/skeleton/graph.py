@@ -1,10 +1,10 @@
-"""Connected pieces and closed chains of a graph of bones."""
+"""Connected pieces, closed chains and twins of a graph of bones."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-__all__ = ["find_cycle", "find_parts", "find_pieces"]
+__all__ = ["find_cycle", "find_parts", "find_pieces", "find_twins"]
 
 Pair = tuple[int, int]
 
@@ -45,6 +45,23 @@ def find_cycle(num_joints: int, bones: Sequence[Pair]) -> list[int] | None:
         neighbours[a].append(b)
         neighbours[b].append(a)
     return None
+
+
+def find_twins(bones: Sequence[Pair], mirror: Sequence[Pair]) -> list[Pair]:
+    """Return (left, right) pairs of bones whose ends are (left, right) pairs of joints, or lie in the middle.
+
+    >>> find_twins([(0, 1), (0, 2), (1, 2)], [(2, 1)])
+    [(1, 0)]
+    """
+    left = {a for a, _ in mirror}
+    twin = {a: b for pair in mirror for a, b in (pair, pair[::-1])}
+    where = {frozenset(bone): i for i, bone in enumerate(bones)}
+    found = []
+    for i, (a, b) in enumerate(bones):
+        j = where.get(frozenset((twin.get(a, a), twin.get(b, b))), -1)
+        if j > i:
+            found.append((i, j) if a in left or b in left else (j, i))
+    return found
 
 
 def find_parts(num_joints: int, bones: Sequence[Pair], least: int = 3) -> list[list[int]]:

@@ -21,7 +21,7 @@ from kcs_torch.errors import SkeletonError, unknown
 if TYPE_CHECKING:
     from kcs_torch.skeleton.core import Skeleton
 
-__all__ = ["arguments", "facts_by_names", "find_mirror", "hinge_to_dict"]
+__all__ = ["arguments", "facts_by_names", "find_mirror"]
 
 Pair = tuple[int, int]
 Point = tuple[float, float, float]
@@ -139,18 +139,6 @@ def find_mirror(names: Sequence[str]) -> tuple[Pair, ...]:
     position = {n: i for i, n in enumerate(names)}
     twins = ((n, mirror_name(n)) for n in names if side_of(n) == "left")
     return tuple((position[a], position[b]) for a, b in twins if b in position)
-
-
-def hinge_to_dict(hinge: Hinge, names: Sequence[str]) -> dict[str, Any]:
-    """The keys that ``Skeleton.from_names`` takes for a hinge, all of them."""
-    return {
-        "joint": names[hinge.joint],
-        "bends": hinge.bends,
-        "axis": [names[hinge.left], names[hinge.right]],
-        "weight": hinge.firm,
-        "parent": names[hinge.parent],
-        "child": names[hinge.child],
-    }
 
 
 def _read_hinge(
