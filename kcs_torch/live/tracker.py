@@ -1,10 +1,9 @@
-"""The live mode's front: takes frames, keeps the window, says when to solve it again."""
+"""The live mode's front: keeps the window, has each frame filtered, and says when to solve the window again."""
 
 from __future__ import annotations
 
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,17 +11,18 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
-from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.live.filter import BodyFilter, ChainFilter, Shape
+from kcs_torch.live.frame import Sight, take_frame
+from kcs_torch.live.pose import Chain, LivePose
 from kcs_torch.live.solve import Solution, solve_window
 from kcs_torch.methods.pkc import PKC
-from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton, get_skeleton
-from kcs_torch.types import Reconstruction, Tracks, as_floats
+from kcs_torch.types import Reconstruction, Tracks
 from kcs_torch.types.intake import as_number
 
-__all__ = ["LivePose", "Tracker"]
+__all__ = ["Tracker"]
 
 LEAST = 12
 """Frames that a window has at least."""
@@ -44,40 +44,6 @@ REPLAYED = 15
 
 LOST = 0.5
 """Seconds without the body after which the filter starts anew from many headings."""
-
-FOUND, USUAL = 0.02, 0.1
-"""Standard deviation of a bone's length as a share: as it is found, and before."""
-
-FLAT = 0.25
-"""Share of its length below which a bone's depth is no better known for being small."""
-
-DRIFT, FARTHEST = 1.0, 0.3
-"""Speed at which an unseen joint's deviation grows, a second, and how far; a person being 1.75 tall."""
-
-LARGEST = 1e100
-"""Largest coordinate: its square is finite."""
-
-
-@dataclass(frozen=True)
-class LivePose:
-    """The pose of one frame.
-
-    Attributes:
-        frame: its number, from 0.
-        points: (N, 3) in the camera frame, in the units of the tracks: x and y in the image, depth relative to the
-            body's middle. NaN until a joint has been seen.
-        uncertainty: (N,) standard deviation of the depths, in the same units; infinite until a joint has been seen.
-        seen: (N,) bool, False where a joint is placed by prediction.
-        ready: whether the body's bone lengths have been found; before, they are the template's.
-        delay: frames since the window ended from which the bone lengths come; -1 before there is one.
-    """
-
-    frame: int
-    points: Tensor
-    uncertainty: Tensor
-    seen: Tensor
-    ready: bool
-    delay: int
 
 
 class Tracker:
@@ -158,10 +124,7 @@ class Tracker:
         else:
             self._filter, early, self._delay = ChainFilter(body, rate), EARLY[-1:], 1.0
         self._early = [min(max(LEAST, round(share * window)), window) for share in early]
-        self._bones = body.bone_index()
-        self._tree = chain_inverse(incidence(self._bones, body.num_joints, dtype=torch.float64))  # (N, B)
-        self._rigid = torch.zeros(body.num_bones, dtype=torch.bool)
-        self._rigid[list(body.rigid)] = True
+        self._chain = Chain(body, self._filter.body, rate)
         self._thread = ThreadPoolExecutor(1, "kcs_torch.live")
         self._closed = False
         self._frame = -1
@@ -174,8 +137,7 @@ class Tracker:
         self._weights: deque[Tensor] = deque(maxlen=self.window)
         self._shape: Shape | None = None
         self._longest = torch.zeros(self.skeleton.num_bones, dtype=torch.float64)  # of the bones' images
-        self._age = torch.zeros(self.skeleton.num_joints, dtype=torch.float64)  # frames since a joint was seen
-        self._met = torch.zeros(self.skeleton.num_joints, dtype=torch.bool)
+        self._sight = Sight(self.skeleton)
         self._solving: Future[Solution | None] | None = None
         self._asked = self._ready = -1  # frames at which the running solve began, and at which it is taken over
         self._solved = -1  # frame at which the last solve began
@@ -197,26 +159,27 @@ class Tracker:
         """
         if self._closed:
             raise OptionError("Tracker: closed: it takes no frames any more; make another one")
-        points, weights, like = self._take(xy, confidence)
+        points, weights, like = take_frame(self.skeleton, self._frame + 1, xy, confidence, self.threshold)
         self._frame += 1
         seen = weights > 0
         if not self._image and not bool(seen.any()):
             self._due = deque(frame + 1 for frame in self._due)
             blank, unsure = (points.new_full((len(points), 3), x).to(like) for x in (torch.nan, torch.inf))
             return LivePose(self._frame, blank, unsure[:, 0], seen.to(blank.device), False, -1)
-        if float(self._age.amin()) > LOST * self.fps and bool(seen.any()):
+        if float(self._sight.age.amin()) > LOST * self.fps and bool(seen.any()):
             self._filter.reset()
             self._begun = self._frame
-        image = self._complete(points, seen)
+        image = self._sight.complete(points, seen, self._image[-1] if self._image else None)
         self._image.append(image)
         self._weights.append(weights)
-        self._longest = torch.maximum(self._longest, bone_vectors(image, self._bones).norm(dim=-1))
+        self._longest = torch.maximum(self._longest, bone_vectors(image, self._chain.bones).norm(dim=-1))
         shape = self._shape or self._filter.guess(self._longest)
         dz = self._filter.step(image, weights, shape)
-        points, unsure = (x.to(like) for x in self._pose(image, dz, shape))
+        points = self._chain.place(image, dz, shape).to(like)
+        unsure = self._chain.deviation(dz, shape, self._filter.doubt, self._sight.age, self._shape is not None).to(like)
         delay = self._frame - self._solved if self._shape else -1
         out = LivePose(self._frame, points, unsure, seen.to(points.device), self._shape is not None, delay)
-        if float(self._age.amin()) >= self.window:
+        if float(self._sight.age.amin()) >= self.window:
             self.reset()
         else:
             self._advance()
@@ -246,7 +209,8 @@ class Tracker:
             raise ShapeError("Tracker: no joint has been seen yet: there is nothing to reconstruct")
         weights = torch.stack(list(self._weights))
         points = torch.where(weights[..., None] > 0, torch.stack(list(self._image)), 0.0)
-        return Tracks(points, weights, self.skeleton, self.fps, self.units, f"live from frame {self._first_kept}")
+        first = self._frame + 1 - len(self._image)
+        return Tracks(points, weights, self.skeleton, self.fps, self.units, f"live from frame {first}")
 
     def result(self) -> Reconstruction:
         """Reconstruct the frames in the window anew by the method, at leisure: more accurate than the live poses.
@@ -255,80 +219,6 @@ class Tracker:
             ShapeError: no joint has been seen.
         """
         return self.method(self.tracks())
-
-    # ------------------------------------------------------------------ one frame
-
-    @property
-    def _first_kept(self) -> int:
-        return self._frame + 1 - len(self._image)
-
-    def _take(self, xy: Any, confidence: Any) -> tuple[Tensor, Tensor, Tensor]:
-        """Points (N, 2), 0 where unseen, weights (N,), and a tensor like the input."""
-        where = f"frame {self._frame + 1}"
-        given = as_floats(xy, f"{where}: xy", 2)
-        count = self.skeleton.num_observed
-        name = lambda bad: f"joint '{self.skeleton.joints[int(bad.nonzero()[0, 0])]}'"  # noqa: E731
-        if given.shape != (count, 2):
-            expected = f"({count}, 2) for skeleton '{self.skeleton.name}'"
-            raise ShapeError(f"{where}: xy: expected shape {expected}, got {tuple(given.shape)}")
-        points = given.detach().to("cpu", torch.float64)
-        infinite = torch.isinf(points).any(-1)
-        huge = (points.abs() > LARGEST).any(-1)
-        if bool(infinite.any()):
-            raise ShapeError(f"{where}: xy: {name(infinite)} is infinite; write NaN where a joint is unseen")
-        if bool(huge.any()):
-            raise ShapeError(f"{where}: xy: {name(huge)} is beyond {LARGEST:g}; scale the tracks")
-        seen = torch.isfinite(points).all(-1)
-        if confidence is None:
-            weights = seen.double()
-        else:
-            weights = as_floats(confidence, f"{where}: confidence", 1).detach().to("cpu", torch.float64)
-            if weights.shape != (count,):
-                raise ShapeError(f"{where}: confidence: expected shape ({count},), got {tuple(weights.shape)}")
-            weights = torch.nan_to_num(weights, nan=0.0, posinf=torch.inf, neginf=-torch.inf)
-            wrong = (weights < 0) | (weights > 1)
-            if bool(wrong.any()):
-                raise ShapeError(f"{where}: confidence: {name(wrong)} has {float(weights[wrong][0]):g}; expected 0..1")
-            weights = torch.where(seen & (weights >= self.threshold), weights, 0.0)
-        points = torch.where(weights[:, None] > 0, points, 0.0)
-        return *self.skeleton.complete(points, weights), given
-
-    def _complete(self, points: Tensor, seen: Tensor) -> Tensor:
-        """The frame with unseen joints where they were, moved as the seen ones moved."""
-        self._age = torch.where(seen, 0.0, self._age + 1)
-        self._met = self._met | seen
-        if bool(seen.all()):
-            return points
-        if self._image:
-            last = self._image[-1]
-            shift = (points - last)[seen].mean(0) if bool(seen.any()) else points.new_zeros(2)
-            points = torch.where(seen[:, None], points, last + shift)
-        if not bool(self._met.all()) and bool(self._met.any()):
-            flat = torch.nn.functional.pad(points, (0, 1))[None]
-            points = place_unseen(flat, self._met, self.skeleton)[0, :, :2]
-        return points
-
-    def _pose(self, image: Tensor, dz: Tensor, shape: Shape) -> tuple[Tensor, Tensor]:
-        """Joints (N, 3) whose rigid bones have their length, and the deviation (N,) of their depths, in tracks' units.
-
-        A bone that looks too long is shortened. Bones of the trunk keep the direction that image and rotation give.
-        """
-        image, length = image * shape.factor, shape.lengths
-        flat = bone_vectors(image, self._bones)
-        size = flat.norm(dim=-1).clamp_min(1e-12)
-        whole = torch.where(self._filter.body, torch.hypot(size, dz), size)
-        share = torch.where(self._filter.body, length / whole, (length / whole).clamp_max(1.0))
-        deep = torch.copysign((length.square() - size.square()).clamp_min(0).sqrt(), dz)
-        depth = torch.where(self._filter.body, dz * share, deep)
-        vectors = torch.cat([flat * share[:, None], depth[:, None]], -1)
-        vectors = torch.where(self._rigid[:, None], vectors, torch.cat([flat, dz[:, None]], -1))
-        points = self._tree @ vectors
-        middle = torch.nn.functional.pad(image.mean(0), (0, 1))
-        points = points - points.mean(0) + middle
-        off = length * (USUAL if self._shape is None else FOUND) / (dz.abs() / length).clamp_min(FLAT)
-        variance = self._tree.square() @ (off.square() + self._filter.doubt * (2 * dz).square())
-        variance = variance + (self._age * (DRIFT / self.fps)).clamp_max(FARTHEST).square()
-        return points / shape.factor, variance.sqrt() / shape.factor
 
     # ------------------------------------------------------------------ the window
 

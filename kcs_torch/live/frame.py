@@ -1,0 +1,100 @@
+"""A frame as it comes in: checked, and its unseen joints placed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import ShapeError
+from kcs_torch.methods.unseen import place_unseen
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.types import as_floats
+
+__all__ = ["Sight", "take_frame"]
+
+LARGEST = 1e100
+"""Largest coordinate: its square is finite."""
+
+
+def take_frame(
+    body: Skeleton, number: int, xy: Any, confidence: Any, threshold: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Check a frame of observed joints, and append the virtual ones.
+
+    Args:
+        body: the skeleton.
+        number: of the frame, for messages.
+        xy: (num_observed, 2); NaN where unseen.
+        confidence: (num_observed,) in 0..1; 1 where None.
+        threshold: a joint with less confidence counts as unseen.
+
+    Returns:
+        Points (N, 2), 0 where unseen, and weights (N,), on the CPU in double precision; and ``xy`` as a tensor.
+
+    Raises:
+        ShapeError: the shape is wrong or a value infinite or out of range.
+    """
+    where = f"frame {number}"
+    given = as_floats(xy, f"{where}: xy", 2)
+    count = body.num_observed
+    name = lambda bad: f"joint '{body.joints[int(bad.nonzero()[0, 0])]}'"  # noqa: E731
+    if given.shape != (count, 2):
+        expected = f"({count}, 2) for skeleton '{body.name}'"
+        raise ShapeError(f"{where}: xy: expected shape {expected}, got {tuple(given.shape)}")
+    points = given.detach().to("cpu", torch.float64)
+    infinite = torch.isinf(points).any(-1)
+    huge = (points.abs() > LARGEST).any(-1)
+    if bool(infinite.any()):
+        raise ShapeError(f"{where}: xy: {name(infinite)} is infinite; write NaN where a joint is unseen")
+    if bool(huge.any()):
+        raise ShapeError(f"{where}: xy: {name(huge)} is beyond {LARGEST:g}; scale the tracks")
+    seen = torch.isfinite(points).all(-1)
+    if confidence is None:
+        weights = seen.double()
+    else:
+        weights = as_floats(confidence, f"{where}: confidence", 1).detach().to("cpu", torch.float64)
+        if weights.shape != (count,):
+            raise ShapeError(f"{where}: confidence: expected shape ({count},), got {tuple(weights.shape)}")
+        weights = torch.nan_to_num(weights, nan=0.0, posinf=torch.inf, neginf=-torch.inf)
+        wrong = (weights < 0) | (weights > 1)
+        if bool(wrong.any()):
+            raise ShapeError(f"{where}: confidence: {name(wrong)} has {float(weights[wrong][0]):g}; expected 0..1")
+        weights = torch.where(seen & (weights >= threshold), weights, 0.0)
+    points = torch.where(weights[:, None] > 0, points, 0.0)
+    return *body.complete(points, weights), given
+
+
+class Sight:
+    """What has been seen of a body so far.
+
+    Attributes:
+        age: (N,) frames since each joint was seen.
+        met: (N,) bool, whether it ever was.
+    """
+
+    def __init__(self, body: Skeleton) -> None:
+        self.body = body
+        self.age = torch.zeros(body.num_joints, dtype=torch.float64)
+        self.met = torch.zeros(body.num_joints, dtype=torch.bool)
+
+    def complete(self, points: Tensor, seen: Tensor, last: Tensor | None) -> Tensor:
+        """Take a frame, and place its unseen joints where they were, moved as the seen ones moved.
+
+        Args:
+            points: (N, 2).
+            seen: (N,) bool.
+            last: (N, 2) the frame before, complete; None if there is none.
+        """
+        self.age = torch.where(seen, 0.0, self.age + 1)
+        self.met = self.met | seen
+        if bool(seen.all()):
+            return points
+        if last is not None:
+            shift = (points - last)[seen].mean(0) if bool(seen.any()) else points.new_zeros(2)
+            points = torch.where(seen[:, None], points, last + shift)
+        if not bool(self.met.all()) and bool(self.met.any()):
+            flat = torch.nn.functional.pad(points, (0, 1))[None]
+            points = place_unseen(flat, self.met, self.body)[0, :, :2]
+        return points

@@ -1,0 +1,100 @@
+"""A frame's pose: joints from the depths of their bones, which have constant length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
+from kcs_torch.live.filter import Shape
+from kcs_torch.skeleton import Skeleton
+
+__all__ = ["Chain", "LivePose"]
+
+FOUND, USUAL = 0.02, 0.1
+"""Standard deviation of a bone's length as a share: as it is found, and before."""
+
+FLAT = 0.25
+"""Share of its length below which a bone's depth is no better known for being small."""
+
+DRIFT, FARTHEST = 1.0, 0.3
+"""Speed at which an unseen joint's deviation grows, a second, and how far; a person being 1.75 tall."""
+
+
+@dataclass(frozen=True)
+class LivePose:
+    """The pose of one frame.
+
+    Attributes:
+        frame: its number, from 0.
+        points: (N, 3) in the camera frame, in the units of the tracks: x and y in the image, depth relative to the
+            body's middle. NaN until a joint has been seen.
+        uncertainty: (N,) standard deviation of the depths, in the same units; infinite until a joint has been seen.
+        seen: (N,) bool, False where a joint is placed by prediction.
+        ready: whether the body's bone lengths have been found; before, they are the template's.
+        delay: frames since the window ended from which the bone lengths come; -1 before there is one.
+    """
+
+    frame: int
+    points: Tensor
+    uncertainty: Tensor
+    seen: Tensor
+    ready: bool
+    delay: int
+
+
+class Chain:
+    """The bones of a body as a tree along which depths add up.
+
+    Args:
+        body: a tree.
+        trunk: (B,) bool, bones whose direction the trunk's rotation gives.
+        fps: frames a second.
+    """
+
+    def __init__(self, body: Skeleton, trunk: Tensor, fps: float) -> None:
+        self.bones, self.trunk, self.fps = body.bone_index(), trunk, fps
+        self.tree = chain_inverse(incidence(self.bones, body.num_joints, dtype=torch.float64))  # (N, B)
+        self.rigid = torch.zeros(body.num_bones, dtype=torch.bool)
+        self.rigid[list(body.rigid)] = True
+
+    def place(self, image: Tensor, dz: Tensor, shape: Shape) -> Tensor:
+        """Place the joints (N, 3), in the tracks' units, so that rigid bones have their length.
+
+        A bone that looks too long is shortened. Bones of the trunk keep the direction that image and rotation give.
+
+        Args:
+            image: (N, 2), complete.
+            dz: (B,) depths of the bones, in the template's units.
+            shape: what is known of the body.
+        """
+        image, length = image * shape.factor, shape.lengths
+        flat = bone_vectors(image, self.bones)
+        size = flat.norm(dim=-1).clamp_min(1e-12)
+        whole = torch.where(self.trunk, torch.hypot(size, dz), size)
+        share = torch.where(self.trunk, length / whole, (length / whole).clamp_max(1.0))
+        deep = torch.copysign((length.square() - size.square()).clamp_min(0).sqrt(), dz)
+        depth = torch.where(self.trunk, dz * share, deep)
+        vectors = torch.cat([flat * share[:, None], depth[:, None]], -1)
+        vectors = torch.where(self.rigid[:, None], vectors, torch.cat([flat, dz[:, None]], -1))
+        points = self.tree @ vectors
+        middle = torch.nn.functional.pad(image.mean(0), (0, 1))
+        return (points - points.mean(0) + middle) / shape.factor
+
+    def deviation(self, dz: Tensor, shape: Shape, doubt: Tensor, age: Tensor, found: bool) -> Tensor:
+        """Standard deviation of the joints' depths (N,), in the tracks' units.
+
+        Args:
+            dz: (B,) depths of the bones, in the template's units.
+            shape: what is known of the body.
+            doubt: (B,) probability that a bone's depth has the other sign.
+            age: (N,) frames since each joint was seen.
+            found: whether the bones' lengths have been found.
+        """
+        length = shape.lengths
+        off = length * (FOUND if found else USUAL) / (dz.abs() / length).clamp_min(FLAT)
+        variance = self.tree.square() @ (off.square() + doubt * (2 * dz).square())
+        variance = variance + (age * (DRIFT / self.fps)).clamp_max(FARTHEST).square()
+        return variance.sqrt() / shape.factor
