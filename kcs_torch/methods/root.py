@@ -5,13 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.temporal import blend_windows, standing, window_starts
+from kcs_torch.functional.temporal import standing
+from kcs_torch.functional.tridiagonal import solve_tridiagonal
 from kcs_torch.types import Tracks
 
 __all__ = ["root_depth"]
-
-WINDOW, OVERLAP = 400, 80
-"""Frames that are solved together, and by how many windows overlap."""
 
 SLIP, CHANGE = 0.012, 0.008
 """Standard deviations of a standing foot's speed, and of the root's acceleration: shares of the body's radius per
@@ -49,19 +47,12 @@ def root_depth(points: Tensor, tracks: Tracks) -> tuple[Tensor | None, str]:
     radius = (body / top).square().sum(-1).mean().sqrt().clamp_min(1e-3) * top
     move = points[:, contacts, 2].diff(dim=0) / radius  # (T - 1, C), while the root stays
     weight = torch.minimum(sure[1:], sure[:-1])
-    frames = len(move)
-    size = min(WINDOW, frames)
-    starts = window_starts(frames, size, min(OVERLAP, size - 1))
-    cut = lambda x: torch.stack([x[s : s + size] for s in starts])  # noqa: E731
-    move, weight = cut(move), cut(weight)
-    difference = torch.eye(size, dtype=points.dtype, device=points.device).diff(dim=0)
-    smooth = difference.mT @ difference / (CHANGE * slow**2) ** 2
-    speed = torch.zeros_like(move[..., 0])
-    slip = SLIP * slow
+    speed = torch.zeros_like(move[:, 0])
+    slip, change = SLIP * slow, CHANGE * slow**2
+    tie = torch.full_like(speed[1:], -1 / change**2)  # of each speed to the next
+    own = torch.nn.functional.pad(-tie, (0, 1)) + torch.nn.functional.pad(-tie, (1, 0))
     for _ in range(10):
-        pull = weight / (1 + ((move + speed[..., None]) / slip).square()) / slip**2
-        normal = smooth + torch.diag_embed(pull.sum(-1) + 1e-3 / slip**2)
-        speed = torch.linalg.solve(normal, -(pull * move).sum(-1))
-    speed = blend_windows(speed, starts, frames)
+        pull = weight / (1 + ((move + speed[:, None]) / slip).square()) / slip**2
+        speed = solve_tridiagonal(own + pull.sum(-1) + 1e-3 / slip**2, tie, -(pull * move).sum(-1))
     path = torch.cat([speed.new_zeros(1), speed.cumsum(0)]) * radius
     return path, "root depth from feet that stand still, relative to the first frame; the camera must not move"
