@@ -258,7 +258,11 @@ class TestCommandLine:
         ("argument", "told"),
         [
             ("model=transformer", "mlp\n\ttemporal"),
-            ("modle=mlp", "Could not override 'modle'"),
+            ("modle=mlp", "unknown setting 'modle': did you mean .*choices: .*experiment, .*model, "),
+            ("hydr/launcher=joblib", "unknown setting 'hydr': did you mean 'hydra'"),
+            ("model.widht=3", "Could not override 'model.widht'"),
+            ("+trainer.gradient_clip_val=1", r"gradient_clip_val: .*\+module\.clip"),
+            ("+trainer.accumulate_grad_batches=2", r"accumulate_grad_batches: .*data\.batch_size"),
             ("+data.noisy=1", "data: .*unexpected keyword argument 'noisy'"),
             ("+module.lr=-1", "lr: expected a positive number"),
             ("+trainer.acelerator=cpu", "trainer: .*unexpected keyword argument 'acelerator'"),
@@ -273,6 +277,10 @@ class TestCommandLine:
         code, _, err = called(capsys, *SMALL, *argument.split(), f"hydra.run.dir={tmp_path}")
         assert code == 1 and re.search(told, err), err
         assert "Traceback" not in err
+
+    def test_settings_of_ones_own_may_be_added(self, capsys):
+        code, out, err = called(capsys, "--cfg=job", "--resolve", SMALL[0], "+wide=9", "+model.channels=${wide}")
+        assert code == 0 and "channels: 9" in out, err
 
     def test_errors_of_the_program_keep_their_traceback(self, tmp_path, capsys, monkeypatch):
         monkeypatch.setattr("kcs_torch.training.run.save_lifter", lambda *a, **k: 1 / 0)

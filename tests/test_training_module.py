@@ -20,6 +20,7 @@ from kcs_torch.training import (
     save_lifter,
 )
 from kcs_torch.training.augment import mirrored, turned, unit_size
+from kcs_torch.training.module import step_share
 
 BODY = kt.SKELETONS["h36m17"]
 QUIET = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "enable_model_summary": False}
@@ -297,6 +298,54 @@ def test_a_run_that_is_resumed_ends_as_it_would_have(tmp_path):
     fit(taken, 4, ckpt_path=tmp_path / "half.ckpt")
     end, other = whole.state_dict(), taken.state_dict()
     assert all(torch.equal(end[name], other[name]) for name in end if name.startswith("network."))
+
+
+def sizes(module):
+    """The size of each step that the module makes from here on."""
+    seen, advance = [], module._advance
+
+    def spy(optimiser, *rest):
+        advance(optimiser, *rest)
+        seen.extend(group["lr"] for group in optimiser.param_groups)
+
+    module._advance = spy
+    return seen
+
+
+def test_steps_rise_and_fall_over_all_epochs():
+    module = module_of(lr=0.1)
+    seen = sizes(module)
+    fit(module, 5)
+    assert len(seen) == 20 and seen[0] == max(seen) == 0.1 and seen == sorted(seen, reverse=True)
+    assert seen[-1] == 0.1 * step_share(19, 20) < 0.002
+    long = [step_share(step, 100) for step in range(100)]
+    assert long[:5] == [0.2, 0.4, 0.6, 0.8, 1.0] and long[5:] == sorted(long[5:], reverse=True)
+
+
+def test_a_run_that_goes_on_for_longer_has_the_steps_of_a_longer_one(tmp_path):
+    """A checkpoint does not bring the length of its own run along, nor its step size."""
+    fit(module_of(), 2).save_checkpoint(tmp_path / "short.ckpt")
+    taken = module_of(lr=0.01, weight_decay=0.5)
+    seen = sizes(taken)
+    trainer = fit(taken, 4, ckpt_path=tmp_path / "short.ckpt")
+    assert seen == [0.01 * step_share(step, 16) for step in range(8, 16)]
+    assert {group["weight_decay"] for group in trainer.optimizers[0].param_groups} == {0.5}
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"gradient_clip_val": 1.0}, r"gradient_clip_val: expected None, got 1\.0: .*\(clip="),
+        ({"accumulate_grad_batches": 4}, r"accumulate_grad_batches: expected 1, got 4: .*\(batch_size="),
+        ({"max_epochs": -1}, "expected max_epochs or max_steps"),
+    ],
+)
+def test_options_of_the_trainer_that_mean_nothing_here_are_told(options, told):
+    module = module_of()
+    trainer = lightning.Trainer(accelerator="cpu", **{**QUIET, "max_epochs": 1, **options})
+    with pytest.raises(kt.OptionError, match=told):
+        trainer.fit(module, datamodule=data_of())
+    assert int(module.step) == 0
 
 
 def test_training_brings_the_error_down():

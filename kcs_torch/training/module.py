@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import lightning
@@ -114,6 +114,21 @@ class LiftingModule(lightning.LightningModule):
         points: Tensor = self.network(tracks, weights)
         return points
 
+    def configure_callbacks(self) -> list[Any]:
+        """Look at the trainer's options, here, as this is what Lightning asks for before it looks at them itself.
+
+        Raises:
+            OptionError: one is set that means nothing to network and critic, which take steps in turn.
+        """
+        for name, usual, instead in (
+            ("gradient_clip_val", None, "the module cuts gradients: LiftingModule(clip=...), +module.clip=..."),
+            ("accumulate_grad_batches", 1, "every batch is a step: TracksDataModule(batch_size=...), +data.batch_size"),
+        ):
+            value = getattr(self.trainer, name)
+            if value not in (usual, 0):
+                raise OptionError(f"trainer: {name}: expected {usual}, got {value!r}: {instead}")
+        return []
+
     def on_fit_start(self) -> None:
         """Compare the skeletons of all parts and of the data: joints in another order would train, and be wrong.
 
@@ -161,7 +176,8 @@ class LiftingModule(lightning.LightningModule):
         self.step += 1
 
     def _train(self, batch: Batch) -> None:
-        optimisers, schedules = _listed(self.optimizers()), _listed(self.lr_schedulers())
+        optimisers = self.optimizers()
+        optimisers = optimisers if isinstance(optimisers, list) else [optimisers]
         points = self(batch.tracks, batch.weights)
         values = {name: term.value(points, batch, self.network) for name, term in self.losses.items()}
         if not self._counted:
@@ -170,22 +186,24 @@ class LiftingModule(lightning.LightningModule):
         if self.critic is not None:
             values["critic"] = generator_loss(self.critic(centre(points)[0])).mean()
             total = total + self.critic_weight * values["critic"]
-        self._advance(optimisers[0], schedules[0], total, self.network)
+        self._advance(optimisers[0], total, self.network)
         if self.critic is not None and bool((batch.labelled > 0).any()):
             true = centre(batch.points[batch.labelled > 0])[0]
             rows = torch.randint(len(points), (len(true),), device=true.device)
             cost = critic_loss(self.critic(true), self.critic(centre(points.detach()[rows])[0])).mean()
             values["critic_own"] = cost
-            self._advance(optimisers[1], schedules[1], cost, self.critic)
+            self._advance(optimisers[1], cost, self.critic)
         self.log_dict({f"train/{name}": value.detach() for name, value in values.items()}, batch_size=len(points))
         self.log("train/loss", total.detach(), prog_bar=True, batch_size=len(points))
 
-    def _advance(self, optimiser: Any, schedule: Any, cost: Tensor, trained: nn.Module) -> None:
+    def _advance(self, optimiser: Any, cost: Tensor, trained: nn.Module) -> None:
+        size = self.lr * step_share(int(self.step), self.total_steps)
+        for group in optimiser.param_groups:  # as it is told now: a checkpoint may hold what an earlier run was told
+            group.update(lr=size, weight_decay=self.weight_decay)
         optimiser.zero_grad()
         self.manual_backward(cost)
         nn.utils.clip_grad_norm_(trained.parameters(), self.clip)
         optimiser.step()
-        schedule.step()
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Measure the network on clips with labels."""
@@ -206,26 +224,27 @@ class LiftingModule(lightning.LightningModule):
             self.log(f"{stage}/{name}", metric, on_step=False, on_epoch=True, batch_size=len(points))
 
     def configure_optimizers(self) -> Any:
-        """AdamW for the network, another for the critic; one schedule for both."""
+        """AdamW for the network, another for the critic; :func:`step_share` says how far both go.
+
+        Raises:
+            OptionError: the trainer has neither a number of epochs nor of steps.
+        """
+        total = self.trainer.estimated_stepping_batches
+        if not math.isfinite(total):
+            raise OptionError("trainer: expected max_epochs or max_steps, which the size of a step depends on")
+        self.total_steps = max(int(total), 1)
         trained = [self.network] + ([] if self.critic is None else [self.critic])
-        optimisers = [torch.optim.AdamW(m.parameters(), lr=self.lr, weight_decay=self.weight_decay) for m in trained]
-        total = max(int(self.trainer.estimated_stepping_batches), 1)
-        return optimisers, [torch.optim.lr_scheduler.LambdaLR(o, _Schedule(total)) for o in optimisers]
+        return [torch.optim.AdamW(m.parameters(), lr=self.lr, weight_decay=self.weight_decay) for m in trained]
 
 
-@dataclass(frozen=True)
-class _Schedule:
-    """Share of the highest step size at a step: up over the first twentieth, then down like a cosine."""
+def step_share(step: int, total: int) -> float:
+    """Share of the highest step size at a step: up over the first twentieth of them, then down like a cosine.
 
-    total: int
-
-    def __call__(self, step: int) -> float:
-        rise = max(self.total // 20, 1)
-        if step < rise:
-            return (step + 1) / rise
-        phase = torch.tensor(min((step - rise) / max(self.total - rise, 1), 1.0))
-        return float(0.01 + 0.99 * 0.5 * (1 + torch.cos(torch.pi * phase)))
-
-
-def _listed(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, (list, tuple)) else [] if value is None else [value]
+    >>> [round(step_share(step, 40), 2) for step in (0, 1, 2, 21, 40)]
+    [0.5, 1.0, 1.0, 0.5, 0.01]
+    """
+    rise = max(total // 20, 1)
+    if step < rise:
+        return (step + 1) / rise
+    phase = torch.tensor(min((step - rise) / max(total - rise, 1), 1.0))
+    return float(0.01 + 0.99 * 0.5 * (1 + torch.cos(torch.pi * phase)))

@@ -301,8 +301,30 @@ def _told(error: Exception) -> str | None:
     return str(error) if isinstance(error, told) else None
 
 
+def _check_names(arguments: Sequence[str]) -> None:
+    """Look at the names of groups and settings: of one that it does not know Hydra says how to add it.
+
+    Raises:
+        OptionError: there is none of that name.
+    """
+    if any(argument.startswith(("--config", "-cn", "-cp", "-cd")) for argument in arguments):
+        return  # another configuration has other names
+    own = OmegaConf.load(configs() / "train.yaml")
+    groups = (next(iter(entry)) for entry in own.defaults if isinstance(entry, Mapping))
+    known = {str(name) for name in (*own, *groups)} - {"defaults"}
+    for argument in arguments:
+        named = re.match(r"([A-Za-z_]\w*)[^=]*=", argument)
+        if named is not None and named[1] not in known:
+            raise unknown("setting", named[1], known)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train as a command line says, by default that of this process; Hydra exits with 1 where it is wrong."""
+    try:
+        _check_names(sys.argv[1:] if arguments is None else arguments)
+    except OptionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
     entry = hydra.main(version_base="1.3", config_path=str(configs()), config_name="train")(job)
     before = sys.argv
     if arguments is not None:
