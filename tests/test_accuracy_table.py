@@ -28,9 +28,9 @@ TABLE = {  # a flat guess is at 92 mm
 SHARE, LEAST = 0.1, 0.3
 """Tolerance: of the figure, and in mm."""
 
-STIFF, LEANING = 15.0, {"kcs": 55.0, "csf": 75.0}
-"""A stiff body before a camera that goes half around is a riddle to few (mm): KCS leans on its template, and CSF's
-ranks have more freedom than such a body needs."""
+STIFF, LEANING = 0.2, {"kcs": 55.0, "pkc": 8.0, "local_rigidity": 8.0}
+"""A stiff body before a camera that goes half around is no riddle (mm) but to those that know better: KCS and PKC lean
+on a template, and local rigidity on flat shapes."""
 
 pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
 
