@@ -55,8 +55,8 @@ class Descent:
         self.plane = plane if plane.ndim == 4 else plane[None]
         lines = [(affine - affine.mean(-1, keepdim=True)) @ obj.tree[posture.trunk]]  # (2, B): the axes' depths
         self.axes = posture.axes.to(like)
-        self.spread = posture.deviation.to(like).mT[..., None]  # (3, B, 1)
-        self.mean = posture.mean.to(like).mT[..., None] / self.spread
+        self.spread = posture.deviation.to(like).mT.contiguous()  # (3, B)
+        self.mean = (posture.mean.to(like).mT / self.spread).reshape(-1, 1)  # (3B, 1)
         hinges = obj.hinges
         if len(hinges.joints):
             parent, joint, child, left, right = hinges.joints.unbind(1)
@@ -150,7 +150,7 @@ class Descent:
     def _posture(
         self, dz: Tensor, lengths: Tensor, depths: Tensor, slope: Tensor, growth: Tensor, back: Tensor
     ) -> Tensor:
-        posture, share = self.objective.posture, self.objective.share
+        obj, posture = self.objective, self.objective.posture
         count, bones, frames = dz.shape
         first, second = torch.cat([self.plane.expand(count, -1, -1, -1), depths[:, :, None]], 2).unbind(1)  # (H, 3, T)
         over = (first.square().sum(1, keepdim=True) + 1e-18).rsqrt()
@@ -161,35 +161,37 @@ class Descent:
         up = square * down
         frame = torch.stack([first, up, torch.linalg.cross(first, up, dim=1)], 1).flatten(2)  # (H, 3, 3 T)
         turn = (self.axes @ frame).view(count, 3, 3, 1, frames)  # [k, j]: how much of coordinate j is in direction k
-        scale = (lengths[:, None, :, None] * self.spread).reciprocal_()  # (H, 3, B, 1)
-        y = turn[:, :, 0] * self.x[:, None]
-        y.addcmul_(turn[:, :, 1], self.y[:, None]).addcmul_(turn[:, :, 2], dz[:, None])
-        y = y.mul_(scale).sub_(self.mean).view(count, 3 * bones, frames)
-        if share is None:
-            amount: Tensor | float = frames / posture.correlation
-            mean = y.mean(-1, keepdim=True)
-            scatter = torch.bmm(y, y.mT).mul_(1 / (posture.correlation * posture.strength))
-        else:
-            amount = share.sum(-1)[:, None, None]
-            weighed = y * share[:, None]
-            mean = weighed.sum(-1, keepdim=True) / torch.where(amount > 0, amount, 1)
-            scatter = torch.bmm(weighed, y.mT).div_(posture.strength)
+        # Bones seen from the trunk, v, and a row that is 1 in real frames: their products with each other tell mean and
+        # scatter of y = v / (length spread) - mean.
+        seen = dz.new_empty(count, 3 * bones + 1, frames)
+        seen[:, -1] = 1 if self.time is None else self.time[:, 0]
+        own = dz if self.time is None else dz * self.time
+        y = seen[:, :-1].view(count, 3, bones, frames)
+        torch.mul(turn[:, :, 0], self.x[:, None], out=y)
+        y.addcmul_(turn[:, :, 1], self.y[:, None]).addcmul_(turn[:, :, 2], own[:, None])
+        total = torch.bmm(seen, seen.mT)  # (H, 3B + 1, 3B + 1)
+        each = 1 / wide(self.weights.posture, 2)  # what a frame counts
+        amount = wide(obj.count, 2) * each
         near = amount / (amount + posture.kappa)
-        scatter.baddbmm_(mean * (-amount * near / posture.strength), mean.mT)
+        scale = (lengths[:, None] * self.spread).reciprocal_().flatten(1)[..., None]  # (H, 3B, 1)
+        middle = total[:, :-1, -1:] / wide(obj.count, 2)
+        scatter = torch.baddbmm(total[:, :-1, :-1], middle, total[:, -1:, :-1], alpha=-1)
+        scatter.mul_(scale * (each / posture.strength)).mul_(scale.mT)
+        mean = scale * middle - self.mean
+        scatter.baddbmm_(mean * (amount * (1 - near) / posture.strength), mean.mT)
         scatter.diagonal(dim1=-2, dim2=-1).add_(1)
         factor, _ = torch.linalg.cholesky_ex(scatter)
         inverse = torch.cholesky_inverse(factor)
         gain = (amount + posture.strength) / posture.strength
-        towards = inverse @ mean  # (H, 3B, 1)
+        towards = inverse @ torch.cat([mean, near * mean + self.mean], -1)  # (H, 3B, 2)
         # The sums over time of slope times y, and of the slope, are those of small matrices.
-        moved = posture.strength * gain * (1 - inverse.diagonal(dim1=-2, dim2=-1)).view(count, 3, bones)
-        pulled = (gain * posture.kappa * near * towards).view(count, 3, bones) * self.mean[..., 0]
-        growth -= (moved + pulled).sum(1)
-        steep = torch.baddbmm(towards * -near, inverse, y).view(count, 3, bones, frames)
-        steep = steep.mul_(gain[..., None] * scale if isinstance(gain, Tensor) else gain * scale)
-        steep = steep.mul_(1 / posture.correlation if share is None else share[:, None, None])
+        moved = posture.strength * (1 - inverse.diagonal(dim1=-2, dim2=-1)[..., None])
+        pulled = posture.kappa * near * towards[..., :1] * self.mean
+        growth -= (gain * (moved + pulled)).view(count, 3, bones).sum(1)
+        steep = torch.cat([inverse * scale.mT, -towards[..., 1:]], -1).mul_(gain * each * scale) @ seen
+        steep = steep.view(count, 3, bones, frames)
         slope += (steep * turn[:, :, 2]).sum(1)
-        turned = [(steep * v[:, None]).sum(2) for v in (self.x, self.y, dz)]  # (H, 3, T): of k, for each j
+        turned = [(steep * v[:, None]).sum(2) for v in (self.x, self.y, own)]  # (H, 3, T): of k, for each j
         into = self.axes.mT @ torch.stack(turned, 2).flatten(2)  # (H, 3, 3 T)
         a, b, c = into.view(count, 3, 3, frames).unbind(1)
         a = a + torch.linalg.cross(up, c, dim=1)
@@ -200,7 +202,7 @@ class Descent:
         back[:, 1] = (b - slant * first)[:, 2]
         back[:, 0] = ((a - first * (first * a).sum(1, keepdim=True)) * over)[:, 2]
         log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        held = amount if isinstance(amount, float) else amount[:, 0, 0]
+        held = amount[:, 0, 0] if isinstance(amount, Tensor) else amount
         return (held + posture.strength) / 2 * log_det
 
     def _hinges(self, lengths: Tensor, depths: Tensor, growth: Tensor, back: Tensor) -> Tensor:
