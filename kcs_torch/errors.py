@@ -14,6 +14,7 @@ __all__ = [
     "FormatError",
     "KcsError",
     "KcsWarning",
+    "NotFiniteError",
     "OptionError",
     "OutputError",
     "ShapeError",
@@ -28,6 +29,10 @@ class KcsError(ValueError):
 
 class ShapeError(KcsError):
     """An array has the wrong shape, type or values."""
+
+
+class NotFiniteError(ShapeError):
+    """A matrix to factorise holds NaN or infinite numbers."""
 
 
 class SkeletonError(KcsError):

@@ -5,7 +5,7 @@ import torch
 from numerics import BODY, FLOATS, HALVES, finite, gradcheck, leaves_arguments_alone, normal, rotations, same_as_loop
 from torch.testing import assert_close
 
-from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.errors import NotFiniteError, OptionError, ShapeError
 from kcs_torch.functional import bone_vectors, kcs_matrix
 from kcs_torch.metrics import ALIGNMENTS, mpjpe
 from kcs_torch.nn import JointDistance, KCSDistance, KCSMatrix
@@ -47,7 +47,7 @@ def test_points_that_are_nan_do_not_pass_for_near(how):
     points, target = pair()
     points[1, 2] = torch.nan
     if how in ("rigid", "similarity", "sequence"):
-        with pytest.raises(ShapeError, match=r"finite numbers.*weights of 0"):
+        with pytest.raises(NotFiniteError, match=r"finite numbers.*weights of 0"):
             JointDistance(how)(points, target)
     else:
         distance = JointDistance(how)(points, target)

@@ -17,7 +17,7 @@ from numerics import (
 )
 from torch.testing import assert_close
 
-from kcs_torch.errors import ShapeError
+from kcs_torch.errors import NotFiniteError, ShapeError
 from kcs_torch.functional import dct_basis, log_det, nuclear_norm, psd_shrink, singular_values, spectral_norm, svt
 
 
@@ -398,7 +398,7 @@ def test_vectors_are_refused(function):
 def test_nan_is_refused_in_our_words(function, recorded):
     matrix = normal(2, 5, 5)
     matrix[1, 2, 3] = torch.nan
-    with pytest.raises(ShapeError, match=r"finite numbers, got NaN.*\(2, 5, 5\).*weights of 0"):
+    with pytest.raises(NotFiniteError, match=r"finite numbers, got NaN.*\(2, 5, 5\).*weights of 0"):
         function(matrix.requires_grad_(recorded))
 
 

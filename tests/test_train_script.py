@@ -215,9 +215,11 @@ class TestWrongConfigurations:
             except hydra.errors.InstantiationException as error:
                 raise error.__cause__ from None
 
-    def test_divergence_is_the_worst_value(self, tmp_path):
+    @pytest.mark.parametrize("solver", ["none", "sfam"])
+    def test_divergence_is_the_worst_value(self, tmp_path, solver):
+        """A solver factorises matrices, and takes no NaN."""
         with pytest.warns(kt.KcsWarning, match="diverged"):
-            outcome = train(composed("+module.lr=1e30"), tmp_path)
+            outcome = train(composed("+module.lr=1e30", f"solver={solver}"), tmp_path)
         assert outcome.value == float("inf") and outcome.lifter is None and not outcome.metrics
 
     def test_divergence_later_leaves_the_best_epoch(self, tmp_path, monkeypatch):

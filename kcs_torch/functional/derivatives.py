@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError
+from kcs_torch.errors import NotFiniteError, ShapeError
 
 __all__ = ["LargestSum", "PSDShrink", "ShrinkSingularValues", "applied", "batch_first"]
 
@@ -22,19 +22,19 @@ def applied(function: type[torch.autograd.Function], *inputs: Any) -> Any:
     """``function.apply``, or its plain forward where nothing is recorded: a Function costs as much as ten steps.
 
     Raises:
-        ShapeError: a factorisation of the first input failed, as it does where that holds NaN.
+        NotFiniteError: the first input holds NaN, so that its factorisation failed.
+        ShapeError: it failed for another reason.
     """
     call: Any = function.apply if torch.is_grad_enabled() else function.forward
     try:
         return call(*inputs)
     except torch.linalg.LinAlgError as error:
-        message = (
-            f"singular values: expected finite numbers, got NaN or infinite ones in a {tuple(inputs[0].shape)} array: "
-            "where joints are unseen give weights of 0"
-        )
         if bool(inputs[0].isfinite().all()):
-            message = f"singular values: {error}"
-        raise ShapeError(message) from None
+            raise ShapeError(f"singular values: {error}") from None
+        raise NotFiniteError(
+            f"singular values: expected finite numbers, got NaN or infinite ones in a {tuple(inputs[0].shape)} array: "
+            "give unseen joints weights of 0; where a network made them, its training diverged"
+        ) from None
 
 
 def batch_first(info: Any, in_dims: tuple[int | None, ...], tensors: tuple[Tensor, ...], cores: tuple[int, ...]) -> Any:

@@ -29,7 +29,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from kcs_torch.errors import KcsError, KcsWarning, OptionError, unknown
+from kcs_torch.errors import KcsError, KcsWarning, NotFiniteError, OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.training.checkpoint import describe, save_lifter
 from kcs_torch.training.sweep import RESULT, tabulate
@@ -174,7 +174,7 @@ def train(config: DictConfig, folder: Path) -> Outcome:
             if resumed is None or "loading state_dict" not in str(error):
                 raise
             raise OptionError(f"resume={resumed}: does not fit this configuration: {error}") from None
-        except _Diverged:
+        except (_Diverged, NotFiniteError):  # a loss or a solver was given NaN
             text = "training diverged: what was best before that counts; try a smaller module.lr"
             warnings.warn(text, KcsWarning, stacklevel=2)
             if best.best_model_score is None:
