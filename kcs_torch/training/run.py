@@ -7,7 +7,6 @@ import logging
 import math
 import os
 import re
-import shutil
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +22,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException, HydraException, InstantiationException
 from hydra.types import RunMode
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
@@ -31,6 +29,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from kcs_torch.errors import KcsError, KcsWarning, NotFiniteError, OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
+from kcs_torch.training.callbacks import Best, Diverged, Last, Watch
 from kcs_torch.training.checkpoint import describe, save_lifter
 from kcs_torch.training.sweep import RESULT, tabulate
 
@@ -66,70 +65,6 @@ class Outcome:
     lifter: Path | None
 
 
-class _Best(ModelCheckpoint):
-    """The checkpoint of the best epoch. A resumed run takes over the best one so far into its own folder."""
-
-    def __init__(self, folder: Path, monitor: str, mode: str, resumed: Path | None) -> None:
-        super().__init__(folder, "best", monitor, mode=mode, enable_version_counter=False)
-        self.resumed = resumed
-
-    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Look for the metric, before the first epoch is spent."""
-        if self.monitor not in trainer.callback_metrics:
-            known = [name for name in trainer.callback_metrics if name.startswith("val/")]
-            raise unknown("metric for optimise", self.monitor, known)
-        super().on_validation_end(trainer, pl_module)
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take over what was best, from where it was or from beside the checkpoint, should the folder have moved."""
-        old = Path(state_dict["best_model_path"])
-        if state_dict["best_model_path"]:
-            moved = Path(self.resumed or "").parent / old.name
-            new = Path(str(self.dirpath)) / old.name
-            found = old if old.is_file() else moved
-            if not found.is_file():
-                raise OptionError(
-                    f"resume={self.resumed}: expected its best checkpoint {old} or {moved}, found neither"
-                )
-            with atomic_path(new) as temporary:
-                shutil.copyfile(found, temporary)
-            score = state_dict["best_model_score"]
-            state_dict = state_dict | {
-                "best_model_path": str(new), "kth_best_model_path": str(new), "best_k_models": {str(new): score}
-            }  # fmt: skip
-        super().load_state_dict(state_dict | {"dirpath": self.dirpath})
-
-
-class _Last(ModelCheckpoint):
-    """The checkpoint of the last epoch, which knows of no other."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder, "last", enable_version_counter=False, save_on_train_epoch_end=True)
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Begin anew, in another folder."""
-
-
-class _Diverged(Exception):
-    """Weights are not numbers any more."""
-
-
-class _Watch(Callback):
-    """Keeps the configuration in every checkpoint, and ends training that came to nothing."""
-
-    def __init__(self, config: dict[str, Any]) -> None:
-        self.config = config
-
-    def on_save_checkpoint(self, trainer: Any, pl_module: Any, checkpoint: dict[str, Any]) -> None:
-        """Add the configuration."""
-        checkpoint["config"] = self.config
-
-    def on_validation_start(self, trainer: Any, pl_module: lightning.LightningModule) -> None:
-        """Look at the weights."""
-        if not all(bool(torch.isfinite(p).all()) for p in pl_module.parameters()):
-            raise _Diverged
-
-
 def configs() -> Path:
     """The folder of the configurations: in a wheel it is a part of the package, in a clone it is beside it."""
     package = Path(__file__).resolve().parents[1]
@@ -156,9 +91,9 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         data = instantiate(config.data, _convert_="all")
         module = instantiate(config.module, _convert_="all")
         savable = _savable(module.network)
-        best = _Best(folder / "checkpoints", config.optimise, config.mode, resumed)
+        best = Best(folder / "checkpoints", config.optimise, config.mode, resumed)
         made: dict[str, Any] = {
-            "callbacks": [_Watch(plain), best, _Last(folder / "checkpoints")],
+            "callbacks": [Watch(plain), best, Last(folder / "checkpoints")],
             "default_root_dir": folder,
         }
         if "logger" not in config.trainer:
@@ -174,7 +109,7 @@ def train(config: DictConfig, folder: Path) -> Outcome:
             if resumed is None or "loading state_dict" not in str(error):
                 raise
             raise OptionError(f"resume={resumed}: does not fit this configuration: {error}") from None
-        except (_Diverged, NotFiniteError):  # a loss or a solver was given NaN
+        except (Diverged, NotFiniteError):  # a loss or a solver was given NaN
             text = "training diverged: what was best before that counts; try a smaller module.lr"
             warnings.warn(text, KcsWarning, stacklevel=2)
             if best.best_model_score is None:

@@ -1,0 +1,80 @@
+"""What is kept of a run as it goes on, its best and last epoch, and what ends it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+
+from kcs_torch.errors import OptionError, unknown
+from kcs_torch.io.atomic import atomic_path
+
+__all__ = ["Best", "Diverged", "Last", "Watch"]
+
+
+class Best(ModelCheckpoint):
+    """The checkpoint of the best epoch. A resumed run takes over the best one so far into its own folder."""
+
+    def __init__(self, folder: Path, monitor: str, mode: str, resumed: Path | None) -> None:
+        super().__init__(folder, "best", monitor, mode=mode, enable_version_counter=False)
+        self.resumed = resumed
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Look for the metric, before the first epoch is spent."""
+        if self.monitor not in trainer.callback_metrics:
+            known = [name for name in trainer.callback_metrics if name.startswith("val/")]
+            raise unknown("metric for optimise", self.monitor, known)
+        super().on_validation_end(trainer, pl_module)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over what was best, from where it was or from beside the checkpoint, should the folder have moved."""
+        old = Path(state_dict["best_model_path"])
+        if state_dict["best_model_path"]:
+            moved = Path(self.resumed or "").parent / old.name
+            new = Path(str(self.dirpath)) / old.name
+            found = old if old.is_file() else moved
+            if not found.is_file():
+                raise OptionError(
+                    f"resume={self.resumed}: expected its best checkpoint {old} or {moved}, found neither"
+                )
+            with atomic_path(new) as temporary:
+                shutil.copyfile(found, temporary)
+            score = state_dict["best_model_score"]
+            state_dict = state_dict | {
+                "best_model_path": str(new), "kth_best_model_path": str(new), "best_k_models": {str(new): score}
+            }  # fmt: skip
+        super().load_state_dict(state_dict | {"dirpath": self.dirpath})
+
+
+class Last(ModelCheckpoint):
+    """The checkpoint of the last epoch, which knows of no other."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, "last", enable_version_counter=False, save_on_train_epoch_end=True)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Begin anew, in another folder."""
+
+
+class Diverged(Exception):
+    """Weights are not numbers any more."""
+
+
+class Watch(Callback):
+    """Keeps the configuration in every checkpoint, and ends training that came to nothing."""
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        self.config = config
+
+    def on_save_checkpoint(self, trainer: Any, pl_module: Any, checkpoint: dict[str, Any]) -> None:
+        """Add the configuration."""
+        checkpoint["config"] = self.config
+
+    def on_validation_start(self, trainer: Any, pl_module: lightning.LightningModule) -> None:
+        """Look at the weights."""
+        if not all(bool(torch.isfinite(p).all()) for p in pl_module.parameters()):
+            raise Diverged
