@@ -139,39 +139,45 @@ def blend_windows(parts: Tensor, starts: list[int], length: int) -> Tensor:
 def best_path(cost: Tensor, transition: Tensor) -> Tensor:
     """Return the states of least total cost, sum_t cost[t, s_t] + transition[t, s_t, s_t+1] (Viterbi).
 
-    Solved by doubling: spans of 1, 2, 4, ... frames are joined by min-plus products of all spans at once, so that no
-    loop runs over frames.
+    Both sweeps go together. Long paths are cut into blocks, whose min-plus products are taken side by side first: then
+    every block begins from what it costs to come there, so that loops run over the root of the number of frames.
 
     Args:
-        cost: (T, S).
-        transition: (T - 1, S, S).
+        cost: (..., T, S).
+        transition: (..., T - 1, S, S).
 
     Returns:
-        (T,) states. Where several paths cost the same, the result may mix them.
+        (..., T) states. Where several paths cost the same, the result may mix them.
 
     >>> best_path(torch.tensor([[0.0, 1], [1, 0], [0, 1]]), torch.ones(2, 2, 2) - torch.eye(2)).tolist()
     [0, 0, 0]
     """
-    if len(cost) == 1:
+    frames, states = cost.shape[-2:]
+    if frames == 1:
         return cost.argmin(-1)
-    forward = _prefix_minima(transition + cost[:-1, :, None])  # costs of frames 0..t-1 and the step into t
-    backward = _prefix_minima((transition + cost[1:, None, :]).flip(0).mT).flip(0)  # of frames t+1.. and the step out
-    start, end = torch.zeros_like(cost[:1]), torch.zeros_like(cost[:1])
-    before = torch.cat([start, forward.amin(-2)])
-    after = torch.cat([backward.amin(-2), end])
-    return (cost + before + after).argmin(-1)  # the least cost of any path through each state
+    batch = torch.broadcast_shapes(cost.shape[:-2], transition.shape[:-3])
+    forward = transition + cost[..., :-1, :, None]  # a frame's cost and the step out of it
+    backward = (transition + cost[..., 1:, None, :]).mT.flip(-3)
+    steps = torch.stack([forward, backward]).reshape(-1, frames - 1, states, states)
+    before, after = _least(steps, frames - 1).reshape(2, *batch, frames, states)
+    return (cost + before + after.flip(-2)).argmin(-1)  # the least cost of any path through each state
 
 
-def _prefix_minima(steps: Tensor) -> Tensor:
-    """Min-plus products of the first 1, 2, ... of (T, S, S) matrices, by doubling.
-
-    Runs of frames at a time, as one product needs S times the memory of its result.
-    """
-    run = max(1, 2**20 // max(1, steps.shape[-1] ** 3))
-    span = 1
-    while span < len(steps):
-        pairs = zip(steps[:-span].split(run), steps[span:].split(run), strict=True)
-        joined = [(left[:, :, :, None] + right[:, None, :, :]).amin(-2) for left, right in pairs]
-        steps = torch.cat([steps[:span], *joined])
-        span *= 2
-    return steps
+def _least(steps: Tensor, count: int) -> Tensor:
+    """Least costs (P, T, S) of coming to each state, from min-plus matrices (P, T - 1, S, S)."""
+    problems, _, states, _ = steps.shape
+    length = count if count <= 16 * problems else math.ceil((count / 2) ** 0.5)
+    blocks = math.ceil(count / length)
+    steps = torch.nn.functional.pad(steps, (0, 0, 0, 0, 0, blocks * length - count)).unflatten(1, (blocks, length))
+    start = steps.new_zeros(problems, 1, states)
+    if blocks > 1:
+        product = steps[:, :, 0]
+        for k in range(1, length):
+            product = (product[..., :, None] + steps[:, :, k, None]).amin(-2)
+        for b in range(blocks - 1):
+            start = torch.cat([start, (start[:, -1:, :, None] + product[:, b, None]).amin(-2)], 1)
+    costs = [start]
+    for k in range(length):
+        costs.append((costs[-1][..., None] + steps[:, :, k]).amin(-2))
+    inner = torch.stack(costs[:-1], 2).flatten(1, 2)
+    return torch.cat([inner, costs[-1][:, -1:]], 1)[:, : count + 1]

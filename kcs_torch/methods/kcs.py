@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -15,12 +15,12 @@ from kcs_torch.functional.align import centre, nearest_rotation
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.chain import bone_lengths, chain_inverse, incidence
 from kcs_torch.methods.base import Estimate, Method
-from kcs_torch.methods.lockstep import Search, run, together
+from kcs_torch.methods.clips import Clips, in_batches, padded
 from kcs_torch.methods.template import clip_scale, rigid_shape
-from kcs_torch.nn.deviation import Arrangement, deviation_scale, deviation_step, frame_scales
+from kcs_torch.nn.deviation import Arrangement, deviation_goal, deviation_scale, deviation_step, frame_scales
 from kcs_torch.nn.steps import continuation
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.solvers.iterate import iterate, relative_change
+from kcs_torch.solvers.iterate import relative_change
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.pose import CameraFit, fit_cameras, steady_cameras
 from kcs_torch.types import Tracks, as_floats
@@ -90,53 +90,64 @@ class KCS(Method):
 
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Alternate cameras and shape until the cameras stand still."""
-        return run(self._steps(tracks, cameras), self._fits)
+        return self._solve([tracks], cameras)[0]
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
-        """Several clips, whose cameras are fitted together: each frame is a problem of its own."""
-        return run(together([self._steps(one, None) for one in tracks]), self._fits)
+        """Several clips as few batches; a clip that has settled leaves its batch."""
+        return in_batches(tracks, lambda clips: self._solve(clips, None))
 
-    def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[_Fit, CameraFit, Estimate]:
-        body = tracks.skeleton.with_links(self.links) if self.links else tracks.skeleton
+    def _solve(self, tracks: Sequence[Tracks], cameras: Tensor | None) -> list[Estimate]:
+        """Clips of one skeleton; known cameras (T, 2, 3) are those of a single clip."""
+        body = tracks[0].skeleton.with_links(self.links) if self.links else tracks[0].skeleton
         body = body.connected()
-        bones = body.bone_index(device=tracks.points.device)
-        matrix = incidence(bones, body.num_joints, dtype=tracks.points.dtype)
+        clips = Clips.of(tracks)
+        bones = body.bone_index(device=clips.points.device)
+        matrix = incidence(bones, body.num_joints, dtype=clips.points.dtype)
         inverse = chain_inverse(matrix)
-        rest, notes = self._template(tracks, cameras)
-        scale = clip_scale(tracks, rest)
+        rests, notes = zip(*(self._template(one, cameras) for one in tracks), strict=True)
+        rest = torch.stack(rests)[:, None]  # (K, 1, N, 3)
+        scale = padded([clip_scale(one, own) for one, own in zip(tracks, rests, strict=True)])
         low, high = scale / self.scale_range, scale * self.scale_range
         if math.isinf(self.scale_range):
             low, high = torch.zeros_like(scale), torch.full_like(scale, math.inf)
-        if cameras is not None and not (self.template is None and tracks.skeleton.template is None):
+        known = None if cameras is None else complete_rotation(cameras)[None]
+        if known is not None and not (self.template is None and body.template is None):
             # A template has a frame of its own: turn it into the world, as it is seen over the whole clip.
-            seen_from, _ = yield from self._cameras(
-                tracks, rest.expand(tracks.num_frames, -1, 3), low, high, None, None
+            seen_from, _ = self._cameras(clips, rest, low, high, None)
+            rest = rest @ nearest_rotation((known.mT @ seen_from).sum(1, keepdim=True)).mT
+        count, frames = scale.shape
+        rotations, scales = rest.new_zeros(count, frames, 3, 3), torch.zeros_like(scale)
+        deviation = rest.new_zeros(count, frames, 3, len(bones))
+        shape = rest + (deviation @ inverse.mT).mT
+        converged = torch.zeros(count, dtype=torch.bool, device=rest.device)
+        made = torch.zeros(count, dtype=torch.long, device=rest.device)
+        live = torch.arange(count, device=rest.device)
+        for turn in range(self.rounds):
+            part, bounds = clips.take(live), (low[live], high[live])
+            if known is None:
+                seen_from, size = self._cameras(part, shape[live], *bounds, rotations[live] if turn else None)
+            else:
+                seen_from, size = known, frame_scales(shape, part.points, known[..., :2, :], part.weights, *bounds)
+            found, settled, steps = self._deviation(
+                part, rest[live], deviation[live], seen_from[..., :2, :], size, matrix, inverse
             )
-            rest = rest @ nearest_rotation((complete_rotation(cameras).mT @ seen_from).sum(0)).mT
-        shape = rest.expand(tracks.num_frames, -1, 3)
-        rotations: Tensor | None = None
-        deviation = torch.zeros(tracks.num_frames, len(bones), 3, dtype=rest.dtype, device=rest.device)
-        converged, made = False, 0
-        for _ in range(self.rounds):
-            last = rotations
-            rotations, scales = yield from self._cameras(tracks, shape, low, high, last, cameras)
-            deviation, settled, steps = self._deviation(
-                tracks, rest, deviation, rotations[:, :2], scales, matrix, inverse
-            )
-            shape, made = rest + inverse @ deviation, made + steps
-            if last is not None:
-                moved = ((rotations - last).square().sum((-2, -1)).mean() / 2).sqrt()
-                converged = bool(moved <= self.tolerance)
-            if converged or cameras is not None or not bool(tracks.seen.any()):
-                converged = settled
+            moved = (part.mean((seen_from - rotations[live]).square().sum((-2, -1))) / 2).sqrt()
+            done = (moved <= self.tolerance) & (turn > 0) | ~(part.weights > 0).any(-1).any(-1) | (known is not None)
+            rotations[live], scales[live], deviation[live] = seen_from, size, found
+            shape[live] = rest[live] + (found @ inverse.mT).mT
+            converged[live], made[live] = done & settled, made[live] + steps
+            live = live[~done]
+            if not len(live):
                 break
-        assert rotations is not None
-        size = scales.mean()
-        points = size * shape @ rotations.mT
+        mean = clips.mean(scales)[:, None]
+        points = mean[..., None, None] * shape @ rotations.mT
         if self.bone_steps:
-            points = self._constant_bones(points, body, tracks.seen)
+            kept = zip(clips.cut(points), clips.cut(clips.weights > 0), strict=True)
+            points = padded([self._constant_bones(one, body, seen) for one, seen in kept])
         points = points - points.mean(-2, keepdim=True)
-        return Estimate(points, rotations[:, :2], scales / size, converged, made, notes)
+        each = [clips.cut(x) for x in (points, rotations[..., :2, :], scales / mean)]
+        ends = zip(*each, converged.tolist(), made.tolist(), notes, strict=True)
+        return [Estimate(x, rows, own, good, steps, note) for x, rows, own, good, steps, note in ends]
 
     def _template(self, tracks: Tracks, cameras: Tensor | None) -> tuple[Tensor, tuple[str, ...]]:
         """The rest pose (N, 3), centred; a stand-in is in the world of the cameras where they are known."""
@@ -157,33 +168,15 @@ class KCS(Method):
         return centre(rest)[0], ()
 
     def _cameras(
-        self, tracks: Tracks, shape: Tensor, low: Tensor, high: Tensor, last: Tensor | None, known: Tensor | None
-    ) -> Search[_Fit, CameraFit, tuple[Tensor, Tensor]]:
-        """Rotations (T, 3, 3) and scales (T,) of the camera step (eq. 22-25), consistent over time."""
-        if known is not None:
-            return complete_rotation(known), frame_scales(shape, tracks.points, known, tracks.weights, low, high)
-        (fit,) = yield [_Fit(tracks.points, shape, tracks.weights, low, high, last)]
-        return steady_cameras(fit, self.continuity)
-
-    def _fits(self, asked: list[_Fit]) -> list[CameraFit]:
-        """Fit the cameras of several clips: those of one number of joints, and with or without a start, together."""
-        groups: dict[object, list[int]] = {}
-        for i, one in enumerate(asked):
-            points = one.points
-            kind = (one.start is None, points.shape[1], points.dtype, points.device)
-            groups.setdefault(kind, []).append(i)
-        out: dict[int, CameraFit] = {}
-        for group in groups.values():
-            tracks, points, weights, low, high = (
-                torch.cat(parts) for parts in zip(*(asked[i][:5] for i in group), strict=True)
-            )
-            starts = [start for i in group if (start := asked[i].start) is not None]
-            start = torch.cat(starts) if starts else None
-            fit = fit_cameras(tracks, points, weights, low, high, robust=self.robust, start=start)
-            counts = [len(asked[i].tracks) for i in group]
-            parts = zip(*(x.split(counts, 1) for x in (fit.rotations, fit.scales, fit.cost)), strict=True)
-            out |= {i: CameraFit(*part) for i, part in zip(group, parts, strict=True)}
-        return [out[i] for i in range(len(asked))]
+        self, clips: Clips, shape: Tensor, low: Tensor, high: Tensor, last: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Rotations (K, T, 3, 3) and scales (K, T) of the camera step (eq. 22-25), consistent over time."""
+        shape = shape.expand(*clips.weights.shape, 3)
+        given = (clips.frames(x) for x in (clips.points, shape, clips.weights, low, high))
+        start = None if last is None else clips.frames(last)
+        fit = fit_cameras(*given, robust=self.robust, start=start)
+        parts = (torch.stack([clips.as_clips(one) for one in x]) for x in (fit.rotations, fit.scales, fit.cost))
+        return steady_cameras(CameraFit(*parts), self.continuity, inside=clips.inside)
 
     def _constant_bones(self, points: Tensor, body: Skeleton, seen: Tensor) -> Tensor:
         """Alternate the bone-length step with the image positions of seen joints."""
@@ -197,43 +190,37 @@ class KCS(Method):
 
     def _deviation(
         self,
-        tracks: Tracks,
+        clips: Clips,
         rest: Tensor,
         start: Tensor,
         cameras: Tensor,
         scales: Tensor,
         matrix: Tensor,
         inverse: Tensor,
-    ) -> tuple[Tensor, bool, int]:
-        """Shape step (eq. 21): deviations (T, B, 3) of least nuclear norm that meet the tracks, by SVT continuation."""
-        goal = tracks.points / scales[:, None, None]
-        given = (rest, goal, cameras, tracks.weights)
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Shape step (eq. 21): deviations (K, T, 3, B) of least nuclear norm that meet the tracks, by SVT continuation.
+
+        With them come whether each clip settled at the last weight, and its steps: at a weight a clip that has settled
+        rests, so that what is beside it in the batch makes no difference.
+        """
+        image = clips.points / torch.where(scales > 0, scales, torch.ones_like(scales))[..., None, None]
+        given = (deviation_goal(rest, image, cameras, clips.weights), cameras, clips.weights)
         top = deviation_scale(*given, matrix=matrix, arrangement=self.arrangement)
-
-        def step(state: Tensor, threshold: Tensor) -> Tensor:
-            return deviation_step(
-                state, *given, threshold, matrix=matrix, inverse=inverse, arrangement=self.arrangement
-            )
-
-        state, settled, made = start, False, 0
+        state, made = start, torch.zeros(len(start), dtype=torch.long, device=start.device)
         for mu in continuation(self.num_weights, self.mu, self.mu * self.rho ** (self.num_weights - 1)):
-            solution = iterate(
-                lambda x, _, mu=mu: step(x, mu * top),  # type: ignore[misc]
-                state,
-                num_steps=self.steps_per_weight,
-                change=lambda old, new: relative_change(old.flatten(0, 1), new.flatten(0, 1)),
-                tolerance=1e-4,
-            )
-            state, settled, made = solution.value, solution.converged, made + solution.iterations
-        return state, settled, made
+            resting = torch.zeros_like(made, dtype=torch.bool)
+            for k in range(1, self.steps_per_weight + 1):
+                new = deviation_step(
+                    state, *given, mu * top, matrix=matrix, inverse=inverse, arrangement=self.arrangement
+                )
+                last, state = state, torch.where(resting[:, None, None, None], state, new) if k > CHECK else new
+                made = made + ~resting
+                if k % CHECK == 0 or k == self.steps_per_weight:
+                    resting = resting | (relative_change(last.flatten(1, 2), state.flatten(1, 2)) <= 1e-4)
+                    if bool(resting.all()):
+                        break
+        return state, resting, made
 
 
-class _Fit(NamedTuple):
-    """Arguments of :func:`fit_cameras` for one clip."""
-
-    tracks: Tensor
-    points: Tensor
-    weights: Tensor
-    low: Tensor
-    high: Tensor
-    start: Tensor | None
+CHECK = 5
+"""Steps from one look at whether a clip has settled to the next."""

@@ -90,5 +90,5 @@ class SMSR(Factorised):
         falling = torch.stack([self.mu * fall**k * size for k in range(self.num_steps)])
         before = fpc(start, gradient, step=self.tau, weights=falling[:-1], steps_per_weight=1).value
         shape = fpc(before, gradient, step=self.tau, weights=falling[-1:], steps_per_weight=1).value
-        settled = bool(relative_change(before, shape) <= SETTLED)
+        settled = bool((relative_change(before, shape) <= SETTLED).all())
         return Solution(shape.unflatten(-1, (joints, 3)), settled, self.num_steps)

@@ -1,6 +1,6 @@
 """The step that KCS and its unrolled layer share: a template's bones plus a deviation of least nuclear norm.
 
-Pose = B0 + A in bone space, B0 the template's bones, A (T, B, 3) the deviation.
+Pose = B0 + A in bone space, B0 the template's bones, A (T, 3, B) the deviation.
 """
 
 from __future__ import annotations
@@ -11,20 +11,31 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.camera import back_project, project
+from kcs_torch.functional.camera import project
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.spectral import spectral_norm, svt
-from kcs_torch.nn.energies import centred_residual
+from kcs_torch.nn.masks import some
 
-__all__ = ["Arrangement", "deviation_scale", "deviation_step", "frame_scales", "template_scale"]
+__all__ = ["Arrangement", "deviation_goal", "deviation_scale", "deviation_step", "frame_scales", "template_scale"]
 
 Arrangement = Literal["stacked", "frames"]
-"""How deviations form one matrix: 3T x B as printed, or T x 3B."""
+"""How deviations form one matrix: 3T x B as printed, or T x 3B (up to the order of rows and columns)."""
+
+
+def deviation_goal(rest: Tensor, tracks: Tensor, cameras: Tensor, weights: Tensor) -> Tensor:
+    """What the tracks ask of the deviation, W - R X0 about its middle, joints last: (..., T, 2, N).
+
+    Args:
+        rest: X0 (..., 1 or T, N, 3), the template in the world frame.
+        tracks: W (..., T, N, 2), in the unit of the template.
+        cameras: R (..., T, 2, 3).
+        weights: w (..., T, N).
+    """
+    return _centred(tracks.mT - cameras @ rest.mT, weights[..., None, :])
 
 
 def deviation_step(
     deviation: Tensor,
-    rest: Tensor,
     goal: Tensor,
     cameras: Tensor,
     weights: Tensor,
@@ -35,15 +46,15 @@ def deviation_step(
     inverse: Tensor,
     arrangement: Arrangement,
 ) -> Tensor:
-    """One step of KCS's shape (eq. 21): A <- shrink(A - tau C^T R^T w (R (X0 + D A) - W), tau mu).
+    """One step of KCS's shape (eq. 21): A <- shrink(A - tau C^T R^T w (R D A - G), tau mu).
 
     Unseen joints take their current projection, and joints seen with low confidence go part of the way: the
     majorisation of the weighted data term.
 
     Args:
-        deviation: A (..., T, B, 3).
-        rest: X0 (..., 1 or T, N, 3), the template in the world frame.
-        goal: W (..., T, N, 2), tracks in the unit of the template.
+        deviation: A (..., T, 3, B), bones last: so D and C are one product for all frames, and the matrix that is
+            shrunk is a view.
+        goal: G (..., T, 2, N) from :func:`deviation_goal`.
         cameras: R (..., T, 2, 3).
         weights: w (..., T, N).
         threshold: mu (...).
@@ -53,19 +64,19 @@ def deviation_step(
         arrangement: of the matrix whose singular values are shrunk.
 
     Returns:
-        (..., T, B, 3).
+        (..., T, 3, B).
     """
-    residual = centred_residual(project(rest + inverse @ deviation, cameras), goal, weights)
-    move = back_project(matrix.mT @ (residual * weights[..., None]), cameras)
-    return _unfold(svt(_fold(deviation - step * move, arrangement), step * threshold), deviation, arrangement)
+    share = weights[..., None, :]
+    residual = _centred((cameras @ deviation) @ inverse.mT - goal, share) * share
+    moved = deviation - step * (cameras.mT @ (residual @ matrix))
+    return svt(_fold(moved, arrangement), step * threshold).view(moved.shape)
 
 
 def deviation_scale(
-    rest: Tensor, goal: Tensor, cameras: Tensor, weights: Tensor, *, matrix: Tensor, arrangement: Arrangement
+    goal: Tensor, cameras: Tensor, weights: Tensor, *, matrix: Tensor, arrangement: Arrangement
 ) -> Tensor:
     """Largest singular value (...) of what the tracks ask of the template: the unit of the shrinkage."""
-    asked = -centred_residual(project(rest, cameras), goal, weights) * weights[..., None]
-    return spectral_norm(_fold(back_project(matrix.mT @ asked, cameras), arrangement))
+    return spectral_norm(_fold(cameras.mT @ ((goal * weights[..., None, :]) @ matrix), arrangement))
 
 
 def frame_scales(rest: Tensor, tracks: Tensor, cameras: Tensor, weights: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -142,13 +153,11 @@ def _quantile_of_known(values: Tensor, quantile: float) -> Tensor:
     return between.squeeze(-2)
 
 
+def _centred(rows: Tensor, share: Tensor) -> Tensor:
+    """Rows (..., 2, N) minus their weighted mean over joints: the translation at its optimum."""
+    return rows - (rows * share).sum(-1, keepdim=True) / some(share.sum(-1, keepdim=True))
+
+
 def _fold(deviation: Tensor, arrangement: Arrangement) -> Tensor:
-    """(..., T, B, 3) as (..., 3T, B) or (..., T, 3B)."""
-    return deviation.mT.flatten(-3, -2) if arrangement == "stacked" else deviation.flatten(-2)
-
-
-def _unfold(matrix: Tensor, like: Tensor, arrangement: Arrangement) -> Tensor:
-    """The way back, to (..., T, B, 3)."""
-    if arrangement == "stacked":
-        return matrix.unflatten(-2, (like.shape[-3], 3)).mT
-    return matrix.unflatten(-1, like.shape[-2:])
+    """(..., T, 3, B) as (..., 3T, B) or (..., T, 3B)."""
+    return deviation.flatten(-3, -2) if arrangement == "stacked" else deviation.flatten(-2)

@@ -27,12 +27,14 @@ class Solution(Generic[State]):
         converged: whether the stopping rule was met (True where there was none).
         iterations: steps made.
         before: the value ten steps earlier, where the solver keeps it.
+        change: what was measured last, of each problem where the measure tells them apart; None where nothing was.
     """
 
     value: State
     converged: bool
     iterations: int
     before: State | None = None
+    change: Tensor | None = None
 
 
 def iterate(
@@ -52,8 +54,8 @@ def iterate(
         step: one step; gets the state and the step's number.
         start: first state: a tensor or a tuple of tensors.
         num_steps: at most so many steps.
-        change: how much a step changed the state, a 0-dimensional tensor; None makes every step.
-        tolerance: stop where ``change`` is at or below it.
+        change: how much a step changed the state, a tensor of one number or one a problem; None makes every step.
+        tolerance: stop where ``change`` is at or below it, for all problems.
         check_every: measure the change at every so-manyth step and at the last (each check waits for the device).
         grad_steps: record only the last so many steps for autograd; None records all, 0 none. An iteration that
             settles before it has recorded them goes on for so many steps.
@@ -76,21 +78,22 @@ def iterate(
     state, recorded, converged = start, torch.is_grad_enabled(), change is None
     partial = recorded and grad_steps is not None and grad_steps < num_steps
     tail = (grad_steps or 0) if partial else 0  # steps to be recorded after others that are not
-    count, end = 0, num_steps
+    count, end, moved = 0, num_steps, None
     while count < end:
         with torch.set_grad_enabled(recorded and (not partial or end - count <= tail)):
             new = step(state, count)
         count += 1
         if change is not None and not converged and (count % check_every == 0 or count == end):
             with torch.no_grad():
-                converged = bool(change(state, new) <= tolerance)
+                moved = change(state, new)
+                converged = bool((moved <= tolerance).all())
             if converged:
                 end = min(end, count + tail)
         state = new
     if not converged and warn is not None:
         message = f"{warn} did not settle within {num_steps} steps; the result says converged=False"
         warnings.warn(message, ConvergenceWarning, stacklevel=2)
-    return Solution(state, converged, count)
+    return Solution(state, converged, count, change=moved)
 
 
 def fpc(
@@ -196,7 +199,7 @@ def svt(
 
 
 def relative_change(old: Tensor, new: Tensor) -> Tensor:
-    """Largest change over the batch, as a share of the new value's size; a batch of matrices (..., M, N)."""
+    """How much a step changed matrices (..., M, N), as a share of the new value's size, (...)."""
     size = torch.linalg.vector_norm(new, dim=(-2, -1))
     moved = torch.linalg.vector_norm(new - old, dim=(-2, -1))
-    return (moved / torch.where(size > 0, size, torch.ones_like(size))).amax()
+    return moved / torch.where(size > 0, size, torch.ones_like(size))

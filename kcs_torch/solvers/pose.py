@@ -70,28 +70,32 @@ def fit_cameras(
     return CameraFit(*(torch.cat(parts, 1) for parts in zip(*fits, strict=True)))
 
 
-def steady_cameras(fit: CameraFit, continuity: float = 1.0) -> tuple[Tensor, Tensor]:
+def steady_cameras(fit: CameraFit, continuity: float = 1.0, *, inside: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Choose one start's camera in each frame: of low cost, and without jumps in time.
 
     Args:
-        fit: from :func:`fit_cameras`.
+        fit: from :func:`fit_cameras`, or of a batch (C, ..., T).
         continuity: weight of the turn between frames (radians squared); 0 takes each frame's best.
+        inside: (..., T), False in frames that pad a shorter clip at its end, whose cost is 0.
 
     Returns:
-        rotations (T, 3, 3) and scales (T,).
+        rotations (..., T, 3, 3) and scales (..., T).
     """
-    cost = fit.cost.mT  # (T, C)
+    cost = fit.cost.movedim(0, -1)  # (..., T, C)
     if continuity > 0:
-        trace = torch.einsum("atij,btij->tab", fit.rotations[:, :-1], fit.rotations[:, 1:])
-        turn = torch.arccos(((trace - 1) / 2).clamp(-1, 1)).square()
-        choice = best_path(cost, continuity * turn)
+        flat = fit.rotations.movedim(0, -3).flatten(-2)  # (..., T, C, 9)
+        trace = flat[..., :-1, :, :] @ flat[..., 1:, :, :].mT
+        turn = continuity * torch.arccos(((trace - 1) / 2).clamp(-1, 1)).square()
+        if inside is not None:
+            turn = torch.where(inside[..., 1:, None, None], turn, torch.zeros_like(turn))
+        choice = best_path(cost, turn)[None]
     else:
-        choice = cost.argmin(-1)
-    frame = torch.arange(len(cost), device=choice.device)
-    return fit.rotations[choice, frame], fit.scales[choice, frame]
+        choice = cost.argmin(-1)[None]
+    rotations = fit.rotations.gather(0, choice[..., None, None].expand(*choice.shape, 3, 3))
+    return rotations[0], fit.scales.gather(0, choice)[0]
 
 
-RUN = 2000
+RUN = 1000
 """Frames that are fitted together: each is a problem of its own, and more would only take memory."""
 
 
@@ -107,16 +111,16 @@ def _fit(
     num_steps: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Rotations (C, T, 3, 3), scales (C, T) and cost (C, T) from starts (C, T, 3, 3)."""
-    share = weights.expand(len(rotations), *weights.shape)
     size = (points - points.mean(-2, keepdim=True)).square().sum(-1).mean(-1).sqrt()
     seen = (centre(tracks, weights)[0].square().sum(-1) * weights).sum(-1) / weights.sum(-1).clamp_min(1e-12)
     # In the image the body is as large as the scale tells or, where the scale is free, as the tracks are: a sphere's
     # shadow has 2/3 of its mean square.
     extent = torch.where(high.isinf(), (1.5 * seen).sqrt(), 0.5 * (low + high) * size)
     reach = torch.where(extent > 0, extent, torch.ones_like(extent)) * (robust or 1.0)
+    share = weights.expand(len(rotations), *weights.shape)
     for _ in range(1 if robust is None else 4):
-        rotations, scales, residual = _refine(rotations, tracks, points, share, low, high, num_steps)
-        square = (residual / reach[:, None]).square()
+        rotations, scales, square = _refine(rotations, tracks, points, share, low, high, num_steps)
+        square = square / reach[:, None].square()
         if robust is not None:
             share = weights / (1 + square).square()
     loss = square if robust is None else square / (1 + square)
@@ -127,53 +131,79 @@ def _fit(
 def _refine(
     rotations: Tensor, tracks: Tensor, points: Tensor, weights: Tensor, low: Tensor, high: Tensor, num_steps: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Weighted least-squares rotations (C, T, 3, 3), scales (C, T) and residual lengths (C, T, N)."""
+    """Weighted least-squares rotations (C, T, 3, 3), scales (C, T) and squared residuals (C, T, N).
+
+    Entries of vectors and matrices come first, so that every operation runs over all frames and starts.
+    """
     total = weights.sum(-1, keepdim=True)
-    unit = (weights / torch.where(total > 0, total, torch.ones_like(total)))[..., None]
-    y, x = tracks - (tracks * unit).sum(-2, keepdim=True), points - (points * unit).sum(-2, keepdim=True)
-    moment = y.mT @ (x * unit)  # (C, T, 2, 3)
-    gram = x.mT @ (x * unit)  # (C, T, 3, 3)
-    power = (y.square() * unit).sum((-2, -1))
-    eye = torch.eye(3, dtype=tracks.dtype, device=tracks.device)
+    unit = weights / torch.where(total > 0, total, torch.ones_like(total))
+    y, x = centre(tracks)[0], centre(points)[0]
+    both = torch.cat([x, y], -1)
+    # All moments of all starts by one product: (T, C, N) @ (T, N, 5 + 25).
+    terms = torch.cat([both, (both[..., :, None] * both[..., None, :]).flatten(-2)], -1)
+    means = (unit.movedim(1, 0) @ terms).movedim((-1, 0), (0, 2)).contiguous()
+    first, second = means[:5], means[5:].unflatten(0, (5, 5))
+    second = second - first[:, None] * first
+    gram, moment = second[:3, :3], second[3:, :3]  # (3, 3, C, T) and (2, 3, C, T)
+    power, spread = second[3, 3] + second[4, 4], gram[0, 0] + gram[1, 1] + gram[2, 2]
     tiny = torch.finfo(tracks.dtype).tiny
 
-    def evaluate(r: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Cost and best scale (C, T); the body's spread G = R gram R^T and M = R moment^T, in the camera's axes."""
-        g, m = r @ gram @ r.mT, r @ moment.mT  # (C, T, 3, 3) and (C, T, 3, 2)
-        match, size = m[..., 0, 0] + m[..., 1, 1], g[..., 0, 0] + g[..., 1, 1]
+    def evaluate(r: Tensor) -> tuple[Tensor, ...]:
+        """Cost and best scale (C, T); R moment^T (3, 2, C, T) and the last column of R gram R^T (3, C, T)."""
+        m, g = (r[:, None] * moment).sum(2), (r * (gram * r[2]).sum(1)).sum(1)
+        match, size = m[0, 0] + m[1, 1], spread - g[2]
         s = torch.minimum(torch.maximum(match / size.clamp_min(tiny), low), high)
-        return power - 2 * s * match + s * s * size, s, g, m
+        return power + s * (s * size - 2 * match), s, m, g
 
-    cost, scales, g, m = evaluate(rotations)
+    r = rotations.movedim((-2, -1), (0, 1)).contiguous()
+    cost, scales, m, g = evaluate(r)
     damping = torch.full_like(cost, 1e-3)
     for _ in range(num_steps):
-        # A turn w takes the rows r0, r1 to r0 + w_y r2 - w_z r1 and r1 + w_z r0 - w_x r2: the normal matrix and the
-        # gradient are sums of entries of G and of the misfit R (moment - scale rows gram)^T = M - scale G.
+        # A turn w takes the rows r0, r1 to r0 + w_y r2 - w_z r1 and r1 + w_z r0 - w_x r2: the normal matrix
+        # (a b x; b c y; x y d) and the gradient are sums of entries of G = R gram R^T and of M = R moment^T.
         square = scales.square()
-        flat = square * (g[..., 0, 0] + g[..., 1, 1])
-        deep, zero = square * g[..., 2, 2], torch.zeros_like(square)
-        zx, zy = -square * g[..., 0, 2], -square * g[..., 1, 2]
-        normal = torch.stack([deep, zero, zx, zero, deep, zy, zx, zy, flat], -1).unflatten(-1, (3, 3))
-        misfit = m - scales[..., None, None] * g[..., :2]
-        target = torch.stack([-misfit[..., 2, 1], misfit[..., 2, 0], misfit[..., 0, 1] - misfit[..., 1, 0]], -1)
+        d, deep, pulls = square * (spread - g[2]), square * g[2], scales * g
+        cross_x, cross_y = -square * g[0], -square * g[1]
+        target = torch.stack([pulls[1] - m[2, 1], m[2, 0] - pulls[0], m[0, 1] - m[1, 0]])
         # Where the scale is free it follows the turn: take its share out of the normal matrix (variable projection).
         # A frontal body that nods shrinks as one that recedes does: without this the two would creep along together.
-        free = ((scales > low) & (scales < high)) / flat.clamp_min(tiny).sqrt()
-        cross = torch.stack([zy, -zx, zero], -1) * free[..., None]
-        normal = normal - cross[..., :, None] * cross[..., None, :]
-        ridge = (damping + 1e-9) * normal.diagonal(dim1=-2, dim2=-1).amax(-1) + tiny
-        move = torch.linalg.solve(normal + ridge[..., None, None] * eye, scales[..., None] * target)
-        trial = rotation_matrix(move) @ rotations
+        free = ((scales > low) & (scales < high)) / d.clamp_min(tiny)
+        a, c = deep - free * cross_y.square(), deep - free * cross_x.square()
+        b = free * cross_x * cross_y
+        ridge = (damping + 1e-9) * torch.maximum(torch.maximum(a, c), d) + tiny
+        trial = _turn(_solve(a + ridge, b, c + ridge, cross_x, cross_y, d + ridge, scales * target), r)
         new, *others = evaluate(trial)
-        better = new < cost
-        pick = better[..., None, None]
-        rotations, g, m = (
-            torch.where(pick, n, o) for n, o in zip((trial, *others[1:]), (rotations, g, m), strict=True)
-        )
+        better = new < cost  # False for NaN, too
+        r, m, g = (torch.where(better, n, o) for n, o in zip((trial, *others[1:]), (r, m, g), strict=True))
         scales, cost = torch.where(better, others[0], scales), torch.where(better, new, cost)
         damping = torch.where(better, damping * 0.3, damping * 5)
-    residual = torch.linalg.vector_norm(y - scales[..., None, None] * (x @ rotations[..., :2, :].mT), dim=-1)
-    return rotations, scales, residual
+    rotations = r.movedim((0, 1), (-2, -1)).contiguous()
+    turned = scales * (r[:2] * first[:3]).sum(1) - first[3:]  # (2, C, T), the translation
+    rows = y.mT - scales[..., None, None] * (rotations[..., :2, :] @ x.mT) + turned.movedim(0, -1)[..., None]
+    return rotations, scales, rows.square().sum(-2)
+
+
+def _solve(a: Tensor, b: Tensor, c: Tensor, x: Tensor, y: Tensor, d: Tensor, target: Tensor) -> Tensor:
+    """Solutions (3, ...) of symmetric positive definite systems (a b x; b c y; x y d) with targets (3, ...)."""
+    u, v = x / d, y / d
+    a, b, c = a - u * x, b - u * y, c - v * y
+    p, q = target[0] - u * target[2], target[1] - v * target[2]
+    det = a * c - b * b
+    first, second = (c * p - b * q) / det, (a * q - b * p) / det
+    return torch.stack([first, second, target[2] / d - u * first - v * second])
+
+
+def _turn(vectors: Tensor, rotations: Tensor) -> Tensor:
+    """exp([w]) R for rotation vectors w (3, ...) and rotations (3, 3, ...), by the unit quaternion of w."""
+    half = (vectors.square().sum(0).sqrt() / 2).clamp_min(torch.finfo(vectors.dtype).tiny)
+    w = half.cos()
+    x, y, z = axis = vectors * (half.sin() / (2 * half))
+    xx, yy, zz = axis * axis
+    xy, yz, zx = x * y, y * z, z * x
+    wx, wy, wz = w * axis
+    spin = [0.5 - yy - zz, xy - wz, zx + wy, xy + wz, 0.5 - zz - xx, yz - wx, zx - wy, yz + wx, 0.5 - xx - yy]
+    matrix = torch.stack(spin).unflatten(0, (3, 3)) * 2
+    return (matrix[:, :, None] * rotations).sum(1)
 
 
 def _headings(count: int, like: Tensor) -> Tensor:

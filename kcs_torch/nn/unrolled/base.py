@@ -105,7 +105,7 @@ class Unrolled(nn.Module):
                 check_every=self.num_steps,
                 grad_steps=self.grad_steps,
             )
-            return Solution(solution.value[0], solution.converged, solution.iterations)
+            return Solution(solution.value[0], solution.converged, solution.iterations, change=solution.change)
         how, last = self.implicit, self.num_steps - 1
         with torch.no_grad():
             first = iterate(advance, (start, start), num_steps=self.num_steps)

@@ -11,7 +11,14 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_lengths, bone_vectors, chain_inverse, incidence
-from kcs_torch.nn.deviation import Arrangement, deviation_scale, deviation_step, frame_scales, template_scale
+from kcs_torch.nn.deviation import (
+    Arrangement,
+    deviation_goal,
+    deviation_scale,
+    deviation_step,
+    frame_scales,
+    template_scale,
+)
 from kcs_torch.nn.energies import centred_residual
 from kcs_torch.nn.layers import full_precision, known
 from kcs_torch.nn.steps import continuation
@@ -226,13 +233,13 @@ class UnrolledKCS(Unrolled):
                     low, high = self._bounds(points, share, rest)
                 scales = frame_scales(rest, points, cameras, share, low, high)
             size = scales.mean(-1)[..., None, None, None]
-            given = (rest, points / scales[..., None, None], cameras, share)
+            given = (deviation_goal(rest, points / scales[..., None, None], cameras, share), cameras, share)
             top = deviation_scale(*given, matrix=matrix, arrangement=self.arrangement)
             if start is None:
                 batch = torch.broadcast_shapes(points.shape[:-3], cameras.shape[:-3], scales.shape[:-1])
-                begin = points.new_zeros(*batch, points.shape[-3], len(self.bones), 3)
+                begin = points.new_zeros(*batch, points.shape[-3], 3, len(self.bones))
             else:
-                begin = bone_vectors(start.to(tracks.dtype) / size - rest, self.bones)
+                begin = bone_vectors(start.to(tracks.dtype) / size - rest, self.bones).mT
             solution = self._run(
                 lambda state, k: deviation_step(
                     state, *given, threshold[k] * top, step[k],
@@ -242,7 +249,7 @@ class UnrolledKCS(Unrolled):
                 measure=measure,
                 depends_on=(tracks, cameras, weights, scales),
             )  # fmt: skip
-            value = size * (rest + inverse @ solution.value)
+            value = size * (rest + (solution.value @ inverse.mT).mT)
         return Solution(value, solution.converged, solution.iterations)
 
     def _centred(self, tracks: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
