@@ -20,6 +20,8 @@ def orthographic_cameras(
     num_starts: int = 7,
     smoothness: float = 0.1,
     seed: int = 0,
+    apart: bool = False,
+    counts: Tensor | None = None,
 ) -> Tensor:
     """Estimate orthographic cameras by rank-3K factorisation and metric upgrade.
 
@@ -34,6 +36,9 @@ def orthographic_cameras(
         num_starts: random starts beside the relaxation's.
         smoothness: weight of the rows' second differences.
         seed: of the random starts.
+        apart: the batch is of different clips, each of which is refined as far as it is alone.
+        counts: (W,) frames of each clip, where shorter ones are padded with zeros at their end; they have no fewer
+            frames than joints, or are all of one length.
 
     Returns:
         (W, T, 2, 3) orthonormal rows; each window has a world frame and a mirror of its own. Windows too short or with
@@ -47,7 +52,8 @@ def orthographic_cameras(
         return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(windows, frames, 2, 3)
     ranks = range(min(2, most), min(5, most) + 1) if rank == "auto" else [min(rank, most)]
     motion, _ = factorize(tracks - tracks.mean(-2, keepdim=True), 3 * ranks[-1])
-    size = motion[..., 0].square().mean((-2, -1)).sqrt()
+    count = motion.new_full((windows,), frames) if counts is None else counts.to(motion)
+    size = (motion[..., 0].square().sum((-2, -1)) / (2 * count)).sqrt()
     motion = motion / torch.where(size > 0, size, torch.ones_like(size))[..., None, None, None]
     # Eigenvectors come with either sign: fix it, so that starts, and the mirror found, depend on no order of joints.
     flat = motion.flatten(-3, -2)
@@ -62,13 +68,17 @@ def orthographic_cameras(
         random = torch.randn(num_starts, 1, 3 * k, 3, generator=generator, dtype=torch.float64, device="cpu").to(motion)
         starts = torch.nn.functional.pad(relaxed, (0, 0, 0, 3 * k - relaxed.shape[-2]))
         starts = torch.cat([starts[None], random.expand(-1, windows, -1, -1)])
-        q, defect = metric_upgrade(part, starts, smoothness=smoothness, tolerance=0, num_steps=12)
+        options = {"smoothness": smoothness, "apart": apart, "counts": counts}
+        q, defect = metric_upgrade(part, starts, tolerance=0, num_steps=12, **options)  # type: ignore[arg-type]
         best = defect.topk(min(2, len(defect)), dim=0, largest=False).indices
-        q, defect = metric_upgrade(part, q[best, window], smoothness=smoothness, tolerance=1e-2, num_steps=60)
+        q, defect = metric_upgrade(part, q[best, window], tolerance=1e-2, num_steps=60, **options)  # type: ignore[arg-type]
         cameras.append(rows_to_cameras(part @ q[:, :, None])[0])
         defects.append(defect)
     candidates, defect = torch.cat(cameras), torch.cat(defects)  # (C, W, T, 2, 3), (C, W)
     turn = complete_rotation(candidates)
     turn = turn[:, :, 1:] @ turn[:, :, :-1].mT
-    uneven = torch.linalg.matrix_norm(turn.diff(dim=2)).mean(-1) if frames > 2 else torch.ones_like(defect)
+    uneven = torch.ones_like(defect)
+    if frames > 2:
+        inside = torch.arange(2, frames, device=tracks.device) < count[:, None]
+        uneven = (torch.linalg.matrix_norm(turn.diff(dim=2)) * inside).sum(-1) / (count - 2)
     return candidates[(uneven * defect.sqrt()).argmin(0), window]

@@ -62,7 +62,7 @@ class Factorised(Method):
         points = local.new_zeros(*tracks.points.shape[:2], 3)
         points[:, known] = local
         if cameras is None:  # known cameras know their mirror
-            sign = points.new_tensor([1.0, 1.0, mirror_sign(points, tracks.skeleton)])
+            sign = torch.nn.functional.pad(mirror_sign(points, tracks.skeleton)[None], (2, 0), value=1.0)
             points, rows = points * sign, rows * sign
         points = place_unseen(points, known, tracks.skeleton).to(tracks.points)
         return Estimate(

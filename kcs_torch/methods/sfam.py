@@ -11,15 +11,17 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
-from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.spectral import dct_basis
-from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
+from kcs_torch.functional.temporal import interpolate, window_starts
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.cameras import orthographic_cameras
+from kcs_torch.methods.clips import Clips, in_batches, padded
 from kcs_torch.methods.mirror import mirror_sign
 from kcs_torch.methods.unseen import place_unseen
+from kcs_torch.methods.windows import join_windows, spread_first
 from kcs_torch.nn.unrolled import UnrolledSfAM
+from kcs_torch.nn.unrolled.base import SETTLED
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.camera_path import constant_path
 from kcs_torch.solvers.completion import complete_tracks
@@ -90,104 +92,126 @@ class SfAM(Method):
             raise OptionError(f"sfam: overlap: expected below the window of {self.window} frames, got {self.overlap}")
 
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
-        """Solve all windows as one batch, then join them."""
-        frames = tracks.num_frames
-        window = min(self.window or frames, frames)
-        starts = window_starts(frames, window, min(self.overlap, window - 1))
-        cut = lambda x: torch.stack([x[s : s + window] for s in starts])  # noqa: E731
-        filled = _fill_blank_frames(tracks)
-        points, seen, weights = cut(filled.points), cut(filled.seen), cut(filled.weights)
-        known = None if cameras is None else cut(cameras)
-        local, rows, solution = self._windows(points, seen, weights, tracks.skeleton, known)
-        flip = torch.ones(len(starts), 3, dtype=local.dtype, device=local.device)
-        if cameras is None:  # known cameras know their mirror
-            flip[:, 2] = _mirror_signs(local, starts)
-        joined = blend_windows(local * flip[:, None, None], starts, frames)
-        path = None
-        if cameras is None:
-            path = _join_rotations(complete_rotation(rows * flip[:, None, None]), starts, frames)
-        known = None if cameras is None else cameras[None]
-        return self._estimates([tracks], joined[None], None if path is None else path[None], known, solution)[0]
+        """Solve windows as one batch, then join them."""
+        return self._solve([tracks], cameras)[0]
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
-        """Solve clips of one skeleton and equally many frames as one batch of windows."""
-        groups: dict[object, list[int]] = {}
-        for i, one in enumerate(tracks):
-            whole = self.lengths == "shape" and one.num_frames <= (self.window or one.num_frames)
-            kind = (one.skeleton, one.num_frames, one.points.dtype, one.points.device)
-            groups.setdefault(kind if whole else i, []).append(i)
-        out: dict[int, Estimate] = {}
-        for group in groups.values():
-            if len(group) == 1:
-                out[group[0]] = self.solve(tracks[group[0]], None)
-                continue
-            clips = [tracks[i] for i in group]
-            filled = [_fill_blank_frames(one) for one in clips]
-            points = torch.stack([one.points for one in filled])
-            seen, weights = torch.stack([one.seen for one in filled]), torch.stack([one.weights for one in filled])
-            local, rows, solution = self._windows(points, seen, weights, clips[0].skeleton, None, one_body=False)
-            out |= zip(group, self._estimates(clips, local, complete_rotation(rows), None, solution), strict=True)
-        return [out[i] for i in range(len(tracks))]
+        """Solve clips of one skeleton and equally many windows as one batch, padded to one length."""
+
+        def kind(one: Tracks) -> tuple[int, int]:
+            # Where frames are fewer than joints their number decides how many shapes there may be.
+            return len(self._starts(one.num_frames)), min(one.num_frames, max(one.num_joints, SHORT))
+
+        return in_batches(tracks, lambda clips: self._solve(clips, None), kind)
+
+    def _starts(self, frames: int) -> list[int]:
+        """First frames of a clip's windows."""
+        window = min(self.window or frames, frames)
+        return window_starts(frames, window, min(self.overlap, window - 1))
+
+    def _solve(self, tracks: Sequence[Tracks], cameras: Tensor | None) -> list[Estimate]:
+        """Clips of one skeleton and one number of windows; known cameras (T, 2, 3) are those of a single clip."""
+        clips = _fill_blank_frames(Clips.of(tracks))
+        starts = [self._starts(count) for count in clips.counts]
+        window = min(self.window or max(clips.counts), max(clips.counts))
+        first = torch.tensor(starts, device=clips.points.device)  # (K, V)
+        order = spread_first(first.shape[1], LEAD)
+        held: list[tuple[Tensor, Tensor]] = []
+        parts = []
+        for some in (order[:LEAD], *order[LEAD:].split(CHUNK)) if len(order) > LEAD else (order,):
+            parts.append(self._windows(clips, first[:, some], window, tracks[0].skeleton, cameras, held))
+        back = order.argsort()
+        local, rows, change = (torch.cat(x, 1)[:, back] for x in zip(*parts, strict=True))
+        del parts
+        ends = zip(local, rows if cameras is None else [None] * len(tracks), starts, clips.counts, strict=True)
+        joined = [join_windows(*one) for one in ends]
+        local = padded([x for x, _ in joined])
+        rows = padded([x for _, x in joined if x is not None]) if cameras is None else cameras[None]
+        settled = change.amax(1) <= SETTLED
+        notes: list[tuple[str, ...]] = [()] * len(tracks)
+        if cameras is None:
+            flip = torch.ones_like(local[:, 0, 0])
+            flip[:, 2] = mirror_sign(local, tracks[0].skeleton, clips.inside)
+            local = local * flip[:, None, None]
+            rows, notes = self._paths(complete_rotation(rows * flip[:, None, None]), clips)
+        pairs = zip(clips.cut(local), tracks, strict=True)
+        placed = [place_unseen(x, one.seen.any(0), one.skeleton) for x, one in pairs]
+        found = zip(placed, clips.cut(rows), settled.tolist(), notes, strict=True)
+        return [Estimate(x, r, x.new_ones(len(x)), good, self.num_steps, note) for x, r, good, note in found]
 
     def _windows(
         self,
-        points: Tensor,
-        seen: Tensor,
-        weights: Tensor,
+        clips: Clips,
+        first: Tensor,
+        window: int,
         skeleton: Skeleton,
         cameras: Tensor | None,
-        one_body: bool = True,
-    ) -> tuple[Tensor, Tensor, Solution[Tensor]]:
-        """Windows (W, T, N, 2): their points (W, T, N, 3) in each frame's camera, and the cameras (W, T, 2, 3)."""
-        filled = complete_tracks(points, seen)
+        held: list[tuple[Tensor, Tensor]],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Points (K, V, T, N, 3) of windows that begin at frames (K, V), their cameras and their last step's change."""
+        at = first[..., None] + torch.arange(window, device=first.device)
+        clip = torch.arange(len(first), device=first.device)[:, None, None]
+        inside = None if clips.inside is None or first.shape[1] > 1 else clips.inside[:, None]
+        points, weights = clips.points[clip, at], clips.weights[clip, at]  # (K, V, T, N, ...)
+        filled = complete_tracks(points, weights > 0, inside=inside)
+        counts = None if inside is None else inside.sum(-1)
         if self.trajectories is not None:
-            window = points.shape[1]
-            basis = dct_basis(window, min(self.trajectories, window), dtype=filled.dtype, device=filled.device)
-            filled = torch.einsum("tk,sk,wsnd->wtnd", basis, basis, filled)
+            lengths = [window] * first.numel() if counts is None else counts.flatten().tolist()
+            smooth = [self._smooth(x[:n]) for x, n in zip(filled.flatten(0, 1), lengths, strict=True)]
+            filled = padded(smooth).view_as(filled)
             points = filled * (weights > 0)[..., None]
-        rows = cameras
-        if rows is None:  # some windows at a time: the search tries several starts for each
-            rows = torch.cat([orthographic_cameras(part, self.rank) for part in filled.split(CHUNK)])
-        solution = self.shape(points, rows, weights, skeleton, one_body=one_body)
-        return solution.value @ complete_rotation(rows).mT, rows, solution
+        if cameras is not None:
+            rows = cameras[at]
+        else:
+            rows = self._cameras(filled, counts)
+        if inside is not None:
+            rows = rows * inside[..., None, None]
+        points, weights = points.squeeze(0), weights.squeeze(0)
+        solution = self.shape(points, rows.squeeze(0), weights, skeleton, inside=inside, held=held)
+        local = solution.value.view(*filled.shape[:-1], 3) @ complete_rotation(rows).mT
+        assert solution.change is not None
+        return local, rows, solution.change.view(first.shape)
 
-    def _estimates(
-        self,
-        tracks: Sequence[Tracks],
-        points: Tensor,
-        path: Tensor | None,
-        cameras: Tensor | None,
-        solution: Solution[Tensor],
-    ) -> list[Estimate]:
-        """What is found of K clips: points (K, T, N, 3), with their own camera paths (K, T, 3, 3) or known cameras."""
-        notes: list[tuple[str, ...]] = [()] * len(tracks)
-        if cameras is None:
-            assert path is not None
-            sign = points.new_ones(len(tracks), 3)
-            sign[:, 2] = points.new_tensor([mirror_sign(x, t.skeleton) for x, t in zip(points, tracks, strict=True)])
-            points = points * sign[:, None, None]
-            cameras, notes = self._paths(complete_rotation(path[..., :2, :] * sign[:, None, None]))
-        ones = points.new_ones(points.shape[1])
-        placed = [place_unseen(x, t.seen.any(0), t.skeleton) for x, t in zip(points, tracks, strict=True)]
-        return [
-            Estimate(x, rows, ones, solution.converged, solution.iterations, note)
-            for x, rows, note in zip(placed, cameras, notes, strict=True)
-        ]
+    def _cameras(self, tracks: Tensor, counts: Tensor | None) -> Tensor:
+        """Cameras (K, V, T, 2, 3) of windows, some at a time: the search tries several starts for each."""
+        if tracks.shape[1] > 1:
+            parts = [[orthographic_cameras(part, self.rank) for part in one.split(SEARCH)] for one in tracks]
+            return torch.stack([torch.cat(one) for one in parts])
+        sizes = [None] * len(tracks) if counts is None else counts[:, 0].split(CHUNK)
+        pieces = zip(tracks[:, 0].split(CHUNK), sizes, strict=False)
+        return torch.cat([orthographic_cameras(part, self.rank, apart=True, counts=n) for part, n in pieces])[:, None]
+
+    def _smooth(self, tracks: Tensor) -> Tensor:
+        """Tracks (T, N, 2) as sums of a few cosines."""
+        assert self.trajectories is not None
+        frames = len(tracks)
+        basis = dct_basis(frames, min(self.trajectories, frames), dtype=tracks.dtype, device=tracks.device)
+        return torch.einsum("tk,sk,snd->tnd", basis, basis, tracks)
 
     def shape(
-        self, tracks: Tensor, cameras: Tensor, weights: Tensor, skeleton: Skeleton, *, one_body: bool = True
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        weights: Tensor,
+        skeleton: Skeleton,
+        *,
+        one_body: bool = True,
+        inside: Tensor | None = None,
+        held: list[tuple[Tensor, Tensor]] | None = None,
     ) -> Solution[Tensor]:
         """Algorithm 1 with known cameras, for a batch of windows.
 
         Args:
-            tracks: (W, T, N, 2), centred.
-            cameras: (W, T, 2, 3).
-            weights: (W, T, N).
+            tracks: (..., W, T, N, 2), centred.
+            cameras: (..., W, T, 2, 3).
+            weights: (..., W, T, N).
             skeleton: of the N joints.
-            one_body: the windows show one body, whose bones have one length in all of them.
+            one_body: the W windows show one body, whose bones have one length in all of them.
+            inside: as of :meth:`kcs_torch.nn.UnrolledSfAM.solve`.
+            held: as of :meth:`kcs_torch.nn.UnrolledSfAM.solve`.
 
         Returns:
-            The shapes (W, T, N, 3) in the windows' world frames.
+            The shapes (..., W, T, N, 3) in the windows' world frames.
 
         Raises:
             OptionError: ``lengths`` are not one per bone, or the skeleton knows none.
@@ -215,19 +239,21 @@ class SfAM(Method):
             articulate_from=self.articulate_from if self.beta > 0 else 1.0,
             learnable=False,
         ).to(tracks.device)
-        return solver.solve(tracks, cameras, weights=weights, lengths=lengths, one_body=one_body)
+        given = {"weights": weights, "lengths": lengths, "one_body": one_body, "inside": inside, "held": held}
+        return solver.solve(tracks, cameras, **given)  # type: ignore[arg-type]
 
-    def _paths(self, rotations: Tensor) -> tuple[Tensor, list[tuple[str, ...]]]:
+    def _paths(self, rotations: Tensor, clips: Clips) -> tuple[Tensor, list[tuple[str, ...]]]:
         """Reported cameras (K, T, 2, 3): free, or of constant angular velocity where that explains them."""
         rows = rotations[..., :2, :]
         notes: list[tuple[str, ...]] = [()] * len(rotations)
-        if self.camera_path == "free" or rotations.shape[1] < 10:
+        if self.camera_path == "free" or min(clips.counts) < SHORT:
             return rows, notes
-        path, angle = constant_path(rotations)
+        counts = torch.tensor(clips.counts, device=rows.device)
+        path, angle = constant_path(rotations, counts=counts)
         first = path[:, 1] @ path[:, 0].mT
         trace = first.diagonal(dim1=-2, dim2=-1).sum(-1)
-        turn = torch.arccos(((trace - 1) / 2).clamp(-1, 1)) * (path.shape[1] - 1)
-        off = angle.median(-1).values
+        turn = torch.arccos(((trace - 1) / 2).clamp(-1, 1)) * (counts - 1)
+        off = angle.nanmedian(-1).values
         even = off < EVEN * turn if self.camera_path == "auto" else torch.ones_like(off, dtype=torch.bool)
         for k in even.nonzero().flatten().tolist():
             degrees = float(torch.rad2deg(off[k]))
@@ -235,45 +261,28 @@ class SfAM(Method):
         return torch.where(even[:, None, None, None], path[..., :2, :], rows), notes
 
 
-CHUNK = 32
-"""Windows whose cameras are searched together: more would only take memory."""
+SEARCH, CHUNK = 32, 8
+"""Windows of one clip whose cameras are searched together; and clips whose cameras are, or windows beyond the first
+ones that are solved together: more would leave the processor's cache."""
+
+LEAD = 40
+"""Windows of a clip that are solved first, together: they tell the lengths of its bones, which the others take."""
+
+SHORT = 10
+"""Frames from which on a constant angular velocity is looked for."""
 
 EVEN = 0.05
 """A constant angular velocity explains the cameras where their median deviation is below this share of its turn."""
 
 
-def _fill_blank_frames(tracks: Tracks) -> Tracks:
+def _fill_blank_frames(clips: Clips) -> Clips:
     """Fill frames without any seen joint between their neighbours, and count them as seen.
 
     No term would hold the shape of such a frame, and the nuclear norm would shrink it.
     """
-    blank = ~tracks.seen.any(-1, keepdim=True)
-    made = blank & tracks.seen.any(0)
-    filled = interpolate(tracks.points, tracks.seen)
-    return replace(
-        tracks,
-        points=torch.where(made[..., None], filled, tracks.points),
-        weights=torch.where(made, torch.ones_like(tracks.weights), tracks.weights),
-    )
-
-
-def _mirror_signs(parts: Tensor, starts: list[int]) -> Tensor:
-    """Signs (W,) that give all windows (W, T, N, 3) the same mirror: neighbours' depths agree where they overlap."""
-    window = parts.shape[1]
-    agree = [torch.ones((), dtype=parts.dtype, device=parts.device)]
-    for i in range(1, len(starts)):
-        shared = starts[i - 1] + window - starts[i]
-        overlap = (parts[i - 1, window - shared :, :, 2] * parts[i, :shared, :, 2]).sum()
-        agree.append(torch.where(overlap < 0, -torch.ones_like(overlap), torch.ones_like(overlap)))
-    return torch.stack(agree).cumprod(0)
-
-
-def _join_rotations(parts: Tensor, starts: list[int], frames: int) -> Tensor:
-    """Rotations (W, T, 3, 3), each window in a world frame of its own, as one run (frames, 3, 3) in the first's."""
-    window = parts.shape[1]
-    turned = [parts[0]]
-    for i in range(1, len(starts)):
-        shared = starts[i - 1] + window - starts[i]
-        between = nearest_rotation((parts[i, :shared].mT @ turned[-1][window - shared :]).sum(0))
-        turned.append(parts[i] @ between)
-    return nearest_rotation(blend_windows(torch.stack(turned), starts, frames))
+    seen = clips.weights > 0
+    made = ~seen.any(-1, keepdim=True) & seen.any(-2, keepdim=True)
+    if clips.inside is not None:
+        made = made & clips.inside[..., None]
+    points = torch.where(made[..., None], interpolate(clips.points, seen), clips.points)
+    return replace(clips, points=points, weights=torch.where(made, torch.ones_like(clips.weights), clips.weights))

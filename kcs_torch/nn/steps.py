@@ -45,7 +45,12 @@ def data_scale(tracks: Tensor, cameras: Tensor, weights: Tensor | None = None) -
 
 
 def estimate_lengths(
-    shape: Tensor, bones: Tensor, weights: Tensor | None = None, *, graded: bool = False
+    shape: Tensor,
+    bones: Tensor,
+    weights: Tensor | None = None,
+    *,
+    graded: bool = False,
+    inside: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return each bone's median length over time, and how rigid it is.
 
@@ -55,6 +60,7 @@ def estimate_lengths(
         weights: (..., T, N); lengths are taken from frames in which both ends are seen, if there are any.
         graded: True grades bones by how little their length varies beside the steadiest quarter of all bones, for
             links that nobody has declared rigid; False trusts all.
+        inside: (..., T), False in frames that pad a shorter clip; takes weights.
 
     Returns:
         lengths (..., B) and rigidity (..., B) in [0, 1], a constant for autograd: among bones that all keep their
@@ -64,6 +70,8 @@ def estimate_lengths(
     if weights is not None:
         seen = torch.minimum(weights[..., bones[:, 0]], weights[..., bones[:, 1]]) > 0
         seen = seen | ~seen.any(-2, keepdim=True)
+        if inside is not None:
+            seen = seen & inside[..., None]
         lengths = torch.where(seen, size, torch.nan).nanmedian(-2).values
     else:
         lengths = size.median(-2).values
@@ -71,9 +79,12 @@ def estimate_lengths(
         return lengths, torch.ones_like(lengths)
     with torch.no_grad():
         whole = torch.maximum(lengths, 1e-6 * size.amax(-2))  # a bone that has no length in most frames is not rigid
-        variation = (size - lengths[..., None, :]).abs().mean(-2) / torch.where(
-            whole > 0, whole, torch.ones_like(whole)
-        )
+        off = (size - lengths[..., None, :]).abs()
+        if inside is None:
+            off = off.mean(-2)
+        else:
+            off = (off * inside[..., None]).sum(-2) / inside.sum(-1, keepdim=True)
+        variation = off / torch.where(whole > 0, whole, torch.ones_like(whole))
         steady = variation.quantile(0.25, -1, keepdim=True)
         ratio = variation / torch.where(steady > 0, steady, torch.ones_like(steady))
         return lengths, 1 / (1 + ratio.square()).square()

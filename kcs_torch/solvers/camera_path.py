@@ -26,7 +26,11 @@ NEAR = math.radians(30)
 """... and below this angle, as a path that races through all directions has length enough for any deviation."""
 
 
-def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Tensor]:
+RUN = 2000
+"""Frames whose waves are summed together: more would only take memory."""
+
+
+def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Fit R_t = exp(t w) R_0 to rotations: six numbers, robustly.
 
     Rotations that come from aligning poses also carry the body's own turning; a camera that moves evenly does
@@ -36,9 +40,10 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Te
     Args:
         rotations: (..., T, 3, 3), T >= 2.
         num_steps: Gauss-Newton steps.
+        counts: (...) frames of each clip, 2 or more, where shorter ones are padded at their end.
 
     Returns:
-        The paths (..., T, 3, 3), and their angles to each rotation (..., T), in radians.
+        The paths (..., T, 3, 3), and their angles to each rotation (..., T), in radians; NaN in the padding.
 
     Raises:
         ShapeError: ``rotations`` is not (..., T, 3, 3) with T >= 2.
@@ -49,30 +54,35 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20) -> tuple[Tensor, Te
         )
     frames, batch = rotations.shape[-3], rotations.shape[:-3]
     rotations = rotations.reshape(-1, frames, 3, 3)
-    time = torch.arange(frames, dtype=rotations.dtype, device=rotations.device) - (frames - 1) / 2
-    turn = rotation_vector(rotations[:, 1:] @ rotations[:, :-1].mT).median(1).values  # (K, 3)
+    time = torch.arange(frames, dtype=rotations.dtype, device=rotations.device)
+    last = time[None, -1:] if counts is None else counts.to(time).reshape(-1, 1) - 1  # (K, 1)
+    inside = time <= last  # (K or 1, T)
+    nowhere = torch.where(inside, 0.0, torch.nan).to(time)  # medians pass over NaN
+    time = time - last / 2
+    step = rotation_vector(rotations[:, 1:] @ rotations[:, :-1].mT)
+    turn = (step + nowhere[:, 1:, None]).nanmedian(1).values  # (K, 3)
     factors = torch.linspace(0.8, 1.2, 161, dtype=turn.dtype, device=turn.device)
-    means = _mean_unturned(rotations, factors[:, None] * time, turn)  # (K, 161, 3, 3)
+    means = _sum_unturned(rotations * inside[..., None, None], factors, time, turn)  # (K, 161, 3, 3)
     starts = nearest_rotation(means)
-    best = (starts * means).sum((-2, -1)).argmax(-1)  # the mean agreement of path and rotations
+    best = (starts * means).sum((-2, -1)).argmax(-1)  # the agreement of path and rotations
     row = torch.arange(len(best), device=best.device)
     speed, start = turn * factors[best][:, None], starts[row, best]
     eye = torch.eye(6, dtype=turn.dtype, device=turn.device)
     for _ in range(num_steps):
-        turned = time[:, None] * speed[:, None]  # (K, T, 3)
+        turned = time[..., None] * speed[:, None]  # (K, T, 3)
         spin = rotation_matrix(turned)
         error = rotation_vector(rotations @ (spin @ start[:, None]).mT)
         angle = error.norm(dim=-1)
-        spread = angle.median(-1, keepdim=True).values.clamp_min(1e-9)
-        weight = 1 / (1 + (angle / spread).square())
-        jacobian = torch.cat([_left_jacobian(turned) * time[:, None, None], spin], -1)
+        spread = (angle + nowhere).nanmedian(-1, keepdim=True).values.clamp_min(1e-9)
+        weight = inside / (1 + (angle / spread).square())
+        jacobian = torch.cat([_left_jacobian(turned) * time[..., None, None], spin], -1)
         normal = (jacobian.mT * weight[..., None, None] @ jacobian).sum(1)
         target = (jacobian.mT @ (error * weight[..., None])[..., None]).sum(1)[..., 0]
         ridge = 1e-12 * normal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] * eye
         move = torch.linalg.solve(normal + ridge, target)
         speed, start = speed + move[:, :3], rotation_matrix(move[:, 3:]) @ start
-    path = rotation_matrix(time[:, None] * speed[:, None]) @ start[:, None]
-    angle = rotation_angle(path, rotations)
+    path = rotation_matrix(time[..., None] * speed[:, None]) @ start[:, None]
+    angle = rotation_angle(path, rotations) + nowhere
     return path.view(*batch, frames, 3, 3), angle.view(*batch, frames)
 
 
@@ -186,10 +196,11 @@ def settle_path(
     return found @ nearest_rotation((found.mT @ path).sum(0))
 
 
-def _mean_unturned(rotations: Tensor, times: Tensor, turn: Tensor) -> Tensor:
-    """Means over t of exp(-times_st turn) R_t (K, S, 3, 3), for R (K, T, 3, 3), times (S, T) and turns (K, 3).
+def _sum_unturned(rotations: Tensor, factors: Tensor, time: Tensor, turn: Tensor) -> Tensor:
+    """Sums over t of exp(-factor_s time_t turn) R_t (K, S, 3, 3), for R (K, T, 3, 3), time (K or 1, T), turns (K, 3).
 
-    By Rodrigues' formula exp(-a n) = cos(a) (I - n n^T) + n n^T - sin(a) [n]: sums of R under S x T cosines and sines.
+    By Rodrigues' formula exp(-a n) = cos(a) (I - n n^T) + n n^T - sin(a) [n]: sums of R under S x T cosines and sines,
+    of some frames at a time.
     """
     size = turn.norm(dim=-1)[:, None]
     axis = turn / torch.where(size > 0, size, torch.ones_like(size))
@@ -197,10 +208,12 @@ def _mean_unturned(rotations: Tensor, times: Tensor, turn: Tensor) -> Tensor:
     zero = torch.zeros_like(x)
     hat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 1, 3, 3)
     along = (axis[:, :, None] * axis[:, None])[:, None]
-    flat = rotations.flatten(-2) / rotations.shape[1]
-    angle = times * size[..., None]  # (K, S, T)
-    cosine, sine = ((wave(angle) @ flat).unflatten(-1, (3, 3)) for wave in (torch.cos, torch.sin))
-    return cosine + along @ (flat.sum(1).unflatten(-1, (3, 3))[:, None] - cosine) - hat @ sine
+    waves = rotations.new_zeros(2, len(rotations), len(factors), 9)
+    for flat, angle in zip(rotations.flatten(-2).split(RUN, 1), (time * size).split(RUN, 1), strict=True):
+        turned = factors[:, None] * angle[:, None]  # (K, S, T)
+        waves += torch.stack([turned.cos() @ flat, turned.sin() @ flat])
+    cosine, sine = waves.unflatten(-1, (3, 3))
+    return cosine + along @ (rotations.sum(1)[:, None] - cosine) - hat @ sine
 
 
 def _left_jacobian(vectors: Tensor) -> Tensor:

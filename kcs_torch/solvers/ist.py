@@ -78,6 +78,8 @@ def metric_upgrade(
     evenness: float = 0.0,
     num_steps: int = 150,
     tolerance: float = 1e-4,
+    apart: bool = False,
+    counts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Refine Q by Levenberg-Marquardt on the orthonormality defect of the rows ``motion @ Q``.
 
@@ -94,6 +96,9 @@ def metric_upgrade(
         evenness: weight of the variance of the frames' scales: 0 for weak perspective, 1 for orthographic cameras.
         num_steps: steps, at most; each is kept only where it lowers the cost.
         tolerance: stop where steps lower the cost by less than this share.
+        apart: every motion of the batch stops for itself, with all its starts, and what is beside it makes no
+            difference; else all go on until the last one stops.
+        counts: (...) frames of each motion, where shorter ones are padded with zeros at their end; without evenness.
 
     Returns:
         Q (..., R, 3), scaled so that rows have mean squared length 1, and the defect (...).
@@ -105,10 +110,17 @@ def metric_upgrade(
     if start.shape[-2:] != (motion.shape[-1], 3):
         raise ShapeError(f"metric_upgrade: expected start (..., {motion.shape[-1]}, 3), got {tuple(start.shape)}")
     a, b = motion[..., 0, :], motion[..., 1, :]
-    frames, rank = motion.shape[-3], motion.shape[-1]
+    rank = motion.shape[-1]
+    count = motion.new_full((), motion.shape[-3]) if counts is None else counts.to(motion)
+    frames = count[..., None, None]
     gram = (a.mT @ a + b.mT @ b) / (2 * frames)  # mean squared row length is tr(Q^T gram Q)
-    forms = _quadratic_forms(a, b, evenness) / frames**0.5  # (..., M, R, R): residuals are <form, Q Q^T>
-    bend = motion.diff(n=2, dim=-3).flatten(-3, -2) if smoothness > 0 and frames > 2 else motion[..., :0, 0, :]
+    forms = _quadratic_forms(a, b, evenness) / frames[..., None].sqrt()  # (..., M, R, R): residuals are <form, Q Q^T>
+    if smoothness > 0 and motion.shape[-3] > 2:
+        bend = motion.diff(n=2, dim=-3)
+        inside = torch.arange(2, motion.shape[-3], device=motion.device) < count[..., None]
+        bend = (bend * inside[..., None, None]).flatten(-3, -2)
+    else:
+        bend = motion[..., :0, 0, :]
     bending = smoothness / frames * (bend.mT @ bend)  # (..., R, R)
     eye = torch.eye(3 * rank, dtype=motion.dtype, device=motion.device)
     three = torch.eye(3, dtype=motion.dtype, device=motion.device)
@@ -124,8 +136,10 @@ def metric_upgrade(
         residual = torch.einsum("...mij,...ij->...m", forms, q @ q.mT)
         return residual, residual.square().sum(-1) + (q * (bending @ q)).sum((-2, -1))
 
-    def step(state: tuple[Tensor, ...], _: int) -> tuple[Tensor, ...]:
-        q, residual, cost, damping, progress = state
+    def step(state: tuple[Tensor, ...], k: int) -> tuple[Tensor, ...]:
+        q, residual, cost, damping, progress, resting = state
+        if tolerance > 0 and k and k % CHECK == 0:
+            resting = resting | at_rest(progress)
         jacobian = 2 * torch.einsum("...mij,...jk->...mik", forms, q).flatten(-2)
         normal = jacobian.mT @ jacobian + stiff
         gradient = (jacobian.mT @ residual[..., None]).squeeze(-1) + (bending @ q).flatten(-2)
@@ -139,26 +153,39 @@ def metric_upgrade(
         move = torch.cholesky_solve(gradient[..., None], factor).squeeze(-1)
         trial = normalise(q - move.unflatten(-1, (rank, 3)))
         moved, new = evaluate(trial)
-        better = new < cost  # False for NaN, too: a failed factorisation only raises the damping
+        better = (new < cost) & ~resting  # False for NaN, too: a failed factorisation only raises the damping
         return (
             torch.where(better[..., None, None], trial, q),
             torch.where(better[..., None], moved, residual),
             torch.where(better, new, cost),
             torch.where(better, damping / 4, damping * 3).clamp(1e-9, 1e6),
             progress / 2 + torch.where(better, 1 - new / cost, 0),  # halved, not zeroed, by a refused step
+            resting,
         )
+
+    def at_rest(progress: Tensor) -> Tensor:
+        """Which motions (...) have stopped."""
+        still, starts = progress <= tolerance, progress.ndim - (motion.ndim - 3)
+        if not apart:
+            return still.all()
+        return still.flatten(0, starts - 1).all(0) if starts else still
 
     q = normalise(start.expand(*torch.broadcast_shapes(start.shape[:-2], motion.shape[:-3]), rank, 3))
     residual, cost = evaluate(q)
-    first_state: tuple[Tensor, ...] = (q, residual, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost))
+    awake = torch.zeros(motion.shape[:-3], dtype=torch.bool, device=motion.device)
+    first_state: tuple[Tensor, ...] = (q, residual, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost), awake)
     q = iterate(
         step,
         first_state,
         num_steps=num_steps,
-        change=lambda _, new: new[4].amax(),
-        tolerance=tolerance,
+        change=(lambda _, new: torch.where(new[5] | at_rest(new[4]), 0.0, 1.0)) if tolerance > 0 else None,
+        check_every=CHECK,
     ).value[0]
-    return q, orthonormality_defect(motion @ q[..., None, :, :]).mean(-1)
+    return q, orthonormality_defect(motion @ q[..., None, :, :]).sum(-1) / count
+
+
+CHECK = 5
+"""Steps from one look at whether a clip rests to the next."""
 
 
 def _quadratic_forms(a: Tensor, b: Tensor, evenness: float = 0.0) -> Tensor:

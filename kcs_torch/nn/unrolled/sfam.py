@@ -118,13 +118,28 @@ class UnrolledSfAM(Unrolled):
         start: Tensor | None = None,
         lengths: Tensor | None = None,
         one_body: bool = False,
+        inside: Tensor | None = None,
+        held: list[tuple[Tensor, Tensor]] | None = None,
     ) -> Solution[Tensor]:
         """As :meth:`forward`, with a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still.
 
-        ``one_body`` takes the batch (W, T, N, ...) for windows of one body, which share their bone lengths;
-        ``lengths`` are then proportions (B,), brought to the scale of the shape.
+        Args:
+            tracks: as of :meth:`forward`.
+            cameras: as of :meth:`forward`.
+            weights: as of :meth:`forward`.
+            start: as of :meth:`forward`.
+            lengths: as of :meth:`forward`.
+            one_body: the batch (..., W, T, N, 2) are windows of one body, which share their bone lengths; ``lengths``
+                are then proportions (..., B), brought to the scale of the shape.
+            inside: (..., T), False in frames that pad a shorter clip at its end; their weights and cameras are 0.
+            held: an empty list is filled with the lengths and rigidity that each articulated step aimed at; a filled
+                one is what other windows of the same body aimed at, and is aimed at again.
+
+        Returns:
+            The solution; ``change`` is that of the last step, (...).
         """
-        return self._solve(tracks, cameras, weights, start, lengths, one_body=one_body, measure=True)
+        options = {"one_body": one_body, "measure": True, "inside": inside, "held": held}
+        return self._solve(tracks, cameras, weights, start, lengths, **options)  # type: ignore[arg-type]
 
     def _solve(
         self,
@@ -136,6 +151,8 @@ class UnrolledSfAM(Unrolled):
         *,
         one_body: bool,
         measure: bool,
+        inside: Tensor | None = None,
+        held: list[tuple[Tensor, Tensor]] | None = None,
     ) -> Solution[Tensor]:
         weights = self._check(tracks, cameras, weights, start)
         joints, count = self.skeleton.num_joints, self.skeleton.num_bones
@@ -152,17 +169,28 @@ class UnrolledSfAM(Unrolled):
         if lengths is None and self.has_lengths:
             lengths = self._values("length", tracks)
         fixed = None if lengths is None else lengths[..., self.rigid]
-        pooled = weights.flatten(0, 1) if one_body else weights
         graded = not self.skeleton.tree
+        earlier = list(held or ())
+
+        def measured(shape: Tensor) -> tuple[Tensor, Tensor]:
+            """Lengths (..., B) to aim at, and rigidity."""
+            share, real = weights, inside
+            if one_body:  # all windows as one clip
+                shape, share = shape.flatten(-4, -3), share.flatten(-3, -2)
+                real = None if real is None else real.flatten(-2)
+            target, rigidity = estimate_lengths(shape, self.bones, share, graded=graded, inside=real)
+            if fixed is not None:
+                target = to_scale(fixed, target) if relative else fixed
+            return target, rigidity
 
         def advance(shape: Tensor, k: int) -> Tensor:
             if k < self.first:
                 return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k])
-            target, rigidity = estimate_lengths(
-                shape.flatten(0, 1) if one_body else shape, self.bones, pooled, graded=graded
-            )
-            if fixed is not None:
-                target = to_scale(fixed, target) if relative else fixed
+            target, rigidity = earlier[k - self.first] if earlier else measured(shape)
+            if held is not None and not earlier:
+                held.append((target, rigidity))
+            if one_body and target.ndim > 1:
+                target, rigidity = target[..., None, :], rigidity[..., None, :]
             return shape_step(
                 shape, tracks, cameras, weights, threshold[k] * scale, step[k],
                 bones=self.bones, lengths=target, stiffness=stiffness[k] * rigidity,
@@ -171,6 +199,8 @@ class UnrolledSfAM(Unrolled):
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
             begin = start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype)
+            if inside is not None:
+                begin = begin * inside[..., None, None]
             return self._run(
                 advance,
                 begin,
