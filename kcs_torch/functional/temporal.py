@@ -156,19 +156,20 @@ def best_path(cost: Tensor, transition: Tensor) -> Tensor:
     if frames == 1:
         return cost.argmin(-1)
     batch = torch.broadcast_shapes(cost.shape[:-2], transition.shape[:-3])
-    forward = transition + cost[..., :-1, :, None]  # a frame's cost and the step out of it
-    backward = (transition + cost[..., 1:, None, :]).mT.flip(-3)
-    steps = torch.stack([forward, backward]).reshape(-1, frames - 1, states, states)
-    before, after = _least(steps, frames - 1).reshape(2, *batch, frames, states)
+    problems, count = 2 * math.prod(batch), frames - 1
+    length = count if count <= 16 * problems else math.ceil((count / 2) ** 0.5)
+    blocks = math.ceil(count / length)
+    steps = cost.new_zeros(2, *batch, blocks * length, states, states)  # one copy: these are most of the memory
+    steps[0, ..., :count, :, :] = transition + cost[..., :-1, :, None]  # a frame's cost and the step out of it
+    steps[1, ..., :count, :, :] = (transition + cost[..., 1:, None, :]).mT.flip(-3)
+    least = _least(steps.view(problems, blocks, length, states, states))[:, :frames]
+    before, after = least.reshape(2, *batch, frames, states)
     return (cost + before + after.flip(-2)).argmin(-1)  # the least cost of any path through each state
 
 
-def _least(steps: Tensor, count: int) -> Tensor:
-    """Least costs (P, T, S) of coming to each state, from min-plus matrices (P, T - 1, S, S)."""
-    problems, _, states, _ = steps.shape
-    length = count if count <= 16 * problems else math.ceil((count / 2) ** 0.5)
-    blocks = math.ceil(count / length)
-    steps = torch.nn.functional.pad(steps, (0, 0, 0, 0, 0, blocks * length - count)).unflatten(1, (blocks, length))
+def _least(steps: Tensor) -> Tensor:
+    """Least costs (P, H L + 1, S) of coming to each state, from min-plus matrices in H blocks (P, H, L, S, S)."""
+    problems, blocks, length, states, _ = steps.shape
     start = steps.new_zeros(problems, 1, states)
     if blocks > 1:
         product = steps[:, :, 0]
@@ -180,4 +181,4 @@ def _least(steps: Tensor, count: int) -> Tensor:
     for k in range(length):
         costs.append((costs[-1][..., None] + steps[:, :, k]).amin(-2))
     inner = torch.stack(costs[:-1], 2).flatten(1, 2)
-    return torch.cat([inner, costs[-1][:, -1:]], 1)[:, : count + 1]
+    return torch.cat([inner, costs[-1][:, -1:]], 1)

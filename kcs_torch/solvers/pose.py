@@ -84,10 +84,11 @@ def steady_cameras(fit: CameraFit, continuity: float = 1.0, *, inside: Tensor | 
     cost = fit.cost.movedim(0, -1)  # (..., T, C)
     if continuity > 0:
         flat = fit.rotations.movedim(0, -3).flatten(-2)  # (..., T, C, 9)
-        trace = flat[..., :-1, :, :] @ flat[..., 1:, :, :].mT
-        turn = continuity * torch.arccos(((trace - 1) / 2).clamp(-1, 1)).square()
+        turn = flat[..., :-1, :, :] @ flat[..., 1:, :, :].mT  # the trace; in place, as of long clips it is large
+        del flat
+        turn.sub_(1).div_(2).clamp_(-1, 1).arccos_().square_().mul_(continuity)
         if inside is not None:
-            turn = torch.where(inside[..., 1:, None, None], turn, torch.zeros_like(turn))
+            turn *= inside[..., 1:, None, None]
         choice = best_path(cost, turn)[None]
     else:
         choice = cost.argmin(-1)[None]
