@@ -108,8 +108,9 @@ def test_proportions_by_hand():
     lengths = usual * (0.1 * normal(16)).exp()
     log = (lengths / usual).log()
     value = (1 + ((log - log.mean()) / 0.05).square() / 2).log().sum()
+    value = value + ((log - log.mean()).clamp_min(0) / 0.3).square().sum() / 2
     value = value + sum(((log[a] - log[b]) / 0.02) ** 2 for a, b in MAN.mirror_bones) / 2
-    assert_close(ProportionEnergy(MAN, spread=0.05, twins=0.02)(lengths), value)
+    assert_close(ProportionEnergy(MAN, spread=0.05, twins=0.02, excess=0.3)(lengths), value)
 
 
 def test_odd_bones_are_borne_but_not_odd_twins():
@@ -118,6 +119,12 @@ def test_odd_bones_are_borne_but_not_odd_twins():
     neck = usual.clone()
     neck[MAN.bone_names.index("spine-thorax")] *= 1.6
     assert energy(neck) < 20
+    short, long = usual.clone(), usual.clone()
+    for pair in MAN.mirror_bones[:2]:  # joints may be defined in such a way that bones are short, but not this long
+        short[list(pair)] *= 0.4
+        long[list(pair)] *= 2.5
+    plain = ProportionEnergy(MAN, excess=1e9)
+    assert energy(short) - plain(short) < 2 < 4 < energy(long) - plain(long)
     arm = usual.clone()
     arm[MAN.mirror_bones[0][0]] *= 1.6
     assert energy(arm) > 100

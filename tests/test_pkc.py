@@ -287,6 +287,22 @@ def test_noise_gaps_and_wrong_detections_are_cleaned_first():
     assert (grown[true > 200] - 1).abs().max() < 0.1  # mm; a hip of 130 is hardly longer than the noise is large
 
 
+def test_confidences_that_vary_are_a_detector_s():
+    """Its joints stray for long, which no smoothing tells: lengths need not be kept as if the image were exact."""
+    clip = walking_person(30, turn=0.0)
+    method = PKC(rounds=0)
+    weights = torch.rand(clip.tracks.weights.shape, generator=torch.Generator().manual_seed(0)).double() * 0.8 + 0.2
+    unsure = replace(clip.tracks, weights=weights)
+    _, noise, notes = method._clean(unsure)
+    assert_close(noise, module.DETECTED / weights.sqrt())
+    assert any("detector" in note for note in notes)
+    for sure in (torch.ones_like(weights), torch.full_like(weights, 0.5), (weights > 0.4).double()):
+        assert not module.detected(sure)
+    assert module.detected(weights) and not module.detected(torch.zeros_like(weights))
+    spread = method(unsure).uncertainty.mean()
+    assert spread > method(clip.tracks).uncertainty.mean()
+
+
 # ---------------------------------------------------------------------- fields
 
 

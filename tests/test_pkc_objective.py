@@ -15,7 +15,8 @@ from kcs_torch.methods.lockstep import run, together
 from kcs_torch.methods.pkc import batch
 from kcs_torch.methods.pkc import objective as module
 from kcs_torch.methods.pkc.batch import Task, minimise_all
-from kcs_torch.methods.pkc.objective import Objective, Unknowns, Weights, at_pace, bone_noise, pace_of
+from kcs_torch.methods.pkc.objective import BLUR, Objective, Unknowns, Weights, at_pace, bone_noise, pace_of
+from kcs_torch.nn import PostureEnergy
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.solvers import lbfgs
 
@@ -354,6 +355,15 @@ def test_lengths_do_not_grow_under_noise(seed):
     assert (grown[0] - 1).abs().max() < 0.1 and abs(grown[0].mean() - 1) < 0.02
     assert grown[1].max() > 1.1 and grown[1].mean() > 1.03
     assert wrong[0] < 0.35 and wrong[0] < 0.5 * wrong[1]
+
+
+def test_directions_stray_the_more_the_noisier_and_shorter_bones_are():
+    points = walk(30)
+    clear, noisy = objective(points), objective(points, noise=0.02)
+    assert_close(clear.posture.deviation, PostureEnergy("h36m17").to(points).deviation)
+    added = (noisy.posture.deviation.square() - clear.posture.deviation.square()).sqrt()  # (B, 3)
+    usual = clear.posture.rest_lengths
+    assert_close(added, (BLUR * math.sqrt(2) * 0.02 / usual)[:, None].expand(-1, 3))
 
 
 # ---------------------------------------------------------------------- pace

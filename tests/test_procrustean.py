@@ -14,7 +14,8 @@ from kcs_torch.functional.scatter import inverse_scatter, scatter_log_det
 from kcs_torch.functional.temporal import jitter
 from kcs_torch.nn.procrustean import ProcrusteanEnergy
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.solvers.curvature import block_roots, frame_curvature
+from kcs_torch.solvers import curvature
+from kcs_torch.solvers.curvature import block_roots, frame_curvature, whitening
 from kcs_torch.solvers.lifts import random_lifts, turning_cameras
 from kcs_torch.solvers.procrustean import (
     COARSE,
@@ -98,15 +99,29 @@ def test_curvature_is_the_hessian_with_covariances_held():
 
     jacobian = torch.autograd.functional.jacobian(surrogate, torch.zeros(21, dtype=torch.float64))
     expected = jacobian.mT @ precision[0] @ jacobian
-    found = frame_curvature(points, turned, BONES, levels, 3)
+    found = frame_curvature(points, turned, BONES, precision, 3)
     assert torch.allclose(found.matrix[0, 2], expected, atol=1e-8 * expected.abs().max())
-    depth = frame_curvature(points, turned, BONES, levels, 1)
+    depth = frame_curvature(points, turned, BONES, precision, 1)
     pick = [*range(12, 18), 18, 19, 20]
     assert torch.allclose(depth.matrix[0, 2], expected[pick][:, pick], atol=1e-8 * expected.abs().max())
     roots = block_roots(depth)
     gauge = depth.matrix.clone()
     gauge[..., :6, :6] += gauge.diagonal(dim1=-2, dim2=-1)[..., :6].mean(-1)[..., None, None] / 6
     assert torch.allclose(roots @ roots.mT @ gauge, torch.eye(9, dtype=torch.float64).expand_as(gauge), atol=1e-2)
+
+
+@pytest.mark.parametrize("free", [1, 3])
+def test_roots_do_not_depend_on_how_many_frames_are_made_together(free, monkeypatch):
+    points, cameras = swinging_body(9)
+    points, turned = torch.stack([points, 1.1 * points]), torch.stack([cameras, cameras])
+    precision = torch.rand(2, 9, 6, dtype=torch.float64) if free == 3 else None
+    levels = aligned_levels(points, turned, BONES, FINE[0])
+    make = lambda: whitening(  # noqa: E731
+        points, turned, BONES, levels, free, BONES, torch.ones(5).double(), 0.01, 3.0, precision
+    )
+    whole = make()
+    monkeypatch.setattr(curvature, "RUN", 4)
+    assert torch.allclose(make(), whole, rtol=1e-6, atol=1e-6)
 
 
 def test_terms_have_gradients_also_where_nothing_moves():

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.derivatives import applied, batch_first
+from kcs_torch.functional.shapes import broadcast_shapes
 
 __all__ = ["inverse_scatter", "scatter_log_det"]
 
@@ -47,7 +48,7 @@ def inverse_scatter(values: Tensor, eps: Tensor | float) -> Tensor:
 
 def _factor(values: Tensor, eps: Tensor) -> Tensor:
     scatter = values.mT @ values / max(values.shape[-2], 1)
-    batch = torch.broadcast_shapes(scatter.shape[:-2], eps.shape)
+    batch = broadcast_shapes(scatter.shape[:-2], eps.shape)
     if batch != scatter.shape[:-2]:
         scatter = scatter.expand(*batch, *scatter.shape[-2:]).clone()
     scatter.diagonal(dim1=-2, dim2=-1).add_(eps[..., None])

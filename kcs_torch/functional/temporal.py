@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
+from kcs_torch.functional.shapes import broadcast_shapes
 
 __all__ = ["best_path", "blend_windows", "interpolate", "jitter", "standing", "window_starts"]
 
@@ -155,7 +156,7 @@ def best_path(cost: Tensor, transition: Tensor) -> Tensor:
     frames, states = cost.shape[-2:]
     if frames == 1:
         return cost.argmin(-1)
-    batch = torch.broadcast_shapes(cost.shape[:-2], transition.shape[:-3])
+    batch = broadcast_shapes(cost.shape[:-2], transition.shape[:-3])
     problems, count = 2 * math.prod(batch), frames - 1
     length = count if count <= 16 * problems else math.ceil((count / 2) ** 0.5)
     blocks = math.ceil(count / length)

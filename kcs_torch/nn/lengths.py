@@ -77,15 +77,17 @@ class ForeshorteningEnergy(SkeletonModule):
 
 
 class ProportionEnergy(SkeletonModule):
-    """How unusual bone lengths are: sum_b log(1 + (l_b/s)^2/2) + 1/2 sum of twins (l_left - l_right)^2/p^2.
+    """How unusual bone lengths are: sum_b log(1 + (l_b/s)^2/2) + max(0, l_b/r)^2/2 + sum_twins (l_b - l_twin)^2/2p^2.
 
     l_b is the log of a length over the skeleton's, less the mean over bones: the size of the body does not count. The
-    heavy tail is for joints that a data set defines in its own way.
+    heavy tail is for joints that a data set defines in its own way. It ends where bones are far too long, which depth
+    alone can make them: in a long bone that points at the camera noise leaves no trace.
 
     Args:
         skeleton: with a template or proportions.
         spread: s, usual deviation of a length, as a share.
         twins: p, usual difference of left and right, as a share.
+        excess: r, the same of lengths that are too long to be another definition of a joint.
 
     Raises:
         SkeletonError: the skeleton knows no lengths.
@@ -94,12 +96,14 @@ class ProportionEnergy(SkeletonModule):
     usual: Tensor
     pairs: Tensor
 
-    def __init__(self, skeleton: str | Path | Skeleton, *, spread: float = 0.08, twins: float = 0.03) -> None:
+    def __init__(
+        self, skeleton: str | Path | Skeleton, *, spread: float = 0.08, twins: float = 0.03, excess: float = 0.45
+    ) -> None:
         super().__init__(skeleton)
         usual = self.skeleton.relative_lengths(dtype=torch.float64)
         if usual is None:
             raise SkeletonError(f"skeleton '{self.skeleton.name}' has neither proportions nor a template")
-        self.spread, self.twins = spread, twins
+        self.spread, self.twins, self.excess = spread, twins, excess
         self.register_buffer("usual", usual, persistent=False)
         pairs = torch.tensor(self.skeleton.mirror_bones, dtype=torch.long).reshape(-1, 2)
         self.register_buffer("pairs", pairs, persistent=False)
@@ -115,10 +119,13 @@ class ProportionEnergy(SkeletonModule):
         apart = ((log[..., self.pairs[:, 0]] - log[..., self.pairs[:, 1]]) / self.twins).square()
         if weights is None:
             off = log - log.mean(-1, keepdim=True)
-            return torch.log1p((off / self.spread).square() / 2).sum(-1) + apart.sum(-1) / 2
+            return self._unusual(off).sum(-1) + apart.sum(-1) / 2
         off = log - (weights * log).sum(-1, keepdim=True) / some(weights.sum(-1, keepdim=True))
         both = torch.minimum(weights[..., self.pairs[:, 0]], weights[..., self.pairs[:, 1]])
-        return (weights * torch.log1p((off / self.spread).square() / 2)).sum(-1) + (both * apart).sum(-1) / 2
+        return (weights * self._unusual(off)).sum(-1) + (both * apart).sum(-1) / 2
+
+    def _unusual(self, off: Tensor) -> Tensor:
+        return torch.log1p((off / self.spread).square() / 2) + (off / self.excess).clamp_min(0).square() / 2
 
 
 def foreshortening(depth: Tensor, length: Tensor, eps: float) -> Tensor:

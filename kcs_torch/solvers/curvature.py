@@ -10,7 +10,7 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors, incidence, safe_norm
 from kcs_torch.functional.scatter import inverse_scatter
 
-__all__ = ["Curvature", "Levels", "block_roots", "frame_curvature"]
+__all__ = ["Curvature", "Levels", "block_roots", "frame_curvature", "whitening"]
 
 Levels = list[tuple[float, Tensor, float, int]]
 """(weight, rows (H, T, 3B), eps, frames that a row links) of each log-determinant."""
@@ -30,14 +30,12 @@ class Curvature:
     free: int
     joints: int
 
-    def add_lengths(self, points: Tensor, rigid: Tensor, stiffness: Tensor, slack: float, reach: float) -> None:
-        """Add the Gauss-Newton term of the lengths (P, 2)."""
+    def add_lengths(self, points: Tensor, rigid: Tensor, pull: Tensor) -> None:
+        """Add the Gauss-Newton term of the lengths (P, 2), with weights (H, P)."""
         if len(rigid) == 0:
             return
         vectors = bone_vectors(points, rigid)
         size = safe_norm(vectors)
-        spread = size.var(-2, unbiased=False)
-        pull = stiffness * (1 / (spread + slack**2) - 1 / (spread + (reach * slack) ** 2))
         along = vectors / size.clamp_min(torch.finfo(size.dtype).tiny)[..., None]
         along = along[..., 3 - self.free :] * pull.sqrt()[..., None, :, None]  # (H, T, P, free)
         ends = incidence(rigid, self.joints, dtype=points.dtype)
@@ -51,7 +49,55 @@ class Curvature:
         self.matrix.diagonal(dim1=-2, dim2=-1)[..., :count] += torch.cat([precision, precision], -1)
 
 
-def frame_curvature(points: Tensor, rotations: Tensor, bones: Tensor, levels: Levels, free: int) -> Curvature:
+RUN = 4096
+"""Frames whose blocks are made together: they are as large as all else that a descent keeps."""
+
+
+def whitening(
+    points: Tensor,
+    rotations: Tensor,
+    bones: Tensor,
+    levels: Levels,
+    free: int,
+    rigid: Tensor,
+    stiffness: Tensor,
+    slack: float,
+    reach: float,
+    precision: Tensor | None = None,
+) -> Tensor:
+    """Return roots (H, T, D, D) of the inverse of each frame's Hessian, of lengths and log-determinants.
+
+    Args:
+        points: (H, T, N, 3).
+        rotations: (H, T, 3, 3).
+        bones: (B, 2).
+        levels: the log-determinants; links between frames count on the diagonal only.
+        free: coordinates of a joint that are free, 1 (depth) or 3.
+        rigid: (P, 2) pairs that keep their distance.
+        stiffness: (P,) weights of their lengths.
+        slack: standard deviation of a length.
+        reach: slacks from which on nothing pulls.
+        precision: curvature (H, T, N) of the residuals of x and of y, where they are free.
+    """
+    hypotheses, frames, joints, _ = points.shape
+    inverse = points.new_zeros(hypotheses, 3 * len(bones), 3 * len(bones))
+    for weight, rows, eps, linked in levels:
+        inverse = inverse + linked * weight * inverse_scatter(rows, eps)
+    spread = safe_norm(bone_vectors(points, rigid)).var(-2, unbiased=False)
+    pull = stiffness * (1 / (spread + slack**2) - 1 / (spread + (reach * slack) ** 2))
+    size = free * joints + 3
+    out = points.new_empty(hypotheses, frames, size, size)
+    run = max(1, RUN // max(hypotheses, 1))
+    for part in (slice(first, first + run) for first in range(0, frames, run)):
+        curvature = frame_curvature(points[:, part], rotations[:, part], bones, inverse, free)
+        curvature.add_lengths(points[:, part], rigid, pull)
+        if precision is not None:
+            curvature.add_tracks(precision[:, part])
+        out[:, part] = block_roots(curvature)
+    return out
+
+
+def frame_curvature(points: Tensor, rotations: Tensor, bones: Tensor, precision: Tensor, free: int) -> Curvature:
     """Return each frame's Hessian of the log-determinants, their covariances held (the majoriser's).
 
     With S the precision of the aligned bones, the block of joints n, m and coordinates i, j is
@@ -61,16 +107,13 @@ def frame_curvature(points: Tensor, rotations: Tensor, bones: Tensor, levels: Le
         points: (H, T, N, 3).
         rotations: (H, T, 3, 3).
         bones: (B, 2).
-        levels: the log-determinants; links between frames count on the diagonal only.
+        precision: S (H, 3B, 3B).
         free: coordinates of a joint that are free, 1 (depth) or 3.
     """
     hypotheses, frames, joints, _ = points.shape
     count = len(bones)
     ends = incidence(bones, joints, dtype=points.dtype)
     vectors = bone_vectors(points, bones)
-    precision = points.new_zeros(hypotheses, 3 * count, 3 * count)
-    for weight, rows, eps, linked in levels:
-        precision = precision + linked * weight * inverse_scatter(rows, eps)
     nine = precision.view(hypotheses, count, 3, count, 3).permute(0, 2, 4, 1, 3)
     nine = (ends @ nine @ ends.mT).flatten(1, 2).flatten(-2)  # (H, 9, N N)
     rows = rotations[:, :, 3 - free :]  # (H, T, free, 3)

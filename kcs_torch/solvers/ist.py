@@ -7,6 +7,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.camera import orthonormality_defect
+from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.functional.spectral import psd_shrink
 from kcs_torch.solvers.iterate import iterate
 
@@ -170,7 +171,7 @@ def metric_upgrade(
             return still.all()
         return still.flatten(0, starts - 1).all(0) if starts else still
 
-    q = normalise(start.expand(*torch.broadcast_shapes(start.shape[:-2], motion.shape[:-3]), rank, 3))
+    q = normalise(start.expand(*broadcast_shapes(start.shape[:-2], motion.shape[:-3]), rank, 3))
     residual, cost = evaluate(q)
     awake = torch.zeros(motion.shape[:-3], dtype=torch.bool, device=motion.device)
     first_state: tuple[Tensor, ...] = (q, residual, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost), awake)

@@ -40,7 +40,8 @@ def lbfgs(
         slopes: ``energy`` returns its gradient, too: (H,) and (H, D). Else autograd tells it.
 
     Returns:
-        The minimisers (H, D); whether all settled within ``num_steps``; where they were ten steps earlier.
+        The minimisers (H, D); whether all settled within ``num_steps``; where they were ``memory`` steps
+        earlier.
 
     >>> goal = torch.tensor([[1.0, 2.0], [3.0, -1.0]], dtype=torch.float64)
     >>> lbfgs(lambda x: ((x - goal) ** 2).sum(-1), torch.zeros_like(goal)).value.round(decimals=4).tolist()
@@ -69,7 +70,7 @@ def lbfgs(
     history = History(x, memory)
     scale = steepest
     resting = torch.zeros_like(value, dtype=torch.bool)
-    past, places = [value], [x]
+    past = [value]
     least = torch.where(value.isfinite(), torch.finfo(x.dtype).eps * value.abs(), 0).clamp_min(tiny)  # if it falls to 0
     failed = resting
     settled, rest, made = False, False, 0
@@ -113,14 +114,13 @@ def lbfgs(
         scale = history.add((new_x, new_gradient), (x, gradient), scale)
         x, value, gradient = new_x, new_value, new_gradient
         past.append(value)
-        places = [*places[-10:], x]
         if made >= 10:
             resting = resting | (past[-11] - value <= (tolerance * value.abs()).maximum(least))
         if made >= 10 or not every:
             rest, settled = torch.stack([resting.any(), resting.all()]).tolist()
             if settled:
                 break
-    return Solution(x, settled, made, places[0])
+    return Solution(x, settled, made, x - history.travelled())
 
 
 class History:
@@ -177,6 +177,10 @@ class History:
         q = torch.baddbmm(gradient, a, changes, alpha=-1)  # (H, 1, D)
         b = torch.addcmul(curves * a, scale, q @ changes.mT, value=-1) @ inverse
         return torch.baddbmm(scale * q, b, steps)[:, 0]
+
+    def travelled(self) -> Tensor:
+        """The way (H, D) of all steps that are kept."""
+        return self._used()[0].sum(1)
 
     def _used(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Steps and changes (H, used, D), the inverse (H, used, used) and curves (H, 1, used)."""

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_vectors, incidence, kcs_matrix
+from kcs_torch.functional.shapes import broadcast_shapes
 
 __all__ = ["fit_bones"]
 
@@ -78,7 +79,7 @@ def fit_bones(
     beta = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device)
     beta = beta.clamp_max(1 / (max(len(bones), 1) * limits.eps))  # beyond it the system loses its unit diagonal
     root = (beta + limits.tiny).sqrt()  # a derivative at 0, too
-    root = root.expand(torch.broadcast_shapes(root.shape, lengths.shape[-1:]))
+    root = root.expand(broadcast_shapes(root.shape, lengths.shape[-1:]))
     floor = 1e-4 * lengths.detach().abs().mean(-1, keepdim=True)
     tiny = limits.tiny**0.5
     eye = torch.eye(len(bones), dtype=points.dtype, device=points.device)

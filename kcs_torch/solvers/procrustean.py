@@ -23,7 +23,7 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors, safe_norm
 from kcs_torch.functional.scatter import scatter_log_det
-from kcs_torch.solvers.curvature import Levels, block_roots, frame_curvature
+from kcs_torch.solvers.curvature import Levels, whitening
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.procrustean_descent import Descent
 
@@ -141,12 +141,11 @@ def procrustean(
     for stage in stages:
         precision = _precision(points, tracks, share, noise)
         levels = aligned_levels(points, rotations, bones, stage)
-        curvature = frame_curvature(points, rotations, bones, levels, free)
-        curvature.add_lengths(points, rigid, stiff, stage.slack, REACH)
-        if noise > 0:
-            curvature.add_tracks(precision)
+        roots = whitening(
+            points, rotations, bones, levels, free, rigid, stiff, stage.slack, REACH, precision if noise > 0 else None
+        )
         descent = Descent(
-            points, rotations, block_roots(curvature), bones, rigid, stiff, stage,
+            points, rotations, roots, bones, rigid, stiff, stage,
             change=CHANGE, reach=REACH, tracks=tracks, weights=share, noise=noise, extra=extra,
         )  # fmt: skip
         start = points.new_zeros(hypotheses, frames * (free * joints + 3))
@@ -189,9 +188,8 @@ def depth_deviation(
     rigid = bones if rigid is None else rigid
     stiff = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device).expand(len(rigid))
     levels = aligned_levels(points, rotations, bones, TELLING)
-    curvature = frame_curvature(points, rotations, bones, levels, 1)
-    curvature.add_lengths(points, rigid, stiff, TELLING.slack, REACH)
-    local = block_roots(curvature)[..., :-3, :].square().sum(-1).sqrt()
+    roots = whitening(points, rotations, bones, levels, 1, rigid, stiff, TELLING.slack, REACH)
+    local = roots[..., :-3, :].norm(dim=-1)
     angle = torch.as_tensor(turn, dtype=points.dtype, device=points.device).clamp_min(1.0)
     return local * (270 / angle).pow(0.6).expand(len(points))[:, None, None]
 

@@ -62,7 +62,7 @@ class Descent:
         self.free = 3 if noise > 0 else 1
         self.points = points.permute(0, 3, 2, 1).contiguous()  # (H, 3, N, T)
         self.rotations = rotations.permute(0, 2, 3, 1).contiguous()  # (H, 3, 3, T)
-        self.roots, self.rows = roots, roots.mT.contiguous()  # a row times a matrix is the faster product
+        self.roots = roots
         self.ends = incidence(bones, joints, dtype=points.dtype).mT  # (B, N)
         self.pairs = None if torch.equal(bones, rigid) else incidence(rigid, joints, dtype=points.dtype).mT
         self.rigid, self.stiffness = len(rigid) > 0, stiffness
@@ -87,7 +87,7 @@ class Descent:
     def _step(self, u: Tensor) -> tuple[Tensor, Turn]:
         """Shifts (H, free, N, T) and turns."""
         count, _, joints, frames = self.points.shape
-        step = (u.view(count, frames, 1, -1) @ self.rows).squeeze(-2).mT.contiguous()  # (H, D, T)
+        step = (u.view(count, frames, 1, -1) @ self.roots.mT).squeeze(-2).mT.contiguous()  # (H, D, T)
         return step[:, :-3].view(count, self.free, joints, frames), Turn(step[:, -3:], self.cross)
 
     def _placed(self, shift: Tensor) -> Tensor:

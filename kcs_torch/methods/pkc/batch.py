@@ -36,7 +36,7 @@ class Task:
     loose: float = 1.0
 
 
-TOGETHER = 16384
+TOGETHER = 1200
 """Frames of hypotheses that are refined as one batch; more would only fall out of the processor's cache."""
 
 

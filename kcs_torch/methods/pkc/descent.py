@@ -55,8 +55,8 @@ class Descent:
         self.plane = plane if plane.ndim == 4 else plane[None]
         lines = [(affine - affine.mean(-1, keepdim=True)) @ obj.tree[posture.trunk]]  # (2, B): the axes' depths
         self.axes = posture.axes.to(like)
-        self.spread = posture.deviation.to(like).mT.contiguous()  # (3, B)
-        self.mean = (posture.mean.to(like).mT / self.spread).reshape(-1, 1)  # (3B, 1)
+        self.spread = posture.deviation.to(like).mT.reshape(-1, 3, body.num_bones)  # (1 or H, 3, B)
+        self.mean = (posture.mean.to(like).mT / self.spread).flatten(1)[..., None]  # (1 or H, 3B, 1)
         hinges = obj.hinges
         if len(hinges.joints):
             parent, joint, child, left, right = hinges.joints.unbind(1)
@@ -240,15 +240,16 @@ class Descent:
         obj = self.objective
         prior, tiny = obj.proportions, torch.finfo(lengths.dtype).tiny
         log = (lengths.clamp_min(tiny) / prior.usual.to(lengths).clamp_min(tiny)).log()
-        off = (log - log.mean(-1, keepdim=True)) / prior.spread
-        half = 1 + off.square() / 2
-        pull = off / (half * prior.spread)
+        off = log - log.mean(-1, keepdim=True)
+        half = 1 + (off / prior.spread).square() / 2
+        over = (off / prior.excess).clamp_min(0)
+        pull = off / (half * prior.spread**2) + over / prior.excess
         growth += pull - pull.mean(-1, keepdim=True)
         left, right = prior.pairs.unbind(1)
         apart = (log[:, left] - log[:, right]) / prior.twins
         growth.index_add_(1, left, apart / prior.twins)
         growth.index_add_(1, right, apart / -prior.twins)
-        value = half.log().sum(-1) + apart.square().sum(-1) / 2
+        value = half.log().sum(-1) + (over.square().sum(-1) + apart.square().sum(-1)) / 2
         if obj.anchor is not None:
             away = (lengths / obj.anchor).log() / ANCHOR
             growth += wide(obj.held, 1) * away / ANCHOR

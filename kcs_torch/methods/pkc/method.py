@@ -41,6 +41,15 @@ LEFT = 0.45
 FILLED = 0.015
 """Standard deviation of a joint that is filled in, a share of the body's size."""
 
+DETECTED = 0.027
+"""The same of a joint that a detector is sure of, however smooth: what it gets wrong it gets wrong for many frames."""
+
+UNSURE = 0.05
+"""Least confidence that counts."""
+
+PARTLY = 0.05
+"""Share of confidences below 1 from which on they are a detector's."""
+
 HELD = 0.1
 """The same in frames before the body is first seen, and after it was last seen."""
 
@@ -178,6 +187,9 @@ class PKC(Method):
             points = place_unseen(flat, known, tracks.skeleton)[..., :2]
         left = LEFT * level if level > CLEAN else 0.0
         noise = torch.where(keep, points.new_full((), left), points.new_full((), math.hypot(left, FILLED)))
+        if detected(tracks.weights):
+            noise = noise.maximum(DETECTED / tracks.weights.clamp_min(UNSURE).sqrt())
+            notes.append("confidences: joints are taken for a detector's, which stray by more than they tremble")
         held = _nearest_shown(keep)
         away = held != torch.arange(len(held), device=held.device)
         if bool(away.any()):  # nothing tells what goes on there, and a model of motion would run off
@@ -274,6 +286,12 @@ def _agreement(depth: Tensor, other: Tensor) -> float:
     """Correlation of two solutions' depths (T, N), whichever mirror images they are."""
     a, b = (z - z.mean(-1, keepdim=True) for z in (depth, other))
     return float((a * b).sum().abs() / (a.norm() * b.norm()).clamp_min(torch.finfo(a.dtype).tiny))
+
+
+def detected(weights: Tensor) -> bool:
+    """Whether confidences (T, N) are a detector's: between 0 and 1, and not all alike."""
+    seen = weights[weights > 0]
+    return len(seen) > 0 and bool((seen < 1).double().mean() > PARTLY) and bool(seen.amin() < seen.amax())
 
 
 def _nearest_shown(seen: Tensor) -> Tensor:

@@ -46,7 +46,7 @@ TIGHT = 10.0
 LOOSE, LOOSER = 0.3, 0.1
 """Weight of each length where the links are no tree (markers, say), in the coarse stages and in the fine ones."""
 
-TOGETHER = 8192
+TOGETHER = 1200
 """Frames of starts that are descended from as one batch; more would only fall out of the processor's cache."""
 
 ROBOT = 10

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
@@ -19,6 +19,12 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
 
 __all__ = ["Objective", "Refined", "Unknowns", "Weights", "at_pace", "bone_noise", "pace_of"]
+
+BLUR = 2.0
+"""By how much a bone's direction strays, over its noise in the image per length: the trunk's frame is noisy as well."""
+
+SHORT = 0.001
+"""Bones are no shorter than this, a standing person being about 1.75 tall."""
 
 WALK = 4.3
 """Frames in which a walking person's bones change in the image by as much as they stray, at 30 frames a second."""
@@ -141,6 +147,9 @@ class Objective:
         self.skeleton, self.image, self.weights, self.anchor = skeleton, image, weights, anchor
         make = lambda module: module.to(image)  # noqa: E731
         self.posture = make(PostureEnergy(skeleton, kappa=weights.kappa, correlation=weights.posture))
+        usual = self.posture.rest_lengths.clamp_min(SHORT)
+        blur = BLUR * bone_noise(noise, self.posture.bones).median(0).values / usual
+        self.posture.deviation = (self.posture.deviation.square() + blur.square()[:, None]).sqrt()
         self.foreshortening = make(ForeshorteningEnergy(skeleton, correlation=weights.foreshortening))
         self.proportions = make(ProportionEnergy(skeleton, spread=weights.proportions, twins=weights.twins))
         self.hinges = make(HingeEnergy(skeleton))
@@ -259,6 +268,8 @@ class Objective:
         out.flat, out.noise = padded([part.flat for part in parts]), padded([part.noise for part in parts])
         out.time = padded([part.image.new_ones(n) for part, n in zip(parts, frames, strict=True)])
         out.rigid = first.rigid * out.time[..., None]
+        out.posture = deepcopy(first.posture)
+        out.posture.deviation = torch.stack([part.posture.deviation for part in parts])[each][:, None]
         out.count, out.noisy = gather(frames), any(part.noisy for part in parts)
         out.share = out.time / gather([part.posture.correlation for part in parts])[:, None]
         ratio = [first.foreshortening.correlation / part.foreshortening.correlation for part in parts]
@@ -293,7 +304,8 @@ class Unknowns:
         each = precision * off.square()
         spread = objective._mean(HEAVY * torch.log1p(each / HEAVY).mT)[..., None]
         pull = precision / (1 + spread.clamp_max(1))
-        shape = wide(w.posture, 2) * (posture.deviation.square().mean(-1)[:, None] * size.square()).clamp_min(1e-3)
+        spread = posture.deviation.square().mean(-1).reshape(-1, size.shape[1], 1)
+        shape = wide(w.posture, 2) * (spread * size.square()).clamp_min(1e-3)
         curve = pull * (self.dz / size).square() + 6 / wide(w.acceleration, 2) ** 2 + 5 / shape  # (H, B, T)
         self.shear = size.square() * self.dz / (self.dz.square() + (0.5 * size).square())
         left = size - self.dz * self.shear / size

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_lengths, bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.nn.deviation import (
     Arrangement,
     deviation_goal,
@@ -236,7 +237,7 @@ class UnrolledKCS(Unrolled):
             given = (deviation_goal(rest, points / scales[..., None, None], cameras, share), cameras, share)
             top = deviation_scale(*given, matrix=matrix, arrangement=self.arrangement)
             if start is None:
-                batch = torch.broadcast_shapes(points.shape[:-3], cameras.shape[:-3], scales.shape[:-1])
+                batch = broadcast_shapes(points.shape[:-3], cameras.shape[:-3], scales.shape[:-1])
                 begin = points.new_zeros(*batch, points.shape[-3], 3, len(self.bones))
             else:
                 begin = bone_vectors(start.to(tracks.dtype) / size - rest, self.bones).mT

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.nn.energies import centred_residual
 from kcs_torch.nn.layers import full_precision, known
 from kcs_torch.nn.majorise import majorise_step, turn_onto_mean
@@ -172,7 +173,7 @@ class UnrolledPKC(Unrolled):
                 for name, least in (("eps", 1e-7), ("slack", 1e-3), ("noise", 1e-3))
             )
             graded = not self.skeleton.tree
-            begin = begin.expand(*torch.broadcast_shapes(begin.shape[:-3], rows.shape[:-3]), *begin.shape[-3:])
+            begin = begin.expand(*broadcast_shapes(begin.shape[:-3], rows.shape[:-3]), *begin.shape[-3:])
             world = complete_rotation(rows).expand(*begin.shape[:-2], 3, 3)
 
             # The state: points, and below them the rotations of frames that are turned.
