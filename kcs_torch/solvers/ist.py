@@ -115,7 +115,8 @@ def metric_upgrade(
     count = motion.new_full((), motion.shape[-3]) if counts is None else counts.to(motion)
     frames = count[..., None, None]
     gram = (a.mT @ a + b.mT @ b) / (2 * frames)  # mean squared row length is tr(Q^T gram Q)
-    forms = _quadratic_forms(a, b, evenness) / frames[..., None].sqrt()  # (..., M, R, R): residuals are <form, Q Q^T>
+    # Residuals are <form, Q Q^T> of forms (..., M, R, R); here they are twice that, forms last.
+    forms = (2 * _quadratic_forms(a, b, evenness) / frames[..., None].sqrt()).movedim(-3, -1).contiguous()
     if smoothness > 0 and motion.shape[-3] > 2:
         bend = motion.diff(n=2, dim=-3)
         inside = torch.arange(2, motion.shape[-3], device=motion.device) < count[..., None]
@@ -123,40 +124,47 @@ def metric_upgrade(
     else:
         bend = motion[..., :0, 0, :]
     bending = smoothness / frames * (bend.mT @ bend)  # (..., R, R)
-    eye = torch.eye(3 * rank, dtype=motion.dtype, device=motion.device)
     three = torch.eye(3, dtype=motion.dtype, device=motion.device)
-    stiff = torch.einsum("...ij,kl->...ikjl", bending, three).reshape(*bending.shape[:-2], 3 * rank, 3 * rank)
+    stiff = torch.einsum("kl,...ij->...kilj", three, bending).reshape(*bending.shape[:-2], 1, 3 * rank, 3 * rank)
     tiny = torch.finfo(motion.dtype).tiny
 
-    def normalise(q: Tensor) -> Tensor:
-        size = (q * (gram @ q)).sum((-2, -1))
-        return q / torch.where(size > 0, size, torch.ones_like(size)).sqrt()[..., None, None]
+    # Unknowns are Q^T (..., S, 3, R), the starts S next to its rows: a product with any matrix is one for all starts.
+    def times(rows: Tensor, matrix: Tensor) -> Tensor:
+        return (rows.flatten(-3, -2) @ matrix).unflatten(-2, rows.shape[-3:-1])
 
-    def evaluate(q: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals (..., M) of the defect, and the cost (...)."""
-        residual = torch.einsum("...mij,...ij->...m", forms, q @ q.mT)
-        return residual, residual.square().sum(-1) + (q * (bending @ q)).sum((-2, -1))
+    def normalise(rows: Tensor) -> Tensor:
+        size = (rows * times(rows, gram)).sum((-2, -1))
+        return rows / torch.where(size > 0, size, torch.ones_like(size)).sqrt()[..., None, None]
+
+    def evaluate(rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Residuals (..., S, M) of the defect, and the cost (..., S)."""
+        residual = (rows.mT @ rows).flatten(-2) @ forms.flatten(-3, -2) / 2
+        return residual, residual.square().sum(-1) + (rows * times(rows, bending)).sum((-2, -1))
 
     def step(state: tuple[Tensor, ...], k: int) -> tuple[Tensor, ...]:
-        q, residual, cost, damping, progress, resting = state
+        rows, residual, cost, damping, progress, resting = state
         if tolerance > 0 and k and k % CHECK == 0:
             resting = resting | at_rest(progress)
-        jacobian = 2 * torch.einsum("...mij,...jk->...mik", forms, q).flatten(-2)
-        normal = jacobian.mT @ jacobian + stiff
-        gradient = (jacobian.mT @ residual[..., None]).squeeze(-1) + (bending @ q).flatten(-2)
+        jacobian = times(rows, forms.flatten(-2)).unflatten(-1, (rank, -1)).flatten(-3, -2)  # (..., S, 3R, M)
+        normal = jacobian @ jacobian.mT
+        normal += stiff
+        gradient = (jacobian @ residual[..., None]).squeeze(-1) + times(rows, bending).flatten(-2)
         size = normal.diagonal(dim1=-2, dim2=-1).mean(-1)
         # The residuals are homogeneous, so the plain step would only shrink Q: hold its scale.
-        radial = (gram @ q).flatten(-2)
+        radial = times(rows, gram).flatten(-2)
         radial = radial / torch.linalg.vector_norm(radial, dim=-1, keepdim=True).clamp_min(tiny)
         gradient = gradient - (gradient * radial).sum(-1, keepdim=True) * radial
-        normal = normal + 1e3 * size[..., None, None] * rank * radial[..., :, None] * radial[..., None, :]
-        factor, _ = torch.linalg.cholesky_ex(normal + (damping * size + tiny)[..., None, None] * eye)
+        normal += (1e3 * rank * size[..., None] * radial)[..., :, None] * radial[..., None, :]
+        normal.diagonal(dim1=-2, dim2=-1).add_((damping * size + tiny)[..., None])
+        factor, _ = torch.linalg.cholesky_ex(normal)
         move = torch.cholesky_solve(gradient[..., None], factor).squeeze(-1)
-        trial = normalise(q - move.unflatten(-1, (rank, 3)))
+        trial = normalise(rows - move.unflatten(-1, (3, rank)))
         moved, new = evaluate(trial)
-        better = (new < cost) & ~resting  # False for NaN, too: a failed factorisation only raises the damping
+        better = (new < cost) & ~resting[
+            ..., None
+        ]  # False for NaN, too: a failed factorisation only raises the damping
         return (
-            torch.where(better[..., None, None], trial, q),
+            torch.where(better[..., None, None], trial, rows),
             torch.where(better[..., None], moved, residual),
             torch.where(better, new, cost),
             torch.where(better, damping / 4, damping * 3).clamp(1e-9, 1e6),
@@ -166,22 +174,24 @@ def metric_upgrade(
 
     def at_rest(progress: Tensor) -> Tensor:
         """Which motions (...) have stopped."""
-        still, starts = progress <= tolerance, progress.ndim - (motion.ndim - 3)
-        if not apart:
-            return still.all()
-        return still.flatten(0, starts - 1).all(0) if starts else still
+        still = progress <= tolerance
+        return still.all(-1) if apart else still.all()
 
-    q = normalise(start.expand(*broadcast_shapes(start.shape[:-2], motion.shape[:-3]), rank, 3))
-    residual, cost = evaluate(q)
+    shape = broadcast_shapes(start.shape[:-2], motion.shape[:-3])
+    starts = shape[: len(shape) - (motion.ndim - 3)]
+    rows = start.expand(*shape, rank, 3).reshape(-1, *shape[len(starts) :], rank, 3).movedim(0, -3).mT.contiguous()
+    rows = normalise(rows)
+    residual, cost = evaluate(rows)
     awake = torch.zeros(motion.shape[:-3], dtype=torch.bool, device=motion.device)
-    first_state: tuple[Tensor, ...] = (q, residual, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost), awake)
-    q = iterate(
+    first: tuple[Tensor, ...] = (rows, residual, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost), awake)
+    rows = iterate(
         step,
-        first_state,
+        first,
         num_steps=num_steps,
         change=(lambda _, new: torch.where(new[5] | at_rest(new[4]), 0.0, 1.0)) if tolerance > 0 else None,
         check_every=CHECK,
     ).value[0]
+    q = rows.mT.movedim(-3, 0).reshape(*shape, rank, 3)
     return q, orthonormality_defect(motion @ q[..., None, :, :]).sum(-1) / count
 
 
