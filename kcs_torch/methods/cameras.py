@@ -13,6 +13,10 @@ from kcs_torch.solvers.ist import ist, metric_upgrade
 __all__ = ["orthographic_cameras"]
 
 
+RUN = 8
+"""Clips whose starts are tried together: more would leave the processor's cache."""
+
+
 def orthographic_cameras(
     tracks: Tensor,
     rank: int | Literal["auto"] = "auto",
@@ -68,10 +72,12 @@ def orthographic_cameras(
         random = torch.randn(num_starts, 1, 3 * k, 3, generator=generator, dtype=torch.float64, device="cpu").to(motion)
         starts = torch.nn.functional.pad(relaxed, (0, 0, 0, 3 * k - relaxed.shape[-2]))
         starts = torch.cat([starts[None], random.expand(-1, windows, -1, -1)])
-        options = {"smoothness": smoothness, "apart": apart, "counts": counts}
-        q, defect = metric_upgrade(part, starts, tolerance=0, num_steps=12, **options)  # type: ignore[arg-type]
+        options = {"smoothness": smoothness, "apart": apart}
+        runs = zip(part.split(RUN), starts.split(RUN, 1), count.split(RUN), strict=True)
+        tried = [metric_upgrade(*two, tolerance=0, num_steps=12, counts=n, **options) for *two, n in runs]  # type: ignore
+        q, defect = (torch.cat(parts, 1) for parts in zip(*tried, strict=True))
         best = defect.topk(min(2, len(defect)), dim=0, largest=False).indices
-        q, defect = metric_upgrade(part, q[best, window], tolerance=1e-2, num_steps=60, **options)  # type: ignore[arg-type]
+        q, defect = metric_upgrade(part, q[best, window], tolerance=1e-2, num_steps=60, counts=count, **options)  # type: ignore[arg-type]
         cameras.append(rows_to_cameras(part @ q[:, :, None])[0])
         defects.append(defect)
     candidates, defect = torch.cat(cameras), torch.cat(defects)  # (C, W, T, 2, 3), (C, W)

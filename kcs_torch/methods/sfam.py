@@ -177,9 +177,8 @@ class SfAM(Method):
         if tracks.shape[1] > 1:
             parts = [[orthographic_cameras(part, self.rank) for part in one.split(SEARCH)] for one in tracks]
             return torch.stack([torch.cat(one) for one in parts])
-        sizes = [None] * len(tracks) if counts is None else counts[:, 0].split(CHUNK)
-        pieces = zip(tracks[:, 0].split(CHUNK), sizes, strict=False)
-        return torch.cat([orthographic_cameras(part, self.rank, apart=True, counts=n) for part, n in pieces])[:, None]
+        sizes = None if counts is None else counts[:, 0]
+        return orthographic_cameras(tracks[:, 0], self.rank, apart=True, counts=sizes)[:, None]
 
     def _smooth(self, tracks: Tensor) -> Tensor:
         """Tracks (T, N, 2) as sums of a few cosines."""
@@ -262,8 +261,8 @@ class SfAM(Method):
 
 
 SEARCH, CHUNK = 32, 8
-"""Windows of one clip whose cameras are searched together; and clips whose cameras are, or windows beyond the first
-ones that are solved together: more would leave the processor's cache."""
+"""Windows of one clip whose cameras are searched together; and windows beyond the first ones that are solved together:
+more would only take memory."""
 
 LEAD = 40
 """Windows of a clip that are solved first, together: they tell the lengths of its bones, which the others take."""

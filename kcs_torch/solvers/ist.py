@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -128,24 +130,23 @@ def metric_upgrade(
     stiff = torch.einsum("kl,...ij->...kilj", three, bending).reshape(*bending.shape[:-2], 1, 3 * rank, 3 * rank)
     tiny = torch.finfo(motion.dtype).tiny
 
-    # Unknowns are Q^T (..., S, 3, R), the starts S next to its rows: a product with any matrix is one for all starts.
+    # Unknowns are Q^T (B, S, 3, R), the starts S next to its rows: a product with any matrix is one for all starts.
     def times(rows: Tensor, matrix: Tensor) -> Tensor:
         return (rows.flatten(-3, -2) @ matrix).unflatten(-2, rows.shape[-3:-1])
 
-    def normalise(rows: Tensor) -> Tensor:
+    def normalise(rows: Tensor, gram: Tensor) -> Tensor:
         size = (rows * times(rows, gram)).sum((-2, -1))
         return rows / torch.where(size > 0, size, torch.ones_like(size)).sqrt()[..., None, None]
 
-    def evaluate(rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals (..., S, M) of the defect, and the cost (..., S)."""
+    def evaluate(rows: Tensor, forms: Tensor, bending: Tensor) -> tuple[Tensor, Tensor]:
+        """Residuals (B, S, M) of the defect, and the cost (B, S)."""
         residual = (rows.mT @ rows).flatten(-2) @ forms.flatten(-3, -2) / 2
         return residual, residual.square().sum(-1) + (rows * times(rows, bending)).sum((-2, -1))
 
-    def step(state: tuple[Tensor, ...], k: int) -> tuple[Tensor, ...]:
-        rows, residual, cost, damping, progress, resting = state
-        if tolerance > 0 and k and k % CHECK == 0:
-            resting = resting | at_rest(progress)
-        jacobian = times(rows, forms.flatten(-2)).unflatten(-1, (rank, -1)).flatten(-3, -2)  # (..., S, 3R, M)
+    def step(state: tuple[Tensor, ...], _: int) -> tuple[Tensor, ...]:
+        rows, residual, cost, damping, progress, *given = state
+        gram, forms, bending, stiff = given
+        jacobian = times(rows, forms.flatten(-2)).unflatten(-1, (rank, -1)).flatten(-3, -2)  # (B, S, 3R, M)
         normal = jacobian @ jacobian.mT
         normal += stiff
         gradient = (jacobian @ residual[..., None]).squeeze(-1) + times(rows, bending).flatten(-2)
@@ -158,45 +159,44 @@ def metric_upgrade(
         normal.diagonal(dim1=-2, dim2=-1).add_((damping * size + tiny)[..., None])
         factor, _ = torch.linalg.cholesky_ex(normal)
         move = torch.cholesky_solve(gradient[..., None], factor).squeeze(-1)
-        trial = normalise(rows - move.unflatten(-1, (3, rank)))
-        moved, new = evaluate(trial)
-        better = (new < cost) & ~resting[
-            ..., None
-        ]  # False for NaN, too: a failed factorisation only raises the damping
+        trial = normalise(rows - move.unflatten(-1, (3, rank)), gram)
+        moved, new = evaluate(trial, forms, bending)
+        better = new < cost  # False for NaN, too: a failed factorisation only raises the damping
         return (
             torch.where(better[..., None, None], trial, rows),
             torch.where(better[..., None], moved, residual),
             torch.where(better, new, cost),
             torch.where(better, damping / 4, damping * 3).clamp(1e-9, 1e6),
             progress / 2 + torch.where(better, 1 - new / cost, 0),  # halved, not zeroed, by a refused step
-            resting,
+            *given,
         )
 
-    def at_rest(progress: Tensor) -> Tensor:
-        """Which motions (...) have stopped."""
-        still = progress <= tolerance
-        return still.all(-1) if apart else still.all()
-
-    shape = broadcast_shapes(start.shape[:-2], motion.shape[:-3])
-    starts = shape[: len(shape) - (motion.ndim - 3)]
-    rows = start.expand(*shape, rank, 3).reshape(-1, *shape[len(starts) :], rank, 3).movedim(0, -3).mT.contiguous()
-    rows = normalise(rows)
-    residual, cost = evaluate(rows)
-    awake = torch.zeros(motion.shape[:-3], dtype=torch.bool, device=motion.device)
-    first: tuple[Tensor, ...] = (rows, residual, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost), awake)
-    rows = iterate(
-        step,
-        first,
-        num_steps=num_steps,
-        change=(lambda _, new: torch.where(new[5] | at_rest(new[4]), 0.0, 1.0)) if tolerance > 0 else None,
-        check_every=CHECK,
-    ).value[0]
-    q = rows.mT.movedim(-3, 0).reshape(*shape, rank, 3)
+    batch = motion.shape[:-3]
+    shape = broadcast_shapes(start.shape[:-2], batch)
+    starts = math.prod(shape[: len(shape) - len(batch)])
+    rows = start.expand(*shape, rank, 3).reshape(starts, -1, rank, 3).movedim(0, 1).mT.contiguous()
+    given = [
+        x.expand(*batch, *x.shape[-d:]).reshape(-1, *x.shape[-d:])
+        for x, d in ((gram, 2), (forms, 3), (bending, 2), (stiff, 3))
+    ]
+    rows = normalise(rows, given[0])
+    residual, cost = evaluate(rows, *given[1:3])
+    state = (rows, residual, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost), *given)
+    found, left = rows, torch.arange(len(rows), device=motion.device)
+    for made in range(0, num_steps, CHECK):
+        state = iterate(step, state, num_steps=min(CHECK, num_steps - made)).value
+        found = found.index_copy(0, left, state[0])
+        goes_on = (state[4] > tolerance).any(-1)
+        if not bool(goes_on.any()):
+            break
+        if apart and not bool(goes_on.all()):  # what has settled takes no more steps
+            state, left = tuple(x[goes_on] for x in state), left[goes_on]
+    q = found.mT.movedim(1, 0).reshape(*shape, rank, 3)
     return q, orthonormality_defect(motion @ q[..., None, :, :]).sum(-1) / count
 
 
 CHECK = 5
-"""Steps from one look at whether a clip rests to the next."""
+"""Steps from one look at whether motions have settled to the next."""
 
 
 def _quadratic_forms(a: Tensor, b: Tensor, evenness: float = 0.0) -> Tensor:
