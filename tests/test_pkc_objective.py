@@ -451,6 +451,19 @@ def test_runs_are_not_too_large(monkeypatch):
     assert sorted(i for run in runs for i in run) == [0, 1, 2] and len(runs) == 3
 
 
+def test_hypotheses_of_long_clips_are_refined_a_few_at_a_time(monkeypatch):
+    task = several()[-1]
+    whole = task.objective.minimise(task.depth, task.lengths, 12)
+    sizes = []
+    refine = Objective.refined
+    monkeypatch.setattr(Objective, "refined", lambda self, z, *rest: sizes.append(len(z)) or refine(self, z, *rest))
+    monkeypatch.setattr(module, "MOST", 2 * task.depth.shape[1])
+    found = task.objective.minimise(task.depth, task.lengths, 12)
+    assert max(sizes) <= 2 and sum(sizes) == len(task.depth)
+    assert_close(found.energy, whole.energy, rtol=1e-6, atol=1e-6)
+    assert_close(found.depth, whole.depth, rtol=0, atol=1e-5)
+
+
 def test_searches_in_lockstep():
     """Each search gets the answers to its own tasks, however many it asks for and however long it goes on."""
 

@@ -41,7 +41,7 @@ def lbfgs(
 
     Returns:
         The minimisers (H, D); whether all settled within ``num_steps``; where they were ``memory`` steps
-        earlier.
+        earlier; and their energies (H,).
 
     >>> goal = torch.tensor([[1.0, 2.0], [3.0, -1.0]], dtype=torch.float64)
     >>> lbfgs(lambda x: ((x - goal) ** 2).sum(-1), torch.zeros_like(goal)).value.round(decimals=4).tolist()
@@ -120,7 +120,7 @@ def lbfgs(
             rest, settled = torch.stack([resting.any(), resting.all()]).tolist()
             if settled:
                 break
-    return Solution(x, settled, made, x - history.travelled())
+    return Solution(x, settled, made, x - history.travelled(), value)
 
 
 class History:

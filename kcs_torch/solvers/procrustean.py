@@ -135,27 +135,43 @@ def procrustean(
     hypotheses, frames, joints, _ = points.shape
     rigid = bones if rigid is None else rigid
     stiff = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device).expand(len(rigid))
-    free = 3 if noise > 0 else 1
     share = tracks.new_ones(frames, joints) if weights is None else weights
-    value = moved = points.new_zeros(hypotheses)
+    zero = points.new_zeros(hypotheses)
+    pose = Pose(points, rotations, zero, zero)
     for stage in stages:
-        precision = _precision(points, tracks, share, noise)
-        levels = aligned_levels(points, rotations, bones, stage)
-        roots = whitening(
-            points, rotations, bones, levels, free, rigid, stiff, stage.slack, REACH, precision if noise > 0 else None
-        )
-        descent = Descent(
-            points, rotations, roots, bones, rigid, stiff, stage,
-            change=CHANGE, reach=REACH, tracks=tracks, weights=share, noise=noise, extra=extra,
-        )  # fmt: skip
-        start = points.new_zeros(hypotheses, frames * (free * joints + 3))
-        solution = lbfgs(descent, start, num_steps=stage.num_steps, first_step=1.0, tolerance=1e-8, slopes=True)
-        points, rotations = descent.moved(solution.value)
-        assert solution.before is not None
-        moved = (points - descent.moved(solution.before)[0]).square().sum(-1).mean((-2, -1)).sqrt()
-        rotations = nearest_rotation(rotations)  # rounding would add up
-        value = descent(solution.value)[0]
-    return Pose(points, rotations, value, moved)
+        pose = _descend(pose, tracks, bones, rigid, stiff, stage, share, noise, extra)
+    return pose
+
+
+def _descend(
+    pose: Pose,
+    tracks: Tensor,
+    bones: Tensor,
+    rigid: Tensor,
+    stiffness: Tensor,
+    stage: Stage,
+    weights: Tensor,
+    noise: float,
+    extra: Callable[[Tensor], Tensor] | None,
+) -> Pose:
+    """One stage, of which nothing large is left behind."""
+    points, rotations = pose.points, pose.rotations
+    levels = aligned_levels(points, rotations, bones, stage)
+    precision = _precision(points, tracks, weights, noise) if noise > 0 else None
+    roots = whitening(
+        points, rotations, bones, levels, 3 if noise > 0 else 1, rigid, stiffness, stage.slack, REACH, precision
+    )
+    del levels
+    descent = Descent(
+        points, rotations, roots, bones, rigid, stiffness, stage,
+        change=CHANGE, reach=REACH, tracks=tracks, weights=weights, noise=noise, extra=extra,
+    )  # fmt: skip
+    start = points.new_zeros(len(points), roots[0, ..., 0].numel())
+    solution = lbfgs(descent, start, num_steps=stage.num_steps, first_step=1.0, tolerance=1e-8, slopes=True)
+    assert solution.before is not None and solution.energy is not None
+    points, rotations = descent.moved(solution.value)
+    moved = (points - descent.moved(solution.before)[0]).square().sum(-1).mean((-2, -1)).sqrt()
+    return Pose(points, nearest_rotation(rotations), solution.energy, moved)  # rounding would add up
 
 
 def depth_deviation(
@@ -250,8 +266,6 @@ def align_rotations(points: Tensor, rotations: Tensor, bones: Tensor, *, num_ste
 
 def _precision(points: Tensor, tracks: Tensor, weights: Tensor, noise: float) -> Tensor:
     """Curvature (H, T, N) of :func:`track_energy`, its robust weights held."""
-    if noise <= 0:
-        return weights
     square = (points[..., :2] - tracks).square().sum(-1) / (REACH * noise) ** 2
     return weights / noise**2 / (1 + square)
 

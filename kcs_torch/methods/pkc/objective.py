@@ -29,6 +29,9 @@ SHORT = 0.001
 WALK = 4.3
 """Frames in which a walking person's bones change in the image by as much as they stray, at 30 frames a second."""
 
+MOST = 40_000
+"""Frames of a clip's hypotheses that are refined together: memory is for few of a very long clip."""
+
 
 @dataclass(frozen=True)
 class Weights:
@@ -228,7 +231,11 @@ class Objective:
         A start whose bones are far from constant is best refined with lengths ``loose`` times less certain first; the
         energies are then those of the loose objective.
         """
-        return self.refined(depth, lengths, num_steps, loose).sorted()
+        few = max(1, MOST // depth.shape[1])
+        parts = zip(depth.split(few), lengths.split(few), strict=True)
+        found = [self.refined(*part, num_steps, loose) for part in parts]
+        z, size, energy, moved, steps = zip(*found, strict=True)
+        return Refined(torch.cat(z), torch.cat(size), torch.cat(energy), torch.cat(moved), max(steps)).sorted()
 
     def refined(self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0) -> Refined:
         """As :meth:`minimise`, in the order of the hypotheses."""
@@ -239,11 +246,10 @@ class Objective:
         solution = lbfgs(Descent(goal, unknowns), start, num_steps=num_steps, tolerance=1e-5, slopes=True)
         with torch.no_grad():
             depth, lengths = unknowns(solution.value)
-            energy = goal(depth, lengths)
-            assert solution.before is not None
+            assert solution.before is not None and solution.energy is not None
             shift = (depth - unknowns(solution.before)[0]).square().sum((1, 2))
             moved = (shift / (self.count * depth.shape[-1])).sqrt()
-        return Refined(depth, lengths, energy, moved, solution.iterations)
+        return Refined(depth, lengths, solution.energy, moved, solution.iterations)
 
     @classmethod
     def joined(cls, parts: Sequence[Objective], counts: Sequence[int]) -> Objective:
