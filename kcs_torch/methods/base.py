@@ -21,59 +21,11 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ConvergenceWarning, KcsWarning, OptionError, ShapeError, unknown
-from kcs_torch.functional.align import centre
-from kcs_torch.functional.camera import viewpoint_turn
-from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.root import root_depth
-from kcs_torch.types import Diagnostics, Reconstruction, Tracks, as_floats
+from kcs_torch.methods.finish import LOOSE, WEAK_TURN, WHY_LOOSE, Estimate, finish, rms
+from kcs_torch.types import Reconstruction, Tracks, as_floats
 
-__all__ = ["Estimate", "Method"]
-
-WEAK_TURN = 30.0
-"""Degrees of viewpoint turn below which depth is weakly determined."""
-
-LOOSE = 5.0
-"""Per cent of bone variation from which on the tracks are hardly those of a body of this skeleton."""
-
-FAR_STEPS = 2
-"""How often joints are weighed anew by their distance, when the body is put in its place."""
-
-_WHY_LOOSE = (
-    "joints may be wrong, swapped or in another order, the skeleton may be another, parts of the body may bend, or the "
-    "camera may be so near that its intrinsics matter"
-)
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What a method finds, in normalised units: centred per frame, root mean square of the tracks 1.
-
-    Attributes:
-        points: (T, N, 3) in the camera frame.
-        cameras: (T, 2, 3) orthonormal rows.
-        scales: (T,) relative weak-perspective scale, mean 1.
-        converged: whether the stopping rule was met.
-        iterations: steps made.
-        notes: sentences for the user.
-        deviation: (T, N) standard deviation of depth, or None.
-        objective: value that ranks the solutions of one method on one clip, lower is better; NaN where it has none.
-        alternatives: further solutions, best first.
-        still: whether the camera may be taken to stand still, so that feet tell the root's depth.
-        doubt: why depth is little more than a guess, a sentence; empty where it is more. The user is warned.
-    """
-
-    points: Tensor
-    cameras: Tensor
-    scales: Tensor
-    converged: bool
-    iterations: int
-    notes: tuple[str, ...] = ()
-    deviation: Tensor | None = None
-    objective: float = math.nan
-    alternatives: tuple[Estimate, ...] = ()
-    still: bool = False
-    doubt: str = ""
+__all__ = ["WEAK_TURN", "Estimate", "Method"]
 
 
 @dataclass(frozen=True)
@@ -126,7 +78,7 @@ class Method(ABC):
         with torch.inference_mode(False), torch.no_grad(), _home([tracks]):
             inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
-            result = self._finish(tracks, found, size, known, time.perf_counter() - begin)
+            result = finish(self, tracks, found, size, known, time.perf_counter() - begin)
         self._warn(result, found.doubt)
         return result
 
@@ -172,7 +124,7 @@ class Method(ABC):
             found = self.solve_all([inner for inner, _, _ in parts])
             each = (time.perf_counter() - begin) / len(tracks)
             rows = zip(tracks, found, parts, strict=True)
-            return [(self._finish(one, x, size, known, each), x.doubt) for one, x, (_, size, known) in rows]
+            return [(finish(self, one, x, size, known, each), x.doubt) for one, x, (_, size, known) in rows]
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
         """Reconstruct normalised tracks of several clips; one by one unless a method knows better."""
@@ -183,7 +135,7 @@ class Method(ABC):
         # Means over the joints that happen to be seen would jump with every joint that comes and goes.
         filled = interpolate(tracks.points, tracks.seen)[:, tracks.seen.any(0)]
         middle = filled.mean(1, keepdim=True) if filled.numel() else tracks.points[:, :1] * 0
-        size = _rms((tracks.points - middle) * tracks.seen[..., None], tracks.weights)
+        size = rms((tracks.points - middle) * tracks.seen[..., None], tracks.weights)
         size = torch.where(size > 0, size, torch.ones_like(size))
         if not self.centred:
             middle = middle.mean(0)
@@ -197,7 +149,7 @@ class Method(ABC):
         if doubt:
             warnings.warn(f"{tracks.source}: {doubt}", KcsWarning, stacklevel=users_level())
         if not found.converged:
-            message = f"{tracks.source}: {self._unsettled(found.iterations)}"
+            message = f"{tracks.source}: {self.unsettled(found.iterations)}"
             warnings.warn(message, ConvergenceWarning, stacklevel=users_level())
         never = [tracks.skeleton.joints[n] for n in (tracks.weights == 0).all(0).nonzero().flatten().tolist()]
         if never:
@@ -208,74 +160,12 @@ class Method(ABC):
             )
 
         if found.bone_variation > LOOSE and self.keeps_lengths and found.converged:
-            message = f"{tracks.source}: bone lengths vary by {found.bone_variation:.1f} %: {_WHY_LOOSE}"
+            message = f"{tracks.source}: bone lengths vary by {found.bone_variation:.1f} %: {WHY_LOOSE}"
             warnings.warn(message, KcsWarning, stacklevel=users_level())
 
-    def _unsettled(self, steps: int) -> str:
+    def unsettled(self, steps: int) -> str:
+        """A sentence for those whose iteration stopped at its limit."""
         return f"{self.name} did not settle within {steps} steps"
-
-    def _finish(self, tracks: Tracks, found: Estimate, size: Tensor, known: Tensor, seconds: float) -> Reconstruction:
-        """An estimate in the tracks' units and place, with what there is to say about it."""
-        points = found.points * size
-        seen = points[..., :2] * found.scales[:, None, None]
-        shift = interpolate(_shift(tracks.points - seen, tracks.weights), known[:, None])
-        points, seen = points + torch.nn.functional.pad(shift, (0, 1)), seen + shift
-        body = tracks.skeleton
-        bones = bone_lengths(points, body.bone_index(device=points.device))
-        rigid = list(body.rigid)
-        mean = bones.mean(0)
-        one = torch.ones_like(bones)
-        ratio = torch.where(mean > 0, bones / torch.where(mean > 0, mean, one), one)
-        variation = (ratio - 1).square().mean(0).sqrt()
-        turn = float(viewpoint_turn(found.cameras))
-        notes = list(found.notes)
-        if turn < WEAK_TURN and not self.learned:
-            rest = "the skeleton's template and lengths" if body.template is not None else "constant lengths alone"
-            notes.append(f"the viewpoint turned by {turn:.0f} degrees only: depth rests on {rest}")
-        if found.doubt:
-            notes.append(found.doubt)
-        if not found.converged:
-            notes.append(self._unsettled(found.iterations))
-        percent = float(100 * variation[rigid].median()) if rigid else math.nan
-        if percent > LOOSE and self.keeps_lengths:
-            notes.append(f"bone lengths vary by more than {LOOSE:g} %: {_WHY_LOOSE}")
-        if not rigid:
-            kind = "no bones" if not body.num_bones else "no rigid bones"
-            notes.append(
-                f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown"
-            )
-        if tracks.fps is None and self.reckons_in_seconds:
-            notes.append("30 frames a second assumed: set the tracks' fps if it is another rate")
-        pointlike = not bool(_extent(tracks) > 0)
-        if pointlike:
-            notes.append("all joints lie at one point in every frame: there is no pose to find")
-        root = None
-        if found.still and not pointlike:
-            root, remark = root_depth(points, tracks)
-            notes.append(remark)
-        diagnostics = Diagnostics(
-            viewpoint_turn=turn,
-            unseen_share=tracks.unseen_share,
-            bone_variation=percent,
-            reprojection_rms=float(_rms(seen - tracks.points, tracks.seen.to(points.dtype))),
-            converged=found.converged,
-            iterations=found.iterations,
-            seconds=seconds,
-            notes=tuple(notes),
-        )
-        return Reconstruction(
-            points,
-            found.cameras,
-            found.scales,
-            bones.median(0).values,
-            tracks,
-            self.name,
-            diagnostics,
-            uncertainty=None if found.deviation is None else found.deviation * size,
-            objective=found.objective,
-            root_depth=root,
-            alternatives=tuple(self._finish(tracks, other, size, known, seconds) for other in found.alternatives),
-        )
 
     @classmethod
     def from_options(cls, **options: object) -> Method:
@@ -345,35 +235,3 @@ def _is_a(value: Any, hint: Any) -> bool:
             return False
         return not math.isnan(value)
     return isinstance(value, hint) if isinstance(hint, type) else True
-
-
-def _shift(residuals: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean over joints, (T, 1, D), joints that are far from it counting less; 0 where no joint is seen."""
-    middle = centre(residuals, weights)[1]
-    for _ in range(FAR_STEPS):
-        off = (residuals - middle).abs()
-        far = (off / off.amax().clamp_min(torch.finfo(off.dtype).tiny)).norm(dim=-1)  # no square overflows
-        usual = far[weights > 0].median() if bool((weights > 0).any()) else far.sum()
-        if not bool(usual > 0):
-            break
-        middle = centre(residuals, weights / (1 + (far / (3 * usual)).square()))[1]
-    return middle
-
-
-def _extent(tracks: Tracks) -> Tensor:
-    """How far seen joints lie apart, at most, in a frame; 0 where it is rounding."""
-    seen = tracks.seen[..., None]
-    far = torch.full_like(tracks.points, math.inf)
-    low = torch.where(seen, tracks.points, far).amin(1)
-    apart = torch.where(seen, tracks.points, -far).amax(1) - low
-    apart = torch.where(apart > 8 * torch.finfo(apart.dtype).eps * low.abs(), apart, torch.zeros_like(apart))
-    return apart.amax() if apart.numel() else apart.sum()
-
-
-def _rms(vectors: Tensor, weights: Tensor) -> Tensor:
-    """Weighted root mean square length of (..., D) vectors, scaled first, so that no square overflows."""
-    vectors = torch.where(weights[..., None] > 0, vectors, torch.zeros_like(vectors))
-    top = vectors.abs().amax()
-    top = torch.where(top > 0, top, torch.ones_like(top))
-    square = (vectors / top).square().sum(-1) * weights
-    return top * (square.sum() / weights.sum()).sqrt()
