@@ -80,14 +80,14 @@ def test_clips_that_fail_are_listed_and_stop_nobody(tmp_path):
 
 def test_a_clip_that_breaks_the_batch_is_found(clips, tmp_path, monkeypatch):
     """An error that no check foresaw costs one clip, and its traceback is kept."""
-    real = kt.KCS._steps
+    real = kt.KCS._template
 
-    def steps(self, tracks, cameras):
+    def template(self, tracks, cameras):
         if "clip2" in tracks.source:
             raise ZeroDivisionError("planted")
         return real(self, tracks, cameras)
 
-    monkeypatch.setattr(kt.KCS, "_steps", steps)
+    monkeypatch.setattr(kt.KCS, "_template", template)
     outcome = run(clips, tmp_path)
     assert outcome.done == 5 and outcome.failed[0][1] == "ZeroDivisionError: planted"
     assert "Traceback" in (tmp_path / "clip2.failed.txt").read_text()
