@@ -46,9 +46,12 @@ PARTS = {
 SYNTHETIC = ("walk", "walk, 15 mm noise", "tree")
 YAWS = (0.0, 45.0, 90.0, 135.0)
 # import_module, as the package's functions have the names of these modules
-BODY, FIXED, MOVING, OBJECTIVE = (
-    import_module(f"kcs_torch.methods.pkc.{name}") for name in ("body", "fixed_view", "moving_view", "objective")
+BODY, FIXED, MOVING, OBJECTIVE, DESCENT = (
+    import_module(f"kcs_torch.methods.pkc.{name}")
+    for name in ("body", "fixed_view", "moving_view", "objective", "descent")
 )
+WRITTEN_OUT = {"posture": "_posture", "hinges": "_hinges", "foreshortening": "_foreshortening", "proportions": "_sizes"}
+"""Terms of the objective, and the methods of its descent that hold them once more, gradients and all."""
 
 Clip = tuple[str, kt.Tracks, Tensor]
 Run = dict[str, Any]
@@ -87,13 +90,24 @@ def without(term: str, **costs: float) -> Variant:
 
         return kept
 
-    return Variant(changes=((OBJECTIVE.Objective, "terms", fewer), searched(lambda usual: replace(usual, **costs))))
+    nothing = constant(DESCENT.Descent, WRITTEN_OUT[term], lambda self, first, *_: first.new_zeros(len(first)))
+    signs = searched(lambda usual: replace(usual, **costs))
+    return Variant(changes=((OBJECTIVE.Objective, "terms", fewer), nothing, signs))
 
 
 def searched(change: Callable[[SignCosts], SignCosts]) -> Change:
     """Other costs in the search for limbs' lengths and signs, but not in that for the trunk, which shares them."""
     put = lambda value: change(value) if isinstance(value, SignCosts) else value  # noqa: E731
-    return FIXED, "limb_paths", lambda search: lambda *args, **more: search(*map(put, args), **more)
+    return FIXED, "placing", lambda make: lambda *args, **more: make(*map(put, args), **more)
+
+
+def first_alone(start: Callable[..., Any]) -> Callable[..., Any]:
+    """A search for starts that finds one."""
+
+    def search(*args: Any) -> Any:
+        return (yield from start(*args))[:1]
+
+    return search
 
 
 def constant(owner: Any, name: str, value: Any) -> Change:
@@ -111,7 +125,9 @@ EVERYTHING = "everything"
 FIXED_VARIANTS = {
     EVERYTHING: Variant(),
     "no cleaning of the tracks": Variant({"denoise": False}),
-    "noise of the image explained in full": Variant(changes=(constant(OBJECTIVE, "NOISE", 0.0),)),
+    "noise of the image explained in full": Variant(
+        changes=tuple(constant(owner, "NOISE", 0.0) for owner in (OBJECTIVE, DESCENT))
+    ),
     "no posture": without("posture", posture=INF),
     "no hinges": without("hinges", hinge=0.0),
     "no foreshortening": without("foreshortening", foreshortening=INF),
@@ -133,9 +149,7 @@ FIXED_VARIANTS = {
     ),
     "no discrete moves": Variant({"rounds": 0}),
     "no turn of the viewpoint asked for": Variant({"viewpoint": "fixed"}),
-    "one hypothesis, no moves": Variant(
-        {"rounds": 0}, ((FIXED._Search, "start", lambda start: lambda *args: start(*args)[:1]),)
-    ),
+    "one hypothesis, no moves": Variant({"rounds": 0}, ((FIXED._Search, "start", first_alone),)),
 }
 MOVING_VARIANTS = {
     EVERYTHING: Variant(),

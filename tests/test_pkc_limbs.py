@@ -1,15 +1,18 @@
 """Limbs: the chains of every skeleton, and lengths and signs of a limb that are known."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
-from numerics import CHAIN
+from numerics import CHAIN, count_operations
 from samples import walk_in_template_units
 from torch.testing import assert_close
 
 from kcs_torch.functional import bone_vectors
-from kcs_torch.methods.pkc.limbs import SignCosts, limb_paths, limbs_of, waves
+from kcs_torch.methods.pkc import placing as module
+from kcs_torch.methods.pkc.limbs import SignCosts, limbs_of, waves
+from kcs_torch.methods.pkc.placing import limb_paths, placing
 from kcs_torch.nn import PostureEnergy
 from kcs_torch.nn.lengths import free_bones
 from kcs_torch.nn.posture import trunk_joints
@@ -67,8 +70,12 @@ def walk(frames=60, dtype=torch.float64, **options):
     return vectors, posture, posture.frame(points)
 
 
-def solve(vectors, posture, frame, limbs, candidates, **options):
-    return limb_paths(
+def solve(*given, **options):
+    return limb_paths([task(*given, **options)])[0]
+
+
+def task(vectors, posture, frame, limbs, candidates, **options):
+    return placing(
         vectors[..., :2], limbs, frame if frame.ndim == 4 else frame[None], posture, free_bones(MAN), SignCosts(),
         noise=torch.zeros_like(vectors[..., 0]), candidates=candidates, **options,
     )  # fmt: skip
@@ -114,6 +121,30 @@ def test_together_as_one_by_one():
         assert torch.equal(one.lengths[0], together.lengths[j]) and torch.equal(one.depths[0], together.depths[j])
 
 
+@pytest.mark.parametrize("most", [1, 60_000, 10**9])
+def test_clips_and_limbs_together_as_alone(most, monkeypatch):
+    """Clips of two lengths, limbs of one bone and of two, with their own weights, in parts however small."""
+    tasks, alone = [], []
+    for frames, yaw in ((30, 0.0), (30, 50.0), (21, 90.0)):
+        vectors, posture, frame = walk(frames, yaw=yaw)
+        for limbs in (ARMS_LEGS, [limb for limb in LIMBS if limb.inner is None]):
+            made = task(vectors, posture, frame, limbs, known(vectors, limbs) * torch.tensor([1.0, 1.1])[:, None])
+            tasks.append(replace(made, costs=made.costs * (1 + yaw / 90)))
+            tasks[-1].costs[:, 1] = made.costs[:, 1]  # the cap
+            alone += limb_paths(tasks[-1:])
+    monkeypatch.setattr(module, "TOGETHER", most)
+    for found, one in zip(limb_paths(tasks), alone, strict=True):
+        assert torch.equal(found.lengths, one.lengths) and torch.equal(found.depths, one.depths)
+
+
+def test_more_limbs_take_no_more_operations():
+    vectors, posture, frame = walk(20)
+    grid = known(vectors, ARMS_LEGS) * torch.tensor([1.0, 1.1])[:, None]
+    few, many = (task(vectors, posture, frame, ARMS_LEGS[:n], grid[:n]) for n in (1, 4))
+    counts = [count_operations(lambda t=tasks: limb_paths(t)).total for tasks in ([few], [many], [many] * 5)]
+    assert max(counts) < min(counts) + 40  # those that join and cut
+
+
 def test_long_clips_in_windows():
     vectors, posture, frame = walk(450)
     found = solve(vectors, posture, frame, ARMS_LEGS, known(vectors, ARMS_LEGS))
@@ -144,10 +175,11 @@ def test_entry_hinges_see_the_bone_before():
     rest = bone_vectors(posture.rest, posture.bones).expand(10, -1, 3)
     grid = torch.stack([posture.rest_lengths[list(limb.bones)] for limb in feet])[:, None]
     near = [rest[:, limb.before] / posture.rest_lengths[limb.before] for limb in feet]
-    found = limb_paths(
+    found = placing(
         rest[..., :2], feet, torch.eye(3).double().expand(1, 10, 3, 3), posture, free_bones(body), SignCosts(),
         noise=torch.zeros_like(rest[..., 0]), candidates=grid, before=near,
     )  # fmt: skip
+    (found,) = limb_paths([found])
     true = torch.stack([rest[..., 2][:, list(limb.bones)] for limb in feet])
     assert_close(found.depths, true, rtol=0, atol=1e-5)
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcs_torch.methods.pkc.moving_view import Descent, descend_all
 from kcs_torch.methods.pkc.objective import Objective, Refined
+from kcs_torch.methods.pkc.placing import Placing, limb_paths
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.types import Tracks
 
@@ -40,10 +41,14 @@ TOGETHER = 1200
 """Frames of hypotheses that are refined as one batch; more would only fall out of the processor's cache."""
 
 
-def serve(requests: Sequence[Task | Descent | Tracks]) -> list[Any]:
-    """Answer what searches of several clips ask for: hypotheses refined, starts descended from, SfAM's solutions."""
+def serve(requests: Sequence[Task | Placing | Descent | Tracks]) -> list[Any]:
+    """Answer what searches of several clips ask for.
+
+    Hypotheses are refined, limbs placed, starts descended from, and tracks solved by SfAM.
+    """
     answers: dict[type, Callable[[list[Any]], list[Any]]] = {
         Task: minimise_all,
+        Placing: limb_paths,
         Descent: descend_all,
         Tracks: SfAM().solve_all,
     }

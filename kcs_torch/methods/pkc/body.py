@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,9 +13,8 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.lockstep import Search, together
-from kcs_torch.methods.pkc.batch import Task
 from kcs_torch.methods.pkc.fixed_view import Hypotheses, refined, searching
-from kcs_torch.methods.pkc.objective import Objective, Refined, Weights, at_pace, bone_noise, pace_of
+from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, bone_noise, pace_of
 from kcs_torch.methods.pkc.trunk import image_scale
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
@@ -59,7 +59,7 @@ class Body:
         """The trunk's rotations (T, 3, 3), template to camera, of depths (T, N)."""
         return nearest_rotation(self.objective.posture.frame(torch.cat([self.image, depth[..., None]], -1)))
 
-    def rank(self, depth: Tensor, steps: int) -> Search[Task, Refined, Hypotheses]:
+    def rank(self, depth: Tensor, steps: int) -> Search[Any, Any, Hypotheses]:
         """Depths (H, T, N) from elsewhere, refined on the objective, best first."""
         points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
         lengths = bone_lengths(points, self.objective.bones).median(1).values
@@ -67,7 +67,7 @@ class Body:
         lengths = torch.where(lengths > 1e-3 * usual, lengths, usual)
         return (yield from refined(self.objective, Hypotheses(depth, lengths, depth.new_zeros(len(depth))), steps))
 
-    def search(self, rounds: int, steps: int) -> Search[Task, Refined, Hypotheses]:
+    def search(self, rounds: int, steps: int) -> Search[Any, Any, Hypotheses]:
         """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best."""
         stride = max(1, round(self.rate / 30)) if self.rate >= FAST else 1
         image = self.image[::stride]
@@ -95,7 +95,7 @@ class Body:
             found = yield from self._on_all_frames(found[:4], stride, steps)
         return found
 
-    def _on_all_frames(self, found: Hypotheses, stride: int, steps: int) -> Search[Task, Refined, Hypotheses]:
+    def _on_all_frames(self, found: Hypotheses, stride: int, steps: int) -> Search[Any, Any, Hypotheses]:
         """Hypotheses of every ``stride``-th frame on all frames, refined."""
         frames = len(self.image)
         known = torch.zeros(frames, 1, dtype=torch.bool, device=self.image.device)

@@ -161,34 +161,33 @@ class Descent:
         up = square * down
         frame = torch.stack([first, up, torch.linalg.cross(first, up, dim=1)], 1).flatten(2)  # (H, 3, 3 T)
         turn = (self.axes @ frame).view(count, 3, 3, 1, frames)  # [k, j]: how much of coordinate j is in direction k
-        # Bones seen from the trunk, v, and a row that is 1 in real frames: their products with each other tell mean and
-        # scatter of y = v / (length spread) - mean.
+        # How bones stray from their usual directions, seen from the trunk, and a row that is 1 in real frames: the
+        # products of these with each other tell mean and scatter.
+        scale = (lengths[:, None] * self.spread).reciprocal_().flatten(1)[..., None]  # (H, 3B, 1)
         seen = dz.new_empty(count, 3 * bones + 1, frames)
         seen[:, -1] = 1 if self.time is None else self.time[:, 0]
         own = dz if self.time is None else dz * self.time
         y = seen[:, :-1].view(count, 3, bones, frames)
         torch.mul(turn[:, :, 0], self.x[:, None], out=y)
         y.addcmul_(turn[:, :, 1], self.y[:, None]).addcmul_(turn[:, :, 2], own[:, None])
+        seen[:, :-1].mul_(scale).addcmul_(self.mean, seen[:, -1:], value=-1)
         total = torch.bmm(seen, seen.mT)  # (H, 3B + 1, 3B + 1)
         each = 1 / wide(self.weights.posture, 2)  # what a frame counts
         amount = wide(obj.count, 2) * each
         near = amount / (amount + posture.kappa)
-        scale = (lengths[:, None] * self.spread).reciprocal_().flatten(1)[..., None]  # (H, 3B, 1)
-        middle = total[:, :-1, -1:] / wide(obj.count, 2)
-        scatter = torch.baddbmm(total[:, :-1, :-1], middle, total[:, -1:, :-1], alpha=-1)
-        scatter.mul_(scale * (each / posture.strength)).mul_(scale.mT)
-        mean = scale * middle - self.mean
-        scatter.baddbmm_(mean * (amount * (1 - near) / posture.strength), mean.mT)
+        mean = total[:, :-1, -1:] / wide(obj.count, 2)
+        scatter = total[:, :-1, :-1] * (each / posture.strength)
+        scatter.baddbmm_(mean * (-amount * near / posture.strength), mean.mT)
         scatter.diagonal(dim1=-2, dim2=-1).add_(1)
         factor, _ = torch.linalg.cholesky_ex(scatter)
         inverse = torch.cholesky_inverse(factor)
         gain = (amount + posture.strength) / posture.strength
-        towards = inverse @ torch.cat([mean, near * mean + self.mean], -1)  # (H, 3B, 2)
+        towards = inverse @ mean  # (H, 3B, 1)
         # The sums over time of slope times y, and of the slope, are those of small matrices.
         moved = posture.strength * (1 - inverse.diagonal(dim1=-2, dim2=-1)[..., None])
-        pulled = posture.kappa * near * towards[..., :1] * self.mean
+        pulled = posture.kappa * near * towards * self.mean
         growth -= (gain * (moved + pulled)).view(count, 3, bones).sum(1)
-        steep = torch.cat([inverse * scale.mT, -towards[..., 1:]], -1).mul_(gain * each * scale) @ seen
+        steep = torch.cat([inverse, -near * towards], -1).mul_(gain * each * scale) @ seen
         steep = steep.view(count, 3, bones, frames)
         slope += (steep * turn[:, :, 2]).sum(1)
         turned = [(steep * v[:, None]).sum(2) for v in (self.x, self.y, own)]  # (H, 3, T): of k, for each j

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,9 +13,10 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.lockstep import Search, run
-from kcs_torch.methods.pkc.batch import Task, minimise_all
-from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limb_paths, limbs_of, waves
-from kcs_torch.methods.pkc.objective import Objective, Refined, Weights, at_pace, pace_of
+from kcs_torch.methods.pkc.batch import Task, serve
+from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limbs_of, waves
+from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, pace_of
+from kcs_torch.methods.pkc.placing import placing
 from kcs_torch.methods.pkc.trunk import TURN, Trunk, longest_image, siblings, trunk_misfit, trunk_path, trunk_turns
 from kcs_torch.nn.lengths import free_bones
 from kcs_torch.skeleton import Skeleton
@@ -123,7 +125,7 @@ def fixed_view(
     """
     noise = torch.zeros_like(image[..., 0]) if noise is None else noise
     search = searching(skeleton, image, rate, noise, rounds, steps, anchor, weights or Weights())
-    return run(search, minimise_all)
+    return run(search, serve)
 
 
 def searching(
@@ -135,7 +137,7 @@ def searching(
     steps: int,
     anchor: Tensor | None = None,
     weights: Weights = Weights(),  # noqa: B008 (frozen)
-) -> Search[Task, Refined, Hypotheses]:
+) -> Search[Any, Any, Hypotheses]:
     """:func:`fixed_view` as a search, which may run beside others; arguments as there."""
     slow = 30.0 / rate
     pace = pace_of(image, skeleton, rate)
@@ -150,18 +152,18 @@ def searching(
     )
     image = image - image.mean(-2, keepdim=True)
     search = _Search(skeleton, image, Objective(skeleton, image, weights, noise, anchor), costs, TURN * slow)
-    found = yield from search.refine(search.start(anchor), steps, LOOSE)
+    first = yield from search.start(anchor)
+    found = yield from search.refine(first, steps, LOOSE)
     for _ in range(rounds):
         best = found.energy[0]
-        found = yield from search.refine(search.moves(found), steps)
+        moved = yield from search.moves(found)
+        found = yield from search.refine(moved, steps)
         if not bool(found.energy[0] < best - 0.5):
             break
     return found
 
 
-def refined(
-    objective: Objective, found: Hypotheses, steps: int, loose: float = 1.0
-) -> Search[Task, Refined, Hypotheses]:
+def refined(objective: Objective, found: Hypotheses, steps: int, loose: float = 1.0) -> Search[Any, Any, Hypotheses]:
     """Hypotheses refined on the objective, best first."""
     (new,) = yield [Task(objective, found.depth, found.lengths, steps, loose)]
     return Hypotheses(new.depth, new.lengths, new.energy, found.steps + new.steps, new.moved)
@@ -179,22 +181,23 @@ class _Search:
     def limbs(self) -> list[Limb]:
         return limbs_of(self.skeleton, self.objective.posture.trunk.tolist())
 
-    def start(self, anchor: Tensor | None) -> Hypotheses:
+    def start(self, anchor: Tensor | None) -> Search[Any, Any, Hypotheses]:
         """Hypotheses from both templates of the trunk."""
         made: list[tuple[Tensor, Tensor]] = []
         for trunk in self._trunks(anchor):
             first = trunk_path(self.image, trunk, self.objective.posture, self.costs.posture, self.turn)
             tried: list[Tensor] = []
-            for path in (*self._settled(first, trunk, anchor), first):
+            settled = yield from self._settled(first, trunk, anchor)
+            for path in (*settled, first):
                 if not any(bool((path - other).abs().amax() < 1e-6) for other in tried):
                     tried.append(path)
-            made += self._places(tried[:1], trunk, anchor)
+            made += yield from self._places(tried[:1], trunk, anchor)
             if tried[1:]:  # the first path's lengths serve all
-                made += self._places(tried[1:], trunk, made[-1][1])
+                made += yield from self._places(tried[1:], trunk, made[-1][1])
         z, length = (torch.stack(part) for part in zip(*made, strict=True))
         return Hypotheses(z, length, z.new_full((len(z),), torch.inf))
 
-    def refine(self, found: Hypotheses, steps: int, loose: float = 1.0) -> Search[Task, Refined, Hypotheses]:
+    def refine(self, found: Hypotheses, steps: int, loose: float = 1.0) -> Search[Any, Any, Hypotheses]:
         """All a little, with loose lengths first where the start is rough, then the best few that differ."""
         few = max(steps // 3, 1)
         if loose > 1:
@@ -203,14 +206,15 @@ class _Search:
         found = yield from refined(self.objective, found, few)
         return (yield from refined(self.objective, distinct(found, BEST, ALIKE), steps))
 
-    def moves(self, found: Hypotheses) -> Hypotheses:
+    def moves(self, found: Hypotheses) -> Search[Any, Any, Hypotheses]:
         """The best, the next ones, and what discrete moves make of the best."""
         z, length = found.depth[0], found.lengths[0]
         points = torch.cat([self.image, z[..., None]], -1)
         trunk = Trunk(self.objective.posture.rest, length)
-        path, *others = self._settled(self.objective.posture.frame(points), trunk, length)
-        near, *turned = self._places([path, *others], trunk, length, [z, *[None] * len(others)])
-        new = [near, *self._places([path], trunk, None, [z]), *turned]
+        path, *others = yield from self._settled(self.objective.posture.frame(points), trunk, length)
+        near, *turned = yield from self._places([path, *others], trunk, length, [z, *[None] * len(others)])
+        again = yield from self._places([path], trunk, None, [z])
+        new = [near, *again, *turned]
         flips = torch.stack(self._flips(z) or [z])
         with torch.no_grad():
             order = self.objective(flips, length.expand(len(flips), -1)).argsort()[:FLIPS]
@@ -237,14 +241,14 @@ class _Search:
             out.append(Trunk(rest, length))
         return out
 
-    def _settled(self, path: Tensor, trunk: Trunk, lengths: Tensor | None) -> Tensor:
+    def _settled(self, path: Tensor, trunk: Trunk, lengths: Tensor | None) -> Search[Any, Any, Tensor]:
         """The path (T, 3, 3), mirrored where the limbs vote for it, and its siblings: (4, T, 3, 3)."""
         axes = self.objective.posture.axes
         paths = siblings(path, axes)[:2]
-        choice = self._settle(paths, trunk, lengths)
+        choice = yield from self._settle(paths, trunk, lengths)
         return siblings(paths[choice, torch.arange(len(path), device=path.device)], axes)
 
-    def _settle(self, paths: Tensor, trunk: Trunk, lengths: Tensor | None) -> Tensor:
+    def _settle(self, paths: Tensor, trunk: Trunk, lengths: Tensor | None) -> Search[Any, Any, Tensor]:
         """Which of several trunk paths each frame takes by the limbs' votes, (T,)."""
         posture, free = self.objective.posture, free_bones(self.skeleton)
         flat = bone_vectors(self.image, posture.bones)
@@ -253,18 +257,11 @@ class _Search:
         if not limbs:
             return torch.zeros(len(self.image), dtype=torch.long, device=self.image.device)
         candidates = self._candidates(flat, limbs, COARSE if lengths is None else lengths)
-        found = limb_paths(
-            flat,
-            limbs,
-            paths,
-            posture,
-            free,
-            self.costs,
-            self.objective.noise,
-            candidates=candidates,
-            transition=moves,
-            margins=True,
-        )
+        task = placing(
+            flat, limbs, paths, posture, free, self.costs, self.objective.noise,
+            candidates=candidates, transition=moves, margins=True,
+        )  # fmt: skip
+        (found,) = yield [task]
         assert found.margins is not None
         votes = (found.margins - found.margins.amin(-1, keepdim=True)).clamp_max(20).sum(0)
         off = trunk_misfit(self.image, trunk, posture.trunk, paths).mT / self.costs.posture
@@ -272,7 +269,7 @@ class _Search:
 
     def _places(
         self, paths: Sequence[Tensor], trunk: Trunk, lengths: Tensor | None, keep: Sequence[Tensor | None] = ()
-    ) -> list[tuple[Tensor, Tensor]]:
+    ) -> Search[Any, Any, list[tuple[Tensor, Tensor]]]:
         """Depths (T, N), lengths (B,) of bodies whose trunks follow paths, or keep the depths that ``keep`` has."""
         posture, free = self.objective.posture, free_bones(self.skeleton)
         flat, rest = bone_vectors(self.image, posture.bones), bone_vectors(trunk.rest, posture.bones)
@@ -290,10 +287,11 @@ class _Search:
                 for limb in wave
             ]
             turned = torch.stack([path for path in paths for _ in wave])[:, None]
-            found = limb_paths(
+            task = placing(
                 flat, wave * len(paths), turned, posture, free, self.costs, self.objective.noise,
                 candidates=candidates.repeat(len(paths), 1, 1), before=near,
             )  # fmt: skip
+            (found,) = yield [task]
             parts = iter(zip(found.depths, found.lengths, strict=True))
             for dz, length in zip(depths, sizes, strict=True):
                 for limb in wave:

@@ -1,0 +1,300 @@
+"""Lengths and signs of depth of limbs whose trunk is known, by dynamic programming, of many limbs and clips at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.temporal import window_starts
+from kcs_torch.methods.pkc.limbs import Limb, SignCosts
+from kcs_torch.nn.lengths import foreshortening
+from kcs_torch.nn.posture import PostureEnergy
+from kcs_torch.skeleton import Hinge
+from kcs_torch.solvers.signs import sign_costs, smooth_signs
+
+__all__ = ["LimbPaths", "Placing", "limb_paths", "placing"]
+
+WINDOW, OVERLAP = 200, 40
+"""Frames whose signs are found together, and by how many neighbouring windows overlap."""
+
+SAMPLE = 4
+"""Windows from which the lengths of a long clip's bones are chosen."""
+
+TOGETHER = 60_000
+"""Costs that are made together, and signs' problems times frames: more would only fall out of the processor's cache."""
+
+
+class LimbPaths(NamedTuple):
+    """Lengths and signs of J limbs.
+
+    Attributes:
+        lengths: (J, M).
+        depths: (J, T, M), signed.
+        margins: (J, T, C), or None.
+    """
+
+    lengths: Tensor
+    depths: Tensor
+    margins: Tensor | None
+
+
+@dataclass(frozen=True)
+class Placing:
+    """J limbs of M bones, of one clip or several, whose lengths and signs are to be found; see :func:`placing`.
+
+    Attributes:
+        image: (J, T, M, 2).
+        noise: (J, T, M).
+        rotations: (J, C, T, 3, 3).
+        candidates: (J, K, M).
+        usual: (J, M) lengths.
+        mean: (J, M, 3) usual directions.
+        weight: (J, M, 3) of what strays from them.
+        free: (J, M).
+        costs: (J, 8), as the fields of :class:`SignCosts`.
+        inner: (J, 5) the hinges' axes, signs and firmness; None for limbs of one bone.
+        entry: (J, 5) those of the hinges to the bones before, firmness 0 where there is none.
+        before: (J, T, 3) directions of the bones before.
+        transition: (J, T - 1, C, C), or None.
+        cap: as of :class:`SignCosts`, one for all.
+        margins: whether they are wanted.
+    """
+
+    image: Tensor
+    noise: Tensor
+    rotations: Tensor
+    candidates: Tensor
+    usual: Tensor
+    mean: Tensor
+    weight: Tensor
+    free: Tensor
+    costs: Tensor
+    inner: Tensor | None
+    entry: Tensor
+    before: Tensor
+    transition: Tensor | None
+    cap: float
+    margins: bool
+
+    @property
+    def kind(self) -> object:
+        """What those share that are placed together."""
+        shapes = self.rotations.shape[1:3], self.candidates.shape[1:], self.transition is None, self.margins, self.cap
+        return *shapes, self.image.dtype, self.image.device
+
+    def __getitem__(self, part: slice) -> Placing:
+        """Some of the limbs."""
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        some: dict[str, Any] = {name: value[part] for name, value in values.items() if isinstance(value, Tensor)}
+        return replace(self, **some)
+
+
+def placing(
+    image: Tensor,
+    limbs: Sequence[Limb],
+    rotations: Tensor,
+    posture: PostureEnergy,
+    free: Tensor,
+    costs: SignCosts,
+    noise: Tensor,
+    *,
+    candidates: Tensor,
+    transition: Tensor | None = None,
+    before: Sequence[Tensor | None] | None = None,
+    margins: bool = False,
+) -> Placing:
+    """Limbs whose lengths are to be chosen among candidates, and their signs of depth, given paths of the trunk.
+
+    Args:
+        image: bones' images (T, B, 2), in units of the lengths.
+        limbs: J limbs of M bones each.
+        rotations: (C, T, 3, 3) of the trunk, or (J, C, T, 3, 3) of the trunk that each limb belongs to.
+        posture: mean directions and spreads.
+        free: (B,) 1 for bones that point anywhere.
+        costs: weights.
+        noise: (T, B) standard deviation of bones' images.
+        candidates: lengths (J, K, M) to choose from.
+        transition: (T - 1, C, C) cost of going from one trunk path to the other.
+        before: (T, 3) direction of the bone before each limb, or None.
+        margins: True also wants to know how much dearer the clip is if a frame takes the other trunk path.
+    """
+    count, frames = len(limbs), len(image)
+    chains = torch.tensor([limb.bones for limb in limbs], device=image.device)  # (J, M)
+    before = [None] * count if before is None else before
+    none = image.new_zeros(frames, 3)
+    axes = torch.stack([_facts(limb.inner, posture) for limb in limbs])
+    known = [limb.entry if near is not None else None for limb, near in zip(limbs, before, strict=True)]
+    each = rotations if rotations.ndim == 5 else rotations.expand(count, *rotations.shape)
+    return Placing(
+        image=image[:, chains].movedim(0, 1),
+        noise=noise[:, chains].movedim(0, 1),
+        rotations=each,
+        candidates=candidates,
+        usual=posture.rest_lengths.to(image)[chains],
+        mean=posture.mean.to(image)[chains],
+        weight=posture.deviation.to(image).square().reciprocal()[chains],
+        free=free.to(image)[chains],
+        costs=image.new_tensor(astuple(costs)).expand(count, -1),
+        inner=axes.to(image) if limbs[0].inner is not None else None,
+        entry=torch.stack([_facts(hinge, posture) for hinge in known]).to(image),
+        before=torch.stack([none if near is None else near for near in before]),
+        transition=None if transition is None else transition.expand(count, *transition.shape),
+        cap=costs.cap,
+        margins=margins,
+    )
+
+
+def limb_paths(tasks: Sequence[Placing]) -> list[LimbPaths]:
+    """Place the limbs of all tasks; those of one kind together."""
+    groups: dict[object, list[int]] = {}
+    for i, task in enumerate(tasks):
+        groups.setdefault(task.kind, []).append(i)
+    out: dict[int, LimbPaths] = {}
+    for group in groups.values():
+        joined = _joined([tasks[i] for i in group])
+        few = max(1, TOGETHER // (joined.candidates.shape[1] * joined.image.shape[1]))
+        parts = [_place(joined[first : first + few]) for first in range(0, len(joined.image), few)]
+        found = [None if column[0] is None else torch.cat(column) for column in zip(*parts, strict=True)]
+        counts = [len(tasks[i].image) for i in group]
+        split = [[None] * len(group) if column is None else column.split(counts) for column in found]
+        out |= {i: LimbPaths(*row) for i, row in zip(group, zip(*split, strict=True), strict=True)}
+    return [out[i] for i in range(len(tasks))]
+
+
+def _joined(tasks: list[Placing]) -> Placing:
+    if len(tasks) == 1:
+        return tasks[0]
+    each: dict[str, Any] = {f.name: [getattr(task, f.name) for task in tasks] for f in fields(Placing)}
+    whole: dict[str, Any] = {n: torch.cat(x) for n, x in each.items() if isinstance(x[0], Tensor)}
+    return replace(tasks[0], **whole)
+
+
+def _place(task: Placing) -> LimbPaths:
+    count, frames, _ = task.noise.shape
+    tried, poses = task.candidates.shape[1], task.rotations.shape[1]
+    size = min(WINDOW, frames)
+    starts = window_starts(frames, size, min(OVERLAP, size - 1))
+    field = dict(zip((f.name for f in fields(SignCosts)), task.costs.unbind(1), strict=True))  # (J,) each
+
+    def problems(lengths: Tensor, begin: list[int]) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+        """W windows of J limbs of K lengths: window w of length k of limb j is problem (j K + k) W + w."""
+        few = max(1, TOGETHER // (lengths.shape[1] * frames * poses * 2 ** lengths.shape[2]))
+        parts = [_unary(task[i : i + few], lengths[i : i + few]) for i in range(0, count, few)]
+        unary, depth = (torch.cat([part[k] for part in parts], -2).flatten(-2) for k in (0, 1))  # (T, ..., J K)
+        at = torch.tensor(begin, device=unary.device) + torch.arange(size, device=unary.device)[:, None]  # (T_w, W)
+
+        def cut(values: Tensor) -> Tensor:
+            """(T, ..., J K) as (J K W, T_w, ...), in memory with the problems last."""
+            return values[at].movedim(1, -1).flatten(-2).movedim(-1, 0)
+
+        moves = None
+        if task.transition is not None:
+            moves = task.transition.float()[:, None, at[:-1].mT].expand(-1, lengths.shape[1], *[-1] * 4).flatten(0, 2)
+        pace = field["acceleration"].repeat_interleave(lengths.shape[1])
+        # Single precision is plenty to compare costs, and twice as fast.
+        return cut(unary.float()), cut((depth / pace).float()), moves, depth
+
+    prior = 0.5 * ((task.candidates / task.usual[:, None]).log() / field["proportions"][:, None, None]).square().sum(-1)
+    best = torch.zeros(count, dtype=torch.long, device=prior.device)
+    if tried > 1:
+        sample = starts
+        if len(starts) > SAMPLE:
+            sample = [starts[round(i * (len(starts) - 1) / (SAMPLE - 1))] for i in range(SAMPLE)]
+        unary, deep, moves, _ = problems(task.candidates, sample)
+        cost = sign_costs(unary, deep, cap=task.cap, transition=moves).view(count, tried, -1).sum(-1)
+        best = (cost * (len(starts) / len(sample)) + prior).argmin(-1)
+    lengths = task.candidates[torch.arange(count, device=best.device), best]  # (J, M)
+    unary, deep, moves, depth = problems(lengths[:, None], starts)
+    path = smooth_signs(unary, deep, cap=task.cap, transition=moves, margins=task.margins)
+    depth = depth.movedim(-1, 0)  # (J, T, M)
+    signs = torch.empty_like(depth)
+    windows = path.signs.unflatten(0, (count, len(starts)))
+    spread = depth.new_empty(count, frames, poses) if task.margins else None
+    for i, begin in enumerate(starts):
+        first = 0 if i == 0 else (starts[i - 1] + size - begin) // 2
+        signs[:, begin + first : begin + size] = windows[:, i, first:]
+        if spread is not None and path.margins is not None:
+            part = path.margins.unflatten(0, (count, len(starts)))[:, i, first:]
+            spread[:, begin + first : begin + size] = part.amin(-1)
+    return LimbPaths(lengths, signs * depth, spread)
+
+
+def _unary(task: Placing, lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Costs (T, C, 2^M, J, K) of each frame's signs, and the depths |dz| (T, M, J, K), of lengths (J, K, M)."""
+    # each weight (J, 1, 1, 1)
+    cost = dict(zip((f.name for f in fields(SignCosts)), task.costs[..., None, None, None].unbind(1), strict=True))
+    size = lengths.mT[:, None]  # (J, 1, M, K)
+    square = size.square() - task.image.square().sum(-1)[..., None]  # (J, T, M, K)
+    depth = square.clamp_min(0).sqrt()
+    over = (-square).clamp_min_(0) / (2 * size)
+    each = (over.square_() / (cost["over"].square() + task.noise.square()[..., None])).clamp_max_(20) / 2
+    density = foreshortening(depth, size, 0.1) - 2 * task.usual.log()[:, None, :, None]
+    base = (each + task.free[:, None, :, None] / cost["foreshortening"] * density).sum(2)  # (J, T, K)
+    over_size = 1 / size
+    deep = depth * over_size
+    # Seen from the trunk a direction is a/L + s b z/L, with the image's part a = R_xy^T (x, y) and b = R_z. Its squared
+    # distance from the mean, in deviations, takes sums over the three coordinates that no length changes.
+    turned = task.rotations.movedim(1, 2)  # (J, T, C, 3, 3)
+    across = task.image[:, :, None] @ turned[..., :2, :]  # (J, T, C, M, 3)
+    along = turned[..., 2:, :]  # (J, T, C, 1, 3)
+    mean, weight = task.mean[:, None, None], task.weight[:, None, None]
+    pull = across * weight
+    still = (pull * across).sum(-1) @ over_size.square() - 2 * ((pull * mean).sum(-1) @ over_size)  # (J, T, C, K)
+    still = still + (mean.square() * weight).sum((-2, -1))[..., None]
+    still = still + (along.square() * weight).sum(-1) @ deep.square()
+    swing = (pull * along).sum(-1)[..., None] * over_size[:, None] - (mean * along * weight).sum(-1)[..., None]
+    fit = _signed((2 * swing * deep[:, :, None]).unbind(3))
+    unary = base[:, :, None, None] + (still[..., None, :] + fit) / (2 * cost["posture"][..., None])
+    if task.inner is not None:
+        lateral = _lateral(turned, task.inner)
+        level, tip, root = _triple_parts(task.image[:, :, None, 0], task.image[:, :, None, 1], lateral)
+        one, two = over_size[:, :, None].unbind(3)  # (J, 1, 1, K) each
+        first, second = deep[:, :, None].unbind(3)  # (J, T, 1, K)
+        sines = _signed((tip * (first * two), root * (second * one))) + (level * (one * two))[..., None, :]
+        unary = unary + _hinge_cost(sines, task.inner, cost)
+    if bool((task.entry[:, -1] > 0).any()):
+        lateral = _lateral(turned, task.entry)
+        level, tip, root = _triple_parts(task.before[:, :, None, :2], task.image[:, :, None, 0], lateral)
+        level = (level + task.before[:, :, None, 2:] * tip) * over_size[:, :, None, 0]
+        none = [torch.zeros_like(level)] * (lengths.shape[2] - 1)
+        sines = _signed((root * deep[:, :, None, 0], *none)) + level[..., None, :]
+        unary = unary + _hinge_cost(sines, task.entry, cost)
+    return unary.movedim(0, -2), depth.movedim(0, -2)
+
+
+def _signed(parts: Sequence[Tensor]) -> Tensor:
+    """Sums of s_1 p_1 + .. + s_M p_M of p (..., K) over all signs, (..., 2^M, K), in the order of sign_table."""
+    total = torch.stack([parts[0], -parts[0]], -2)
+    for part in parts[1:]:
+        total = (total[..., None, :] + torch.stack([part, -part], -2)[..., None, :, :]).flatten(-3, -2)
+    return total
+
+
+def _facts(hinge: Hinge | None, posture: PostureEnergy) -> Tensor:
+    """A hinge's axis in rest, sign and firmness, (5,); all 0 for none."""
+    if hinge is None:
+        return posture.rest.new_zeros(5)
+    axis = posture.rest[hinge.left] - posture.rest[hinge.right]
+    return torch.cat([axis / axis.norm(), axis.new_tensor([hinge.sign, hinge.firm])])
+
+
+def _lateral(turned: Tensor, hinges: Tensor) -> Tensor:
+    """The hinges' axes (J, T, C, 3), which turn with the trunk."""
+    return (turned @ hinges[:, None, None, :3, None])[..., 0]
+
+
+def _triple_parts(first: Tensor, second: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """k, p, q of (u x v) . a = k + u_z p + v_z q, (..., 1) each, of images u, v (..., 2) and axes a (..., 3)."""
+    (ux, uy), (vx, vy), (ax, ay, az) = (v.split(1, -1) for v in (first, second, axis))
+    return az * (ux * vy - uy * vx), vx * ay - vy * ax, uy * ax - ux * ay
+
+
+def _hinge_cost(sines: Tensor, hinges: Tensor, cost: dict[str, Tensor]) -> Tensor:
+    """Cost of the sines (J, T, C, S, K) of hinges' bends, elementwise."""
+    sign, firm = hinges[:, 3:, None, None, None, None].unbind(1)
+    wrong = (-sign * sines).clamp_min(0)
+    return cost["hinge"][..., None] * firm / 2 * (wrong / cost["sine"][..., None]).square()
