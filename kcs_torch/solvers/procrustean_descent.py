@@ -133,25 +133,32 @@ class Descent:
         return value, (step.unsqueeze(-2) @ self.roots).view(count, -1)
 
     def _motion(self, aligned: Tensor) -> tuple[Tensor, Tensor]:
-        """The log-determinants (H,) of aligned bones (H, 3 B, T), which are centred in place, and their gradient."""
+        """The log-determinants (H,) of aligned bones (H, 3 B, T), which are centred in place, and their gradient.
+
+        Of few frames, Y^T Y is the smaller matrix: it has the eigenvalues of Y Y^T but for zeros, and
+        (Y Y^T + e I)^-1 Y = Y (Y^T Y + e I)^-1.
+        """
         weights, eps, frames = self.levels
+        zeros = max(0, aligned.shape[1] - aligned.shape[2])
         aligned -= aligned.mean(-1, keepdim=True)
         rows = [aligned] if self.still else []
         if self.moving:
-            rows.append(aligned.diff())
+            rows.append(torch.nn.functional.pad(aligned.diff(), (0, 1)))
         if not rows:
             return aligned.new_zeros(len(aligned)), torch.zeros_like(aligned)
-        scatter = torch.stack([torch.bmm(y, y.mT) for y in rows]).div_(frames)  # (levels, H, 3 B, 3 B)
+        # (levels, H, 3 B, 3 B) or (levels, H, T, T)
+        scatter = torch.stack([torch.bmm(y.mT, y) if zeros else torch.bmm(y, y.mT) for y in rows]).div_(frames)
         scatter.diagonal(dim1=-2, dim2=-1).add_(eps[..., 0])
         factor, info = torch.linalg.cholesky_ex(scatter)
         factor.masked_fill_((info != 0)[..., None, None], torch.nan)  # where nothing is left of eps
         half = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        value = ((weights * frames)[..., 0, 0] * half).sum(0)
-        pulls = list(map(torch.bmm, torch.cholesky_inverse(factor).mul_(weights), rows))
+        value = ((weights * frames)[..., 0, 0] * (half + zeros / 2 * eps[..., 0, 0].log())).sum(0)
+        inverse = torch.cholesky_inverse(factor).mul_(weights)
+        pulls = [torch.bmm(y, part) if zeros else torch.bmm(part, y) for y, part in zip(rows, inverse, strict=True)]
         slope = pulls[0] if self.still else torch.zeros_like(aligned)
         if self.moving:
-            slope[..., 1:] += pulls[-1]
-            slope[..., :-1] -= pulls[-1]
+            slope[..., 1:] += pulls[-1][..., :-1]
+            slope -= pulls[-1]
         return value, slope
 
     def _lengths(self, loose: Tensor) -> tuple[Tensor, Tensor]:
