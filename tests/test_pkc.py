@@ -10,7 +10,9 @@ from torch.testing import assert_close
 from kcs_torch import PKC, ConvergenceWarning, KcsWarning, OptionError, Skeleton, Tracks
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_lengths
+from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pkc import method as module
+from kcs_torch.methods.pkc.batch import Noisy, clean_all, serve
 
 # Many tests take few steps, after which nothing has settled.
 pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")
@@ -287,13 +289,27 @@ def test_noise_gaps_and_wrong_detections_are_cleaned_first():
     assert (grown[true > 200] - 1).abs().max() < 0.1  # mm; a hip of 130 is hardly longer than the noise is large
 
 
+def test_clips_are_cleaned_together_as_alone():
+    tasks = []
+    for seed, frames in enumerate((30, 41, 30, 30, 5)):
+        clip = walking_person(
+            frames, noise=5.0 * seed, missing=0.1, generator=torch.Generator().manual_seed(seed)
+        ).tracks
+        tasks.append(Noisy(clip.points, clip.weights))
+    for task, found in zip(tasks, clean_all(tasks), strict=True):
+        (alone,) = clean_all([task])
+        assert torch.equal(found.outliers, alone.outliers) and torch.equal(found.weights, alone.weights)
+        assert_close(found.points, alone.points, rtol=1e-6, atol=1e-3)  # mm
+        assert_close(found.noise, alone.noise, rtol=1e-6, atol=1e-3)
+
+
 def test_confidences_that_vary_are_a_detector_s():
     """Its joints stray for long, which no smoothing tells: lengths need not be kept as if the image were exact."""
     clip = walking_person(30, turn=0.0)
     method = PKC(rounds=0)
     weights = torch.rand(clip.tracks.weights.shape, generator=torch.Generator().manual_seed(0)).double() * 0.8 + 0.2
     unsure = replace(clip.tracks, weights=weights)
-    _, noise, notes = method._clean(unsure)
+    _, noise, notes = run(method._clean(unsure), serve)
     assert_close(noise, module.DETECTED / weights.sqrt())
     assert any("detector" in note for note in notes)
     for sure in (torch.ones_like(weights), torch.full_like(weights, 0.5), (weights > 0.4).double()):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,9 +13,10 @@ from kcs_torch.methods.pkc.moving_view import Descent, descend_all
 from kcs_torch.methods.pkc.objective import Objective, Refined
 from kcs_torch.methods.pkc.placing import Placing, limb_paths
 from kcs_torch.methods.sfam import SfAM
+from kcs_torch.solvers.denoise import Denoised, denoise_tracks
 from kcs_torch.types import Tracks
 
-__all__ = ["Task", "minimise_all", "serve"]
+__all__ = ["Noisy", "Task", "clean_all", "minimise_all", "serve"]
 
 
 @dataclass(frozen=True)
@@ -37,19 +38,27 @@ class Task:
     loose: float = 1.0
 
 
+class Noisy(NamedTuple):
+    """Tracks (T, N, 2) of weights (T, N) that are to be cleaned by :func:`denoise_tracks`."""
+
+    points: Tensor
+    weights: Tensor
+
+
 TOGETHER = 1200
 """Frames of hypotheses that are refined as one batch; more would only fall out of the processor's cache."""
 
 
-def serve(requests: Sequence[Task | Placing | Descent | Tracks]) -> list[Any]:
+def serve(requests: Sequence[Task | Placing | Descent | Noisy | Tracks]) -> list[Any]:
     """Answer what searches of several clips ask for.
 
-    Hypotheses are refined, limbs placed, starts descended from, and tracks solved by SfAM.
+    Hypotheses are refined, limbs placed, starts descended from, tracks cleaned, and solved by SfAM.
     """
     answers: dict[type, Callable[[list[Any]], list[Any]]] = {
         Task: minimise_all,
         Placing: limb_paths,
         Descent: descend_all,
+        Noisy: clean_all,
         Tracks: SfAM().solve_all,
     }
     out: dict[int, Any] = {}
@@ -58,6 +67,20 @@ def serve(requests: Sequence[Task | Placing | Descent | Tracks]) -> list[Any]:
         if asked:
             out |= zip(asked, answer([requests[i] for i in asked]), strict=True)
     return [out[i] for i in range(len(requests))]
+
+
+def clean_all(tasks: Sequence[Noisy]) -> list[Denoised]:
+    """:func:`denoise_tracks` of each task; those of equal size together."""
+    groups: dict[object, list[int]] = {}
+    for i, (points, _) in enumerate(tasks):
+        groups.setdefault((points.shape, points.dtype, points.device), []).append(i)
+    out: dict[int, Denoised] = {}
+    for group in groups.values():
+        few = max(1, TOGETHER // tasks[group[0]].points.shape[0])
+        for run in (group[first : first + few] for first in range(0, len(group), few)):
+            found = denoise_tracks(*(torch.stack(part) for part in zip(*(tasks[i] for i in run), strict=True)))
+            out |= {i: Denoised(*row) for i, row in zip(run, zip(*found, strict=True), strict=True)}
+    return [out[i] for i in range(len(tasks))]
 
 
 def minimise_all(tasks: Sequence[Task]) -> list[Refined]:

@@ -16,7 +16,7 @@ from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import WEAK_TURN, Estimate, Method
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, depth_deviation, told_by_prior
-from kcs_torch.methods.pkc.batch import serve
+from kcs_torch.methods.pkc.batch import Noisy, serve
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.fixed_view import Hypotheses, distinct
 from kcs_torch.methods.pkc.gate import plausible
@@ -26,7 +26,6 @@ from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import weak_perspective
 from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.nn.posture import trunk_joints
-from kcs_torch.solvers.denoise import denoise_tracks
 from kcs_torch.solvers.procrustean import COARSE, FINE, align_rotations
 from kcs_torch.types import Tracks
 
@@ -121,7 +120,7 @@ class PKC(Method):
         return run(together([self._steps(one, None) for one in tracks]), serve)
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
-        image, noise, notes = self._clean(tracks)
+        image, noise, notes = yield from self._clean(tracks)
         size = weak_perspective(image, tracks.seen, tracks.skeleton, tracks.fps or 30.0)
         if size is None:
             return (yield from self._solve(tracks, image, noise, cameras, notes))
@@ -162,13 +161,13 @@ class PKC(Method):
         assert found is not None
         return self._from_hypotheses(found, body, image, cameras, notes)
 
-    def _clean(self, tracks: Tracks) -> tuple[Tensor, Tensor, tuple[str, ...]]:
+    def _clean(self, tracks: Tracks) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
         """Complete tracks (T, N, 2), centred per frame, the noise (T, N) left in them, and what was done."""
         level, keep = 0.0, tracks.seen
         points, notes = tracks.points, []
         if self.denoise:
             keep = plausible(points, keep, tracks.skeleton)
-            clean = denoise_tracks(points, torch.where(keep, tracks.weights, 0))
+            (clean,) = yield [Noisy(points, torch.where(keep, tracks.weights, 0))]
             level = float(clean.noise.median())
             wrong = int((clean.outliers & keep).sum()) + int((tracks.seen & ~keep).sum())
             if wrong:
