@@ -81,12 +81,7 @@ def reconstruct(
 
 
 def reconstruct_all(
-    people: Iterable[Tracks],
-    *,
-    method: str | Method = "auto",
-    intrinsics: Any = None,
-    workers: int = 1,
-    **fields: Any,
+    people: Iterable[Tracks], *, method: str | Method = "auto", intrinsics: Any = None, **fields: Any
 ) -> list[Reconstruction]:
     """Turn the tracks of several bodies, or of many clips, into 3D motion, as one batch where the method can.
 
@@ -94,8 +89,6 @@ def reconstruct_all(
         people: tracks of any lengths, such as :func:`kcs_torch.io.load_people` gives.
         method: as of :func:`reconstruct`.
         intrinsics: of the camera that saw them all, as of :func:`reconstruct`.
-        workers: threads that share the clips, as of :meth:`kcs_torch.Method.many`; without effect where
-            intrinsics are given.
         **fields: of the method.
 
     Returns:
@@ -118,7 +111,7 @@ def reconstruct_all(
     if intrinsics is not None:
         lens = Intrinsics.of(intrinsics)
         return [reconstruct_perspective(chosen, one, lens) for one in people]
-    return chosen.many(people, workers=workers)
+    return chosen.many(people)
 
 
 def _method(method: str | Method, fields: dict[str, Any]) -> Method:

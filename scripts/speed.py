@@ -172,26 +172,42 @@ def grow_joints(names: Sequence[str], counts: list[int], frames: int, runs: int)
             yield {"ms a frame": name, "joints": joints} | row | {"frames a second": 1000 / row["median"]}
 
 
-def together(names: Sequence[str], frames: list[int], clips: int) -> Iterator[Row]:
-    """Milliseconds a clip one by one and as one batch: people before cameras that turn or stand still."""
+def together(names: Sequence[str], frames: list[int], clips: int, runs: int) -> Iterator[Row]:
+    """Milliseconds a clip one by one and as one batch: people before cameras that turn or stand still.
+
+    Lengths differ by up to a quarter. Times are the processor's, in the best of some runs; ``wall`` ones the clock's,
+    which tell what several threads of PyTorch (``--threads``) are worth.
+    """
     for name in names:
         method = kt.METHODS[name]()
         for length in frames:
-            tracks = [walking_person(length, turn=TURN * (i % 2), yaw=7.0 * i).tracks for i in range(clips)]
+            lengths = [length - (length // 3) * (i % 4) // 4 for i in range(clips)]
+            tracks = [walking_person(n, turn=TURN * (i % 2), yaw=7.0 * i).tracks for i, n in enumerate(lengths)]
             few = tracks[: min(clips, 16)]
             method.many(tracks[:2])  # loads what is loaded late
-            times = []
-            for run, count in ((partial(list, map(method, few)), len(few)), (partial(method.many, tracks), clips)):
-                start = time.process_time()
-                run()
-                times.append(1000 * (time.process_time() - start) / count)
-            yield {
-                "ms a clip": name,
-                "frames": length,
-                "clips": clips,
-                "one by one": times[0],
-                "together": times[1],
-            } | {"ratio": times[0] / times[1]}
+            alone = spent(partial(one_by_one, method, few), runs)
+            batch = spent(partial(method.many, tracks), runs)
+            row: Row = {"ms a clip": name, "frames": length, "clips": clips}
+            for what, k in (("", 0), ("wall ", 1)):
+                one, many = alone[k] / len(few), batch[k] / clips
+                row |= {f"{what}one by one": one, f"{what}together": many, f"{what}ratio": one / many}
+            yield row
+
+
+def one_by_one(method: kt.Method, tracks: Sequence[kt.Tracks]) -> None:
+    for one in tracks:
+        method(one)
+
+
+def spent(run: Callable[[], object], runs: int) -> tuple[float, float]:
+    """Milliseconds of the processor and of the clock, each in the best of some runs."""
+    times = []
+    for _ in range(runs):
+        cpu, wall = time.process_time(), time.perf_counter()
+        run()
+        times.append((1000 * (time.process_time() - cpu), 1000 * (time.perf_counter() - wall)))
+    cpu, wall = (min(each) for each in zip(*times, strict=True))
+    return cpu, wall
 
 
 def on_gpu(device: str, batches: list[int], frames: int, names: Sequence[str]) -> Iterator[Row]:
@@ -291,6 +307,7 @@ def arguments(words: list[str] | None) -> argparse.Namespace:
     known = list(kt.METHODS)
     parser.add_argument("--which", nargs="+", choices=known, default=FAST, metavar="METHOD", help=", ".join(known))
     parser.add_argument("--clips", type=int, default=64, help="of the part batch")
+    parser.add_argument("--threads", type=int, default=1, help="of PyTorch's own")
     parser.add_argument("--short", type=int, nargs="+", default=[30, 100], metavar="FRAMES", help="of its clips")
     parser.add_argument("--scale", type=int, nargs="+", default=[1000, 100_000], metavar="FRAMES")
     parser.add_argument("--device", default="cuda", help="of the part gpu")
@@ -308,7 +325,7 @@ def arguments(words: list[str] | None) -> argparse.Namespace:
 def main(words: list[str] | None = None) -> None:
     """Measure what is asked for and print one table a part."""
     options = arguments(words)
-    torch.set_num_threads(1)
+    torch.set_num_threads(options.threads)
     warnings.simplefilter("ignore", kt.KcsWarning)  # of short clips that do not settle
     if options.peak:
         print(json.dumps(measure_peak(options.peak[0], int(options.peak[1]))))
@@ -319,7 +336,7 @@ def main(words: list[str] | None = None) -> None:
         "kernels": lambda: compare_kernels(options.frames, options.runs),
         "growth": lambda: grow_frames(options.which, options.growth, options.runs),
         "joints": lambda: grow_joints(options.which, options.joints, options.frames, options.runs),
-        "batch": lambda: together(options.which, options.short, options.clips),
+        "batch": lambda: together(options.which, options.short, options.clips, min(options.runs, 3)),
         "scale": lambda: peak_memory(options.which, options.scale),
         "gpu": lambda: on_gpu(options.device, options.batches, options.frames, options.which),
     }
@@ -327,7 +344,8 @@ def main(words: list[str] | None = None) -> None:
         raise SystemExit(
             "--parts gpu: expected a GPU that PyTorch can use, found none; --device cpu tries the script out"
         )
-    print(f"torch {torch.__version__}, {platform.machine()}, 1 thread, float64, median of {options.runs} runs")
+    run = f"{options.threads} thread(s), float64, median of {options.runs} runs"
+    print(f"torch {torch.__version__}, {platform.machine()}, {run}")
     everything: list[Row] = []
     for part in parts:
         if part in options.parts:

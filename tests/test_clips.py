@@ -9,9 +9,8 @@ import torch
 from numerics import count_operations, normal
 from torch.testing import assert_close
 
-from kcs_torch import KCS, SfAM, Tracks, reconstruct_all
+from kcs_torch import KCS, SfAM, Tracks
 from kcs_torch.data import walking_person
-from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import best_path, complete_rotation, orbit
 from kcs_torch.methods import clips as module
 from kcs_torch.methods.cameras import orthographic_cameras
@@ -208,31 +207,3 @@ def test_a_batch_takes_few_more_operations_than_a_clip(method):
         warnings.simplefilter("ignore")
         one, many = (count_operations(lambda c=some: method.many(c)).total for some in (clips[-1:], clips))
     assert many < 4 * one
-
-
-# ---------------------------------------------------------------------- threads
-
-
-def test_threads_share_the_clips():
-    """The same results in the same order, whoever found them; warnings and errors come as from one thread."""
-    method, clips = KCS(rounds=1), CLIPS[:5]
-    with warnings.catch_warnings(record=True) as alone:
-        warnings.simplefilter("always")
-        expected = method.many(clips)
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        found = method.many(clips, workers=3)
-    for one, other in zip(found, expected, strict=True):
-        assert_close(one.points, other.points, rtol=0, atol=1e-5 * float(other.points.std()))
-        assert not one.points.requires_grad and one.tracks is other.tracks
-    assert [str(one.message) for one in told] == [str(one.message) for one in alone] != []
-    assert reconstruct_all(clips[:1], method="kcs", workers=2)[0].points.shape == (40, 17, 3)
-    assert method.many([], workers=2) == []
-    with pytest.raises(ShapeError, match="kcs: template"):
-        KCS(template=[[0.0, 0.0, 0.0]] * 4).many(clips, workers=2)
-
-
-@pytest.mark.parametrize("workers", [0, -1, True, 1.5])
-def test_numbers_of_threads_that_are_none(workers):
-    with pytest.raises(OptionError, match="kcs: workers: expected a number of threads"):
-        KCS().many(CLIPS, workers=workers)

@@ -13,7 +13,6 @@ import typing
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -82,13 +81,11 @@ class Method(ABC):
         self._warn(result, found.doubt)
         return result
 
-    def many(self, tracks: Sequence[Tracks], *, workers: int = 1) -> list[Reconstruction]:
+    def many(self, tracks: Sequence[Tracks]) -> list[Reconstruction]:
         """Reconstruct several clips, of one length or many: together where the method can, else one by one.
 
         Args:
             tracks: of any number of bodies.
-            workers: threads that share the clips, each with a batch of its own; more than one go best with one thread
-                of PyTorch's own (``torch.set_num_threads(1)``).
 
         Returns:
             What a call for each gives, up to rounding (which may choose the other of two solutions that are as good);
@@ -97,34 +94,17 @@ class Method(ABC):
         Warns:
             KcsWarning: as a call does.
             ConvergenceWarning: as a call does.
-
-        Raises:
-            OptionError: ``workers`` is no positive number.
         """
-        if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
-            raise OptionError(f"{self.name}: workers: expected a number of threads, 1 or more, got {workers!r}")
-        # Dealt out by length, so that all have as much to do, and batches of nearly one length.
-        order = sorted(range(len(tracks)), key=lambda i: tracks[i].num_frames)
-        shares = [order[k::workers] for k in range(min(workers, len(order)))]
-        found: dict[int, tuple[Reconstruction, str]] = {}
-        with ThreadPoolExecutor(workers) as pool:
-            run = pool.map if len(shares) > 1 else map
-            batches = run(self._batch, [[tracks[i] for i in share] for share in shares])
-            for share, results in zip(shares, batches, strict=True):
-                found |= zip(share, results, strict=True)
-        for i in range(len(tracks)):
-            self._warn(*found[i])
-        return [found[i][0] for i in range(len(tracks))]
-
-    def _batch(self, tracks: Sequence[Tracks]) -> list[tuple[Reconstruction, str]]:
-        """What is found of several clips, and what is doubtful about it; modes of PyTorch are each thread's own."""
         begin = time.perf_counter()
         with torch.inference_mode(False), torch.no_grad(), _home(tracks):
             parts = [self._normalised(one) for one in tracks]
             found = self.solve_all([inner for inner, _, _ in parts])
-            each = (time.perf_counter() - begin) / len(tracks)
+            each = (time.perf_counter() - begin) / max(len(tracks), 1)
             rows = zip(tracks, found, parts, strict=True)
-            return [(finish(self, one, x, size, known, each), x.doubt) for one, x, (_, size, known) in rows]
+            results = [finish(self, one, estimate, size, known, each) for one, estimate, (_, size, known) in rows]
+        for result, estimate in zip(results, found, strict=True):
+            self._warn(result, estimate.doubt)
+        return results
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
         """Reconstruct normalised tracks of several clips; one by one unless a method knows better."""
