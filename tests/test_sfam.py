@@ -10,6 +10,8 @@ from torch.testing import assert_close
 from kcs_torch import OptionError, SfAM, Skeleton, Tracks
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_lengths, complete_rotation, window_starts
+from kcs_torch.methods import sfam
+from kcs_torch.methods.windows import spread_first
 from kcs_torch.nn import UnrolledSfAM
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.solvers import fit_bones
@@ -334,3 +336,36 @@ def test_several_clips_at_once():
     for alone, one in zip(map(SfAM(), clips), SfAM().many(clips), strict=True):
         assert_close(one.points, alone.points, rtol=0, atol=0.02 * float(alone.points.std()))
         assert_close(one.cameras, alone.cameras, rtol=0, atol=0.02)
+
+
+# ---------------------------------------------------------------------- very long clips
+
+
+def test_windows_of_very_long_clips_share_the_lengths_of_some(monkeypatch):
+    """Four of seven windows are solved together and tell the lengths; the others aim at these, a few at a time."""
+    clip = walking_person(300, turn=180.0)
+    method = SfAM(window=60, overlap=20)
+    together = method(clip.tracks)
+    asked = []
+    real = UnrolledSfAM.solve
+
+    def solve(self, tracks, *given, **options):
+        asked.append((len(tracks), len(options["held"])))
+        return real(self, tracks, *given, **options)
+
+    monkeypatch.setattr(UnrolledSfAM, "solve", solve)
+    monkeypatch.setattr(sfam, "LEAD", 4)
+    monkeypatch.setattr(sfam, "CHUNK", 2)
+    apart = method(clip.tracks)
+    assert asked == [(4, 0), (2, 24), (1, 24)]  # 24 articulated steps, whose lengths are held
+    assert (apart.points - together.points).norm() < 0.01 * together.points.norm()
+    assert_close(apart.lengths, together.lengths, rtol=0.03, atol=0)
+    known = method(clip.tracks, clip.cameras)
+    monkeypatch.setattr(sfam, "LEAD", 40)
+    assert (known.points - method(clip.tracks, clip.cameras).points).norm() < 0.01 * known.points.norm()
+
+
+def test_windows_that_go_first_are_spread_over_the_clip():
+    assert spread_first(5, 5).tolist() == [0, 1, 2, 3, 4]
+    order = spread_first(10, 4)
+    assert order[:4].tolist() == [0, 3, 6, 9] and sorted(order.tolist()) == list(range(10))
