@@ -121,7 +121,7 @@ def test_together_as_one_by_one():
         assert torch.equal(one.lengths[0], together.lengths[j]) and torch.equal(one.depths[0], together.depths[j])
 
 
-@pytest.mark.parametrize("most", [1, 60_000, 10**9])
+@pytest.mark.parametrize("most", [1, 5000, 10**9])
 def test_clips_and_limbs_together_as_alone(most, monkeypatch):
     """Clips of two lengths, limbs of one bone and of two, with their own weights, in parts however small."""
     tasks, alone = [], []

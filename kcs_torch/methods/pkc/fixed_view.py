@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
-from kcs_torch.methods.lockstep import Search, run
+from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.batch import Task, serve
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limbs_of, waves
 from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, pace_of
@@ -183,19 +183,22 @@ class _Search:
 
     def start(self, anchor: Tensor | None) -> Search[Any, Any, Hypotheses]:
         """Hypotheses from both templates of the trunk."""
-        made: list[tuple[Tensor, Tensor]] = []
-        for trunk in self._trunks(anchor):
-            first = trunk_path(self.image, trunk, self.objective.posture, self.costs.posture, self.turn)
-            tried: list[Tensor] = []
-            settled = yield from self._settled(first, trunk, anchor)
-            for path in (*settled, first):
-                if not any(bool((path - other).abs().amax() < 1e-6) for other in tried):
-                    tried.append(path)
-            made += yield from self._places(tried[:1], trunk, anchor)
-            if tried[1:]:  # the first path's lengths serve all
-                made += yield from self._places(tried[1:], trunk, made[-1][1])
-        z, length = (torch.stack(part) for part in zip(*made, strict=True))
+        made = yield from together([self._about(trunk, anchor) for trunk in self._trunks(anchor)])
+        z, length = (torch.stack(part) for part in zip(*(body for part in made for body in part), strict=True))
         return Hypotheses(z, length, z.new_full((len(z),), torch.inf))
+
+    def _about(self, trunk: Trunk, anchor: Tensor | None) -> Search[Any, Any, list[tuple[Tensor, Tensor]]]:
+        """Depths (T, N) and lengths (B,) of bodies about one template of the trunk."""
+        first = trunk_path(self.image, trunk, self.objective.posture, self.costs.posture, self.turn)
+        tried: list[Tensor] = []
+        settled = yield from self._settled(first, trunk, anchor)
+        for path in (*settled, first):
+            if not any(bool((path - other).abs().amax() < 1e-6) for other in tried):
+                tried.append(path)
+        made = yield from self._places(tried[:1], trunk, anchor)
+        if tried[1:]:  # the first path's lengths serve all
+            made += yield from self._places(tried[1:], trunk, made[-1][1])
+        return made
 
     def refine(self, found: Hypotheses, steps: int, loose: float = 1.0) -> Search[Any, Any, Hypotheses]:
         """All a little, with loose lengths first where the start is rough, then the best few that differ."""
