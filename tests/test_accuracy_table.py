@@ -1,10 +1,12 @@
 """What each method makes of small synthetic clips, held to a table: a change that costs accuracy does not pass unseen.
 
 Figures are mm of a person of 1750 mm: mean distance to the truth, each frame moved and turned (KCS's "3D error"). One
-that becomes better by more than its tolerance fails as well: write the better figure down, so that it is kept.
+that becomes better by more than its tolerance fails as well: write the better figure down, so that it is kept. What
+chance has a part in is the mean of three clips.
 """
 
 from dataclasses import replace
+from statistics import fmean
 
 import pytest
 import roma
@@ -21,9 +23,9 @@ CASES = {
     "missing": {"turn": 180.0, "missing": 0.2},
 }
 TABLE = {  # a flat guess is at 92 mm
-    "pkc": {"still": 3.77, "sway": 4.40, "orbit": 3.21, "noise": 20.2, "missing": 15.8},
-    "sfam": {"still": 89.8, "sway": 52.3, "orbit": 15.7, "noise": 46.8, "missing": 35.8},
-    "kcs": {"still": 53.0, "sway": 34.8, "orbit": 43.9, "noise": 47.8, "missing": 55.3},
+    "pkc": {"still": 3.77, "sway": 4.40, "orbit": 3.21, "noise": 22.1, "missing": 16.1},
+    "sfam": {"still": 89.8, "sway": 52.3, "orbit": 15.7, "noise": 48.4, "missing": 34.1},
+    "kcs": {"still": 53.0, "sway": 34.8, "orbit": 43.9, "noise": 47.7, "missing": 59.6},
 }
 SHARE, LEAST = 0.1, 0.3
 """Tolerance: of the figure, and in mm."""
@@ -35,8 +37,8 @@ on a template, and local rigidity on flat shapes."""
 pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
 
 
-def clip_of(case, frames=60):
-    return walking_person(frames, generator=torch.Generator().manual_seed(0), **CASES[case])
+def clip_of(case, frames=60, seed=0):
+    return walking_person(frames, generator=torch.Generator().manual_seed(seed), **CASES[case])
 
 
 def error(points, truth):
@@ -46,8 +48,8 @@ def error(points, truth):
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("name", TABLE)
 def test_as_in_the_table(name, case):
-    clip = clip_of(case)
-    found = error(kt.METHODS[name]()(clip.tracks).points, clip.points)
+    clips = [clip_of(case, seed=seed) for seed in range(3 if "noise" in case or "missing" in case else 1)]
+    found = fmean(error(kt.METHODS[name]()(clip.tracks).points, clip.points) for clip in clips)
     assert found == pytest.approx(TABLE[name][case], rel=SHARE, abs=LEAST)
 
 

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from kcs_torch.methods.pkc import answers
 from kcs_torch.methods.pkc.answers import depth_deviation, told_by_prior
-from kcs_torch.methods.pkc.fixed_view import Hypotheses
+from kcs_torch.methods.pkc.hypotheses import Hypotheses
 
 
 def hypotheses(depths, energy, lengths=None):

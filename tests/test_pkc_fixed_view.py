@@ -7,7 +7,8 @@ from samples import walk_in_template_units as walk
 from torch.testing import assert_close
 
 from kcs_torch.functional import bone_lengths
-from kcs_torch.methods.pkc.fixed_view import Hypotheses, distinct, fixed_view
+from kcs_torch.methods.pkc.fixed_view import fixed_view
+from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct
 from kcs_torch.nn import PostureEnergy
 from kcs_torch.skeleton import SKELETONS
 

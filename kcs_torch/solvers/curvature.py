@@ -83,7 +83,8 @@ def whitening(
     inverse = points.new_zeros(hypotheses, 3 * len(bones), 3 * len(bones))
     for weight, rows, eps, linked in levels:
         inverse = inverse + linked * weight * inverse_scatter(rows, eps)
-    spread = safe_norm(bone_vectors(points, rigid)).var(-2, unbiased=False)
+    length = safe_norm(bone_vectors(points, rigid))
+    spread = (length - length.mean(-2, keepdim=True)).square().mean(-2)  # var() warns where no pair is rigid
     pull = stiffness * (1 / (spread + slack**2) - 1 / (spread + (reach * slack) ** 2))
     size = free * joints + 3
     out = points.new_empty(hypotheses, frames, size, size)

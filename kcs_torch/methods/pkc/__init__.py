@@ -1,6 +1,7 @@
 """PKC: Procrustean kinematic chains; every stage is a function of its own."""
 
-from kcs_torch.methods.pkc.fixed_view import Hypotheses, fixed_view
+from kcs_torch.methods.pkc.fixed_view import fixed_view
+from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.method import PKC
 from kcs_torch.methods.pkc.moving_view import MovingView, moving_view
 from kcs_torch.methods.pkc.objective import Objective, Weights

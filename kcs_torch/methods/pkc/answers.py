@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
-from kcs_torch.methods.pkc.fixed_view import Hypotheses
+from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.objective import bone_noise
 from kcs_torch.skeleton import Skeleton
 

@@ -13,7 +13,8 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.lockstep import Search, together
-from kcs_torch.methods.pkc.fixed_view import Hypotheses, refined, searching
+from kcs_torch.methods.pkc.fixed_view import searching
+from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, bone_noise, pace_of
 from kcs_torch.methods.pkc.trunk import image_scale
 from kcs_torch.nn.posture import PostureEnergy

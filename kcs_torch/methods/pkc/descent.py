@@ -33,10 +33,10 @@ class Descent:
 
     Args:
         objective: what is minimised.
-        unknowns: its coordinates.
+        unknowns: its coordinates; only :meth:`at` goes without.
     """
 
-    def __init__(self, objective: Objective, unknowns: Unknowns) -> None:
+    def __init__(self, objective: Objective, unknowns: Unknowns | None = None) -> None:
         self.objective, self.unknowns, self.weights = objective, unknowns, objective.weights
         obj, body, like = objective, objective.skeleton, objective.image
         self.x, self.y = (_early(v) for v in bone_vectors(obj.image, obj.bones).unbind(-1))  # (1 or H, B, T) each
@@ -77,10 +77,17 @@ class Descent:
     def __call__(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Value (H,) and gradient (H, B T + B) of unknowns (H, B T + B)."""
         u = self.unknowns
+        assert u is not None
         count, bones, frames = u.dz.shape
         part, grown = (state * u.scale).split([bones * frames, bones], 1)
         own = torch.addcmul(part.view(count, bones, frames), u.shear, grown[..., None]).add_(u.dz)
-        lengths = u.lengths * grown.exp()
+        value, slope, growth = self.at(own, u.lengths * grown.exp())
+        growth += (slope * u.shear).sum(-1)
+        return value, torch.cat([slope.flatten(1), growth], 1).mul_(u.scale)
+
+    def at(self, own: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Value (H,) of bones' depths (H, B, T) and lengths (H, B), its derivatives in depths and log lengths."""
+        count = len(own)
         dz = own if self.mix is None else self.mix @ own
         value, slope, growth = self._lengths(dz, lengths)
         lines = self.lines @ dz
@@ -94,8 +101,7 @@ class Descent:
         slope.baddbmm_(self.lines.mT.expand(count, -1, -1), back)
         if self.mix is not None:
             slope = self.mix.mT @ slope
-        growth += (slope * u.shear).sum(-1)
-        return value, torch.cat([slope.flatten(1), growth], 1).mul_(u.scale)
+        return value, slope, growth
 
     # Each term returns its value (H,) and adds its derivative in dz to slope (H, B, T), that in the logarithms of the
     # lengths to growth (H, B).

@@ -13,7 +13,9 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.lockstep import Search, run, together
-from kcs_torch.methods.pkc.batch import Task, serve
+from kcs_torch.methods.pkc.batch import serve
+from kcs_torch.methods.pkc.flips import flipped, parts_of, turned_over
+from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limbs_of, waves
 from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, pace_of
 from kcs_torch.methods.pkc.placing import placing
@@ -37,55 +39,13 @@ BETTER, BEST = 6, 4
 """Hypotheses that are refined at all, and well."""
 
 FLIPS = 4
-"""Flips of limbs that are refined."""
+"""Flips of runs of signs beside other moves."""
 
 ALIKE = 0.02
 """Root mean square depth below which hypotheses are one, a person being about 1.75 tall."""
 
 SWITCH = 8.0
 """Largest cost of the trunk's change of sign from one frame to the next."""
-
-
-@dataclass(frozen=True)
-class Hypotheses:
-    """Solutions of one clip, best first.
-
-    Attributes:
-        depth: (H, T, N), centred per frame, in units of the template.
-        lengths: (H, B).
-        energy: (H,) of the objective.
-        steps: L-BFGS steps made for them.
-        moved: (H,) root mean square change of the depths in the last ten steps; None before any.
-    """
-
-    depth: Tensor
-    lengths: Tensor
-    energy: Tensor
-    steps: int = 0
-    moved: Tensor | None = None
-
-    def __getitem__(self, index: slice | Tensor) -> Hypotheses:
-        moved = None if self.moved is None else self.moved[index]
-        return Hypotheses(self.depth[index], self.lengths[index], self.energy[index], self.steps, moved)
-
-    def joined(self, other: Hypotheses) -> Hypotheses:
-        """Both together, best first."""
-        parts = zip(*((h.depth, h.lengths, h.energy) for h in (self, other)), strict=True)
-        depth, lengths, energy = (torch.cat(part) for part in parts)
-        moved = None if self.moved is None or other.moved is None else torch.cat([self.moved, other.moved])
-        return Hypotheses(depth, lengths, energy, self.steps + other.steps, moved)[energy.argsort()]
-
-
-def distinct(found: Hypotheses, count: int, apart: float) -> Hypotheses:
-    """The best hypotheses whose depths differ by ``apart`` from each other (root mean square), at most ``count``."""
-    keep: list[int] = []
-    for k in range(len(found.energy)):
-        if len(keep) == count:
-            break
-        far = [float((found.depth[k] - found.depth[j]).square().mean().sqrt()) for j in keep]
-        if bool(torch.isfinite(found.energy[k])) and all(d > apart for d in far):
-            keep.append(k)
-    return found[torch.tensor(keep or [0], device=found.energy.device)]
 
 
 def fixed_view(
@@ -160,13 +120,7 @@ def searching(
         found = yield from search.refine(moved, steps)
         if not bool(found.energy[0] < best - 0.5):
             break
-    return found
-
-
-def refined(objective: Objective, found: Hypotheses, steps: int, loose: float = 1.0) -> Search[Any, Any, Hypotheses]:
-    """Hypotheses refined on the objective, best first."""
-    (new,) = yield [Task(objective, found.depth, found.lengths, steps, loose)]
-    return Hypotheses(new.depth, new.lengths, new.energy, found.steps + new.steps, new.moved)
+    return (yield from turned_over(search.objective, search.parts, found, steps)) if rounds else found
 
 
 @dataclass(frozen=True)
@@ -176,6 +130,10 @@ class _Search:
     objective: Objective
     costs: SignCosts
     turn: float
+
+    @cached_property
+    def parts(self) -> list[tuple[int, ...]]:
+        return parts_of(self.skeleton, self.limbs)
 
     @cached_property
     def limbs(self) -> list[Limb]:
@@ -218,14 +176,12 @@ class _Search:
         near, *turned = yield from self._places([path, *others], trunk, length, [z, *[None] * len(others)])
         again = yield from self._places([path], trunk, None, [z])
         new = [near, *again, *turned]
-        flips = torch.stack(self._flips(z) or [z])
-        with torch.no_grad():
-            order = self.objective(flips, length.expand(len(flips), -1)).argsort()[:FLIPS]
-        new += [(flips[k], length) for k in order.tolist()]
+        flips = flipped(self.objective, self.parts, found[:1])[:FLIPS]
+        made = len(new)
         return Hypotheses(
-            torch.cat([found.depth[:2], torch.stack([n[0] for n in new])]),
-            torch.cat([found.lengths[:2], torch.stack([n[1] for n in new])]),
-            torch.cat([found.energy[:2], found.energy.new_full((len(new),), torch.inf)]),
+            torch.cat([found.depth[:2], torch.stack([n[0] for n in new]), flips.depth]),
+            torch.cat([found.lengths[:2], torch.stack([n[1] for n in new]), flips.lengths]),
+            torch.cat([found.energy[:2], found.energy.new_full((made + len(flips.energy),), torch.inf)]),
             found.steps,
         )
 
@@ -319,20 +275,6 @@ class _Search:
     def _direction(flat: Tensor, dz: Tensor, length: Tensor, bone: int) -> Tensor:
         """Direction (T, 3) of a bone that is already placed."""
         return torch.cat([flat[:, bone], dz[:, bone, None]], -1) / length[bone].clamp_min(1e-9)
-
-    def _flips(self, z: Tensor) -> list[Tensor]:
-        """The pose with one bone, or both, of each two-bone limb mirrored in depth."""
-        dz = bone_vectors(z[..., None], self.objective.posture.bones)[..., 0]
-        out = []
-        for limb in self.limbs:
-            if limb.inner is None:
-                continue
-            for part in ((limb.bones[0],), (limb.bones[1],), limb.bones):
-                flipped = dz.clone()
-                flipped[:, list(part)] *= -1
-                depth = self._chain(flipped.mT).mT
-                out.append(depth - depth.mean(-1, keepdim=True))
-        return out
 
     def _chain(self, vectors: Tensor) -> Tensor:
         """Joints (N, ...) from bone vectors (B, ...), the root at 0."""

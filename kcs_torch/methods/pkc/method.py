@@ -18,8 +18,8 @@ from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.batch import Noisy, serve
 from kcs_torch.methods.pkc.body import Body
-from kcs_torch.methods.pkc.fixed_view import Hypotheses, distinct
 from kcs_torch.methods.pkc.gate import plausible
+from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct
 from kcs_torch.methods.pkc.moving_view import Descent, MovingView
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.sfam import SfAM

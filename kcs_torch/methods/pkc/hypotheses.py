@@ -1,0 +1,63 @@
+"""Solutions of one clip that may yet be right, and their refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcs_torch.methods.lockstep import Search
+from kcs_torch.methods.pkc.batch import Task
+from kcs_torch.methods.pkc.objective import Objective
+
+__all__ = ["Hypotheses", "distinct", "refined"]
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Solutions of one clip, best first.
+
+    Attributes:
+        depth: (H, T, N), centred per frame, in units of the template.
+        lengths: (H, B).
+        energy: (H,) of the objective.
+        steps: L-BFGS steps made for them.
+        moved: (H,) root mean square change of the depths in the last ten steps; None before any.
+    """
+
+    depth: Tensor
+    lengths: Tensor
+    energy: Tensor
+    steps: int = 0
+    moved: Tensor | None = None
+
+    def __getitem__(self, index: slice | Tensor) -> Hypotheses:
+        moved = None if self.moved is None else self.moved[index]
+        return Hypotheses(self.depth[index], self.lengths[index], self.energy[index], self.steps, moved)
+
+    def joined(self, other: Hypotheses) -> Hypotheses:
+        """Both together, best first."""
+        parts = zip(*((h.depth, h.lengths, h.energy) for h in (self, other)), strict=True)
+        depth, lengths, energy = (torch.cat(part) for part in parts)
+        moved = None if self.moved is None or other.moved is None else torch.cat([self.moved, other.moved])
+        return Hypotheses(depth, lengths, energy, self.steps + other.steps, moved)[energy.argsort()]
+
+
+def distinct(found: Hypotheses, count: int, apart: float) -> Hypotheses:
+    """The best hypotheses whose depths differ by ``apart`` from each other (root mean square), at most ``count``."""
+    keep: list[int] = []
+    for k in range(len(found.energy)):
+        if len(keep) == count:
+            break
+        far = [float((found.depth[k] - found.depth[j]).square().mean().sqrt()) for j in keep]
+        if bool(torch.isfinite(found.energy[k])) and all(d > apart for d in far):
+            keep.append(k)
+    return found[torch.tensor(keep or [0], device=found.energy.device)]
+
+
+def refined(objective: Objective, found: Hypotheses, steps: int, loose: float = 1.0) -> Search[Any, Any, Hypotheses]:
+    """Hypotheses refined on the objective, best first."""
+    (new,) = yield [Task(objective, found.depth, found.lengths, steps, loose)]
+    return Hypotheses(new.depth, new.lengths, new.energy, found.steps + new.steps, new.moved)

@@ -1,0 +1,114 @@
+"""Runs of signs: which there are, what they cost, and that wrong ones are found."""
+
+import pytest
+import torch
+from numerics import normal
+from samples import walk_in_template_units as walk
+from torch.testing import assert_close
+
+from kcs_torch.functional import bone_vectors
+from kcs_torch.methods.lockstep import run
+from kcs_torch.methods.pkc import flips as module
+from kcs_torch.methods.pkc.batch import Task, minimise_all
+from kcs_torch.methods.pkc.flips import flipped, flipped_runs, parts_of, turned_over
+from kcs_torch.methods.pkc.hypotheses import Hypotheses
+from kcs_torch.methods.pkc.limbs import limbs_of
+from kcs_torch.methods.pkc.objective import Objective, Weights
+from kcs_torch.skeleton import SKELETONS
+
+BODY = SKELETONS["h36m17"]
+ACCELERATION = Weights().acceleration
+
+
+def test_parts_of_a_body():
+    weights = Objective(BODY, walk(5)[..., :2], Weights(), torch.zeros(5, 17).double()).posture
+    limbs = limbs_of(BODY, weights.trunk.tolist())
+    parts = parts_of(BODY, limbs)
+    assert len(set(parts)) == len(parts) and all(parts)
+    for limb in limbs:
+        assert limb.bones in parts and all((b,) in parts for b in limb.bones)
+    assert all(tuple(pair) in parts for pair in BODY.mirror_bones)
+    outer = {b for limb in limbs for b in limb.bones}
+    assert tuple(b for b in range(16) if b not in outer) in [tuple(sorted(part)) for part in parts]
+
+
+def bones_of(frames=40, seed=0):
+    """Depths (T, B) of bones that swing through the image plane, and lengths."""
+    time = torch.arange(frames).double()[:, None]
+    phase, pace = normal(6, seed=seed), 0.1 + 0.1 * normal(6, seed=seed + 1).abs()
+    return 0.3 * torch.sin(time * pace + 3 * phase), torch.full((6,), 0.3).double()
+
+
+PARTS = [(0,), (1,), (0, 1), (2, 3, 4), (5,)]
+
+
+@pytest.mark.parametrize("seed", [0, 3, 5])
+def test_flips_change_one_run_of_one_part(seed):
+    depth, lengths = bones_of(seed=seed)
+    turned, which = flipped_runs(depth, lengths, PARTS, ACCELERATION)
+    assert len(turned) == len(which) > 5
+    seen = set()
+    for one, part in zip(turned, which.tolist(), strict=True):
+        assert_close(one.abs(), depth.abs())
+        own = (one - depth).abs() > 1e-9
+        assert set(own.any(0).nonzero().flatten().tolist()) <= set(PARTS[part])
+        frames = own.any(1).nonzero().flatten()
+        seen.add((part, int(frames[0]), int(frames[-1])))
+        assert (own.any(1)[frames[0] : frames[-1] + 1]).float().mean() > 0.9
+    assert len(seen) > 0.8 * len(which)  # the same run of a part is not told twice
+
+
+def test_bends_are_counted_where_signs_change(monkeypatch):
+    """What is left out as too sharp is what a count over all frames says."""
+    depth, lengths = bones_of(seed=1)
+    monkeypatch.setattr(module, "SHARP", torch.inf)
+    every, _ = flipped_runs(depth, lengths, PARTS, ACCELERATION)
+    cost = lambda d: d.diff(n=2, dim=-2).square().sum((-2, -1)) / (2 * ACCELERATION**2)  # noqa: E731
+    bends = cost(every) - cost(depth)
+    limit = float(bends.median())
+    monkeypatch.setattr(module, "SHARP", limit)
+    some, _ = flipped_runs(depth, lengths, PARTS, ACCELERATION)
+    assert 0 < len(some) < len(every)
+    assert_close(some, every[bends < limit])
+
+
+@pytest.mark.parametrize("frames", [1, 2, 4, 5, 6])
+@pytest.mark.parametrize("kind", ["moving", "still", "flat", "no length"])
+def test_clips_that_tell_little(frames, kind):
+    depth, lengths = bones_of(frames)
+    depth = depth[:1].expand_as(depth) if kind == "still" else 0 * depth if kind == "flat" else depth
+    lengths = 0 * lengths if kind == "no length" else lengths
+    turned, which = flipped_runs(depth, lengths, PARTS, ACCELERATION)
+    assert turned.shape == (len(which), frames, 6) and torch.isfinite(turned).all()
+    assert kind != "flat" or not len(which)
+
+
+def test_a_wrong_run_is_turned_over():
+    """A part that passes through the image plane, and is mirrored before it does."""
+    points = walk(60, yaw=45.0)
+    image = points[..., :2] - points[..., :2].mean(1, keepdim=True)
+    objective = Objective(BODY, image, Weights(), torch.zeros(60, 17).double())
+    lengths = bone_vectors(points, objective.bones).norm(dim=-1).mean(0)
+    true = points[..., 2] - points[..., 2].mean(1, keepdim=True)
+    (best,) = minimise_all([task(objective, true[None], lengths[None])])
+    parts = parts_of(BODY, limbs_of(BODY, objective.posture.trunk.tolist()))
+    start = Hypotheses(best.depth, best.lengths, best.energy)
+    flips = flipped(objective, parts, start)
+    assert 0 < len(flips.energy) <= module.FLIPS and (flips.energy.diff() >= 0).all()
+    assert_close(objective(flips.depth, flips.lengths), flips.energy, rtol=1e-6, atol=1e-3)
+    own = bone_vectors(start.depth[0, :, :, None], objective.bones)[..., 0]
+    runs, _ = flipped_runs(own, start.lengths[0], parts, ACCELERATION)
+    depth = (runs @ objective.tree.mT)[:40]
+    (tried,) = minimise_all([task(objective, depth, start.lengths.expand(len(depth), -1))])
+    stuck = int((tried.energy > start.energy[0] + 1).nonzero()[0])  # the refinement alone does not get out of it
+    wrong = Hypotheses(tried.depth[stuck, None], tried.lengths[stuck, None], tried.energy[stuck, None], 20)
+    assert wrong.energy[0] > start.energy[0] + 1
+    found = run(turned_over(objective, parts, wrong, 20), minimise_all)
+    assert found.energy[0] < wrong.energy[0] - 1 and (found.energy.diff() >= 0).all()
+    apart = lambda z: float((z - start.depth[0]).square().mean().sqrt())  # noqa: E731
+    assert apart(found.depth[0]) < 0.3 * apart(wrong.depth[0])
+    assert 20 < found.steps < 20 + 4 * 2 * 30
+
+
+def task(objective, depth, lengths):
+    return Task(objective, depth, lengths, 20)
