@@ -19,7 +19,7 @@ from kcs_torch.methods.pkc.answers import APART, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.batch import Noisy, serve
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.gate import plausible
-from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct
+from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.moving_view import Descent, MovingView
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.sfam import SfAM
@@ -61,6 +61,9 @@ TURNING = 90.0
 STILL = 0.01
 """A solution has settled where the last ten steps (fewer tell nothing) moved depths by no more than so much, root mean
 square: a share of the body's size."""
+
+AGAIN = 3
+"""How often depths of the moving viewpoint are refined anew until they settle."""
 
 SURE, DOUBT = 0.8, 0.6
 """Correlation with SfAM's depths from which on those of the moving viewpoint are sure, and below which they are a
@@ -256,6 +259,10 @@ class PKC(Method):
         assert moving is not None
         depth = moving.pose.points[:1, ..., 2] * body.factor
         ranked = yield from body.rank(depth if cameras is not None else torch.cat([depth, -depth]), self.steps)
+        for _ in range(AGAIN):  # depths found under another objective may have far to go
+            if ranked.moved is None or bool(ranked.moved[0] <= STILL):
+                break
+            ranked = yield from refined(body.objective, ranked, self.steps)
         ranked = replace(ranked, steps=ranked.steps + MOVING_STEPS)
         return ranked if found is None else found.joined(ranked)
 
