@@ -66,7 +66,11 @@ class Descent:
         self.ends = incidence(bones, joints, dtype=points.dtype).mT  # (B, N)
         self.pairs = None if torch.equal(bones, rigid) else incidence(rigid, joints, dtype=points.dtype).mT
         self.rigid, self.stiffness = len(rigid) > 0, stiffness
-        self.tracks, self.weights = tracks.permute(2, 1, 0).contiguous(), weights.mT.contiguous()  # (2, N, T), (N, T)
+        if noise > 0:
+            self.tracks, self.weights = (
+                tracks.permute(2, 1, 0).contiguous(),
+                weights.mT.contiguous(),
+            )  # (2, N, T), (N, T)
         self.bones = self.ends @ self.points  # (H, 3, B, T), of which the first 3 - free never move
         self.links = self.bones if self.pairs is None else self.pairs @ self.points  # (H, 3, P, T)
         self.flat = self.links[:, : 3 - self.free].square().sum(1)  # (H, P, T)

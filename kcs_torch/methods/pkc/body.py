@@ -25,7 +25,7 @@ __all__ = ["Body"]
 BLOCK, OVERLAP = 400, 40
 """Frames of a long clip that are searched together, and by how many blocks overlap."""
 
-ABREAST = 32
+ABREAST = 8
 """Blocks that are searched side by side: what searches of more would hold is for batches no gain."""
 
 FAST = 45.0

@@ -24,7 +24,7 @@ WINDOW, OVERLAP = 200, 40
 SAMPLE = 4
 """Windows from which the lengths of a long clip's bones are chosen."""
 
-TOGETHER = 250_000
+TOGETHER = 100_000
 """Costs that are made together, and signs' problems times frames: more would only fall out of the processor's cache."""
 
 
