@@ -46,9 +46,9 @@ PARTS = {
 SYNTHETIC = ("walk", "walk, 15 mm noise", "tree")
 YAWS = (0.0, 45.0, 90.0, 135.0)
 # import_module, as the package's functions have the names of these modules
-BODY, FIXED, MOVING, OBJECTIVE, DESCENT = (
+BODY, FIXED, FLIPS, MOVING, OBJECTIVE, DESCENT = (
     import_module(f"kcs_torch.methods.pkc.{name}")
-    for name in ("body", "fixed_view", "moving_view", "objective", "descent")
+    for name in ("body", "fixed_view", "flips", "moving_view", "objective", "descent")
 )
 WRITTEN_OUT = {"posture": "_posture", "hinges": "_hinges", "foreshortening": "_foreshortening", "proportions": "_sizes"}
 """Terms of the objective, and the methods of its descent that hold them once more, gradients and all."""
@@ -128,6 +128,7 @@ FIXED_VARIANTS = {
     "noise of the image explained in full": Variant(
         changes=tuple(constant(owner, "NOISE", 0.0) for owner in (OBJECTIVE, DESCENT))
     ),
+    "directions as sure as in a clear image": Variant(changes=(constant(OBJECTIVE, "BLUR", 0.0),)),
     "no posture": without("posture", posture=INF),
     "no hinges": without("hinges", hinge=0.0),
     "no foreshortening": without("foreshortening", foreshortening=INF),
@@ -147,6 +148,7 @@ FIXED_VARIANTS = {
     "trunk without its leaning siblings": Variant(
         changes=(constant(FIXED, "siblings", lambda path, axes: torch.stack([path, mirror(path)])),)
     ),
+    "no runs turned over": Variant(changes=(constant(FLIPS, "TIMES", 0),)),
     "no discrete moves": Variant({"rounds": 0}),
     "no turn of the viewpoint asked for": Variant({"viewpoint": "fixed"}),
     "one hypothesis, no moves": Variant({"rounds": 0}, ((FIXED._Search, "start", first_alone),)),
