@@ -312,11 +312,25 @@ def test_confidences_that_vary_are_a_detector_s():
     _, noise, notes = run(method._clean(unsure), serve)
     assert_close(noise, module.DETECTED / weights.sqrt())
     assert any("detector" in note for note in notes)
-    for sure in (torch.ones_like(weights), torch.full_like(weights, 0.5), (weights > 0.4).double()):
+    chosen = torch.where(weights > 0.6, 1.0, 0.3)
+    for sure in (torch.ones_like(weights), torch.full_like(weights, 0.5), (weights > 0.4).double(), chosen):
         assert not module.detected(sure)
     assert module.detected(weights) and not module.detected(torch.zeros_like(weights))
     spread = method(unsure).uncertainty.mean()
     assert spread > method(clip.tracks).uncertainty.mean()
+
+
+def test_bones_are_constant_though_the_image_is_not_exact():
+    """Where it is exact it stays as it is; otherwise joints move by less than their noise."""
+    clip = walking_person(40, turn=0.0, noise=20.0, generator=torch.Generator().manual_seed(2))
+    method, bones = PKC(rounds=0), clip.tracks.skeleton.bone_index()
+    result = method(clip.tracks)
+    lengths = bone_lengths(result.points, bones)
+    assert (lengths.std(0) / lengths.mean(0)).median() < 0.004
+    moved = centred(result.points)[..., :2] - centred(clip.points)[..., :2]
+    assert moved.square().mean().sqrt() < 20.0
+    exact = method(walking_person(40, turn=0.0).tracks)
+    assert_close(centred(exact.points)[..., :2], centred(exact.tracks.points))
 
 
 # ---------------------------------------------------------------------- fields

@@ -19,6 +19,7 @@ from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, bone_no
 from kcs_torch.methods.pkc.trunk import image_scale
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.solvers.lm import fit_bones
 
 __all__ = ["Body"]
 
@@ -27,6 +28,9 @@ BLOCK, OVERLAP = 400, 40
 
 ABREAST = 8
 """Blocks that are searched side by side: what searches of more would hold is for batches no gain."""
+
+HOLD = 5
+"""Levenberg-Marquardt steps that make bones constant."""
 
 FAST = 45.0
 """Frames a second from which on the search leaves frames out."""
@@ -62,6 +66,20 @@ class Body:
     def frames(self, depth: Tensor) -> Tensor:
         """The trunk's rotations (T, 3, 3), template to camera, of depths (T, N)."""
         return nearest_rotation(self.objective.posture.frame(torch.cat([self.image, depth[..., None]], -1)))
+
+    def bodies(self, found: Hypotheses) -> Tensor:
+        """Joints (H, T, N, 3) of hypotheses, in units of the image; bones keep their lengths as far as noise allows.
+
+        Where the image is exact, only depth may differ from frame to frame. Where it is not, joints move by the least
+        that makes bones as constant as the model takes them to be, which is SfAM's articulated step.
+        """
+        points = torch.cat([self.image.expand(*found.depth.shape, 2), found.depth[..., None]], -1)
+        goal = self.objective
+        if goal.noisy:
+            stiffness = goal.rigid * (goal.noise / goal.weights.length).square()
+            points = fit_bones(points, found.lengths[:, None], goal.bones, stiffness=stiffness, num_steps=HOLD)
+            points = points - points.mean(-2, keepdim=True)
+        return points / self.factor
 
     def rank(self, depth: Tensor, steps: int) -> Search[Any, Any, Hypotheses]:
         """Depths (H, T, N) from elsewhere, refined on the objective, best first."""

@@ -84,7 +84,7 @@ def fixed_view(
         The hypotheses, best first.
     """
     noise = torch.zeros_like(image[..., 0]) if noise is None else noise
-    search = searching(skeleton, image, rate, noise, rounds, steps, anchor, weights or Weights())
+    search = searching(skeleton, image, rate, noise, rounds, steps, anchor, weights)
     return run(search, serve)
 
 
@@ -96,12 +96,12 @@ def searching(
     rounds: int,
     steps: int,
     anchor: Tensor | None = None,
-    weights: Weights = Weights(),  # noqa: B008 (frozen)
+    weights: Weights | None = None,
 ) -> Search[Any, Any, Hypotheses]:
     """:func:`fixed_view` as a search, which may run beside others; arguments as there."""
     slow = 30.0 / rate
     pace = pace_of(image, skeleton, rate)
-    weights = at_pace(weights, rate, pace)
+    weights = at_pace(weights or Weights(), rate, pace)
     costs = SignCosts()
     costs = replace(
         costs,

@@ -46,8 +46,8 @@ DETECTED = 0.027
 UNSURE = 0.05
 """Least confidence that counts."""
 
-PARTLY = 0.05
-"""Share of confidences below 1 from which on they are a detector's."""
+PARTLY, GRADES = 0.05, 10
+"""Share of confidences below 1, and number of different ones, from which on they are a detector's."""
 
 HELD = 0.1
 """The same in frames before the body is first seen, and after it was last seen."""
@@ -162,7 +162,7 @@ class PKC(Method):
             moving, _ = yield from self._moving(tracks, image, cameras, enough)
             found = yield from self._ranked(body, moving, cameras, found)
         assert found is not None
-        return self._from_hypotheses(found, body, image, cameras, notes)
+        return self._from_hypotheses(found, body, cameras, notes)
 
     def _clean(self, tracks: Tracks) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
         """Complete tracks (T, N, 2), centred per frame, the noise (T, N) left in them, and what was done."""
@@ -267,7 +267,7 @@ class PKC(Method):
         return ranked if found is None else found.joined(ranked)
 
     def _from_hypotheses(
-        self, found: Hypotheses, body: Body, image: Tensor, cameras: Tensor | None, notes: tuple[str, ...]
+        self, found: Hypotheses, body: Body, cameras: Tensor | None, notes: tuple[str, ...]
     ) -> Estimate:
         """Estimates of the distinct hypotheses, in the tracks' units."""
         found = distinct(found, self.alternatives + 1, APART)
@@ -275,8 +275,7 @@ class PKC(Method):
         if told:
             notes = (*notes, f"the depth's sign was decided by the prior for {', '.join(told)}: see the alternatives")
         made = []
-        for k, depth in enumerate(found.depth):
-            points = torch.cat([image, depth[..., None] / body.factor], -1)
+        for k, (depth, points) in enumerate(zip(found.depth, body.bodies(found), strict=True)):
             one = torch.ones_like(points[:, 0, 0])
             spread = depth_deviation(found[k:] if k else found, body.noise, body.skeleton) / body.factor
             value = float(found.energy[k])
@@ -295,9 +294,10 @@ def _agreement(depth: Tensor, other: Tensor) -> float:
 
 
 def detected(weights: Tensor) -> bool:
-    """Whether confidences (T, N) are a detector's: between 0 and 1, and not all alike."""
+    """Whether confidences (T, N) are a detector's: between 0 and 1, and of many values, which nobody would choose."""
     seen = weights[weights > 0]
-    return len(seen) > 0 and bool((seen < 1).double().mean() > PARTLY) and bool(seen.amin() < seen.amax())
+    partly = seen[seen < 1]
+    return len(partly) > PARTLY * len(seen) and len(partly.unique()) > GRADES
 
 
 def _nearest_shown(seen: Tensor) -> Tensor:
