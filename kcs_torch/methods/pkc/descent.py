@@ -56,6 +56,7 @@ class Descent:
         lines = [(affine - affine.mean(-1, keepdim=True)) @ obj.tree[posture.trunk]]  # (2, B): the axes' depths
         self.axes = posture.axes.to(like)
         self.spread = posture.deviation.to(like).mT.reshape(-1, 3, body.num_bones)  # (1 or H, 3, B)
+        self.eye = torch.eye(3 * body.num_bones, dtype=like.dtype, device=like.device)
         self.mean = (posture.mean.to(like).mT / self.spread).flatten(1)[..., None]  # (1 or H, 3B, 1)
         hinges = obj.hinges
         if len(hinges.joints):
@@ -185,7 +186,9 @@ class Descent:
         scatter = total[:, :-1, :-1] * (each / posture.strength)
         scatter.baddbmm_(mean * (-amount * near / posture.strength), mean.mT)
         scatter.diagonal(dim1=-2, dim2=-1).add_(1)
-        factor, _ = torch.linalg.cholesky_ex(scatter)
+        factor, info = torch.linalg.cholesky_ex(scatter)
+        failed = info > 0  # a step so far that rounding or overflow leaves no scatter: it costs infinitely much
+        factor = torch.where(failed[:, None, None], self.eye, factor)
         inverse = torch.cholesky_inverse(factor)
         gain = (amount + posture.strength) / posture.strength
         towards = inverse @ mean  # (H, 3B, 1)
@@ -208,7 +211,7 @@ class Descent:
         back[:, 0] = ((a - first * (first * a).sum(1, keepdim=True)) * over)[:, 2]
         log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         held = amount[:, 0, 0] if isinstance(amount, Tensor) else amount
-        return (held + posture.strength) / 2 * log_det
+        return torch.where(failed, torch.inf, (held + posture.strength) / 2 * log_det)
 
     def _hinges(self, lengths: Tensor, depths: Tensor, growth: Tensor, back: Tensor) -> Tensor:
         w, limbs = self.weights, self.objective.hinges.limbs
