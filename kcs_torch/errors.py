@@ -19,6 +19,7 @@ __all__ = [
     "OutputError",
     "ShapeError",
     "SkeletonError",
+    "counted",
     "unknown",
 ]
 
@@ -57,6 +58,15 @@ class KcsWarning(UserWarning):
 
 class ConvergenceWarning(KcsWarning):
     """An iteration stopped at its limit before it converged; the result says ``converged=False``."""
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things, in the singular or the plural.
+
+    >>> counted(1, "frame"), counted(2, "frame")
+    ('1 frame', '2 frames')
+    """
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def unknown(what: str, name: object, choices: Iterable[str], error: type[KcsError] = OptionError) -> KcsError:

@@ -14,8 +14,9 @@ from kcs_torch.methods.found import find_skeleton
 from kcs_torch.methods.perspective import reconstruct_perspective
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
+from kcs_torch.types.intake import no_bones
 
-__all__ = ["reconstruct", "reconstruct_all"]
+__all__ = ["reconstruct", "reconstruct_all", "with_found_bones"]
 
 DEFAULT = "pkc"
 """What "auto" stands for."""
@@ -73,7 +74,7 @@ def reconstruct(
     else:
         tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units)
     if find:
-        tracks = replace(tracks, skeleton=find_skeleton(tracks))
+        tracks = with_found_bones(tracks)
     chosen = _method(method, fields)
     if lens is not None:
         return reconstruct_perspective(chosen, tracks, lens, cameras)
@@ -112,6 +113,16 @@ def reconstruct_all(
         lens = Intrinsics.of(intrinsics)
         return [reconstruct_perspective(chosen, one, lens) for one in people]
     return chosen.many(people)
+
+
+def with_found_bones(tracks: Tracks) -> Tracks:
+    """The tracks with the skeleton that their motion shows, and without the note that bones are lacking.
+
+    Args:
+        tracks: of a body that moves.
+    """
+    said = no_bones(tracks.skeleton.num_joints)
+    return replace(tracks, skeleton=find_skeleton(tracks), notes=tuple(note for note in tracks.notes if note != said))
 
 
 def _method(method: str | Method, fields: dict[str, Any]) -> Method:

@@ -28,6 +28,7 @@ from kcs_torch.io.formats import sleap
 from kcs_torch.io.motion import detect_motion_format
 from kcs_torch.io.pickles import load_arrays
 from kcs_torch.io.registry import Probe
+from kcs_torch.types.intake import no_bones
 
 pytest.importorskip("h5py")
 quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -60,13 +61,13 @@ FILES = {  # frames, joints of the first animal, and the unseen share in per cen
     "sleap/minimal_instance.000_centered_pair_low_quality.analysis.csv": (1, ("A", "B"), [0]),
     "sleap/predictions.analysis.h5": (3000, FLY, [1.67, 2.24]),
 }
-NO_BONES = "the file names no bones: give a skeleton, or let reconstruct(..., skeleton='auto') find one"
+NO_BONES = no_bones(3)
 OTHERS = {
     "deeplabcut/reachingDEMO_3D.h5": "got 3D motion .*load_motion reads",
     "sleap/points3d.h5": "got 3D motion .*load_motion reads",
     "sleap/minimal_side_proofread.slp": "got a project: write one with sleap-convert --format analysis minimal_side",
     "sleap/minimal_instance.json": "JSON with other content",
-    "sleap/calibration.toml": r"a file that begins with b'\[cam_0",
+    "sleap/calibration.toml": r"a file that begins with '\[cam_0",
 }
 
 

@@ -246,7 +246,7 @@ def test_gaps_are_filled_and_told(tmp_path):
     gappy = replace(motion, weights=weights, points=motion.points * weights[..., None])
     notes: list[str] = []
     back = load_motion(save(gappy, tmp_path / "w.bvh", notes=notes))
-    assert any("0.9 % of the joints are filled in between frames" in note for note in notes)
+    assert any("1.0 % of the joints are filled in between frames" in note for note in notes)
     assert torch.allclose(back.points[8] / 100, motion.points[8], atol=0.01)
 
 

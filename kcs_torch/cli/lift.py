@@ -279,11 +279,12 @@ def _is_video(path: str) -> bool:
 def _lifted(people: list[Tracks], method: str | Method, fields: dict[str, Any], find: bool) -> list[Reconstruction]:
     """Reconstruct everybody, with the skeleton that their motion shows where it is to be found."""
     import kcs_torch as kt
+    from kcs_torch.reconstruct import with_found_bones
 
     frames = sum(one.num_frames for one in people)
     joints = people[0].num_joints
     who = f"{len(people)} people, " if len(people) > 1 else ""
     with progress(f"reconstructing {who}{frames} frames of {joints} joints"):
         if find:
-            people = [replace(one, skeleton=kt.find_skeleton(one)) for one in people]
+            people = [with_found_bones(one) for one in people]
         return kt.reconstruct_all(people, method=method, **fields)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +23,6 @@ LINES, LINE = 2**23, 2**23  # of a table of text, and letters of one
 _OVERSHOOT = 1.5  # some networks' confidences pass 1 a little; above this they are on another scale
 _FARTHEST = 1e9  # pixels
 _FRAGMENT = 0.1  # share of the frames, below which an animal that is seen is a piece of somebody's track
-_NO_BONES = "the file names no bones: give a skeleton, or let reconstruct(..., skeleton='auto') find one"
 _SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]*\Z")
 _NUMBER = re.compile(r"([0-9]+)\Z")
 
@@ -153,7 +151,7 @@ def build_animals(
             fps=fps,
             notes=[*shared, *own],
         )
-        people.append(tracks if tracks.skeleton.bones else replace(tracks, notes=(*tracks.notes, _NO_BONES)))
+        people.append(tracks)
     return people
 
 
@@ -188,4 +186,4 @@ def _within_one(confidence: NDArray[np.float64], notes: list[str]) -> NDArray[np
 
 def refuse_3d(path: Path) -> FormatError:
     """The error for 3D motion where tracks are wanted."""
-    return FormatError(f"{path}: expected 2D tracks, got 3D motion (x, y, z): kcs_torch.load_motion reads that")
+    return FormatError(f"{path}: expected 2D tracks, got 3D motion (x, y, z): kcs_torch.load_motion reads it")

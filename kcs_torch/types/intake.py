@@ -16,7 +16,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton, map_joints
 
-__all__ = ["Intake", "as_floats", "as_number", "choose_skeleton", "joint_order", "take_in"]
+__all__ = ["Intake", "as_floats", "as_number", "choose_skeleton", "joint_order", "no_bones", "take_in"]
 
 _SPARE = 1e6  # coordinates are smaller than the largest number by this factor, so that their sums are finite
 
@@ -47,6 +47,18 @@ def as_number(value: Any) -> float | None:
     return float(value) if isinstance(value, Real) else None
 
 
+def fitting(num_joints: int) -> list[str]:
+    """Names of the built-in skeletons that have so many observed joints."""
+    return [body.name for body in SKELETONS.values() if body.num_observed == num_joints]
+
+
+def no_bones(num_joints: int) -> str:
+    """What to say of tracks that come without bones."""
+    fits = fitting(num_joints)
+    choice = f" ({num_joints} joints fit {', '.join(fits)})" if fits else ""
+    return f"no bones are given: name a skeleton{choice}, or skeleton='auto' (--skeleton auto) to find the bones"
+
+
 def choose_skeleton(
     skeleton: str | Path | Skeleton | None,
     names: Sequence[str] | None,
@@ -59,7 +71,7 @@ def choose_skeleton(
     if skeleton is not None:
         body = get_skeleton(skeleton)
         if body.num_observed != num_joints:
-            fits = [s.name for s in SKELETONS.values() if s.num_observed == num_joints]
+            fits = fitting(num_joints)
             hint = f"; {num_joints} joints fit {', '.join(fits)}" if fits else ""
             raise SkeletonError(
                 f"{source}: expected the {body.num_observed} joints of skeleton '{body.name}', got {num_joints}{hint}"
@@ -161,11 +173,12 @@ def take_in(
 ) -> Intake:
     """Check arrays of one body's motion in ``dims`` dimensions; arguments and errors as of ``Tracks.from_arrays``."""
     remarks = list(notes)
-    xy = as_floats(points, f"{source}: points", 3)
+    xy = as_floats(points, f"{source}: points (frames, joints, {dims})", 3)
     if confidence is not None:
-        confidence = as_floats(confidence, f"{source}: confidence", 2)
+        confidence = as_floats(confidence, f"{source}: confidence (frames, joints)", 2)
     if xy.shape[-1] != dims:
-        raise ShapeError(f"{source}: points: expected shape (frames, joints, {dims}), got {tuple(xy.shape)}")
+        hint = "; confidences go into an array of their own" if xy.shape[-1] == dims + 1 else ""
+        raise ShapeError(f"{source}: points: expected shape (frames, joints, {dims}), got {tuple(xy.shape)}{hint}")
     num_frames, num_joints = xy.shape[:2]
     if num_frames < 1:
         raise ShapeError(f"{source}: expected at least 1 frame, got none")

@@ -15,6 +15,7 @@ from kcs_torch.errors import OptionError
 from kcs_torch.functional import orbit
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
 from kcs_torch.types.axes import from_y_up, to_y_up
+from kcs_torch.types.clip import Clip
 from kcs_torch.types.intake import as_floats, take_in
 from kcs_torch.types.intrinsics import Intrinsics
 from kcs_torch.types.reconstruction import Reconstruction
@@ -24,8 +25,8 @@ from kcs_torch.types.tracks import Tracks
 __all__ = ["Motion"]
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
+@dataclass(frozen=True, eq=False, repr=False)
+class Motion(Clip):
     """3D motion of one body in a world of right-handed axes with y up.
 
     Seen from a camera on the z axis, x points right and z towards the viewer; a body that faces +z has its left at +x.
@@ -41,13 +42,7 @@ class Motion:
         notes: what was changed or assumed on the way in, one sentence each.
     """
 
-    points: Tensor
-    weights: Tensor
-    skeleton: Skeleton
-    fps: float | None = None
-    units: str = ""
     source: str = "motion"
-    notes: tuple[str, ...] = ()
 
     @classmethod
     def from_arrays(
@@ -151,31 +146,6 @@ class Motion:
             tuple(dict.fromkeys(notes)),
         )
 
-    def __repr__(self) -> str:
-        return (
-            f"Motion({self.source!r}: {self.num_frames} frames, {self.num_joints} joints of skeleton "
-            f"'{self.skeleton.name}', fps {self.fps}, {self.units or 'unit unknown'}, "
-            f"{100 * self.unseen_share:.1f} % unseen)"
-        )
-
-    @property
-    def num_frames(self) -> int:
-        return self.points.shape[0]
-
-    @property
-    def num_joints(self) -> int:
-        return self.points.shape[1]
-
-    @property
-    def seen(self) -> Tensor:
-        """(T, N), True where a joint is seen."""
-        return self.weights > 0
-
-    @property
-    def unseen_share(self) -> float:
-        """Share of joints that are unseen, 0..1."""
-        return float(1 - self.seen.double().mean())
-
     @property
     def lengths(self) -> Tensor:
         """(B,) mean bone lengths over the frames in which both ends are seen; NaN where there is none."""
@@ -183,15 +153,6 @@ class Motion:
         both = self.seen[:, a] & self.seen[:, b]
         length = (self.points[:, b] - self.points[:, a]).norm(dim=-1)
         return torch.where(both, length, torch.full_like(length, math.nan)).nanmean(0)
-
-    def to(self, *args: Any, **kwargs: Any) -> Motion:
-        """Move or cast the tensors, as ``Tensor.to``."""
-        return replace(self, points=self.points.to(*args, **kwargs), weights=self.weights.to(*args, **kwargs))
-
-    def frames(self, start: int, stop: int, step: int = 1) -> Motion:
-        """A run of frames; with a step, every so many, at the slower rate."""
-        rate = None if self.fps is None else self.fps / step
-        return replace(self, points=self.points[start:stop:step], weights=self.weights[start:stop:step], fps=rate)
 
     def scaled(self, *, units: str, factor: float | None = None, **sizes: float) -> Motion:
         """The same motion in another unit; arguments and errors as of :meth:`Reconstruction.scaled`."""

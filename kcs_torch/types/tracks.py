@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
+from kcs_torch.errors import counted
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types.intake import take_in
+from kcs_torch.types.clip import Clip
+from kcs_torch.types.intake import no_bones, take_in
 
 __all__ = ["Tracks"]
 
 
-@dataclass(frozen=True, eq=False)
-class Tracks:
+@dataclass(frozen=True, eq=False, repr=False)
+class Tracks(Clip):
     """2D joint tracks of one body. Build it with :meth:`from_arrays` or :func:`kcs_torch.load_tracks`.
 
     Attributes:
@@ -29,13 +29,8 @@ class Tracks:
         notes: what was changed or assumed on the way in, one sentence each.
     """
 
-    points: Tensor
-    weights: Tensor
-    skeleton: Skeleton
-    fps: float | None = None
     units: str = "px"
     source: str = "tracks"
-    notes: tuple[str, ...] = ()
 
     @classmethod
     def from_arrays(
@@ -87,6 +82,8 @@ class Tracks:
             notes=notes,
         )
         body, remarks = taken.skeleton, taken.notes
+        if skeleton is None and not body.bones:
+            remarks.append(no_bones(body.num_joints))
         xy, weights = body.complete(taken.points, taken.weights)
         never = [body.joints[n] for n in (weights == 0).all(0).nonzero().flatten().tolist()]
         if never:
@@ -94,37 +91,6 @@ class Tracks:
         blank = (weights == 0).all(1).nonzero().flatten().tolist()
         if blank:
             shown = ", ".join(map(str, blank[:8])) + (", ..." if len(blank) > 8 else "")
-            remarks.append(f"{len(blank)} frames without any seen joint (frame {shown}): filled from their neighbours")
+            frames = counted(len(blank), "frame")
+            remarks.append(f"{frames} without any seen joint (frame {shown}): filled from their neighbours")
         return cls(xy, weights, body, taken.fps, units, source, tuple(remarks))
-
-    def __repr__(self) -> str:
-        return (
-            f"Tracks({self.source!r}: {self.num_frames} frames, {self.num_joints} joints of skeleton "
-            f"'{self.skeleton.name}', fps {self.fps}, {self.units}, {100 * self.unseen_share:.1f} % unseen)"
-        )
-
-    @property
-    def num_frames(self) -> int:
-        return self.points.shape[0]
-
-    @property
-    def num_joints(self) -> int:
-        return self.points.shape[1]
-
-    @property
-    def seen(self) -> Tensor:
-        """(T, N), True where a joint is seen."""
-        return self.weights > 0
-
-    @property
-    def unseen_share(self) -> float:
-        """Share of observed joints that are unseen, 0..1."""
-        return float(1 - self.seen[:, : self.skeleton.num_observed].double().mean())
-
-    def to(self, *args: Any, **kwargs: Any) -> Tracks:
-        """Move or cast the tensors, as ``Tensor.to``."""
-        return replace(self, points=self.points.to(*args, **kwargs), weights=self.weights.to(*args, **kwargs))
-
-    def frames(self, start: int, stop: int) -> Tracks:
-        """A run of frames."""
-        return replace(self, points=self.points[start:stop], weights=self.weights[start:stop])
