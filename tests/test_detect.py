@@ -563,7 +563,7 @@ def test_lift_of_a_video_by_ones_own_models(video, rtmlib):
 
 COMMAND_MISTAKES = {
     "suffix": (["detect", "VIDEO", "-o", "OUT.html"], "OutputError", "the suffix .npz"),
-    "person": (["detect", "VIDEO", "-o", "OUT.npz", "--person", "7"], "FormatError", "got 2 people"),
+    "person": (["detect", "VIDEO", "-o", "OUT.npz", "--person", "7"], "FormatError", "as there are 2 people"),
     "person's name": (
         ["detect", "VIDEO", "-o", "OUT.npz", "--person", "bob"],
         "OptionError",
@@ -572,7 +572,7 @@ COMMAND_MISTAKES = {
     "frames": (["detect", "VIDEO", "-o", "OUT.npz", "--frames", "9"], "OptionError", "such as 100:400"),
     "no video": (["detect", "absent.mp4", "-o", "OUT.npz"], "FormatError", "expected a video file, got none"),
     "lift": (["lift", "VIDEO", "-o", "OUT.npz", "--detector", "yolo"], "OptionError", "choices are"),
-    "lift's person": (["lift", "VIDEO", "-o", "OUT.npz", "--person", "2"], "FormatError", "got 2 people"),
+    "lift's person": (["lift", "VIDEO", "-o", "OUT.npz", "--person", "2"], "FormatError", "as there are 2 people"),
 }
 
 

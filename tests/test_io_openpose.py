@@ -80,7 +80,7 @@ def test_two_layouts_of_25_joints_are_told_apart(tmp_path, name):
     detections = [[np.column_stack([frame, np.full(25, 0.8)])] for frame in xy]
     tracks = load_tracks(write_openpose(tmp_path / "json", detections))
     assert tracks.skeleton.name == name
-    assert any("the joints' places say body25b" in n for n in tracks.notes) == (name == "body25b")
+    assert any("the joints lie as those of body25b" in n for n in tracks.notes) == (name == "body25b")
 
 
 def test_other_lengths_name_the_skeletons_that_fit(tmp_path):
@@ -138,7 +138,7 @@ def test_people_are_linked_and_sorted_by_how_much_is_seen(tmp_path):
     chosen = load_tracks(folder)
     assert np.allclose(numbers(chosen), b)
     assert "3 people" in chosen.notes[-1]
-    with pytest.raises(FormatError, match=r"person number 3 \(counted from 0\), got 3 people"):
+    with pytest.raises(FormatError, match=r"person: expected 0 to 2, as there are 3 people, got 3"):
         load_tracks(folder, person=3)
 
 

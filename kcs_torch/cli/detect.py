@@ -122,7 +122,7 @@ def people_of(
 
     from kcs_torch.cli.options import person_number
     from kcs_torch.detect import detect_video
-    from kcs_torch.errors import FormatError
+    from kcs_torch.io.load import check_person
 
     number = person_number(person)
     start, stop = frame_range(frames)
@@ -143,10 +143,7 @@ def people_of(
         )
     if person == "all":
         return list(enumerate(people))
-    if number is not None and number >= len(people):
-        some = "1 person" if len(people) == 1 else f"{len(people)} people"
-        raise FormatError(f"{video}: expected a person number {number} (counted from 0), got {some}")
-    one = people[number or 0]
+    one = people[check_person(video, number or 0, len(people))]
     if number is None and len(people) > 1:
         note = f"{len(people)} people found: this is the most seen one, number 0; --person all takes all"
         one = replace(one, notes=(*one.notes, note))

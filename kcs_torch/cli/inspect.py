@@ -22,6 +22,7 @@ from kcs_torch.cli.options import (
 from kcs_torch.cli.outputs import Scale, Units, Up, check_up, parse_scale, sized, write_files
 from kcs_torch.cli.pictures import check_picture, write_picture
 from kcs_torch.cli.report import answer, one_line, print_json, progress
+from kcs_torch.errors import counted
 
 if TYPE_CHECKING:
     from kcs_torch.types import Tracks
@@ -117,7 +118,7 @@ def _spoken(facts: dict[str, Any]) -> str:
     shape = "a tree" if facts["tree"] else "not a tree"
     virtual = f" and virtual {', '.join(facts['virtual_joints'])}" if facts["virtual_joints"] else ""
     lines = [
-        f"{facts['path']}: format {facts['format']}, {facts['frames']} frames, {rate}, in {facts['units']}",
+        f"{facts['path']}: format {facts['format']}, {counted(facts['frames'], 'frame')}, {rate}, in {facts['units']}",
         f"skeleton {facts['skeleton']}: {len(facts['joints'])} joints, {len(facts['bones'])} bones, {shape}",
         f"joints: {', '.join(facts['joints'])}{virtual}",
         "person  frames seen  mean confidence  joints unseen",

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from kcs_torch.errors import KcsError, KcsWarning, counted
+
 if TYPE_CHECKING:
     from kcs_torch.types import Reconstruction
 
@@ -26,8 +28,6 @@ def one_line(text: object) -> str:
 @contextmanager
 def answer(as_json: bool = False) -> Iterator[None]:
     """Run a command's body: an error of bad input becomes one line and exit code 2, a warning one line."""
-    from kcs_torch.errors import KcsError, KcsWarning
-
     usual = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
@@ -127,6 +127,7 @@ def summary(result: Reconstruction, solution: int = 1) -> dict[str, Any]:
 def describe(facts: dict[str, Any]) -> str:
     """The same for a reader: a heading and a line a fact."""
     rate = f", {facts['fps']:g} frames a second" if facts["fps"] else ""
+    variation = facts["bone_variation"]
     ended = "converged" if facts["converged"] else "did not converge"
     pace = 1000 * facts["seconds"] / facts["frames"]
     took = "" if math.isnan(pace) else f", {facts['seconds']:.2f} s ({pace:.1f} ms a frame)"
@@ -134,12 +135,13 @@ def describe(facts: dict[str, Any]) -> str:
         "unseen joints": f"{100 * facts['unseen_share']:.1f} %",
         "method": f"{facts['method']}: {ended}, {facts['iterations']} iterations{took}",
         "viewpoint turn": f"{facts['viewpoint_turn']:.0f} degrees",
-        "bone variation": f"{facts['bone_variation']:.2f} %",
+        "bone variation": "unknown: no bones" if math.isnan(variation) else f"{variation:.2f} %",
         "reprojection": f"{facts['reprojection_rms']:.3g} {facts['track_units']} (root mean square)",
     }
-    head = f"{facts['source']}: {facts['frames']} frames, {facts['joints']} joints ({facts['skeleton']}){rate}"
+    frames = counted(facts["frames"], "frame")
+    head = f"{facts['source']}: {frames}, {facts['joints']} joints ({facts['skeleton']}){rate}"
     lines = [head, *(f"  {name:<15} {text}" for name, text in rows.items())]
-    best = "" if math.isnan(facts["objective"]) else f" ({facts['objective']:.1f} here)"
+    best = "" if math.isnan(facts["objective"]) else f" (this one: {facts['objective']:.1f})"
     for other in facts["alternatives"]:
         value = "" if math.isnan(other["objective"]) else f"objective {other['objective']:.1f}{best}, "
         apart = f"{other['rms_difference']:.3g} {facts['units']} away (root mean square)"

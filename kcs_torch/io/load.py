@@ -14,7 +14,7 @@ from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
-__all__ = ["READERS", "WRITERS", "detect_format", "load_people", "load_tracks"]
+__all__ = ["READERS", "WRITERS", "check_person", "detect_format", "load_people", "load_tracks"]
 
 READERS, WRITERS = discover()
 """The formats that tracks come in, by name, and those that can be written, by suffix."""
@@ -124,14 +124,23 @@ def load_tracks(
         trust=trust,
     )
     if person is not None:
-        if person >= len(people):
-            some = "1 person" if len(people) == 1 else f"{len(people)} people"
-            raise FormatError(f"{path}: expected a person number {person} (counted from 0), got {some}")
-        return people[person]
+        return people[check_person(path, person, len(people))]
     if len(people) == 1:
         return people[0]
     note = f"{len(people)} people found: this is the most seen one, number 0"
     return replace(people[0], notes=(*people[0].notes, note))
+
+
+def check_person(path: str | Path, person: int, count: int) -> int:
+    """The number of one of ``count`` people.
+
+    Raises:
+        FormatError: there are fewer people.
+    """
+    if person < count:
+        return person
+    there = "0, as there is one person" if count == 1 else f"0 to {count - 1}, as there are {count} people"
+    raise FormatError(f"{path}: person: expected {there}, got {person}")
 
 
 def _size(size: tuple[int, int]) -> tuple[int, int]:
@@ -155,7 +164,10 @@ def _describe(probe: Probe) -> str:
     """What a path that no reader recognises holds, in a few words."""
     motion = [reader.name for reader in MOTION_READERS.values() if reader.recognises(probe)]
     if motion:
-        return f"3D motion ({motion[0]}): load_motion(path).tracks() films it; `kcs-torch convert` and `score` take it"
+        return (
+            f"3D motion ({motion[0]}): `kcs-torch convert` and `kcs-torch score` take it; in Python "
+            "load_motion(path) reads it, and its .tracks() makes 2D tracks"
+        )
     if probe.files:
         suffixes = sorted({f.suffix or f.name for f in probe.files})
         shown = ", ".join(suffixes[:5]) + (", ..." if len(suffixes) > 5 else "")
@@ -179,4 +191,7 @@ def _describe(probe: Probe) -> str:
         return f"an HDF5 file with other content ({', '.join(held[:8]) or 'nothing'}{', ...' if len(held) > 8 else ''})"
     if probe.head.startswith((b"PK\x03\x04", b"\x80")):
         return "a binary file with other content"
-    return f"a file that begins with {probe.head[:16]!r}"
+    if probe.head.startswith(b"\x93NUMPY"):
+        return "a single array: write it with numpy.savez(path, points2d=array), (frames, joints, 2), NaN where unseen"
+    start = probe.head[:16]
+    return f"a file that begins with {start.decode()!r}" if start.isascii() else f"a file that begins with {start!r}"

@@ -71,7 +71,8 @@ def fit_rig(points: Tensor, body: Skeleton, *, up: str = "y") -> Rig:
         else:
             reason = "closes a chain"
         raise OutputError(
-            f"expected a skeleton whose bones are one tree, got '{body.name}', which {reason}: give one with skeleton="
+            f"expected a skeleton whose bones are one tree, got '{body.name}', which {reason}: "
+            "give one with skeleton=..., on the command line --skeleton"
         )
     rest = points[0]
     if body.template is not None:

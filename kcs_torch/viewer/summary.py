@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from kcs_torch.errors import counted
 from kcs_torch.types import Reconstruction
 
 __all__ = ["summarise"]
@@ -14,7 +15,7 @@ def summarise(result: Reconstruction) -> str:
     d = result.diagnostics
     fps = f" at {result.fps:g} a second" if result.fps else ""
     facts = [
-        f"{len(result.points)} frames{fps}",
+        f"{counted(len(result.points), 'frame')}{fps}",
         f"skeleton {result.skeleton.name}",
         _fact("viewpoint turn {:.0f}°", d.viewpoint_turn),
         _fact("unseen {:.1f} %", 100 * d.unseen_share),

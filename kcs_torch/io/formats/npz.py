@@ -53,7 +53,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
     if "points2d" not in file and "points3d" in file:
         raise FormatError(
             f"{path}: expected 2D tracks under 'points2d', got 3D motion only (points3d): "
-            "load_motion(path).tracks() films it"
+            "load_motion(path) reads it, and its .tracks() makes 2D tracks"
         )
     points = file.array("points2d", "fiu", 3)
     return [
@@ -169,13 +169,13 @@ def load_reconstruction(path: str | Path) -> Reconstruction:
     """
     probe = Probe(path)
     if not recognises(probe):
-        raise FormatError(f"{path}: expected an .npz file that save() wrote, got something else")
+        raise FormatError(f"{path}: expected a result (.npz) of `kcs-torch lift` or save(), got something else")
     file = Archive(probe.path)
     wanted = ("points2d", "confidence", "points3d_all", "cameras", "scales", "lengths", "skeleton", "diagnostics")
     missing = [k for k in wanted if k not in file]
     if missing:
         raise FormatError(
-            f"{path}: expected a result that save() wrote, got a file without {', '.join(missing)}; "
+            f"{path}: expected a result of `kcs-torch lift` or save(), got a file without {', '.join(missing)}; "
             "load_tracks() reads tracks"
         )
     tracks = _tracks_in(file)

@@ -147,7 +147,7 @@ def _layout(joints: int, detections: list[Person], options: Options, path: Path,
         spread = {name: mean_bone(SKELETONS[name], np.concatenate(detections)) for name in (usual, *others)}
         best = min(spread, key=lambda name: spread[name])
         if spread[best] < _CLEARLY * spread[usual]:
-            notes.append(f"{3 * joints} numbers a person are {usual} as a rule; the joints' places say {best}")
+            notes.append(f"{3 * joints} numbers per person usually mean {usual}, but the joints lie as those of {best}")
             return best
         return usual
     if options.skeleton is not None and get_skeleton(options.skeleton).num_observed == joints:
