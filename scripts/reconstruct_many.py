@@ -10,7 +10,7 @@ r"""Reconstruct a folder of thousands of track files; stop it whenever you like,
 Finished results are skipped, failures are listed and leave NAME.failed.txt beside the results, and no file is ever half
 written. The shards of a multirun share nothing but the two folders, so that they may run on any machines that see
 these: hydra/launcher is joblib (processes), submitit_slurm or submitit_local, or ray: pip install
-"kcs-torch[launchers]".
+".[launchers]".
 Exit code 1 where a clip failed.
 """
 

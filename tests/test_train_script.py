@@ -400,4 +400,4 @@ class TestKcsTorchTrain:
         )
         done = CliRunner().invoke(app, ["train", "trainer.max_epochs=1"])
         assert done.exit_code == 2
-        assert done.stderr == f'error: train: {missing} is missing: pip install "kcs-torch[train]"\n'
+        assert done.stderr == f'error: train: {missing} is missing: pip install ".[train]" in a clone of kcs_torch\n'

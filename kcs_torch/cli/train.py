@@ -23,7 +23,7 @@ def train(context: typer.Context) -> None:
         if missing:
             from kcs_torch.errors import OptionError
 
-            raise OptionError(f'train: {", ".join(missing)} is missing: pip install "kcs-torch[train]"')
+            raise OptionError(f'train: {", ".join(missing)} is missing: pip install ".[train]" in a clone of kcs_torch')
     from kcs_torch.training.run import main
 
     main(context.args)

@@ -19,8 +19,8 @@ except ModuleNotFoundError as reason:
     if reason.name != "torchmetrics":
         raise
     raise ModuleNotFoundError(
-        "kcs_torch.metrics: MPJPE, PCK, E3D and BoneDeviation need the package torchmetrics, which the extra "
-        "'train' brings: pip install 'kcs-torch[train]'. The functions mpjpe, pck, e3d, bone_deviation do without.",
+        "kcs_torch.metrics: MPJPE, PCK, E3D and BoneDeviation need the package torchmetrics: "
+        "pip install torchmetrics. The functions mpjpe, pck, e3d and bone_deviation do without it.",
         name="torchmetrics",
     ) from None
 

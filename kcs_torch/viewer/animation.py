@@ -152,7 +152,7 @@ def _ffmpeg() -> str:
         found = shutil.which("ffmpeg")
     if found is None:
         raise OutputError(
-            "an MP4 needs ffmpeg, which was not found: pip install 'kcs-torch[video]', or install ffmpeg; "
+            "an MP4 needs ffmpeg, which was not found: pip install imageio-ffmpeg, or install ffmpeg; "
             "a .gif needs neither"
         )
     return found

@@ -33,9 +33,7 @@ def save_recording(results: Reconstruction | Sequence[Reconstruction], path: str
         import rerun as rr
         import rerun.blueprint as rrb
     except ImportError as error:
-        raise OutputError(
-            f"a recording needs the package rerun-sdk ({error}): pip install 'kcs-torch[rerun]'"
-        ) from None
+        raise OutputError(f"a recording needs the package rerun-sdk ({error}): pip install rerun-sdk") from None
     layout = rrb.Horizontal(
         rrb.Spatial3DView(origin="/space", name="3D"),
         rrb.Vertical(
