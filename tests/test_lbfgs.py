@@ -53,6 +53,38 @@ def test_rows_do_not_see_each_other():
     assert_close(together, alone, rtol=1e-5, atol=1e-5)  # products of other shapes round in another way
 
 
+def test_no_row_waits_for_another():
+    """Row by row the same steps; and of rows that are done, or in another's line search, hardly any is evaluated."""
+    starts = torch.cat([STARTS, torch.ones(9, 6).double()])  # at the minimum: nothing to do
+    evaluated: list[int] = []
+
+    def energy(rows, x):
+        evaluated.append(len(rows))
+        return rosenbrock(x)
+
+    def part(rows):
+        return lambda x: energy(rows, x)
+
+    options = {"num_steps": 100, "tolerance": 1e-4}
+    every = torch.arange(len(starts))
+    with_part = lbfgs(part(every), starts, part=part, **options)
+    count = sum(evaluated)
+    alone = []
+    for row in starts:
+        evaluated.clear()
+        one = lbfgs(part(every[:1]), row[None], **options)
+        alone.append((one.value[0], one.before[0], one.energy[0], sum(evaluated), one.iterations))
+    value, before, least, needed, steps = zip(*alone, strict=True)
+    assert_close(with_part.value, torch.stack(value), rtol=1e-5, atol=1e-5)
+    assert_close(with_part.before, torch.stack(before), rtol=1e-5, atol=1e-5)
+    assert_close(with_part.energy, torch.stack(least), rtol=1e-5, atol=1e-5)
+    assert with_part.iterations == max(steps) and with_part.converged
+    assert max(needed) * len(starts) > 2 * sum(needed)  # what waiting would cost
+    assert count < 1.3 * sum(needed)
+    waiting = lbfgs(rosenbrock, starts, **options)
+    assert_close(waiting.value, with_part.value, rtol=1e-5, atol=1e-5)
+
+
 @pytest.mark.parametrize("memory", [1, 3, 10])
 def test_as_the_two_loops_over_pairs(memory):
     """Against Nocedal's own recursion, while pairs come and go; a pair without curvature counts for nothing."""
@@ -74,10 +106,10 @@ def test_as_the_two_loops_over_pairs(memory):
         assert_close(history.turned(gradient, scale), q)
         step = random(2, 30) * 10.0 ** -(made % 7)
         change = (matrix @ step[..., None])[..., 0]
-        told = history.add((step, change), (0 * step, 0 * change), scale)
+        told = history.add(step, change, scale)
         assert_close(told, (step * change).sum(-1, keepdim=True) / change.square().sum(-1, keepdim=True))
         pairs = [*pairs, (step, change)][-memory:]
-    assert torch.equal(history.add((like, -like), (0 * like, 0 * like), scale), scale)
+    assert torch.equal(history.add(like, -like, scale), scale)
     assert torch.isfinite(history.turned(like, scale)).all()
     if memory == 1:
         assert_close(history.turned(like, scale), scale * like)
@@ -88,9 +120,8 @@ def test_operations_do_not_grow_with_the_memory():
     for memory in (5, 10, 40):
         history = History(STARTS, memory)
         for k in range(50):
-            history.add(
-                (STARTS, normal(*STARTS.shape, seed=k)), (0 * STARTS, STARTS), torch.ones(len(STARTS), 1).double()
-            )
+            change = normal(*STARTS.shape, seed=k) - STARTS
+            history.add(STARTS, change, torch.ones(len(STARTS), 1).double())
         counts.append(count_operations(lambda h=history: h.turned(STARTS, torch.ones(len(STARTS), 1).double())).total)
     assert len(set(counts)) == 1 and counts[0] < 25
 

@@ -167,7 +167,10 @@ def _descend(
         change=CHANGE, reach=REACH, tracks=tracks, weights=weights, noise=noise, extra=extra,
     )  # fmt: skip
     start = points.new_zeros(len(points), roots[0, ..., 0].numel())
-    solution = lbfgs(descent, start, num_steps=stage.num_steps, first_step=1.0, tolerance=1e-8, slopes=True)
+    solution = lbfgs(
+        descent, start, num_steps=stage.num_steps, first_step=1.0, tolerance=1e-8, slopes=True,
+        part=None if extra else descent.rows,  # what else is wanted may be of each hypothesis its own
+    )  # fmt: skip
     assert solution.before is not None and solution.energy is not None
     points, rotations = descent.moved(solution.value)
     moved = (points - descent.moved(solution.before)[0]).square().sum(-1).mean((-2, -1)).sqrt()

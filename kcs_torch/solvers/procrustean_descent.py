@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from copy import copy
 from typing import TYPE_CHECKING
 
 import torch
@@ -81,6 +82,13 @@ class Descent:
         levels += [(stage.moving, change * stage.eps, frames - 1)] if self.moving else []
         # weights, eps and frames of the log-determinants: (levels, 1, 1, 1) each
         self.levels = points.new_tensor(levels).view(len(levels), 3, 1, 1, 1).unbind(1)
+
+    def rows(self, index: Tensor) -> Descent:
+        """That of some hypotheses."""
+        out = copy(self)
+        for name in ("points", "rotations", "roots", "bones", "links", "flat"):
+            setattr(out, name, getattr(self, name)[index])
+        return out
 
     def moved(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Points (H, T, N, 3) and rotations (H, T, 3, 3) of steps u (H, T D)."""

@@ -106,14 +106,16 @@ class Body:
             moved = bone_vectors(blocks, self.objective.bones).diff(dim=1).square().sum((1, 2, 3))
             order = moved.argsort(descending=True).tolist()  # lengths come from the liveliest block
             part = lambda i, anchor: lift(blocks[i], noise=noise[starts[i] : starts[i] + size], anchor=anchor)  # noqa: E731
-            first = (yield from part(order[0], None))[:1]
-            lengths = first.lengths[0]
-            best = [first]
+            depths = blocks.new_empty(blocks.shape[:3])  # all that is kept of a block
+            first = yield from part(order[0], None)
+            lengths, count = first.lengths[0], first.steps
+            depths[order[0]] = first.depth[0]
             for begin in range(1, len(order), ABREAST):
-                best += yield from together([part(i, lengths) for i in order[begin : begin + ABREAST]])
-            depths = [best[order.index(i)].depth[0] for i in range(len(starts))]
-            joined = blend_windows(torch.stack(depths), starts, frames)
-            found = Hypotheses(joined[None], lengths[None], joined.new_zeros(1), sum(one.steps for one in best))
+                some = order[begin : begin + ABREAST]
+                for i, one in zip(some, (yield from together([part(i, lengths) for i in some])), strict=True):
+                    depths[i], count = one.depth[0], count + one.steps
+            joined = blend_windows(depths, starts, frames)
+            found = Hypotheses(joined[None], lengths[None], joined.new_zeros(1), count)
         if stride > 1 or len(starts) > 1:
             found = yield from self._on_all_frames(found[:4], stride, steps)
         return found

@@ -56,7 +56,6 @@ class Descent:
         lines = [(affine - affine.mean(-1, keepdim=True)) @ obj.tree[posture.trunk]]  # (2, B): the axes' depths
         self.axes = posture.axes.to(like)
         self.spread = posture.deviation.to(like).mT.reshape(-1, 3, body.num_bones)  # (1 or H, 3, B)
-        self.eye = torch.eye(3 * body.num_bones, dtype=like.dtype, device=like.device)
         self.mean = (posture.mean.to(like).mT / self.spread).flatten(1)[..., None]  # (1 or H, 3B, 1)
         hinges = obj.hinges
         if len(hinges.joints):
@@ -85,6 +84,12 @@ class Descent:
         value, slope, growth = self.at(own, u.lengths * grown.exp())
         growth += (slope * u.shear).sum(-1)
         return value, torch.cat([slope.flatten(1), growth], 1).mul_(u.scale)
+
+    def rows(self, index: Tensor) -> Descent:
+        """That of some hypotheses."""
+        assert self.unknowns is not None
+        unknowns = self.unknowns.rows(index)
+        return Descent(unknowns.objective, unknowns)
 
     def at(self, own: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Value (H,) of bones' depths (H, B, T) and lengths (H, B), its derivatives in depths and log lengths."""
@@ -168,36 +173,39 @@ class Descent:
         up = square * down
         frame = torch.stack([first, up, torch.linalg.cross(first, up, dim=1)], 1).flatten(2)  # (H, 3, 3 T)
         turn = (self.axes @ frame).view(count, 3, 3, 1, frames)  # [k, j]: how much of coordinate j is in direction k
-        # How bones stray from their usual directions, seen from the trunk, and a row that is 1 in real frames: the
-        # products of these with each other tell mean and scatter.
+        # How bones stray from their usual directions, seen from the trunk, less that share of their mean for which the
+        # prior does not charge: log det(I + Z Z^T) is then all there is to it.
         scale = (lengths[:, None] * self.spread).reciprocal_().flatten(1)[..., None]  # (H, 3B, 1)
-        seen = dz.new_empty(count, 3 * bones + 1, frames)
-        seen[:, -1] = 1 if self.time is None else self.time[:, 0]
         own = dz if self.time is None else dz * self.time
-        y = seen[:, :-1].view(count, 3, bones, frames)
-        torch.mul(turn[:, :, 0], self.x[:, None], out=y)
+        y = turn[:, :, 0] * self.x[:, None]
         y.addcmul_(turn[:, :, 1], self.y[:, None]).addcmul_(turn[:, :, 2], own[:, None])
-        seen[:, :-1].mul_(scale).addcmul_(self.mean, seen[:, -1:], value=-1)
-        total = torch.bmm(seen, seen.mT)  # (H, 3B + 1, 3B + 1)
-        each = 1 / wide(self.weights.posture, 2)  # what a frame counts
-        amount = wide(obj.count, 2) * each
-        near = amount / (amount + posture.kappa)
-        mean = total[:, :-1, -1:] / wide(obj.count, 2)
-        scatter = total[:, :-1, :-1] * (each / posture.strength)
-        scatter.baddbmm_(mean * (-amount * near / posture.strength), mean.mT)
+        seen = y.view(count, 3 * bones, frames)
+        real = wide(obj.count, 2)
+        amount = real / wide(self.weights.posture, 2)  # what these frames count
+        root, part = (amount / (real * posture.strength)) ** 0.5, (posture.kappa / (amount + posture.kappa)) ** 0.5
+        mean = scale * seen.sum(-1, keepdim=True) / real - self.mean
+        seen.mul_(root * scale)
+        self._lower(seen, root * (self.mean + (1 - part) * mean))
+        few = frames < 3 * bones  # Z^T Z is then the smaller matrix, and (I + Z Z^T)^-1 Z = Z (I + Z^T Z)^-1
+        scatter = torch.bmm(seen.mT, seen) if few else torch.bmm(seen, seen.mT)
         scatter.diagonal(dim1=-2, dim2=-1).add_(1)
         factor, info = torch.linalg.cholesky_ex(scatter)
         failed = info > 0  # a step so far that rounding or overflow leaves no scatter: it costs infinitely much
-        factor = torch.where(failed[:, None, None], self.eye, factor)
+        if bool(failed.any()):
+            factor = torch.where(failed[:, None, None], torch.ones_like(factor[0, 0]).diag(), factor)
         inverse = torch.cholesky_inverse(factor)
-        gain = (amount + posture.strength) / posture.strength
-        towards = inverse @ mean  # (H, 3B, 1)
-        # The sums over time of slope times y, and of the slope, are those of small matrices.
-        moved = posture.strength * (1 - inverse.diagonal(dim1=-2, dim2=-1)[..., None])
-        pulled = posture.kappa * near * towards * self.mean
-        growth -= (gain * (moved + pulled)).view(count, 3, bones).sum(1)
-        steep = torch.cat([inverse, -near * towards], -1).mul_(gain * each * scale) @ seen
-        steep = steep.view(count, 3, bones, frames)
+        firm = amount + posture.strength
+        if few:
+            steep = torch.bmm(seen, inverse)
+            moved = (steep * seen).sum(-1, keepdim=True)
+            steep.mul_(firm * root * scale)
+        else:
+            moved = 1 - inverse.diagonal(dim1=-2, dim2=-1)[..., None]
+            steep = torch.bmm(inverse.mul_(firm * root * scale), seen)
+        total = steep.sum(-1, keepdim=True)
+        growth -= (firm * moved + part * total * self.mean / scale).view(count, 3, bones).sum(1)
+        self._lower(steep, (1 - part) * total / real)
+        steep = steep.view_as(y)
         slope += (steep * turn[:, :, 2]).sum(1)
         turned = [(steep * v[:, None]).sum(2) for v in (self.x, self.y, own)]  # (H, 3, T): of k, for each j
         into = self.axes.mT @ torch.stack(turned, 2).flatten(2)  # (H, 3, 3 T)
@@ -209,9 +217,15 @@ class Descent:
         a = a - along * b - slant * second
         back[:, 1] = (b - slant * first)[:, 2]
         back[:, 0] = ((a - first * (first * a).sum(1, keepdim=True)) * over)[:, 2]
-        log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        held = amount[:, 0, 0] if isinstance(amount, Tensor) else amount
-        return torch.where(failed, torch.inf, (held + posture.strength) / 2 * log_det)
+        half = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        return torch.where(failed, torch.inf, half * (firm[:, 0, 0] if isinstance(firm, Tensor) else firm))
+
+    def _lower(self, values: Tensor, by: Tensor) -> None:
+        """Take (H, C, 1) from values (H, C, T), but in frames that pad a clip."""
+        if self.time is None:
+            values -= by
+        else:
+            values.addcmul_(by, self.time, value=-1)
 
     def _hinges(self, lengths: Tensor, depths: Tensor, growth: Tensor, back: Tensor) -> Tensor:
         w, limbs = self.weights, self.objective.hinges.limbs

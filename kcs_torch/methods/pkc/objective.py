@@ -243,7 +243,8 @@ class Objective:
         goal.weights = replace(self.weights, length=loose * self.weights.length)
         unknowns = Unknowns(goal, depth, lengths)
         start = depth.new_zeros(len(depth), unknowns.scale.shape[-1])
-        solution = lbfgs(Descent(goal, unknowns), start, num_steps=num_steps, tolerance=1e-5, slopes=True)
+        descent = Descent(goal, unknowns)
+        solution = lbfgs(descent, start, num_steps=num_steps, tolerance=1e-5, slopes=True, part=descent.rows)
         with torch.no_grad():
             depth, lengths = unknowns(solution.value)
             assert solution.before is not None and solution.energy is not None
@@ -284,6 +285,20 @@ class Objective:
             one = first.image.new_ones(first.skeleton.num_bones)
             out.anchor = torch.stack([one if part.anchor is None else part.anchor for part in parts])[each]
             out.held = gather([float(part.anchor is not None) for part in parts])
+        return out
+
+    def rows(self, index: Tensor) -> Objective:
+        """That of some hypotheses, of several clips together; of one clip it is the same for all."""
+        if self.time is None:
+            return self
+        out, pick = copy(self), lambda value: value[index]
+        for name in ("image", "flat", "noise", "time", "rigid", "count", "share", "clear"):
+            setattr(out, name, pick(getattr(self, name)))
+        out.weights = Weights(**{f.name: pick(getattr(self.weights, f.name)) for f in fields(Weights)})
+        out.posture = deepcopy(self.posture)
+        out.posture.deviation = pick(self.posture.deviation)
+        if self.anchor is not None:
+            out.anchor, out.held = pick(self.anchor), pick(self.held)
         return out
 
 
@@ -331,3 +346,11 @@ class Unknowns:
         own = dz.mT @ obj.tree[: obj.skeleton.num_observed].mT
         depth = own @ obj.complete
         return depth - depth.mean(-1, keepdim=True), self.lengths * grown.exp()
+
+    def rows(self, index: Tensor) -> Unknowns:
+        """Those of some hypotheses."""
+        out = copy(self)
+        out.objective = self.objective.rows(index)
+        for name in ("lengths", "dz", "shear", "scale"):
+            setattr(out, name, getattr(self, name)[index])
+        return out
