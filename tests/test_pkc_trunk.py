@@ -9,9 +9,11 @@ from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
 from kcs_torch.functional import best_path, bone_lengths
+from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pkc.trunk import (
     FIT,
     Trunk,
+    facings,
     image_scale,
     mirror,
     siblings,
@@ -28,7 +30,7 @@ RIGID = torch.ones(16, dtype=torch.bool)
 
 def paths_of(points):
     """The path that is found, and its mirror image."""
-    return siblings(trunk_path(points[..., :2], TRUNK, POSTURE, 15.0, 0.15), POSTURE.axes)[:2]
+    return siblings(run(trunk_path(points[..., :2], TRUNK, POSTURE, 15.0, 0.15), facings), POSTURE.axes)[:2]
 
 
 def angle(a, b):
@@ -173,7 +175,7 @@ def test_paths_are_rotations_whatever_is_seen(frames, dtype):
     posture = PostureEnergy("h36m17").to(dtype)
     trunk = Trunk(posture.rest, posture.rest_lengths)
     for image in (still, 0 * still, still * torch.tensor([0.0, 1.0])):
-        path = trunk_path(image.to(dtype), trunk, posture, 15.0, 0.15)
+        path = run(trunk_path(image.to(dtype), trunk, posture, 15.0, 0.15), facings)
         assert path.shape == (frames, 3, 3) and path.dtype == dtype
         found = siblings(path, posture.axes)
         assert_close(found.mT @ found, torch.eye(3).expand_as(found).to(found), rtol=0, atol=1e-4)

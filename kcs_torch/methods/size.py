@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.methods.clips import Clips, in_batches, padded
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.types import Tracks
 
-__all__ = ["size_path", "slow_waves", "weak_perspective"]
+__all__ = ["size_path", "slow_waves", "weak_perspective", "weak_perspectives"]
 
 QUANTILE = 0.8
 """Of a bone's images, over its length: what follows the body's size."""
@@ -60,59 +63,92 @@ def size_path(image: Tensor, seen: Tensor, skeleton: Skeleton, rate: float) -> t
     Returns:
         (T,), positive, of geometric mean 1; and (P,), by how much smaller each pair's deviation is with it, as a share.
     """
-    frames, joints, _ = image.shape
-    pairs = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
-    if not len(pairs):
-        pairs = torch.combinations(torch.arange(joints, device=image.device))
-    length = bone_vectors(image, pairs).norm(dim=-1)  # (T, P)
-    weight = (seen[:, pairs[:, 0]] & seen[:, pairs[:, 1]]).to(image)
-    top = torch.where(weight > 0, length, torch.zeros_like(length)).amax(0)
-    use = (weight.sum(0) >= 3) & (top > 0)
-    if frames < 3 or not bool(use.any()):
-        return image.new_ones(frames), image.new_zeros(len(pairs))
-    length, weight, top = length[:, use], weight[:, use], top[use]
-    value = (length / top).clamp_min(0.05).log()
-    waves = slow_waves(frames, rate, image)
-    _, plain = _regress(value, weight, waves[:, :0])
-    path, spread = _regress(value, weight, waves)
-    gain = image.new_zeros(len(pairs))
-    gain[use] = 1 - spread / plain
-    path = path - path.mean()
-    return path.exp(), gain
+    path, gain = _paths(image[None], seen[None], skeleton, slow_waves(len(image), rate, image)[None], (len(image),))
+    return path[0], gain[0]
 
 
 def weak_perspective(image: Tensor, seen: Tensor, skeleton: Skeleton, rate: float) -> Tensor | None:
     """The size of :func:`size_path` (T,), of mean 1, if the tracks clearly ask for it, else None."""
-    path, gain = size_path(image, seen, skeleton, rate)
+    return _believed(*size_path(image, seen, skeleton, rate))
+
+
+def weak_perspectives(tracks: Sequence[Tracks]) -> list[Tensor | None]:
+    """:func:`weak_perspective` of several clips, batch by batch; their points are the images."""
+
+    def solve(some: list[Tracks]) -> list[Tensor | None]:
+        clips = Clips.of(some)
+        waves = [slow_waves(one.num_frames, one.fps or 30.0, one.points) for one in some]
+        most = max(each.shape[1] for each in waves)
+        wide = [torch.nn.functional.pad(each, (0, most - each.shape[1])) for each in waves]
+        paths, gains = _paths(clips.points, clips.weights > 0, some[0].skeleton, padded(wide), clips.counts)
+        return [_believed(path, gain) for path, gain in zip(clips.cut(paths), gains, strict=True)]
+
+    return in_batches(tracks, solve)
+
+
+def _believed(path: Tensor, gain: Tensor) -> Tensor | None:
+    """A path (T,) of mean 1, if what it explains (P,) of the bones' deviations is worth it."""
     if float(path.amax() / path.amin()) < LEAST_RANGE or float(gain.median()) < LEAST_GAIN:
         return None
     return path / path.mean()
 
 
+def _paths(
+    image: Tensor, seen: Tensor, skeleton: Skeleton, waves: Tensor, counts: Sequence[int]
+) -> tuple[Tensor, Tensor]:
+    """:func:`size_path` (K, T) and (K, P) of clips (K, T, N, 2), whose size is a sum of waves (K, T, W).
+
+    In frames that pad a clip to T nothing is seen and waves are 0; so are waves that a clip has fewer of than others.
+    """
+    pairs = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
+    if not len(pairs):
+        pairs = torch.combinations(torch.arange(image.shape[2], device=image.device))
+    length = bone_vectors(image, pairs).norm(dim=-1)  # (K, T, P)
+    weight = (seen[..., pairs[:, 0]] & seen[..., pairs[:, 1]]).to(image)
+    top = torch.where(weight > 0, length, 0).amax(1, keepdim=True)
+    use = (weight.sum(1, keepdim=True) >= 3) & (top > 0)
+    weight = weight * use
+    value = (length / torch.where(use, top, 1)).clamp_min(0.05).log()
+    _, plain = _regress(value, weight, waves[..., :0])
+    path, spread = _regress(value, weight, waves)
+    mean = path.sum(1) / torch.tensor(counts, dtype=path.dtype, device=path.device)
+    return (path - mean[:, None]).exp(), torch.where(use[:, 0], 1 - spread / plain, 0)
+
+
 def _regress(value: Tensor, weight: Tensor, waves: Tensor, steps: int = 40) -> tuple[Tensor, Tensor]:
-    """Path (T,) and deviations s (P,) of least sum_p [sum_t pinball(value - level_p - path_t) / s_p + T log s_p]."""
-    total = weight.sum(0)
-    level = (weight * value).sum(0) / total
-    path = torch.zeros_like(value[:, 0])
-    spread = torch.full_like(level, 0.2)
-    ridge = 1e-6 * torch.eye(waves.shape[1], dtype=value.dtype, device=value.device)
-    for _ in range(steps):
-        off = value - level - path[:, None]
+    """Paths (K, T) and deviations s (K, P) of least sum_p [sum_t pinball(value - level_p - path_t) / s_p + T log s_p].
+
+    Args:
+        value: (K, T, P).
+        weight: (K, T, P), 1 or 0.
+        waves: (K, T, W), of which paths are sums.
+        steps: of reweighting.
+    """
+    total = weight.sum(1).clamp_min(1)
+    level = (weight * value).sum(1) / total
+    path = torch.zeros_like(value[..., 0])
+    own = (waves != 0).any(1)  # (K, W)
+    ridge = 1e-6 * torch.eye(waves.shape[-1], dtype=value.dtype, device=value.device)
+
+    def stray() -> tuple[Tensor, Tensor, Tensor]:
+        """What level and path leave, how steep it costs there, (K, T, P) each, and the deviations (K, P)."""
+        off = value - level[:, None] - path[..., None]
         slope = torch.where(off > 0, QUANTILE, 1 - QUANTILE)
-        spread = ((weight * slope * off.abs()).sum(0) / total).clamp_min(FLOOR / 3)
-        pull = weight * slope / off.abs().clamp_min(1e-3) / spread
-        each = pull.sum(0)
+        return off, slope, ((weight * slope * off.abs()).sum(1) / total).clamp_min(FLOOR / 3)
+
+    for _ in range(steps):
+        off, slope, spread = stray()
+        pull = weight * slope / off.abs().clamp_min(1e-3) / spread[:, None]
+        each = pull.sum(1)
+        each = torch.where(each > 0, each, 1)  # of pairs that are never seen
         # the levels eliminated: each pair's waves and values less their weighted means
-        mean = (pull * value).sum(0) / each
-        if waves.shape[1]:
-            centre = pull.mT @ waves / each[:, None]  # (P, K)
-            normal = waves.mT @ (pull.sum(1)[:, None] * waves) - centre.mT @ (each[:, None] * centre)
-            goal = waves.mT @ (pull * (value - mean)).sum(1)
-            coefficient = torch.linalg.solve(normal + ridge * normal.diagonal().mean().clamp_min(1), goal)
-            path = waves @ coefficient
-            level = mean - centre @ coefficient
-        else:
-            level = mean
-    off = value - level - path[:, None]
-    slope = torch.where(off > 0, QUANTILE, 1 - QUANTILE)
-    return path, ((weight * slope * off.abs()).sum(0) / total).clamp_min(FLOOR / 3)
+        level = (pull * value).sum(1) / each
+        if len(ridge):
+            centre = pull.mT @ waves / each[..., None]  # (K, P, W)
+            normal = waves.mT @ (pull.sum(-1, keepdim=True) * waves) - centre.mT @ (each[..., None] * centre)
+            goal = waves.mT @ (pull * (value - level[:, None])).sum(-1, keepdim=True)
+            usual = normal.diagonal(dim1=-2, dim2=-1).sum(-1) / own.sum(-1).clamp_min(1)
+            coefficient = torch.linalg.solve(normal + ridge * usual.clamp_min(1)[:, None, None], goal)
+            path = (waves @ coefficient)[..., 0]
+            level = level - (centre @ coefficient)[..., 0]
+    return path, stray()[2]

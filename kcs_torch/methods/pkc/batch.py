@@ -12,11 +12,13 @@ from torch import Tensor
 from kcs_torch.methods.pkc.moving_view import Descent, descend_all
 from kcs_torch.methods.pkc.objective import Objective, Refined
 from kcs_torch.methods.pkc.placing import Placing, limb_paths
+from kcs_torch.methods.pkc.trunk import Facing, facings
 from kcs_torch.methods.sfam import SfAM
+from kcs_torch.methods.size import weak_perspectives
 from kcs_torch.solvers.denoise import Denoised, denoise_tracks
 from kcs_torch.types import Tracks
 
-__all__ = ["Noisy", "Task", "clean_all", "minimise_all", "serve"]
+__all__ = ["Noisy", "Sized", "Task", "clean_all", "minimise_all", "serve"]
 
 
 @dataclass(frozen=True)
@@ -45,20 +47,29 @@ class Noisy(NamedTuple):
     weights: Tensor
 
 
+class Sized(NamedTuple):
+    """Tracks whose points are images, of which the size over time is wanted, see :func:`weak_perspectives`."""
+
+    tracks: Tracks
+
+
 TOGETHER = 1200
 """Frames of hypotheses that are refined as one batch; more would only fall out of the processor's cache."""
 
 
-def serve(requests: Sequence[Task | Placing | Descent | Noisy | Tracks]) -> list[Any]:
+def serve(requests: Sequence[Task | Placing | Facing | Descent | Noisy | Sized | Tracks]) -> list[Any]:
     """Answer what searches of several clips ask for.
 
-    Hypotheses are refined, limbs placed, starts descended from, tracks cleaned, and solved by SfAM.
+    Hypotheses are refined, limbs placed, trunks fitted, starts descended from; tracks are cleaned, their sizes found,
+    and solved by SfAM.
     """
     answers: dict[type, Callable[[list[Any]], list[Any]]] = {
         Task: minimise_all,
         Placing: limb_paths,
+        Facing: facings,
         Descent: descend_all,
         Noisy: clean_all,
+        Sized: lambda asked: weak_perspectives([one.tracks for one in asked]),
         Tracks: SfAM().solve_all,
     }
     out: dict[int, Any] = {}

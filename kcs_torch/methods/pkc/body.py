@@ -15,9 +15,8 @@ from kcs_torch.functional.temporal import blend_windows, interpolate, window_sta
 from kcs_torch.methods.lockstep import Search, together
 from kcs_torch.methods.pkc.fixed_view import searching
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
-from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, bone_noise, pace_of
+from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, bone_noise, pace_of, usual_posture
 from kcs_torch.methods.pkc.trunk import image_scale
-from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lm import fit_bones
 
@@ -52,7 +51,7 @@ class Body:
     """
 
     def __init__(self, skeleton: Skeleton, image: Tensor, rate: float, noise: Tensor) -> None:
-        posture = PostureEnergy(skeleton).to(image)
+        posture = usual_posture(skeleton, image.dtype, image.device)
         rigid = torch.zeros(skeleton.num_bones, dtype=torch.bool, device=image.device)
         rigid[list(skeleton.rigid)] = True
         scale = image_scale(image, posture.rest_lengths, posture.bones, rigid, bone_noise(noise, posture.bones))

@@ -91,15 +91,18 @@ class Descent:
         unknowns = self.unknowns.rows(index)
         return Descent(unknowns.objective, unknowns)
 
-    def at(self, own: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Value (H,) of bones' depths (H, B, T) and lengths (H, B), its derivatives in depths and log lengths."""
+    def at(self, own: Tensor, lengths: Tensor, *, steep: bool = True) -> tuple[Tensor, Tensor, Tensor]:
+        """Value (H,) of bones' depths (H, B, T) and lengths (H, B), its derivatives in depths and log lengths.
+
+        Without ``steep`` those of the posture, most of the work, are left out.
+        """
         count = len(own)
         dz = own if self.mix is None else self.mix @ own
         value, slope, growth = self._lengths(dz, lengths)
         lines = self.lines @ dz
         back = torch.zeros_like(lines)
         value = value + self._smoothness(dz, slope)
-        value = value + self._posture(dz, lengths, lines[:, :2], slope, growth, back[:, :2])
+        value = value + self._posture(dz, lengths, lines[:, :2], slope, growth, back[:, :2], steep)
         if len(self.lines) > 2:
             value = value + self._hinges(lengths, lines[:, 2:], growth, back[:, 2:])
         value = value + self._foreshortening(dz, lengths, slope, growth)
@@ -160,7 +163,7 @@ class Descent:
         return (bend * pull).sum((1, 2)) / 2
 
     def _posture(
-        self, dz: Tensor, lengths: Tensor, depths: Tensor, slope: Tensor, growth: Tensor, back: Tensor
+        self, dz: Tensor, lengths: Tensor, depths: Tensor, slope: Tensor, growth: Tensor, back: Tensor, steep: bool
     ) -> Tensor:
         obj, posture = self.objective, self.objective.posture
         count, bones, frames = dz.shape
@@ -193,21 +196,25 @@ class Descent:
         failed = info > 0  # a step so far that rounding or overflow leaves no scatter: it costs infinitely much
         if bool(failed.any()):
             factor = torch.where(failed[:, None, None], torch.ones_like(factor[0, 0]).diag(), factor)
-        inverse = torch.cholesky_inverse(factor)
         firm = amount + posture.strength
+        half = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        value = torch.where(failed, torch.inf, half * (firm[:, 0, 0] if isinstance(firm, Tensor) else firm))
+        if not steep:
+            return value
+        inverse = torch.cholesky_inverse(factor)
         if few:
-            steep = torch.bmm(seen, inverse)
-            moved = (steep * seen).sum(-1, keepdim=True)
-            steep.mul_(firm * root * scale)
+            pull = torch.bmm(seen, inverse)
+            moved = (pull * seen).sum(-1, keepdim=True)
+            pull.mul_(firm * root * scale)
         else:
             moved = 1 - inverse.diagonal(dim1=-2, dim2=-1)[..., None]
-            steep = torch.bmm(inverse.mul_(firm * root * scale), seen)
-        total = steep.sum(-1, keepdim=True)
+            pull = torch.bmm(inverse.mul_(firm * root * scale), seen)
+        total = pull.sum(-1, keepdim=True)
         growth -= (firm * moved + part * total * self.mean / scale).view(count, 3, bones).sum(1)
-        self._lower(steep, (1 - part) * total / real)
-        steep = steep.view_as(y)
-        slope += (steep * turn[:, :, 2]).sum(1)
-        turned = [(steep * v[:, None]).sum(2) for v in (self.x, self.y, own)]  # (H, 3, T): of k, for each j
+        self._lower(pull, (1 - part) * total / real)
+        pull = pull.view_as(y)
+        slope += (pull * turn[:, :, 2]).sum(1)
+        turned = [(pull * v[:, None]).sum(2) for v in (self.x, self.y, own)]  # (H, 3, T): of k, for each j
         into = self.axes.mT @ torch.stack(turned, 2).flatten(2)  # (H, 3, 3 T)
         a, b, c = into.view(count, 3, 3, frames).unbind(1)
         a = a + torch.linalg.cross(up, c, dim=1)
@@ -217,8 +224,7 @@ class Descent:
         a = a - along * b - slant * second
         back[:, 1] = (b - slant * first)[:, 2]
         back[:, 0] = ((a - first * (first * a).sum(1, keepdim=True)) * over)[:, 2]
-        half = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        return torch.where(failed, torch.inf, half * (firm[:, 0, 0] if isinstance(firm, Tensor) else firm))
+        return value
 
     def _lower(self, values: Tensor, by: Tensor) -> None:
         """Take (H, C, 1) from values (H, C, T), but in frames that pad a clip."""

@@ -147,7 +147,7 @@ class _Search:
 
     def _about(self, trunk: Trunk, anchor: Tensor | None) -> Search[Any, Any, list[tuple[Tensor, Tensor]]]:
         """Depths (T, N) and lengths (B,) of bodies about one template of the trunk."""
-        first = trunk_path(self.image, trunk, self.objective.posture, self.costs.posture, self.turn)
+        first = yield from trunk_path(self.image, trunk, self.objective.posture, self.costs.posture, self.turn)
         tried: list[Tensor] = []
         settled = yield from self._settled(first, trunk, anchor)
         for path in (*settled, first):

@@ -81,7 +81,7 @@ def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypoth
     own = bone_vectors(best.depth[0, ..., None], objective.bones)[..., 0]
     runs, which = flipped_runs(own, best.lengths[0], parts, objective.weights.acceleration)
     cost, some = Descent(objective), runs.mT.contiguous().split(max(1, ROWS // len(own)))
-    energy = torch.cat([cost.at(run, best.lengths.expand(len(run), -1))[0] for run in some])
+    energy = torch.cat([cost.at(run, best.lengths.expand(len(run), -1), steep=False)[0] for run in some])
     order = energy.argsort()
     owner = which[order].tolist()
     order = order[[k for k, part in enumerate(owner) if part not in owner[:k]][:FLIPS]]

@@ -16,14 +16,13 @@ from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import WEAK_TURN, Estimate, Method
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, depth_deviation, told_by_prior
-from kcs_torch.methods.pkc.batch import Noisy, serve
+from kcs_torch.methods.pkc.batch import Noisy, Sized, serve
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.moving_view import Descent, MovingView
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.sfam import SfAM
-from kcs_torch.methods.size import weak_perspective
 from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.procrustean import COARSE, FINE, align_rotations
@@ -124,7 +123,7 @@ class PKC(Method):
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
         image, noise, notes = yield from self._clean(tracks)
-        size = weak_perspective(image, tracks.seen, tracks.skeleton, tracks.fps or 30.0)
+        (size,) = yield [Sized(replace(tracks, points=image))]
         if size is None:
             return (yield from self._solve(tracks, image, noise, cameras, notes))
         share = float(size.amax() / size.amin())

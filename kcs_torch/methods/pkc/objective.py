@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy, deepcopy
+from copy import copy
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
 
-__all__ = ["Objective", "Refined", "Unknowns", "Weights", "at_pace", "bone_noise", "pace_of"]
+__all__ = ["Objective", "Refined", "Unknowns", "Weights", "at_pace", "bone_noise", "pace_of", "usual_posture"]
 
 BLUR = 2.0
 """By how much a bone's direction strays, over its noise in the image per length: the trunk's frame is noisy as well."""
@@ -149,10 +150,10 @@ class Objective:
     ) -> None:
         self.skeleton, self.image, self.weights, self.anchor = skeleton, image, weights, anchor
         make = lambda module: module.to(image)  # noqa: E731
-        self.posture = make(PostureEnergy(skeleton, kappa=weights.kappa, correlation=weights.posture))
-        usual = self.posture.rest_lengths.clamp_min(SHORT)
-        blur = BLUR * bone_noise(noise, self.posture.bones).median(0).values / usual
-        self.posture.deviation = (self.posture.deviation.square() + blur.square()[:, None]).sqrt()
+        plain = usual_posture(skeleton, image.dtype, image.device)
+        blur = BLUR * bone_noise(noise, plain.bones).median(0).values / plain.rest_lengths.clamp_min(SHORT)
+        spread = (plain.deviation.square() + blur.square()[:, None]).sqrt()
+        self.posture = _altered(plain, kappa=weights.kappa, correlation=weights.posture, deviation=spread)
         self.foreshortening = make(ForeshorteningEnergy(skeleton, correlation=weights.foreshortening))
         self.proportions = make(ProportionEnergy(skeleton, spread=weights.proportions, twins=weights.twins))
         self.hinges = make(HingeEnergy(skeleton))
@@ -275,8 +276,8 @@ class Objective:
         out.flat, out.noise = padded([part.flat for part in parts]), padded([part.noise for part in parts])
         out.time = padded([part.image.new_ones(n) for part, n in zip(parts, frames, strict=True)])
         out.rigid = first.rigid * out.time[..., None]
-        out.posture = deepcopy(first.posture)
-        out.posture.deviation = torch.stack([part.posture.deviation for part in parts])[each][:, None]
+        spread = torch.stack([part.posture.deviation for part in parts])[each][:, None]
+        out.posture = _altered(first.posture, deviation=spread)
         out.count, out.noisy = gather(frames), any(part.noisy for part in parts)
         out.share = out.time / gather([part.posture.correlation for part in parts])[:, None]
         ratio = [first.foreshortening.correlation / part.foreshortening.correlation for part in parts]
@@ -295,11 +296,26 @@ class Objective:
         for name in ("image", "flat", "noise", "time", "rigid", "count", "share", "clear"):
             setattr(out, name, pick(getattr(self, name)))
         out.weights = Weights(**{f.name: pick(getattr(self.weights, f.name)) for f in fields(Weights)})
-        out.posture = deepcopy(self.posture)
-        out.posture.deviation = pick(self.posture.deviation)
+        out.posture = _altered(self.posture, deviation=pick(self.posture.deviation))
         if self.anchor is not None:
             out.anchor, out.held = pick(self.anchor), pick(self.held)
         return out
+
+
+@lru_cache(maxsize=16)
+def usual_posture(skeleton: Skeleton, dtype: torch.dtype, device: torch.device) -> PostureEnergy:
+    """The skeleton's posture, made once for all clips: not to be changed."""
+    with torch.inference_mode(False):
+        return PostureEnergy(skeleton).to(device, dtype)
+
+
+def _altered(posture: PostureEnergy, **values: Any) -> PostureEnergy:
+    """One that shares all but some values."""
+    out = copy(posture)
+    out.__dict__["_buffers"] = dict(posture._buffers)
+    for name, value in values.items():
+        setattr(out, name, value)
+    return out
 
 
 class Unknowns:

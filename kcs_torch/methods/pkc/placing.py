@@ -126,7 +126,7 @@ def placing(
     chains = torch.tensor([limb.bones for limb in limbs], device=image.device)  # (J, M)
     before = [None] * count if before is None else before
     none = image.new_zeros(frames, 3)
-    axes = torch.stack([_facts(limb.inner, posture) for limb in limbs])
+    axes = _facts([limb.inner for limb in limbs], posture)
     known = [limb.entry if near is not None else None for limb, near in zip(limbs, before, strict=True)]
     each = rotations if rotations.ndim == 5 else rotations.expand(count, *rotations.shape)
     return Placing(
@@ -140,7 +140,7 @@ def placing(
         free=free.to(image)[chains],
         costs=image.new_tensor(astuple(costs)).expand(count, -1),
         inner=axes.to(image) if limbs[0].inner is not None else None,
-        entry=torch.stack([_facts(hinge, posture) for hinge in known]).to(image),
+        entry=_facts(known, posture).to(image),
         before=torch.stack([none if near is None else near for near in before]),
         transition=None if transition is None else transition.expand(count, *transition.shape),
         cap=costs.cap,
@@ -274,12 +274,14 @@ def _signed(parts: Sequence[Tensor]) -> Tensor:
     return total
 
 
-def _facts(hinge: Hinge | None, posture: PostureEnergy) -> Tensor:
-    """A hinge's axis in rest, sign and firmness, (5,); all 0 for none."""
-    if hinge is None:
-        return posture.rest.new_zeros(5)
-    axis = posture.rest[hinge.left] - posture.rest[hinge.right]
-    return torch.cat([axis / axis.norm(), axis.new_tensor([hinge.sign, hinge.firm])])
+def _facts(hinges: Sequence[Hinge | None], posture: PostureEnergy) -> Tensor:
+    """Hinges' axes in rest, signs and firmness, (J, 5); all 0 for none."""
+    rest = posture.rest
+    ends = [(0, 0) if hinge is None else (hinge.left, hinge.right) for hinge in hinges]
+    left, right = rest[torch.tensor(ends, device=rest.device)].unbind(1)
+    axis = torch.nn.functional.normalize(left - right, dim=-1)
+    told = rest.new_tensor([(0.0, 0.0) if hinge is None else (hinge.sign, hinge.firm) for hinge in hinges])
+    return torch.cat([axis, told], -1)
 
 
 def _lateral(turned: Tensor, hinges: Tensor) -> Tensor:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,11 +12,14 @@ from torch import Tensor
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
+from kcs_torch.methods.lockstep import Search
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.solvers.pose import fit_cameras
 
 __all__ = [
+    "Facing",
     "Trunk",
+    "facings",
     "image_scale",
     "longest_image",
     "mirror",
@@ -46,6 +51,29 @@ class Trunk:
 
     rest: Tensor
     lengths: Tensor
+
+
+class Facing(NamedTuple):
+    """A rigid template (n, 3) whose rotation and scale are wanted in each frame of an image (T, n, 2), both centred."""
+
+    image: Tensor
+    rest: Tensor
+
+
+def facings(tasks: Sequence[Facing]) -> list[tuple[Tensor, Tensor]]:
+    """Rotations (C, T, 3, 3) and scales (C, T) of each task from C headings; all frames are fitted together."""
+    groups: dict[object, list[int]] = {}
+    for i, (image, _) in enumerate(tasks):
+        groups.setdefault((image.shape[1], image.dtype, image.device), []).append(i)
+    out: dict[int, tuple[Tensor, Tensor]] = {}
+    for group in groups.values():
+        counts = [len(tasks[i].image) for i in group]
+        image = torch.cat([tasks[i].image for i in group])
+        rest = torch.cat([tasks[i].rest.expand(len(tasks[i].image), -1, -1) for i in group])
+        one = image.new_ones(len(image))
+        fit = fit_cameras(image, rest, image.new_ones(image.shape[:2]), 0.9 * one, 1.1 * one, robust=None)
+        out |= zip(group, zip(fit.rotations.split(counts, 1), fit.scales.split(counts, 1), strict=True), strict=True)
+    return [out[i] for i in range(len(tasks))]
 
 
 def image_scale(image: Tensor, lengths: Tensor, bones: Tensor, rigid: Tensor, noise: Tensor) -> Tensor:
@@ -111,8 +139,10 @@ def trunk_misfit(
     return (scales * (rest @ rotations[..., :2, :].mT) - goal).square().sum((-2, -1)) / (2 * FIT**2)
 
 
-def trunk_path(image: Tensor, trunk: Trunk, posture: PostureEnergy, correlation: float, turn: float) -> Tensor:
-    """A smooth path of the trunk's rotation, template to camera, (T, 3, 3).
+def trunk_path(
+    image: Tensor, trunk: Trunk, posture: PostureEnergy, correlation: float, turn: float
+) -> Search[Facing, tuple[Tensor, Tensor], Tensor]:
+    """A smooth path of the trunk's rotation, template to camera, (T, 3, 3), as a search.
 
     Args:
         image: (T, N, 2), in units of the template.
@@ -124,12 +154,9 @@ def trunk_path(image: Tensor, trunk: Trunk, posture: PostureEnergy, correlation:
     joints = posture.trunk
     rest = trunk.rest[joints] - trunk.rest[joints].mean(0)
     goal = image[:, joints] - image[:, joints].mean(1, keepdim=True)
-    one = image.new_ones(len(image))
-    fit = fit_cameras(
-        goal, rest.expand(len(image), -1, 3), image.new_ones(goal.shape[:2]), 0.9 * one, 1.1 * one, robust=None
-    )
-    rotations = torch.cat([fit.rotations, mirror(fit.rotations)])  # (16, T, 3, 3)
-    off = trunk_misfit(image, trunk, joints, rotations, fit.scales.repeat(2, 1)[..., None, None])
+    ((rotations, scales),) = yield [Facing(goal, rest)]
+    rotations = torch.cat([rotations, mirror(rotations)])  # (16, T, 3, 3)
+    off = trunk_misfit(image, trunk, joints, rotations, scales.repeat(2, 1)[..., None, None])
     choice = best_path(off.mT / correlation, trunk_turns(rotations, turn))
     return rotations[choice, torch.arange(len(image), device=image.device)]
 
