@@ -3,6 +3,8 @@
 import importlib.util
 import json
 import os
+import sys
+from importlib import import_module
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run side by side, one thread each
@@ -38,6 +40,18 @@ def protocol(shared):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def import_script(root):
+    """Import a script by its name; it, and the scripts that it imports, are forgotten after the file's tests."""
+    folder = root / "scripts"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(folder))
+        yield import_module
+    for name, module in list(sys.modules.items()):
+        if Path(getattr(module, "__file__", None) or "").parent == folder:
+            del sys.modules[name]
 
 
 def moving_body(skeleton, num_frames: int = 40) -> torch.Tensor:

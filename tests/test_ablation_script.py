@@ -1,10 +1,8 @@
 """scripts/ablation.py: every ingredient is really off, and on again; a run on a few frames."""
 
 import csv
-import sys
 import warnings
 from dataclasses import replace
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -15,12 +13,8 @@ from kcs_torch.data import walking_person
 
 
 @pytest.fixture(scope="module")
-def script(root):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(root / "scripts"))
-        yield import_module("ablation")
-        for name in ("ablation", "benchmark"):
-            sys.modules.pop(name, None)
+def script(import_script):
+    return import_script("ablation")
 
 
 @pytest.fixture(scope="module")
@@ -71,11 +65,10 @@ def test_a_term_that_does_not_exist_cannot_be_switched_off(script, clips):
         lifted(script.without("friction"), clips["fixed"][0])
 
 
-def test_figures_are_the_protocols(script, shared):
+def test_figures_are_the_protocols(script, shared, protocol):
     ((_, tracks, truth),) = script.recorded(shared, "static_walk", 1, 20)
     assert tracks.num_frames == 20
     bent = truth + 30 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0), dtype=truth.dtype)
-    protocol = import_module("benchmark").load_protocol(shared)
     for points in (bent, bent * torch.tensor([1.0, 1.0, -1.0])):
         expected = protocol.score(points.numpy(), truth.numpy(), None)
         assert script.rigid(points, truth) == pytest.approx(expected["rigid"], rel=1e-6)

@@ -1,7 +1,6 @@
 """scripts/benchmark.py, on a small protocol made here and on a case of the real one."""
 
 import csv
-import importlib.util
 import subprocess
 import sys
 
@@ -81,11 +80,8 @@ def test_a_failing_case_is_a_row_and_an_exit_code(root, folder):
 
 
 @pytest.fixture(scope="module")
-def script(root):
-    spec = importlib.util.spec_from_file_location("benchmark", root / "scripts" / "benchmark.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def script(import_script):
+    return import_script("benchmark")
 
 
 def test_suites_and_cases_are_chosen_by_name_and_pattern(script, folder):

@@ -142,13 +142,8 @@ def test_roots_by_name():
         compare(truth, truth, align=["sequense"])
 
 
-def test_against_the_protocol_on_a_lifted_walk(shared):
+def test_against_the_protocol_on_a_lifted_walk(protocol, shared):
     """The whole way: a clip of the benchmark, lifted; our figures are those of the protocol."""
-    import sys
-
-    sys.path.insert(0, str(shared / "protocol"))
-    import protocol
-
     case = {"src": "cmu/cmu_35_01", "yaw": 45, "pitch": 10, "orbit": 90, "max_frames": 30}
     given, truth = protocol.build(shared / "data", case)
     tracks = kt.types.Tracks.from_arrays(

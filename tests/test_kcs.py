@@ -1,7 +1,6 @@
 """KCS: what its shape step must give in closed form, its options, and real walks."""
 
 import math
-import sys
 
 import pytest
 import torch
@@ -232,10 +231,7 @@ def test_scale_range_bounds_each_frames_scale():
 # ---------------------------------------------------------------------- real walks
 
 
-def test_static_walk(shared):
-    sys.path.insert(0, str(shared / "protocol"))
-    import protocol
-
+def test_static_walk(protocol, shared):
     case = next(c for c in protocol.suites()["static_walk"] if c["yaw"] == 90)
     given, truth = protocol.build(shared / "data", case)
     tracks = Tracks.from_arrays(given["points2d"], edges=given["edges"], joint_names=given["joint_names"])

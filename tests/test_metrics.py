@@ -1,7 +1,5 @@
 """The metrics against the measuring protocol, scipy and closed forms; with batches, gaps and mirrors."""
 
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -120,10 +118,7 @@ def test_similarity_against_scipy_and_our_own():
     assert float((ours - truth[:1]).square().sum() / target.square().sum()) == pytest.approx(disparity)
 
 
-def test_against_the_protocol(shared):
-    sys.path.insert(0, str(shared / "protocol"))
-    import protocol
-
+def test_against_the_protocol(protocol):
     generator = torch.Generator().manual_seed(3)
     truth = 300 * clip(frames=40, joints=8)
     gaps = torch.rand(40, 8, generator=generator) < 0.1

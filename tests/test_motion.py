@@ -1,7 +1,6 @@
 """3D motion: axes, virtual joints, gaps, sizes, cameras; reading it from native files."""
 
 import math
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -110,10 +109,7 @@ def test_frames_thin_out():
 # ---------------------------------------------------------------------- filming it
 
 
-def test_tracks_are_those_of_the_protocol(shared):
-    sys.path.insert(0, str(shared / "protocol"))
-    import protocol
-
+def test_tracks_are_those_of_the_protocol(protocol, shared):
     case = {"src": "cmu/cmu_35_01", "yaw": 45, "pitch": 10, "orbit": 180, "max_frames": 60}
     given, truth = protocol.build(shared / "data", case)
     motion = load_motion(shared / "data" / "cmu" / "cmu_35_01.npz", up="y").frames(0, 240, 4)

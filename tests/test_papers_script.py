@@ -4,7 +4,6 @@ import csv
 import math
 import subprocess
 import sys
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -15,26 +14,20 @@ from torch.testing import assert_close
 from kcs_torch.functional.align import centre
 from kcs_torch.methods import METHODS
 
-NAMES = ("papers_sfam", "papers_kcs", "papers", "robustness", "benchmark")
+
+@pytest.fixture(scope="module")
+def papers(import_script):
+    return import_script("papers")
 
 
 @pytest.fixture(scope="module")
-def papers(root):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(root / "scripts"))
-        yield import_module("papers")
-        for name in NAMES:
-            sys.modules.pop(name, None)
+def kcs(import_script):
+    return import_script("papers_kcs")
 
 
 @pytest.fixture(scope="module")
-def kcs(papers):
-    return import_module("papers_kcs")
-
-
-@pytest.fixture(scope="module")
-def settings(papers, shared):
-    bench = import_module("robustness").Bench(shared, 30, 1)
+def settings(papers, import_script, shared):
+    bench = import_script("robustness").Bench(shared, 30, 1)
     return papers.Settings(bench, ("kcs", "sfam", "bmm"), paths=2, seeds=1, walks=1, frames=100)
 
 
@@ -161,7 +154,7 @@ def test_one_command_writes_rows_tables_and_plots(root, shared, tmp_path):
             assert all(row["setting"] and row["at"] for row in csv.DictReader(file))
 
 
-def test_unknown_methods_are_named(papers, tmp_path):
+def test_unknown_methods_are_named(import_script, tmp_path):
     paper = {"parts": "all", "methods": ["kcs", "sfm"], "clip": 30, "sequences": 1}
     with pytest.raises(SystemExit, match=f"sfm: expected all or some of {', '.join(METHODS)}"):
-        import_module("benchmark").make_papers(OmegaConf.create(paper), tmp_path, tmp_path)
+        import_script("benchmark").make_papers(OmegaConf.create(paper), tmp_path, tmp_path)

@@ -2,8 +2,6 @@
 
 import csv
 import math
-import sys
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -17,12 +15,8 @@ from kcs_torch.skeleton import SKELETONS
 
 
 @pytest.fixture(scope="module")
-def script(root):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(root / "scripts"))
-        yield import_module("robustness")
-        for name in ("robustness", "benchmark"):
-            sys.modules.pop(name)
+def script(import_script):
+    return import_script("robustness")
 
 
 @pytest.mark.parametrize(("share", "degrees"), [(0.0, 0.0), (0.3, 0.0), (0.0, 20.0), (0.1, 10.0)])

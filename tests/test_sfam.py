@@ -1,7 +1,6 @@
 """SfAM: the printed iteration written out, cameras, windows and their seams, options, and motion capture."""
 
 import math
-import sys
 
 import pytest
 import torch
@@ -314,11 +313,8 @@ def test_few_cosines_smooth_noise_away():
 
 
 @pytest.mark.parametrize(("name", "bound"), [("pickup", 0.1), ("yoga", 0.1242)])
-def test_motion_capture_in_the_world_frame(shared, name, bound):
+def test_motion_capture_in_the_world_frame(protocol, shared, name, bound):
     """Below the published 0.1921 and 0.1242, with the method's own cameras."""
-    sys.path.insert(0, str(shared / "protocol"))
-    import protocol
-
     case = next(c for c in protocol.suites()["akhter"] if c["src"].endswith(name))
     given, truth = protocol.build(shared / "data", case)
     tracks = Tracks.from_arrays(given["points2d"], edges=given.get("edges"), joint_names=given.get("joint_names"))

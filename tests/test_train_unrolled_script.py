@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -14,12 +13,8 @@ BONES = [[0, 1], [1, 2], [2, 3]]
 
 
 @pytest.fixture(scope="module")
-def scripts(root):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(root / "scripts"))
-        yield import_module("train_unrolled"), import_module("unrolled_memory")
-        for name in ("train_unrolled", "unrolled_memory"):
-            sys.modules.pop(name, None)
+def scripts(import_script):
+    return import_script("train_unrolled"), import_script("unrolled_memory")
 
 
 def rows(text):
