@@ -123,11 +123,20 @@ def reference(name: str) -> str:
         if kind == "data":  # the words below an assignment, which autodoc looks for in this module only
             about += [f".. py:data:: {one}", "", f"   {said_of(one)}", ""]
             continue
-        about += [f".. auto{kind}:: {one}", *(["   :members:"] if kind == "class" else []), ""]
+        about += [f".. auto{kind}:: {one}", *members(getattr(module, one), kind), ""]
     text.append("```{eval-rst}\n" + "\n".join(about) + "```\n")
     if elsewhere:
         text.append("On the page of [the package](kcs_torch.md): " + ", ".join(f"`{one}`" for one in elsewhere) + ".\n")
     return "\n".join(text)
+
+
+def members(value: Any, kind: str) -> list[str]:
+    """What autodoc is to show of a class; of tracks and motion also what their base, which has no page, holds."""
+    from kcs_torch.types.clip import Clip
+
+    if kind != "class":
+        return []
+    return ["   :members:", *(["   :inherited-members: object"] if issubclass(value, Clip) else [])]
 
 
 def kind_of(value: object) -> str:

@@ -34,6 +34,15 @@ def shared() -> Path:
 
 
 @pytest.fixture(scope="session")
+def raw(shared) -> Path:
+    """The real files of detectors and of motion capture."""
+    folder = shared / "data" / "raw_formats"
+    if not folder.is_dir():
+        pytest.skip("needs ../shared/data/raw_formats, which is not part of the repository")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def protocol(shared):
     """The module that makes the benchmarks' inputs and scores answers."""
     spec = importlib.util.spec_from_file_location("protocol", shared / "protocol" / "protocol.py")

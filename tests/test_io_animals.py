@@ -71,14 +71,6 @@ OTHERS = {
 }
 
 
-@pytest.fixture(scope="session")
-def raw(shared):
-    folder = shared / "data" / "raw_formats"
-    if not folder.is_dir():
-        pytest.skip("needs ../shared/data/raw_formats, which is not part of the repository")
-    return folder
-
-
 # ---------------------------------------------------------------------- real files
 
 

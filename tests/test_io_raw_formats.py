@@ -27,14 +27,6 @@ FILES = {
 }
 
 
-@pytest.fixture(scope="module")
-def raw(shared):
-    folder = shared / "data" / "raw_formats"
-    if not folder.is_dir():
-        pytest.skip("needs ../shared/data/raw_formats, which is not part of the repository")
-    return folder
-
-
 def test_the_table_has_every_file(raw):
     kinds = {name.partition("/")[0] for name in FILES}
     there = {f"{kind}/{f.name}" for kind in kinds for f in (raw / kind).iterdir() if f.suffix != ".toml"}

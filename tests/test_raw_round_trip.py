@@ -54,14 +54,6 @@ OTHER = {".toml", ".asf", ".slp"}
 NO_TRACKS = {"minimal_instance.json"}  # an object of sleap-io's own
 
 
-@pytest.fixture(scope="module")
-def raw(shared):
-    folder = shared / "data" / "raw_formats"
-    if not folder.is_dir():
-        pytest.skip("needs ../shared/data/raw_formats, which is not part of the repository")
-    return folder
-
-
 def test_every_file_is_listed(raw):
     there = {f"{kind.name}/{f.name}" for kind in raw.iterdir() for f in kind.iterdir() if f.suffix not in OTHER}
     assert {name for name in there if name.partition("/")[2] not in NO_TRACKS} == {*TRACKS, *MOTION}

@@ -3,14 +3,30 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from kcs_torch.errors import SkeletonError
 
 if TYPE_CHECKING:
     from kcs_torch.skeleton.core import Skeleton
 
-__all__ = ["check_facts", "check_tree"]
+__all__ = ["as_tuples", "check_facts", "check_tree"]
+
+
+def as_tuples(body: Skeleton) -> dict[str, Any]:
+    """The fields of a skeleton that may come as lists, as tuples of plain numbers: so it can be hashed."""
+    return {
+        "joints": tuple(body.joints),
+        "bones": tuple((int(a), int(b)) for a, b in body.bones),
+        "mirror": tuple((int(a), int(b)) for a, b in body.mirror),
+        "virtual": tuple((int(v), tuple(sources)) for v, sources in body.virtual),
+        "flexible": tuple(body.flexible),
+        "hinges": tuple(body.hinges),
+        "contacts": tuple(body.contacts),
+        "template": None if body.template is None else tuple(tuple(map(float, place)) for place in body.template),
+        "proportions": None if body.proportions is None else tuple(map(float, body.proportions)),
+        "spread": None if body.spread is None else tuple(map(float, body.spread)),
+    }
 
 
 def check_facts(body: Skeleton) -> None:

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from kcs_torch.anatomy import UNKNOWN_SPREAD, Hinge
 from kcs_torch.errors import FormatError, SkeletonError, unknown
-from kcs_torch.skeleton.check import check_facts, check_tree
+from kcs_torch.skeleton.check import as_tuples, check_facts, check_tree
 from kcs_torch.skeleton.files import as_mapping, check_mapping, read_mapping
 from kcs_torch.skeleton.graph import find_cycle, find_pieces, find_twins
 from kcs_torch.skeleton.mapping import map_joints
-from kcs_torch.skeleton.parse import arguments, facts_by_names
+from kcs_torch.skeleton.parse import arguments, facts_by_names, index_pairs
 
 __all__ = ["Skeleton"]
 
@@ -62,7 +62,7 @@ class Skeleton:
     name: str = "custom"
     mirror: tuple[Pair, ...] = ()
     virtual: tuple[tuple[int, tuple[int, ...]], ...] = ()
-    template: tuple[tuple[float, float, float], ...] | None = None
+    template: tuple[Point, ...] | None = None
     proportions: tuple[float, ...] | None = None
     flexible: tuple[int, ...] = ()
     tree: bool = True
@@ -71,20 +71,8 @@ class Skeleton:
     spread: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        settle = object.__setattr__  # lists become tuples, so that a skeleton can be hashed
-        settle(self, "joints", tuple(self.joints))
-        settle(self, "bones", tuple((int(a), int(b)) for a, b in self.bones))
-        settle(self, "mirror", tuple((int(a), int(b)) for a, b in self.mirror))
-        settle(self, "virtual", tuple((int(v), tuple(sources)) for v, sources in self.virtual))
-        settle(self, "flexible", tuple(self.flexible))
-        settle(self, "hinges", tuple(self.hinges))
-        settle(self, "contacts", tuple(self.contacts))
-        if self.template is not None:
-            settle(self, "template", tuple(tuple(float(c) for c in p) for p in self.template))
-        if self.proportions is not None:
-            settle(self, "proportions", tuple(float(p) for p in self.proportions))
-        if self.spread is not None:
-            settle(self, "spread", tuple(float(s) for s in self.spread))
+        for field, value in as_tuples(self).items():
+            object.__setattr__(self, field, value)
         check_facts(self)
         if self.tree:
             self.validate()
@@ -171,11 +159,7 @@ class Skeleton:
         from kcs_torch.skeleton.builtin import guess_skeleton  # the built-in ones are made by this class
 
         names = tuple(f"joint{i}" for i in range(joints)) if isinstance(joints, int) else tuple(map(str, joints))
-        pairs = []
-        for edge in edges:
-            if len(edge) != 2 or not all(float(e).is_integer() for e in edge):
-                raise SkeletonError(f"edges of skeleton '{name}': expected pairs of joint indices, got {edge!r}")
-            pairs.append((int(edge[0]), int(edge[1])))
+        pairs = index_pairs(edges, name)
         plain = cls(joints=names, bones=tuple(pairs), name=name, tree=tree)
         return replace(plain, **facts_by_names(names, pairs, guess_skeleton(names)))
 

@@ -21,10 +21,24 @@ from kcs_torch.errors import SkeletonError, unknown
 if TYPE_CHECKING:
     from kcs_torch.skeleton.core import Skeleton
 
-__all__ = ["arguments", "facts_by_names", "find_mirror"]
+__all__ = ["arguments", "facts_by_names", "find_mirror", "index_pairs"]
 
 Pair = tuple[int, int]
 Point = tuple[float, float, float]
+
+
+def index_pairs(edges: Iterable[Sequence[int]], name: str) -> list[Pair]:
+    """Pairs of joint indices as plain integers.
+
+    Raises:
+        SkeletonError: an edge of the skeleton of that name is no pair of whole numbers.
+    """
+    pairs = []
+    for edge in edges:
+        if len(edge) != 2 or not all(float(e).is_integer() for e in edge):
+            raise SkeletonError(f"edges of skeleton '{name}': expected pairs of joint indices, got {edge!r}")
+        pairs.append((int(edge[0]), int(edge[1])))
+    return pairs
 
 
 def arguments(
