@@ -7,9 +7,12 @@ import torch
 from numerics import CHAIN
 from torch.testing import assert_close
 
+from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.methods.pkc import answers
-from kcs_torch.methods.pkc.answers import depth_deviation, told_by_prior
+from kcs_torch.methods.pkc.answers import angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
+from kcs_torch.methods.pkc.objective import Objective, Weights
+from kcs_torch.skeleton import SKELETONS
 
 
 def hypotheses(depths, energy, lengths=None):
@@ -36,28 +39,85 @@ def test_bones_that_a_rival_flips():
     assert told_by_prior(rival[:1], CHAIN) == []
 
 
-@pytest.mark.parametrize("level", [0.0, 0.05])
-def test_deviation_by_hand(level):
-    """Independent bones, dL L / |dz|, add up from the middle: of the chain a-b-c-d, lengths 1, depths 0.6."""
-    noise = torch.full((5, 4), level).double()
-    found = depth_deviation(hypotheses([BENT], [0.0]), noise, CHAIN)
-    wrong = math.hypot(answers.LENGTH, answers.NOISE * 2**0.5 * level)  # of both ends of a bone
-    one = wrong / 0.6 * answers.CALIBRATION
+def spread_over_chain(one):
+    """Independent bones of one deviation add up from the middle of the chain a-b-c-d."""
     outer = one * ((3 / 4) ** 2 + (2 / 4) ** 2 + (1 / 4) ** 2) ** 0.5  # how the three bones move the first joint
     inner = one * ((1 / 4) ** 2 + (2 / 4) ** 2 + (1 / 4) ** 2) ** 0.5
-    assert_close(found, torch.tensor([outer, inner, inner, outer]).double().expand(5, 4))
+    return torch.tensor([outer, inner, inner, outer]).double().expand(5, 4)
+
+
+@pytest.mark.parametrize(("level", "doubt"), [(0.0, 1.0), (0.05, 1.0), (0.05, 0.4)])
+def test_deviation_by_hand(level, doubt):
+    """Bones of length 1 that point 0.6 away in every frame: tan a = 0.75 where they are nearest to the image plane."""
+    noise = torch.full((5, 4), level).double()
+    found = depth_deviation(hypotheses([BENT], [0.0]), noise, CHAIN, doubt=doubt)
+    told = (0.75 * doubt * answers.ANGLE) ** -2 + answers.USUAL**-2
+    length = (1 / told + (doubt * answers.LEAST) ** 2) ** 0.5
+    wrong = math.hypot(length, answers.NOISE * 2**0.5 * level)  # of both ends of a bone
+    assert_close(found, spread_over_chain(wrong / math.hypot(0.6, answers.FLAT)))
+
+
+def test_lengths_are_told_by_bones_that_pass_through_the_image_plane():
+    exact = torch.zeros(5, 4).double()
+    passing = BENT.clone()
+    passing[2] = 0  # one frame in which all bones lie in the plane
+    found = depth_deviation(hypotheses([passing], [0.0]), exact, CHAIN)
+    assert_close(found[0], spread_over_chain(answers.LEAST / math.hypot(0.6, answers.FLAT))[0])
+    assert (found[0] < 0.5 * depth_deviation(hypotheses([BENT], [0.0]), exact, CHAIN)[0]).all()
 
 
 def test_deviation_grows_towards_the_image_plane_and_with_rivals():
     exact = torch.zeros(5, 4).double()
     steep = depth_deviation(hypotheses([BENT], [0.0]), exact, CHAIN)
-    flat = depth_deviation(hypotheses([0.5 * BENT], [0.0]), exact, CHAIN)
+    bent = BENT.clone()
+    bent[0] *= 0.5
+    nearer = depth_deviation(hypotheses([bent], [0.0]), exact, CHAIN)
+    assert (nearer[0] > nearer[1]).all()
     none = depth_deviation(hypotheses([0 * BENT], [0.0]), exact, CHAIN)
-    assert (steep < flat).all() and (flat < none).all() and torch.isfinite(none).all()
-    rivals = [depth_deviation(hypotheses([BENT, -BENT], [0.0, e]), exact, CHAIN) for e in (0.0, 10.0, 1e4)]
+    along = depth_deviation(hypotheses([BENT / 0.6], [0.0]), exact, CHAIN)  # straight at the camera
+    assert torch.isfinite(none).all() and torch.isfinite(along).all() and (along > 0).all()
+    rivals = [depth_deviation(hypotheses([BENT, -BENT], [0.0, e]), exact, CHAIN) for e in (0.0, 6.0, 1e4)]
     assert (rivals[0][:, 0] > rivals[1][:, 0]).all() and (rivals[1][:, 0] > rivals[2][:, 0]).all()
     assert_close(rivals[2], steep)
-    assert rivals[0][0, 3].item() == pytest.approx(math.hypot(steep[0, 3].item(), 1.8 * 0.5**0.5 * answers.CALIBRATION))
+    share = answers.RIVAL / (1 + answers.RIVAL)
+    assert rivals[0][0, 3].item() == pytest.approx(math.hypot(steep[0, 3].item(), 1.8 * share**0.5))
+
+
+def test_a_detector_s_joints_are_less_sure():
+    """By more noise, by the direction they are seen from, and as rivals may be right though they are worse."""
+    exact = torch.zeros(5, 4).double()
+    image = torch.zeros(5, 4, 2).double()
+    image[..., 1] = torch.tensor([1.0, 0.5, -0.5, -1.0])
+    alone = hypotheses([BENT], [0.0])
+    found = depth_deviation(alone, exact, CHAIN, image=image)
+    noisy = depth_deviation(alone, exact + answers.NEAR, CHAIN)
+    assert_close(found.square() - noisy.square(), (answers.HEADING * image[..., 1]).square())
+    assert_close(depth_deviation(alone, exact, CHAIN, image=image + 3), found)  # wherever it is in the image
+    both = hypotheses([BENT, -BENT], [0.0, 20.0])
+    more, usual = (
+        depth_deviation(both, exact, CHAIN, image=x).square() - depth_deviation(alone, exact, CHAIN, image=x).square()
+        for x in (image, None)
+    )
+    assert (more[:, 0] > 5 * usual[:, 0]).all()
+
+
+def test_angles_are_surer_where_the_viewpoint_turns_and_postures_are_usual():
+    skeleton = SKELETONS["h36m17"]
+    rest = skeleton.template_points(dtype=torch.float64)
+    rest = rest - rest.mean(0)
+    usual = rest.expand(30, -1, -1)
+    odd = usual.clone()
+    hand = skeleton.joints.index("left_wrist")
+    odd[:, hand, :2] = odd[:, hand, :2] * 1.2 - 0.3
+    found = {}
+    for name, body in (("usual", usual), ("odd", odd)):
+        goal = Objective(skeleton, body[..., :2], Weights(), torch.zeros(30, 17).double())
+        lengths = bone_lengths(body, goal.bones).mean(0)
+        found[name] = [angle_doubt(goal, body[..., 2], lengths, turn) for turn in (0.0, 22.0, 180.0)]
+    still, little, much = found["usual"]
+    assert still > little > much > 0
+    assert little == pytest.approx(still / 2**0.5)
+    assert found["odd"][0] > still
 
 
 def test_noise_in_one_frame_is_that_frame_s():

@@ -201,6 +201,17 @@ def test_deviation_grows_as_the_viewpoint_turns_less():
     assert torch.allclose(far, near * 10**0.6)
 
 
+def test_deviation_is_smaller_where_lengths_are_constant():
+    points, cameras = swinging_body()
+    stretched = points.clone()
+    stretched[::2, 5] += 0.02 * (points[::2, 5] - points[::2, 4])  # one bone of five, in every other frame
+    constant, less, none = (
+        depth_deviation(p[None], cameras[None], BONES, turn=90.0, rigid=r)
+        for p, r in ((points, None), (stretched, None), (points, BONES[:0]))
+    )
+    assert (constant < 0.5 * less).all() and torch.isfinite(none).all()
+
+
 @pytest.mark.parametrize("turned", [(2, 5, 3, 3), (1, 4, 3, 3)])
 def test_shapes_are_checked(turned):
     with pytest.raises(ShapeError, match="procrustean"):

@@ -69,6 +69,10 @@ FINE = (Stage(1e-4, 30, 0.01, 1.0, 0.01), Stage(1e-5, 40, 0.01, 1.0, 0.01), Stag
 TELLING = Stage(1e-4, 0, 1.0, 0.0, 0.03)
 """Scales at which the curvature tells how sure depths are."""
 
+CONSTANT, SURE, UNSURE = 0.0043, 0.15, 1.3
+"""Standard deviation of rigid lengths at which depths are as sure as the curvature tells, and the least and largest
+factors, which go with its root: a model that holds so well is hardly wrong."""
+
 CHANGE = 0.1
 """The eps of the changes, a share of the poses'."""
 
@@ -191,7 +195,8 @@ def depth_deviation(
     The curvature in each frame says which joints the others hold: a tip less than a hip. It does not know of errors
     that all frames share, a depth stretched as a whole above all, which only a turning viewpoint rules out: their size
     goes about with the turn's power -0.6. The constants were set on motion capture of people, dogs and hands seen
-    from paths of 40 to 5,000 degrees, so that one standard deviation covers about two thirds.
+    from paths of 40 to 5,000 degrees, so that one standard deviation covers about two thirds. How constant lengths come
+    out tells how well the model holds, and deviations go with the root of that.
 
     Args:
         points: (H, T, N, 3), of root mean square near 1.
@@ -210,7 +215,11 @@ def depth_deviation(
     roots = whitening(points, rotations, bones, levels, 1, rigid, stiff, TELLING.slack, REACH)
     local = roots[..., :-3, :].norm(dim=-1)
     angle = torch.as_tensor(turn, dtype=points.dtype, device=points.device).clamp_min(1.0)
-    return local * (270 / angle).pow(0.6).expand(len(points))[:, None, None]
+    scale = (270 / angle).pow(0.6).expand(len(points))
+    if len(rigid):
+        spread = bone_vectors(points, rigid).norm(dim=-1).var(-2, unbiased=False).mean(-1).sqrt()
+        scale = scale * (spread / CONSTANT).sqrt().clamp(SURE, UNSURE)
+    return local * scale[:, None, None]
 
 
 def aligned_levels(points: Tensor, rotations: Tensor, bones: Tensor, stage: Stage) -> Levels:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
-from kcs_torch.methods.pkc.objective import bone_noise
+from kcs_torch.methods.pkc.objective import Objective, bone_noise
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["APART", "depth_deviation", "told_by_prior"]
+__all__ = ["APART", "angle_doubt", "depth_deviation", "told_by_prior"]
 
 APART = 0.04
 """Root mean square depth by which solutions must differ to be told apart, a person being about 1.75 tall."""
@@ -18,17 +20,50 @@ APART = 0.04
 CLOSE = 10.0
 """Objective by which another solution may be worse and still be a rival."""
 
-LENGTH = 0.02
-"""Standard deviation of a bone's length as it is found, as a share."""
+ANGLE = 0.22
+"""Standard deviation, in radians, of a bone's angle to the image plane where it is nearest to it: what postures, hinges
+and proportions tell of a length that no crossing of the plane tells."""
 
-FLAT = 0.25
+USUAL = 0.12
+"""Standard deviation of a length of which the image tells nothing, as a share: bodies differ by so much."""
+
+LEAST = 0.028
+"""Standard deviation of any length, as a share; with what else moves a bone's depth as a wrong length does."""
+
+FLAT = 0.4
 """Share of its length below which a bone's depth is no better known for being small."""
 
-NOISE = 0.7
-"""Share of the image's noise that a bone's length and depth take on."""
+STEEP = 0.98
+"""Largest share of its length that counts as a bone's depth: its angle is no better known."""
 
-CALIBRATION = 0.85
-"""Factor by which deviations are scaled so that two thirds of all joints are within one."""
+NEAREST = 0.02
+"""Share of the frames in which a bone may be nearer to the image plane than where it counts as nearest."""
+
+NOISE = 1.15
+"""What a bone's depth takes on of its image's noise."""
+
+POSTURE = 0.15
+"""Energy of usual postures, for each bone and frame that counts. Deviations grow with it: the further postures stray,
+the less the template tells of them."""
+
+TURN, POWER = 22.0, 0.6
+"""Degrees of the viewpoint's turn that tell as much as the template, and the power of the turn that deviations fall
+with, as those of the moving viewpoint do."""
+
+RIVAL, COLD = 0.15, 6.0
+"""Odds of another solution that is no worse, and objective by which they fall to a third."""
+
+HOT_RIVAL, HOT = 0.55, 35.0
+"""The same of a detector's joints, whose errors last, so that frames tell less than the objective takes them to: of
+200 such solutions of simulated detections every third was nearer to the truth, be it worse by 2 or by 20."""
+
+NEAR = 0.016
+"""Standard deviation of a detector's joint, a standing person being about 1.75 tall, beyond what the objective allows
+for: the camera is a few metres away, and joints are defined in another way than bones are."""
+
+HEADING = 0.2
+"""Standard deviation, in radians, of the direction from which a detector's joints are seen: without intrinsics nobody
+knows how far from the image's middle that is, and what is nearer looks larger, as if the body leant."""
 
 
 def told_by_prior(found: Hypotheses, skeleton: Skeleton) -> list[str]:
@@ -41,25 +76,53 @@ def told_by_prior(found: Hypotheses, skeleton: Skeleton) -> list[str]:
     return [skeleton.bone_names[b] for b in (share.amax(0) > 0.3).nonzero().flatten().tolist()]
 
 
-def depth_deviation(found: Hypotheses, noise: Tensor, skeleton: Skeleton) -> Tensor:
+@torch.no_grad()
+def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: float) -> float:
+    """How uncertain angles of a solution (T, N), (B,) are, over those of usual postures before a camera at rest.
+
+    More where postures stray from the template, and less where the viewpoint turned by ``turn`` degrees.
+    """
+    posture = objective.posture
+    points = torch.cat([objective.image, depth[..., None]], -1)
+    counted = (len(depth) / posture.correlation + posture.strength) * len(lengths)
+    strange = float(posture(points[None], lengths[None])) / counted / POSTURE
+    return strange / math.sqrt(1 + (turn / TURN) ** (2 * POWER))
+
+
+def depth_deviation(
+    found: Hypotheses, noise: Tensor, skeleton: Skeleton, *, doubt: float = 1.0, image: Tensor | None = None
+) -> Tensor:
     """Standard deviation of the best solution's depths, (T, N).
 
     A bone's depth dz = sqrt(L^2 - |xy|^2) is off by L dL / |dz|: little where it points at the camera, much where it is
-    nearly parallel to the image. These add up along the chain to the body's middle; rival solutions add their distance.
+    nearly parallel to the image. Its length is told best where it is nearest to the image plane: off by an angle a
+    there, L is off by tan(a) da, so hardly where it passes through the plane. These add up along the chain to the
+    body's middle; rival solutions add their distance.
 
     Args:
         found: solutions, best first.
         noise: (T, N) standard deviation of the joints' images.
         skeleton: of the N joints.
+        doubt: of angles, see :func:`angle_doubt`.
+        image: (T, N, 2) of a detector's joints, or None: these may be off in many ways that their noise does not tell.
     """
     bones = skeleton.bone_index(device=noise.device)
     dz = bone_vectors(found.depth[0][..., None], bones)[..., 0]  # (T, B)
     length = found.lengths[0].clamp_min(1e-9)
-    wrong = ((length * LENGTH).square() + (NOISE * bone_noise(noise, bones)).square()).sqrt()
-    off = wrong / (dz.abs() / length).clamp_min(FLAT)
+    steep = (dz.abs() / length).clamp_max(STEEP)
+    nearest = steep.kthvalue(1 + int(NEAREST * (len(steep) - 1)), 0).values.square()
+    told = (nearest / (1 - nearest)) * (doubt * ANGLE) ** 2  # tan(a)^2 da^2
+    told = told * USUAL**2 / (told + USUAL**2) + (doubt * LEAST) ** 2
+    if image is not None:
+        noise = noise.square().add(NEAR**2).sqrt()
+    wrong = length.square() * told + (NOISE * bone_noise(noise, bones)).square()
     tree = chain_inverse(incidence(bones, skeleton.num_joints, dtype=noise.dtype))  # (N, B)
-    variance = off.square() @ tree.square().mT
+    variance = (wrong / (steep.square() + FLAT**2)) @ tree.square().mT
+    if image is not None:
+        variance = variance + HEADING**2 * (image - image.mean(-2, keepdim=True)).square().sum(-1)
     if len(found.energy) > 1:
-        share = torch.softmax(-(found.energy - found.energy[0]) / CLOSE, 0)
-        variance = variance + torch.einsum("h,htn->tn", share, (found.depth - found.depth[0]).square())
-    return CALIBRATION * variance.sqrt()
+        most, cold = (RIVAL, COLD) if image is None else (HOT_RIVAL, HOT)
+        odds = most * torch.exp(-(found.energy - found.energy[0]) / cold)
+        odds = torch.cat([torch.ones_like(odds[:1]), odds[1:]])
+        variance = variance + torch.einsum("h,htn->tn", odds / odds.sum(), (found.depth - found.depth[0]).square())
+    return variance.sqrt()

@@ -15,7 +15,7 @@ from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import WEAK_TURN, Estimate, Method
 from kcs_torch.methods.lockstep import Search, run, together
-from kcs_torch.methods.pkc.answers import APART, depth_deviation, told_by_prior
+from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.batch import Noisy, Sized, serve
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.gate import plausible
@@ -161,7 +161,7 @@ class PKC(Method):
             moving, _ = yield from self._moving(tracks, image, cameras, enough)
             found = yield from self._ranked(body, moving, cameras, found)
         assert found is not None
-        return self._from_hypotheses(found, body, cameras, notes)
+        return self._from_hypotheses(found, body, cameras, notes, detected(tracks.weights))
 
     def _clean(self, tracks: Tracks) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
         """Complete tracks (T, N, 2), centred per frame, the noise (T, N) left in them, and what was done."""
@@ -266,9 +266,10 @@ class PKC(Method):
         return ranked if found is None else found.joined(ranked)
 
     def _from_hypotheses(
-        self, found: Hypotheses, body: Body, cameras: Tensor | None, notes: tuple[str, ...]
+        self, found: Hypotheses, body: Body, cameras: Tensor | None, notes: tuple[str, ...], detections: bool
     ) -> Estimate:
         """Estimates of the distinct hypotheses, in the tracks' units."""
+        image = body.image if detections else None
         found = distinct(found, self.alternatives + 1, APART)
         told = told_by_prior(found, body.skeleton)
         if told:
@@ -276,9 +277,10 @@ class PKC(Method):
         made = []
         for k, (depth, points) in enumerate(zip(found.depth, body.bodies(found), strict=True)):
             one = torch.ones_like(points[:, 0, 0])
-            spread = depth_deviation(found[k:] if k else found, body.noise, body.skeleton) / body.factor
             value = float(found.energy[k])
             path = body.frames(depth)[:, :2] if cameras is None else cameras
+            unsure = angle_doubt(body.objective, depth, found.lengths[k], float(viewpoint_turn(path)))
+            spread = depth_deviation(found[k:], body.noise, body.skeleton, doubt=unsure, image=image) / body.factor
             settled = self.steps >= 10 and found.moved is not None and bool(found.moved[k] <= STILL)
             made.append(
                 Estimate(points, path, one, settled, found.steps, () if k else notes, spread, value, still=True)
