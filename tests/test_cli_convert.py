@@ -209,7 +209,7 @@ def test_score_as_json(scored):
 def test_score_tells_of_a_mirror(scored):
     save(load_reconstruction(scored / "pred.npz").mirrored(), scored / "flip.npz")
     told = run("score", scored / "flip.npz", scored / "truth.trc", "--align", "rigid").output
-    assert "note: the mirror image in depth is nearer (rigid" in told
+    assert "note: the mirror image in depth is closer (rigid" in told
     plain = run("score", scored / "pred.npz", scored / "truth.trc", "--align", "rigid").output
     mirrored = run("score", scored / "flip.npz", scored / "truth.trc", "--align", "rigid", "--mirror").output
     pick = lambda text: next(line for line in text.splitlines() if line.startswith("rigid"))  # noqa: E731

@@ -15,15 +15,15 @@ __all__ = ["SEEN", "Fill", "Frames", "Gate", "Resample", "Smooth", "Smooth3D", "
 
 SEEN = "seen"
 
-_PANEL = "Cleaning (nothing of this happens unasked; each step is told in the report)"
+_PANEL = "Cleaning (done only if asked for; the report lists each step)"
 
 Frames = Annotated[
     str | None,
     typer.Option(
         "--frames",
         metavar="A:B|seen",
-        help="Take frames A to B, counted from 0, B not included (A: and :B go to the ends), or those from the first "
-        "to the last in which the person is in sight.",
+        help="Take frames A to B, counted from 0, without B (A: and :B extend to the ends), or seen: from the first "
+        "to the last frame in which the person is visible.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -34,7 +34,7 @@ Gate = Annotated[
 Fill = Annotated[
     int | None,
     typer.Option(
-        metavar="FRAMES", help="Fill gaps of up to so many frames, with a lower weight.", rich_help_panel=_PANEL
+        metavar="FRAMES", help="Fill gaps of up to this many frames, with a lower weight.", rich_help_panel=_PANEL
     ),
 ]
 Smooth = Annotated[
@@ -48,14 +48,14 @@ Smooth = Annotated[
 ]
 Resample = Annotated[
     float | None,
-    typer.Option(metavar="FPS", help="Put the tracks at another frame rate.", rich_help_panel=_PANEL),
+    typer.Option(metavar="FPS", help="Resample the tracks to another frame rate.", rich_help_panel=_PANEL),
 ]
 Smooth3D = Annotated[
     str | None,
     typer.Option(
         "--smooth-3d",
         metavar="METHOD=HZ",
-        help="Smooth the 3D motion; bones then keep their length less exactly.",
+        help="Smooth the 3D motion; bone lengths then become slightly less constant.",
         rich_help_panel=_PANEL,
     ),
 ]

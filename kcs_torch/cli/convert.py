@@ -16,11 +16,13 @@ __all__ = ["FromUnits", "FromUp", "convert"]
 FromUp = Annotated[
     str | None,
     typer.Option(
-        "--from-up", metavar="y|z|x|-y|-z", help="The axis that points up in a file of 3D motion that does not say it."
+        "--from-up",
+        metavar="y|z|x|-y|-z",
+        help="The axis that points up in IN, if it is 3D motion and does not say so.",
     ),
 ]
 FromUnits = Annotated[
-    str | None, typer.Option("--from-units", metavar="m|cm|mm|in|ft", help="The unit of a file that does not say it.")
+    str | None, typer.Option("--from-units", metavar="m|cm|mm|in|ft", help="The unit of a file that does not say so.")
 ]
 
 
@@ -47,21 +49,23 @@ def convert(
     from_up: FromUp = None,
     from_units: FromUnits = None,
     format: Annotated[
-        str | None, typer.Option("--format", metavar="NAME", help="Format of IN; found by content if not given.")
+        str | None,
+        typer.Option("--format", metavar="NAME", help="Format of IN; recognised by its content if not given."),
     ] = None,
     skeleton: Annotated[
         str | None,
         typer.Option(
             "--skeleton",
             metavar="NAME|FILE",
-            help="A built-in skeleton or a YAML or JSON file, whose joints are found by name; for .amc its .asf file.",
+            help="A built-in skeleton or a YAML or JSON file; joints are matched by name. For .amc: its .asf file.",
         ),
     ] = None,
     fps: Annotated[
-        float | None, typer.Option(metavar="NUMBER", help="Frames a second; as IN says if not given.")
+        float | None, typer.Option(metavar="NUMBER", help="Frames a second; those of IN if not given.")
     ] = None,
     person: Annotated[
-        str | None, typer.Option(metavar="NUMBER", help="Whose 2D tracks, counted from 0; the most seen if not given.")
+        str | None,
+        typer.Option(metavar="NUMBER", help="Which person's 2D tracks, counted from 0; the most visible if not given."),
     ] = None,
     threshold: Threshold = 0.3,
     size: ImageSize = None,

@@ -24,7 +24,7 @@ DetectorName = Annotated[
     typer.Option(
         "--detector",
         metavar="NAME",
-        help="mediapipe (brings its models; one person at a time) or rtmlib (your ONNX files); auto is rtmlib where "
+        help="mediapipe (ships its models; one person at a time) or rtmlib (your ONNX files); auto means rtmlib if "
         "--model is given, else mediapipe.",
         rich_help_panel=_PANEL,
     ),
@@ -57,18 +57,18 @@ def detect(
         str | None,
         typer.Option(
             metavar="NUMBER|all",
-            help="Whom to write, counted from 0, the most seen first; or all, each to a file of its own.",
+            help="Which person, counted from 0, the most visible first; or all, each in a separate file.",
         ),
     ] = None,
     frames: Frames = None,
     skeleton: UseSkeleton = None,
     fps: Annotated[
-        float | None, typer.Option(metavar="NUMBER", help="Frames a second; as VIDEO says if not given.")
+        float | None, typer.Option(metavar="NUMBER", help="Frames a second; those of VIDEO if not given.")
     ] = None,
     threshold: Threshold = 0.3,
     as_json: AsJson = False,
 ) -> None:
-    """Find the joints of the people in a video; a detector is an extra (see `kcs-torch doctor`)."""
+    """Find the joints of people in a video; this needs a detector (see `kcs-torch doctor`)."""
     with answer(as_json):
         from kcs_torch.errors import OutputError
         from kcs_torch.io import save
@@ -145,7 +145,7 @@ def people_of(
         return list(enumerate(people))
     one = people[check_person(video, number or 0, len(people))]
     if number is None and len(people) > 1:
-        note = f"{len(people)} people found: this is the most seen one, number 0; --person all takes all"
+        note = f"{len(people)} people found: this is the most seen one, number 0; --person chooses others"
         one = replace(one, notes=(*one.notes, note))
     return [(number or 0, one)]
 

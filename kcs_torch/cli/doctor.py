@@ -21,13 +21,13 @@ from kcs_torch.cli.report import one_line, print_json
 __all__ = ["PURPOSES", "doctor"]
 
 PURPOSES = {
-    "benchmark": "Hydra, for the scripts of measurements",
-    "detect": "kcs-torch detect and lift of videos, by MediaPipe, which brings its models (needs numpy below 2)",
+    "benchmark": "Hydra, for the benchmark scripts",
+    "detect": "kcs-torch detect and lift of videos with MediaPipe, which ships its models (needs numpy below 2)",
     "docs": "building the pages of docs/",
     "hdf5": "reading HDF5: MATLAB 7.3, DeepLabCut, SLEAP",
-    "launchers": "scripts on many processes, a Slurm cluster or a ray cluster",
+    "launchers": "running scripts on many processes, a Slurm cluster or a ray cluster",
     "mocap": "reading and writing C3D files",
-    "onnx": "kcs-torch detect and lift of videos, by RTMPose and RTMO models of your own",
+    "onnx": "kcs-torch detect and lift of videos with your own RTMPose and RTMO models",
     "rerun": "recordings for the rerun viewer",
     "test": "running the tests",
     "train": "training networks",
@@ -37,7 +37,7 @@ PURPOSES = {
 
 
 def doctor(as_json: AsJson = False) -> None:
-    """Tell versions, device and extras, and run a self-test of a second; exit code 1 if the core does not work."""
+    """Show versions, device and extras, and run a short self-test; exit code 1 if the core does not work."""
     facts = examine()
     if as_json:
         print_json(facts)
@@ -199,7 +199,7 @@ def spoken(facts: dict[str, Any]) -> str:
         limit = device["omp_num_threads"]
         lines.append(
             f"  device: {runs}; {device['cores']} cores, torch uses {device['threads']} threads"
-            + ("" if limit else " (OMP_NUM_THREADS=1 is faster where others use the machine)")
+            + ("" if limit else " (OMP_NUM_THREADS=1 is faster on a busy machine)")
         )
     lines.append("  extras:")
     for extra in facts["extras"]:

@@ -43,13 +43,13 @@ def info(
             "--output",
             "-o",
             metavar="FILE",
-            help="Draw a frame with the joints' names at the joints: .png, .svg or .pdf.",
+            help="Draw a frame with the names of the joints: .png, .svg or .pdf.",
             show_default=False,
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show what is in a file of tracks: frames, people, skeleton, joints, and how much is unseen."""
+    """Show what a file of tracks holds: frames, people, skeleton, joints, and how much is unseen."""
     with answer(as_json):
         from kcs_torch.io import detect_format, load_people
 
@@ -77,7 +77,7 @@ def info(
         if output is not None:
             typer.echo(f"wrote {output}")
         else:
-            typer.echo(f"see which joint is which: kcs-torch info {shlex.quote(tracks)} -o picture.png")
+            typer.echo(f"to see which joint is which: kcs-torch info {shlex.quote(tracks)} -o picture.png")
 
 
 def _facts(path: str, format: str, people: list[Tracks]) -> dict[str, Any]:
@@ -137,7 +137,7 @@ def view(
         list[Path],
         typer.Argument(
             metavar="RESULT...",
-            help="A result written by `kcs-torch lift` (.npz), or several of the same clip to see together.",
+            help="A result of `kcs-torch lift` (.npz), or several of the same clip, shown together.",
             show_default=False,
         ),
     ],
@@ -148,7 +148,7 @@ def view(
             "-o",
             metavar="FILE",
             help="Where to write: .html (a player), .png (key frames), .gif, .mp4, .rrd, .csv or .json; may be "
-            "repeated. The first RESULT with the suffix .html if not given.",
+            "repeated. If not given, the first RESULT with the suffix .html.",
             show_default=False,
         ),
     ] = [],  # noqa: B006 (typer reads it and never changes it)
@@ -167,7 +167,7 @@ def view(
         check_up(up, outputs)
         if len(results) > 1 and units is not None:
             raise OptionError(
-                "--units: expected one RESULT; several are shown in the unit that they have, or --scale says"
+                "--units: expected one RESULT; several are shown in their own unit, or in that of --scale"
             )
         for result in results:
             check_outputs(outputs, source=str(result))

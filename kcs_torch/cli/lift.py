@@ -41,7 +41,7 @@ MethodName = Annotated[
         "--method",
         "-m",
         metavar="NAME",
-        help="pkc, which is auto, sfam, kcs, pnd, smsr, local_rigidity, rigid, pta, csf or bmm; lift also takes a "
+        help="pkc (also called auto), sfam, kcs, pnd, smsr, local_rigidity, rigid, pta, csf or bmm; lift also takes a "
         "trained network (.safetensors).",
     ),
 ]
@@ -50,7 +50,7 @@ Settings = Annotated[
     typer.Option(
         "--set",
         metavar="NAME=VALUE",
-        help="Set a field of the method; may be repeated. A wrong name is answered with the right ones.",
+        help="Set a field of the method; may be repeated. If the name is wrong, the error lists the right ones.",
         show_default=False,
     ),
 ]
@@ -80,8 +80,8 @@ def lift(
         typer.Option(
             "--skeleton",
             metavar="NAME|FILE|auto",
-            help="A built-in skeleton (see `kcs-torch skeletons`), a YAML or JSON file, or auto: found from motion. "
-            "As TRACKS says if not given.",
+            help="A built-in skeleton (see `kcs-torch skeletons`), a YAML or JSON file, or auto: bones are found from "
+            "the motion. That of TRACKS if not given.",
         ),
     ] = None,
     format: FormatName = None,
@@ -89,12 +89,12 @@ def lift(
         str | None,
         typer.Option(
             metavar="NUMBER|all",
-            help="Whom to take, counted from 0, the most seen first; or all, each to a file of its own (OUT_0, OUT_1); "
-            "pages, films and recordings also together (OUT).",
+            help="Which person, counted from 0, the most visible first; or all: each in a separate file (OUT_0, "
+            "OUT_1), and pages, films and recordings also of all together (OUT).",
         ),
     ] = None,
     fps: Annotated[
-        float | None, typer.Option(metavar="NUMBER", help="Frames a second; as TRACKS says if not given.")
+        float | None, typer.Option(metavar="NUMBER", help="Frames a second; those of TRACKS if not given.")
     ] = None,
     threshold: Threshold = 0.3,
     size: ImageSize = None,
@@ -103,12 +103,12 @@ def lift(
         str | None,
         typer.Option(
             metavar="FX,FY,CX,CY",
-            help="Focal lengths and principal point of the camera in pixels; perspective is then taken into account.",
+            help="Focal lengths and principal point of the camera in pixels; perspective is then modelled.",
             show_default=False,
         ),
     ] = None,
     mirror: Annotated[
-        bool, typer.Option("--mirror", help="Write the mirror image in depth, which fits the tracks as well.")
+        bool, typer.Option("--mirror", help="Write the mirror image in depth, which fits the tracks equally well.")
     ] = False,
     solution: Annotated[
         int,
@@ -116,7 +116,7 @@ def lift(
             "--solution",
             metavar="NUMBER",
             min=1,
-            help="Write the solution of this number instead of the best, which is 1; the report lists them, with their "
+            help="Write this solution instead of the best, which is number 1; the report lists them, with their "
             "objective (lower is better) and how they differ.",
         ),
     ] = 1,
@@ -179,7 +179,8 @@ def lift(
         reports, results = [], []
         together = [path for path in output if person == "all" and writer_for(path).write_people is not None]
         if together and frames == "seen":  # each has a first frame of their own then
-            typer.echo(f"note: {', '.join(map(str, together))} not written: people begin at different frames", err=True)
+            say = "with --frames seen people begin at different frames"
+            typer.echo(f"note: {', '.join(map(str, together))} not written: {say}", err=True)
             together = []
         for number, one in people:
             check_outputs([numbered(path, number) for path in output] if person == "all" else [], source=tracks)
@@ -187,7 +188,7 @@ def lift(
                 check_size(one.skeleton, next(name for name in size_of if name != "units"), "--scale")
             share = float(one.seen.any(1).double().mean())
             if person == "all" and share < FEW:
-                say = f"person {number} is in sight in {100 * share:.0f} % of the frames only: the rest is made up"
+                say = f"person {number} is visible in only {100 * share:.0f} % of the frames: the rest is guessed"
                 typer.echo(f"warning: {say}", err=True)
         cleaned = [clean(one) for _, one in people]
         found = _lifted(cleaned, learned or method, fields, find)

@@ -27,20 +27,21 @@ TracksPath = Annotated[
     str,
     typer.Argument(
         metavar="TRACKS",
-        help="2D joint tracks: a file, a folder of files (OpenPose), or the beginning of their names.",
+        help="2D joint tracks: a file, a folder of files (OpenPose), or the start of the names of a folder's files.",
         show_default=False,
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 FormatName = Annotated[
-    str | None, typer.Option("--format", metavar="NAME", help="Format of TRACKS; found by content if not given.")
+    str | None,
+    typer.Option("--format", metavar="NAME", help="Format of TRACKS; recognised by its content if not given."),
 ]
 UseSkeleton = Annotated[
     str | None,
     typer.Option(
         "--skeleton",
         metavar="NAME|FILE",
-        help="A built-in skeleton (see `kcs-torch skeletons`) or a YAML or JSON file; as TRACKS says if not given.",
+        help="A built-in skeleton (see `kcs-torch skeletons`) or a YAML or JSON file; that of TRACKS if not given.",
     ),
 ]
 Threshold = Annotated[
@@ -51,12 +52,12 @@ ImageSize = Annotated[
     typer.Option(
         "--image-size",
         metavar="WIDTHxHEIGHT",
-        help="Size of the video in pixels, for formats whose coordinates are shares of it (MediaPipe).",
+        help="Size of the video in pixels, for formats with coordinates relative to it (MediaPipe).",
     ),
 ]
 Trust = Annotated[
     bool,
-    typer.Option("--trust", help="Read a file although it is a pickle (VideoPose3D's .npz); no code of it is run."),
+    typer.Option("--trust", help="Read a file even if it is a pickle (VideoPose3D's .npz); none of its code is run."),
 ]
 
 

@@ -22,8 +22,8 @@ Up = Annotated[
     typer.Option(
         "--up",
         metavar="y|z",
-        help="The axis that points up in .bvh, .c3d, .csv and .trc files; y if not given. Other files, and .csv if it "
-        "is not given, hold results in the camera's axes (y down).",
+        help="The axis that points up in .bvh, .c3d, .csv and .trc files; y if not given. Other files hold results in "
+        "the camera's axes (y down), and so does .csv if this is not given.",
         show_default=False,
     ),
 ]
@@ -31,7 +31,7 @@ Units = Annotated[
     str | None,
     typer.Option(
         metavar="m|cm|mm|in|ft",
-        help="Unit of length in the files; if not given .bvh cm, .trc m, .c3d mm, others as the motion is.",
+        help="Unit of length in the files; if not given, cm in .bvh, m in .trc, mm in .c3d, else that of the motion.",
         show_default=False,
     ),
 ]
@@ -41,7 +41,7 @@ Scale = Annotated[
         "--scale",
         metavar="SIZE",
         help="The true size: height=1.75m (head to foot), a bone such as left_knee-left_ankle=430mm, or factor=2mm "
-        "(millimetres of one unit).",
+        "(one unit of the motion is 2 mm).",
         show_default=False,
     ),
 ]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["score"]
 
-_Up = "The axis that points up in {}, if the file does not say it: y, z, x, -y (the camera's axes) or -z."
+_Up = "The axis that points up in {}, if the file does not say so: y, z, x, -y (the camera's axes) or -z."
 
 
 def score(
@@ -39,9 +39,9 @@ def score(
         list[str],
         typer.Option(
             metavar="NAME",
-            help="Alignment before distances are taken: none, root, scale, rigid (each frame turned), similarity "
-            "(turned and scaled: PA-MPJPE), sequence (one turn and scale for the clip); may be repeated. If not given, "
-            "all that sizes allow.",
+            help="Alignment before distances are measured: none, root, scale, rigid (each frame rotated), similarity "
+            "(rotated and scaled: PA-MPJPE), sequence (one rotation and scale for the clip); may be repeated. If not "
+            "given, all that make sense for these sizes.",
             show_default=False,
         ),
     ] = [],  # noqa: B006 (typer reads it and never changes it)
@@ -60,7 +60,7 @@ def score(
     from_units: FromUnits = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare a motion with the truth: joints by name, frames by number or time, each figure with its alignment."""
+    """Compare a motion with ground truth; joints are matched by name, frames by number or time."""
     with answer(as_json):
         from kcs_torch.io import load_motion
         from kcs_torch.metrics import compare
@@ -115,5 +115,5 @@ def _spoken(found: Comparison, pred: str, truth: str) -> str:
     better = [how for how in found.mpjpe if found.mirrored[how] < 0.98 * found.mpjpe[how]]
     if better:
         shown = ", ".join(f"{how} {found.mirrored[how]:.4g}{unit}" for how in better)
-        lines.append(f"note: the mirror image in depth is nearer ({shown}): --mirror scores it")
+        lines.append(f"note: the mirror image in depth is closer ({shown}): score it with --mirror")
     return "\n".join([*lines, *(f"note: {one_line(note)}" for note in found.notes)])
