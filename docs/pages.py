@@ -132,11 +132,11 @@ def reference(name: str) -> str:
 
 def members(value: Any, kind: str) -> list[str]:
     """What autodoc is to show of a class; of tracks and motion also what their base, which has no page, holds."""
-    from kcs_torch.types.clip import Clip
+    from kcs_torch.types.trajectories import Trajectories
 
     if kind != "class":
         return []
-    return ["   :members:", *(["   :inherited-members: object"] if issubclass(value, Clip) else [])]
+    return ["   :members:", *(["   :inherited-members: object"] if issubclass(value, Trajectories) else [])]
 
 
 def kind_of(value: object) -> str:

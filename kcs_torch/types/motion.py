@@ -15,18 +15,18 @@ from kcs_torch.errors import OptionError
 from kcs_torch.functional import orbit
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
 from kcs_torch.types.axes import from_y_up, to_y_up
-from kcs_torch.types.clip import Clip
 from kcs_torch.types.intake import as_floats, take_in
 from kcs_torch.types.intrinsics import Intrinsics
 from kcs_torch.types.reconstruction import Reconstruction
 from kcs_torch.types.size import size_factor
 from kcs_torch.types.tracks import Tracks
+from kcs_torch.types.trajectories import Trajectories
 
 __all__ = ["Motion"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Motion(Clip):
+class Motion(Trajectories):
     """3D motion of one body in a world of right-handed axes with y up.
 
     Seen from a camera on the z axis, x points right and z towards the viewer; a body that faces +z has its left at +x.

@@ -9,14 +9,14 @@ from typing import Any
 
 from kcs_torch.errors import counted
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types.clip import Clip
 from kcs_torch.types.intake import no_bones, take_in
+from kcs_torch.types.trajectories import Trajectories
 
 __all__ = ["Tracks"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Tracks(Clip):
+class Tracks(Trajectories):
     """2D joint tracks of one body. Build it with :meth:`from_arrays` or :func:`kcs_torch.load_tracks`.
 
     Attributes:

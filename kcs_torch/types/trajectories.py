@@ -9,11 +9,11 @@ from torch import Tensor
 
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["Clip"]
+__all__ = ["Trajectories"]
 
 
 @dataclass(frozen=True, eq=False)
-class Clip:
+class Trajectories:
     """Joints of one body over time. :class:`Tracks` has them in the image, :class:`Motion` in space.
 
     Attributes:
@@ -31,7 +31,7 @@ class Clip:
     skeleton: Skeleton
     fps: float | None = None
     units: str = ""
-    source: str = "clip"
+    source: str = "trajectories"
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -43,10 +43,12 @@ class Clip:
 
     @property
     def num_frames(self) -> int:
+        """T."""
         return self.points.shape[0]
 
     @property
     def num_joints(self) -> int:
+        """N, virtual joints included."""
         return self.points.shape[1]
 
     @property
