@@ -109,10 +109,10 @@ def test_mp4_can_be_played_by_others(result, tmp_path):
     assert stream["r_frame_rate"] == "25/1"
 
 
-def test_without_ffmpeg_the_extra_is_named(result, tmp_path, monkeypatch):
+def test_without_ffmpeg_the_package_is_named(result, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(OutputError, match=r"pip install 'kcs-torch\[video\]'"):
+    with pytest.raises(OutputError, match="pip install imageio-ffmpeg"):
         save(result, tmp_path / "walk.mp4")
     assert list(tmp_path.iterdir()) == []
 
@@ -162,9 +162,9 @@ def test_recording_is_read_by_rerun(result, tmp_path):
         assert entity in told.replace("\\ ", "_"), entity
 
 
-def test_without_rerun_the_extra_is_named(result, tmp_path, monkeypatch):
+def test_without_rerun_the_package_is_named(result, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(OutputError, match=r"pip install 'kcs-torch\[rerun\]'"):
+    with pytest.raises(OutputError, match="pip install rerun-sdk"):
         save(result, tmp_path / "walk.rrd")
     assert list(tmp_path.iterdir()) == []
 
