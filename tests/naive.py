@@ -9,6 +9,7 @@ The twin of a method is the same iteration with the same number of steps, in whi
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -27,11 +28,11 @@ __all__ = ["fit_bones", "fit_bones_frame_by_frame", "fit_cameras_frame_by_frame"
 BATCHED_CAMERAS = pose.fit_cameras
 
 
-def svt(matrix: Tensor, threshold: Tensor | float) -> Tensor:
-    """U max(S - threshold, 0) V^T of (..., M, N), as the formula says."""
+def svt(matrix: Tensor, threshold: Tensor | float, corner: Tensor | float = math.inf) -> Tensor:
+    """U max(S - threshold / (1 + S / corner), 0) V^T of (..., M, N), as the formula says."""
     u, s, vh = torch.linalg.svd(matrix, full_matrices=False)
-    level = torch.as_tensor(threshold, dtype=s.dtype)[..., None]
-    return (u * (s - level).clamp_min(0)[..., None, :]) @ vh
+    level, bend = (torch.as_tensor(x, dtype=s.dtype)[..., None] for x in (threshold, corner))
+    return (u * (s - level / (1 + s / bend)).clamp_min(0)[..., None, :]) @ vh
 
 
 def fit_bones(
@@ -91,9 +92,10 @@ def fit_cameras_frame_by_frame(*arrays: Tensor, start: Tensor | None = None, **o
 def window_by_window(step: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """A step of SfAM that takes the windows (W, T, N, 3) of one body, with a Python loop over them."""
 
-    def looped(*batched: Tensor, **shared: Tensor) -> Tensor:
-        *windows, size = batched  # shape, tracks, cameras, weights and threshold are each window's own
-        return torch.stack([step(*window, size, **shared) for window in zip(*windows, strict=True)])
+    def looped(*batched: Tensor, corner: Tensor, **shared: Tensor) -> Tensor:
+        *windows, size = batched  # shape, tracks, cameras, weights, threshold and corner are each window's own
+        own = zip(*windows, corner, strict=True)
+        return torch.stack([step(*window, size, corner=bend, **shared) for *window, bend in own])
 
     return looped
 

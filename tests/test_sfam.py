@@ -78,7 +78,7 @@ def written_out(tracks, cameras, weights, method, lengths=None):
             gradient = gradient + ahead - fit_bones(ahead, target, bones, stiffness=method.beta, num_steps=1)
         tau = method.tau if articulated else 2 * method.tau
         u, s, v = torch.linalg.svd(sharp(ahead - tau * gradient), full_matrices=False)
-        flat = u @ torch.diag((s - tau * mu).clamp_min(0)) @ v
+        flat = u @ torch.diag((s - tau * mu / (1 + s / (method.corner * unit))).clamp_min(0)) @ v
         new = flat.reshape(frames, 3, joints).permute(0, 2, 1)
         shape, ahead = new, new + method.momentum * (new - shape)
     return shape
@@ -111,7 +111,11 @@ def test_unrolled_layer_untrained_is_the_method(steps):
     layer = UnrolledSfAM(BODY, steps)
     with torch.no_grad():
         out = layer(tracks, SHORT.cameras, weights=weights)
-    found = SfAM(num_steps=steps).shape(tracks[None], SHORT.cameras[None], weights[None], BODY).value[0]
+    found = (
+        SfAM(num_steps=steps, momentum=layer.momentum)
+        .shape(tracks[None], SHORT.cameras[None], weights[None], BODY)
+        .value[0]
+    )
     assert_close(out, found, rtol=0, atol=1e-6)  # its parameters pass through a softplus
 
 
@@ -219,7 +223,7 @@ def test_no_jump_and_no_flip_at_seams(long_clip, options):
     for a, b in zip(starts[1:], starts, strict=False):
         seam[a - 1 : b + method.window] = True
     assert seam.any() and not seam.all()
-    assert change[seam].max() < 2 * change[~seam].max()
+    assert change[seam].max() < (truth[1:] - truth[:-1]).abs().mean()  # mm a frame: less than the body's own depth
 
 
 def test_cameras_have_one_world_over_all_windows(long_clip):
@@ -339,7 +343,7 @@ def test_several_clips_at_once():
 
 def test_windows_of_very_long_clips_share_the_lengths_of_some(monkeypatch):
     """Four of seven windows are solved together and tell the lengths; the others aim at these, a few at a time."""
-    clip = walking_person(300, turn=180.0)
+    clip = walking_person(300, turn=360.0)
     method = SfAM(window=60, overlap=20)
     together = method(clip.tracks)
     asked = []
@@ -353,7 +357,7 @@ def test_windows_of_very_long_clips_share_the_lengths_of_some(monkeypatch):
     monkeypatch.setattr(sfam, "LEAD", 4)
     monkeypatch.setattr(sfam, "CHUNK", 2)
     apart = method(clip.tracks)
-    assert asked == [(4, 0), (2, 24), (1, 24)]  # 24 articulated steps, whose lengths are held
+    assert asked == [(4, 0), (2, 40), (1, 40)]  # 40 articulated steps, whose lengths are held
     assert (apart.points - together.points).norm() < 0.01 * together.points.norm()
     assert_close(apart.lengths, together.lengths, rtol=0.03, atol=0)
     known = method(clip.tracks, clip.cameras)

@@ -1,5 +1,7 @@
 """Functions of singular values: against plain SVDs, as proximal maps, and their derivatives where the SVD has none."""
 
+import math
+
 import pytest
 import scipy.fft
 import torch
@@ -21,10 +23,10 @@ from kcs_torch.errors import NotFiniteError, ShapeError
 from kcs_torch.functional import dct_basis, log_det, nuclear_norm, psd_shrink, singular_values, spectral_norm, svt
 
 
-def plain_svt(matrix, threshold):
+def plain_svt(matrix, threshold, corner=math.inf):
     """The textbook, through torch.linalg.svd and its derivative."""
     u, s, vt = torch.linalg.svd(matrix, full_matrices=False)
-    return (u * (s - threshold).clamp_min(0)[..., None, :]) @ vt
+    return (u * (s - threshold / (1 + s / corner)).clamp_min(0)[..., None, :]) @ vt
 
 
 def nuclear(matrix):
@@ -72,16 +74,47 @@ each_matrix = pytest.mark.parametrize("matrix", MATRICES.values(), ids=MATRICES.
 # ---------------------------------------------------------------------- svt
 
 
+each_corner = pytest.mark.parametrize("corner", [math.inf, 3.0, 0.2])
+
+
 @each_matrix
+@each_corner
 @pytest.mark.parametrize("threshold", [0.0, 0.4, 2.0, 50.0])
-def test_svt_is_the_textbook(matrix, threshold):
-    assert_close(svt(matrix, threshold), plain_svt(matrix, threshold))
+def test_svt_is_the_textbook(matrix, threshold, corner):
+    assert_close(svt(matrix, threshold, corner), plain_svt(matrix, threshold, corner))
 
 
 @each_matrix
+@each_corner
 @pytest.mark.parametrize("threshold", [0.4, 2.0, 50.0])
-def test_svt_gradient(matrix, threshold):
-    assert gradcheck(svt, matrix, torch.tensor(threshold, dtype=torch.float64))
+def test_svt_gradient(matrix, threshold, corner):
+    rest = [torch.tensor(x, dtype=torch.float64) for x in (threshold, corner) if x < math.inf]
+    assert gradcheck(svt, matrix, *rest)
+
+
+def test_svt_takes_a_corner_of_nothing_for_none():
+    """The size of a matrix of zeros, of which a corner is a share, is 0."""
+    matrix = torch.stack([normal(5, 4), torch.zeros(5, 4, dtype=torch.float64)])
+    corner = 0.1 * spectral_norm(matrix)
+    assert_close(svt(matrix, 0.3, corner)[0], plain_svt(matrix[0], 0.3, corner[0]))
+    assert_close(svt(matrix, 0.3, corner)[1], matrix[1])
+    assert_close(svt(matrix, 0.3, 0.0), svt(matrix, 0.3))
+
+
+@pytest.mark.parametrize("name", ["tall", "wide", "tied tall", "static wide", "unseen joints"])
+@pytest.mark.parametrize("corner", [0.2, 3.0])
+def test_reweighted_svt_does_not_raise_the_logarithmic_penalty(name, corner):
+    """It minimises a majoriser of t c sum log(1 + s / c) that touches it at the matrix itself."""
+    target, threshold = MATRICES[name], 0.4
+    best = svt(target, threshold, corner)
+
+    def objective(x):
+        penalty = corner * (torch.linalg.svdvals(x) / corner).log1p().sum(-1)
+        return 0.5 * (x - target).square().sum((-2, -1)) + threshold * penalty
+
+    assert objective(best) < objective(target)
+    slope = threshold / (1 + torch.linalg.svdvals(target) / corner)
+    assert_close(torch.linalg.svdvals(best), (torch.linalg.svdvals(target) - slope).clamp_min(0))
 
 
 @each_matrix
@@ -96,9 +129,10 @@ def test_svt_without_threshold_passes_gradients_through(matrix):
 def test_svt_gradient_is_that_of_autograd_where_it_has_one(name):
     grads = []
     for function in (svt, plain_svt):
-        matrix, level = MATRICES[name].clone().requires_grad_(), torch.tensor(0.7, dtype=torch.float64).requires_grad_()
-        function(matrix, level).backward(normal(*matrix.shape, seed=2))
-        grads.append((matrix.grad, level.grad))
+        matrix = MATRICES[name].clone().requires_grad_()
+        level, corner = (torch.tensor(x, dtype=torch.float64).requires_grad_() for x in (0.7, 1.5))
+        function(matrix, level, corner).backward(normal(*matrix.shape, seed=2))
+        grads.append((matrix.grad, level.grad, corner.grad))
     assert_close(grads[0], grads[1])
 
 

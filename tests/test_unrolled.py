@@ -65,7 +65,7 @@ def scene(body, kind="any", *, frames=6, dtype=torch.float64):
 KINDS = ["any", "static", "one frame", "two frames", "gaps", "unseen joint", "unseen frame", "nothing seen", "zero"]
 
 
-def naive(body, tracks, cameras, weights, *, steps, mu, final, tau, momentum, beta, articulate_from):
+def naive(body, tracks, cameras, weights, *, steps, mu, final, tau, momentum, beta, articulate_from, corner):
     """The iteration written out, with plain SVDs and 3N x 3N systems: one clip."""
     share = weights[..., None]
     middle = (tracks * share).sum(-2, keepdim=True) / share.sum(-2, keepdim=True)
@@ -90,6 +90,7 @@ def naive(body, tracks, cameras, weights, *, steps, mu, final, tau, momentum, be
             gradient = gradient + ahead - torch.stack(fitted)
         u, s, vt = torch.linalg.svd((ahead - rate * gradient).flatten(-2), full_matrices=False)
         level = mu * (final / mu) ** (k / (steps - 1)) * scale
+        level = level / (1 + s / (corner * scale))
         new = ((u * (s - rate * level).clamp_min(0)) @ vt).unflatten(-1, shape.shape[-2:])
         ahead, shape = new + momentum * (new - shape), new
     return shape
@@ -102,9 +103,10 @@ def naive(body, tracks, cameras, weights, *, steps, mu, final, tau, momentum, be
 @pytest.mark.parametrize("kind", ["any", "gaps", "two frames"])
 @pytest.mark.parametrize("momentum", [0.0, 0.8])
 @pytest.mark.parametrize("articulate_from", [0.0, 0.6])
-def test_untrained_is_the_iteration_written_out(body, kind, momentum, articulate_from):
+@pytest.mark.parametrize("corner", [math.inf, 0.1])
+def test_untrained_is_the_iteration_written_out(body, kind, momentum, articulate_from, corner):
     tracks, cameras, weights = scene(body, kind)
-    options = {"mu": 0.4, "final": 1e-4, "tau": 0.45, "momentum": momentum}
+    options = {"mu": 0.4, "final": 1e-4, "tau": 0.45, "momentum": momentum, "corner": corner}
     module = UnrolledSfAM(body, 8, beta=1.2, articulate_from=articulate_from, **options)
     expected = naive(body, tracks, cameras, weights, steps=8, beta=1.2, articulate_from=articulate_from, **options)
     assert_close(module(tracks, cameras, weights=weights), expected, rtol=1e-6, atol=1e-6)
@@ -120,20 +122,22 @@ def test_untrained_is_the_iteration_written_out(body, kind, momentum, articulate
 @pytest.mark.parametrize("articulate_from", [0.0, 0.6])
 def test_untrained_is_the_method(body, learnable, articulate_from):
     tracks, cameras, weights = scene(body, "gaps", frames=12)
-    options = {"mu": 0.4, "final": 1e-4, "tau": 0.45, "momentum": 0.7, "beta": 1.2}
+    options = {"mu": 0.4, "final": 1e-4, "tau": 0.45, "momentum": 0.7, "beta": 1.2, "corner": 0.3}
     method = SfAM(num_steps=9, articulate_from=articulate_from, window=None, **options)
     expected = method.shape(tracks[None], cameras[None], weights[None], body).value[0]
     module = UnrolledSfAM(body, 9, articulate_from=articulate_from, learnable=learnable, **options)
     assert_close(module(tracks, cameras, weights=weights), expected)
     method = SfAM(num_steps=9, window=None, **{**options, "beta": 0.0})
     expected = method.shape(tracks[None], cameras[None], weights[None], body).value[0]
-    module = UnrolledFPC(9, learnable=learnable, mu=0.4, final=1e-4, tau=0.9, momentum=0.7)
+    module = UnrolledFPC(9, learnable=learnable, mu=0.4, final=1e-4, tau=0.9, momentum=0.7, corner=0.3)
     assert_close(module(tracks, cameras, weights=weights), expected)
 
 
 def test_defaults_are_those_of_the_method():
     tracks, cameras, weights = scene(BODY, frames=12)
-    expected = SfAM(num_steps=10, window=None).shape(tracks[None], cameras[None], weights[None], BODY).value[0]
+    expected = (
+        SfAM(num_steps=10, momentum=0.8, window=None).shape(tracks[None], cameras[None], weights[None], BODY).value[0]
+    )
     assert_close(UnrolledSfAM(BODY)(tracks, cameras), expected)
 
 
@@ -410,8 +414,8 @@ def test_parameters_pushed_far_stay_harmless(dtype):
 @pytest.mark.parametrize("grad_steps", [0, 1, 2, 4, 9, None])
 def test_grad_steps_records_the_last_steps(grad_steps):
     tracks, cameras, _ = scene(BODY)
-    whole = UnrolledSfAM(BODY, 4, articulate_from=0.5)
-    module = UnrolledSfAM(BODY, 4, articulate_from=0.5, grad_steps=grad_steps)
+    options = {"articulate_from": 0.5, "corner": math.inf}
+    whole, module = UnrolledSfAM(BODY, 4, **options), UnrolledSfAM(BODY, 4, **options, grad_steps=grad_steps)
     value = module(tracks, cameras)
     assert torch.equal(value, whole(tracks, cameras))
     if grad_steps == 0:
@@ -425,7 +429,7 @@ def test_grad_steps_records_the_last_steps(grad_steps):
     if recorded == 1:
         with torch.no_grad():
             state = _states(whole, tracks, cameras)
-        by_hand = UnrolledSfAM(BODY, 4, articulate_from=0.5)
+        by_hand = UnrolledSfAM(BODY, 4, **options)
         last = shape_step(
             state[-1], tracks, cameras, None,
             by_hand._values("threshold", tracks)[3] * data_scale(tracks, cameras), by_hand._values("step", tracks)[3],
@@ -549,6 +553,8 @@ def test_wrong_joint_count_names_the_skeleton(joints):
         {"mu": 0.1, "final": 0.2},
         {"momentum": 1.0},
         {"momentum": -0.1},
+        {"corner": 0.0},
+        {"corner": math.nan},
     ],
 )
 def test_options_out_of_range(options):
@@ -562,7 +568,7 @@ def test_options_out_of_range(options):
     "options", [{"beta": 0.0}, {"beta": math.nan}, {"articulate_from": 1.5}, {"articulate_from": -0.1}]
 )
 def test_articulated_options_out_of_range(options):
-    with pytest.raises(OptionError, match="beta > 0 and articulate_from"):
+    with pytest.raises(OptionError, match="beta and corner > 0 and articulate_from"):
         UnrolledSfAM(BODY, **options)
 
 
@@ -576,7 +582,7 @@ def test_skeleton_without_rigid_bones_is_plain_fpc():
 
     loose = replace(CHAIN, flexible=(0, 1, 2))
     tracks, cameras, _ = scene(CHAIN)
-    options = {"mu": 0.4, "final": 1e-3}
+    options = {"mu": 0.4, "final": 1e-3, "momentum": 0.5, "corner": 0.2}
     plain = UnrolledFPC(5, tau=1.0, **options)(tracks, cameras)
     assert_close(UnrolledSfAM(loose, 5, tau=0.5, **options)(tracks, cameras), plain)
 

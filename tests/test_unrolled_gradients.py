@@ -101,8 +101,8 @@ def strict(name, **options):
         return UnrolledFPC(3, mu=0.3, final=0.3, momentum=0.0, **options)
     if name == "sfam":
         return UnrolledSfAM(
-            BODY, 3, mu=0.3, final=0.3, momentum=0.0, articulate_from=0.0, lengths=LENGTHS, learnable_lengths=True,
-            **options,
+            BODY, 3, mu=0.3, final=0.3, momentum=0.0, corner=2.0, articulate_from=0.0, lengths=LENGTHS,
+            learnable_lengths=True, **options,
         )  # fmt: skip
     if name == "kcs":
         return UnrolledKCS(

@@ -76,53 +76,64 @@ class _Once(torch.autograd.Function):
 
 
 class ShrinkSingularValues(torch.autograd.Function):
-    """(matrix (..., M, N), threshold (...)) to U max(S - threshold, 0) V^T, and two intermediates."""
+    """(matrix (..., M, N), threshold t (...), bend k (...)) to U f(S) V^T, and two intermediates.
+
+    f(s) = max(s - t / (1 + k s), 0).
+    """
 
     @staticmethod
-    def forward(matrix: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(matrix: Tensor, threshold: Tensor, bend: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         rotated, raw, right = rotate(matrix)
-        out = (rotated * ratio(raw, threshold[..., None])[..., None, :]) @ right.mT
+        out = (rotated * ratio(raw, threshold[..., None], bend[..., None])[..., None, :]) @ right.mT
         return (out if tall(matrix) else out.mT), raw, right
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, Tensor, Tensor]) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
         ctx.mark_non_differentiable(*output[1:])
         ctx.save_for_backward(*inputs, *output[1:])
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
-        pulled: tuple[Tensor, Tensor] = _ShrinkAdjoint.apply(grad, *ctx.saved_tensors)
+    def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor, Tensor, Tensor]:
+        pulled: tuple[Tensor, Tensor, Tensor] = _ShrinkAdjoint.apply(grad, *ctx.saved_tensors)
         return pulled
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], matrix: Tensor, threshold: Tensor) -> Any:
-        padded, _ = batch_first(info, in_dims, (matrix, threshold), (2, 0))
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *tensors: Tensor) -> Any:
+        padded, _ = batch_first(info, in_dims, tensors, (2, 0, 0))
         return ShrinkSingularValues.apply(*padded), (0, 0, 0)
 
 
 class _ShrinkAdjoint(_Once):
     @staticmethod
-    def forward(grad: Tensor, matrix: Tensor, threshold: Tensor, raw: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        grad: Tensor, matrix: Tensor, threshold: Tensor, bend: Tensor, raw: Tensor, right: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         upright = tall(matrix)
         left, s = left_vectors((matrix if upright else matrix.mT) @ right, raw)
-        level = threshold[..., None]
-        f = (s - level).clamp_min(0)
+        level, k = threshold[..., None], bend[..., None]
+        fall = 1 / (1 + k * s)
+        f = (s - level * fall).clamp_min(0)
         gv = (grad if upright else grad.mT) @ right  # (..., M, n)
         p = left.mT @ gv  # (..., n, n)
-        share = ratio(s, level)
+        share = ratio(s, level, k)
         total = s[..., :, None] + s[..., None, :]
         odd = (f[..., :, None] + f[..., None, :]) / torch.where(total > 0, total, torch.ones_like(total))
         odd = torch.where(total > 0, odd, torch.maximum(share[..., :, None], share[..., None, :]))
-        inner = divided(s, level) * (p + p.mT) / 2 + odd * (p - p.mT) / 2
+        inner = divided(s, level, k) * (p + p.mT) / 2 + odd * (p - p.mT) / 2
         out = (left @ inner + (gv - left @ p) * share[..., None, :]) @ right.mT
-        slope = -(p.diagonal(dim1=-2, dim2=-1) * (f > 0)).sum(-1)
-        return (out if upright else out.mT).sum_to_size(matrix.shape), slope.sum_to_size(threshold.shape)
+        pulled = p.diagonal(dim1=-2, dim2=-1) * (f > 0) * fall
+        slope, turn = -pulled.sum(-1), (pulled * fall * level * s).sum(-1)
+        return (
+            (out if upright else out.mT).sum_to_size(matrix.shape),
+            slope.sum_to_size(threshold.shape),
+            turn.sum_to_size(bend.shape),
+        )
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *tensors: Tensor) -> Any:
-        padded, shapes = batch_first(info, in_dims, tensors, (2, 2, 0, 1, 2))
-        matrix, threshold = _ShrinkAdjoint.apply(*padded)
-        return (matrix.reshape(shapes[1]), threshold.reshape(shapes[2])), (0, 0)
+        padded, shapes = batch_first(info, in_dims, tensors, (2, 2, 0, 0, 1, 2))
+        pulled = _ShrinkAdjoint.apply(*padded)
+        return tuple(x.reshape(shape) for x, shape in zip(pulled, shapes[1:4], strict=True)), (0, 0, 0)
 
 
 # ---------------------------------------------------------------------- V f(L) V^T
@@ -243,23 +254,27 @@ def left_vectors(rotated: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
     return rotated * inverse[..., None, :], torch.where(kept, s, torch.zeros_like(s))
 
 
-def divided(s: Tensor, level: Tensor) -> Tensor:
-    """Divided differences (f_i - f_j) / (s_i - s_j) of f(s) = max(s - level, 0), f' on equal pairs; in [0, 1].
+def divided(s: Tensor, level: Tensor, bend: Tensor | float = 0.0) -> Tensor:
+    """Divided differences (f_i - f_j) / (s_i - s_j) of :func:`ratio`'s f, f' on equal pairs; in [0, 2].
 
-    It is the share of the interval between the two values that lies above the level: written so, no difference of
-    nearly equal numbers is divided by another.
+    With e the value at which f leaves 0 they are the share of the interval between the two values that lies above e,
+    times 1 + t k / (1 + k s_i) (1 + k s_j), where a value below e counts as e: written so, no difference of nearly
+    equal numbers is divided by another.
     """
     hi = torch.maximum(s[..., :, None], s[..., None, :])
     lo = torch.minimum(s[..., :, None], s[..., None, :])
-    edge = level[..., None]
+    # Levels below 0, which thresholds of symmetric matrices may have, come without bend.
+    edge = (2 * level / (1 + (1 + 4 * (level * bend).clamp_min(0)).sqrt()))[..., None]
     split = (lo < edge) & (hi > edge)  # only then is the share neither 0 nor 1; the gap is positive there
     share = (hi - edge) / torch.where(split, hi - lo, torch.ones_like(hi))
     above = (lo >= edge) & ((hi > edge) | (edge <= 0))
-    return torch.where(split, share, above.to(s.dtype))
+    k = bend[..., None] if isinstance(bend, Tensor) else bend
+    steep = 1 + level[..., None] * k / ((1 + k * hi) * (1 + k * torch.maximum(lo, edge)))
+    return torch.where(split, share, above.to(s.dtype)) * steep
 
 
-def ratio(s: Tensor, level: Tensor) -> Tensor:
-    """f(s) / s for f(s) = max(s - level, 0), continued to s = 0: 1 where the level is 0, else 0."""
+def ratio(s: Tensor, level: Tensor, bend: Tensor | float = 0.0) -> Tensor:
+    """f(s) / s for f(s) = max(s - level / (1 + bend s), 0), continued to s = 0: 1 where the level is 0, else 0."""
     positive = s > 0
-    share = (1 - level / torch.where(positive, s, torch.ones_like(s))).clamp_min(0)
+    share = (1 - level / torch.where(positive, s * (1 + bend * s), torch.ones_like(s))).clamp_min(0)
     return torch.where(positive, share, (level <= 0).to(s.dtype))

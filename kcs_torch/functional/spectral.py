@@ -6,12 +6,14 @@ padded or unseen tracks. The functions here differentiate the spectral *function
 
     (f_i - f_j) / (s_i - s_j)    and    (f_i + f_j) / (s_i + s_j),
 
-both in [0, 1], applied to the symmetric and skew part of ``U^T G V``. Repeated and zero singular values are harmless.
-The derivatives are in ``kcs_torch.functional.derivatives``; ``torch.compile``, ``torch.export`` and ``torch.func.vmap``
-take them.
+which are bounded, applied to the symmetric and skew part of ``U^T G V``. Repeated and zero singular values are
+harmless. The derivatives are in ``kcs_torch.functional.derivatives``; ``torch.compile``, ``torch.export`` and
+``torch.func.vmap`` take them.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
@@ -22,8 +24,11 @@ from kcs_torch.functional.derivatives import LargestSum, PSDShrink, ShrinkSingul
 __all__ = ["dct_basis", "log_det", "nuclear_norm", "psd_shrink", "singular_values", "spectral_norm", "svt"]
 
 
-def svt(matrix: Tensor, threshold: Tensor | float) -> Tensor:
+def svt(matrix: Tensor, threshold: Tensor | float, corner: Tensor | float = math.inf) -> Tensor:
     """Return U max(S - threshold, 0) V^T: singular value thresholding, the prox of the nuclear norm.
+
+    With a corner c each singular value s is shrunk by threshold c / (c + s) instead: the reweighted nuclear norm, which
+    majorises sum_i c log(1 + s_i / c), a tighter surrogate of rank that leaves what is large nearly as it is.
 
     Computed in double precision from the eigenvectors of the smaller Gram matrix, which for tall matrices is many
     times faster than the SVD; singular values are then measured as column norms of ``matrix @ V``, so the error is that
@@ -33,14 +38,15 @@ def svt(matrix: Tensor, threshold: Tensor | float) -> Tensor:
     Args:
         matrix: (..., M, N).
         threshold: non-negative, a number or a tensor that broadcasts against (...); in the unit of the matrix.
+        corner: positive, as the threshold; 0, the size of a matrix of zeros, is taken for infinite.
 
     Returns:
-        (..., M, N). Differentiable once, in both arguments; a second derivative raises ``RuntimeError``.
+        (..., M, N). Differentiable once, in all arguments; a second derivative raises ``RuntimeError``.
 
     Raises:
         ShapeError: fewer than 2 dimensions, or NaN.
 
-    Cai, Candes, Shen 2010; Ma, Goldfarb, Chen 2011 (the shrinkage of FPC).
+    Cai, Candes, Shen 2010; Ma, Goldfarb, Chen 2011 (the shrinkage of FPC); Candes, Wakin, Boyd 2008 (reweighting).
 
     >>> svt(torch.diag(torch.tensor([3.0, 1.0])), 2.0).round(decimals=5).tolist()
     [[1.0, 0.0], [0.0, 0.0]]
@@ -48,7 +54,9 @@ def svt(matrix: Tensor, threshold: Tensor | float) -> Tensor:
     _check_matrix(matrix, "svt")
     work = _double(matrix)
     level = torch.as_tensor(threshold, dtype=work.dtype, device=matrix.device)
-    out: Tensor = applied(ShrinkSingularValues, work, level)[0]
+    size = torch.as_tensor(corner, dtype=work.dtype, device=matrix.device)
+    bend = torch.where(size > 0, 1 / torch.where(size > 0, size, torch.ones_like(size)), torch.zeros_like(size))
+    out: Tensor = applied(ShrinkSingularValues, work, level, bend)[0]
     return out.to(matrix.dtype)
 
 

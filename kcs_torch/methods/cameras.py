@@ -31,7 +31,7 @@ def orthographic_cameras(
 
     Many subspaces have nearly orthonormal rows; the wrong ones make the camera jump. So for every K the upgrade
     runs from the convex relaxation (:func:`ist`) and some random starts, with a weak pull to smooth rows; the two best
-    are refined, and of all candidates the one with the least product of both faults wins: the rows' root mean square
+    are refined, and of all candidates the one with the least product of both faults wins: the rows' mean squared
     defect, and the unevenness of the camera's motion.
 
     Args:
@@ -87,4 +87,4 @@ def orthographic_cameras(
     if frames > 2:
         inside = torch.arange(2, frames, device=tracks.device) < count[:, None]
         uneven = (torch.linalg.matrix_norm(turn.diff(dim=2)) * inside).sum(-1) / (count - 2)
-    return candidates[(uneven * defect.sqrt()).argmin(0), window]
+    return candidates[(uneven * defect).argmin(0), window]

@@ -42,6 +42,8 @@ class SfAM(Method):
         final: last weight. The factor from step to step (the paper's rho) follows from the three.
         tau: step size of the articulated steps, below 1; the others take twice that.
         momentum: share of the last change that the next step starts ahead by; 0 is the printed iteration.
+        corner: singular values well above this share of the data's largest are hardly shrunk (the reweighted nuclear
+            norm); infinite is the plain nuclear norm, as printed.
         articulate_from: share of the steps after which the bones' term joins; 0 is all of them, as printed. While mu
             is large the shapes are shrunk, and lengths taken from them would be too short.
         lengths: where the bone lengths come from: "shape" (re-estimated at each step), or "skeleton" (its
@@ -59,12 +61,13 @@ class SfAM(Method):
 
     name: ClassVar[str] = "sfam"
     beta: float = 1.5
-    num_steps: int = 60
+    num_steps: int = 50
     mu: float = 0.5
-    final: float = 1e-5
+    final: float = 1e-4
     tau: float = 0.5
-    momentum: float = 0.8
-    articulate_from: float = 0.6
+    momentum: float = 0.88
+    corner: float = 0.05
+    articulate_from: float = 0.2
     lengths: Literal["shape", "skeleton"] | Sequence[float] = "shape"
     rank: int | Literal["auto"] = "auto"
     camera_path: Literal["auto", "free", "constant"] = "auto"
@@ -80,6 +83,7 @@ class SfAM(Method):
         self._expect(0 < self.final <= self.mu, "final", f"a positive number up to mu = {self.mu}")
         self._expect(0 < self.tau < 1, "tau", "a number between 0 and 1")
         self._expect(0 <= self.momentum < 1, "momentum", "a share within [0, 1)")
+        self._expect(self.corner > 0, "corner", "a positive number")
         self._expect(0 <= self.articulate_from <= 1, "articulate_from", "a share within 0..1")
         if not isinstance(self.lengths, str):
             positive = len(self.lengths) > 0 and all(0 < x < math.inf for x in self.lengths)
@@ -234,6 +238,7 @@ class SfAM(Method):
             final=self.final,
             tau=self.tau,
             momentum=self.momentum,
+            corner=self.corner,
             beta=self.beta or 1.0,
             articulate_from=self.articulate_from if self.beta > 0 else 1.0,
             learnable=False,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -13,7 +15,7 @@ from kcs_torch.functional.temporal import interpolate
 from kcs_torch.nn.energies import centred_residual
 from kcs_torch.solvers.lm import fit_bones
 
-__all__ = ["continuation", "data_scale", "estimate_lengths", "shape_step", "start_shape", "to_scale"]
+__all__ = ["continuation", "corner_of", "data_scale", "estimate_lengths", "shape_step", "start_shape", "to_scale"]
 
 
 def continuation(num_weights: int, mu: float = 0.5, final: float = 1e-5) -> list[float]:
@@ -42,6 +44,11 @@ def data_scale(tracks: Tensor, cameras: Tensor, weights: Tensor | None = None) -
     if weights is not None:
         data = data * weights[..., None]
     return spectral_norm(back_project(data, cameras).flatten(-2))
+
+
+def corner_of(share: float, scale: Tensor) -> Tensor | float:
+    """The corner of the shrinkage (...), a share of the scale; infinite where the share is, for every scale."""
+    return share * scale if math.isfinite(share) else math.inf
 
 
 def estimate_lengths(
@@ -105,6 +112,7 @@ def shape_step(
     threshold: Tensor,
     step: Tensor | float,
     *,
+    corner: Tensor | float = math.inf,
     bones: Tensor | None = None,
     lengths: Tensor | None = None,
     stiffness: Tensor | None = None,
@@ -118,6 +126,7 @@ def shape_step(
         weights: w (..., T, N) or None.
         threshold: mu (...), in the unit of S#'s singular values.
         step: tau.
+        corner: (...), of :func:`kcs_torch.functional.svt`.
         bones: (B, 2), or None for plain FPC without A.
         lengths: (..., B) target lengths.
         stiffness: (..., B), the paper's beta of each bone.
@@ -135,7 +144,7 @@ def shape_step(
         beta = stiffness[..., None, :] * directed
         articulated = fit_bones(shape, lengths[..., None, :], bones, stiffness=beta, num_steps=1)
         gradient = gradient + (shape - articulated)
-    return svt((shape - step * gradient).flatten(-2), step * threshold).unflatten(-1, shape.shape[-2:])
+    return svt((shape - step * gradient).flatten(-2), step * threshold, corner).unflatten(-1, shape.shape[-2:])
 
 
 def start_shape(tracks: Tensor, cameras: Tensor, weights: Tensor | None) -> Tensor:

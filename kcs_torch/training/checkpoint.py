@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -150,7 +151,8 @@ def _build(path: Path, facts: Any, tensors: Mapping[str, Tensor]) -> nn.Module:
         if solver is None:
             return network
         own: dict[str, Any] = {} if solver == "UnrolledFPC" else {"skeleton": skeleton}
-        return RefinedLifter(network, SOLVERS[solver](**own, **more))
+        # What names no corner has none: its file says so, or is older than corners.
+        return RefinedLifter(network, SOLVERS[solver](**own, **{"corner": math.inf, **more}))
 
     try:
         skeleton = Skeleton.from_dict(facts.get("skeleton") or {}, source=str(path))
@@ -191,6 +193,8 @@ def _checked(options: Any, count: int, what: str) -> dict[str, Any]:
 def _solver_options(solver: UnrolledFPC | UnrolledSfAM) -> dict[str, Any]:
     """What its constructor takes that its weights do not tell."""
     options: dict[str, Any] = {"num_steps": solver.num_steps, "momentum": solver.momentum}
+    if math.isfinite(solver.corner):
+        options["corner"] = solver.corner
     if isinstance(solver, UnrolledSfAM):
         options["articulate_from"] = solver.first / solver.num_steps
         if solver.has_lengths:

@@ -13,7 +13,7 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.lockstep import Search, run
-from kcs_torch.nn.unrolled import UnrolledSfAM
+from kcs_torch.nn.unrolled import UnrolledFPC
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.camera_path import CameraPath, choose_path, settle_path
 from kcs_torch.solvers.lifts import random_lifts, turning_cameras
@@ -265,7 +265,7 @@ def _starts(
     if turns:
         cameras = turning_cameras(turns, frames, dtype=image.dtype, device=image.device)[:, pick]
         seen = image.expand(len(cameras), -1, -1, -1)
-        solver = UnrolledSfAM(skeleton, 30, articulate_from=1.0, learnable=False).to(image.device)
+        solver = UnrolledFPC(30, learnable=False).to(image.device)
         lifted = (solver(seen, cameras[:, :, :2]) @ cameras.mT)[..., 2:]
         starts.append((torch.cat([seen, lifted - lifted.mean(-2, keepdim=True)], -1), cameras))
     if lifts > 0:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
 from kcs_torch.nn.layers import full_precision, known
-from kcs_torch.nn.steps import continuation, data_scale, shape_step, start_shape
+from kcs_torch.nn.steps import continuation, corner_of, data_scale, shape_step, start_shape
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.solvers.iterate import Solution
 
@@ -22,6 +24,8 @@ class UnrolledFPC(Unrolled):
         final: last threshold; between them they fall geometrically.
         tau: step size.
         momentum: share of the last change that the next step starts ahead by.
+        corner: singular values well above this share of the data's largest are hardly shrunk, of
+            :func:`kcs_torch.functional.svt`; infinite is the plain nuclear norm.
         learnable: step sizes and thresholds are parameters (positive through a softplus); else constants.
         grad_steps: record only the last so many steps for autograd; None all.
         gradient: "unrolled", or "implicit": go on with the last step until the shape stands still, and differentiate
@@ -47,13 +51,15 @@ class UnrolledFPC(Unrolled):
         final: float = 1e-5,
         tau: float = 1.0,
         momentum: float = 0.8,
+        corner: float = math.inf,
         learnable: bool = True,
         grad_steps: int | None = None,
         gradient: Gradient = "unrolled",
     ) -> None:
         super().__init__(num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
-        if not tau > 0:
-            raise OptionError(f"{type(self).__name__}: expected tau > 0, got {tau}")
+        if not (tau > 0 and corner > 0):
+            raise OptionError(f"{type(self).__name__}: expected tau > 0 and corner > 0, got {tau} and {corner}")
+        self.corner = corner
         self._positive("threshold", continuation(num_steps, mu, final))
         self._positive("step", [tau] * num_steps)
 
@@ -93,8 +99,13 @@ class UnrolledFPC(Unrolled):
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
+            corner = corner_of(self.corner, scale)
+
+            def advance(shape: Tensor, k: int) -> Tensor:
+                return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corner)
+
             return self._run(
-                lambda shape, k: shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k]),
+                advance,
                 start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype),
                 measure=measure,
                 depends_on=(tracks, cameras, weights),

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.nn.layers import full_precision, known
-from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape, to_scale
+from kcs_torch.nn.steps import continuation, corner_of, data_scale, estimate_lengths, shape_step, start_shape, to_scale
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution
@@ -26,7 +26,8 @@ class UnrolledSfAM(Unrolled):
         mu: first threshold, a share of the data's largest singular value.
         final: last threshold.
         tau: step size of the articulated steps, below 1; the others take twice that.
-        momentum: as in :class:`UnrolledFPC`.
+        momentum: as in :class:`UnrolledFPC`; few steps want less of it than the method's many.
+        corner: as in :class:`UnrolledFPC`.
         beta: stiffness of the bones.
         articulate_from: share of the steps after which the articulated term joins; 0 is all of them, as printed.
         lengths: relative bone lengths, one per bone, brought to the scale of each clip; lengths estimated from the
@@ -54,11 +55,12 @@ class UnrolledSfAM(Unrolled):
         num_steps: int = 10,
         *,
         mu: float = 0.5,
-        final: float = 1e-5,
+        final: float = 1e-4,
         tau: float = 0.5,
         momentum: float = 0.8,
+        corner: float = 0.05,
         beta: float = 1.5,
-        articulate_from: float = 0.6,
+        articulate_from: float = 0.2,
         lengths: Sequence[float] | None = None,
         learnable: bool = True,
         learnable_lengths: bool = False,
@@ -66,11 +68,12 @@ class UnrolledSfAM(Unrolled):
         gradient: Gradient = "unrolled",
     ) -> None:
         super().__init__(num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
-        if not (tau > 0 and beta > 0) or not 0 <= articulate_from <= 1:
+        if not (tau > 0 and beta > 0 and corner > 0) or not 0 <= articulate_from <= 1:
             raise OptionError(
-                f"UnrolledSfAM: expected tau > 0, beta > 0 and articulate_from in 0..1, got {tau}, {beta} and "
-                f"{articulate_from}"
+                f"UnrolledSfAM: expected tau, beta and corner > 0 and articulate_from in 0..1, got {tau}, {beta}, "
+                f"{corner} and {articulate_from}"
             )
+        self.corner = corner
         self.skeleton = get_skeleton(skeleton)
         self.rigid = list(self.skeleton.rigid)
         self.register_buffer("bones", self.skeleton.bone_index()[self.rigid], persistent=False)
@@ -185,19 +188,20 @@ class UnrolledSfAM(Unrolled):
 
         def advance(shape: Tensor, k: int) -> Tensor:
             if k < self.first:
-                return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k])
+                return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corner)
             target, rigidity = earlier[k - self.first] if earlier else measured(shape)
             if held is not None and not earlier:
                 held.append((target, rigidity))
             if one_body and target.ndim > 1:
                 target, rigidity = target[..., None, :], rigidity[..., None, :]
             return shape_step(
-                shape, tracks, cameras, weights, threshold[k] * scale, step[k],
+                shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corner,
                 bones=self.bones, lengths=target, stiffness=stiffness[k] * rigidity,
             )  # fmt: skip
 
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
+            corner = corner_of(self.corner, scale)
             begin = start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype)
             if inside is not None:
                 begin = begin * inside[..., None, None]
