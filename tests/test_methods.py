@@ -307,14 +307,14 @@ def test_confidence_zero_is_the_same_as_nan(method):
 def test_weights_are_soft(method):
     """The image follows a wrong joint the more, the more it is trusted."""
     spoiled = WALK.clone()
-    spoiled[:, 16] += 400.0
+    spoiled[:, 16] += 150.0  # not so far that PKC drops it, whatever the trust
     away = []
     for trust in (0.0, 0.35, 1.0):
         confidence = torch.ones(12, 17, dtype=torch.float64)
         confidence[:, 16] = trust
         found = reconstruct(spoiled, method=method, skeleton=BODY, confidence=confidence, cameras=CLIP.cameras)
         away.append(float((image_of(found)[:, 16] - spoiled[:, 16]).norm(dim=-1).mean()))
-    assert away[0] > 300 and away[0] > away[1] > away[2]
+    assert away[0] > 250 and away[1] < 0.2 * away[0] and away[2] < away[1] + 1e-9
 
 
 # ---------------------------------------------------------------------- unseen joints and frames
