@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from kcs_torch.errors import counted
 from kcs_torch.functional.align import centre
 from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
@@ -95,7 +96,7 @@ def finish(
     notes = list(found.notes)
     if turn < WEAK_TURN and not method.learned:
         rest = "the skeleton's template and lengths" if body.template is not None else "constant lengths alone"
-        notes.append(f"the viewpoint turned by {turn:.0f} degrees only: depth rests on {rest}")
+        notes.append(f"the viewpoint turned by only {counted(round(turn), 'degree')}: depth rests on {rest}")
     if found.doubt:
         notes.append(found.doubt)
     if not found.converged:
@@ -107,7 +108,7 @@ def finish(
         kind = "no bones" if not body.num_bones else "no rigid bones"
         notes.append(f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown")
     if tracks.fps is None and method.reckons_in_seconds:
-        notes.append("30 frames a second assumed: set the tracks' fps if it is another rate")
+        notes.append("30 frames a second assumed, as the rate is not known: give fps=..., on the command line --fps")
     pointlike = not bool(_extent(tracks) > 0)
     if pointlike:
         notes.append("all joints lie at one point in every frame: there is no pose to find")

@@ -55,4 +55,7 @@ def root_depth(points: Tensor, tracks: Tracks) -> tuple[Tensor | None, str]:
         pull = weight / (1 + ((move + speed[:, None]) / slip).square()) / slip**2
         speed = solve_tridiagonal(own + pull.sum(-1) + 1e-3 / slip**2, tie, -(pull * move).sum(-1))
     path = torch.cat([speed.new_zeros(1), speed.cumsum(0)]) * radius
-    return path, "root depth from feet that stand still, relative to the first frame; the camera must not move"
+    return (
+        path,
+        "motion in depth found from feet that stand still, from the first frame on: right only for a fixed camera",
+    )

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError
+from kcs_torch.errors import OptionError, counted
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import WEAK_TURN, Estimate, Method
@@ -173,7 +173,8 @@ class PKC(Method):
             level = float(clean.noise.median())
             wrong = int((clean.outliers & keep).sum()) + int((tracks.seen & ~keep).sum())
             if wrong:
-                notes.append(f"{wrong} detections ({100 * wrong / int(tracks.seen.sum()):.1f} %) rejected as outliers")
+                share = wrong / int(tracks.seen.sum())
+                notes.append(f"{counted(wrong, 'detection')} ({100 * share:.1f} %) rejected as outliers")
             keep = keep & ~clean.outliers
             exact = keep
             if level > CLEAN:
@@ -190,12 +191,12 @@ class PKC(Method):
         noise = torch.where(keep, points.new_full((), left), points.new_full((), math.hypot(left, FILLED)))
         if detected(tracks.weights):
             noise = noise.maximum(DETECTED / tracks.weights.clamp_min(UNSURE).sqrt())
-            notes.append("confidences: joints are taken for a detector's, which stray by more than they tremble")
+            notes.append("confidences vary as a detector's do: joints may be off by a centimetre or more")
         held = _nearest_shown(keep)
         away = held != torch.arange(len(held), device=held.device)
         if bool(away.any()):  # nothing tells what goes on there, and a model of motion would run off
             points, noise = points[held], torch.where(away[:, None], points.new_full((), HELD), noise)
-            notes.append(f"{int(away.sum())} frames at the clip's ends show nobody: the nearest pose is held")
+            notes.append(f"{counted(int(away.sum()), 'frame')} at the clip's ends show nobody: nearest pose held")
         return points - points.mean(-2, keepdim=True), noise, tuple(notes)
 
     def _moving(
@@ -273,7 +274,8 @@ class PKC(Method):
         found = distinct(found, self.alternatives + 1, APART)
         told = told_by_prior(found, body.skeleton)
         if told:
-            notes = (*notes, f"the depth's sign was decided by the prior for {', '.join(told)}: see the alternatives")
+            doubtful = f"forward or backward is uncertain for {', '.join(told)}, decided by usual postures"
+            notes = (*notes, f"{doubtful}: see the alternatives")
         made = []
         for k, (depth, points) in enumerate(zip(found.depth, body.bodies(found), strict=True)):
             one = torch.ones_like(points[:, 0, 0])
