@@ -53,7 +53,7 @@ def test_deviation_by_hand(level, doubt):
     found = depth_deviation(hypotheses([BENT], [0.0]), noise, CHAIN, doubt=doubt)
     told = (0.75 * doubt * answers.ANGLE) ** -2 + answers.USUAL**-2
     length = (1 / told + (doubt * answers.LEAST) ** 2) ** 0.5
-    wrong = math.hypot(length, answers.NOISE * 2**0.5 * level)  # of both ends of a bone
+    wrong = math.hypot(length, 2**0.5 * level * math.hypot(answers.NOISE, answers.LASTING))  # of both ends of a bone
     assert_close(found, spread_over_chain(wrong / math.hypot(0.6, answers.FLAT)))
 
 

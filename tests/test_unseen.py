@@ -1,4 +1,4 @@
-"""Joints that no frame shows are placed by the skeleton."""
+"""How far filled gaps may be wrong; joints that no frame shows are placed by the skeleton."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import torch
 from numerics import leaves_arguments_alone, normal, turning
 from torch.testing import assert_close
 
-from kcs_torch.methods.unseen import place_unseen
+from kcs_torch.methods.unseen import BEND, LEAST, gap_deviation, place_unseen
 from kcs_torch.skeleton import SKELETONS, Skeleton
 
 BODY = SKELETONS["h36m17"]
@@ -79,3 +79,56 @@ def test_few_known_joints_and_degenerate_poses_are_finite(shown, dtype):
         known = torch.arange(17) < shown
         found = place_unseen(points.to(dtype), known, BODY)
         assert found.dtype == dtype and torch.isfinite(found).all()
+
+
+def swing(frames, rate, radius=0.5):
+    """A joint that circles once a second beside one at rest, (T, 2, 2)."""
+    angle = 2 * torch.pi * torch.arange(frames).double() / rate
+    moving = radius * torch.stack([angle.cos(), angle.sin()], -1)
+    return torch.stack([moving, torch.zeros_like(moving)], 1)
+
+
+def test_gaps_are_uncertain_by_their_middle_and_by_what_moves():
+    points = swing(90, 30)
+    seen = torch.ones(90, 2).bool()
+    seen[40:47] = False
+    found = gap_deviation(points, seen, 30.0, most=1.0)
+    assert (found[seen] == 0).all()
+    assert_close(found[40:47, 1], torch.full((7,), LEAST).double())
+    bend = 0.5 * (2 * torch.pi / 30) ** 2
+    away = torch.tensor([1, 2, 3, 4, 3, 2, 1]).double()
+    assert_close(found[40:47, 0], LEAST + BEND * bend * away.square(), rtol=0.01, atol=0)
+    assert (gap_deviation(points, seen, 30.0, most=0.01) <= 0.01).all()
+
+
+def test_gaps_at_the_ends_and_joints_never_seen():
+    points = swing(60, 30)
+    seen = torch.ones(60, 2).bool()
+    seen[:3, 0] = False
+    seen[:, 1] = False
+    found = gap_deviation(points, seen, 30.0, most=0.2)
+    assert found[0, 0] > found[1, 0] > found[2, 0] > 0
+    assert (found[:, 1] == 0.2).all()
+    for frames in (1, 2, 3):
+        short = gap_deviation(points[:frames], seen[:frames], 30.0)
+        assert short.shape == (frames, 2) and torch.isfinite(short).all() and (short[:, 1] > 0).all()
+
+
+def test_gaps_of_one_duration_are_as_uncertain_at_any_frame_rate():
+    """The middle of a fifth of a second without a joint."""
+    slow, fast = (int(rate) for rate in (30, 120))
+    middle = []
+    for rate in (slow, fast):
+        seen = torch.ones(3 * rate, 2).bool()
+        seen[rate + 1 : rate + rate // 5] = False
+        middle.append(gap_deviation(swing(3 * rate, rate), seen, float(rate))[rate + rate // 10, 0] - LEAST)
+    assert_close(middle[0], middle[1], rtol=0.02, atol=0)
+
+
+def test_only_the_second_about_a_gap_counts():
+    points = swing(300, 30)
+    points[150:] = points[150]  # at rest from here on
+    seen = torch.ones(300, 2).bool()
+    seen[[50, 250]] = False
+    found = gap_deviation(points, seen, 30.0)
+    assert found[50, 0] > 2 * LEAST and found[250, 0] == LEAST

@@ -39,8 +39,9 @@ STEEP = 0.98
 NEAREST = 0.02
 """Share of the frames in which a bone may be nearer to the image plane than where it counts as nearest."""
 
-NOISE = 1.15
-"""What a bone's depth takes on of its image's noise."""
+NOISE, LASTING = 0.6, 1.0
+"""What a bone's depth takes on of its image's noise in a frame, which its neighbours make good in part, and of the
+noise of usual frames, which its length takes on."""
 
 POSTURE = 0.15
 """Energy of usual postures, for each bone and frame that counts. Deviations grow with it: the further postures stray,
@@ -115,7 +116,8 @@ def depth_deviation(
     told = told * USUAL**2 / (told + USUAL**2) + (doubt * LEAST) ** 2
     if image is not None:
         noise = noise.square().add(NEAR**2).sqrt()
-    wrong = length.square() * told + (NOISE * bone_noise(noise, bones)).square()
+    blur = bone_noise(noise, bones).square()
+    wrong = length.square() * told + NOISE**2 * blur + LASTING**2 * blur.median(0).values
     tree = chain_inverse(incidence(bones, skeleton.num_joints, dtype=noise.dtype))  # (N, B)
     variance = (wrong / (steep.square() + FLAT**2)) @ tree.square().mT
     if image is not None:

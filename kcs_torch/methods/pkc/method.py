@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -23,7 +22,7 @@ from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.moving_view import Descent, MovingView
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.sfam import SfAM
-from kcs_torch.methods.unseen import place_unseen
+from kcs_torch.methods.unseen import gap_deviation, place_unseen
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.procrustean import COARSE, FINE, align_rotations
 from kcs_torch.types import Tracks
@@ -36,11 +35,9 @@ CLEAN = 0.003
 LEFT = 0.45
 """Share of the noise that smoothing leaves."""
 
-FILLED = 0.015
-"""Standard deviation of a joint that is filled in, a share of the body's size."""
-
 DETECTED = 0.027
-"""The same of a joint that a detector is sure of, however smooth: what it gets wrong it gets wrong for many frames."""
+"""Standard deviation of a joint that a detector is sure of, a share of the body's size, however smooth: what it gets
+wrong it gets wrong for many frames."""
 
 UNSURE = 0.05
 """Least confidence that counts."""
@@ -188,7 +185,7 @@ class PKC(Method):
             flat = torch.nn.functional.pad(points, (0, 1))
             points = place_unseen(flat, known, tracks.skeleton)[..., :2]
         left = LEFT * level if level > CLEAN else 0.0
-        noise = torch.where(keep, points.new_full((), left), points.new_full((), math.hypot(left, FILLED)))
+        noise = (gap_deviation(points, keep, tracks.fps or 30.0, HELD).square() + left**2).sqrt()
         if detected(tracks.weights):
             noise = noise.maximum(DETECTED / tracks.weights.clamp_min(UNSURE).sqrt())
             notes.append("confidences vary as a detector's do: joints may be off by a centimetre or more")
