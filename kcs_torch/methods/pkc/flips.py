@@ -20,16 +20,27 @@ from kcs_torch.skeleton import Skeleton
 
 __all__ = ["flipped", "flipped_runs", "parts_of", "turned_over"]
 
-FLIPS, TIMES = 6, 4
-"""Flips that are refined together, and how often at most."""
+TIMES = 6
+"""How often flips are tried at most."""
 
-GATE, GAIN = 5.0, 0.3
-"""How much dearer a flip may be before it is refined, and how much cheaper a solution has to be to count as better."""
+GAIN = 0.3
+"""How much cheaper a solution has to be to count as better."""
+
+LARGE = 0.02
+"""Root mean square depth from which on a flip leads to another body rather than to another arm for a while: it may
+cost more at first, and takes longer to settle. A standing person is about 1.75 tall."""
+
+NEAR, MOVING = 2.5, 1e-3
+"""Large flips go on where they cost little more than the best, and the last ten steps moved depths by so much."""
+
+FIRST, THEN = ((15.0, 6), (5.0, 4)), ((5.0, 2), (GAIN, 1))
+"""How much dearer than the best large flips may be, and small ones, and how many of each are refined: at first, and
+then well."""
 
 ROWS = 4096
 """Frames of flips that are compared at a time."""
 
-NEAR = 0.4
+FLAT = 0.4
 """Depth, as a share of a part's length, below which it may have bounced off the image plane, or passed through it."""
 
 PASSAGES = 4
@@ -62,18 +73,39 @@ def turned_over(
 ) -> Search[Any, Any, Hypotheses]:
     """Hypotheses, best first, whose best one no flip of a run makes better; ``steps`` as in a refinement."""
     for _ in range(TIMES):
-        flips = flipped(objective, parts, found[:1])
-        flips = flips[flips.energy < found.energy[0] + GATE]
-        if not len(flips.energy):
-            break
-        tried = yield from refined(objective, flips, max(steps // 3, 1))
-        if not bool(tried.energy[0] < found.energy[0] + GAIN):
-            break
-        tried = yield from refined(objective, tried[:1], steps)
-        if not bool(tried.energy[0] < found.energy[0] - GAIN):
-            break
-        found = found.joined(replace(tried, steps=tried.steps - flips.steps))
+        best, gain = found[:1], found.energy[0] - GAIN
+        tried = flipped(objective, parts, best)
+        before = tried.steps
+        for limits, count in ((FIRST, max(steps // 3, 1)), (THEN, steps)):
+            tried = tried[_promising(tried, best, limits)]
+            if not len(tried.energy):
+                return found
+            tried = yield from refined(objective, tried, count)
+        if not bool(tried.energy[0] < gain):  # what has far to go may get there yet
+            assert tried.moved is not None
+            tried = tried[(_change(tried, best) > LARGE) & (tried.energy < best.energy + NEAR) & (tried.moved > MOVING)]
+            if not len(tried.energy):
+                return found
+            tried = yield from refined(objective, tried, steps)
+        if not bool(tried.energy[0] < gain):
+            return found
+        found = found.joined(replace(tried[:1], steps=tried.steps - before))
     return found
+
+
+def _promising(flips: Hypotheses, best: Hypotheses, limits: tuple[tuple[float, int], tuple[float, int]]) -> Tensor:
+    """Indices of the large flips, and of the small ones, that cost little more than the best; so many of each."""
+    large, dearer = _change(flips, best) > LARGE, flips.energy - best.energy
+    some = [
+        (kind & (dearer < most)).nonzero().flatten()[:count]
+        for kind, (most, count) in zip((large, ~large), limits, strict=True)
+    ]
+    return torch.cat(some)
+
+
+def _change(flips: Hypotheses, best: Hypotheses) -> Tensor:
+    """Root mean square depth (H,) by which flips differ from the best."""
+    return (flips.depth - best.depth).square().mean((1, 2)).sqrt()
 
 
 def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypotheses) -> Hypotheses:
@@ -84,7 +116,7 @@ def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypoth
     energy = torch.cat([cost.at(run, best.lengths.expand(len(run), -1), steep=False)[0] for run in some])
     order = energy.argsort()
     owner = which[order].tolist()
-    order = order[[k for k, part in enumerate(owner) if part not in owner[:k]][:FLIPS]]
+    order = order[[k for k, part in enumerate(owner) if part not in owner[:k]]]
     depth = runs[order] @ objective.tree.to(own).mT
     depth = depth - depth.mean(-1, keepdim=True)
     return Hypotheses(depth, best.lengths.expand(len(order), -1), energy[order], best.steps)
@@ -134,7 +166,7 @@ def _runs(near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     if frames > 2 * WINDOW:
         wide = torch.nn.functional.pad(near[:, None], (WINDOW, WINDOW), mode="replicate")
         least = -torch.nn.functional.max_pool1d(-wide, 2 * WINDOW + 1, 1)[:, 0]
-        passes = (near <= least) & (near < NEAR)
+        passes = (near <= least) & (near < FLAT)
         passes[:, :WINDOW] = passes[:, frames - WINDOW :] = False
         value, place = torch.where(passes, near, torch.inf).topk(min(PASSAGES, frames), largest=False)
         places.insert(1, torch.where(value < torch.inf, place, frames).sort(1).values)
