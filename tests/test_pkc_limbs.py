@@ -13,6 +13,7 @@ from kcs_torch.functional import bone_vectors
 from kcs_torch.methods.pkc import placing as module
 from kcs_torch.methods.pkc.limbs import SignCosts, limbs_of, waves
 from kcs_torch.methods.pkc.placing import limb_paths, placing
+from kcs_torch.methods.pkc.trunk import mirror, trunk_turns
 from kcs_torch.nn import PostureEnergy
 from kcs_torch.nn.lengths import free_bones
 from kcs_torch.nn.posture import trunk_joints
@@ -135,6 +136,28 @@ def test_clips_and_limbs_together_as_alone(most, monkeypatch):
     monkeypatch.setattr(module, "TOGETHER", most)
     for found, one in zip(limb_paths(tasks), alone, strict=True):
         assert torch.equal(found.lengths, one.lengths) and torch.equal(found.depths, one.depths)
+
+
+def test_padded_clips_and_their_trunks_paths_as_alone():
+    """Clips of many lengths, whose frames choose between two paths of the trunk; what pads them tells nothing."""
+    tasks, alone = [], []
+    for frames in (24, 25, 31, 36, 50, 3, 2, 210, 220):
+        vectors, posture, frame = walk(frames, yaw=3.0 * frames)
+        both = torch.stack([frame, mirror(frame)])
+        grid = known(vectors, ARMS_LEGS) * torch.tensor([1.0, 1.1])[:, None]
+        moves = trunk_turns(both, 0.15, 8.0)
+        tasks.append(
+            placing(
+                vectors[..., :2], ARMS_LEGS, both, posture, free_bones(MAN), SignCosts(), 0 * vectors[..., 0],
+                candidates=grid, transition=moves, margins=True,
+            )
+        )  # fmt: skip
+        alone += limb_paths(tasks[-1:])
+    for found, one in zip(limb_paths(tasks), alone, strict=True):
+        assert torch.equal(found.lengths, one.lengths) and torch.equal(found.depths, one.depths)
+        assert_close(found.margins, one.margins, rtol=1e-4, atol=1e-3)
+    calls = [count_operations(lambda t=some: limb_paths(t)).total for some in (tasks[:1], tasks[:3], tasks[1:4])]
+    assert max(calls) < 1.7 * calls[0]
 
 
 def test_more_limbs_take_no_more_operations():

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from numerics import normal, rotations, turning
+from numerics import count_operations, normal, rotations, turning
 from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
@@ -12,6 +12,7 @@ from kcs_torch.functional import best_path, bone_lengths
 from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pkc.trunk import (
     FIT,
+    Facing,
     Trunk,
     facings,
     image_scale,
@@ -166,6 +167,20 @@ def test_a_walk_is_followed():
     points = points * (POSTURE.rest_lengths / bone_lengths(points, POSTURE.bones).mean(0)).median()
     off = torch.stack([angle(path, POSTURE.frame(points)) for path in paths_of(points)])
     assert off.amin(0).median() < 15
+
+
+def test_clips_together_as_alone():
+    """Trunks of other numbers of joints among them, and as many operations as for one."""
+    rest = TRUNK.rest - TRUNK.rest.mean(0)
+    tasks = [
+        Facing(image - image.mean(1, keepdim=True), rest[: image.shape[1]] - rest[: image.shape[1]].mean(0))
+        for image in (normal(9, 17, 2), normal(4, 17, 2, seed=1), normal(6, 5, 2, seed=2), normal(1, 17, 2, seed=3))
+    ]
+    for task, found in zip(tasks, facings(tasks), strict=True):
+        for one, other in zip(found, facings([task])[0], strict=True):
+            assert_close(one, other)
+    one, many = (count_operations(lambda n=n: facings(tasks[:1] * n)).total for n in (1, 20))
+    assert many < one + 10
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

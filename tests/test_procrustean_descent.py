@@ -10,6 +10,7 @@ from numerics import BODY, CHAIN, RING, count_operations, gradcheck, normal, rot
 from torch.testing import assert_close
 
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.solvers import procrustean_descent as module
 from kcs_torch.solvers.procrustean import CHANGE, REACH, Stage, length_energy, motion_energy, track_energy
 from kcs_torch.solvers.procrustean_descent import Descent, Turn, cross_matrix
 
@@ -66,6 +67,19 @@ def agree(descent, move, energy, u):
         assert_close(one, other, rtol=1e-9, atol=1e-7 * float(other.abs().amax()))  # few frames, small eps
     for one, other in zip(descent.moved(u), move(u), strict=True):
         assert_close(one, other)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("run", [1, 7, 20, 39, 40])
+def test_long_clips_in_runs(run, stage, noise, monkeypatch):
+    """Runs of frames, of which the last may be short, take nothing from the changes between them."""
+    descent, _, _, start = problem(frames=40, stage=STAGES[stage], noise=noise)
+    u = start + 0.3 * normal(*start.shape, seed=5)
+    value, slope = descent(u)
+    monkeypatch.setattr(module, "RUN", run)
+    for one, other in zip(descent(u), (value, slope), strict=True):
+        assert_close(one, other, rtol=1e-9, atol=1e-9 * float(other.abs().amax()))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 import kcs_torch as kt
 from kcs_torch.data.synthetic import walking_person
-from kcs_torch.methods.size import size_path, slow_waves, weak_perspective
+from kcs_torch.methods.size import size_path, slow_waves, weak_perspective, weak_perspectives
 
 
 def grown(clip, ratio):
@@ -43,6 +44,27 @@ def test_gaps_and_outliers_do_not_change_the_size():
     path = weak_perspective(image, seen, clip.skeleton, 30.0)
     assert path is not None
     torch.testing.assert_close(path, size / size.mean(), rtol=0.03, atol=0)
+
+
+def test_clips_together_as_alone():
+    """Of many lengths, rates and skeletons; one with a joint that is never seen, one that shows nobody, one frame."""
+    clips = []
+    for i, (frames, ratio, skeleton) in enumerate(
+        [(90, 1.8, "h36m17"), (80, 1.0, "h36m17"), (70, 1.5, "h36m17"), (61, 1.7, "coco17"), (30, 1.4, "h36m17")]
+    ):
+        clip = walking_person(frames, turn=0, yaw=20 * i, skeleton=skeleton, fps=30.0 + 5 * i)
+        clips.append(replace(clip.tracks, points=grown(clip, ratio)[0]))
+    hidden = clips[0].weights.clone()
+    hidden[:, 5] = 0
+    clips += [replace(clips[0], weights=hidden), replace(clips[1], weights=0 * hidden[:80])]
+    clips.append(replace(clips[4], points=clips[4].points[:1], weights=clips[4].weights[:1]))
+    alone = [weak_perspective(one.points, one.seen, one.skeleton, one.fps) for one in clips]
+    assert 2 < sum(path is not None for path in alone) < len(clips)
+    for one, other in zip(weak_perspectives(clips), alone, strict=True):
+        if other is None:
+            assert one is None
+        else:
+            torch.testing.assert_close(one, other, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 8])

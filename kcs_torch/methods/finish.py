@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -81,10 +81,43 @@ def finish(
         known: (T,) frames that show something.
         seconds: that it took.
     """
+    every = [found, *found.alternatives]
+    placed = [_placed(tracks, one, size, known) for one in every]
+    still, roots, remark = [i for i, one in enumerate(every) if one.still], None, ""
+    pointlike = not bool(_extent(tracks) > 0)
+    if still and not pointlike:
+        roots, remark = root_depth(torch.stack([placed[i][0] for i in still]), tracks)
+    paths = {} if roots is None else dict(zip(still, roots, strict=True))
+    results = [
+        _reconstruction(
+            method, tracks, one, size, seconds, *where, pointlike, paths.get(i), remark if one.still else ""
+        )
+        for i, (one, where) in enumerate(zip(every, placed, strict=True))
+    ]
+    return replace(results[0], alternatives=tuple(results[1:]))
+
+
+def _placed(tracks: Tracks, found: Estimate, size: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (T, N, 3) in the tracks' units and place, and their images (T, N, 2)."""
     points = found.points * size
     seen = points[..., :2] * found.scales[:, None, None]
     shift = interpolate(_shift(tracks.points - seen, tracks.weights), known[:, None])
-    points, seen = points + torch.nn.functional.pad(shift, (0, 1)), seen + shift
+    return points + torch.nn.functional.pad(shift, (0, 1)), seen + shift
+
+
+def _reconstruction(
+    method: Method,
+    tracks: Tracks,
+    found: Estimate,
+    size: Tensor,
+    seconds: float,
+    points: Tensor,
+    seen: Tensor,
+    pointlike: bool,
+    root: Tensor | None,
+    remark: str,
+) -> Reconstruction:
+    """One solution, whose place is known."""
     body = tracks.skeleton
     bones = bone_lengths(points, body.bone_index(device=points.device))
     rigid = list(body.rigid)
@@ -109,12 +142,9 @@ def finish(
         notes.append(f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown")
     if tracks.fps is None and method.reckons_in_seconds:
         notes.append("30 frames a second assumed, as the rate is not known: give fps=..., on the command line --fps")
-    pointlike = not bool(_extent(tracks) > 0)
     if pointlike:
         notes.append("all joints lie at one point in every frame: there is no pose to find")
-    root = None
-    if found.still and not pointlike:
-        root, remark = root_depth(points, tracks)
+    if remark:
         notes.append(remark)
     diagnostics = Diagnostics(
         viewpoint_turn=turn,
@@ -137,7 +167,6 @@ def finish(
         uncertainty=None if found.deviation is None else found.deviation * size,
         objective=found.objective,
         root_depth=root,
-        alternatives=tuple(finish(method, tracks, other, size, known, seconds) for other in found.alternatives),
     )
 
 

@@ -25,7 +25,9 @@ def run(search: Search[Request, Answer, Result], serve: Callable[[list[Request]]
             requests = next(search) if answers is None else search.send(answers)
         except StopIteration as end:
             return end.value
+        answers = None  # of long clips they are large, and it is for the search to keep them
         answers = serve(requests)
+        del requests
 
 
 def together(searches: Sequence[Search[Request, Answer, Result]]) -> Search[Request, Answer, list[Result]]:

@@ -27,34 +27,34 @@ def root_depth(points: Tensor, tracks: Tracks) -> tuple[Tensor | None, str]:
     reweighted least squares.
 
     Args:
-        points: (T, N, 3), depth relative to the body's middle.
+        points: (..., T, N, 3) of one or several solutions, depth relative to the body's middle.
         tracks: they were made from, with the skeleton's contact points.
 
     Returns:
-        (T,) in the unit of the points, and a sentence; None where there are too few contacts.
+        (..., T) in the unit of the points, and a sentence; None where there are too few contacts.
     """
     contacts = list(tracks.skeleton.contacts)
     if not contacts:
         return None, f"no root depth: skeleton '{tracks.skeleton.name}' has no contact points"
-    if len(points) < 3:
+    if points.shape[-3] < 3:
         return None, "no root depth: too few frames"
     slow = 30.0 / (tracks.fps or 30.0)
     sure = standing(tracks.points[:, contacts], tracks.weights[:, contacts])
     if float((sure.amax(-1) > 0.5).double().mean()) < ENOUGH:
         return None, "no root depth: the feet hardly ever stand still in the image"
-    body = points - points.mean(1, keepdim=True)
+    body = points - points.mean(-2, keepdim=True)
     top = body.abs().amax().clamp_min(torch.finfo(points.dtype).tiny)  # squares must not overflow
-    radius = (body / top).square().sum(-1).mean().sqrt().clamp_min(1e-3) * top
-    move = points[:, contacts, 2].diff(dim=0) / radius  # (T - 1, C), while the root stays
+    radius = ((body / top).square().sum(-1).mean((-2, -1)).sqrt().clamp_min(1e-3) * top)[..., None]
+    move = points[..., contacts, 2].diff(dim=-2) / radius[..., None]  # (..., T - 1, C), while the root stays
     weight = torch.minimum(sure[1:], sure[:-1])
-    speed = torch.zeros_like(move[:, 0])
+    speed = torch.zeros_like(move[..., 0])
     slip, change = SLIP * slow, CHANGE * slow**2
-    tie = torch.full_like(speed[1:], -1 / change**2)  # of each speed to the next
+    tie = torch.full_like(speed[..., 1:], -1 / change**2)  # of each speed to the next
     own = torch.nn.functional.pad(-tie, (0, 1)) + torch.nn.functional.pad(-tie, (1, 0))
     for _ in range(10):
-        pull = weight / (1 + ((move + speed[:, None]) / slip).square()) / slip**2
+        pull = weight / (1 + ((move + speed[..., None]) / slip).square()) / slip**2
         speed = solve_tridiagonal(own + pull.sum(-1) + 1e-3 / slip**2, tie, -(pull * move).sum(-1))
-    path = torch.cat([speed.new_zeros(1), speed.cumsum(0)]) * radius
+    path = torch.nn.functional.pad(speed.cumsum(-1), (1, 0)) * radius
     return (
         path,
         "motion in depth found from feet that stand still, from the first frame on: right only for a fixed camera",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -22,6 +23,7 @@ _PRIOR_SAMPLES = 10.0  # modes' worth of belief that joints move independently
 # Estimates and conjugate gradient steps before outliers are judged, and again after: most by the last.
 _ROUNDS = ((2, 40), (1, 40), (1, 60))
 _CHUNK = 256  # windows solved at once: bounds memory
+_NUMBERS = 2**18  # joints times frames that are judged at once: this takes a hundred times the memory
 # Of the body's size: below it nothing is gained, and gaps would converge more slowly.
 _LEAST_NOISE = 1e-3
 _TINY = 1e-30
@@ -102,7 +104,7 @@ def denoise_tracks(
     index = torch.tensor(starts, device=tracks.device)[:, None] + torch.arange(length, device=tracks.device)
     model = _Model(length, values)
 
-    outliers = _stray_from_neighbours(values, given > 0, threshold, floor)
+    outliers = _each_joint(_stray_from_neighbours, values, given > 0, threshold, floor)
     points = values
     for last, (rounds, steps) in enumerate(_ROUNDS, start=1 - len(_ROUNDS)):
         live = torch.where(outliers, torch.zeros_like(given), given)
@@ -119,7 +121,7 @@ def denoise_tracks(
         if last == 0:
             break
         error = (values - points).norm(dim=-1) / (1 - model.leverage()[:, None] * live).clamp_min(1e-3)
-        outliers = _far(error, given > 0, threshold, floor)
+        outliers = _each_joint(_far, error, given > 0, threshold, floor)
     noise = (model.measured.sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints)
     return Denoised(
         (points * unit).reshape(shape).to(tracks.dtype),
@@ -276,6 +278,13 @@ def _fill(values: Tensor, seen: Tensor) -> Tensor:
         points = centre + interpolate(values - centre, seen)
     centre = points.mean(2, keepdim=True)
     return complete_tracks(values - centre, seen, num_steps=20) + centre
+
+
+def _each_joint(judge: Callable[..., Tensor], values: Tensor, seen: Tensor, *limits: float) -> Tensor:
+    """(K, T, N) what a judge that looks at each joint by itself says, of few joints at a time where clips are long."""
+    few = max(1, _NUMBERS // max(values.shape[0] * values.shape[1], 1))
+    parts = zip(values.split(few, 2), seen.split(few, 2), strict=True)
+    return torch.cat([judge(*part, *limits) for part in parts], 2)
 
 
 def _stray_from_neighbours(values: Tensor, seen: Tensor, threshold: float, floor: float) -> Tensor:

@@ -25,6 +25,7 @@ from kcs_torch.functional.chain import bone_vectors, safe_norm
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.solvers.curvature import Levels, whitening
 from kcs_torch.solvers.lbfgs import lbfgs
+from kcs_torch.solvers.memory import give_back
 from kcs_torch.solvers.procrustean_descent import Descent
 
 __all__ = [
@@ -159,6 +160,7 @@ def _descend(
     extra: Callable[[Tensor], Tensor] | None,
 ) -> Pose:
     """One stage, of which nothing large is left behind."""
+    give_back(tracks.shape[0])
     points, rotations = pose.points, pose.rotations
     levels = aligned_levels(points, rotations, bones, stage)
     precision = _precision(points, tracks, weights, noise) if noise > 0 else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from copy import copy
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
     from kcs_torch.solvers.procrustean import Stage
 
 __all__ = ["Descent", "Turn", "cross_matrix"]
+
+
+RUN = 4096
+"""Frames of a long clip whose changes and slopes are made at a time: they would be most of an evaluation's memory."""
 
 
 class Descent:
@@ -118,10 +123,14 @@ class Descent:
         aligned = rotations[:, 0, :, None] * bones[0][:, None]  # (H, 3, B, T)
         for j in (1, 2):
             aligned.addcmul_(rotations[:, j, :, None], bones[j][:, None])
-        value, pull = self._motion(aligned.view(count, -1, frames))
-        pull = pull.view_as(aligned)
-        turned = torch.stack([(pull * bone[:, None]).sum(2) for bone in bones], 1)  # (H, 3, 3, T): of R_jk
-        drawn = torch.stack([(rotations[:, j, :, None] * pull).sum(1) for j in range(3 - self.free, 3)], 1)
+        value, slopes = self._motion(aligned.view(count, -1, frames))
+        turned, drawn = rotations.new_empty(count, 3, 3, frames), torch.empty_like(loose)
+        for run in _runs(frames):
+            pull = slopes(run).unflatten(1, (3, -1))
+            for j, bone in enumerate(bones):
+                torch.sum(pull * bone[:, None, :, run], 2, out=turned[:, j, :, run])  # of R_jk
+            for j in range(self.free):
+                torch.sum(rotations[:, j - self.free, :, None, run] * pull, 1, out=drawn[:, j, :, run])
         # drawn is the gradient (H, free, B, T) in the bones, slope (H, free, N, T) in the joints
         if not self.rigid:
             slope = self.ends.mT @ drawn
@@ -144,34 +153,50 @@ class Descent:
         step = torch.cat([slope.flatten(1, 2), spun], 1).mT.contiguous()  # (H, T, D)
         return value, (step.unsqueeze(-2) @ self.roots).view(count, -1)
 
-    def _motion(self, aligned: Tensor) -> tuple[Tensor, Tensor]:
-        """The log-determinants (H,) of aligned bones (H, 3 B, T), which are centred in place, and their gradient.
+    def _motion(self, aligned: Tensor) -> tuple[Tensor, Callable[[slice], Tensor]]:
+        """The log-determinants (H,) of aligned bones (H, 3 B, T), centred in place, and their slopes in runs of frames.
 
         Of few frames, Y^T Y is the smaller matrix: it has the eigenvalues of Y Y^T but for zeros, and
         (Y Y^T + e I)^-1 Y = Y (Y^T Y + e I)^-1.
         """
         weights, eps, frames = self.levels
-        zeros = max(0, aligned.shape[1] - aligned.shape[2])
+        last = aligned.shape[-1]
+        zeros = max(0, aligned.shape[1] - last)
         aligned -= aligned.mean(-1, keepdim=True)
-        rows = [aligned] if self.still else []
-        if self.moving:
-            rows.append(torch.nn.functional.pad(aligned.diff(), (0, 1)))
-        if not rows:
-            return aligned.new_zeros(len(aligned)), torch.zeros_like(aligned)
+
+        def changes(run: slice) -> Tensor:
+            """To the next frame, 0 from the last one on."""
+            some = aligned[..., run.start : run.stop + 1].diff()
+            return some if run.stop < last else torch.nn.functional.pad(some, (0, 1))
+
+        kept = changes(slice(0, last)) if self.moving and last <= RUN else None
+        poses = lambda run: aligned[..., run]  # noqa: E731
+        moves = changes if kept is None else lambda run: kept[..., run]
+        levels = [poses] * self.still + [moves] * self.moving
+        if not levels:
+            return aligned.new_zeros(len(aligned)), lambda run: torch.zeros_like(aligned[..., run])
+        square = lambda y: torch.bmm(y.mT, y) if zeros else torch.bmm(y, y.mT)  # noqa: E731
         # (levels, H, 3 B, 3 B) or (levels, H, T, T)
-        scatter = torch.stack([torch.bmm(y.mT, y) if zeros else torch.bmm(y, y.mT) for y in rows]).div_(frames)
+        parts = (torch.stack([square(rows(run)) for rows in levels]) for run in _runs(last))
+        scatter = functools.reduce(Tensor.add_, parts).div_(frames)
         scatter.diagonal(dim1=-2, dim2=-1).add_(eps[..., 0])
         factor, info = torch.linalg.cholesky_ex(scatter)
         factor.masked_fill_((info != 0)[..., None, None], torch.nan)  # where nothing is left of eps
         half = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         value = ((weights * frames)[..., 0, 0] * (half + zeros / 2 * eps[..., 0, 0].log())).sum(0)
         inverse = torch.cholesky_inverse(factor).mul_(weights)
-        pulls = [torch.bmm(y, part) if zeros else torch.bmm(part, y) for y, part in zip(rows, inverse, strict=True)]
-        slope = pulls[0] if self.still else torch.zeros_like(aligned)
-        if self.moving:
-            slope[..., 1:] += pulls[-1][..., :-1]
-            slope -= pulls[-1]
-        return value, slope
+        times = lambda y, part: torch.bmm(y, part) if zeros else torch.bmm(part, y)  # noqa: E731
+
+        def slopes(run: slice) -> Tensor:
+            slope = times(poses(run), inverse[0]) if self.still else torch.zeros_like(poses(run))
+            if self.moving:
+                early = min(run.start, 1)
+                pull = times(moves(slice(run.start - early, run.stop)), inverse[-1])
+                slope -= pull[..., early:]
+                slope[..., 1 - early :] += pull[..., :-1]
+            return slope
+
+        return value, slopes
 
     def _lengths(self, loose: Tensor) -> tuple[Tensor, Tensor]:
         """The energy (H,) of lengths that vary, and its gradient (H, free, P, T) in the pairs' free coordinates."""
@@ -237,3 +262,8 @@ def cross_matrix(like: Tensor) -> Tensor:
 def _times(left: Tensor, right: Tensor) -> Tensor:
     """Products (H, 3, 3, T) of matrices in each frame."""
     return (left[:, :, :, None] * right[:, None]).sum(2)
+
+
+def _runs(frames: int) -> list[slice]:
+    """Runs of frames that are dealt with at a time."""
+    return [slice(begin, min(begin + RUN, frames)) for begin in range(0, frames, RUN)]

@@ -28,8 +28,8 @@ BLOCK, OVERLAP = 400, 40
 ABREAST = 8
 """Blocks that are searched side by side: what searches of more would hold is for batches no gain."""
 
-HOLD = 5
-"""Levenberg-Marquardt steps that make bones constant."""
+HOLD, FRAMES = 5, 4096
+"""Levenberg-Marquardt steps that make bones constant, and frames of all hypotheses for which they are made together."""
 
 FAST = 45.0
 """Frames a second from which on the search leaves frames out."""
@@ -76,7 +76,10 @@ class Body:
         goal = self.objective
         if goal.noisy:
             stiffness = goal.rigid * (goal.noise / goal.weights.length).square()
-            points = fit_bones(points, found.lengths[:, None], goal.bones, stiffness=stiffness, num_steps=HOLD)
+            few = max(1, FRAMES // len(points))  # each frame is a problem of its own
+            parts = zip(points.split(few, 1), stiffness.split(few), strict=True)
+            held = [fit_bones(p, found.lengths[:, None], goal.bones, stiffness=s, num_steps=HOLD) for p, s in parts]
+            points = torch.cat(held, 1)
             points = points - points.mean(-2, keepdim=True)
         return points / self.factor
 

@@ -155,7 +155,7 @@ class PKC(Method):
             turn = float(viewpoint_turn(body.frames(found.depth[0])[:, :2]))
             moves = moves and (cameras is not None or turn >= TURNING)
         if moves:
-            moving, _ = yield from self._moving(tracks, image, cameras, enough)
+            moving = (yield from self._moving(tracks, image, cameras, enough))[0]
             found = yield from self._ranked(body, moving, cameras, found)
         assert found is not None
         return self._from_hypotheses(found, body, cameras, notes, detected(tracks.weights))

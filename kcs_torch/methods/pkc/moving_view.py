@@ -234,7 +234,9 @@ def searching(
         points = torch.where(own[:, None, None, None], first, points)
         turned = torch.where(own[:, None, None, None], align_rotations(first, rotations[None], bones), turned)
         stages = coarse if bool(own.any()) else coarse[-1:]
-        pose = yield from descend(image, replace(pose, points=points, rotations=turned), tight[0], stages, weights)
+        pose = replace(pose, points=points, rotations=turned)
+        del first, start, points, turned  # of long clips they are large
+        pose = yield from descend(image, pose, tight[0], stages, weights)
     if len(pick) == frames and is_tree:  # the finest stages have seen all frames
         return MovingView(pose, bones, rigid, tight[0])
     if not is_tree:

@@ -18,6 +18,7 @@ from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy, free_bo
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
+from kcs_torch.solvers.memory import give_back
 
 __all__ = ["Objective", "Refined", "Unknowns", "Weights", "at_pace", "bone_noise", "pace_of", "usual_posture"]
 
@@ -240,6 +241,7 @@ class Objective:
 
     def refined(self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0) -> Refined:
         """As :meth:`minimise`, in the order of the hypotheses."""
+        give_back(depth.shape[1])
         goal = copy(self)
         goal.weights = replace(self.weights, length=loose * self.weights.length)
         unknowns = Unknowns(goal, depth, lengths)

@@ -24,6 +24,13 @@ WINDOW, OVERLAP = 200, 40
 SAMPLE = 4
 """Windows from which the lengths of a long clip's bones are chosen."""
 
+SPREAD = 1.5
+"""Clips of one window are padded to one length: the longest has at most so many times the frames of the shortest."""
+
+FAR = 1e4
+"""Depth where a clip is padded, in accelerations' deviations: what a clip's last frames have to do with it costs the
+same whatever their signs are."""
+
 TOGETHER = 100_000
 """Costs that are made together, and signs' problems times frames: more would only fall out of the processor's cache."""
 
@@ -60,6 +67,7 @@ class Placing:
         entry: (J, 5) those of the hinges to the bones before, firmness 0 where there is none.
         before: (J, T, 3) directions of the bones before.
         transition: (J, T - 1, C, C), or None.
+        inside: (J, T), False where clips of several lengths are padded; None where they are not.
         cap: as of :class:`SignCosts`, one for all.
         margins: whether they are wanted.
     """
@@ -77,14 +85,39 @@ class Placing:
     entry: Tensor
     before: Tensor
     transition: Tensor | None
+    inside: Tensor | None
     cap: float
     margins: bool
 
     @property
+    def frames(self) -> int:
+        """T."""
+        return self.image.shape[1]
+
+    @property
     def kind(self) -> object:
-        """What those share that are placed together."""
-        shapes = self.rotations.shape[1:3], self.candidates.shape[1:], self.transition is None, self.margins, self.cap
+        """What those share that are placed together, beside their length."""
+        shapes = self.rotations.shape[1], self.candidates.shape[1:], self.transition is None, self.margins, self.cap
         return *shapes, self.image.dtype, self.image.device
+
+    def padded(self, frames: int) -> Placing:
+        """The same with as many frames."""
+        more = frames - self.frames
+
+        def pad(values: Tensor, dims: int) -> Tensor:
+            """Zeros behind the frames, which ``dims`` dimensions follow."""
+            return torch.nn.functional.pad(values, (0,) * (2 * dims) + (0, more))
+
+        time = torch.arange(frames, device=self.image.device) < self.frames
+        return replace(
+            self,
+            image=pad(self.image, 2),
+            noise=pad(self.noise, 1),
+            rotations=pad(self.rotations, 2),
+            before=pad(self.before, 1),
+            transition=None if self.transition is None else pad(self.transition, 2),
+            inside=time.expand(len(self.image), -1),
+        )
 
     def __getitem__(self, part: slice) -> Placing:
         """Some of the limbs."""
@@ -143,31 +176,42 @@ def placing(
         entry=_facts(known, posture).to(image),
         before=torch.stack([none if near is None else near for near in before]),
         transition=None if transition is None else transition.expand(count, *transition.shape),
+        inside=None,
         cap=costs.cap,
         margins=margins,
     )
 
 
 def limb_paths(tasks: Sequence[Placing]) -> list[LimbPaths]:
-    """Place the limbs of all tasks; those of one kind together."""
-    groups: dict[object, list[int]] = {}
-    for i, task in enumerate(tasks):
-        groups.setdefault(task.kind, []).append(i)
+    """Place the limbs of all tasks; those of one kind and of nearly one length together."""
+    groups: dict[object, list[list[int]]] = {}
+    for i in sorted(range(len(tasks)), key=lambda i: tasks[i].frames):
+        runs, frames = groups.setdefault(tasks[i].kind, []), tasks[i].frames
+        least = tasks[runs[-1][0]].frames if runs else 0
+        if frames == least or frames <= min(WINDOW, SPREAD * least):
+            runs[-1].append(i)
+        else:
+            runs.append([i])
     out: dict[int, LimbPaths] = {}
-    for group in groups.values():
-        joined = _joined([tasks[i] for i in group])
-        few = max(1, TOGETHER // (joined.candidates.shape[1] * joined.image.shape[1]))
+    for run in (run for runs in groups.values() for run in runs):
+        joined = _joined([tasks[i] for i in run])
+        few = max(1, TOGETHER // (joined.candidates.shape[1] * joined.frames))
         parts = [_place(joined[first : first + few]) for first in range(0, len(joined.image), few)]
         found = [None if column[0] is None else torch.cat(column) for column in zip(*parts, strict=True)]
-        counts = [len(tasks[i].image) for i in group]
-        split = [[None] * len(group) if column is None else column.split(counts) for column in found]
-        out |= {i: LimbPaths(*row) for i, row in zip(group, zip(*split, strict=True), strict=True)}
+        counts = [len(tasks[i].image) for i in run]
+        split = [[None] * len(run) if column is None else column.split(counts) for column in found]
+        for i, (lengths, depths, margins) in zip(run, zip(*split, strict=True), strict=True):
+            frames = tasks[i].frames
+            out[i] = LimbPaths(lengths, depths[:, :frames], None if margins is None else margins[:, :frames])
     return [out[i] for i in range(len(tasks))]
 
 
 def _joined(tasks: list[Placing]) -> Placing:
     if len(tasks) == 1:
         return tasks[0]
+    most = max(task.frames for task in tasks)
+    if any(task.frames < most for task in tasks):
+        tasks = [task.padded(most) for task in tasks]
     each: dict[str, Any] = {f.name: [getattr(task, f.name) for task in tasks] for f in fields(Placing)}
     whole: dict[str, Any] = {n: torch.cat(x) for n, x in each.items() if isinstance(x[0], Tensor)}
     return replace(tasks[0], **whole)
@@ -178,25 +222,28 @@ def _place(task: Placing) -> LimbPaths:
     tried, poses = task.candidates.shape[1], task.rotations.shape[1]
     size = min(WINDOW, frames)
     starts = window_starts(frames, size, min(OVERLAP, size - 1))
+    outside = None if task.inside is None else ~task.inside.mT[:, None, :, None]  # (T, 1, J, 1)
     field = dict(zip((f.name for f in fields(SignCosts)), task.costs.unbind(1), strict=True))  # (J,) each
 
     def problems(lengths: Tensor, begin: list[int]) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
         """W windows of J limbs of K lengths: window w of length k of limb j is problem (j K + k) W + w."""
         few = max(1, TOGETHER // (lengths.shape[1] * frames * poses * 2 ** lengths.shape[2]))
         parts = [_unary(task[i : i + few], lengths[i : i + few]) for i in range(0, count, few)]
-        unary, depth = (torch.cat([part[k] for part in parts], -2).flatten(-2) for k in (0, 1))  # (T, ..., J K)
+        unary, depth = (torch.cat([part[k] for part in parts], -2) for k in (0, 1))
+        deep = depth / field["acceleration"][:, None]
+        if outside is not None:
+            unary, deep = unary.masked_fill(outside[:, None], 0), deep.masked_fill(outside, FAR)
         at = torch.tensor(begin, device=unary.device) + torch.arange(size, device=unary.device)[:, None]  # (T_w, W)
 
         def cut(values: Tensor) -> Tensor:
-            """(T, ..., J K) as (J K W, T_w, ...), in memory with the problems last."""
-            return values[at].movedim(1, -1).flatten(-2).movedim(-1, 0)
+            """(T, ..., J, K) as (J K W, T_w, ...), in memory with the problems last."""
+            return values.flatten(-2)[at].movedim(1, -1).flatten(-2).movedim(-1, 0)
 
         moves = None
         if task.transition is not None:
             moves = task.transition.float()[:, None, at[:-1].mT].expand(-1, lengths.shape[1], *[-1] * 4).flatten(0, 2)
-        pace = field["acceleration"].repeat_interleave(lengths.shape[1])
         # Single precision is plenty to compare costs, and twice as fast.
-        return cut(unary.float()), cut((depth / pace).float()), moves, depth
+        return cut(unary.float()), cut(deep.float()), moves, depth.flatten(-2)
 
     prior = 0.5 * ((task.candidates / task.usual[:, None]).log() / field["proportions"][:, None, None]).square().sum(-1)
     best = torch.zeros(count, dtype=torch.long, device=prior.device)
