@@ -115,6 +115,36 @@ def test_as_the_two_loops_over_pairs(memory):
         assert_close(history.turned(like, scale), scale * like)
 
 
+def test_each_row_has_pairs_of_its_own():
+    """Rows that now and then miss a pair, in memory that held something else, are as each alone and as a few."""
+    generator = torch.Generator().manual_seed(1)
+    random = lambda *shape: torch.randn(*shape, dtype=torch.float64, generator=generator)  # noqa: E731
+    histories = [History(torch.zeros(n, 20).double(), 4) for n in (3, 1, 1, 1)]
+    for history in histories:
+        history.steps.fill_(torch.nan)
+        history.changes.fill_(torch.nan)
+    scales = [torch.ones(len(history.steps), 1).double() for history in histories]
+    missing = [(0,), (), (1,), (), (0, 2), (), (), (1,), (), ()]
+    for absent in missing:
+        step = random(3, 20)
+        change = step * (1 + random(3, 20).abs())
+        rows = torch.tensor([i not in absent for i in range(3)])
+        scales[0] = histories[0].add(
+            step * rows[:, None], change * rows[:, None], scales[0], None if bool(rows.all()) else rows
+        )
+        for i in set(range(3)) - set(absent):
+            scales[i + 1] = histories[i + 1].add(step[i : i + 1], change[i : i + 1], scales[i + 1])
+        gradient = random(3, 20)
+        known = [i for i in range(3) if histories[i + 1].used]
+        together, way = histories[0].turned(gradient, scales[0]), histories[0].travelled()
+        some = histories[0][torch.tensor(known)].turned(gradient[known], scales[0][known])
+        for k, i in enumerate(known):
+            alone = histories[i + 1].turned(gradient[i : i + 1], scales[i + 1])[0]
+            assert_close(together[i], alone)
+            assert_close(some[k], alone)
+            assert_close(way[i], histories[i + 1].travelled()[0])
+
+
 def test_operations_do_not_grow_with_the_memory():
     counts = []
     for memory in (5, 10, 40):

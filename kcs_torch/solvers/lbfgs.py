@@ -75,6 +75,7 @@ def lbfgs(
     while num_steps > 0:
         down, slope = rows.direction()
         trial = torch.addcmul(rows.x, down, rows.length[:, None], value=-1)
+        del down  # of very long problems every vector tells
         rows.judge(trial, *evaluate(trial), slope, max_trials)
         done = rows.settle(tolerance, num_steps)
         count = int(done.sum())
@@ -202,7 +203,7 @@ class History:
         self.steps, self.changes = like.new_empty(2, count, memory, size)
         self.inverse, self.curves = like.new_zeros(count, memory, memory), like.new_zeros(count, memory)  # R^-1, D
         self.made = torch.zeros(count, dtype=torch.long, device=like.device)
-        self.used = 0  # slots, at most
+        self.used, self.even = 0, True  # slots, at most; whether all problems have as many pairs
 
     def __getitem__(self, index: Tensor) -> History:
         """Those of some of the problems."""
@@ -217,9 +218,10 @@ class History:
         Returns the new scales (H, 1). A pair that tells no curvature counts for nothing.
         """
         memory = self.steps.shape[1]
+        self.even &= rows is None
         if self.used < memory:
             self.used += 1
-            if rows is not None:
+            if not self.even:  # not all problems write there
                 self.steps[:, self.used - 1] = self.changes[:, self.used - 1] = 0
         at = torch.arange(len(step), device=step.device) if rows is None else rows.nonzero().flatten()
         slot = self.made[at] % memory
