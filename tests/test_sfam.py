@@ -98,6 +98,13 @@ def test_shape_is_algorithm_1_written_out(momentum, lengths):
     assert_close(found, written_out(tracks, cameras, weights, method, given), rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize(("turn", "plain"), [(0.0, True), (40.0, True), (70.0, False), (180.0, False)])
+def test_singular_values_are_reweighted_only_where_the_viewpoint_turns(turn, plain):
+    clip = walking_person(30, turn=turn)
+    points = [SfAM(num_steps=10, corner=c)(clip.tracks, clip.cameras).points for c in (SfAM.corner, math.inf)]
+    assert torch.equal(*points) == plain
+
+
 def test_printed_schedule_has_the_bones_in_every_step():
     method = SfAM(num_steps=5, momentum=0.0, articulate_from=0.0)
     tracks, weights = SHORT.tracks.points / 500, torch.ones(30, 17, dtype=torch.float64)

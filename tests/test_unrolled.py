@@ -40,7 +40,7 @@ def scene(body, kind="any", *, frames=6, dtype=torch.float64):
     """Tracks (T, N, 2), cameras (T, 2, 3) and weights (T, N); ordinary or degenerate."""
     joints = body.num_joints
     frames = {"one frame": 1, "two frames": 2}.get(kind, frames)
-    cameras = turning(frames, 90.0)[:, :2]
+    cameras = turning(frames, 180.0)[:, :2]
     points = normal(joints, 3) + 0.3 * normal(frames, joints, 3, seed=1)
     weights = torch.ones(frames, joints, dtype=torch.float64)
     if kind == "static":

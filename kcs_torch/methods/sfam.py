@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
-from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.spectral import dct_basis
 from kcs_torch.functional.temporal import interpolate, window_starts
 from kcs_torch.methods.base import Estimate, Method
@@ -43,7 +43,8 @@ class SfAM(Method):
         tau: step size of the articulated steps, below 1; the others take twice that.
         momentum: share of the last change that the next step starts ahead by; 0 is the printed iteration.
         corner: singular values well above this share of the data's largest are hardly shrunk (the reweighted nuclear
-            norm); infinite is the plain nuclear norm, as printed.
+            norm), where the viewpoint turns: by less than 45 degrees the norm is the plain one, which keeps depths
+            small that nothing tells. Infinite is the plain norm always, as printed.
         articulate_from: share of the steps after which the bones' term joins; 0 is all of them, as printed. While mu
             is large the shapes are shrunk, and lengths taken from them would be too short.
         lengths: where the bone lengths come from: "shape" (re-estimated at each step), or "skeleton" (its
@@ -243,7 +244,10 @@ class SfAM(Method):
             articulate_from=self.articulate_from if self.beta > 0 else 1.0,
             learnable=False,
         ).to(tracks.device)
+        shown = cameras if inside is None else torch.where(inside[..., None, None], cameras, cameras[..., :1, :, :])
+        told = ((viewpoint_turn(shown) - TURNS[0]) / (TURNS[1] - TURNS[0])).clamp(0, 1)
         given = {"weights": weights, "lengths": lengths, "one_body": one_body, "inside": inside, "held": held}
+        given["corner"] = self.corner / told
         return solver.solve(tracks, cameras, **given)  # type: ignore[arg-type]
 
     def _paths(self, rotations: Tensor, clips: Clips) -> tuple[Tensor, list[tuple[str, ...]]]:
@@ -271,6 +275,10 @@ more would only take memory."""
 
 LEAD = 40
 """Windows of a clip that are solved first, together: they tell the lengths of its bones, which the others take."""
+
+TURNS = 45.0, 90.0
+"""Degrees that a window's viewpoint turns: up to the first the nuclear norm is the plain one, from the second on the
+reweighted."""
 
 SHORT = 10
 """Frames from which on a constant angular velocity is looked for."""

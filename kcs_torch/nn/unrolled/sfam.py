@@ -123,6 +123,7 @@ class UnrolledSfAM(Unrolled):
         one_body: bool = False,
         inside: Tensor | None = None,
         held: list[tuple[Tensor, Tensor]] | None = None,
+        corner: Tensor | None = None,
     ) -> Solution[Tensor]:
         """As :meth:`forward`, with a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still.
 
@@ -137,11 +138,12 @@ class UnrolledSfAM(Unrolled):
             inside: (..., T), False in frames that pad a shorter clip at its end; their weights and cameras are 0.
             held: an empty list is filled with the lengths and rigidity that each articulated step aimed at; a filled
                 one is what other windows of the same body aimed at, and is aimed at again.
+            corner: (...) instead of the module's.
 
         Returns:
             The solution; ``change`` is that of the last step, (...).
         """
-        options = {"one_body": one_body, "measure": True, "inside": inside, "held": held}
+        options = {"one_body": one_body, "measure": True, "inside": inside, "held": held, "corner": corner}
         return self._solve(tracks, cameras, weights, start, lengths, **options)  # type: ignore[arg-type]
 
     def _solve(
@@ -156,6 +158,7 @@ class UnrolledSfAM(Unrolled):
         measure: bool,
         inside: Tensor | None = None,
         held: list[tuple[Tensor, Tensor]] | None = None,
+        corner: Tensor | None = None,
     ) -> Solution[Tensor]:
         weights = self._check(tracks, cameras, weights, start)
         joints, count = self.skeleton.num_joints, self.skeleton.num_bones
@@ -188,20 +191,20 @@ class UnrolledSfAM(Unrolled):
 
         def advance(shape: Tensor, k: int) -> Tensor:
             if k < self.first:
-                return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corner)
+                return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=bend)
             target, rigidity = earlier[k - self.first] if earlier else measured(shape)
             if held is not None and not earlier:
                 held.append((target, rigidity))
             if one_body and target.ndim > 1:
                 target, rigidity = target[..., None, :], rigidity[..., None, :]
             return shape_step(
-                shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corner,
+                shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=bend,
                 bones=self.bones, lengths=target, stiffness=stiffness[k] * rigidity,
             )  # fmt: skip
 
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
-            corner = corner_of(self.corner, scale)
+            bend = corner_of(self.corner if corner is None else corner, scale)
             begin = start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype)
             if inside is not None:
                 begin = begin * inside[..., None, None]
