@@ -105,6 +105,20 @@ def test_a_few_steps_suffice_near_the_solution():
         assert (fit_bones(points, bone_lengths(rest, bones), bones, num_steps=steps) - limit).abs().max() < error
 
 
+def test_damping_lets_short_bones_settle():
+    """A heel whose joints have to move by more than its length: undamped steps turn it back and forth for ever."""
+    leg = torch.tensor([[0, 0, 0], [0, 0.42, 0], [0.02, 0.57, 0], [-0.033, 0.42, 0]], dtype=torch.float64)
+    points, bones = leg + 0.06 * normal(200, 4, 3), torch.tensor([[0, 1], [1, 2], [1, 3]])
+    lengths = torch.tensor([0.42, 0.15, 0.033], dtype=torch.float64)
+
+    def off(**options):
+        found = bone_lengths(fit_bones(points, lengths, bones, stiffness=100.0, **options), bones)
+        return float((((found - lengths).abs() / lengths).amax(-1) > 0.05).double().mean())
+
+    assert off(num_steps=40) > 0.8
+    assert off(num_steps=10, damping=2.0) < 0.25
+
+
 def test_damping_does_not_move_the_solution():
     points, lengths = problem("tree", 4, share=0.1)
     plain = fit_bones(points, lengths, BONES["tree"], num_steps=100)

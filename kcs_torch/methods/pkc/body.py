@@ -28,8 +28,12 @@ BLOCK, OVERLAP = 400, 40
 ABREAST = 8
 """Blocks that are searched side by side: what searches of more would hold is for batches no gain."""
 
-HOLD, FRAMES = 5, 4096
-"""Levenberg-Marquardt steps that make bones constant, and frames of all hypotheses for which they are made together."""
+HOLD, DAMPING = 10, 2.0
+"""Levenberg-Marquardt steps that make bones constant, and their damping: undamped, a bone that is short beside what its
+joints have to move (a heel, a finger) turns back and forth and never settles."""
+
+FRAMES = 4096
+"""Frames of hypotheses whose bones are made constant at a time."""
 
 FAST = 45.0
 """Frames a second from which on the search leaves frames out."""
@@ -78,7 +82,8 @@ class Body:
             stiffness = goal.rigid * (goal.noise / goal.weights.length).square()
             few = max(1, FRAMES // len(points))  # each frame is a problem of its own
             parts = zip(points.split(few, 1), stiffness.split(few), strict=True)
-            held = [fit_bones(p, found.lengths[:, None], goal.bones, stiffness=s, num_steps=HOLD) for p, s in parts]
+            given = (found.lengths[:, None], goal.bones)
+            held = [fit_bones(p, *given, stiffness=s, num_steps=HOLD, damping=DAMPING) for p, s in parts]
             points = torch.cat(held, 1)
             points = points - points.mean(-2, keepdim=True)
         return points / self.factor
