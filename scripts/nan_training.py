@@ -13,6 +13,7 @@ as far as its first NaN, after which every step is one.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -122,11 +123,11 @@ class Model(torch.nn.Module):
         return loss + (self.joints(both, truth, weights) + self.aligned(both, truth, weights)).mean()
 
 
-def plain_svt(matrix: Tensor, threshold: Tensor | float) -> Tensor:
-    """U max(S - threshold, 0) V^T as the formula says, its derivative left to autograd."""
+def plain_svt(matrix: Tensor, threshold: Tensor | float, corner: Tensor | float = math.inf) -> Tensor:
+    """U max(S - threshold / (1 + S / corner), 0) V^T as the formula says, its derivative left to autograd."""
     u, s, vh = torch.linalg.svd(matrix, full_matrices=False)
-    level = torch.as_tensor(threshold, dtype=s.dtype)[..., None]
-    return (u * (s - level).clamp_min(0)[..., None, :]) @ vh
+    level, bend = (torch.as_tensor(x, dtype=s.dtype)[..., None] for x in (threshold, corner))
+    return (u * (s - level / (1 + s / bend)).clamp_min(0)[..., None, :]) @ vh
 
 
 def plain_nuclear_norm(matrix: Tensor) -> Tensor:

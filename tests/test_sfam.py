@@ -98,6 +98,7 @@ def test_shape_is_algorithm_1_written_out(momentum, lengths):
     assert_close(found, written_out(tracks, cameras, weights, method, given), rtol=0, atol=1e-9)
 
 
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
 @pytest.mark.parametrize(("turn", "plain"), [(0.0, True), (40.0, True), (70.0, False), (180.0, False)])
 def test_singular_values_are_reweighted_only_where_the_viewpoint_turns(turn, plain):
     clip = walking_person(30, turn=turn)

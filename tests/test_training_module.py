@@ -424,6 +424,7 @@ def test_a_network_of_ones_own_trains_and_is_told_that_it_has_no_file(tmp_path):
                 "solver.num_steps=1",
                 "~solver.mu",
                 "~solver.articulate_from",
+                "~solver.corner",
                 "+trainer.logger=false",
             ],
         )

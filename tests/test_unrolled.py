@@ -36,11 +36,11 @@ BODIES = {"body": BODY, "chain": CHAIN, "ring": RING}
 each_body = pytest.mark.parametrize("body", BODIES.values(), ids=BODIES.keys())
 
 
-def scene(body, kind="any", *, frames=6, dtype=torch.float64):
+def scene(body, kind="any", *, frames=6, turn=90.0, dtype=torch.float64):
     """Tracks (T, N, 2), cameras (T, 2, 3) and weights (T, N); ordinary or degenerate."""
     joints = body.num_joints
     frames = {"one frame": 1, "two frames": 2}.get(kind, frames)
-    cameras = turning(frames, 180.0)[:, :2]
+    cameras = turning(frames, turn)[:, :2]
     points = normal(joints, 3) + 0.3 * normal(frames, joints, 3, seed=1)
     weights = torch.ones(frames, joints, dtype=torch.float64)
     if kind == "static":
@@ -121,7 +121,7 @@ def test_untrained_is_the_iteration_written_out(body, kind, momentum, articulate
 @pytest.mark.parametrize("learnable", [True, False])
 @pytest.mark.parametrize("articulate_from", [0.0, 0.6])
 def test_untrained_is_the_method(body, learnable, articulate_from):
-    tracks, cameras, weights = scene(body, "gaps", frames=12)
+    tracks, cameras, weights = scene(body, "gaps", frames=12, turn=180.0)
     options = {"mu": 0.4, "final": 1e-4, "tau": 0.45, "momentum": 0.7, "beta": 1.2, "corner": 0.3}
     method = SfAM(num_steps=9, articulate_from=articulate_from, window=None, **options)
     expected = method.shape(tracks[None], cameras[None], weights[None], body).value[0]
@@ -134,7 +134,7 @@ def test_untrained_is_the_method(body, learnable, articulate_from):
 
 
 def test_defaults_are_those_of_the_method():
-    tracks, cameras, weights = scene(BODY, frames=12)
+    tracks, cameras, weights = scene(BODY, frames=12, turn=180.0)
     expected = (
         SfAM(num_steps=10, momentum=0.8, window=None).shape(tracks[None], cameras[None], weights[None], BODY).value[0]
     )
