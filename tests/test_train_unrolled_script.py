@@ -1,6 +1,7 @@
 """scripts/train_unrolled.py and scripts/unrolled_memory.py: small runs, and who is trained and who is tested on."""
 
 import argparse
+import math
 import sys
 
 import numpy as np
@@ -38,15 +39,15 @@ def test_a_small_run_prints_its_table(scripts, solver, monkeypatch, capsys, tmp_
 def test_training_lowers_the_error_of_others(scripts):
     script = scripts[0]
     options = argparse.Namespace(
-        frames=20, turn=(60.0, 180.0), noise=2.0, missing=0.0, rounds=60, batch=4, lr=0.1, seed=0, verbose=False
+        frames=20, turn=(60.0, 180.0), noise=2.0, missing=0.0, rounds=25, batch=4, lr=0.1, seed=0, verbose=False
     )
     skeleton, clips = script.motions("synthetic", tested=False)
     film, others = script.Film(clips, options), script.Film(script.motions("synthetic", tested=True)[1], options)
     held_out = [others.batch(8, torch.Generator().manual_seed(5))]
-    layer = script.build("sfam", skeleton, 4, trained=True)
+    layer = script.build("sfam", skeleton, 4, trained=True, corner=math.inf)  # the norm that leaves most to learn
     before = script.score(layer, held_out)[0].mean()
     script.train(layer, film, options)
-    assert script.score(layer, held_out)[0].mean() < 0.93 * before
+    assert script.score(layer, held_out)[0].mean() < 0.85 * before
 
 
 def test_nobody_is_trained_and_tested_on(scripts, tmp_path):

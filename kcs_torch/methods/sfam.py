@@ -246,9 +246,10 @@ class SfAM(Method):
         ).to(tracks.device)
         shown = cameras if inside is None else torch.where(inside[..., None, None], cameras, cameras[..., :1, :, :])
         told = ((viewpoint_turn(shown) - TURNS[0]) / (TURNS[1] - TURNS[0])).clamp(0, 1)
-        given = {"weights": weights, "lengths": lengths, "one_body": one_body, "inside": inside, "held": held}
-        given["corner"] = self.corner / told
-        return solver.solve(tracks, cameras, **given)  # type: ignore[arg-type]
+        return solver.solve(
+            tracks, cameras, weights=weights, lengths=lengths, one_body=one_body, inside=inside, held=held,
+            corner=self.corner / told,
+        )  # fmt: skip
 
     def _paths(self, rotations: Tensor, clips: Clips) -> tuple[Tensor, list[tuple[str, ...]]]:
         """Reported cameras (K, T, 2, 3): free, or of constant angular velocity where that explains them."""

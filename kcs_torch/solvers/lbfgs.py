@@ -121,7 +121,7 @@ class _Rows:
         self.length, self.trials, self.made = torch.ones_like(value), torch.zeros_like(self.index), self.index * 0
         self.failed = self.resting = torch.zeros_like(value, dtype=torch.bool)
         self.past = value[:, None].repeat(1, PATIENCE + 1)
-        # if it falls to 0
+        # the least fall that counts, where the value itself falls to 0
         self.least = torch.where(value.isfinite(), torch.finfo(x.dtype).eps * value.abs(), 0).clamp_min(tiny)
         self.done = self.resting
 

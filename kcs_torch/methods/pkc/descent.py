@@ -10,7 +10,8 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors, incidence
 
 if TYPE_CHECKING:
-    from kcs_torch.methods.pkc.objective import Objective, Unknowns
+    from kcs_torch.methods.pkc.objective import Objective
+    from kcs_torch.methods.pkc.unknowns import Unknowns
 
 __all__ = ["ANCHOR", "CORNER", "HEAVY", "NOISE", "Descent", "wide"]
 

@@ -46,7 +46,8 @@ PARTLY, GRADES = 0.05, 10
 """Share of confidences below 1, and number of different ones, from which on they are a detector's."""
 
 HELD = 0.1
-"""The same in frames before the body is first seen, and after it was last seen."""
+"""Standard deviation, a share of the body's size, of joints in frames before the body is first seen and after it was
+last seen, and the largest in gaps."""
 
 MOVING_STEPS = sum(stage.num_steps for stage in (*COARSE, *FINE))
 """L-BFGS steps of the moving viewpoint's solver, at most."""

@@ -214,7 +214,7 @@ def searching(
 
     pick = torch.arange(0, frames, max(1, -(-frames // coarse_frames)), device=image.device)
     few, few_weights = image[pick], None if weights is None else weights[pick]
-    made = _starts(few, skeleton, bones, turns, lifts if joints > ROBOT else 20 * lifts, frames, pick, seed)
+    made = _starts(few, bones, turns, lifts if joints > ROBOT else 20 * lifts, frames, pick, seed)
     points = torch.cat([first[:, pick], *(p for p, _ in made)])
     turned = align_rotations(points, torch.cat([rotations[None, pick], *(r for _, r in made)]), bones)
     zero = points.new_zeros(len(points))
@@ -259,9 +259,8 @@ def _rank(pose: Pose, bones: Tensor, rigid: Tensor, stiffness: float, noise: flo
 
 
 def _starts(
-    image: Tensor, skeleton: Skeleton, bones: Tensor, turns: Sequence[float], lifts: int, frames: int, pick: Tensor,
-    seed: int,
-) -> list[tuple[Tensor, Tensor]]:  # fmt: skip
+    image: Tensor, bones: Tensor, turns: Sequence[float], lifts: int, frames: int, pick: Tensor, seed: int
+) -> list[tuple[Tensor, Tensor]]:
     """Points (H, T', N, 3) and rotations (H, T', 3, 3) of further starts, for the frames in ``pick``."""
     starts = []
     if turns:
