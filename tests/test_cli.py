@@ -154,6 +154,22 @@ def test_lift_everybody(openpose_folder, tmp_path):
     assert people[0]["unseen_share"] < 0.1 < people[1]["unseen_share"]
 
 
+def test_lift_everybody_says_whom_a_warning_is_about(openpose_folder, tmp_path):
+    """Each warning names the file and the person, each once; what is true of everybody is said once."""
+    words = ("lift", openpose_folder, "-o", tmp_path / "a.npz", "--person", "all", "-m", "sfam")
+    done = run(*words, "--set", "num_steps=2")
+    for number in (0, 1):
+        warning = f"warning: {openpose_folder}, person {number}: sfam did not settle within 2 steps\n"
+        assert done.stderr.count(warning) == 1
+        assert f"{openpose_folder}, person {number}: 40 frames" in done.stdout
+    assert all(line.count(", person ") == line.count(str(openpose_folder)) == 1 for line in done.stderr.splitlines())
+    everybody = done.stdout.rpartition("everybody:\n")[2]
+    notes = [line for line in everybody.splitlines() if line.startswith("  note: ")]
+    assert notes and all(done.stdout.count(note) == 1 for note in notes)
+    told = json.loads(run(*words, "--json").stdout)["people"]
+    assert all(note.removeprefix("  note: ") in one["notes"] for note in notes[:1] for one in told)
+
+
 def test_lift_one_of_several(openpose_folder, tmp_path):
     done = run("lift", openpose_folder, "-o", tmp_path / "a.npz", "--person", 1, "-m", "sfam", "--json")
     (person,) = json.loads(done.stdout)["people"]

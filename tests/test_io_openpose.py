@@ -149,6 +149,8 @@ def test_people_below_the_threshold_are_left_out(tmp_path):
     assert len(people) == 1
     assert any("1 people never reach" in n for n in people[0].notes)
     assert len(load_people(folder, threshold=0.1)) == 2
+    assert [one.source for one in load_people(folder, threshold=0.1)] == [f"{folder}, person {k}" for k in (0, 1)]
+    assert load_tracks(folder, person=1, threshold=0.1).source == f"{folder}, person 1"
     with pytest.raises(ShapeError, match="lower the threshold"):
         load_people(folder, threshold=0.95)
 

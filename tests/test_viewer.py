@@ -207,6 +207,20 @@ def test_several_people_share_a_scene(result):
     assert [p["name"] for p in scene(player(people, names=["a", "b"]))["people"]] == ["a", "b"]
 
 
+def test_people_of_one_file_are_called_by_their_numbers(result):
+    """Also in another order than the file's; what is said of everybody is said once."""
+    several = [
+        replace(one, tracks=replace(one.tracks, source=f"shots/walk.json, person {number}"))
+        for number, one in zip((2, 0), two_people(result), strict=True)
+    ]
+    text = player(several)
+    assert [p["name"] for p in scene(text)["people"]] == ["person 2", "person 0"]
+    assert Page(text).all("title")[0]["text"] == "SfAM: walk.json"
+    assert Page(player(several[0])).all("title")[0]["text"] == "SfAM: walk.json, person 2"
+    told = [e["text"] for e in Page(text).all("li")]
+    assert [note for note in told if "made for a test" in note] == ["everybody: made for a test"]
+
+
 def test_people_of_no_clip_are_told(result):
     other = replace(result, tracks=replace(result.tracks, fps=50.0))
     with pytest.raises(OptionError, match="people of one clip, got frame rates"):

@@ -172,9 +172,10 @@ def _facts(number: int, tracks: Tracks, path: Path) -> dict[str, Any]:
 
 def _spoken(facts: dict[str, Any]) -> str:
     rate = f"{facts['fps']:g} frames a second" if facts["fps"] else "frames a second unknown"
+    video = facts["source"].removesuffix(f", person {facts['person']}")
     return "\n".join(
         [
-            f"{facts['source']}: person {facts['person']} seen in {facts['frames_seen']} of {facts['frames']} frames, "
+            f"{video}: person {facts['person']} seen in {facts['frames_seen']} of {facts['frames']} frames, "
             f"{facts['joints']} joints ({facts['skeleton']}), {rate}",
             f"  unseen joints   {100 * facts['unseen_share']:.1f} %",
             *(f"  note: {one_line(note)}" for note in facts["notes"]),

@@ -81,9 +81,11 @@ def info(
 
 
 def _facts(path: str, format: str, people: list[Tracks]) -> dict[str, Any]:
+    from kcs_torch.types.people import shared
+
     first = people[0]
     body = first.skeleton
-    common = [note for note in first.notes if all(note in one.notes for one in people)]
+    common = shared([one.notes for one in people]) if people[1:] else list(first.notes)
     rows = []
     for number, one in enumerate(people):
         weights = one.weights[:, : one.skeleton.num_observed]

@@ -24,7 +24,7 @@ from kcs_torch.cli.options import (
     use_one_thread,
 )
 from kcs_torch.cli.outputs import Scale, Units, Up, check_up, parse_scale, sized, write_files
-from kcs_torch.cli.report import answer, describe, print_json, progress, summary
+from kcs_torch.cli.report import answer, describe, one_line, print_json, progress, summary
 
 if TYPE_CHECKING:
     from kcs_torch.methods import Method
@@ -137,6 +137,7 @@ def lift(
     """Turn 2D joint tracks, or a video where a detector is installed, into 3D motion."""
     with answer(as_json):
         from kcs_torch.io import save_people, writer_for
+        from kcs_torch.types.people import shared
         from kcs_torch.types.size import check_size
 
         check_outputs(output, source=tracks)
@@ -188,14 +189,14 @@ def lift(
                 check_size(one.skeleton, next(name for name in size_of if name != "units"), "--scale")
             share = float(one.seen.any(1).double().mean())
             if person == "all" and share < FEW:
-                say = f"person {number} is visible in only {100 * share:.0f} % of the frames: the rest is guessed"
-                typer.echo(f"warning: {say}", err=True)
+                say = f"visible in only {100 * share:.0f} % of the frames: the rest is guessed"
+                typer.echo(f"warning: {one_line(one.source)}: {say}", err=True)
         cleaned = [clean(one) for _, one in people]
-        found = _lifted(cleaned, learned or method, fields, find)
-        for (number, one), neat, lifted in zip(people, cleaned, found, strict=True):
+        chosen = (one.solution(solution) for one in _lifted(cleaned, learned or method, fields, find))
+        found = [sized(finish(one.mirrored() if mirror else one), size_of) for one in chosen]
+        common = shared([(*one.tracks.notes, *one.diagnostics.notes) for one in found])
+        for (number, one), neat, result in zip(people, cleaned, found, strict=True):
             names = [numbered(path, number) if person == "all" else path for path in output]
-            result = lifted.solution(solution)
-            result = sized(finish(result.mirrored() if mirror else result), size_of)
             made = new_folders(names)
             told = write_files(result, names, up, units)
             if together:
@@ -204,10 +205,12 @@ def lift(
             reports[-1]["notes"] += told
             reports[-1]["cleaning"] = [note for note in neat.notes if note not in one.notes]
             if not as_json:
-                typer.echo(describe(reports[-1]))
+                typer.echo(describe(reports[-1], common))
                 folders = f", in new folders: {', '.join(map(str, made))}" if made else ""
                 typer.echo(f"  wrote {', '.join(map(str, names))}{folders}")
             reports[-1] |= {"person": number, "files": names, "new_folders": made}
+        if common and not as_json:
+            typer.echo("\n".join(["everybody:", *(f"  note: {one_line(note)}" for note in common)]))
         for path in together:
             with progress(f"writing {path}"):
                 save_people(results, path)

@@ -6,7 +6,7 @@ import json
 import math
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -124,8 +124,8 @@ def summary(result: Reconstruction, solution: int = 1) -> dict[str, Any]:
     }
 
 
-def describe(facts: dict[str, Any]) -> str:
-    """The same for a reader: a heading and a line a fact."""
+def describe(facts: dict[str, Any], leave_out: Container[str] = ()) -> str:
+    """The same for a reader: a heading and a line a fact; without those notes that are told elsewhere."""
     rate = f", {facts['fps']:g} frames a second" if facts["fps"] else ""
     variation = facts["bone_variation"]
     ended = "converged" if facts["converged"] else "did not converge"
@@ -134,7 +134,7 @@ def describe(facts: dict[str, Any]) -> str:
     rows = {
         "unseen joints": f"{100 * facts['unseen_share']:.1f} %",
         "method": f"{facts['method']}: {ended}, {facts['iterations']} iterations{took}",
-        "viewpoint turn": f"{facts['viewpoint_turn']:.0f} degrees",
+        "viewpoint turn": counted(round(facts["viewpoint_turn"]), "degree"),
         "bone variation": "unknown: no bones" if math.isnan(variation) else f"{variation:.2f} %",
         "reprojection": f"{facts['reprojection_rms']:.3g} {facts['track_units']} (root mean square)",
     }
@@ -146,4 +146,4 @@ def describe(facts: dict[str, Any]) -> str:
         value = "" if math.isnan(other["objective"]) else f"objective {other['objective']:.1f}{best}, "
         apart = f"{other['rms_difference']:.3g} {facts['units']} away (root mean square)"
         lines.append(f"  solution {other['solution']:<6} {value}{apart}: {other['differs']}")
-    return "\n".join([*lines, *(f"  note: {one_line(note)}" for note in facts["notes"])])
+    return "\n".join([*lines, *(f"  note: {one_line(note)}" for note in facts["notes"] if note not in leave_out)])

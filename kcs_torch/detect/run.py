@@ -14,6 +14,7 @@ from kcs_torch.io.people import Sighting, people_tracks
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
+from kcs_torch.types.people import tell_apart
 
 __all__ = ["DETECTORS", "WHAT", "detect_video"]
 
@@ -100,7 +101,7 @@ def detect_video(
         notes=(told, *finder.notes),
     )
     people.sort(key=lambda one: float(one.weights[:, : one.skeleton.num_observed].sum()), reverse=True)
-    return [replace(one, notes=(*one.notes, *_remarks(one, start))) for one in people]
+    return tell_apart(replace(one, notes=(*one.notes, *_remarks(one, start))) for one in people)
 
 
 def _remarks(tracks: Tracks, start: int) -> list[str]:

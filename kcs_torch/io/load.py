@@ -13,6 +13,7 @@ from kcs_torch.io.registry import Options, Probe, Reader, discover
 from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
+from kcs_torch.types.people import tell_apart
 
 __all__ = ["READERS", "WRITERS", "check_person", "detect_format", "load_people", "load_tracks"]
 
@@ -58,7 +59,8 @@ def load_people(
         trust: read a file although it is a pickle (VideoPose3D's .npz): arrays and numbers are taken from it, no code.
 
     Returns:
-        At least one :class:`Tracks`; those of one video have the same number of frames.
+        At least one :class:`Tracks`; those of one video have the same number of frames. The ``source`` of several names
+        the person: ``walk.json, person 1``.
 
     Raises:
         FormatError: the path cannot be read as tracks.
@@ -77,7 +79,7 @@ def load_people(
     probe = Probe(path)
     reader: Reader = READERS[detect_format(path) if format is None else format]
     people = reader.read(probe.path, Options(skeleton, fps, threshold, image_size, trust))
-    return sorted(people, key=_amount_seen, reverse=True)
+    return tell_apart(sorted(people, key=_amount_seen, reverse=True))
 
 
 def load_tracks(

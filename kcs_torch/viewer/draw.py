@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
+from kcs_torch.types.people import files_named
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.labels import write_labels
 from kcs_torch.viewer.layout import flat_layout
@@ -60,7 +60,7 @@ def draw_tracks(people: Tracks | Sequence[Tracks], *, frame: int | None = None) 
     named = sorted(sorted(there, key=lambda k: -counts[k])[:NAMED])
     panels: list[list[int]] = ([there] if len(people) > 1 else []) + [[k] for k in named]
     figure, axes = _panels(len(panels), max(p.num_joints for p in people))
-    head = f"{Path(people[0].source).name}: frame {chosen} of {frames} (the first is 0)"
+    head = f"{files_named(people)}: frame {chosen} of {frames} (the first is 0)"
     which = ", the first that is clear" if frame is None and chosen else ""
     _title(figure, f"{head}{which} · skeleton {people[0].skeleton.name}")
     for axis, members in zip(axes, panels, strict=True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import OutputError
 from kcs_torch.types import Reconstruction
+from kcs_torch.types.people import files_named
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.draw import new_figure
 from kcs_torch.viewer.names import person_names, printable
@@ -54,8 +54,7 @@ class Film:
         _limits(axes[1], self.space.middle, self.space.half)
         for axis, title in zip(axes, ("tracks", "3D"), strict=True):
             axis.set_title(title, fontsize=9, pad=3)
-        names = ", ".join(dict.fromkeys(Path(r.tracks.source).name for r in people))
-        title = f"{', '.join(dict.fromkeys(r.method for r in people))}: {names}"
+        title = f"{', '.join(dict.fromkeys(r.method for r in people))}: {files_named(r.tracks for r in people)}"
         self.title = printable(title)[:90]
         self.head = self.figure.suptitle("", fontsize=10, y=0.985, parse_math=False)
         self.artists: list[tuple[Any, Any, list[str]]] = []  # bones, joints, the bones' colours

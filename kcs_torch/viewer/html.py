@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kcs_torch.types import Reconstruction
+from kcs_torch.types.people import files_named, shared
 from kcs_torch.viewer.scene import scene_of
 from kcs_torch.viewer.summary import summarise
 
@@ -50,8 +51,7 @@ def player(
     people = [results] if isinstance(results, Reconstruction) else list(results)
     data = scene_of(people, names)
     if title is None:
-        sources = list(dict.fromkeys(Path(r.tracks.source).name for r in people))
-        title = f"{', '.join(dict.fromkeys(r.method for r in people))}: {', '.join(sources)}"
+        title = f"{', '.join(dict.fromkeys(r.method for r in people))}: {files_named(r.tracks for r in people)}"
     folder = Path(__file__).parent / "page"
     parts = {
         "TITLE": html.escape(title),
@@ -77,11 +77,12 @@ def _notes(people: Sequence[Reconstruction], data: dict[str, Any]) -> list[str]:
     notes = []
     if len(people) > 1:
         notes.append("how far people stand behind each other is not known: each is at a depth of its own")
-    for result, person in zip(people, data["people"], strict=True):
+    told = [list(dict.fromkeys((*r.diagnostics.notes, *r.tracks.notes))) for r in people]
+    common = shared(told)
+    for one, person in zip(told, data["people"], strict=True):
         start = f"{person['name']}: " if len(people) > 1 else ""
-        told = dict.fromkeys((*result.diagnostics.notes, *result.tracks.notes))
-        notes += [start + note for note in ([person["summary"]] if start else []) + list(told)]
-    return notes
+        notes += [start + note for note in ([person["summary"]] if start else []) + one if note not in common]
+    return [*notes, *(f"everybody: {note}" for note in common)]
 
 
 def _script_safe(text: str) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from kcs_torch.types import Reconstruction
+from kcs_torch.types.people import file_and_person
 
 __all__ = ["person_names", "printable"]
 
@@ -16,7 +17,11 @@ def printable(text: str) -> str:
 
 
 def person_names(results: Sequence[Reconstruction]) -> list[str]:
-    """Name people by what tells them apart: the source's file, else the method, else their number."""
+    """Name people by what tells them apart: the source's file, its person, else the method, else their order."""
+    if len({r.tracks.source for r in results}) == len(results) > 1:
+        files, people = zip(*(file_and_person(r.tracks.source) for r in results), strict=True)
+        if len(set(files)) == 1 and all(people):
+            return list(people)
     sources = [printable(Path(r.tracks.source).name) for r in results]
     methods = [printable(r.method) for r in results]
     if len(results) == 1:
