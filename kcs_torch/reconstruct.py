@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from kcs_torch.errors import OptionError, unknown
+from kcs_torch.errors import KcsWarning, OptionError, unknown
 from kcs_torch.methods import METHODS
-from kcs_torch.methods.base import Method
+from kcs_torch.methods.base import Method, users_level
 from kcs_torch.methods.found import find_skeleton
 from kcs_torch.methods.perspective import reconstruct_perspective
 from kcs_torch.skeleton import Skeleton
@@ -57,6 +58,9 @@ def reconstruct(
         ShapeError: an array, or the intrinsics, has the wrong shape or values.
         SkeletonError: the skeleton is unknown or does not fit.
 
+    Warns:
+        KcsWarning: no bones are given, and the method knows of bones; or as :meth:`Method.__call__`.
+
     >>> from kcs_torch.data.synthetic import walking_person
     >>> result = reconstruct(walking_person(60).tracks, method="sfam", beta=2.0)
     >>> result.points.shape, result.method
@@ -76,6 +80,9 @@ def reconstruct(
     if find:
         tracks = with_found_bones(tracks)
     chosen = _method(method, fields)
+    lacking = no_bones(tracks.skeleton.num_joints)
+    if chosen.knows_bones and lacking in tracks.notes:
+        warnings.warn(f"{tracks.source}: {lacking}", KcsWarning, stacklevel=users_level())
     if lens is not None:
         return reconstruct_perspective(chosen, tracks, lens, cameras)
     return chosen(tracks, cameras)

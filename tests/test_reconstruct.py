@@ -62,9 +62,15 @@ def test_arrays_with_nan_and_confidence():
 
 
 def test_arrays_without_a_skeleton():
-    result = reconstruct(POINTS)
+    with pytest.warns(kt.KcsWarning, match=r"^tracks: no bones .* give a skeleton \(17 joints fit .*coco17.*'auto'") as told:
+        result = reconstruct(POINTS)
     assert (result.method, result.skeleton.name, result.units) == ("pkc", "points", "px")
     assert result.lengths.shape == (0,)
+    assert len(told) == 1 and told[0].filename == __file__
+
+
+def test_methods_that_know_of_no_bones_do_not_ask_for_them():
+    assert not reconstruct(POINTS, method="rigid", num_steps=1).skeleton.bones  # a warning would be an error here
 
 
 @pytest.mark.parametrize("name", METHODS)

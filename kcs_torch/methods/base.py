@@ -39,6 +39,8 @@ class Method(ABC):
     """Whether :meth:`solve` takes tracks about the body's middle in each frame; else about its mean over time."""
     keeps_lengths: ClassVar[bool] = True
     """Whether bones keep their length as far as the tracks admit; else lengths that vary say nothing of the tracks."""
+    knows_bones: ClassVar[bool] = True
+    """Whether the result depends on the skeleton's bones: then a user who gives none should know."""
     learned: ClassVar[bool] = False
     """Whether depth comes from examples: then it does not rest on the viewpoint's turn."""
     reckons_in_seconds: ClassVar[bool] = False

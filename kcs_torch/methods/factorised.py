@@ -37,6 +37,7 @@ class Factorised(Method):
     """
 
     keeps_lengths: ClassVar[bool] = False
+    knows_bones: ClassVar[bool] = False
 
     @abstractmethod
     def find_cameras(self, tracks: Tensor) -> Tensor:

@@ -56,7 +56,10 @@ def no_bones(num_joints: int) -> str:
     """What to say of tracks that come without bones."""
     fits = fitting(num_joints)
     choice = f" ({num_joints} joints fit {', '.join(fits)})" if fits else ""
-    return f"no bones are given: name a skeleton{choice}, or skeleton='auto' (--skeleton auto) to find the bones"
+    return (
+        "no bones are given, so joints are taken as points that move freely: give a skeleton"
+        f"{choice}, or skeleton='auto' (--skeleton auto) to find the bones"
+    )
 
 
 def choose_skeleton(

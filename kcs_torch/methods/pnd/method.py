@@ -50,6 +50,7 @@ class PND(Method):
 
     name: ClassVar[str] = "pnd"
     keeps_lengths: ClassVar[bool] = False
+    knows_bones: ClassVar[bool] = False
     num_steps: int = 50
     noise: float = 0.015
     final: float = 1e-6
