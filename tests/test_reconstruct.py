@@ -62,7 +62,8 @@ def test_arrays_with_nan_and_confidence():
 
 
 def test_arrays_without_a_skeleton():
-    with pytest.warns(kt.KcsWarning, match=r"^tracks: no bones .* give a skeleton \(17 joints fit .*coco17.*'auto'") as told:
+    words = r"^tracks: no bones .* give a skeleton \(17 joints fit .*coco17.*'auto'"
+    with pytest.warns(kt.KcsWarning, match=words) as told:
         result = reconstruct(POINTS)
     assert (result.method, result.skeleton.name, result.units) == ("pkc", "points", "px")
     assert result.lengths.shape == (0,)
