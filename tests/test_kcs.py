@@ -92,6 +92,19 @@ def test_a_rigid_body_with_its_own_template_is_found_exactly():
         assert result.diagnostics.viewpoint_turn == pytest.approx(60, abs=2)
 
 
+def test_a_flat_rigid_body_settles():
+    """Its images have two cameras each, mirror images that explain them equally; in each round rounding chooses."""
+    body = Skeleton.from_edges(BODY.bones, 17)
+    cameras = walking_person(26, turn=280.0).cameras
+    for seed in range(24):
+        shape = torch.randn(17, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        shape = centred(shape * torch.tensor([1.0, 1.0, 0.0]))
+        turned = shape @ complete_rotation(cameras).mT
+        result = KCS(template=shape.tolist())(Tracks.from_arrays(turned[..., :2], skeleton=body))
+        assert result.diagnostics.converged  # a warning would be an error, too
+        assert rigid_error(centred(result.points), turned) < 1e-6
+
+
 def test_a_deviation_that_recurs_gains_depth_in_frames():
     clip = walking_person(100, turn=90.0)
     error = {a: rigid_error(KCS(arrangement=a)(clip.tracks).points, clip.points) for a in ("stacked", "frames")}

@@ -133,8 +133,11 @@ class KCS(Method):
             )
             moved = (part.mean((seen_from - rotations[live]).square().sum((-2, -1))) / 2).sqrt()
             done = (moved <= self.tolerance) & (turn > 0) | ~(part.weights > 0).any(-1).any(-1) | (known is not None)
+            before = scales[live][..., None, None] * shape[live] @ rotations[live].mT
             rotations[live], scales[live], deviation[live] = seen_from, size, found
             shape[live] = rest[live] + (found @ inverse.mT).mT
+            if turn and not bool(done.all()):
+                done = done | _same(part, before, size[..., None, None] * shape[live] @ seen_from.mT)
             converged[live], made[live] = done & settled, made[live] + steps
             live = live[~done]
             if not len(live):
@@ -220,6 +223,18 @@ class KCS(Method):
                     if bool(resting.all()):
                         break
         return state, resting, made
+
+
+def _same(clips: Clips, before: Tensor, after: Tensor) -> Tensor:
+    """Whether poses (K, T, N, 3) of each clip (K,) are the same but for rounding, or mirror images in depth.
+
+    Cameras may differ then: a flat body's images have two, a straight one's any number, and rounding chooses.
+    """
+    before, after = (x - x.mean(-2, keepdim=True) for x in (before, after))
+    flip = after.new_tensor([1.0, 1.0, -1.0])
+    apart, mirrored = (clips.mean((after - x).square().sum((-2, -1))) for x in (before, before * flip))
+    size = clips.mean(after.square().sum((-2, -1)))
+    return torch.minimum(apart, mirrored) <= torch.finfo(after.dtype).eps * size
 
 
 CHECK = 5
