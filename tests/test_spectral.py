@@ -101,6 +101,24 @@ def test_svt_takes_a_corner_of_nothing_for_none():
     assert_close(svt(matrix, 0.3, 0.0), svt(matrix, 0.3))
 
 
+@each_matrix
+@pytest.mark.parametrize("threshold", [0.4, 2.0])
+def test_svt_gradient_in_an_infinite_corner_is_0(matrix, threshold):
+    corner = torch.tensor(math.inf, dtype=torch.float64, requires_grad=True)
+    svt(matrix, threshold, corner).sum().backward()
+    assert corner.grad == 0
+
+
+@each_matrix
+@pytest.mark.parametrize("corner", [5e-324, 1e-310, 1e-200, 1e300])
+def test_svt_corners_without_measure(matrix, corner):
+    """What is no longer a normal number has an infinite inverse, and infinity times 0 is NaN."""
+    corner = torch.tensor(corner, dtype=torch.float64)
+    for level in (0.4, 1e-200):
+        finite(svt, matrix, torch.tensor(level, dtype=torch.float64), corner)
+    assert_close(svt(matrix, 0.4, corner), svt(matrix, 0.0 if corner < 1 else 0.4))
+
+
 @pytest.mark.parametrize("name", ["tall", "wide", "tied tall", "static wide", "unseen joints"])
 @pytest.mark.parametrize("corner", [0.2, 3.0])
 def test_reweighted_svt_does_not_raise_the_logarithmic_penalty(name, corner):

@@ -55,7 +55,8 @@ def svt(matrix: Tensor, threshold: Tensor | float, corner: Tensor | float = math
     work = _double(matrix)
     level = torch.as_tensor(threshold, dtype=work.dtype, device=matrix.device)
     size = torch.as_tensor(corner, dtype=work.dtype, device=matrix.device)
-    bend = torch.where(size > 0, 1 / torch.where(size > 0, size, torch.ones_like(size)), torch.zeros_like(size))
+    least = torch.finfo(work.dtype).tiny ** 0.5  # of which the inverse, and its square in the derivative, are finite
+    bend = torch.where(size > 0, 1 / torch.where(size > 0, size.clamp_min(least), 1), 0)
     out: Tensor = applied(ShrinkSingularValues, work, level, bend)[0]
     return out.to(matrix.dtype)
 
