@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import json
+import math
 import re
 import subprocess
 import sys
@@ -54,6 +55,13 @@ def run(tmp_path_factory):
     return train(composed("trainer.max_epochs=4"), folder), folder
 
 
+def told_by(lifter):
+    """The configuration that a lifter's file holds."""
+    data = lifter.read_bytes()
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["kcs_torch"]
+    return json.loads(header)["notes"]["config"]
+
+
 class TestARun:
     def test_logs_to_csv(self, run):
         _, folder = run
@@ -89,14 +97,16 @@ class TestARun:
         outcome, folder = run
         config = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["config"]
         assert config["trainer"]["max_epochs"] == 4 and config["model"]["channels"] == 8
-        data = outcome.lifter.read_bytes()
-        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["kcs_torch"]
-        assert json.loads(header)["notes"]["config"] == config
+        assert told_by(outcome.lifter) == config
 
     def test_a_solver_behind_the_network_is_a_part_of_the_lifter(self, tmp_path):
-        outcome = train(composed("solver=sfam", "solver.num_steps=2", "trainer.max_epochs=1"), tmp_path)
+        outcome = train(composed("solver=sfam", "solver.num_steps=2", "trainer.max_epochs=1"), tmp_path / "first")
         network = load_lifter(outcome.lifter).network
         assert isinstance(network, kt.nn.RefinedLifter) and network.solver.num_steps == 2
+        assert network.solver.corner == math.inf and told_by(outcome.lifter)["solver"]["corner"] == ".inf"
+        with pytest.warns(kt.KcsWarning), pytest.raises(kt.OptionError, match="resume=.*does not fit.*parameter group"):
+            constants = "solver.num_steps=2", "+solver.learnable=false"
+            train(composed("solver=sfam", *constants, f"resume={tmp_path / 'first'}"), tmp_path / "second")
 
     def test_the_same_seed_gives_the_same_run(self, run, tmp_path):
         outcome, folder = run

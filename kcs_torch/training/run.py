@@ -105,20 +105,20 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         trainer = instantiate(config.trainer, **made, _convert_="all")
         try:
             trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
-        except RuntimeError as error:
-            if resumed is None or "loading state_dict" not in str(error):
-                raise
-            raise OptionError(f"resume={resumed}: does not fit this configuration: {error}") from None
         except (Diverged, NotFiniteError):  # a loss or a solver was given NaN
             text = "training diverged: what was best before that counts; try a smaller module.lr"
             warnings.warn(text, KcsWarning, stacklevel=2)
             if best.best_model_score is None:
                 return Outcome(math.inf if config.mode == "min" else -math.inf, {}, None)
+        except (RuntimeError, ValueError) as error:  # of a module's state, of an optimiser's
+            if resumed is None or not re.search("state.dict", str(error)):
+                raise
+            raise OptionError(f"resume={resumed}: does not fit this configuration: {error}") from None
         if best.best_model_score is None:
             raise OptionError("train: expected at least one epoch with validation, got none: see the group trainer")
         tested = trainer.test(module, datamodule=data, ckpt_path=best.best_model_path, verbose=False, weights_only=True)
     metrics = {name: float(figure) for figures in tested for name, figure in figures.items()}
-    notes = {"config": plain, "metrics": {name: f for name, f in metrics.items() if math.isfinite(f)}}
+    notes = {"config": _for_json(plain), "metrics": {name: f for name, f in metrics.items() if math.isfinite(f)}}
     lifter = folder / "lifter.safetensors"
     if savable:
         save_lifter(lifter, module.network, fps=data.fps, notes=notes)
@@ -161,6 +161,15 @@ def _checkpoint(path: Path, config: Mapping[str, Any]) -> Path:
     for key in differing:
         warnings.warn(f"resume: {key} was {before.get(key)}, is {now.get(key)}", KcsWarning, stacklevel=2)
     return found.resolve()
+
+
+def _for_json(value: Any) -> Any:
+    """A configuration whose infinite numbers are as YAML writes them, in words: JSON has none."""
+    if isinstance(value, dict):
+        return {name: _for_json(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_for_json(inner) for inner in value]
+    return str(value).replace("inf", ".inf") if isinstance(value, float) and math.isinf(value) else value
 
 
 def _flat(config: Any, key: str = "") -> dict[str, Any]:
