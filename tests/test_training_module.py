@@ -1,6 +1,8 @@
 """Training: what each loss is given, what one step does, and that it is the same whenever it is done."""
 
 import copy
+import json
+import math
 
 import lightning
 import pytest
@@ -407,6 +409,32 @@ def test_a_refined_network_keeps_to_the_tracks_and_can_be_saved(tmp_path):
     assert torch.isfinite(blank).all()
     with pytest.raises(kt.OptionError, match="solver to save"):
         save_lifter(tmp_path / "other.safetensors", kt.nn.RefinedLifter(network.network, nn.Identity()))
+
+
+@pytest.mark.parametrize("corner", [0.3, math.inf])
+@pytest.mark.parametrize("solver", ["UnrolledFPC", "UnrolledSfAM"])
+def test_files_from_before_corners_were_learned(tmp_path, corner, solver):
+    """A file says which corner its solver was made with, or is from before there were any; it has no more."""
+    from safetensors.torch import load, save
+
+    torch.manual_seed(0)
+    options = {"num_steps": 3, "mu": 0.1, "corner": corner}
+    own = kt.nn.UnrolledFPC(**options) if solver == "UnrolledFPC" else kt.nn.UnrolledSfAM(BODY, **options)
+    network = kt.nn.RefinedLifter(kt.nn.TemporalLifter(BODY, channels=8), own).eval()
+    tracks = torch.randn(2, 9, 17, 2)
+    path, old = save_lifter(tmp_path / "new.safetensors", network), tmp_path / "old.safetensors"
+    data = path.read_bytes()
+    facts = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]
+    assert ("corner" in json.loads(facts["kcs_torch"])["solver_options"]) == math.isfinite(corner)
+    tensors = load(data)
+    assert (tensors.pop("solver.raw_corner", None) is not None) == math.isfinite(corner)
+    old.write_bytes(save(tensors, facts))
+    for file in (path, old):
+        assert torch.equal(load_lifter(file).network.eval()(tracks), network(tracks))
+    del tensors["solver.raw_step"]
+    old.write_bytes(save(tensors, facts))
+    with pytest.raises(kt.FormatError, match=r"do not fit its options: solver\.raw_step"):
+        load_lifter(old)
 
 
 def test_a_network_of_ones_own_trains_and_is_told_that_it_has_no_file(tmp_path):

@@ -120,16 +120,17 @@ def test_untrained_is_the_iteration_written_out(body, kind, momentum, articulate
 @each_body
 @pytest.mark.parametrize("learnable", [True, False])
 @pytest.mark.parametrize("articulate_from", [0.0, 0.6])
-def test_untrained_is_the_method(body, learnable, articulate_from):
+@pytest.mark.parametrize("corner", [math.inf, 0.3])
+def test_untrained_is_the_method(body, learnable, articulate_from, corner):
     tracks, cameras, weights = scene(body, "gaps", frames=12, turn=180.0)
-    options = {"mu": 0.4, "final": 1e-4, "tau": 0.45, "momentum": 0.7, "beta": 1.2, "corner": 0.3}
+    options = {"mu": 0.4, "final": 1e-4, "tau": 0.45, "momentum": 0.7, "beta": 1.2, "corner": corner}
     method = SfAM(num_steps=9, articulate_from=articulate_from, window=None, **options)
     expected = method.shape(tracks[None], cameras[None], weights[None], body).value[0]
     module = UnrolledSfAM(body, 9, articulate_from=articulate_from, learnable=learnable, **options)
     assert_close(module(tracks, cameras, weights=weights), expected)
     method = SfAM(num_steps=9, window=None, **{**options, "beta": 0.0})
     expected = method.shape(tracks[None], cameras[None], weights[None], body).value[0]
-    module = UnrolledFPC(9, learnable=learnable, mu=0.4, final=1e-4, tau=0.9, momentum=0.7, corner=0.3)
+    module = UnrolledFPC(9, learnable=learnable, mu=0.4, final=1e-4, tau=0.9, momentum=0.7, corner=corner)
     assert_close(module(tracks, cameras, weights=weights), expected)
 
 
@@ -266,9 +267,10 @@ def with_parameters(module):
 
 
 @pytest.mark.parametrize("kind", [*SMOOTH_KINDS, "static"])
-def test_fpc_gradient(kind):
+@pytest.mark.parametrize("corner", [math.inf, 0.3])
+def test_fpc_gradient(kind, corner):
     tracks, cameras, weights = scene(CHAIN, kind, frames=4)
-    run, parameters = with_parameters(UnrolledFPC(3, mu=0.3, final=0.03))
+    run, parameters = with_parameters(UnrolledFPC(3, mu=0.3, final=0.03, corner=corner))
 
     def function(w, r, *values):
         return run((w, r), values, weights=weights)
@@ -310,13 +312,15 @@ def test_gradient_in_the_weights():
 
 def test_gradient_of_a_batch_and_of_repeated_singular_values():
     """Four joints on the axes: S# has equal singular values from the start."""
-    module = UnrolledFPC(2, mu=0.3, final=0.2)
+    module, bent = UnrolledFPC(2, mu=0.3, final=0.2), UnrolledFPC(2, mu=0.3, final=0.2, corner=0.3)
     eye = torch.eye(3).double()[:2].expand(2, 3, 2, 3)
     tracks = torch.zeros(2, 3, 4, 2).double()
     tracks[:, :, 0, 0] = tracks[:, :, 1, 1] = 1
     tracks[:, :, 2, 0] = tracks[:, :, 3, 1] = -1
     tracks = tracks * torch.tensor([1.0, -1.0, 1.0])[:, None, None]
     assert gradcheck(lambda w, r: module(w, r), tracks, eye, fast=True)
+    run, parameters = with_parameters(bent)
+    assert gradcheck(lambda w, r, *values: run((w, r), values), tracks, eye, *parameters, fast=True)
 
 
 @each_body
@@ -325,7 +329,7 @@ def test_gradient_of_a_batch_and_of_repeated_singular_values():
 @pytest.mark.parametrize("articulate_from", [0.0, 0.6])
 def test_degenerate_clips_are_finite(body, kind, dtype, articulate_from):
     tracks, cameras, weights = scene(body, kind, dtype=dtype)
-    for module in (UnrolledFPC(6), UnrolledSfAM(body, 6, articulate_from=articulate_from)):
+    for module in (UnrolledFPC(6), UnrolledFPC(6, corner=0.1), UnrolledSfAM(body, 6, articulate_from=articulate_from)):
         run, parameters = with_parameters(module.to(dtype))
         finite(lambda w, r, *values, f=run: f((w, r), values, weights=weights), tracks, cameras, *parameters)
 
@@ -376,7 +380,10 @@ def test_there_is_a_parameter_for_each_step():
         "raw_step": (4,),
     }
     names = {n: tuple(p.shape) for n, p in UnrolledSfAM(BODY, 4).named_parameters()}
-    assert names == {"raw_threshold": (4,), "raw_step": (4,), "raw_stiffness": (4,)}
+    assert names == {"raw_threshold": (4,), "raw_step": (4,), "raw_stiffness": (4,), "raw_corner": (4,)}
+    # The plain nuclear norm has no corner to learn.
+    assert {n for n, _ in UnrolledFPC(4, corner=0.2).named_parameters()} == {"raw_threshold", "raw_step", "raw_corner"}
+    assert {n for n, _ in UnrolledSfAM(BODY, 4, corner=math.inf).named_parameters()} == {*names} - {"raw_corner"}
     assert not list(UnrolledSfAM(BODY, 4, learnable=False).parameters())
 
 
@@ -393,7 +400,7 @@ def test_learning_lowers_the_error_and_keeps_parameters_positive():
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
-        for name in ("threshold", "step", "stiffness"):
+        for name in ("threshold", "step", "stiffness", "corner"):
             assert (module._values(name, truth) > 0).all()
     assert min(losses) < 0.8 * losses[0]
 
@@ -404,7 +411,7 @@ def test_parameters_pushed_far_stay_harmless(dtype):
     tracks, cameras, weights = scene(BODY, "gaps", dtype=dtype)
     module = UnrolledSfAM(BODY, 4, articulate_from=0.0).to(dtype)
     for value in (-2000.0, -100.0, 50.0):
-        for name in ("raw_threshold", "raw_stiffness"):
+        for name in ("raw_threshold", "raw_stiffness", "raw_corner"):
             with torch.no_grad():
                 getattr(module, name).fill_(value)
             run, parameters = with_parameters(module)
@@ -460,12 +467,66 @@ def _states(module, tracks, cameras):
 @pytest.mark.parametrize("learnable", [True, False])
 def test_state_round_trip(learnable, tmp_path):
     tracks, cameras, _ = scene(BODY)
-    one = UnrolledSfAM(BODY, 4, mu=0.3, tau=0.4, beta=3.0, learnable=learnable)
+    one = UnrolledSfAM(BODY, 4, mu=0.3, tau=0.4, beta=3.0, corner=0.3, learnable=learnable)
     two = UnrolledSfAM(BODY, 4, learnable=learnable)
-    assert set(one.state_dict()) == {"raw_threshold", "raw_step", "raw_stiffness"}
+    assert set(one.state_dict()) == {"raw_threshold", "raw_step", "raw_stiffness", "raw_corner"}
     torch.save(one.state_dict(), tmp_path / "state.pt")
     two.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
     assert torch.equal(two(tracks, cameras), one(tracks, cameras))
+
+
+@pytest.mark.parametrize("learnable", [True, False])
+def test_states_from_before_corners_were_learned(learnable):
+    """The corner stays what the constructor was told, as it was then; a plain norm takes no other's corners."""
+    tracks, cameras, _ = scene(BODY)
+    for make in (lambda **o: UnrolledSfAM(BODY, 4, **o), lambda **o: UnrolledFPC(4, **o)):
+        old = make(mu=0.3, corner=0.3, learnable=learnable)
+        state = {name: value for name, value in old.state_dict().items() if name != "raw_corner"}
+        new = make(corner=0.3, learnable=learnable)
+        kept = dict(state)
+        new.load_state_dict(kept)
+        assert kept.keys() == state.keys()
+        assert torch.equal(new(tracks, cameras), old(tracks, cameras))
+        inside = torch.nn.Sequential(make(corner=0.3, learnable=learnable))
+        inside.load_state_dict({f"0.{name}": value for name, value in state.items()})
+        assert torch.equal(inside[0](tracks, cameras), old(tracks, cameras))
+        plain = make(corner=math.inf, learnable=learnable)
+        plain.load_state_dict(state)
+        with pytest.raises(RuntimeError, match="raw_corner"):
+            plain.load_state_dict(old.state_dict())
+
+
+def test_each_step_has_its_corner():
+    """Learned corners that differ: the steps one after another, each with its own."""
+    tracks, cameras, weights = scene(BODY, "gaps")
+    corners = torch.tensor([0.5, 0.02, 3.0], dtype=torch.float64)
+    module = UnrolledFPC(3, mu=0.3, final=0.03, momentum=0.0, corner=0.2)
+    with torch.no_grad():
+        module.raw_corner.copy_(corners.expm1().log())
+    shape, scale = start_shape(tracks, cameras, weights), data_scale(tracks, cameras, weights)
+    for level, corner in zip(continuation(3, 0.3, 0.03), corners, strict=True):
+        one = torch.as_tensor(level) * scale
+        shape = shape_step(shape, tracks, cameras, weights, one, 1.0, corner=corner * scale)
+    assert_close(module(tracks, cameras, weights=weights), shape)
+
+
+def test_learning_turns_a_wrong_corner():
+    """Truth of rank two, which a corner far too large makes smaller: once it has fallen, the error has, too."""
+    truth = (normal(20, 2, seed=5) @ normal(2, 21, seed=6)).unflatten(-1, (7, 3))
+    truth = truth - truth.mean(-2, keepdim=True)
+    cameras = turning(20, 200.0)[:, :2]
+    module = UnrolledFPC(6, mu=0.3, final=0.05, corner=2.0)
+    for name in ("raw_threshold", "raw_step"):
+        getattr(module, name).requires_grad_(False)
+    optimizer = torch.optim.Adam([module.raw_corner], lr=0.3)
+    losses = []
+    for _ in range(20):
+        optimizer.zero_grad()
+        loss = (module(truth @ cameras.mT, cameras) - truth).square().mean()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.5 * losses[0] and (module._values("corner", truth)[1:] < 1.0).all()
 
 
 @pytest.mark.parametrize("body", [BODY, "h36m17"])

@@ -46,10 +46,8 @@ def data_scale(tracks: Tensor, cameras: Tensor, weights: Tensor | None = None) -
     return spectral_norm(back_project(data, cameras).flatten(-2))
 
 
-def corner_of(share: Tensor | float, scale: Tensor) -> Tensor | float:
+def corner_of(share: Tensor, scale: Tensor) -> Tensor:
     """The corner of the shrinkage (...), a share of the scale; infinite where the share is, for every scale."""
-    if not isinstance(share, Tensor):
-        return share * scale if math.isfinite(share) else math.inf
     finite = share.isfinite()
     return torch.where(finite, torch.where(finite, share, torch.zeros_like(share)) * scale, torch.inf)
 

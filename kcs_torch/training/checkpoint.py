@@ -162,7 +162,9 @@ def _build(path: Path, facts: Any, tensors: Mapping[str, Tensor]) -> nn.Module:
         raise FormatError(f"{path}: {error}") from None
     except (TypeError, ValueError, RuntimeError) as error:
         raise FormatError(f"{what}, got options {str(options)[:200]} {str(more)[:200]} ({error})") from None
-    wrong = [n for n in {*plan, *tensors} if n not in plan or n not in tensors or plan[n].shape != tensors[n].shape]
+    # In older files the corner is an option alone, which the solver then is made with.
+    needed = {name for name in plan if name in tensors or name != "solver.raw_corner"}
+    wrong = [n for n in {*needed, *tensors} if n not in plan or n not in tensors or plan[n].shape != tensors[n].shape]
     if wrong:
         raise FormatError(f"{what}, got weights that do not fit its options: {min(wrong)}")
     kinds = {value.dtype for name, value in tensors.items() if not name.startswith("solver.")}

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.nn.energies import check_weights
 from kcs_torch.nn.layers import inverse_softplus, seen_weights
+from kcs_torch.nn.steps import corner_of
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.implicit import Implicit, fixed_point
 from kcs_torch.solvers.iterate import Solution, iterate, relative_change
@@ -23,6 +24,9 @@ Gradient = Literal["unrolled", "implicit"] | Implicit
 
 SETTLED = 5e-3
 """A shape stands still where a step changes it by no more than this share."""
+
+SHARPEST = 1e-6
+"""Least corner that a step may learn: at 0 nothing would be shrunk but what is 0."""
 
 
 class Unrolled(nn.Module):
@@ -39,6 +43,8 @@ class Unrolled(nn.Module):
     Raises:
         OptionError: a number is out of range, or ``grad_steps`` is given with the implicit gradient.
     """
+
+    raw_corner: Tensor
 
     def __init__(
         self, num_steps: int, *, momentum: float, learnable: bool, grad_steps: int | None, gradient: Gradient
@@ -138,6 +144,26 @@ class Unrolled(nn.Module):
 
     def _values(self, name: str, like: Tensor) -> Tensor:
         return nn.functional.softplus(getattr(self, f"raw_{name}")).to(like)
+
+    def _hold_corner(self, corner: float) -> None:
+        """Hold the corner of each step; an infinite one is the plain nuclear norm, and nothing to learn."""
+        self.corner = corner
+        if math.isfinite(corner):
+            self._positive("corner", [corner] * self.num_steps)
+
+    def _corners(self, scale: Tensor, share: Tensor | None = None) -> Sequence[Tensor | float]:
+        """Corner (...) of each step in the unit of the singular values: of the module, or one share (...) for all."""
+        if share is not None:
+            return [corner_of(share, scale)] * self.num_steps
+        if not math.isfinite(self.corner):
+            return [math.inf] * self.num_steps
+        return (self._values("corner", scale).clamp_min(SHARPEST) * scale[..., None]).unbind(-1)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *arguments: Any) -> None:
+        """Older states have no corners, which were not learned: they stay what the constructor was told."""
+        if hasattr(self, "raw_corner"):
+            state_dict.setdefault(f"{prefix}raw_corner", self.raw_corner.detach())
+        super()._load_from_state_dict(state_dict, prefix, *arguments)
 
     def _hold_lengths(self, skeleton: Skeleton, lengths: Sequence[float] | None, learnable: bool) -> None:
         """Hold relative bone lengths with mean 1: those given, or the skeleton's where they are to be learned."""

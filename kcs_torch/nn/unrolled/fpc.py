@@ -8,7 +8,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError
 from kcs_torch.nn.layers import full_precision, known
-from kcs_torch.nn.steps import continuation, corner_of, data_scale, shape_step, start_shape
+from kcs_torch.nn.steps import continuation, data_scale, shape_step, start_shape
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.solvers.iterate import Solution
 
@@ -19,14 +19,15 @@ class UnrolledFPC(Unrolled):
     """``num_steps`` steps of fixed-point continuation from 2D tracks and cameras to 3D shape.
 
     Args:
-        num_steps: steps; each has its own step size and threshold.
+        num_steps: steps; each has its own step size, threshold and corner.
         mu: first threshold, a share of the data's largest singular value.
         final: last threshold; between them they fall geometrically.
         tau: step size.
         momentum: share of the last change that the next step starts ahead by.
         corner: singular values well above this share of the data's largest are hardly shrunk, of
-            :func:`kcs_torch.functional.svt`; infinite is the plain nuclear norm.
-        learnable: step sizes and thresholds are parameters (positive through a softplus); else constants.
+            :func:`kcs_torch.functional.svt`; infinite is the plain nuclear norm, in all steps and for good.
+        learnable: step sizes, thresholds and finite corners are parameters (positive through a softplus); else
+            constants.
         grad_steps: record only the last so many steps for autograd; None all.
         gradient: "unrolled", or "implicit": go on with the last step until the shape stands still, and differentiate
             that fixed point, in the memory of one step; an :class:`kcs_torch.solvers.Implicit` sets tolerances.
@@ -59,7 +60,7 @@ class UnrolledFPC(Unrolled):
         super().__init__(num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
         if not (tau > 0 and corner > 0):
             raise OptionError(f"{type(self).__name__}: expected tau > 0 and corner > 0, got {tau} and {corner}")
-        self.corner = corner
+        self._hold_corner(corner)
         self._positive("threshold", continuation(num_steps, mu, final))
         self._positive("step", [tau] * num_steps)
 
@@ -99,10 +100,10 @@ class UnrolledFPC(Unrolled):
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
-            corner = corner_of(self.corner, scale)
+            corners = self._corners(scale)
 
             def advance(shape: Tensor, k: int) -> Tensor:
-                return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corner)
+                return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corners[k])
 
             return self._run(
                 advance,

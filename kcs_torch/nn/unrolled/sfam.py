@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.nn.layers import full_precision, known
-from kcs_torch.nn.steps import continuation, corner_of, data_scale, estimate_lengths, shape_step, start_shape, to_scale
+from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape, to_scale
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution
@@ -22,7 +22,7 @@ class UnrolledSfAM(Unrolled):
 
     Args:
         skeleton: a :class:`Skeleton`, a built-in name or a file.
-        num_steps: steps; each has its own step size, threshold and stiffness.
+        num_steps: steps; each has its own step size, threshold, corner and stiffness.
         mu: first threshold, a share of the data's largest singular value.
         final: last threshold.
         tau: step size of the articulated steps, below 1; the others take twice that.
@@ -73,11 +73,11 @@ class UnrolledSfAM(Unrolled):
                 f"UnrolledSfAM: expected tau, beta and corner > 0 and articulate_from in 0..1, got {tau}, {beta}, "
                 f"{corner} and {articulate_from}"
             )
-        self.corner = corner
         self.skeleton = get_skeleton(skeleton)
         self.rigid = list(self.skeleton.rigid)
         self.register_buffer("bones", self.skeleton.bone_index()[self.rigid], persistent=False)
         self.first = round(articulate_from * num_steps) if self.rigid else num_steps
+        self._hold_corner(corner)
         self._positive("threshold", continuation(num_steps, mu, final))
         self._positive("step", [2 * tau] * self.first + [tau] * (num_steps - self.first))
         self._positive("stiffness", [beta] * num_steps)
@@ -138,7 +138,7 @@ class UnrolledSfAM(Unrolled):
             inside: (..., T), False in frames that pad a shorter clip at its end; their weights and cameras are 0.
             held: an empty list is filled with the lengths and rigidity that each articulated step aimed at; a filled
                 one is what other windows of the same body aimed at, and is aimed at again.
-            corner: (...) instead of the module's.
+            corner: (...) share of the scale, in all steps instead of the module's; may be infinite.
 
         Returns:
             The solution; ``change`` is that of the last step, (...).
@@ -191,20 +191,20 @@ class UnrolledSfAM(Unrolled):
 
         def advance(shape: Tensor, k: int) -> Tensor:
             if k < self.first:
-                return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=bend)
+                return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corners[k])
             target, rigidity = earlier[k - self.first] if earlier else measured(shape)
             if held is not None and not earlier:
                 held.append((target, rigidity))
             if one_body and target.ndim > 1:
                 target, rigidity = target[..., None, :], rigidity[..., None, :]
             return shape_step(
-                shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=bend,
+                shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corners[k],
                 bones=self.bones, lengths=target, stiffness=stiffness[k] * rigidity,
             )  # fmt: skip
 
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
-            bend = corner_of(self.corner if corner is None else corner, scale)
+            corners = self._corners(scale, corner)
             begin = start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype)
             if inside is not None:
                 begin = begin * inside[..., None, None]
