@@ -599,7 +599,7 @@ def test_wrong_joint_count_names_the_skeleton(joints):
     with pytest.raises(ShapeError, match="7, 2.*skeleton 'body7', got"):
         UnrolledSfAM(BODY, 2)(normal(6, joints, 2), turning(6)[:, :2])
     tracks, cameras, _ = scene(BODY)
-    with pytest.raises(ShapeError, match=r"lengths \(\.\.\., 6\) for skeleton 'body7'"):
+    with pytest.raises(ShapeError, match=r"lengths \(\.\.\., 6\), got \(5,\)"):
         UnrolledSfAM(BODY, 2)(tracks, cameras, lengths=torch.ones(5))
 
 

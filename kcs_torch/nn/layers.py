@@ -16,6 +16,28 @@ from kcs_torch.skeleton import Skeleton, get_skeleton
 __all__ = ["SVT", "BoneLengths", "BoneVectors", "KCSMatrix"]
 
 
+def check_joints(module: nn.Module, skeleton: Skeleton, points: Tensor, form: str) -> None:
+    """Raise a ShapeError unless ``points`` have the joints of the skeleton.
+
+    Args:
+        module: which is asking.
+        skeleton: whose joints they have to be.
+        points: (..., N, D).
+        form: such as "points (..., T, {}, 3)": what is expected, with a place for the number of joints.
+    """
+    joints = skeleton.num_joints
+    if points.ndim >= form.count(",") and points.shape[-2] == joints:
+        return
+    message = (
+        f"{type(module).__name__}: expected {form.format(joints)} for skeleton '{skeleton.name}', "
+        f"got {tuple(points.shape)}"
+    )
+    if points.ndim >= 2 and points.shape[-2] == skeleton.num_observed < joints:
+        virtual = ", ".join(skeleton.joints[skeleton.num_observed :])
+        message += f": without its virtual joints {virtual}, which skeleton.complete(points, weights) appends to both"
+    raise ShapeError(message)
+
+
 class SkeletonModule(nn.Module):
     """Base of modules that know a skeleton: holds its bones as a buffer and checks what comes in."""
 
@@ -29,18 +51,9 @@ class SkeletonModule(nn.Module):
 
     def check(self, points: Tensor, *, clip: bool = False) -> None:
         """Raise a ShapeError unless ``points`` are (..., N, D), or a clip (..., T, N, D), with this skeleton's N."""
-        joints = len(self.skeleton.joints)
         if not isinstance(points, Tensor):
             raise ShapeError(f"{type(self).__name__}: expected a tensor of points, got {type(points).__name__}")
-        if points.ndim < 2 + clip or points.shape[-2] != joints:
-            message = (
-                f"{type(self).__name__}: expected points (..., {'T, ' if clip else ''}{joints}, 3) for skeleton "
-                f"'{self.skeleton.name}', got {tuple(points.shape)}"
-            )
-            if points.ndim >= 2 and points.shape[-2] == self.skeleton.num_observed < joints:
-                virtual = ", ".join(self.skeleton.joints[self.skeleton.num_observed :])
-                message += f": without its virtual joints {virtual}, which skeleton.complete(points) appends"
-            raise ShapeError(message)
+        check_joints(self, self.skeleton, points, "points (..., T, {}, 3)" if clip else "points (..., {}, 3)")
 
     def extra_repr(self) -> str:
         return f"skeleton='{self.skeleton.name}'"

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.nn.energies import check_weights
-from kcs_torch.nn.layers import inverse_softplus, seen_weights
+from kcs_torch.nn.layers import check_joints, inverse_softplus, seen_weights
 from kcs_torch.nn.steps import corner_of
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.implicit import Implicit, fixed_point
@@ -189,7 +189,13 @@ class Unrolled(nn.Module):
         self._positive("length", known, learnable=learnable)
 
     def _check(
-        self, tracks: Tensor, cameras: Tensor | None, weights: Tensor | None, start: Tensor | None, **others: Any
+        self,
+        tracks: Tensor,
+        cameras: Tensor | None,
+        weights: Tensor | None,
+        start: Tensor | None,
+        skeleton: Skeleton | None = None,
+        **others: Any,
     ) -> Tensor:
         """Return the weights (..., T, N), 0 where tracks are not finite.
 
@@ -207,6 +213,8 @@ class Unrolled(nn.Module):
                 f"{name}: expected cameras of the tracks' dtype and device, got {cameras.dtype} on "
                 f"{cameras.device} for {tracks.dtype} on {tracks.device}: use cameras.to(tracks)"
             )
+        if skeleton is not None:
+            check_joints(self, skeleton, tracks, "tracks (..., T, {}, 2)")
         check_weights(weights, tracks, self)
         if start is not None and start.shape[-3:] != (*tracks.shape[-3:-1], 3):
             expected = f"(..., {tracks.shape[-3]}, {tracks.shape[-2]}, 3)"

@@ -84,17 +84,21 @@ class UnrolledFPC(Unrolled):
         Warns:
             ConvergenceWarning: with the implicit gradient, in the backward pass.
         """
-        return self._solve(tracks, cameras, weights, start, measure=False).value
+        return self.solve(tracks, cameras, weights=weights, start=start, measure=False).value
 
     def solve(
-        self, tracks: Tensor, cameras: Tensor, *, weights: Tensor | None = None, start: Tensor | None = None
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        *,
+        weights: Tensor | None = None,
+        start: Tensor | None = None,
+        measure: bool = True,
     ) -> Solution[Tensor]:
-        """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still."""
-        return self._solve(tracks, cameras, weights, start, measure=True)
+        """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution`.
 
-    def _solve(
-        self, tracks: Tensor, cameras: Tensor, weights: Tensor | None, start: Tensor | None, *, measure: bool
-    ) -> Solution[Tensor]:
+        With ``measure`` it tells whether the last step stood still, which waits for the device.
+        """
         weights = self._check(tracks, cameras, weights, start)
         tracks = known(tracks, weights)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)

@@ -155,8 +155,7 @@ class UnrolledKCS(Unrolled):
         Raises:
             ShapeError: the shapes do not fit.
         """
-        weights = self._check(tracks, None, weights, None)
-        self._check_joints(tracks)
+        weights = self._check(tracks, None, weights, None, self.skeleton)
         with torch.no_grad(), full_precision(tracks):
             points, share = self._centred(tracks, weights)
             rest = self.template(tracks)
@@ -198,7 +197,7 @@ class UnrolledKCS(Unrolled):
         Warns:
             ConvergenceWarning: with the implicit gradient, in the backward pass.
         """
-        return self._solve(tracks, cameras, scales, weights, start, measure=False).value
+        return self.solve(tracks, cameras, scales=scales, weights=weights, start=start, measure=False).value
 
     def solve(
         self,
@@ -208,22 +207,13 @@ class UnrolledKCS(Unrolled):
         scales: Tensor | None = None,
         weights: Tensor | None = None,
         start: Tensor | None = None,
+        measure: bool = True,
     ) -> Solution[Tensor]:
-        """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still."""
-        return self._solve(tracks, cameras, scales, weights, start, measure=True)
+        """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution`.
 
-    def _solve(
-        self,
-        tracks: Tensor,
-        cameras: Tensor,
-        scales: Tensor | None,
-        weights: Tensor | None,
-        start: Tensor | None,
-        *,
-        measure: bool,
-    ) -> Solution[Tensor]:
-        weights = self._check(tracks, cameras, weights, start, scales=(scales, tracks.shape[-3:-2]))
-        self._check_joints(tracks)
+        With ``measure`` it tells whether the last step stood still, which waits for the device.
+        """
+        weights = self._check(tracks, cameras, weights, start, self.skeleton, scales=(scales, tracks.shape[-3:-2]))
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         with full_precision(tracks):
             points, share = self._centred(tracks, weights)
@@ -265,11 +255,3 @@ class UnrolledKCS(Unrolled):
         if math.isinf(self.scale_range):
             return torch.zeros_like(scale), torch.full_like(scale, math.inf)
         return scale / self.scale_range, scale * self.scale_range
-
-    def _check_joints(self, tracks: Tensor) -> None:
-        joints = self.skeleton.num_joints
-        if tracks.shape[-2] != joints:
-            raise ShapeError(
-                f"UnrolledKCS: expected tracks (..., T, {joints}, 2) for skeleton '{self.skeleton.name}', "
-                f"got {tuple(tracks.shape)}"
-            )

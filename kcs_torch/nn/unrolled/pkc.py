@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.nn.energies import centred_residual
@@ -122,7 +122,7 @@ class UnrolledPKC(Unrolled):
         Warns:
             ConvergenceWarning: with the implicit gradient, in the backward pass.
         """
-        return self._solve(tracks, cameras, weights, start, lengths, measure=False).value
+        return self.solve(tracks, cameras, weights=weights, start=start, lengths=lengths, measure=False).value
 
     def solve(
         self,
@@ -132,27 +132,14 @@ class UnrolledPKC(Unrolled):
         weights: Tensor | None = None,
         start: Tensor | None = None,
         lengths: Tensor | None = None,
+        measure: bool = True,
     ) -> Solution[Tensor]:
-        """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still."""
-        return self._solve(tracks, cameras, weights, start, lengths, measure=True)
+        """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution`.
 
-    def _solve(
-        self,
-        tracks: Tensor,
-        cameras: Tensor,
-        weights: Tensor | None,
-        start: Tensor | None,
-        lengths: Tensor | None,
-        *,
-        measure: bool,
-    ) -> Solution[Tensor]:
+        With ``measure`` it tells whether the last step stood still, which waits for the device.
+        """
         joints, count = self.skeleton.num_joints, self.skeleton.num_bones
-        weights = self._check(tracks, cameras, weights, start, lengths=(lengths, (count,)))
-        if tracks.shape[-2] != joints:
-            raise ShapeError(
-                f"UnrolledPKC: expected tracks (..., T, {joints}, 2) for skeleton '{self.skeleton.name}', "
-                f"got {tuple(tracks.shape)}"
-            )
+        weights = self._check(tracks, cameras, weights, start, self.skeleton, lengths=(lengths, (count,)))
         depends_on = (tracks, cameras, weights, start, lengths)
         with full_precision(tracks):
             # Factorisations of covariances: in double precision, as for singular values.

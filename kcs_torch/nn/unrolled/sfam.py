@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.errors import OptionError
 from kcs_torch.nn.layers import full_precision, known
 from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape, to_scale
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
@@ -110,7 +110,7 @@ class UnrolledSfAM(Unrolled):
         Warns:
             ConvergenceWarning: with the implicit gradient, in the backward pass.
         """
-        return self._solve(tracks, cameras, weights, start, lengths, one_body=False, measure=False).value
+        return self.solve(tracks, cameras, weights=weights, start=start, lengths=lengths, measure=False).value
 
     def solve(
         self,
@@ -124,8 +124,9 @@ class UnrolledSfAM(Unrolled):
         inside: Tensor | None = None,
         held: list[tuple[Tensor, Tensor]] | None = None,
         corner: Tensor | None = None,
+        measure: bool = True,
     ) -> Solution[Tensor]:
-        """As :meth:`forward`, with a :class:`kcs_torch.solvers.Solution` that tells whether the last step stood still.
+        """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution`.
 
         Args:
             tracks: as of :meth:`forward`.
@@ -139,35 +140,13 @@ class UnrolledSfAM(Unrolled):
             held: an empty list is filled with the lengths and rigidity that each articulated step aimed at; a filled
                 one is what other windows of the same body aimed at, and is aimed at again.
             corner: (...) share of the scale, in all steps instead of the module's; may be infinite.
+            measure: tell whether the last step stood still, which waits for the device.
 
         Returns:
             The solution; ``change`` is that of the last step, (...).
         """
-        options = {"one_body": one_body, "measure": True, "inside": inside, "held": held, "corner": corner}
-        return self._solve(tracks, cameras, weights, start, lengths, **options)  # type: ignore[arg-type]
-
-    def _solve(
-        self,
-        tracks: Tensor,
-        cameras: Tensor,
-        weights: Tensor | None,
-        start: Tensor | None,
-        lengths: Tensor | None,
-        *,
-        one_body: bool,
-        measure: bool,
-        inside: Tensor | None = None,
-        held: list[tuple[Tensor, Tensor]] | None = None,
-        corner: Tensor | None = None,
-    ) -> Solution[Tensor]:
-        weights = self._check(tracks, cameras, weights, start)
-        joints, count = self.skeleton.num_joints, self.skeleton.num_bones
-        given = None if lengths is None else tuple(lengths.shape)
-        if tracks.shape[-2] != joints or (given is not None and given[-1:] != (count,)):
-            raise ShapeError(
-                f"UnrolledSfAM: expected tracks (..., T, {joints}, 2) and lengths (..., {count}) for skeleton "
-                f"'{self.skeleton.name}', got {tuple(tracks.shape)} and {given}"
-            )
+        expected = (self.skeleton.num_bones,)
+        weights = self._check(tracks, cameras, weights, start, self.skeleton, lengths=(lengths, expected))
         tracks = known(tracks, weights)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         stiffness = self._values("stiffness", tracks)
