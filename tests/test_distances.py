@@ -55,6 +55,25 @@ def test_points_that_are_nan_do_not_pass_for_near(how):
 
 
 @each_alignment
+@pytest.mark.parametrize("weighted", [True, False])
+def test_targets_that_are_nan_are_unknown(how, weighted):
+    """As tracks are: no label, no value, and no gradient."""
+    points, target = pair(3)
+    weights = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(0)).double() if weighted else None
+    some = torch.ones(3, 5, 7).double() if weights is None else weights.clone()
+    target[0, 1, 2] = target[2, 3] = torch.nan
+    some[0, 1, 2] = some[2, 3] = 0
+    filled = target.nan_to_num(7.0)
+    for loss in (JointDistance(how), KCSDistance(BODY), KCSDistance(BODY, scale_free=True, squared=False)):
+        leaf = points.clone().requires_grad_()
+        value = loss(leaf, target, weights)
+        assert_close(value, loss(points, filled, some))
+        assert value[2, 3] == 0
+        value.sum().backward()
+        assert leaf.grad.isfinite().all() and (leaf.grad[2, 3] == 0).all() and (leaf.grad[0, 1, 2] == 0).all()
+
+
+@each_alignment
 def test_joint_distance_gradient(how):
     points, target = pair(frames=3)
     weights = torch.rand(3, 7, generator=torch.Generator().manual_seed(0)).double() + 0.1
@@ -203,3 +222,27 @@ def test_kcs_distance_that_does_not_fit():
     for wrong in ((5, 6), (4, 7)):
         with pytest.raises(ShapeError, match=r"KCSDistance: expected weights \(5, 7\)"):
             KINDS["squared"](points, target, torch.ones(wrong))
+
+
+def test_targets_that_do_not_fit_the_poses():
+    points, target = pair(3)
+    for wrong in (target[:2], target[:, :4], target[..., :2]):
+        with pytest.raises(ShapeError, match=r"points \(\.\.\., N, 3\) and a target like it"):
+            KCSDistance(BODY)(points, wrong)
+    with pytest.raises(ShapeError, match=r"and target \(\.\.\., 5, 7, 3\)"):
+        JointDistance()(points, target[:2])
+    for loss in (JointDistance(), KCSDistance(BODY)):
+        assert_close(loss(points, target[0]), loss(points, target[:1].expand(3, -1, -1, -1)))
+        with pytest.raises(ShapeError, match="expected a tensor of target, got ndarray"):
+            loss(points, target.numpy())
+
+
+def test_what_half_precision_cannot_hold_is_its_largest_number():
+    """Of values a million times larger it used to be 0: the difference of both was lost to rounding."""
+    points, target = (300 * x for x in pair(3, dtype=torch.float32))
+    leaf = points.half().requires_grad_()
+    value = KCSDistance(BODY)(leaf, target.half())
+    assert KCSDistance(BODY)(points, target).min() > 1e10
+    assert (value == torch.finfo(torch.float16).max).all()
+    (1e-6 * value.float()).sum().backward()
+    assert leaf.grad.abs().max() > 0

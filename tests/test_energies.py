@@ -22,7 +22,21 @@ from torch.testing import assert_close
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths, project
-from kcs_torch.nn import BoneLengthEnergy, LowRankEnergy, ReprojectionEnergy, SmoothnessEnergy, SymmetryEnergy
+from kcs_torch.nn import (
+    BoneLengthEnergy,
+    ForeshorteningEnergy,
+    HingeEnergy,
+    JointDistance,
+    KCSDistance,
+    LowRankEnergy,
+    PerspectiveEnergy,
+    PostureEnergy,
+    ProcrusteanEnergy,
+    ReprojectionEnergy,
+    SmoothnessEnergy,
+    SymmetryEnergy,
+)
+from kcs_torch.skeleton import SKELETONS
 
 BONES = BODY.bone_index()
 RIGID = torch.tensor([0.0, 1, 1, 1, 1, 1]).double()  # the spine is flexible
@@ -563,13 +577,74 @@ def test_other_shapes_that_do_not_fit():
         lambda w: SmoothnessEnergy()(points, w),
         lambda w: ReprojectionEnergy()(points, tracks, cameras, w),
     ):
-        with pytest.raises(ShapeError, match=r"weights \(\.\.\., 5, 7\), got \(5, 6\)"):
+        with pytest.raises(ShapeError, match=r"weights \(\.\.\., 5, 7\) for points \(5, 7, 3\), got \(5, 6\)"):
             run(torch.ones(5, 6))
     for wrong in (tracks[:1], tracks[:, :6], points):
         with pytest.raises(ShapeError, match=r"tracks \(\.\.\., 5, 7, 2\)"):
             ReprojectionEnergy()(points, wrong, cameras)
-    with pytest.raises(ShapeError, match=r"cameras \(\.\.\., 5, 2, 3\)"):
-        ReprojectionEnergy()(points, tracks, cameras[:1])
+    for wrong in ((points, cameras[:1]), (points[..., :2], cameras)):
+        with pytest.raises(ShapeError, match=r"points \(\.\.\., T, N, 3\) and cameras \(\.\.\., 5, 2, 3\)"):
+            ReprojectionEnergy()(wrong[0], tracks, wrong[1])
+
+
+TRUNK = SKELETONS["h36m17"]
+CALLS = {
+    "bone length": lambda p, w: BoneLengthEnergy(TRUNK)(p, None, w),
+    "symmetry": lambda p, w: SymmetryEnergy(TRUNK)(p, w),
+    "smoothness": lambda p, w: SmoothnessEnergy()(p, w),
+    "low rank": lambda p, w: LowRankEnergy()(p, w),
+    "reprojection": lambda p, w: ReprojectionEnergy()(p, torch.zeros(4, 5, 17, 2), None, w),
+    "perspective": lambda p, w: PerspectiveEnergy()(p, torch.zeros(4, 5, 17, 2), (1000, 1000, 0, 0), w),
+    "joints": lambda p, w: JointDistance()(p, torch.zeros(4, 5, 17, 3), w),
+    "kcs": lambda p, w: KCSDistance(TRUNK)(p, torch.zeros(4, 5, 17, 3), w),
+    "foreshortening": lambda p, w: ForeshorteningEnergy(TRUNK)(p, None, w),
+    "procrustean": lambda p, w: ProcrusteanEnergy(TRUNK)(p, None, w),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_what_is_no_batch_of_weighted_points_is_refused_in_our_words(name):
+    """Without these checks torch tells of sizes at dimensions, or of attributes that arrays do not have."""
+    call, points, weights = CALLS[name], torch.randn(4, 5, 17, 3), torch.ones(4, 5, 17)
+    assert call(points, weights).isfinite().all()
+    with pytest.raises(ShapeError, match="expected a tensor of points, got ndarray"):
+        call(points.numpy(), weights)
+    with pytest.raises(ShapeError, match="expected points in floating point, got torch.int64"):
+        call(points.long(), weights)
+    with pytest.raises(ShapeError, match="expected a tensor of weights, got ndarray"):
+        call(points, weights.numpy())
+    with pytest.raises(ShapeError, match=r"expected weights .*got \(3, 5, 17\)"):
+        call(points, weights[:3])
+    with pytest.raises(ShapeError, match=r"expected weights .*got \(4, 5, 17, 1\)"):
+        call(points, weights[..., None])
+
+
+@pytest.mark.parametrize("energy", [BoneLengthEnergy, HingeEnergy, PostureEnergy, ForeshorteningEnergy])
+def test_lengths_that_do_not_fit(energy):
+    """Weights given in their place, most of all."""
+    energy, points = energy(TRUNK), torch.randn(4, 5, 17, 3)
+    assert energy(points, torch.ones(4, 16)).isfinite().all()
+    assert_close(energy(points, torch.ones(16)), energy(points, torch.ones(4, 16)))
+    for wrong in (torch.ones(15), torch.ones(4, 5, 17), torch.ones(3, 16), torch.ones(4, 5, 16), torch.ones(())):
+        with pytest.raises(ShapeError, match=r"expected lengths \(\.\.\., 16\), the same in all frames"):
+            energy(points, wrong)
+    with pytest.raises(ShapeError, match="expected a tensor of lengths, got list"):
+        energy(points, [1.0] * 16)
+
+
+def test_other_arguments_that_do_not_fit():
+    points = torch.randn(4, 5, 17, 3)
+    for wrong in (torch.eye(3), torch.ones(4, 5, 17)):
+        with pytest.raises(ShapeError, match=r"rotations \(\.\.\., 5, 3, 3\)"):
+            ProcrusteanEnergy(TRUNK)(points, wrong)
+    with pytest.raises(ShapeError, match=r"points \(\.\.\., T, 17, 3\) and rotations"):
+        ProcrusteanEnergy(TRUNK)(points[..., :2])
+    with pytest.raises(ShapeError, match=r"expected points \(\.\.\., T, N, 3\)"):
+        ForeshorteningEnergy(TRUNK)(points[..., :2])
+    with pytest.raises(ShapeError, match=r"expected bone_weights \(\.\.\., 5, 16\)"):
+        ForeshorteningEnergy(TRUNK)(points, bone_weights=torch.ones(4, 5, 17))
+    with pytest.raises(ShapeError, match=r"expected tracks .*for points \(4, 5, 17, 3\), got \(3, 5, 17, 2\)"):
+        ReprojectionEnergy()(points, torch.zeros(3, 5, 17, 2))
 
 
 def test_unknown_skeletons_are_named():

@@ -138,7 +138,7 @@ def test_shapes_that_do_not_fit():
     for points in (torch.zeros(5, 7, 3), torch.zeros(6, 3), torch.zeros(5, 6, 2)):
         with pytest.raises(ShapeError, match="expected points"):
             energy(points)
-    with pytest.raises(ShapeError, match=r"expected lengths \(..., 5\), got \(4,\)"):
+    with pytest.raises(ShapeError, match=r"expected lengths \(..., 5\), .* got \(4,\)"):
         energy(torch.zeros(3, 6, 3), torch.zeros(4))
 
 

@@ -1,5 +1,7 @@
 """Reprojection through a pinhole: where a body stands, the energy by hand, gradients, and what lies behind."""
 
+import warnings
+
 import pytest
 import scipy.optimize
 import torch
@@ -97,6 +99,23 @@ def test_intrinsics_in_any_form():
     other = torch.stack([K, 2 * K])  # of each clip
     both = PerspectiveEnergy()(points, torch.stack([tracks[0], 2 * tracks[1]]), other)
     assert_close(both, torch.stack([expected[0], 4 * expected[1]]))
+    matrices = torch.tensor(matrix).double() * torch.tensor([[[1.0]], [[2.0]]])
+    matrices[:, 2, 2] = 1
+    assert_close(PerspectiveEnergy()(points, torch.stack([tracks[0], 2 * tracks[1]]), matrices), both)
+    with pytest.raises(ShapeError, match=r"intrinsics of all clips, or of each, got those of \(3,\)"):
+        PerspectiveEnergy()(points, tracks, K.expand(3, 4))
+
+
+@pytest.mark.parametrize("lens", [LENS, Intrinsics.of(LENS), K], ids=["numbers", "object", "tensor"])
+def test_it_compiles_without_a_break(lens):
+    points, _, tracks = scene(2, noise=5.0)
+    energy = PerspectiveEnergy()
+    torch._dynamo.reset()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what Dynamo says of itself
+        found = torch.compile(energy, backend="aot_eager", fullgraph=True)(points, tracks, lens)
+    torch._dynamo.reset()
+    assert_close(found, energy(points, tracks, lens))
 
 
 @pytest.mark.parametrize("translation", [True, False])

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from kcs_torch.errors import ShapeError
 
-__all__ = ["broadcast_shapes"]
+__all__ = ["broadcast_shapes", "fit_together"]
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> tuple[int, ...]:
@@ -28,3 +28,12 @@ def broadcast_shapes(*shapes: Sequence[int]) -> tuple[int, ...]:
                     raise ShapeError(f"batch dimensions: expected sizes that are equal or 1, got {told}")
                 common[-k] = shape[-k]
     return tuple(common)
+
+
+def fit_together(one: Sequence[int], other: Sequence[int]) -> bool:
+    """Whether two shapes broadcast.
+
+    >>> fit_together((4, 1), (3,)), fit_together((4,), (3,))
+    (True, False)
+    """
+    return all(a == b or 1 in (a, b) for a, b in zip(one[::-1], other[::-1], strict=False))

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.nn.energies import check_lengths
 from kcs_torch.nn.layers import SkeletonModule, wide
 from kcs_torch.nn.masks import known_points, weighs_joints
 from kcs_torch.skeleton import Skeleton
@@ -73,8 +74,7 @@ class HingeEnergy(SkeletonModule):
         self.check(points, clip=True)
         if points.shape[-1] != 3:
             raise ShapeError(f"HingeEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
-        if lengths is not None and lengths.shape[-1:] != (len(self.bones),):
-            raise ShapeError(f"HingeEnergy: expected lengths (..., {len(self.bones)}), got {tuple(lengths.shape)}")
+        check_lengths(lengths, points, self)
         share = None if weights is None else self._share(points, weights)
         full = wide(known_points(points, weights, self))
         ends = full.index_select(-2, self.joints.mT.reshape(-1)).unflatten(-2, (5, len(self.joints)))

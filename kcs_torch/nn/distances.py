@@ -10,8 +10,9 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.align import check_alignment, superpose
 from kcs_torch.functional.chain import pose_matrix, safe_norm
+from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_clip, check_weights
-from kcs_torch.nn.layers import SkeletonModule, full_precision, known, narrow, wide
+from kcs_torch.nn.layers import SkeletonModule, check_tensor, full_precision, known, narrow, seen_weights, wide
 from kcs_torch.nn.masks import bone_share, some
 from kcs_torch.skeleton import Skeleton
 
@@ -44,8 +45,8 @@ class JointDistance(nn.Module):
 
         Args:
             points: (..., T, N, 3).
-            target: (..., T, N, 3).
-            weights: (..., T, N), 0 where a joint of the target is unknown. A frame without its root does not count.
+            target: (..., T, N, 3), NaN where a joint is unknown.
+            weights: (..., T, N), 0 where a joint is unknown, too. A frame without its root does not count.
 
         Returns:
             (..., T), in the unit of the points; 0 where nothing counts.
@@ -56,16 +57,19 @@ class JointDistance(nn.Module):
         """
         check_clip(points, self)
         check_weights(weights, points, self)
+        check_tensor(target, "target", self)
         joints = points.shape[-2]
-        if target.shape[-3:] != points.shape[-3:] or points.shape[-1] != 3:
+        fits = target.shape[-3:] == points.shape[-3:] and fit_together(target.shape, points.shape)
+        if not fits or points.shape[-1] != 3:
             expected = f"points (..., T, N, 3) and target (..., {points.shape[-3]}, {joints}, 3)"
             raise ShapeError(f"JointDistance: expected {expected}, got {tuple(points.shape)} and {tuple(target.shape)}")
         if self.root is not None and not -joints <= self.root < joints:
             raise OptionError(f"root: expected a joint index below {joints}, got {self.root}")
         with full_precision(points):
+            weights = seen_weights(target, weights)
             source, goal = wide(known(points, weights)), known(wide(target), weights)
             source, goal = torch.broadcast_tensors(source, goal)
-            share = torch.ones_like(goal[..., 0]) if weights is None else weights.to(goal).expand(goal.shape[:-1])
+            share = weights.to(goal).expand(goal.shape[:-1])
             distance = safe_norm(superpose(source, goal, self.align, share, root=self.root) - goal)
             if self.root is not None and self.align in ("root", "scale"):
                 share = share * (share[..., self.root, None] > 0)
@@ -97,7 +101,7 @@ class KCSDistance(SkeletonModule):
 
         Args:
             points: (..., N, 3).
-            target: (..., N, 3).
+            target: (..., N, 3), NaN where a joint is unknown.
             weights: (..., N) of the joints: a bone weighs as much as the lesser of its two ends, a pair of bones as
                 much as the lesser of them.
 
@@ -108,17 +112,20 @@ class KCSDistance(SkeletonModule):
             ShapeError: the shapes do not fit.
         """
         self.check(points)
+        check_tensor(target, "target", self)
+        if target.shape[-1] != points.shape[-1] or not fit_together(target.shape[:-2], points.shape[:-2]):
+            message = f"KCSDistance: expected points (..., N, 3) and a target like it, got {tuple(points.shape)}"
+            raise ShapeError(f"{message} and {tuple(target.shape)}")
         self.check(target)
         check_pose_weights(weights, points, self)
         with full_precision(points):
-            share = None if weights is None else bone_share(weights, self.bones)
+            weights = seen_weights(target, weights)
+            share = bone_share(weights, self.bones)
             apart = self._matrix(points, weights, share) - self._matrix(target, weights, share)
             each = 0.5 * apart.square() if self.squared else apart.abs()
-            if share is not None:
-                each = each * torch.minimum(share[..., :, None], share[..., None, :])
-            return narrow(each.sum((-2, -1)), points)
+            return narrow((each * torch.minimum(share[..., :, None], share[..., None, :])).sum((-2, -1)), points)
 
-    def _matrix(self, points: Tensor, weights: Tensor | None, share: Tensor | None) -> Tensor:
+    def _matrix(self, points: Tensor, weights: Tensor, share: Tensor) -> Tensor:
         return pose_matrix(wide(known(points, weights)), self.bones, normalise=self.scale_free, weights=share)
 
 
@@ -126,9 +133,7 @@ def check_pose_weights(weights: Tensor | None, points: Tensor, module: nn.Module
     """Raise a ShapeError unless ``weights`` are (..., N) for poses (..., N, D), or broadcast to that."""
     if weights is None:
         return
-    fits = weights.shape[-1:] == points.shape[-2:-1] and all(
-        a == b or 1 in (a, b) for a, b in zip(weights.shape[::-1], points.shape[-2::-1], strict=False)
-    )
-    if not fits:
+    check_tensor(weights, "weights", module)
+    if weights.shape[-1:] != points.shape[-2:-1] or not fit_together(weights.shape, points.shape[:-1]):
         expected = ", ".join(map(str, points.shape[:-1]))
         raise ShapeError(f"{type(module).__name__}: expected weights ({expected}), got {tuple(weights.shape)}")

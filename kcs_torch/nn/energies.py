@@ -15,8 +15,18 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.spectral import log_det, nuclear_norm, svt
-from kcs_torch.nn.layers import SkeletonModule, full_precision, known, narrow, seen_weights, wide
+from kcs_torch.nn.layers import (
+    SkeletonModule,
+    check_points,
+    check_tensor,
+    full_precision,
+    known,
+    narrow,
+    seen_weights,
+    wide,
+)
 from kcs_torch.nn.masks import bone_share, safe_root, some
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lm import fit_bones
@@ -61,8 +71,7 @@ class BoneLengthEnergy(SkeletonModule):
         """
         self.check(points, clip=True)
         check_weights(weights, points, self)
-        if lengths is not None and lengths.shape[-1:] != (len(self.bones),):
-            raise ShapeError(f"BoneLengthEnergy: expected lengths (..., {len(self.bones)}), got {tuple(lengths.shape)}")
+        check_lengths(lengths, points, self)
         size = bone_lengths(known(wide(points), weights), self.bones)  # (..., T, B)
         share = self.rigid.to(size.dtype).expand_as(size)
         if weights is not None:
@@ -134,12 +143,14 @@ class ReprojectionEnergy(nn.Module):
     ) -> Tensor:
         """R x + t - y, (..., T, N, 2); of no meaning where the weight is 0 or a track NaN."""
         check_clip(points, self)
-        if tracks.shape[-3:] != (*points.shape[-3:-1], 2):
-            expected = f"(..., {points.shape[-3]}, {points.shape[-2]}, 2)"
+        check_tensor(tracks, "tracks", self)
+        if tracks.shape[-3:] != (*points.shape[-3:-1], 2) or not fit_together(tracks.shape[:-3], points.shape[:-3]):
+            expected = f"(..., {points.shape[-3]}, {points.shape[-2]}, 2) for points {tuple(points.shape)}"
             raise ShapeError(f"ReprojectionEnergy: expected tracks {expected}, got {tuple(tracks.shape)}")
-        if cameras is not None and cameras.shape[-3:] != (points.shape[-3], 2, 3):
-            expected = f"(..., {points.shape[-3]}, 2, 3)"
-            raise ShapeError(f"ReprojectionEnergy: expected cameras {expected}, got {tuple(cameras.shape)}")
+        if cameras is not None and (cameras.shape[-3:] != (points.shape[-3], 2, 3) or points.shape[-1] != 3):
+            expected = f"points (..., T, N, 3) and cameras (..., {points.shape[-3]}, 2, 3)"
+            got = f"{tuple(points.shape)} and {tuple(cameras.shape)}"
+            raise ShapeError(f"ReprojectionEnergy: expected {expected}, got {got}")
         check_weights(weights, points, self)
         weights = seen_weights(tracks, weights)
         points, tracks = known(points, weights), known(tracks, weights)
@@ -279,15 +290,30 @@ class SymmetryEnergy(SkeletonModule):
 
 def check_clip(points: Tensor, module: nn.Module) -> None:
     """Raise a ShapeError unless ``points`` are (..., T, N, D)."""
+    check_points(points, module)
     if points.ndim < 3:
         raise ShapeError(f"{type(module).__name__}: expected points (..., T, N, D), got {tuple(points.shape)}")
 
 
 def check_weights(weights: Tensor | None, points: Tensor, module: nn.Module) -> None:
     """Raise a ShapeError unless ``weights`` are (..., T, N) for points (..., T, N, D)."""
-    if weights is not None and weights.shape[-2:] != points.shape[-3:-1]:
-        expected = f"(..., {points.shape[-3]}, {points.shape[-2]})"
+    if weights is None:
+        return
+    check_tensor(weights, "weights", module)
+    if weights.shape[-2:] != points.shape[-3:-1] or not fit_together(weights.shape[:-2], points.shape[:-3]):
+        expected = f"(..., {points.shape[-3]}, {points.shape[-2]}) for points {tuple(points.shape)}"
         raise ShapeError(f"{type(module).__name__}: expected weights {expected}, got {tuple(weights.shape)}")
+
+
+def check_lengths(lengths: Tensor | None, points: Tensor, module: SkeletonModule) -> None:
+    """Raise a ShapeError unless ``lengths`` are (..., B) for points (..., T, N, D) of the module's skeleton."""
+    if lengths is None:
+        return
+    check_tensor(lengths, "lengths", module)
+    count = module.skeleton.num_bones
+    if lengths.shape[-1:] != (count,) or not fit_together(lengths.shape[:-1], points.shape[:-3]):
+        expected = f"(..., {count}), the same in all frames, for points {tuple(points.shape)}"
+        raise ShapeError(f"{type(module).__name__}: expected lengths {expected}, got {tuple(lengths.shape)}")
 
 
 def huber_square(square: Tensor, huber: float | None) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +15,22 @@ from kcs_torch.functional.spectral import svt
 from kcs_torch.skeleton import Skeleton, get_skeleton
 
 __all__ = ["SVT", "BoneLengths", "BoneVectors", "KCSMatrix"]
+
+
+def check_tensor(value: Any, what: str, module: nn.Module) -> None:
+    """Raise a ShapeError unless ``value`` is a tensor."""
+    if not isinstance(value, Tensor):
+        kind = type(value).__name__
+        raise ShapeError(
+            f"{type(module).__name__}: expected a tensor of {what}, got {kind}: use torch.as_tensor({what})"
+        )
+
+
+def check_points(points: Any, module: nn.Module) -> None:
+    """Raise a ShapeError unless ``points`` are a tensor of floating-point numbers."""
+    check_tensor(points, "points", module)
+    if not points.is_floating_point():
+        raise ShapeError(f"{type(module).__name__}: expected points in floating point, got {points.dtype}")
 
 
 def check_joints(module: nn.Module, skeleton: Skeleton, points: Tensor, form: str) -> None:
@@ -51,8 +68,7 @@ class SkeletonModule(nn.Module):
 
     def check(self, points: Tensor, *, clip: bool = False) -> None:
         """Raise a ShapeError unless ``points`` are (..., N, D), or a clip (..., T, N, D), with this skeleton's N."""
-        if not isinstance(points, Tensor):
-            raise ShapeError(f"{type(self).__name__}: expected a tensor of points, got {type(points).__name__}")
+        check_points(points, self)
         check_joints(self, self.skeleton, points, "points (..., T, {}, 3)" if clip else "points (..., {}, 3)")
 
     def extra_repr(self) -> str:
@@ -150,7 +166,8 @@ def narrow(value: Tensor, like: Tensor) -> Tensor:
     if value.dtype == like.dtype:
         return value
     top = torch.finfo(like.dtype).max
-    return (value + (value.clamp(-top, top) - value).detach()).to(like.dtype)
+    # In this order: beside a value that is far larger, its largest number would be lost to rounding.
+    return (value - value.detach() + value.detach().clamp(-top, top)).to(like.dtype)
 
 
 def known(values: Tensor, weights: Tensor | None) -> Tensor:

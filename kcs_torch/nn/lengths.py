@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.nn.energies import check_lengths, check_weights
 from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
 from kcs_torch.nn.masks import bone_share, some
 from kcs_torch.skeleton import Skeleton
@@ -62,11 +63,15 @@ class ForeshorteningEnergy(SkeletonModule):
             ShapeError: the shapes do not fit.
         """
         self.check(points, clip=True)
+        if points.shape[-1] != 3:
+            raise ShapeError(f"ForeshorteningEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
+        check_weights(weights, points, self)
+        check_lengths(lengths, points, self)
         if weights is not None:
-            if weights.shape[-2:] != points.shape[-3:-1]:
-                expected = f"(..., {points.shape[-3]}, {points.shape[-2]})"
-                raise ShapeError(f"ForeshorteningEnergy: expected weights {expected}, got {tuple(weights.shape)}")
             bone_weights = bone_share(weights, self.bones)
+        elif bone_weights is not None and bone_weights.shape[-1] not in (1, len(self.bones)):
+            expected = f"(..., {points.shape[-3]}, {len(self.bones)})"
+            raise ShapeError(f"ForeshorteningEnergy: expected bone_weights {expected}, got {tuple(bone_weights.shape)}")
         vectors = known(bone_vectors(wide(points), self.bones), bone_weights)
         if lengths is None:
             lengths = usual_size(vectors.square().sum(-1), bone_weights)

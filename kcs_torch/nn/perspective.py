@@ -9,8 +9,9 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import perspective, pinhole_translation
+from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_clip, check_weights, huber_square
-from kcs_torch.nn.layers import full_precision, known, narrow, seen_weights, wide
+from kcs_torch.nn.layers import check_tensor, full_precision, known, narrow, seen_weights, wide
 from kcs_torch.nn.masks import some
 from kcs_torch.types.intrinsics import Intrinsics
 
@@ -54,7 +55,7 @@ class PerspectiveEnergy(nn.Module):
             points: (..., T, N, 3) in the camera's axes.
             tracks: (..., T, N, 2), NaN where unseen.
             intrinsics: of all clips: (fx, fy, cx, cy), K (3, 3) or :class:`kcs_torch.types.Intrinsics`; of each clip: a
-                tensor (..., 4). In the unit of the tracks.
+                tensor (..., 4) or (..., 3, 3). In the unit of the tracks.
             weights: (..., T, N) confidences; 0 where unseen.
 
         Returns:
@@ -66,12 +67,17 @@ class PerspectiveEnergy(nn.Module):
         """
         check_clip(points, self)
         check_weights(weights, points, self)
+        check_tensor(tracks, "tracks", self)
         if tracks.shape[-3:] != (*points.shape[-3:-1], 2) or points.shape[-1] != 3:
             expected = f"points (..., T, N, 3) and tracks (..., {points.shape[-3]}, {points.shape[-2]}, 2)"
             got = f"{tuple(points.shape)} and {tuple(tracks.shape)}"
             raise ShapeError(f"PerspectiveEnergy: expected {expected}, got {got}")
         with full_precision(points):
-            lens = lens_tensor(intrinsics, wide(points))[..., None, None, :]  # (..., 1, 1, 4)
+            lens = lens_tensor(intrinsics, wide(points))
+            if not fit_together(lens.shape[:-1], points.shape[:-3]):
+                got = f"got those of {tuple(lens.shape[:-1])} for points {tuple(points.shape)}"
+                raise ShapeError(f"PerspectiveEnergy: expected intrinsics of all clips, or of each, {got}")
+            lens = lens[..., None, None, :]  # (..., 1, 1, 4)
             weights = seen_weights(tracks, weights)
             at, seen = wide(known(points, weights)), known(wide(tracks), weights)
             share = weights.to(at.dtype).expand(at.shape[:-1])
@@ -89,6 +95,9 @@ def lens_tensor(intrinsics: Any, like: Tensor) -> Tensor:
     """Intrinsics as a tensor (..., 4) of fx, fy, cx, cy."""
     if isinstance(intrinsics, Tensor) and intrinsics.shape[-1:] == (4,):
         return intrinsics.to(like)
+    if isinstance(intrinsics, Tensor) and intrinsics.ndim > 2 and intrinsics.shape[-2:] == (3, 3):
+        each = [intrinsics[..., row, column] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))]
+        return torch.stack(each, -1).to(like)
     return Intrinsics.of(intrinsics).tensor(like)
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.nn.energies import check_lengths
 from kcs_torch.nn.layers import SkeletonModule, narrow, wide
 from kcs_torch.nn.lengths import usual_size
 from kcs_torch.nn.masks import bone_share, known_points, safe_root, some, weighs_joints
@@ -112,6 +113,7 @@ class PostureEnergy(SkeletonModule):
         self.check(points, clip=True)
         if points.shape[-1] != 3:
             raise ShapeError(f"PostureEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
+        check_lengths(lengths, points, self)
         joints = weights is not None and weighs_joints(weights, points, self)
         points = wide(known_points(points, weights, self))
         vectors = bone_vectors(points, self.bones)

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.scatter import scatter_log_det
@@ -67,6 +67,13 @@ class ProcrusteanEnergy(SkeletonModule):
         """
         self.check(points, clip=True)
         check_weights(weights, points, self)
+        turns = (points.shape[-3], 3, 3)
+        if points.shape[-1] != 3 or (rotations is not None and rotations.shape[-3:] != turns):
+            expected = (
+                f"points (..., T, {points.shape[-2]}, 3) and rotations (..., {', '.join(map(str, turns))}) or None"
+            )
+            got = f"{tuple(points.shape)} and {None if rotations is None else tuple(rotations.shape)}"
+            raise ShapeError(f"ProcrusteanEnergy: expected {expected}, got {got}")
         with full_precision(points):
             wide = known(points, weights).to(torch.promote_types(points.dtype, torch.float32))
             vectors = bone_vectors(wide, self.bones)

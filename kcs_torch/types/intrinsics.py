@@ -47,6 +47,8 @@ class Intrinsics:
         """
         if isinstance(value, Intrinsics):
             return value
+        if isinstance(value, (tuple, list)) and len(value) == 4 and all(isinstance(x, (int, float)) for x in value):
+            return cls(*map(float, value))  # without tensors, so that torch.compile follows
         what = "intrinsics: expected (fx, fy, cx, cy) or a matrix K (3, 3)"
         try:
             matrix = torch.as_tensor(value, dtype=torch.float64).cpu()

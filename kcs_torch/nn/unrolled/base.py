@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.nn.energies import check_weights
-from kcs_torch.nn.layers import check_joints, inverse_softplus, seen_weights
+from kcs_torch.nn.layers import check_joints, check_tensor, inverse_softplus, seen_weights
 from kcs_torch.nn.steps import corner_of
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.implicit import Implicit, fixed_point
@@ -203,6 +203,7 @@ class Unrolled(nn.Module):
             ShapeError: the arguments do not fit; ``others`` are (tensor or None, expected trailing shape).
         """
         name = type(self).__name__
+        check_tensor(tracks, "tracks", self)
         if tracks.ndim < 3 or tracks.shape[-1] != 2 or (
             cameras is not None and cameras.shape[-3:] != (tracks.shape[-3], 2, 3)
         ):  # fmt: skip
