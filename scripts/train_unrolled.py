@@ -97,6 +97,11 @@ def solver(layer: Unrolled) -> Solve:
     return lambda tracks, cameras, weights: layer(tracks, cameras, weights=weights)
 
 
+def learned(layer: Unrolled) -> list[str]:
+    """Names of what a layer learns."""
+    return [name.removeprefix("raw_") for name, value in layer.named_parameters() if value.requires_grad]
+
+
 def train(layer: Unrolled, film: Film, options: argparse.Namespace) -> float:
     """Adam on the mean distance from the truth; return the CPU seconds it took."""
     generator, begin = torch.Generator().manual_seed(options.seed), time.process_time()
@@ -142,6 +147,7 @@ def main() -> None:
     parser.add_argument("--test", type=int, default=64, help="windows tested")
     parser.add_argument("--lr", type=float, default=0.05)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--fix", nargs="*", default=(), help="what is not learned, such as: corner length")
     parser.add_argument("--save", type=Path, help="write the trained parameters to this file")
     parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
@@ -151,6 +157,10 @@ def main() -> None:
     generator = torch.Generator().manual_seed(options.seed + 1)
     held_out = [unseen.batch(options.batch, generator) for _ in range(max(1, options.test // options.batch))]
     layer = build(options.solver, skeleton, options.steps, trained=True)
+    for name in options.fix:
+        if not hasattr(layer, f"raw_{name}"):
+            raise SystemExit(f"--fix {name}: {options.solver} learns {', '.join(learned(layer))}")
+        getattr(layer, f"raw_{name}").requires_grad_(False)
     rows: list[tuple[str, Unrolled]] = [
         ("untrained", build(options.solver, skeleton, options.steps)),
         ("untrained", build(options.solver, skeleton, options.many)),
@@ -162,8 +172,9 @@ def main() -> None:
         rows.append(("untrained, last threshold by grid", best))
     seconds = train(layer, film, options)
     rows.append(("trained", layer))
-    count = sum(p.numel() for p in layer.parameters())
-    print(f"\n{options.solver}: trained in {seconds:.0f} s of CPU, {count} parameters; figures are of")
+    count = sum(p.numel() for p in layer.parameters() if p.requires_grad)
+    told = f"{count} parameters ({', '.join(learned(layer))})"
+    print(f"\n{options.solver}: trained in {seconds:.0f} s of CPU, {told}; figures are of")
     print(
         f"{len(held_out) * options.batch} windows of {options.frames} frames of other people, the same for all rows\n"
     )

@@ -36,6 +36,20 @@ def test_a_small_run_prints_its_table(scripts, solver, monkeypatch, capsys, tmp_
     assert state and all(bool(x.isfinite().all()) for x in state.values())
 
 
+def test_what_is_fixed_is_not_learned(scripts, monkeypatch, capsys, tmp_path):
+    arguments = "--data synthetic --rounds 1 --batch 2 --test 2 --frames 8 --steps 2 --many 2 --fix"
+    arguments = arguments.split()
+    monkeypatch.setattr(sys, "argv", ["train_unrolled.py", *arguments, "corner", "--save", str(tmp_path / "solver.pt")])
+    scripts[0].main()
+    assert "(threshold, step, stiffness, length)" in capsys.readouterr().out
+    state, fresh = torch.load(tmp_path / "solver.pt", weights_only=True), kt.nn.UnrolledSfAM("h36m17", 2).state_dict()
+    assert torch.equal(state["raw_corner"], fresh["raw_corner"])
+    assert not torch.equal(state["raw_step"], fresh["raw_step"])
+    monkeypatch.setattr(sys, "argv", ["train_unrolled.py", *arguments, "eps"])
+    with pytest.raises(SystemExit, match=r"--fix eps: sfam learns .*corner"):
+        scripts[0].main()
+
+
 def test_training_lowers_the_error_of_others(scripts):
     script = scripts[0]
     options = argparse.Namespace(
