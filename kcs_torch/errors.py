@@ -7,6 +7,7 @@ Every error that bad input causes is a :class:`KcsError`, which is a ``ValueErro
 from __future__ import annotations
 
 import difflib
+import sys
 from collections.abc import Iterable
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "SkeletonError",
     "counted",
     "unknown",
+    "users_level",
 ]
 
 
@@ -81,3 +83,11 @@ def unknown(what: str, name: object, choices: Iterable[str], error: type[KcsErro
     hint = f": did you mean {' or '.join(repr(c) for c in close)}?" if close else ":"
     listing = f"(choices: {', '.join(choices)})" if close else f"choices are {', '.join(choices)}"
     return error(f"unknown {what} {shown}{hint} {listing}")
+
+
+def users_level() -> int:
+    """The stack level at which a warning names the user's own line, however deep in this package it is given."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "kcs_torch":
+        level, frame = level + 1, frame.f_back
+    return level

@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from kcs_torch.errors import KcsWarning, OptionError, unknown
+from kcs_torch.errors import KcsWarning, OptionError, unknown, users_level
 from kcs_torch.methods import METHODS
-from kcs_torch.methods.base import Method, users_level
+from kcs_torch.methods.base import Method
 from kcs_torch.methods.found import find_skeleton
 from kcs_torch.methods.perspective import reconstruct_perspective
 from kcs_torch.skeleton import Skeleton

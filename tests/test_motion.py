@@ -285,8 +285,9 @@ def test_an_unknown_size_is_told(tmp_path):
 
 def test_an_unknown_rate_is_told(tmp_path):
     for suffix in (".trc", ".c3d", ".bvh"):
-        with pytest.warns(kt.KcsWarning, match="frame rate is not known: 30 is written"):
-            save(replace(walk(), fps=None), tmp_path / f"m{suffix}")
+        with pytest.warns(kt.KcsWarning, match="frame rate is not known: 30 is written") as told:
+            replace(walk(), fps=None).save(tmp_path / f"m{suffix}")
+        assert {w.filename for w in told} == {__file__}  # the user's own line
         assert load_motion(tmp_path / f"m{suffix}").fps == pytest.approx(30)
 
 

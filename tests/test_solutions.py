@@ -14,6 +14,7 @@ from kcs_torch.cli import app
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.io import load_reconstruction
 from kcs_torch.metrics import difference
+from kcs_torch.metrics.solutions import Difference
 
 
 def several():
@@ -63,6 +64,11 @@ def test_a_flipped_forearm_is_named_with_its_share_of_frames():
     # 300 in 10 frames and 151 in one, of which the pose's middle takes a 17th
     assert found.rms == pytest.approx(((10 * 300**2 + 151**2) / 20 * (16 / 17) / 17) ** 0.5, rel=1e-3)
     assert "left_elbow-left_wrist in 50 % of the frames" in str(found)
+
+
+def test_more_than_four_bones_are_counted():
+    some = Difference(1.0, False, {f"a-{k}": 0.5 for k in range(6)})
+    assert str(some).endswith("a-2 in 50 %, a-3 in 50 % of the frames, and 2 more bones")
 
 
 def test_where_depth_begins_is_no_difference():

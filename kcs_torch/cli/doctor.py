@@ -17,6 +17,7 @@ import typer
 
 from kcs_torch.cli.options import AsJson, use_one_thread
 from kcs_torch.cli.report import one_line, print_json
+from kcs_torch.errors import counted
 
 __all__ = ["PURPOSES", "doctor"]
 
@@ -198,7 +199,7 @@ def spoken(facts: dict[str, Any]) -> str:
         runs = ", ".join(device["cuda"]) or ("Apple GPU (mps)" if device["mps"] else "CPU only")
         limit = device["omp_num_threads"]
         lines.append(
-            f"  device: {runs}; {device['cores']} cores, torch uses {device['threads']} threads"
+            f"  device: {runs}; {device['cores']} cores, torch uses {counted(device['threads'], 'thread')}"
             + ("" if limit else " (OMP_NUM_THREADS=1 is faster on a busy machine)")
         )
     lines.append("  extras:")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from kcs_torch.errors import KcsWarning, OptionError, OutputError, unknown
+from kcs_torch.errors import KcsWarning, OptionError, OutputError, unknown, users_level
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.load import WRITERS
 from kcs_torch.io.registry import Saving, Writer
@@ -98,7 +98,7 @@ def save(
         notes.extend([*saving.warnings, *saving.notes])
     else:
         for warning in saving.warnings:
-            warnings.warn(f"{path}: {warning}", KcsWarning, stacklevel=2)
+            warnings.warn(f"{path}: {warning}", KcsWarning, stacklevel=users_level())
     return Path(path)
 
 

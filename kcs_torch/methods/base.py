@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import math
 import numbers
-import sys
 import time
 import types
 import typing
@@ -19,7 +18,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ConvergenceWarning, KcsWarning, OptionError, ShapeError, unknown
+from kcs_torch.errors import ConvergenceWarning, KcsWarning, OptionError, ShapeError, unknown, users_level
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.finish import LOOSE, WEAK_TURN, WHY_LOOSE, Estimate, finish, rms
 from kcs_torch.types import Reconstruction, Tracks, as_floats
@@ -174,14 +173,6 @@ def _home(tracks: Sequence[Tracks]) -> contextlib.AbstractContextManager[object]
     if len(devices) != 1 or devices == {torch.get_default_device()}:
         return contextlib.nullcontext()
     return devices.pop()
-
-
-def users_level() -> int:
-    """The stack level at which a warning names the user's own line, however deep in this package it is given."""
-    level, frame = 1, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "kcs_torch":
-        level, frame = level + 1, frame.f_back
-    return level
 
 
 def check_cameras(cameras: Tensor, frames: int) -> Tensor:

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import KcsWarning
+from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.base import Method, check_cameras, users_level
+from kcs_torch.methods.base import Method, check_cameras
 from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
 from kcs_torch.methods.size import slow_waves, weak_perspective
 from kcs_torch.nn.posture import PostureEnergy, trunk_joints

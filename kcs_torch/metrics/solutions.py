@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from kcs_torch.errors import ShapeError
+from kcs_torch.errors import ShapeError, counted
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.types import Reconstruction
 
@@ -42,8 +42,8 @@ class Difference:
         if not self.flipped:
             return "depths differ, no bone tips the other way"
         some = [f"{bone} in {100 * share:.0f} %" for bone, share in list(self.flipped.items())[:4]]
-        more = f" and {len(self.flipped) - 4} more" if len(self.flipped) > 4 else ""
-        return f"other sign of depth: {', '.join(some)}{more} of the frames"
+        more = f", and {counted(len(self.flipped) - 4, 'more bone')}" if len(self.flipped) > 4 else ""
+        return f"other sign of depth: {', '.join(some)} of the frames{more}"
 
 
 def difference(best: Reconstruction, other: Reconstruction) -> Difference:
