@@ -5,8 +5,8 @@ import sys
 import pytest
 import torch
 
-from kcs_torch.data.synthetic import walking_person
-from kcs_torch.functional import complete_rotation, viewpoint_turn
+from kcs_torch.data.synthetic import random_motion, walking_person
+from kcs_torch.functional import bone_lengths, complete_rotation, viewpoint_turn
 from kcs_torch.methods.pkc.moving_view import Descent, descend_all, moving_view
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.procrustean import Stage, align_rotations
@@ -106,3 +106,22 @@ def test_descents_of_several_clips_together_as_alone(monkeypatch):
             assert found.points.shape == task.points.shape
             torch.testing.assert_close(found.points, alone.points, rtol=0, atol=1e-6)
             torch.testing.assert_close(found.objective, alone.objective, rtol=1e-6, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    """Points (T, N, 3) of an arm of five bones that turn anyhow, before a camera that turns by 120 degrees."""
+    skeleton = Skeleton.from_edges([(i, i + 1) for i in range(5)], 6)
+    clip = random_motion(skeleton, num_frames=120, turn=120, generator=torch.Generator().manual_seed(0))
+    points = clip.points - clip.points.mean(1, keepdim=True)
+    return points / points[..., :2].square().sum(-1).mean().sqrt(), skeleton
+
+
+def test_few_bones_of_constant_length_are_put_together_from_paths(robot):
+    points, skeleton = robot
+    exact, loose = (solve(points, skeleton, exact=exact) for exact in (True, False))
+    error = depth_error(exact.pose.points[0], points)
+    assert error < 0.05 < 0.2 < depth_error(loose.pose.points[0], points)
+    lengths = bone_lengths(exact.pose.points[0], skeleton.bone_index())
+    assert float((lengths.std(0) / lengths.mean(0)).amax()) < 0.01
+    assert exact.lead > 1 and loose.lead == 0

@@ -67,6 +67,10 @@ SURE, DOUBT = 0.8, 0.6
 guess. Before cameras that turn by 180 degrees it is above .95 for people, dogs and hands, by 60 about .8, by none
 .3 and less; robots, whose joints turn about fixed axes, are below .3 everywhere."""
 
+LEAD = 6.0
+"""Lead of a solution whose bones are held to their lengths (see :class:`MovingView`) that is as sure as full agreement:
+of 47 views of robot arms, real and random, 14 had one, and 12 of these were right to within a tenth of their size."""
+
 LEAST_FRAMES = 12
 """Frames from which on the viewpoint may have turned."""
 
@@ -142,7 +146,7 @@ class PKC(Method):
         body = Body(skeleton, image, tracks.fps or 30.0, noise) if has_trunk else None
         enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
         if body is None:
-            moving, first = yield from self._moving(tracks, image, cameras, enough)
+            moving, first = yield from self._moving(tracks, image, noise, cameras, enough)
             if moving is None:
                 why = "so few frames or joints are" if not enough else "with known cameras, bones that are no tree are"
                 return replace(first, notes=(*notes, f"{why} solved by sfam", *first.notes))
@@ -156,7 +160,7 @@ class PKC(Method):
             turn = float(viewpoint_turn(body.frames(found.depth[0])[:, :2]))
             moves = moves and (cameras is not None or turn >= TURNING)
         if moves:
-            moving = (yield from self._moving(tracks, image, cameras, enough))[0]
+            moving = (yield from self._moving(tracks, image, noise, cameras, enough))[0]
             found = yield from self._ranked(body, moving, cameras, found)
         assert found is not None
         return self._from_hypotheses(found, body, cameras, notes, detected(tracks.weights))
@@ -198,7 +202,7 @@ class PKC(Method):
         return points - points.mean(-2, keepdim=True), noise, tuple(notes)
 
     def _moving(
-        self, tracks: Tracks, image: Tensor, cameras: Tensor | None, enough: bool
+        self, tracks: Tracks, image: Tensor, noise: Tensor, cameras: Tensor | None, enough: bool
     ) -> Search[Any, Any, tuple[MovingView | None, Estimate]]:
         """Solutions of the moving viewpoint, and SfAM's first guess; the guess alone where there is too little."""
         seen = replace(tracks, points=image, weights=torch.ones_like(tracks.weights))
@@ -208,7 +212,8 @@ class PKC(Method):
         rotations = complete_rotation(first.cameras)
         if cameras is None:
             lifts = 0 if self.viewpoint == "auto" and len(trunk_joints(tracks.skeleton)) >= 3 else self.lifts
-            search = turning(image, tracks.skeleton, first.points, rotations, lifts=lifts, seed=self.seed)
+            exact = float(noise.median()) == 0
+            search = turning(image, tracks.skeleton, first.points, rotations, lifts=lifts, exact=exact, seed=self.seed)
             return (yield from search), first
         bones = tracks.skeleton.bone_index(device=image.device)
         if not tracks.skeleton.is_tree:
@@ -224,7 +229,8 @@ class PKC(Method):
         """The estimate and its mirror image, which nothing but known cameras tells apart.
 
         Where the viewpoint hardly turns the objective has many minima. SfAM, which looks for depth in another way, then
-        finds other depths: how far both agree is how far depth is to be believed.
+        finds other depths: how far both agree is how far depth is to be believed. Of few bones that are held to their
+        lengths, all solutions have been compared: one that leads by far needs no other witness.
         """
         points = moving.pose.points[0]
         path = moving.cameras()[0] if cameras is None else complete_rotation(cameras)
@@ -235,8 +241,9 @@ class PKC(Method):
         if cameras is None:
             agree = _agreement(points[..., 2], first.points[..., 2])
             size = points[..., 2].square().mean().sqrt()
-            spread = (spread.square() + (size * max(0.0, 1 - agree / SURE)).square()).sqrt()
-            if agree < DOUBT:
+            sure = max(agree / SURE, moving.lead / LEAD)
+            spread = (spread.square() + (size * max(0.0, 1 - sure)).square()).sqrt()
+            if sure < DOUBT / SURE:
                 doubt = (
                     "depth is little more than a guess: two methods find depths that hardly agree "
                     f"(correlation {agree:.2f}). The viewpoint should turn about the body by 60 degrees or more, or "

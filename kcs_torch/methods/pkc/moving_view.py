@@ -13,8 +13,10 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.lockstep import Search, run
+from kcs_torch.methods.pkc.assembly import Assembly, followed
 from kcs_torch.nn.unrolled import UnrolledFPC
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.solvers.bone_paths import bone_paths, path_energy
 from kcs_torch.solvers.camera_path import CameraPath, choose_path, settle_path
 from kcs_torch.solvers.lifts import random_lifts, turning_cameras
 from kcs_torch.solvers.procrustean import (
@@ -46,8 +48,18 @@ TIGHT = 10.0
 LOOSE, LOOSER = 0.3, 0.1
 """Weight of each length where the links are no tree (markers, say), in the coarse stages and in the fine ones."""
 
+SAME = 0.05
+"""Root mean square distance of solutions that are one, of tracks of root mean square 1."""
+
+OTHER = 0.1
+"""Root mean square difference of depths from which on solutions are different bodies."""
+
 TOGETHER = 1200
 """Frames of starts that are descended from as one batch; more would only fall out of the processor's cache."""
+
+WORTH = 20.0
+"""Weight of how likely the path of each bone is by itself: a bone keeps its direction for about so many frames, which
+the other terms count one by one."""
 
 ROBOT = 10
 """Up to as many joints, twenty times the random starts are tried: they are cheap, and little else decides."""
@@ -62,12 +74,15 @@ class MovingView:
         bones: (B, 2) tree that the poses were aligned in.
         rigid: (P, 2) pairs that keep their distance.
         stiffness: weight of each length.
+        lead: by how much the next solution is dearer, for each frame compared, where paths of bones were combined; 0
+            where they were not, or no solution was left to compare.
     """
 
     pose: Pose
     bones: Tensor
     rigid: Tensor
     stiffness: float
+    lead: float = 0.0
 
     def cameras(self, index: int = 0, kind: CameraPath = "auto") -> tuple[Tensor, CameraPath]:
         """Rotations (T, 3, 3), world to camera, of one solution, and the kind of path they follow.
@@ -154,6 +169,7 @@ def moving_view(
     lifts: int = 6,
     coarse_frames: int = 100,
     alternatives: int = 1,
+    exact: bool = True,
     seed: int = 0,
 ) -> MovingView:
     """Lift one clip by low-rank motion of aligned bones of constant length.
@@ -170,6 +186,8 @@ def moving_view(
         lifts: number of further starts from bone lengths with random signs.
         coarse_frames: starts are compared on about as many frames, evenly spread.
         alternatives: how many of the best (at most the last of KEPT) are refined on all frames.
+        exact: the image shows lengths without noise: where all bones of a tree are rigid, those that vary count against
+            a solution, and starts are put together from paths that single bones can take.
         seed: of the random starts.
 
     Returns:
@@ -177,7 +195,7 @@ def moving_view(
     """
     search = searching(
         image, skeleton, start, rotations, weights=weights, noise=noise, turns=turns, lifts=lifts,
-        coarse_frames=coarse_frames, alternatives=alternatives, seed=seed,
+        coarse_frames=coarse_frames, alternatives=alternatives, exact=exact, seed=seed,
     )  # fmt: skip
     return run(search, descend_all)
 
@@ -194,12 +212,14 @@ def searching(
     lifts: int = 6,
     coarse_frames: int = 100,
     alternatives: int = 1,
+    exact: bool = True,
     seed: int = 0,
 ) -> Search[Descent, Pose, MovingView]:
     """:func:`moving_view` as a search, which may run beside others; arguments as there."""
     frames, joints, _ = image.shape
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
+    held = is_tree and exact and len(rigid) == joints - 1
     first = torch.cat([image, start[..., 2:] - start[..., 2:].mean(1, keepdim=True)], -1)[None]
     spread = lambda points: rigid_tree(distance_spread(points)[1])  # noqa: E731
     bones = skeleton.bone_index(device=image.device) if is_tree else spread(first[0])
@@ -211,6 +231,14 @@ def searching(
     ) -> Search[Descent, Pose, Pose]:
         (found,) = yield [Descent(tracks, pose.points, pose.rotations, bones, weights, rigid, pull, noise, stages)]
         return found
+
+    def value(pose: Pose) -> Tensor:
+        """How solutions are ranked, (H,)."""
+        total = _value(pose, bones, rigid, TIGHT if held else tight[0], noise)
+        if held:
+            own = bone_vectors(pose.points, rigid).transpose(-3, -2)  # (H, P, T, 3)
+            total = total + WORTH * path_energy(own[..., 2], own[..., :2]).sum(-1)
+        return total
 
     pick = torch.arange(0, frames, max(1, -(-frames // coarse_frames)), device=image.device)
     few, few_weights = image[pick], None if weights is None else weights[pick]
@@ -225,11 +253,24 @@ def searching(
         best = pose.objective.argsort()[: kept if joints > ROBOT else 3 * kept]
         pose, order = pose[best], order[best.cpu()]
     pose = yield from descend(few, pose, tight[1], fine, few_weights)
-    best = _rank(pose, bones, rigid, tight[0], noise)[:alternatives]
+    lead, paths = 0.0, bone_paths(image, bones) if held and lifts > 0 else None
+    if paths is not None:
+        mine, pose = pose.points[(order == 0).to(image.device)], pose[value(pose).argsort()[: KEPT[-1]]]
+        assembly = Assembly(
+            few, bones, paths.at(pick), (coarse[-1], *fine), value,
+            lambda pose, stages: descend(few, pose, TIGHT, stages, few_weights), seed,
+        )  # fmt: skip
+        pose = yield from (assembly.searched(pose) if joints <= ROBOT else assembly.near(pose))
+        near = (pose.points[:, None] - mine).square().sum(-1).mean((-2, -1)) < SAME**2
+        order = 1 - near.any(-1).long().cpu()  # some are the first guess's still
+        lead = _lead(pose, value(pose)) if joints <= ROBOT else 0.0
+    best = value(pose).argsort()[:alternatives]
     pose, order = pose[best], order[best.cpu()]
 
     if len(pick) < frames:
         points, turned = _spread_out(pose, image, pick)
+        if paths is not None:
+            points = followed(paths, points, bones, pick)
         own = (order == 0).to(image.device)  # the first guess has all frames of its own
         points = torch.where(own[:, None, None, None], first, points)
         turned = torch.where(own[:, None, None, None], align_rotations(first, rotations[None], bones), turned)
@@ -238,11 +279,11 @@ def searching(
         del first, start, points, turned  # of long clips they are large
         pose = yield from descend(image, pose, tight[0], stages, weights)
     if len(pick) == frames and is_tree:  # the finest stages have seen all frames
-        return MovingView(pose, bones, rigid, tight[0])
+        return MovingView(pose, bones, rigid, tight[0], lead)
     if not is_tree:
         bones = spread(pose.points[0])
     pose = yield from descend(image, pose, tight[1], fine, weights)
-    return MovingView(pose[_rank(pose, bones, rigid, tight[0], noise)], bones, rigid, tight[0])
+    return MovingView(pose[value(pose).argsort()], bones, rigid, tight[0], lead)
 
 
 def _soften(stage: Stage, noise: float) -> Stage:
@@ -250,12 +291,20 @@ def _soften(stage: Stage, noise: float) -> Stage:
     return replace(stage, eps=max(stage.eps, 0.1 * noise**2), slack=max(stage.slack, 0.3 * noise))
 
 
-def _rank(pose: Pose, bones: Tensor, rigid: Tensor, stiffness: float, noise: float) -> Tensor:
-    """Indices of the hypotheses, best first."""
+def _value(pose: Pose, bones: Tensor, rigid: Tensor, stiffness: float, noise: float) -> Tensor:
+    """Energy (H,) at the scales at which hypotheses are compared."""
     stage = _soften(RANKING, noise)
     pull = pose.points.new_full((len(rigid),), stiffness)
     total = motion_energy(pose.points, pose.rotations, bones, stage)
-    return (total + length_energy(pose.points, rigid, pull, stage.slack)).argsort()
+    return total + length_energy(pose.points, rigid, pull, stage.slack)
+
+
+def _lead(pose: Pose, value: Tensor) -> float:
+    """How much dearer than the best, for each frame, the next solution is that is not the same or its mirror image."""
+    depth, best = pose.points[..., 2], value.argmin()
+    off = torch.minimum((depth - depth[best]).square().mean((1, 2)), (depth + depth[best]).square().mean((1, 2)))
+    dearer = (value - value[best])[off.sqrt() > OTHER]
+    return float(dearer.amin()) / depth.shape[1] if len(dearer) else 0.0
 
 
 def _starts(
