@@ -587,6 +587,24 @@ def test_shapes_that_do_not_fit():
         for wrong in (tracks[0], tracks[:4], normal(6, 7, 3)):
             with pytest.raises(ShapeError, match=r"tracks \(\.\.\., T, N, 2\) and cameras"):
                 module(wrong, cameras)
+        with pytest.raises(ShapeError, match=r"of rotations the first two rows, cameras\[\.\.\., :2, :\]"):
+            module(tracks, turning(6))
+        with pytest.raises(ShapeError, match="at least 1 frame"):
+            module(tracks[:0], cameras[:0])
+        with pytest.raises(ShapeError, match="tracks in floating point, got torch.int64"):
+            module(tracks.long(), cameras)
+        for wrong in (
+            (tracks.numpy(), cameras, None),
+            (tracks, cameras.numpy(), None),
+            (tracks, cameras, tracks.numpy()),
+        ):
+            with pytest.raises(ShapeError, match=r"a tensor of (tracks|cameras|start), got ndarray"):
+                module(wrong[0], wrong[1], start=wrong[2])
+        many = tracks.expand(3, -1, -1, -1)
+        with pytest.raises(ShapeError, match=r"cameras like that of tracks \(3, 6, 7, 2\), got \(2, 6, 2, 3\)"):
+            module(many, cameras.expand(2, -1, -1, -1))
+        with pytest.raises(ShapeError, match="start like that of tracks"):
+            module(many, cameras, start=normal(2, 6, 7, 3))
         with pytest.raises(ShapeError, match=r"weights \(\.\.\., 6, 7\)"):
             module(tracks, cameras, weights=weights[:, :5])
         with pytest.raises(ShapeError, match=r"start \(\.\.\., 6, 7, 3\)"):

@@ -26,11 +26,11 @@ def check_tensor(value: Any, what: str, module: nn.Module) -> None:
         )
 
 
-def check_points(points: Any, module: nn.Module) -> None:
+def check_points(points: Any, module: nn.Module, what: str = "points") -> None:
     """Raise a ShapeError unless ``points`` are a tensor of floating-point numbers."""
-    check_tensor(points, "points", module)
+    check_tensor(points, what, module)
     if not points.is_floating_point():
-        raise ShapeError(f"{type(module).__name__}: expected points in floating point, got {points.dtype}")
+        raise ShapeError(f"{type(module).__name__}: expected {what} in floating point, got {points.dtype}")
 
 
 def check_joints(module: nn.Module, skeleton: Skeleton, points: Tensor, form: str) -> None:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.nn.layers import SkeletonModule
+from kcs_torch.nn.layers import SkeletonModule, check_joints, check_points, check_tensor
 from kcs_torch.nn.normalise import NormalisedTracks, neighbours, normalise_tracks
 from kcs_torch.skeleton import Skeleton
 
@@ -96,7 +96,10 @@ class _Network(SkeletonModule):
         self, tracks: Tensor, weights: Tensor | None, scale: Tensor | None = None
     ) -> tuple[Tensor, NormalisedTracks]:
         """The ``outputs`` numbers of each frame (..., T, outputs), and what they were made from."""
-        self.check(tracks, clip=True)
+        check_points(tracks, self, "tracks")
+        check_joints(self, self.skeleton, tracks, "tracks (..., T, {}, 2)")
+        if weights is not None:
+            check_tensor(weights, "weights", self)
         if tracks.shape[-1] != 2:
             raise ShapeError(f"{type(self).__name__}: expected tracks (..., T, N, 2), got {tuple(tracks.shape)}")
         if weights is not None and weights.shape != tracks.shape[:-1]:

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
+from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_weights
-from kcs_torch.nn.layers import check_joints, check_tensor, inverse_softplus, seen_weights
+from kcs_torch.nn.layers import check_joints, check_points, check_tensor, inverse_softplus, seen_weights
 from kcs_torch.nn.steps import corner_of
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.implicit import Implicit, fixed_point
@@ -203,12 +204,20 @@ class Unrolled(nn.Module):
             ShapeError: the arguments do not fit; ``others`` are (tensor or None, expected trailing shape).
         """
         name = type(self).__name__
-        check_tensor(tracks, "tracks", self)
+        check_points(tracks, self, "tracks")
+        given = {"cameras": cameras, "start": start}
+        for what, value in given.items():
+            if value is not None:
+                check_tensor(value, what, self)
         if tracks.ndim < 3 or tracks.shape[-1] != 2 or (
             cameras is not None and cameras.shape[-3:] != (tracks.shape[-3], 2, 3)
         ):  # fmt: skip
             got = f"{tuple(tracks.shape)} and {None if cameras is None else tuple(cameras.shape)}"
+            if cameras is not None and cameras.shape[-2:] == (3, 3):
+                got += ": of rotations the first two rows, cameras[..., :2, :]"
             raise ShapeError(f"{name}: expected tracks (..., T, N, 2) and cameras (..., T, 2, 3), got {got}")
+        if tracks.shape[-3] == 0:
+            raise ShapeError(f"{name}: expected at least 1 frame, got none")
         if cameras is not None and (cameras.dtype != tracks.dtype or cameras.device != tracks.device):
             raise ShapeError(
                 f"{name}: expected cameras of the tracks' dtype and device, got {cameras.dtype} on "
@@ -220,6 +229,10 @@ class Unrolled(nn.Module):
         if start is not None and start.shape[-3:] != (*tracks.shape[-3:-1], 3):
             expected = f"(..., {tracks.shape[-3]}, {tracks.shape[-2]}, 3)"
             raise ShapeError(f"{name}: expected start {expected}, got {tuple(start.shape)}")
+        for what, value in given.items():
+            if value is not None and not fit_together(value.shape[:-3], tracks.shape[:-3]):
+                expected = f"a batch of {what} like that of tracks {tuple(tracks.shape)}"
+                raise ShapeError(f"{name}: expected {expected}, got {tuple(value.shape)}")
         for other, (value, shape) in others.items():
             if value is not None and tuple(value.shape[value.ndim - len(shape) :]) != tuple(shape):
                 raise ShapeError(
