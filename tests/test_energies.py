@@ -1,5 +1,7 @@
 """Energies: values by hand, gradients with degenerate inputs, and the prox and gradient that solvers use."""
 
+import warnings
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -588,13 +590,14 @@ def test_other_shapes_that_do_not_fit():
 
 
 TRUNK = SKELETONS["h36m17"]
+SEEN = 1000 * normal(4, 5, 17, 3)[..., :2] / (10 + normal(4, 5, 17, 3)[..., 2:])
 CALLS = {
     "bone length": lambda p, w: BoneLengthEnergy(TRUNK)(p, None, w),
     "symmetry": lambda p, w: SymmetryEnergy(TRUNK)(p, w),
     "smoothness": lambda p, w: SmoothnessEnergy()(p, w),
     "low rank": lambda p, w: LowRankEnergy()(p, w),
     "reprojection": lambda p, w: ReprojectionEnergy()(p, torch.zeros(4, 5, 17, 2), None, w),
-    "perspective": lambda p, w: PerspectiveEnergy()(p, torch.zeros(4, 5, 17, 2), (1000, 1000, 0, 0), w),
+    "perspective": lambda p, w: PerspectiveEnergy()(p, SEEN, (1000, 1000, 0, 0), w),
     "joints": lambda p, w: JointDistance()(p, torch.zeros(4, 5, 17, 3), w),
     "kcs": lambda p, w: KCSDistance(TRUNK)(p, torch.zeros(4, 5, 17, 3), w),
     "foreshortening": lambda p, w: ForeshorteningEnergy(TRUNK)(p, None, w),
@@ -617,6 +620,37 @@ def test_what_is_no_batch_of_weighted_points_is_refused_in_our_words(name):
         call(points, weights[:3])
     with pytest.raises(ShapeError, match=r"expected weights .*got \(4, 5, 17, 1\)"):
         call(points, weights[..., None])
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_second_derivatives_are_right_or_refused(name):
+    points, weights = 1.1 * normal(4, 5, 17, 3), torch.ones(4, 5, 17, dtype=torch.float64)
+    leaf, direction = points.clone().requires_grad_(), normal(*points.shape, seed=4)
+    first = lambda x: torch.autograd.grad(CALLS[name](x, weights).sum(), x, create_graph=True)[0]  # noqa: E731
+    if name in ("low rank", "procrustean"):
+        with pytest.raises(RuntimeError, match="second derivatives of .* not supported"):
+            first(leaf).square().sum().backward()
+        return
+    (found,) = torch.autograd.grad((first(leaf) * direction).sum(), leaf)
+    near = [first((points + s * 1e-6 * direction).requires_grad_()).detach() for s in (-1, 1)]
+    assert_close(found, (near[1] - near[0]) / 2e-6, rtol=1e-4, atol=1e-4 * float(found.abs().max()))
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_losses_compile_without_a_break_and_map(name):
+    points, weights = normal(4, 5, 17, 3, dtype=torch.float32), torch.ones(4, 5, 17)
+    plain = CALLS[name](points, weights)
+    torch._dynamo.reset()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what Dynamo says of itself
+        found = torch.compile(CALLS[name], backend="aot_eager", fullgraph=True)(points, weights)
+    torch._dynamo.reset()
+    assert_close(found, plain)
+    if name in ("bone length", "symmetry", "smoothness", "low rank", "foreshortening", "procrustean"):
+        slope = torch.func.vmap(torch.func.grad(lambda x, w: CALLS[name](x, w).sum()))(points, weights)
+        leaf = points.clone().requires_grad_()
+        CALLS[name](leaf, weights).sum().backward()
+        assert_close(slope, leaf.grad)
 
 
 @pytest.mark.parametrize("energy", [BoneLengthEnergy, HingeEnergy, PostureEnergy, ForeshorteningEnergy])
