@@ -41,9 +41,9 @@ from kcs_torch.methods.pkc.trunk import mirror
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 PARTS = {
     "fixed": ("walk", "walk, 15 mm noise", "static_walk", "static_action", "noise"),
-    "moving": ("tree", "akhter"),
+    "moving": ("tree", "arm", "akhter"),
 }
-SYNTHETIC = ("walk", "walk, 15 mm noise", "tree")
+SYNTHETIC = ("walk", "walk, 15 mm noise", "tree", "arm")
 YAWS = (0.0, 45.0, 90.0, 135.0)
 # import_module, as the package's functions have the names of these modules
 BODY, FIXED, FLIPS, MOVING, OBJECTIVE, DESCENT = (
@@ -169,6 +169,7 @@ MOVING_VARIANTS = {
     ),
     "no coarse stages": Variant(changes=(constant(MOVING, "COARSE", ()), constant(MOVING, "KEPT", ()))),
     "SfAM's guess as the only start": Variant(changes=(constant(MOVING, "_starts", lambda *_: []),)),
+    "no paths of single bones": Variant(changes=(constant(MOVING, "bone_paths", lambda *_: None),)),
 }
 VARIANTS = {"fixed": FIXED_VARIANTS, "moving": MOVING_VARIANTS}
 
@@ -196,13 +197,16 @@ FIGURES: dict[str, tuple[Callable[[Tensor, Tensor], float], str]] = {"fixed": (r
 
 
 def synthetic(suite: str, frames: int) -> Iterator[Clip]:
-    """Walks before a fixed camera, or trees of bones in random motion before one that turns."""
+    """Walks before a fixed camera, or trees and chains of bones in random motion before one that turns."""
     for seed, yaw in enumerate(YAWS):
         chance = torch.Generator().manual_seed(seed)
         clip: SyntheticClip
         if suite == "tree":
             body = kt.Skeleton.from_edges([((i - 1) // 2, i) for i in range(1, 15)], 15, name="tree")
             clip = random_motion(body, frames, swing=20, turn=180, generator=chance)
+        elif suite == "arm":
+            body = kt.Skeleton.from_edges([(i, i + 1) for i in range(6)], 7, name="arm")
+            clip = random_motion(body, frames, turn=120, generator=chance)
         else:
             clip = walking_person(frames, yaw=yaw, turn=0, noise=15.0 * ("noise" in suite), generator=chance)
         yield f"{suite} {seed}", clip.tracks, clip.points[:, : clip.skeleton.num_observed]

@@ -65,7 +65,7 @@ AGAIN = 3
 SURE, DOUBT = 0.8, 0.6
 """Correlation with SfAM's depths from which on those of the moving viewpoint are sure, and below which they are a
 guess. Before cameras that turn by 180 degrees it is above .95 for people, dogs and hands, by 60 about .8, by none
-.3 and less; robots, whose joints turn about fixed axes, are below .3 everywhere."""
+.3 and less; robots, whose joints turn about fixed axes, are anywhere."""
 
 LEAD = 6.0
 """Lead of a solution whose bones are held to their lengths (see :class:`MovingView`) that is as sure as full agreement:

@@ -61,6 +61,9 @@ WORTH = 20.0
 """Weight of how likely the path of each bone is by itself: a bone keeps its direction for about so many frames, which
 the other terms count one by one."""
 
+GIVEN = 3
+"""Solutions whose bones are then led along paths of constant length."""
+
 ROBOT = 10
 """Up to as many joints, twenty times the random starts are tried: they are cheap, and little else decides."""
 
@@ -255,9 +258,9 @@ def searching(
     pose = yield from descend(few, pose, tight[1], fine, few_weights)
     lead, paths = 0.0, bone_paths(image, bones) if held and lifts > 0 else None
     if paths is not None:
-        mine, pose = pose.points[(order == 0).to(image.device)], pose[value(pose).argsort()[: KEPT[-1]]]
+        mine, pose = pose.points[(order == 0).to(image.device)], pose[value(pose).argsort()[:GIVEN]]
         assembly = Assembly(
-            few, bones, paths.at(pick), (coarse[-1], *fine), value,
+            few, bones, paths.at(pick), (*coarse[-1:], *fine), value,
             lambda pose, stages: descend(few, pose, TIGHT, stages, few_weights), seed,
         )  # fmt: skip
         pose = yield from (assembly.searched(pose) if joints <= ROBOT else assembly.near(pose))
