@@ -125,3 +125,18 @@ def test_few_bones_of_constant_length_are_put_together_from_paths(robot):
     lengths = bone_lengths(exact.pose.points[0], skeleton.bone_index())
     assert float((lengths.std(0) / lengths.mean(0)).amax()) < 0.01
     assert exact.lead > 1 and loose.lead == 0
+
+
+def test_long_clips_are_not_put_together_from_paths(robot, monkeypatch):
+    points, skeleton = robot
+    module = sys.modules["kcs_torch.methods.pkc.moving_view"]
+    monkeypatch.setattr(module, "LONG", 100)
+    monkeypatch.setattr(module, "bone_paths", None)  # to call it would fail
+    found = solve(points, skeleton)
+    assert found.lead == 0 and found.pose.points.isfinite().all()
+
+
+def test_paths_lead_between_the_frames_that_are_compared(robot):
+    points, skeleton = robot
+    found = solve(points, skeleton, coarse_frames=40)
+    assert depth_error(found.pose.points[0], points) < 0.05

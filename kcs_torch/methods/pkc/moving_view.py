@@ -61,6 +61,10 @@ WORTH = 20.0
 """Weight of how likely the path of each bone is by itself: a bone keeps its direction for about so many frames, which
 the other terms count one by one."""
 
+LONG = 2000
+"""Frames of a clip up to which paths of bones are put together: of longer ones the frames that are compared are too far
+apart, and paths of all frames would take much memory."""
+
 GIVEN = 3
 """Solutions whose bones are then led along paths of constant length."""
 
@@ -256,7 +260,7 @@ def searching(
         best = pose.objective.argsort()[: kept if joints > ROBOT else 3 * kept]
         pose, order = pose[best], order[best.cpu()]
     pose = yield from descend(few, pose, tight[1], fine, few_weights)
-    lead, paths = 0.0, bone_paths(image, bones) if held and lifts > 0 else None
+    lead, paths = 0.0, bone_paths(image, bones) if held and lifts > 0 and frames <= LONG else None
     if paths is not None:
         mine, pose = pose.points[(order == 0).to(image.device)], pose[value(pose).argsort()[:GIVEN]]
         assembly = Assembly(
