@@ -226,7 +226,7 @@ def searching(
     frames, joints, _ = image.shape
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
-    held = is_tree and exact and len(rigid) == joints - 1
+    held = is_tree and exact and noise == 0 and len(rigid) == joints - 1
     first = torch.cat([image, start[..., 2:] - start[..., 2:].mean(1, keepdim=True)], -1)[None]
     spread = lambda points: rigid_tree(distance_spread(points)[1])  # noqa: E731
     bones = skeleton.bone_index(device=image.device) if is_tree else spread(first[0])
