@@ -101,17 +101,18 @@ class Assembly:
         depth, cost = self.paths
         count = len(depth)
         generator = torch.Generator().manual_seed(self.seed)
-        draw = lambda *size: torch.randint(0, 2, size, generator=generator)  # noqa: E731
+        draw = lambda *size: torch.randint(0, 2, size, generator=generator, device="cpu")  # noqa: E731
         if 2 ** (count - 1) <= ALL:
-            index = torch.arange(2 ** (count - 1))[:, None] >> torch.arange(count)
+            bits = torch.arange(count, device="cpu")
+            index = torch.arange(2 ** (count - 1), device="cpu")[:, None] >> bits
             signs = torch.cat([index & 1, draw(DRAWN, count)])
         else:
             signs = draw(ALL + DRAWN, count)
         likely = (-cost / SPREAD).softmax(-1).double().cpu()
         drawn = likely.multinomial(DRAWN, replacement=True, generator=generator).mT  # (DRAWN, B)
-        which = torch.cat([torch.zeros(len(signs) - DRAWN, count, dtype=torch.long), drawn]).to(depth.device)
+        which = torch.cat([torch.zeros_like(signs[DRAWN:]), drawn]).to(depth.device)
         made = (1 - 2 * signs).to(depth)[..., None] * depth[torch.arange(count, device=depth.device), which]
-        degrees = 360 * torch.rand(len(made), generator=generator, dtype=torch.float64)
+        degrees = 360 * torch.rand(len(made), generator=generator, dtype=torch.float64, device="cpu")
         return self._placed(made, turning_cameras(degrees, depth.shape[-1], dtype=depth.dtype, device=depth.device))
 
     def _changes(self, pose: Pose) -> Tensor:
