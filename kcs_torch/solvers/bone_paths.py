@@ -95,12 +95,15 @@ def path_energy(depth: Tensor, flat: Tensor) -> Tensor:
 
     Args:
         depth: (..., T).
-        flat: (..., T, 2), broadcast against it.
+        flat: (..., T, 2), in the same unit; broadcast against it.
+
+    Returns:
+        (...). Other units add the same to all.
     """
     frames = depth.shape[-1]
     middle = flat - flat.mean(-2, keepdim=True)
     stray = middle.square().sum(-1).mean(-1).sqrt()
-    speed = flat.diff(dim=-2).square().sum(-1).sum(-1).div(max(frames - 1, 1)).sqrt()
+    speed = flat.diff(dim=-2).square().sum((-2, -1)).div(max(frames - 1, 1)).sqrt()
     tiny = torch.finfo(depth.dtype).tiny ** 0.25
     square = depth.square()
     size = (flat.square().sum(-1) + square).mean(-1).clamp_min(tiny)

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence, points_from_bones
 from kcs_torch.methods.lockstep import Search
 from kcs_torch.solvers.bone_paths import BonePaths, nearest_paths
 from kcs_torch.solvers.lifts import turning_cameras
@@ -32,9 +32,8 @@ TIMES, TRIED = 4, 8
 GAIN = 1.0
 """How much cheaper a solution has to be to count as better."""
 
-OTHER = 0.02
+CHANGED = 0.02
 """Root mean square change of a bone's depth that is another path, of tracks of root mean square 1."""
-
 
 FIT = 0.1
 """Root mean square difference, a share of the bone's length, of depths that follow a path."""
@@ -86,15 +85,12 @@ class Assembly:
 
     def _placed(self, depth: Tensor, rotations: Tensor, num_steps: int = 10) -> Pose:
         """Bodies of bones' depths (H, B, T), aligned from rotations (H or 1, T, 3, 3)."""
-        count, zero = len(depth), depth.new_zeros(len(depth))
-        tree = chain_inverse(incidence(self.bones, self.image.shape[1], dtype=depth.dtype))  # (N, B)
-        joints = depth.mT @ tree.mT
-        points = torch.cat([self.image.expand(count, -1, -1, -1), joints[..., None]], -1)
-        turned = align_rotations(points, rotations.expand(count, -1, -1, -1), self.bones, num_steps=num_steps)
+        points, zero = _lifted(self.image, depth, self.bones), depth.new_zeros(len(depth))
+        turned = align_rotations(points, rotations.expand(len(depth), -1, -1, -1), self.bones, num_steps=num_steps)
         return Pose(points, turned, zero, zero)
 
     def _nearest(self, found: Pose) -> Pose:
-        return self._placed(nearest_paths(self.paths, _depths(found, self.bones)), found.rotations)
+        return self._placed(nearest_paths(self.paths, _depths(found.points, self.bones)), found.rotations)
 
     def _combined(self) -> Pose:
         """Bones' likeliest paths with all signs (or some), and paths drawn by their cost, before turning cameras."""
@@ -117,11 +113,11 @@ class Assembly:
 
     def _changes(self, pose: Pose) -> Tensor:
         """The best with another path, or the mirror image, of one bone, (H, B, T)."""
-        own = _depths(pose[:1], self.bones)  # (1, B, T)
+        own = _depths(pose.points[:1], self.bones)  # (1, B, T)
         paths, cost = self.paths
         mirrored = torch.cat([paths, -paths, -own[0, :, None]], 1)  # (B, 2 K + 1, T)
         real = torch.cat([cost.isfinite(), cost.isfinite(), torch.ones_like(cost[:, :1], dtype=torch.bool)], 1)
-        real &= (mirrored - own[0, :, None]).square().mean(-1).sqrt() > OTHER
+        real &= (mirrored - own[0, :, None]).square().mean(-1).sqrt() > CHANGED
         bone, which = real.nonzero().unbind(-1)
         out = own.repeat(len(bone), 1, 1)
         out[torch.arange(len(bone), device=out.device), bone] = mirrored[bone, which]
@@ -130,18 +126,23 @@ class Assembly:
 
 def followed(paths: BonePaths, points: Tensor, bones: Tensor, frames: Tensor) -> Tensor:
     """Points (H, T, N, 3) that are right at some frames, in between along those of the bones' paths that fit there."""
-    depth = bone_vectors(points[..., 2:], bones)[..., 0].mT  # (H, B, T)
+    depth = _depths(points, bones)
     near = nearest_paths(paths, depth)
     off = (near - depth)[..., frames].square().mean(-1)
     length = bone_vectors(points, bones).square().sum(-1).mean(-2)  # (H, B), squared
     fits = off < FIT**2 * length
-    own = torch.where(fits[..., None], near, depth)
-    tree = chain_inverse(incidence(bones, points.shape[-2], dtype=points.dtype))
-    return torch.cat([points[..., :2], (own.mT @ tree.mT)[..., None]], -1)
+    return _lifted(points[..., :2], torch.where(fits[..., None], near, depth), bones)
 
 
-def _depths(pose: Pose, bones: Tensor) -> Tensor:
-    return bone_vectors(pose.points[..., 2:], bones)[..., 0].mT
+def _depths(points: Tensor, bones: Tensor) -> Tensor:
+    """Depths (H, B, T) of the bones of points (H, T, N, 3)."""
+    return bone_vectors(points[..., 2:], bones)[..., 0].mT
+
+
+def _lifted(image: Tensor, depth: Tensor, bones: Tensor) -> Tensor:
+    """Points (H, T, N, 3) of an image (T, N, 2) or (H, T, N, 2), and bones' depths (H, B, T)."""
+    joints = points_from_bones(depth, chain_inverse(incidence(bones, image.shape[-2], dtype=depth.dtype))).mT
+    return torch.cat([image.expand(*joints.shape, 2), joints[..., None]], -1)
 
 
 def _joined(*poses: Pose) -> Pose:

@@ -241,7 +241,10 @@ def searching(
 
     def value(pose: Pose) -> Tensor:
         """How solutions are ranked, (H,)."""
-        total = _value(pose, bones, rigid, TIGHT if held else tight[0], noise)
+        stage = _soften(RANKING, noise)
+        pull = image.new_full((len(rigid),), TIGHT if held else tight[0])
+        total = motion_energy(pose.points, pose.rotations, bones, stage)
+        total = total + length_energy(pose.points, rigid, pull, stage.slack)
         if held:
             own = bone_vectors(pose.points, rigid).transpose(-3, -2)  # (H, P, T, 3)
             total = total + WORTH * path_energy(own[..., 2], own[..., :2]).sum(-1)
@@ -296,14 +299,6 @@ def searching(
 def _soften(stage: Stage, noise: float) -> Stage:
     """The stage, with no scale far below the noise."""
     return replace(stage, eps=max(stage.eps, 0.1 * noise**2), slack=max(stage.slack, 0.3 * noise))
-
-
-def _value(pose: Pose, bones: Tensor, rigid: Tensor, stiffness: float, noise: float) -> Tensor:
-    """Energy (H,) at the scales at which hypotheses are compared."""
-    stage = _soften(RANKING, noise)
-    pull = pose.points.new_full((len(rigid),), stiffness)
-    total = motion_energy(pose.points, pose.rotations, bones, stage)
-    return total + length_energy(pose.points, rigid, pull, stage.slack)
 
 
 def _lead(pose: Pose, value: Tensor) -> float:
