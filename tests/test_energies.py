@@ -647,6 +647,7 @@ def test_losses_compile_without_a_break_and_map(name):
     torch._dynamo.reset()
     assert_close(found, plain)
     if name in ("bone length", "symmetry", "smoothness", "low rank", "foreshortening", "procrustean"):
+        points, weights = points.double(), weights.double()  # in single precision rounding alone is .1 % of a slope
         slope = torch.func.vmap(torch.func.grad(lambda x, w: CALLS[name](x, w).sum()))(points, weights)
         leaf = points.clone().requires_grad_()
         CALLS[name](leaf, weights).sum().backward()
