@@ -20,7 +20,7 @@ from kcs_torch.skeleton import Skeleton
 
 __all__ = ["flipped", "flipped_runs", "parts_of", "turned_over"]
 
-TIMES = 6
+TIMES = 8
 """How often flips are tried at most."""
 
 GAIN = 0.3
@@ -40,17 +40,15 @@ then well."""
 ROWS = 4096
 """Frames of flips that are compared at a time."""
 
-FLAT = 0.4
-"""Depth, as a share of a part's length, below which it may have bounced off the image plane, or passed through it."""
-
-PASSAGES = 4
-"""Passages of a part that are considered, those nearest to the image plane."""
+PASSAGES, ACROSS = 16, 2
+"""Passages of a part that are considered, those where a change of sign bends its motion least, and how many of them a
+run within the clip may be long."""
 
 WINDOW = 2
-"""Frames on either side to which a passage is the nearest."""
+"""Frames on either side in which nothing bends the motion less than a change of sign at the passage."""
 
-SHARP = 15.0
-"""Cost of the bend at a run's ends from which on a flip is hopeless."""
+SHARP = 3.0
+"""Cost of the bends at a run's ends from which on a flip is hopeless."""
 
 SLIGHT = 0.006
 """Root mean square depth that a flip has to change, a standing person being about 1.75 tall."""
@@ -64,7 +62,7 @@ def parts_of(skeleton: Skeleton, limbs: Sequence[Limb]) -> list[tuple[int, ...]]
     along, across = tuple(b for b in trunk if b not in twins), tuple(b for b in trunk if b in twins)
     central = tuple(b for b in range(skeleton.num_bones) if b not in twins)
     parts = [part for limb in limbs for part in (*((b,) for b in limb.bones), limb.bones)]
-    parts += [along, across, along + across, central, *skeleton.mirror_bones]
+    parts += [along, across, along + across, central, *skeleton.mirror_bones, *((b,) for b in trunk)]
     return [part for part in dict.fromkeys(parts) if part]
 
 
@@ -111,7 +109,7 @@ def _change(flips: Hypotheses, best: Hypotheses) -> Tensor:
 def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypotheses) -> Hypotheses:
     """The best flips of one run of a solution, at most one a part, best first; they are not refined yet."""
     own = bone_vectors(best.depth[0, ..., None], objective.bones)[..., 0]
-    runs, which = flipped_runs(own, best.lengths[0], parts, objective.weights.acceleration)
+    runs, which = flipped_runs(own, parts, objective.weights.acceleration)
     cost, some = Descent(objective), runs.mT.contiguous().split(max(1, ROWS // len(own)))
     energy = torch.cat([cost.at(run, best.lengths.expand(len(run), -1), steep=False)[0] for run in some])
     order = energy.argsort()
@@ -122,17 +120,14 @@ def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypoth
     return Hypotheses(depth, best.lengths.expand(len(order), -1), energy[order], best.steps)
 
 
-def flipped_runs(
-    depth: Tensor, lengths: Tensor, parts: Sequence[tuple[int, ...]], acceleration: float
-) -> tuple[Tensor, Tensor]:
+def flipped_runs(depth: Tensor, parts: Sequence[tuple[int, ...]], acceleration: float) -> tuple[Tensor, Tensor]:
     """Bones' depths with the sign of one part changed over one run of frames, and which part it is.
 
-    Runs are from one passage to the next, from the clip's start to a passage, from there to its end, or the whole clip.
-    Those that would bend the motion too much, or change hardly anything, are left out.
+    Runs are from a passage to one of the next, from the clip's start to a passage, from there to its end, or the whole
+    clip. Those that would bend the motion too much, or change hardly anything, are left out.
 
     Args:
         depth: (T, B) depths of the bones.
-        lengths: (B,).
         parts: indices of bones.
         acceleration: standard deviation of a bone's second difference in depth.
 
@@ -143,38 +138,53 @@ def flipped_runs(
     member = depth.new_zeros(len(parts), bones)
     for row, part in zip(member, parts, strict=True):
         row[list(part)] = 1
-    starts, ends, which = _runs(((depth.square() @ member.mT) / (lengths.square() @ member.mT)).mT.sqrt())
+    bend = _bends(depth, member.mT) / (2 * acceleration**2)
+    starts, ends, which = _runs(bend)
+    costs = torch.nn.functional.pad(bend, (0, 1))  # to the end of the clip nothing bends
+    sharp = costs[which, starts] + costs[which, ends]
     time = torch.arange(frames, device=depth.device)
     sign = 1 - 2 * ((time >= starts[:, None]) & (time < ends[:, None])).to(depth)  # (K, T)
     own = member[which]
-    # Second differences only change about a run's ends: (s_0 d_0 - 2 s_1 d_1 + s_2 d_2)^2 less the same without signs.
-    near, far = 1 - sign[:, 1:] * sign[:, :-1], 1 - sign[:, 2:] * sign[:, :-2]
-    next_to, over = own @ (depth[1:] * depth[:-1]).mT, own @ (depth[2:] * depth[:-2]).mT
-    both = near[:, :-1] * next_to[:, :-1] + near[:, 1:] * next_to[:, 1:]
-    bend = (4 * both - 2 * far * over).sum(1) / (2 * acceleration**2)
     change = 2 * (((1 - sign) @ depth.square()) * own).sum(1) / (frames * bones)
-    keep = (bend < SHARP) & (change > SLIGHT**2)
+    keep = (sharp < SHARP) & (change > SLIGHT**2)
     signs = 1 + (sign[keep] - 1)[..., None] * own[keep][:, None]
     return depth * signs, which[keep]
 
 
-def _runs(near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Starts, ends and parts (K,) of runs between the least of parts' depths over their lengths (P, T)."""
-    parts, frames = near.shape
-    ends = torch.full((parts, 1), frames, device=near.device)
+def _bends(depth: Tensor, member: Tensor) -> Tensor:
+    """By how much parts' squared second differences grow if signs change from a frame on, (P, T).
+
+    Of a sum (s_0 d_0 - 2 s_1 d_1 + s_2 d_2)^2 only the products across the change matter; where signs jumped there, the
+    sum shrinks.
+
+    Args:
+        depth: (T, B).
+        member: (B, P), 1 for a part's bones.
+    """
+    out = depth.new_zeros(len(depth), member.shape[1])
+    near, over = 8 * (depth[1:] * depth[:-1]) @ member, 4 * (depth[2:] * depth[:-2]) @ member
+    out[2:] += near[1:] - over
+    out[1:-1] += near[:-1] - over
+    return out.mT
+
+
+def _runs(bend: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Starts, ends and parts (K,) of runs between the frames from which on signs change most cheaply, of (P, T)."""
+    parts, frames = bend.shape
+    ends = torch.full((parts, 1), frames, device=bend.device)
     places = [torch.zeros_like(ends), ends]
     if frames > 2 * WINDOW:
-        wide = torch.nn.functional.pad(near[:, None], (WINDOW, WINDOW), mode="replicate")
+        wide = torch.nn.functional.pad(bend[:, None], (WINDOW, WINDOW), mode="replicate")
         least = -torch.nn.functional.max_pool1d(-wide, 2 * WINDOW + 1, 1)[:, 0]
-        passes = (near <= least) & (near < FLAT)
+        passes = (bend <= least) & (bend < SHARP)
         passes[:, :WINDOW] = passes[:, frames - WINDOW :] = False
-        value, place = torch.where(passes, near, torch.inf).topk(min(PASSAGES, frames), largest=False)
+        value, place = torch.where(passes, bend, torch.inf).topk(min(PASSAGES, frames), largest=False)
         places.insert(1, torch.where(value < torch.inf, place, frames).sort(1).values)
     at = torch.cat(places, 1)  # (P, passages + 2)
     last = at.shape[1] - 1
-    runs = [(i, j) for i, j in combinations(range(last + 1), 2) if j == i + 1 or i == 0 or j == last]
+    runs = [(i, j) for i, j in combinations(range(last + 1), 2) if j <= i + ACROSS or i == 0 or j == last]
     first, second = (at[:, list(side)] for side in zip(*runs, strict=True))
-    closes = torch.tensor([j == last for _, j in runs], device=near.device)
+    closes = torch.tensor([j == last for _, j in runs], device=bend.device)
     real = (first < second) & (closes | (second < frames))  # passages that there are not lie at the end
-    which = torch.arange(parts, device=near.device)[:, None].expand_as(first)
+    which = torch.arange(parts, device=bend.device)[:, None].expand_as(first)
     return first[real], second[real], which[real]
