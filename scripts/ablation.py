@@ -50,7 +50,7 @@ BODY, FIXED, FLIPS, MOVING, OBJECTIVE, DESCENT = (
     import_module(f"kcs_torch.methods.pkc.{name}")
     for name in ("body", "fixed_view", "flips", "moving_view", "objective", "descent")
 )
-WRITTEN_OUT = {"posture": "_posture", "hinges": "_hinges", "foreshortening": "_foreshortening", "proportions": "_sizes"}
+WRITTEN_OUT = {"posture": "_posture", "foreshortening": "_foreshortening", "proportions": "_sizes"}
 """Terms of the objective, and the methods of its descent that hold them once more, gradients and all."""
 
 Clip = tuple[str, kt.Tracks, Tensor]
@@ -130,7 +130,8 @@ FIXED_VARIANTS = {
     ),
     "directions as sure as in a clear image": Variant(changes=(constant(OBJECTIVE, "BLUR", 0.0),)),
     "no posture": without("posture", posture=INF),
-    "no hinges": without("hinges", hinge=0.0),
+    "no hinges": Variant(changes=(*weighted(hinge=0.0), searched(lambda usual: replace(usual, hinge=0.0)))),
+    "limbs may reach across the body": Variant(changes=weighted(adduction=0.0)),
     "no foreshortening": without("foreshortening", foreshortening=INF),
     "no proportions": without("proportions", proportions=INF),
     "left and right not alike": Variant(changes=weighted(twins=INF)),

@@ -19,12 +19,25 @@ def script(import_script):
 
 @pytest.fixture(scope="module")
 def clips(script):
-    """A noisy walk, a clean one in slow motion, and one before a camera that goes round; a tree in motion."""
+    """Walks, with noise, in slow motion, before a camera that goes round and with arms spread; a tree in motion."""
     noisy = walking_person(30, yaw=0, turn=0, noise=15, generator=torch.Generator().manual_seed(0)).tracks
     slow = replace(walking_person(30, fps=150, yaw=0, turn=0).tracks, fps=30)
     round_ = walking_person(24, yaw=0, turn=270).tracks
+    spread = arms_spread(30)
     tree = next(iter(script.synthetic("tree", 24)))[1]
-    return {"fixed": [noisy, slow, round_], "moving": [tree]}
+    return {"fixed": [noisy, slow, round_, spread], "moving": [tree]}
+
+
+def arms_spread(frames):
+    """A walk seen from the side, arms stretched out to both sides: towards the camera and away from it."""
+    clip = walking_person(frames, yaw=75, turn=0)
+    points, joints = clip.points.clone(), clip.tracks.skeleton.joints
+    for side, sign in (("left", 1), ("right", -1)):
+        shoulder, elbow, wrist = (joints.index(f"{side}_{part}") for part in ("shoulder", "elbow", "wrist"))
+        across = points[:, joints.index("left_shoulder")] - points[:, joints.index("right_shoulder")]
+        points[:, elbow] = points[:, shoulder] + 0.8 * sign * across
+        points[:, wrist] = points[:, elbow] + 0.7 * sign * across
+    return replace(clip.tracks, points=points[..., :2])
 
 
 def lifted(variant, tracks):

@@ -25,6 +25,7 @@ from torch.testing import assert_close
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths, project
 from kcs_torch.nn import (
+    AdductionEnergy,
     BoneLengthEnergy,
     ForeshorteningEnergy,
     HingeEnergy,
@@ -654,7 +655,9 @@ def test_losses_compile_without_a_break_and_map(name):
         assert_close(slope, leaf.grad)
 
 
-@pytest.mark.parametrize("energy", [BoneLengthEnergy, HingeEnergy, PostureEnergy, ForeshorteningEnergy])
+@pytest.mark.parametrize(
+    "energy", [AdductionEnergy, BoneLengthEnergy, HingeEnergy, PostureEnergy, ForeshorteningEnergy]
+)
 def test_lengths_that_do_not_fit(energy):
     """Weights given in their place, most of all."""
     energy, points = energy(TRUNK), torch.randn(4, 5, 17, 3)

@@ -10,6 +10,7 @@ from kcs_torch.data import walking_person
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional import bone_lengths
 from kcs_torch.nn import (
+    AdductionEnergy,
     BoneLengthEnergy,
     ContactEnergy,
     ForeshorteningEnergy,
@@ -55,6 +56,7 @@ WEIGHTED = {
     "ContactEnergy": lambda x, w, t: ContactEnergy(MAN)(x, 0.01 * normal(FRAMES)[t], STAND[t], w),
     "ForeshorteningEnergy": lambda x, w, t: ForeshorteningEnergy(MAN)(x, LENGTHS, w),
     "ForeshorteningEnergy, own": lambda x, w, t: ForeshorteningEnergy(MAN)(x, None, w),
+    "AdductionEnergy": lambda x, w, t: AdductionEnergy(MAN, limit=0)(x, None, w),
     "HingeEnergy": lambda x, w, t: HingeEnergy(MAN)(-x, None, w),
     "HingeEnergy, given": lambda x, w, t: HingeEnergy(MAN)(-x, LENGTHS, w),
     "JointDistance": lambda x, w, t: JointDistance()(x, TARGET[t], w),

@@ -9,8 +9,8 @@ import torch
 from numerics import BATCHES, CHAIN, FLOATS, HALVES, finite, gradcheck, leaves_arguments_alone, normal, rotations
 from torch.testing import assert_close
 
-from kcs_torch.errors import ShapeError
-from kcs_torch.nn import HingeEnergy
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.nn import AdductionEnergy, HingeEnergy
 from kcs_torch.skeleton import SKELETONS, Skeleton
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -72,9 +72,47 @@ def test_templates_bend_as_they_should(name):
     assert energy(points * torch.tensor([1, 1, -1])).item() > 0
 
 
+def spread(left: float, right: float):
+    """Someone who faces the viewer, thighs to the side by so many degrees: (1, 6, 3)."""
+    points = legs(0, 0)
+    for knee, side, degrees in ((2, 1, left), (3, -1, right)):
+        way = [side * math.sin(math.radians(degrees)), math.cos(math.radians(degrees)), 0]
+        points[0, knee] = points[0, knee - 2] + 0.4 * torch.tensor(way).double()
+    return points
+
+
+def test_thighs_that_reach_across_by_hand():
+    energy = AdductionEnergy(LEGS)
+    assert_close(energy.abduction(spread(30, -45)), torch.tensor([[0.5, -math.sqrt(0.5)]]).double())
+    assert_close(energy(spread(30, -45)), torch.tensor([0.5 * (math.sqrt(0.5) - 0.35) ** 2]).double())
+    assert energy(spread(90, 80)).item() == energy(spread(-20, -20)).item() == 0
+    assert_close(AdductionEnergy(LEGS, limit=0)(spread(-30, -30)), torch.tensor([0.25]).double())
+    lengths = torch.tensor([0.2, 0.8, 0.5, 0.4, 0.5]).double()  # in place of the clip's
+    assert_close(energy.abduction(spread(30, -30), lengths), torch.tensor([[0.25, -0.5]]).double())
+
+
+def test_only_limbs_from_twins_reach_across():
+    assert AdductionEnergy("h36m17").limbs.shape == (4, 1)  # thighs and upper arms
+    assert AdductionEnergy("body25").limbs.shape == (4, 1)  # no feet, which have hinges
+    assert AdductionEnergy("hand21").limbs.shape == (0, 1)  # no fingers, either
+    for limit in (-0.1, 1.5, math.nan):
+        with pytest.raises(OptionError, match=r"limit: expected a sine within 0..1"):
+            AdductionEnergy(LEGS, limit=limit)
+
+
+@pytest.mark.parametrize("name", sorted(SKELETONS))
+def test_templates_do_not_reach_across(name):
+    points = SKELETONS[name].template_points(dtype=torch.float64)[None]
+    energy = AdductionEnergy(name)
+    assert energy(points).item() == 0
+    turned = points @ rotations(1)[0] * 3 + 1
+    assert_close(energy.abduction(turned), energy.abduction(points))
+
+
+@pytest.mark.parametrize("make", [HingeEnergy, lambda body: AdductionEnergy(body, limit=0.1)])
 @pytest.mark.parametrize("kind", ["any", "one frame", "zero", "short in a frame", "short", "batch"])
 @pytest.mark.parametrize("given", [False, True])
-def test_gradients(kind, given):
+def test_gradients(make, kind, given):
     points = normal(*((2, 3) if kind == "batch" else ()), 1 if kind == "one frame" else 4, 6, 3)
     if kind == "zero":
         points = torch.zeros_like(points)
@@ -83,7 +121,7 @@ def test_gradients(kind, given):
     if kind == "short":
         points[:, 2] = points[:, 0]
     lengths = normal(*points.shape[:-3], 5, seed=4).abs() + 0.5
-    energy = HingeEnergy(LEGS)
+    energy = make(LEGS)
     arguments = (points, lengths) if given else (points,)
     finite(energy, *arguments)
     if kind not in ("zero", "short") or (given and kind == "short"):  # a length of 0 has no derivative
@@ -152,3 +190,4 @@ def test_real_people_bend_their_joints_that_way(clip):
     firm = torch.tensor([h.firm for h in body.hinges])
     assert (firm == 1).sum() == 4 and bend[:, firm == 1].min() > -0.1
     assert (bend[:, firm < 1] > -0.05).double().mean() > 0.85
+    assert AdductionEnergy(body).abduction(points).min() > -0.5

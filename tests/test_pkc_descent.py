@@ -52,6 +52,18 @@ def test_noise_that_changes_in_time_and_lengths_below_the_image():
     agree(found, points[None, ..., 2], 0.7 * lengths_of(found, points)[None])
 
 
+@pytest.mark.parametrize("skeleton", ["h36m17", "body25"])
+def test_limbs_that_reach_across_the_body(skeleton):
+    """Bodies whose hinges are all of such limbs, and others."""
+    points = walk(8, skeleton, yaw=90.0)
+    found = objective(points, skeleton)
+    elbow = found.adduction.joints[-1, 1]
+    points[..., elbow, 2] -= torch.linspace(-0.4, 0.4, 8)  # seen from the side, across is away
+    depth, lengths = points[None, ..., 2], lengths_of(found, points)[None]
+    assert found.terms(depth, lengths)["adduction"] > 1
+    agree(found, depth, lengths, 0.1)
+
+
 @pytest.mark.parametrize("flexible", [(), (0, 3), tuple(range(16))])
 def test_flexible_bones(flexible):
     points = walk(8)
@@ -131,7 +143,7 @@ def test_follows_dtype_and_leaves_its_arguments_alone(dtype):
 def test_fewer_operations_than_autograd_takes():
     """Counts, which no busy machine changes: of operations, which cost microseconds each, and of numbers written."""
     points = walk(60)
-    for noise, most in ((0.0, 270), (0.01, 310)):
+    for noise, most in ((0.0, 295), (0.01, 335)):
         found = objective(points, noise=noise)
         unknowns = Unknowns(found, points[None, ..., 2], lengths_of(found, points)[None])
         state, descent = torch.zeros_like(unknowns.scale), Descent(found, unknowns)

@@ -332,7 +332,9 @@ def test_frame_rates_count_alike():
     assert at_pace(Weights(), 60.0).acceleration == pytest.approx(Weights().acceleration / 4)
     slow = at_pace(Weights(), 30.0, 3.0)
     assert slow == replace(
-        Weights(), posture=3 * Weights().posture, foreshortening=3 * Weights().foreshortening, hinge=Weights().hinge / 3
+        Weights(),
+        **{name: 3 * getattr(Weights(), name) for name in ("posture", "foreshortening")},
+        **{name: getattr(Weights(), name) / 3 for name in ("hinge", "adduction")},
     )
 
 

@@ -1,6 +1,6 @@
 """Modules: layers, energies that are losses and solver terms at once, and unrolled solvers."""
 
-from kcs_torch.nn.anatomy import HingeEnergy
+from kcs_torch.nn.anatomy import AdductionEnergy, HingeEnergy
 from kcs_torch.nn.contact import ContactEnergy
 from kcs_torch.nn.critic import KCSCritic, critic_loss, generator_loss
 from kcs_torch.nn.distances import JointDistance, KCSDistance
@@ -22,6 +22,7 @@ from kcs_torch.nn.unrolled import UnrolledFPC, UnrolledKCS, UnrolledPKC, Unrolle
 
 __all__ = [
     "SVT",
+    "AdductionEnergy",
     "BoneLengthEnergy",
     "BoneLengths",
     "BoneVectors",

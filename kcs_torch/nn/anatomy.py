@@ -2,21 +2,92 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.nn.energies import check_lengths
 from kcs_torch.nn.layers import SkeletonModule, wide
 from kcs_torch.nn.masks import known_points, weighs_joints
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["HingeEnergy"]
+__all__ = ["AdductionEnergy", "HingeEnergy"]
 
 
-class HingeEnergy(SkeletonModule):
+class _JointEnergy(SkeletonModule):
+    """1/2 sum_h f_h wrong_h^2 of each frame, of joints whose bones are seen against an axis across the body.
+
+    Lengths are the clip's, not each frame's, so that energy and gradient are smooth where a bone shrinks to nothing in
+    a frame.
+    """
+
+    joints: Tensor  # (H, K): those of a chain outwards, then the left and the right end of the axis
+    limbs: Tensor  # (H, K - 3): the bones of the chain
+    firm: Tensor  # (H,)
+
+    def _take(
+        self, joints: Sequence[tuple[int, ...]], limbs: Sequence[list[int]], firm: list[float], size: int
+    ) -> None:
+        self.register_buffer("joints", torch.tensor(joints, dtype=torch.long).reshape(-1, size), persistent=False)
+        self.register_buffer("limbs", torch.tensor(limbs, dtype=torch.long).reshape(-1, size - 3), persistent=False)
+        self.register_buffer("firm", torch.tensor(firm), persistent=False)
+
+    def _wrong(self, points: Tensor, lengths: Tensor | None, weights: Tensor | None) -> Tensor:
+        """How far each joint is where it should not be, (..., T, H)."""
+        raise NotImplementedError
+
+    def forward(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
+        """Return the energy of each frame.
+
+        Args:
+            points: (..., T, N, 3).
+            lengths: (..., B) of the bones; None takes each bone's root mean square over the T frames, as is always done
+                for the axes.
+            weights: (..., T, N) of the joints: each term weighs as much as the least joint that defines it; or (..., T)
+                of the frames: 0 for one that pads a shorter clip; all 1 if None.
+
+        Returns:
+            (..., T), without unit.
+
+        Raises:
+            ShapeError: the shapes do not fit.
+        """
+        wrong = self._wrong(points, lengths, weights)
+        each = 0.5 * self.firm.to(wrong.dtype) * wrong.square()
+        if weights is not None:
+            each = each * self._share(points, weights)
+        return each.sum(-1)
+
+    def _vectors(self, points: Tensor, lengths: Tensor | None, weights: Tensor | None) -> tuple[Tensor, ...]:
+        """Bones of the chains and then the axes, each (..., T, H, 3) over its length; arguments as in forward."""
+        self.check(points, clip=True)
+        if points.shape[-1] != 3:
+            raise ShapeError(f"{type(self).__name__}: expected points (..., T, N, 3), got {tuple(points.shape)}")
+        check_lengths(lengths, points, self)
+        share = None if weights is None else self._share(points, weights)
+        full = wide(known_points(points, weights, self))
+        ends = full.index_select(-2, self.joints.mT.reshape(-1)).unflatten(-2, self.joints.mT.shape)
+        *chain, left, right = ends.unbind(-3)  # each (..., T, H, 3)
+        edges = [b - a for a, b in pairwise(chain)]
+        if lengths is None:
+            edges = [_to_size(edge, share) for edge in edges]
+        else:
+            sizes = lengths.to(full.dtype)[..., None, self.limbs].unbind(-1)  # each (..., 1, H)
+            edges = [_divide(edge, size[..., None]) for edge, size in zip(edges, sizes, strict=True)]
+        return *edges, _to_size(left - right, share)
+
+    def _share(self, points: Tensor, weights: Tensor) -> Tensor:
+        """Weights of the joints' terms, (..., T, H), or of all alike, (..., T, 1)."""
+        if weighs_joints(weights, points, self):
+            return weights[..., self.joints].amin(-1)
+        return weights[..., None]
+
+
+class HingeEnergy(_JointEnergy):
     """1/2 sum_h f_h max(0, -s_h)^2 of each frame: no joint bends the wrong way.
 
     s_h = sign_h (u x v) . a / (|u| |v| |a|), where u and v are the bones above and below hinge h and a is its axis from
@@ -31,67 +102,73 @@ class HingeEnergy(SkeletonModule):
     torch.Size([4, 30])
     """
 
-    joints: Tensor
-    limbs: Tensor
     sign: Tensor
-    firm: Tensor
 
     def __init__(self, skeleton: str | Path | Skeleton) -> None:
         super().__init__(skeleton)
-        hinges = self.skeleton.hinges
-        where = {frozenset(bone): i for i, bone in enumerate(self.skeleton.bones)}
+        hinges, where = self.skeleton.hinges, _bone_places(self.skeleton)
         joints = [(h.parent, h.joint, h.child, h.left, h.right) for h in hinges]
-        limbs = [[where[frozenset(bone)] for bone in h.bones] for h in hinges]
-        self.register_buffer("joints", torch.tensor(joints, dtype=torch.long).reshape(-1, 5), persistent=False)
-        self.register_buffer("limbs", torch.tensor(limbs, dtype=torch.long).reshape(-1, 2), persistent=False)
+        self._take(joints, [[where[frozenset(bone)] for bone in h.bones] for h in hinges], [h.firm for h in hinges], 5)
         self.register_buffer("sign", torch.tensor([h.sign for h in hinges]), persistent=False)
-        self.register_buffer("firm", torch.tensor([h.firm for h in hinges]), persistent=False)
 
-    def forward(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
-        """Return the energy of each frame.
-
-        Args:
-            points: (..., T, N, 3).
-            lengths: (..., B) of the bones; None takes each bone's root mean square over the T frames, as is always done
-                for the axes.
-            weights: (..., T, N) of the joints: a hinge weighs as much as the least of the five that define it; or
-                (..., T) of the frames: 0 for one that pads a shorter clip; all 1 if None.
-
-        Returns:
-            (..., T), without unit.
-
-        Raises:
-            ShapeError: the shapes do not fit.
-        """
-        wrong = (-self.bend(points, lengths, weights)).clamp_min(0)
-        each = 0.5 * self.firm.to(wrong.dtype) * wrong.square()
-        if weights is not None:
-            each = each * self._share(points, weights)
-        return each.sum(-1)
+    def _wrong(self, points: Tensor, lengths: Tensor | None, weights: Tensor | None) -> Tensor:
+        return (-self.bend(points, lengths, weights)).clamp_min(0)
 
     def bend(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """The sine s of each hinge, (..., T, H), positive where it bends its way; arguments as in :meth:`forward`."""
-        self.check(points, clip=True)
-        if points.shape[-1] != 3:
-            raise ShapeError(f"HingeEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
-        check_lengths(lengths, points, self)
-        share = None if weights is None else self._share(points, weights)
-        full = wide(known_points(points, weights, self))
-        ends = full.index_select(-2, self.joints.mT.reshape(-1)).unflatten(-2, (5, len(self.joints)))
-        parent, joint, child, left, right = ends.unbind(-3)  # each (..., T, H, 3)
-        upper, lower, axis = joint - parent, child - joint, left - right
-        if lengths is None:
-            upper, lower = _to_size(upper, share), _to_size(lower, share)
-        else:
-            above, below = lengths.to(full.dtype)[..., None, self.limbs].unbind(-1)  # each (..., 1, H)
-            upper, lower = _divide(upper, above[..., None]), _divide(lower, below[..., None])
-        return (self.sign.to(full.dtype) * _triple(upper, lower, _to_size(axis, share))).to(points.dtype)
+        upper, lower, axis = self._vectors(points, lengths, weights)
+        return (self.sign.to(axis.dtype) * _triple(upper, lower, axis)).to(points.dtype)
 
-    def _share(self, points: Tensor, weights: Tensor) -> Tensor:
-        """Weights of the hinges, (..., T, H), or of all alike, (..., T, 1)."""
-        if weighs_joints(weights, points, self):
-            return weights[..., self.joints].amin(-1)
-        return weights[..., None]
+
+class AdductionEnergy(_JointEnergy):
+    """1/2 sum_l max(0, -s_l - limit)^2 of each frame: no upper arm or thigh reaches far across the body.
+
+    s_l = side_l (u . a) / (|u| |a|), where u is the bone from the shoulder or hip outwards, a is the axis from the
+    right one to the left, and side_l is +1 on the left and -1 on the right: the sine of the abduction. An arm goes up
+    to 90 degrees and more to its own side, but to the other only as far as the trunk lets it. Lengths are the clip's.
+
+    Args:
+        skeleton: a :class:`Skeleton`, a built-in name or a file. Limbs are those from one of two twins, hips or
+            shoulders, to a hinge whose axis joins both; without any the energy is 0.
+        limit: sine of the adduction from which on it costs.
+
+    Raises:
+        OptionError: the limit is not within 0 to 1.
+
+    >>> energy = AdductionEnergy("h36m17")
+    >>> energy(torch.randn(4, 30, 17, 3)).shape
+    torch.Size([4, 30])
+    """
+
+    side: Tensor
+
+    def __init__(self, skeleton: str | Path | Skeleton, *, limit: float = 0.35) -> None:
+        super().__init__(skeleton)
+        if not 0 <= limit <= 1:
+            raise OptionError(f"AdductionEnergy: limit: expected a sine within 0..1, got {limit}")
+        self.limit = limit
+        twins = {frozenset(pair) for pair in self.skeleton.mirror}
+        limbs = [
+            h for h in self.skeleton.hinges if h.parent in (h.left, h.right) and frozenset((h.left, h.right)) in twins
+        ]
+        where = _bone_places(self.skeleton)
+        joints = [(h.parent, h.joint, h.left, h.right) for h in limbs]
+        self._take(joints, [[where[frozenset(h.bones[0])]] for h in limbs], [1.0] * len(limbs), 4)
+        side = [1.0 if h.parent == h.left else -1.0 for h in limbs]
+        self.register_buffer("side", torch.tensor(side), persistent=False)
+
+    def _wrong(self, points: Tensor, lengths: Tensor | None, weights: Tensor | None) -> Tensor:
+        return (-self.limit - self.abduction(points, lengths, weights)).clamp_min(0)
+
+    def abduction(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
+        """The sine s of each limb, (..., T, L), positive to its own side; arguments as in :meth:`forward`."""
+        upper, axis = self._vectors(points, lengths, weights)
+        return (self.side.to(axis.dtype) * (upper * axis).sum(-1)).to(points.dtype)
+
+
+def _bone_places(skeleton: Skeleton) -> dict[frozenset[int], int]:
+    """The index of the bone between two joints."""
+    return {frozenset(bone): i for i, bone in enumerate(skeleton.bones)}
 
 
 def _triple(a: Tensor, b: Tensor, c: Tensor) -> Tensor:

@@ -68,6 +68,10 @@ class Descent:
             self.turns = ux * vy - uy * vx, ax * uy - ay * ux, ax * vy - ay * vx
             self.across = ax.square() + ay.square()
             self.firm, self.sign = hinges.firm.to(like), hinges.sign.to(like)
+            # Upper arms and thighs, which must not reach far across the body, are bones above hinges.
+            limbs = obj.adduction
+            self.outer = [hinges.joints[:, [0, 1, 3, 4]].tolist().index(limb) for limb in limbs.joints.tolist()]
+            self.along, self.side = (ux * ax + uy * ay)[:, self.outer], limbs.side.to(like)
             lines += [obj.tree[a] - obj.tree[b] for a, b in pairs]
         self.lines = torch.cat(lines)  # (2 + 3 hinges, B)
         free = obj.foreshortening
@@ -249,10 +253,26 @@ class Descent:
         pull = wrong * (wide(w.hinge / w.sine**2, 2) * self.firm[:, None] * share)
         energy = (pull * wrong).sum(-1)  # twice that of each hinge
         pull = pull.mul_(scale)
-        shrink = torch.where(known, energy / total, 0)[..., None] * share
-        back[:] = torch.cat([pull * rise, -pull * lean, -pull * tilt - shrink * axis], 1)
+        back[:] = torch.cat([pull * rise, -pull * lean, -pull * tilt], 1)
         growth.index_add_(1, limbs.flatten(), -energy.repeat_interleave(2, 1))
-        return energy.sum(-1) / 2
+        value, shrink = energy.sum(-1) / 2, energy
+        if self.outer:  # the same for bones that reach across: -(u . a) / (|u| |a|) is at most the limit
+            some = slice(None) if len(self.outer) == energy.shape[1] else self.outer
+            bound = self.objective.adduction.limit
+            scale = (self.side / (above * size)[:, some])[..., None]
+            across = torch.addcmul(self.along, upper[:, some], axis[:, some]).mul_(-scale)
+            wrong = (across - bound).clamp_min_(0)
+            pull = wrong * (wide(w.adduction / w.sine**2, 2) * share)
+            each = (pull * across).sum(-1)
+            value = value + (pull * wrong).sum((1, 2)) / 2
+            pull = pull.mul_(scale)
+            ends = back.unflatten(1, (3, -1))
+            ends[:, 0, some] -= pull * axis[:, some]
+            ends[:, 2, some] -= pull * upper[:, some]
+            growth.index_add_(1, limbs[some, 0], -each)
+            shrink[:, some] += each
+        back[:, -len(limbs) :] -= torch.where(known, shrink / total, 0)[..., None] * share * axis
+        return value
 
     def _foreshortening(self, dz: Tensor, lengths: Tensor, slope: Tensor, growth: Tensor) -> Tensor:
         depth, size = dz.index_select(1, self.limbs), lengths[:, self.limbs]

@@ -14,7 +14,7 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.methods.pkc.descent import ANCHOR, CORNER, HEAVY, NOISE, Descent, wide
 from kcs_torch.methods.pkc.unknowns import Unknowns
-from kcs_torch.nn.anatomy import HingeEnergy
+from kcs_torch.nn.anatomy import AdductionEnergy, HingeEnergy
 from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy, free_bones
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
@@ -47,7 +47,8 @@ class Weights:
         kappa: independent frames that the template's directions are worth.
         foreshortening: frames that count as one for the foreshortening.
         hinge: weight of a hinge in a frame.
-        sine: sine of a wrong bend that costs half its weight.
+        adduction: weight of an arm or a leg that reaches across the body, in a frame.
+        sine: sine of a wrong bend, or beyond the limit, that costs half its weight.
         proportions: usual deviation of a length, as a share.
         twins: usual difference between left and right, as a share.
     """
@@ -58,6 +59,7 @@ class Weights:
     kappa: float = 20.0
     foreshortening: float = 10.0
     hinge: float = 0.08
+    adduction: float = 0.03
     sine: float = 0.05
     proportions: float = 0.08
     twins: float = 0.03
@@ -76,6 +78,7 @@ def at_pace(weights: Weights, rate: float, pace: float = 1.0) -> Weights:
         posture=weights.posture * pace,
         foreshortening=weights.foreshortening * pace,
         hinge=weights.hinge / pace,
+        adduction=weights.adduction / pace,
     )
 
 
@@ -134,7 +137,7 @@ class Objective:
 
     T/2 sum_b log(1 + v_b)        bones keep their length,
     + sum_tb |second difference of dz|^2 / (2 a^2)        move smoothly,
-    + PostureEnergy + HingeEnergy + ForeshorteningEnergy + ProportionEnergy.
+    + PostureEnergy + HingeEnergy + AdductionEnergy + ForeshorteningEnergy + ProportionEnergy.
 
     v_b is the robust mean over time of ((|b|^2 - L^2) / 2L)^2 / s^2: how well a bone keeps its length is for the data
     to say. Perspective and a detector's habits change lengths by much more than s, all clip long.
@@ -159,6 +162,7 @@ class Objective:
         self.foreshortening = make(ForeshorteningEnergy(skeleton, correlation=weights.foreshortening))
         self.proportions = make(ProportionEnergy(skeleton, spread=weights.proportions, twins=weights.twins))
         self.hinges = make(HingeEnergy(skeleton))
+        self.adduction = make(AdductionEnergy(skeleton))
         self.bones = skeleton.bone_index(device=image.device)
         self.flat = bone_vectors(image, self.bones).square().sum(-1)  # (T, B)
         self.rigid = torch.zeros(skeleton.num_bones, dtype=image.dtype, device=image.device)
@@ -191,6 +195,7 @@ class Objective:
             "smoothness": bend.sum((1, 2)) / (2 * w.acceleration**2),
             "posture": self.posture(points, lengths, self.share),
             "hinges": w.hinge / w.sine**2 * self.hinges(points, lengths, self.time).sum(-1),
+            "adduction": w.adduction / w.sine**2 * self.adduction(points, lengths, self.time).sum(-1),
             "foreshortening": self.foreshortening(points, lengths, bone_weights=self.clear),
             "proportions": self.proportions(lengths),
         }
