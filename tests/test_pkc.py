@@ -82,12 +82,21 @@ def test_the_walker_walks_through_space(still):
 
 @pytest.mark.parametrize("case", ["fixed", "turning"])
 def test_most_joints_are_within_two_deviations(case, still, turning):
-    clip, result = still if case == "fixed" else turning
-    off = (centred(result.points) - centred(clip.points))[..., 2].abs()
-    assert result.uncertainty.shape == off.shape and (result.uncertainty > 0).all()
-    assert ((off < 2 * result.uncertainty).double().mean()) > 0.8
-    size = centred(clip.points).square().sum(-1).mean().sqrt()
-    assert result.uncertainty.mean() < 0.5 * size
+    """Of several clips: an error of a length or a sign is one of all frames of a clip."""
+    pairs = [still if case == "fixed" else turning]
+    for yaw in (20.0, 40.0, 70.0):
+        clip = walking_person(50, turn=0.0 if case == "fixed" else 180.0, yaw=yaw)
+        pairs.append((clip, PKC()(clip.tracks)))
+    once, twice = [], []
+    for clip, result in pairs:
+        off = (centred(result.points) - centred(clip.points))[..., 2].abs()
+        assert result.uncertainty.shape == off.shape and (result.uncertainty > 0).all()
+        once.append(float((off < result.uncertainty).double().mean()))
+        twice.append(float((off < 2 * result.uncertainty).double().mean()))
+        size = centred(clip.points).square().sum(-1).mean().sqrt()
+        assert result.uncertainty.mean() < 0.5 * size
+    assert 0.5 < sum(once) / len(once) < 0.95, once
+    assert sum(twice) / len(twice) > 0.8 and min(twice) > 0.6, twice
 
 
 @pytest.mark.parametrize("case", ["fixed", "turning"])

@@ -10,7 +10,7 @@ from kcs_torch.functional import bone_vectors
 from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pkc import flips as module
 from kcs_torch.methods.pkc.batch import Task, minimise_all
-from kcs_torch.methods.pkc.flips import flipped, flipped_runs, parts_of, turned_over
+from kcs_torch.methods.pkc.flips import flipped, flipped_runs, parts_of, turned, turned_over
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
 from kcs_torch.methods.pkc.objective import Objective, Weights
@@ -39,16 +39,22 @@ def bones_of(frames=40, seed=0):
     return 0.3 * torch.sin(time * pace + 3 * phase)
 
 
+def every_flip(depth, parts):
+    """All flips of a solution's runs, as depths (K, T, B), and their parts."""
+    sign, which = flipped_runs(depth, parts, ACCELERATION)
+    return turned(depth, sign, module._members(parts, depth)[which]), which
+
+
 PARTS = [(0,), (1,), (0, 1), (2, 3, 4), (5,)]
 
 
 @pytest.mark.parametrize("seed", [0, 3, 5])
 def test_flips_change_one_run_of_one_part(seed):
     depth = bones_of(seed=seed)
-    turned, which = flipped_runs(depth, PARTS, ACCELERATION)
-    assert len(turned) == len(which) > 5
+    found, which = every_flip(depth, PARTS)
+    assert len(found) == len(which) > 5
     seen = set()
-    for one, part in zip(turned, which.tolist(), strict=True):
+    for one, part in zip(found, which.tolist(), strict=True):
         assert_close(one.abs(), depth.abs())
         own = (one - depth).abs() > 1e-9
         assert set(own.any(0).nonzero().flatten().tolist()) <= set(PARTS[part])
@@ -67,11 +73,11 @@ def test_bends_are_counted_where_signs_change(frames, monkeypatch):
         column[list(part)] = 1
     cost = lambda d: d.diff(n=2, dim=0).square().sum(0)  # noqa: E731
     for k, bend in enumerate(module._bends(depth, member).mT):
-        turned = torch.cat([depth[:k], -depth[k:]])
-        assert_close(bend, (cost(turned) - cost(depth)) @ member)
+        other = torch.cat([depth[:k], -depth[k:]])
+        assert_close(bend, (cost(other) - cost(depth)) @ member)
     monkeypatch.setattr(module, "SHARP", 0.5)
-    turned, _ = flipped_runs(depth, PARTS, ACCELERATION)
-    grown = (cost(turned.movedim(0, 1)) - cost(depth)).sum(-1) / (2 * ACCELERATION**2)
+    found, _ = every_flip(depth, PARTS)
+    grown = (cost(found.movedim(0, 1)) - cost(depth)).sum(-1) / (2 * ACCELERATION**2)
     assert (grown < 0.51).all() and (frames < 40 or len(grown))
 
 
@@ -81,8 +87,8 @@ def test_signs_that_jump_are_changed_where_they_jump():
     depth[:, 5] = 0.1 + 0.05 * torch.sin(torch.arange(40) / 9)
     wrong = depth.clone()
     wrong[17:24, 5] *= -1
-    turned, _ = flipped_runs(wrong, PARTS, ACCELERATION)
-    best = turned[(turned - depth).square().sum((1, 2)).argmin()]
+    found, _ = every_flip(wrong, PARTS)
+    best = found[(found - depth).square().sum((1, 2)).argmin()]
     assert_close(best, depth)
 
 
@@ -91,8 +97,8 @@ def test_signs_that_jump_are_changed_where_they_jump():
 def test_clips_that_tell_little(frames, kind):
     depth = bones_of(frames)
     depth = depth[:1].expand_as(depth) if kind == "still" else 0 * depth if kind == "flat" else depth
-    turned, which = flipped_runs(depth, PARTS, ACCELERATION)
-    assert turned.shape == (len(which), frames, 6) and torch.isfinite(turned).all()
+    found, which = every_flip(depth, PARTS)
+    assert found.shape == (len(which), frames, 6) and torch.isfinite(found).all()
     assert kind != "flat" or not len(which)
 
 
@@ -120,7 +126,7 @@ def test_a_wrong_run_is_turned_over():
     assert 0 < len(flips.energy) <= len(parts) and (flips.energy.diff() >= 0).all()
     assert_close(objective(flips.depth, flips.lengths), flips.energy, rtol=1e-6, atol=1e-3)
     own = bone_vectors(start.depth[0, :, :, None], objective.bones)[..., 0]
-    runs, _ = flipped_runs(own, parts, ACCELERATION)
+    runs, _ = every_flip(own, parts)
     depth = (runs @ objective.tree.mT)[:40]
     (tried,) = minimise_all([task(objective, depth, start.lengths.expand(len(depth), -1))])
     stuck = int((tried.energy > start.energy[0] + 1).nonzero()[0])  # the refinement alone does not get out of it

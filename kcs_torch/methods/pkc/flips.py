@@ -18,7 +18,7 @@ from kcs_torch.methods.pkc.limbs import Limb
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["flipped", "flipped_runs", "parts_of", "turned_over"]
+__all__ = ["flipped", "flipped_runs", "parts_of", "turned", "turned_over"]
 
 TIMES = 8
 """How often flips are tried at most."""
@@ -69,7 +69,10 @@ def parts_of(skeleton: Skeleton, limbs: Sequence[Limb]) -> list[tuple[int, ...]]
 def turned_over(
     objective: Objective, parts: Sequence[tuple[int, ...]], found: Hypotheses, steps: int
 ) -> Search[Any, Any, Hypotheses]:
-    """Hypotheses, best first, whose best one no flip of a run makes better; ``steps`` as in a refinement."""
+    """Hypotheses, best first, whose best one no flip of a run makes better; ``steps`` as in a refinement.
+
+    The flips that cost little more are among them: they are what else the motion may have been.
+    """
     for _ in range(TIMES):
         best, gain = found[:1], found.energy[0] - GAIN
         tried = flipped(objective, parts, best)
@@ -81,12 +84,13 @@ def turned_over(
             tried = yield from refined(objective, tried, count)
         if not bool(tried.energy[0] < gain):  # what has far to go may get there yet
             assert tried.moved is not None
-            tried = tried[(_change(tried, best) > LARGE) & (tried.energy < best.energy + NEAR) & (tried.moved > MOVING)]
-            if not len(tried.energy):
-                return found
-            tried = yield from refined(objective, tried, steps)
+            far = (_change(tried, best) > LARGE) & (tried.energy < best.energy + NEAR) & (tried.moved > MOVING)
+            rivals = found.joined(replace(tried[tried.energy >= best.energy], steps=tried.steps - before))
+            if not bool(far.any()):
+                return rivals
+            tried = yield from refined(objective, tried[far], steps)
         if not bool(tried.energy[0] < gain):
-            return found
+            return rivals
         found = found.joined(replace(tried[:1], steps=tried.steps - before))
     return found
 
@@ -109,19 +113,36 @@ def _change(flips: Hypotheses, best: Hypotheses) -> Tensor:
 def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypotheses) -> Hypotheses:
     """The best flips of one run of a solution, at most one a part, best first; they are not refined yet."""
     own = bone_vectors(best.depth[0, ..., None], objective.bones)[..., 0]
-    runs, which = flipped_runs(own, parts, objective.weights.acceleration)
-    cost, some = Descent(objective), runs.mT.contiguous().split(max(1, ROWS // len(own)))
-    energy = torch.cat([cost.at(run, best.lengths.expand(len(run), -1), steep=False)[0] for run in some])
+    sign, which = flipped_runs(own, parts, objective.weights.acceleration)
+    member = _members(parts, own)
+    cost, few = Descent(objective), max(1, ROWS // len(own))
+    energy = own.new_empty(len(which))
+    for k in range(0, len(which), few):  # what all of them would take in memory is for long blocks too much
+        run = turned(own, sign[k : k + few], member[which[k : k + few]]).mT.contiguous()
+        energy[k : k + few] = cost.at(run, best.lengths.expand(len(run), -1), steep=False)[0]
     order = energy.argsort()
     owner = which[order].tolist()
     order = order[[k for k, part in enumerate(owner) if part not in owner[:k]]]
-    depth = runs[order] @ objective.tree.to(own).mT
+    depth = turned(own, sign[order], member[which[order]]) @ objective.tree.to(own).mT
     depth = depth - depth.mean(-1, keepdim=True)
     return Hypotheses(depth, best.lengths.expand(len(order), -1), energy[order], best.steps)
 
 
+def turned(depth: Tensor, sign: Tensor, member: Tensor) -> Tensor:
+    """Bones' depths (K, T, B) of depths (T, B), with signs (K, T) for the bones that are members (K, B)."""
+    return depth * (1 + (sign - 1)[..., None] * member[:, None])
+
+
+def _members(parts: Sequence[tuple[int, ...]], depth: Tensor) -> Tensor:
+    """1 for the bones of each part, (P, B), of depths (T, B)."""
+    member = depth.new_zeros(len(parts), depth.shape[1])
+    for row, part in zip(member, parts, strict=True):
+        row[list(part)] = 1
+    return member
+
+
 def flipped_runs(depth: Tensor, parts: Sequence[tuple[int, ...]], acceleration: float) -> tuple[Tensor, Tensor]:
-    """Bones' depths with the sign of one part changed over one run of frames, and which part it is.
+    """Signs that change over one run of frames, -1 there and 1 elsewhere, and the part that they are for.
 
     Runs are from a passage to one of the next, from the clip's start to a passage, from there to its end, or the whole
     clip. Those that would bend the motion too much, or change hardly anything, are left out.
@@ -132,23 +153,19 @@ def flipped_runs(depth: Tensor, parts: Sequence[tuple[int, ...]], acceleration: 
         acceleration: standard deviation of a bone's second difference in depth.
 
     Returns:
-        (K, T, B) and (K,).
+        (K, T) and (K,).
     """
     frames, bones = depth.shape
-    member = depth.new_zeros(len(parts), bones)
-    for row, part in zip(member, parts, strict=True):
-        row[list(part)] = 1
+    member = _members(parts, depth)
     bend = _bends(depth, member.mT) / (2 * acceleration**2)
     starts, ends, which = _runs(bend)
     costs = torch.nn.functional.pad(bend, (0, 1))  # to the end of the clip nothing bends
     sharp = costs[which, starts] + costs[which, ends]
     time = torch.arange(frames, device=depth.device)
     sign = 1 - 2 * ((time >= starts[:, None]) & (time < ends[:, None])).to(depth)  # (K, T)
-    own = member[which]
-    change = 2 * (((1 - sign) @ depth.square()) * own).sum(1) / (frames * bones)
+    change = 2 * (((1 - sign) @ depth.square()) * member[which]).sum(1) / (frames * bones)
     keep = (sharp < SHARP) & (change > SLIGHT**2)
-    signs = 1 + (sign[keep] - 1)[..., None] * own[keep][:, None]
-    return depth * signs, which[keep]
+    return sign[keep], which[keep]
 
 
 def _bends(depth: Tensor, member: Tensor) -> Tensor:
