@@ -71,6 +71,15 @@ def test_flexible_bones(flexible):
     agree(found, points[None, ..., 2], lengths_of(found, points)[None])
 
 
+@pytest.mark.parametrize("frames", [3, 12, 80])
+def test_bodies_without_twins_and_long_clips(frames):
+    """One block of directions, and more frames than directions."""
+    points = walk(frames)
+    for body in (replace(SKELETONS["h36m17"], mirror=()), SKELETONS["h36m17"]):
+        found = Objective(body, points[..., :2], Weights(), torch.zeros(frames, 17).double())
+        agree(found, points[None, ..., 2], lengths_of(found, points)[None], 0.5)
+
+
 def test_without_hinges():
     points = walk(8)
     body = replace(SKELETONS["h36m17"], hinges=())
@@ -143,7 +152,7 @@ def test_follows_dtype_and_leaves_its_arguments_alone(dtype):
 def test_fewer_operations_than_autograd_takes():
     """Counts, which no busy machine changes: of operations, which cost microseconds each, and of numbers written."""
     points = walk(60)
-    for noise, most in ((0.0, 295), (0.01, 335)):
+    for noise, most in ((0.0, 315), (0.01, 355)):
         found = objective(points, noise=noise)
         unknowns = Unknowns(found, points[None, ..., 2], lengths_of(found, points)[None])
         state, descent = torch.zeros_like(unknowns.scale), Descent(found, unknowns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import torch
@@ -35,11 +36,18 @@ class PostureEnergy(SkeletonModule):
 
     the log-det of Procrustes-aligned bones for long clips, a pull to the template for short ones.
 
+    A body that moves in one way might as well do so as its own mirror image, left and right exchanged. Of a Gaussian
+    that says so, what both sides have in common, (y_left + M y_right) / sqrt 2, is independent of what sets them apart,
+    (y_left - M y_right) / sqrt 2, with M the reflection in the body's middle plane. The energy is then the sum of one
+    such term for each of the two (Shah, Chandrasekaran: Group Symmetry and Covariance Regularization, 2012).
+
     Args:
         skeleton: with a template and spreads, and a trunk of at least three joints.
         strength: nu, in frames.
         kappa: strength of the prior on the mean, in frames.
         correlation: frames that tell as much as one independent frame.
+        symmetric: the mirror image of a motion is as likely as the motion; it makes no difference to skeletons without
+            twins, or with bones whose mirror images are no bones.
 
     Raises:
         SkeletonError: the skeleton has no template, no spreads or no trunk.
@@ -56,9 +64,16 @@ class PostureEnergy(SkeletonModule):
     deviation: Tensor
     rest: Tensor
     rest_lengths: Tensor
+    halves: Tensor
 
     def __init__(
-        self, skeleton: str | Path | Skeleton, *, strength: float = 10.0, kappa: float = 1.0, correlation: float = 15.0
+        self,
+        skeleton: str | Path | Skeleton,
+        *,
+        strength: float = 10.0,
+        kappa: float = 1.0,
+        correlation: float = 15.0,
+        symmetric: bool = True,
     ) -> None:
         super().__init__(skeleton)
         body = self.skeleton
@@ -90,6 +105,7 @@ class PostureEnergy(SkeletonModule):
         self.register_buffer("deviation", torch.stack([side, along, along], -1), persistent=False)
         self.register_buffer("rest", rest, persistent=False)
         self.register_buffer("rest_lengths", length, persistent=False)
+        self.register_buffer("halves", _halves(body, symmetric), persistent=False)
 
     def frame(self, points: Tensor) -> Tensor:
         """The trunk's rotation R_t, template to camera, (..., T, 3, 3): the best affine fit, made square.
@@ -144,28 +160,30 @@ class PostureEnergy(SkeletonModule):
         local = self.directions(points, lengths, weights)
         y = ((local - self.mean.to(local)) / self.deviation.to(local)).flatten(-2)
         count: Tensor | float
+        each: Tensor | float = 1.0
+        pull: Tensor | float = 1.0
         if weights is None:
             count, mean = y.shape[-2] / self.correlation, y.mean(-2, keepdim=True)
-            scatter = (y - mean).mT @ (y - mean) / self.correlation
-            pull: Tensor | float = count * self.kappa / (count + self.kappa)
+            off, each = y - mean, 1 / self.correlation
+            pull = count * self.kappa / (count + self.kappa)
         elif weighs_joints(weights, points, self):
             firm = torch.minimum(bone_share(weights, self.bones), weights[..., self.trunk].amin(-1, keepdim=True))
             share = firm.to(local).repeat_interleave(3, -1) / self.correlation  # (..., T, 3B)
             count, own = share.amax(-1).sum(-1), share.sum(-2, keepdim=True)
             mean = (share * y).sum(-2, keepdim=True) / some(own)
             off = safe_root(share) * (y - mean)
-            scatter, pull = off.mT @ off, 1.0
             mean = mean * safe_root(own * self.kappa / (own + self.kappa))
         else:
             share = weights.to(local)[..., None]
             count = share.sum((-2, -1))
             mean = (share * y).sum(-2, keepdim=True) / torch.where(count > 0, count, 1)[..., None, None]
-            scatter = ((y - mean) * share).mT @ (y - mean)
-            pull = (count * self.kappa / (count + self.kappa))[..., None, None]
-        scatter = scatter + pull * (mean.mT @ mean)
+            off, each = y - mean, share[..., None, :, :]
+            pull = (count * self.kappa / (count + self.kappa))[..., None, None, None]
+        off, mean = (rows[..., None, :, :] @ self.halves.to(local).mT for rows in (off, mean))  # (..., S, T or 1, K)
+        scatter = (off * each).mT @ off + pull * (mean.mT @ mean)
         eye = torch.eye(scatter.shape[-1], dtype=local.dtype, device=local.device)
         factor, _ = torch.linalg.cholesky_ex(eye + scatter / self.strength)
-        log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum((-2, -1))
         return narrow((count + self.strength) / 2 * log_det, points)
 
 
@@ -199,6 +217,26 @@ def _hinge_facts(body: Skeleton, rest: Tensor) -> tuple[Tensor, set[int]]:
         if hinge.firm >= 0.5:
             firm |= {upper, lower}
     return shift, firm
+
+
+def _halves(body: Skeleton, symmetric: bool) -> Tensor:
+    """Orthonormal rows (S, K, 3B) that take bones (B, 3) apart: into what both sides share and what sets them apart.
+
+    S is 2, the rows of the second filled up with zeros; or 1, with the rows of the identity, where the body has no
+    twins, or bones whose mirror images are no bones of it.
+    """
+    size = body.num_bones
+    rows = torch.eye(3 * size, dtype=torch.float64).view(size, 3, 3 * size)
+    twin = {a: b for pair in body.mirror for a, b in (pair, pair[::-1])}
+    whole = {(twin.get(a, a), twin.get(b, b)) for a, b in body.bones} == set(body.bones)
+    if not (symmetric and whole and body.mirror_bones):
+        return rows.view(1, 3 * size, 3 * size)
+    left, right = torch.tensor(body.mirror_bones).T
+    middle = [b for b in range(size) if b not in {*left.tolist(), *right.tolist()}]
+    image = rows[right] * rows.new_tensor([-1.0, 1.0, 1.0])[:, None]
+    shared = torch.cat([math.sqrt(0.5) * (rows[left] + image).flatten(0, 1), rows[middle, 1:].flatten(0, 1)])
+    apart = torch.cat([math.sqrt(0.5) * (rows[left] - image).flatten(0, 1), rows[middle, 0]])
+    return torch.nn.utils.rnn.pad_sequence([shared, apart], batch_first=True)
 
 
 def _unit(vectors: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,6 +13,7 @@ from kcs_torch.functional.chain import bone_vectors, incidence
 if TYPE_CHECKING:
     from kcs_torch.methods.pkc.objective import Objective
     from kcs_torch.methods.pkc.unknowns import Unknowns
+    from kcs_torch.nn.posture import PostureEnergy
 
 __all__ = ["ANCHOR", "CORNER", "HEAVY", "NOISE", "Descent", "wide"]
 
@@ -40,7 +42,6 @@ class Descent:
     def __init__(self, objective: Objective, unknowns: Unknowns | None = None) -> None:
         self.objective, self.unknowns, self.weights = objective, unknowns, objective.weights
         obj, body, like = objective, objective.skeleton, objective.image
-        self.x, self.y = (_early(v) for v in bone_vectors(obj.image, obj.bones).unbind(-1))  # (1 or H, B, T) each
         self.flat = _early(obj.flat)
         self.noise = _early(obj.noise).square() if obj.noisy else None
         self.rigid = obj.rigid[None, :, None] if obj.rigid.ndim == 1 else _early(obj.rigid)
@@ -56,8 +57,12 @@ class Descent:
         self.plane = plane if plane.ndim == 4 else plane[None]
         lines = [(affine - affine.mean(-1, keepdim=True)) @ obj.tree[posture.trunk]]  # (2, B): the axes' depths
         self.axes = posture.axes.to(like)
-        self.spread = posture.deviation.to(like).mT.reshape(-1, 3, body.num_bones)  # (1 or H, 3, B)
-        self.mean = (posture.mean.to(like).mT / self.spread).flatten(1)[..., None]  # (1 or H, 3B, 1)
+        self.sides = sides = Sides(posture)
+        seen = bone_vectors(obj.image, obj.bones)[..., sides.order, :]
+        self.x, self.y = (_early(v) for v in seen.unbind(-1))  # (1 or H, B, T) each
+        spread = posture.deviation.to(like).mT[..., sides.order].reshape(-1, 3, body.num_bones)
+        self.spread = spread * sides.share.to(like)  # (1 or H, 3, B)
+        self.mean = (posture.mean.to(like).mT[:, sides.order] / self.spread).flatten(1)[..., None]  # (1 or H, 3B, 1)
         hinges = obj.hinges
         if len(hinges.joints):
             parent, joint, child, left, right = hinges.joints.unbind(1)
@@ -183,8 +188,13 @@ class Descent:
         turn = (self.axes @ frame).view(count, 3, 3, 1, frames)  # [k, j]: how much of coordinate j is in direction k
         # How bones stray from their usual directions, seen from the trunk, less that share of their mean for which the
         # prior does not charge: log det(I + Z Z^T) is then all there is to it.
-        scale = (lengths[:, None] * self.spread).reciprocal_().flatten(1)[..., None]  # (H, 3B, 1)
-        own = dz if self.time is None else dz * self.time
+        sides = self.sides
+        scale = (
+            (lengths.index_select(1, sides.order)[:, None] * self.spread).reciprocal_().flatten(1)[..., None]
+        )  # (H, 3B, 1)
+        own = dz.index_select(1, sides.order)
+        if self.time is not None:
+            own = own * self.time
         y = turn[:, :, 0] * self.x[:, None]
         y.addcmul_(turn[:, :, 1], self.y[:, None]).addcmul_(turn[:, :, 2], own[:, None])
         seen = y.view(count, 3 * bones, frames)
@@ -194,31 +204,29 @@ class Descent:
         mean = scale * seen.sum(-1, keepdim=True) / real - self.mean
         seen.mul_(root * scale)
         self._lower(seen, root * (self.mean + (1 - part) * mean))
-        few = frames < 3 * bones  # Z^T Z is then the smaller matrix, and (I + Z Z^T)^-1 Z = Z (I + Z^T Z)^-1
-        scatter = torch.bmm(seen.mT, seen) if few else torch.bmm(seen, seen.mT)
+        halves = sides.apart(seen)  # (S H, K, T)
+        few = frames < halves.shape[1]  # Z^T Z is then the smaller matrix, and (I + Z Z^T)^-1 Z = Z (I + Z^T Z)^-1
+        scatter = torch.bmm(halves.mT, halves) if few else torch.bmm(halves, halves.mT)
         scatter.diagonal(dim1=-2, dim2=-1).add_(1)
         factor, info = torch.linalg.cholesky_ex(scatter)
         failed = info > 0  # a step so far that rounding or overflow leaves no scatter: it costs infinitely much
         if bool(failed.any()):
             factor = torch.where(failed[:, None, None], torch.ones_like(factor[0, 0]).diag(), factor)
         firm = amount + posture.strength
-        half = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        value = torch.where(failed, torch.inf, half * (firm[:, 0, 0] if isinstance(firm, Tensor) else firm))
+        log_det = torch.where(failed, torch.inf, factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)).view(-1, count).sum(0)
+        value = log_det * (firm[:, 0, 0] if isinstance(firm, Tensor) else firm)
         if not steep:
             return value
         inverse = torch.cholesky_inverse(factor)
-        if few:
-            pull = torch.bmm(seen, inverse)
-            moved = (pull * seen).sum(-1, keepdim=True)
-            pull.mul_(firm * root * scale)
-        else:
-            moved = 1 - inverse.diagonal(dim1=-2, dim2=-1)[..., None]
-            pull = torch.bmm(inverse.mul_(firm * root * scale), seen)
+        pull = sides.joined(torch.bmm(halves, inverse) if few else torch.bmm(inverse, halves), count)  # (H, 3B, T)
+        moved = (pull * seen).sum(-1, keepdim=True)
+        pull.mul_(firm * root * scale)
         total = pull.sum(-1, keepdim=True)
-        growth -= (firm * moved + part * total * self.mean / scale).view(count, 3, bones).sum(1)
+        grown = (firm * moved + part * total * self.mean / scale).view(count, 3, bones).sum(1)
+        growth -= grown.index_select(1, sides.back)
         self._lower(pull, (1 - part) * total / real)
         pull = pull.view_as(y)
-        slope += (pull * turn[:, :, 2]).sum(1)
+        slope += (pull * turn[:, :, 2]).sum(1).index_select(1, sides.back)
         turned = [(pull * v[:, None]).sum(2) for v in (self.x, self.y, own)]  # (H, 3, T): of k, for each j
         into = self.axes.mT @ torch.stack(turned, 2).flatten(2)  # (H, 3, 3 T)
         a, b, c = into.view(count, 3, 3, frames).unbind(1)
@@ -304,6 +312,65 @@ class Descent:
             growth += wide(obj.held, 1) * away / ANCHOR
             value = value + obj.held * away.square().sum(-1) / 2
         return value
+
+
+class Sides:
+    """Takes a body's bones apart as :attr:`PostureEnergy.halves` does, at the cost of a sum and a difference.
+
+    Bones are brought into the order left twins, right twins, others. What each is divided by holds the rest: a root of
+    two for twins, and the sign with which the right one's first coordinate counts.
+
+    Args:
+        posture: of the body.
+    """
+
+    def __init__(self, posture: PostureEnergy) -> None:
+        body, device = posture.skeleton, posture.halves.device
+        pairs = body.mirror_bones if len(posture.halves) > 1 else ()
+        left, right = ([pair[i] for pair in pairs] for i in (0, 1))
+        other = [b for b in range(body.num_bones) if b not in {*left, *right}]
+        self.twins, self.others = len(pairs), len(other)
+        self.order = torch.tensor([*left, *right, *other], device=device)
+        self.back = self.order.argsort()
+        share = torch.ones(3, body.num_bones, dtype=posture.halves.dtype, device=device)
+        share[:, : 2 * self.twins] = math.sqrt(2)
+        share[0, self.twins : 2 * self.twins] *= -1
+        self.share = share
+
+    def apart(self, seen: Tensor) -> Tensor:
+        """(H, 3B, T), bones in this order, as (S H, K, T), first what both sides share."""
+        if not self.twins:
+            return seen
+        count, _, frames = seen.shape
+        left, right, other = self._split(seen.view(count, 3, -1, frames))
+        out = seen.new_empty(2, count, 3 * self.twins + 2 * self.others, frames)
+        for both, rest, sign, first in zip(*self._parts(out), (1, -1), (1, 0), strict=True):
+            torch.add(left, right, alpha=sign, out=both)
+            own = other[:, first : first + 1 + first]
+            rest[:, : own.shape[1]] = own
+            rest[:, own.shape[1] :] = 0
+        return out.flatten(0, 1)
+
+    def joined(self, halves: Tensor, count: int) -> Tensor:
+        """The way back."""
+        if not self.twins:
+            return halves
+        out = halves.new_empty(count, 3, len(self.order), halves.shape[-1])
+        left, right, other = self._split(out)
+        (shared, apart), rest = self._parts(halves.view(2, count, *halves.shape[1:]))
+        torch.add(shared, apart, out=left)
+        torch.sub(shared, apart, out=right)
+        other[:, 1:], other[:, 0] = rest[0], rest[1][:, 0]
+        return out.flatten(1, 2)
+
+    def _split(self, seen: Tensor) -> tuple[Tensor, ...]:
+        """Left twins, right twins and others of (H, 3, B, T)."""
+        return seen.split([self.twins, self.twins, self.others], 2)
+
+    def _parts(self, halves: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+        """Both halves' rows of twins (H, 3, P, T), and of others (H, 2, B - 2P, T)."""
+        twins, others = halves.split([3 * self.twins, 2 * self.others], 2)
+        return list(twins.unflatten(2, (3, -1))), list(others.unflatten(2, (2, -1)))
 
 
 def wide(value: Tensor | float, dims: int) -> Tensor | float:
