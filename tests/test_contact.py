@@ -55,6 +55,41 @@ def test_contact_gradient_batches_and_no_contacts():
     assert ContactEnergy("hand21")(normal(4, 21, 3), torch.zeros(4).double(), torch.zeros(4, 0).double()) == 0
 
 
+def test_the_best_velocity_is_found():
+    """No other costs less, and the energy has the slope in the points that it has at this velocity."""
+    clip = walking_person(40, turn=0.0)
+    points = clip.points / 1000
+    points = points - points.mean(1, keepdim=True)
+    feet = list(MAN.contacts)
+    sure = standing(clip.tracks.points[:, feet], clip.tracks.weights[:, feet])
+    energy = ContactEnergy(MAN)
+    least = energy(points, None, sure)
+    velocity = torch.zeros(40).double().requires_grad_()
+    search = torch.optim.LBFGS([velocity], max_iter=500, tolerance_grad=1e-9, line_search_fn="strong_wolfe")
+
+    def closure():
+        search.zero_grad()
+        value = energy(points, velocity, sure)
+        value.backward()
+        return value
+
+    search.step(closure)
+    assert least.item() == pytest.approx(float(energy(points, velocity.detach(), sure)), rel=1e-3)
+    leaf = points.clone().requires_grad_()
+    slopes = [torch.autograd.grad(energy(leaf, v, sure), leaf)[0] for v in (None, velocity.detach())]
+    assert_close(slopes[0], slopes[1], rtol=0, atol=0.02 * float(slopes[1].abs().amax()))
+
+
+def test_the_best_velocity_in_batches_and_where_nothing_tells():
+    energy = ContactEnergy(MAN)
+    same_as_loop(lambda p, s: energy(0.01 * p, None, s.sigmoid()), (4, 17, 3), (4, 2))
+    for frames in (1, 2, 5):
+        nothing = torch.zeros(frames, 2).double()
+        assert energy(normal(frames, 17, 3), None, nothing) == 0
+        finite(lambda p, none=nothing: energy(p, None, none + 0.5), 0 * normal(frames, 17, 3))
+    assert ContactEnergy("hand21")(normal(4, 21, 3), None, torch.zeros(4, 0).double()) == 0
+
+
 def test_feet_of_a_walk_stand_by_turns():
     clip = walking_person(90, turn=0.0)
     feet = list(MAN.contacts)

@@ -16,6 +16,7 @@ from kcs_torch.methods.pkc import batch
 from kcs_torch.methods.pkc import objective as module
 from kcs_torch.methods.pkc.batch import Task, minimise_all
 from kcs_torch.methods.pkc.objective import BLUR, Objective, Unknowns, Weights, at_pace, bone_noise, pace_of
+from kcs_torch.methods.root import standing_feet
 from kcs_torch.nn import PostureEnergy
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.solvers import lbfgs
@@ -318,6 +319,30 @@ def test_minimise_lowers_sorts_and_keeps_good_starts():
     assert_close(alone[2][0], energy[0], rtol=1e-3, atol=0)
 
 
+def test_contacts_rank_solutions():
+    """A walk before a fixed camera: legs whose depths have the wrong sign slide over the ground."""
+    clip = walking_person(60, turn=0.0, yaw=20.0)
+    points = clip.points / 1000
+    points = points - points.mean(1, keepdim=True)
+    sure = standing_feet(clip.tracks)
+    plain = objective(points)
+    found = Objective(plain.skeleton, points[..., :2], Weights(), torch.zeros(60, 17).double(), standing=sure)
+    wrong = points.clone()
+    for joint in (5, 6):  # one leg
+        wrong[:, joint, 2] = 2 * points[:, 4, 2] - points[:, joint, 2]
+    depth = torch.stack([points[..., 2], wrong[..., 2] - wrong[..., 2].mean(1, keepdim=True)])
+    right, slides = found.contact(depth)
+    assert slides > right + 20
+    assert_close(found.contact(-depth[:1])[0], right)  # the mirror image walks the other way
+    assert not plain.contact(depth).any()
+    lengths = lengths_of(found, points).expand(2, -1)
+    free, ranked = plain.minimise(depth, lengths, 3), found.minimise(depth, lengths, 3)
+    assert_close(ranked.energy - found.contact(ranked.depth), found(ranked.depth, ranked.lengths))
+    assert_close(free.depth[free.energy.argmin()], ranked.depth[0])  # contacts do not pull
+    shaken = Objective(plain.skeleton, points[..., :2], Weights(), torch.full((60, 17), 0.02).double(), standing=sure)
+    assert shaken.contact(depth)[1] < 0.8 * slides
+
+
 def test_frame_rates_count_alike():
     """Twice the frames a second: each tells half as much, so that the terms stay about the same."""
     slow, fast = walk(60), walk(120, fps=60.0)
@@ -334,7 +359,7 @@ def test_frame_rates_count_alike():
     assert slow == replace(
         Weights(),
         **{name: 3 * getattr(Weights(), name) for name in ("posture", "foreshortening")},
-        **{name: getattr(Weights(), name) / 3 for name in ("hinge", "adduction")},
+        **{name: getattr(Weights(), name) / 3 for name in ("hinge", "adduction", "contact")},
     )
 
 
@@ -430,6 +455,7 @@ def test_clips_together_have_the_energies_of_each():
     joined = Objective.joined([task.objective for task in tasks], counts)
     pad = lambda z: torch.nn.functional.pad(z, (0, 0, 0, 33 - z.shape[1]), value=0.7)  # noqa: E731
     depth, lengths = torch.cat([pad(task.depth) for task in tasks]), torch.cat([task.lengths for task in tasks])
+    assert joined.standing is None
     together = joined.terms(depth, lengths)
     for task, *rows in zip(tasks, *(term.split(counts) for term in together.values()), strict=True):
         alone = task.objective.terms(task.depth, task.lengths)

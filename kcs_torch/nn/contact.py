@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.solvers.standing import RIDGE, root_velocity
 
 __all__ = ["ContactEnergy"]
 
@@ -24,32 +25,47 @@ class ContactEnergy(SkeletonModule):
         skeleton: with contacts; without them the energy is 0.
         slip: s, in units of the points per frame.
         change: a, of the root's velocity from frame to frame.
+        num_steps: reweightings that find the best velocity where none is given.
     """
 
     contacts: Tensor
 
-    def __init__(self, skeleton: str | Path | Skeleton, *, slip: float = 0.006, change: float = 0.004) -> None:
+    def __init__(
+        self, skeleton: str | Path | Skeleton, *, slip: float = 0.006, change: float = 0.004, num_steps: int = 10
+    ) -> None:
         super().__init__(skeleton)
-        self.slip, self.change = slip, change
+        self.slip, self.change, self.num_steps = slip, change, num_steps
         contacts = torch.tensor(self.skeleton.contacts, dtype=torch.long)
         self.register_buffer("contacts", contacts, persistent=False)
 
-    def forward(self, points: Tensor, velocity: Tensor, standing: Tensor, weights: Tensor | None = None) -> Tensor:
+    def forward(
+        self, points: Tensor, velocity: Tensor | None, standing: Tensor, weights: Tensor | None = None
+    ) -> Tensor:
         """Return (...).
 
         Args:
             points: (..., T, N, 3), depth relative to the root or the body's middle.
-            velocity: v (..., T), the first frame's does not count.
+            velocity: v (..., T), the first frame's does not count; None takes the best one
+                (:func:`kcs_torch.solvers.standing.root_velocity`), at which the energy has no slope in v.
             standing: c (..., T, C).
             weights: (..., T, N) of the joints: a foot stands no more than it is seen.
         """
         self.check(points, clip=True)
         if weights is not None:
             standing = torch.minimum(standing, weights[..., self.contacts])
-        depth, velocity = wide(points)[..., self.contacts, 2], wide(velocity)
+        depth = wide(points)[..., self.contacts, 2]
         both = torch.minimum(standing[..., 1:, :], standing[..., :-1, :])
         step = known((depth[..., 1:, :] - depth[..., :-1, :])[..., None], both)[..., 0]
+        velocity = self._best(step, both) if velocity is None else wide(velocity)
         move = step + velocity[..., 1:, None]
         slip = (both * torch.log1p((move / self.slip).square())).sum((-2, -1)) / 2
         steady = ((velocity[..., 2:] - velocity[..., 1:-1]) / self.change).square().sum(-1) / 2
-        return narrow(slip + steady + 5e-4 * (velocity[..., 1:] / self.slip).square().sum(-1), points)
+        return narrow(slip + steady + RIDGE / 2 * (velocity[..., 1:] / self.slip).square().sum(-1), points)
+
+    @torch.no_grad()
+    def _best(self, step: Tensor, standing: Tensor) -> Tensor:
+        """The velocity (..., T) that costs least."""
+        if not self.contacts.numel() or not step.shape[-2]:
+            return step.new_zeros(*step.shape[:-2], step.shape[-2] + 1)
+        best = root_velocity(step, standing.to(step), self.slip, self.change, num_steps=self.num_steps)
+        return torch.nn.functional.pad(best, (1, 0))

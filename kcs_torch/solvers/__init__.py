@@ -12,6 +12,7 @@ from kcs_torch.solvers.nullspace import null_space_upgrade
 from kcs_torch.solvers.procrustean import procrustean
 from kcs_torch.solvers.sign_filter import SignFilter
 from kcs_torch.solvers.signs import SignPath, sign_costs, sign_table, smooth_signs
+from kcs_torch.solvers.standing import root_velocity
 
 __all__ = [
     "Denoised",
@@ -33,6 +34,7 @@ __all__ = [
     "metric_upgrade",
     "null_space_upgrade",
     "procrustean",
+    "root_velocity",
     "settle_path",
     "sign_costs",
     "sign_table",

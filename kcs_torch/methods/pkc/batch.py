@@ -139,5 +139,5 @@ def _minimise_joined(tasks: list[Task]) -> list[Refined]:
     out = []
     for task, *part in zip(tasks, *(x.split(counts) for x in found[:4]), strict=True):
         z, size, energy, moved = part
-        out.append(Refined(z[:, : task.depth.shape[1]], size, energy, moved, found.steps).sorted())
+        out.append(task.objective.ranked(Refined(z[:, : task.depth.shape[1]], size, energy, moved, found.steps)))
     return out

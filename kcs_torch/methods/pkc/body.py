@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -47,6 +46,7 @@ class Body:
         image: (T, N, 2), complete, centred per frame.
         rate: frames a second.
         noise: (T, N) standard deviation of the joints in the image.
+        standing: (T, C) how surely the skeleton's contact points stand still, or None where nothing tells.
 
     Attributes:
         factor: units of the template per unit of the image.
@@ -54,7 +54,9 @@ class Body:
         objective: that ranks hypotheses, over all frames.
     """
 
-    def __init__(self, skeleton: Skeleton, image: Tensor, rate: float, noise: Tensor) -> None:
+    def __init__(
+        self, skeleton: Skeleton, image: Tensor, rate: float, noise: Tensor, standing: Tensor | None = None
+    ) -> None:
         posture = usual_posture(skeleton, image.dtype, image.device)
         rigid = torch.zeros(skeleton.num_bones, dtype=torch.bool, device=image.device)
         rigid[list(skeleton.rigid)] = True
@@ -64,7 +66,7 @@ class Body:
         self.image = image / scale
         self.noise = noise / scale
         weights = at_pace(Weights(), rate, pace_of(image, skeleton, rate))
-        self.objective = Objective(skeleton, self.image, weights, self.noise)
+        self.objective = Objective(skeleton, self.image, weights, self.noise, standing=standing)
 
     def frames(self, depth: Tensor) -> Tensor:
         """The trunk's rotations (T, 3, 3), template to camera, of depths (T, N)."""
@@ -96,6 +98,12 @@ class Body:
         lengths = torch.where(lengths > 1e-3 * usual, lengths, usual)
         return (yield from refined(self.objective, Hypotheses(depth, lengths, depth.new_zeros(len(depth))), steps))
 
+    def without_contacts(self, found: Hypotheses) -> Hypotheses:
+        """Hypotheses ranked anew, and from now on, without contacts: nothing stands still if the camera turns."""
+        energy = found.energy - self.objective.contact(found.depth)
+        self.objective.standing = None
+        return replace(found, energy=energy)[energy.argsort()]
+
     def search(self, rounds: int, steps: int) -> Search[Any, Any, Hypotheses]:
         """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best."""
         stride = max(1, round(self.rate / 30)) if self.rate >= FAST else 1
@@ -104,15 +112,19 @@ class Body:
         frames = len(image)
         size = min(BLOCK, frames)
         starts = window_starts(frames, size, min(OVERLAP, size - 1))
-        noise = self.noise[::stride]
-        lift = partial(searching, self.skeleton, rate=rate, rounds=rounds, steps=steps)
+        standing = self.objective.standing
+
+        def lift(some: slice, anchor: Tensor | None = None) -> Search[Any, Any, Hypotheses]:
+            noise, feet = self.noise[::stride][some], None if standing is None else standing[::stride][some]
+            return searching(self.skeleton, image[some], rate, noise, rounds, steps, anchor, standing=feet)
+
         if len(starts) == 1:
-            found = yield from lift(image, noise=noise)
+            found = yield from lift(slice(None))
         else:
             blocks = torch.stack([image[s : s + size] for s in starts])
             moved = bone_vectors(blocks, self.objective.bones).diff(dim=1).square().sum((1, 2, 3))
             order = moved.argsort(descending=True).tolist()  # lengths come from the liveliest block
-            part = lambda i, anchor: lift(blocks[i], noise=noise[starts[i] : starts[i] + size], anchor=anchor)  # noqa: E731
+            part = lambda i, anchor: lift(slice(starts[i], starts[i] + size), anchor)  # noqa: E731
             depths = blocks.new_empty(blocks.shape[:3])  # all that is kept of a block
             first = yield from part(order[0], None)
             lengths, count = first.lengths[0], first.steps

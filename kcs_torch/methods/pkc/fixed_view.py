@@ -58,6 +58,7 @@ def fixed_view(
     steps: int = 30,
     weights: Weights | None = None,
     anchor: Tensor | None = None,
+    standing: Tensor | None = None,
 ) -> Hypotheses:
     """Lift one clip by lengths, signs and posture, without any turn of the viewpoint.
 
@@ -79,12 +80,13 @@ def fixed_view(
         steps: L-BFGS steps of each refinement.
         weights: of the objective.
         anchor: (B,) lengths known from elsewhere, or None.
+        standing: (T, C) how surely the skeleton's contact points stand still, or None where nothing tells.
 
     Returns:
         The hypotheses, best first.
     """
     noise = torch.zeros_like(image[..., 0]) if noise is None else noise
-    search = searching(skeleton, image, rate, noise, rounds, steps, anchor, weights)
+    search = searching(skeleton, image, rate, noise, rounds, steps, anchor, weights, standing)
     return run(search, serve)
 
 
@@ -97,6 +99,7 @@ def searching(
     steps: int,
     anchor: Tensor | None = None,
     weights: Weights | None = None,
+    standing: Tensor | None = None,
 ) -> Search[Any, Any, Hypotheses]:
     """:func:`fixed_view` as a search, which may run beside others; arguments as there."""
     slow = 30.0 / rate
@@ -111,7 +114,8 @@ def searching(
         hinge=costs.hinge / pace,
     )
     image = image - image.mean(-2, keepdim=True)
-    search = _Search(skeleton, image, Objective(skeleton, image, weights, noise, anchor), costs, TURN * slow)
+    objective = Objective(skeleton, image, weights, noise, anchor, standing)
+    search = _Search(skeleton, image, objective, costs, TURN * slow)
     first = yield from search.start(anchor)
     found = yield from search.refine(first, steps, LOOSE)
     for _ in range(rounds):

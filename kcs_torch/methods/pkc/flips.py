@@ -120,11 +120,18 @@ def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypoth
     for k in range(0, len(which), few):  # what all of them would take in memory is for long blocks too much
         run = turned(own, sign[k : k + few], member[which[k : k + few]]).mT.contiguous()
         energy[k : k + few] = cost.at(run, best.lengths.expand(len(run), -1), steep=False)[0]
+
+    def depths(some: Tensor) -> Tensor:
+        depth = turned(own, sign[some], member[which[some]]) @ objective.tree.to(own).mT
+        return depth - depth.mean(-1, keepdim=True)
+
+    near = (energy < best.energy + FIRST[0][0]).nonzero().flatten()  # contacts only add to the cost
+    for some in near.split(few):
+        energy[some] += objective.contact(depths(some))
     order = energy.argsort()
     owner = which[order].tolist()
     order = order[[k for k, part in enumerate(owner) if part not in owner[:k]]]
-    depth = turned(own, sign[order], member[which[order]]) @ objective.tree.to(own).mT
-    depth = depth - depth.mean(-1, keepdim=True)
+    depth = depths(order)
     return Hypotheses(depth, best.lengths.expand(len(order), -1), energy[order], best.steps)
 
 

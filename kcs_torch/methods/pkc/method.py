@@ -21,6 +21,7 @@ from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.moving_view import Descent, MovingView
 from kcs_torch.methods.pkc.moving_view import searching as turning
+from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.unseen import gap_deviation, place_unseen
 from kcs_torch.nn.posture import trunk_joints
@@ -143,7 +144,8 @@ class PKC(Method):
             raise OptionError(
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
-        body = Body(skeleton, image, tracks.fps or 30.0, noise) if has_trunk else None
+        feet = standing_feet(tracks) if cameras is None and self.viewpoint != "moving" else None
+        body = Body(skeleton, image, tracks.fps or 30.0, noise, feet) if has_trunk else None
         enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
         if body is None:
             moving, first = yield from self._moving(tracks, image, noise, cameras, enough)
@@ -161,6 +163,10 @@ class PKC(Method):
             moves = moves and (cameras is not None or turn >= TURNING)
         if moves:
             moving = (yield from self._moving(tracks, image, noise, cameras, enough))[0]
+            if found is not None and moving is not None and cameras is None:
+                path, kind = moving.cameras()
+                if kind != "free" and float(viewpoint_turn(path[:, :2])) >= TURNING:
+                    found = body.without_contacts(found)
             found = yield from self._ranked(body, moving, cameras, found)
         assert found is not None
         return self._from_hypotheses(found, body, cameras, notes, detected(tracks.weights))

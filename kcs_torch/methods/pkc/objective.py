@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
@@ -15,6 +16,7 @@ from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.methods.pkc.descent import ANCHOR, CORNER, HEAVY, NOISE, Descent, wide
 from kcs_torch.methods.pkc.unknowns import Unknowns
 from kcs_torch.nn.anatomy import AdductionEnergy, HingeEnergy
+from kcs_torch.nn.contact import ContactEnergy
 from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy, free_bones
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
@@ -25,6 +27,12 @@ __all__ = ["Objective", "Refined", "Weights", "at_pace", "bone_noise", "pace_of"
 
 BLUR = 2.0
 """By how much a bone's direction strays, over its noise in the image per length: the trunk's frame is noisy as well."""
+
+SHAKY = 2.0
+"""By how much a standing foot strays in depth, over its noise in the image: it hangs on a chain of bones."""
+
+STEADY = 5
+"""Reweightings by which the body's velocity is found; more change what contacts cost by .02 on average."""
 
 SHORT = 0.001
 """Bones are no shorter than this, a standing person being about 1.75 tall."""
@@ -51,6 +59,9 @@ class Weights:
         sine: sine of a wrong bend, or beyond the limit, that costs half its weight.
         proportions: usual deviation of a length, as a share.
         twins: usual difference between left and right, as a share.
+        contact: weight of feet that stand still, in a frame.
+        slip: standard deviation of a standing foot's change of depth from a frame to the next.
+        change: standard deviation of the second difference of the body's own.
     """
 
     length: float = 0.003
@@ -63,6 +74,9 @@ class Weights:
     sine: float = 0.05
     proportions: float = 0.08
     twins: float = 0.03
+    contact: float = 1.0
+    slip: float = 0.009
+    change: float = 0.006
 
 
 def at_pace(weights: Weights, rate: float, pace: float = 1.0) -> Weights:
@@ -79,6 +93,9 @@ def at_pace(weights: Weights, rate: float, pace: float = 1.0) -> Weights:
         foreshortening=weights.foreshortening * pace,
         hinge=weights.hinge / pace,
         adduction=weights.adduction / pace,
+        contact=weights.contact / pace,
+        slip=weights.slip * slow,
+        change=weights.change * slow**2,
     )
 
 
@@ -137,7 +154,7 @@ class Objective:
 
     T/2 sum_b log(1 + v_b)        bones keep their length,
     + sum_tb |second difference of dz|^2 / (2 a^2)        move smoothly,
-    + PostureEnergy + HingeEnergy + AdductionEnergy + ForeshorteningEnergy + ProportionEnergy.
+    + PostureEnergy + HingeEnergy + AdductionEnergy + ForeshorteningEnergy + ProportionEnergy + ContactEnergy.
 
     v_b is the robust mean over time of ((|b|^2 - L^2) / 2L)^2 / s^2: how well a bone keeps its length is for the data
     to say. Perspective and a detector's habits change lengths by much more than s, all clip long.
@@ -148,10 +165,17 @@ class Objective:
         weights: of the terms.
         noise: (T, N) standard deviation of each joint's image: its bones may look longer or shorter than they are.
         anchor: (B,) lengths known from elsewhere in the clip, or None.
+        standing: (T, C) how surely the skeleton's contact points stand still, or None where nothing tells.
     """
 
     def __init__(
-        self, skeleton: Skeleton, image: Tensor, weights: Weights, noise: Tensor, anchor: Tensor | None = None
+        self,
+        skeleton: Skeleton,
+        image: Tensor,
+        weights: Weights,
+        noise: Tensor,
+        anchor: Tensor | None = None,
+        standing: Tensor | None = None,
     ) -> None:
         self.skeleton, self.image, self.weights, self.anchor = skeleton, image, weights, anchor
         make = lambda module: module.to(image)  # noqa: E731
@@ -163,6 +187,10 @@ class Objective:
         self.proportions = make(ProportionEnergy(skeleton, spread=weights.proportions, twins=weights.twins))
         self.hinges = make(HingeEnergy(skeleton))
         self.adduction = make(AdductionEnergy(skeleton))
+        self.standing = standing
+        shaken = SHAKY * float(noise[:, list(skeleton.contacts)].median()) if skeleton.contacts else 0.0
+        slip = math.hypot(weights.slip, shaken)
+        self.feet = make(ContactEnergy(skeleton, slip=slip, change=weights.change, num_steps=STEADY))
         self.bones = skeleton.bone_index(device=image.device)
         self.flat = bone_vectors(image, self.bones).square().sum(-1)  # (T, B)
         self.rigid = torch.zeros(skeleton.num_bones, dtype=image.dtype, device=image.device)
@@ -203,6 +231,18 @@ class Objective:
             out["anchor"] = self.held * ((lengths / self.anchor).log() / ANCHOR).square().sum(-1) / 2
         return out
 
+    def contact(self, depth: Tensor) -> Tensor:
+        """What feet that should stand still cost, (H,), of depths (H, T, N) centred per frame.
+
+        It ranks solutions but does not pull on them: it ties the depths of both legs to each other, so stiffly that a
+        descent with it gets stuck.
+        """
+        if self.standing is None:
+            return depth.new_zeros(len(depth))
+        few = max(1, MOST // depth.shape[1])
+        points = torch.nn.functional.pad(depth[..., None], (2, 0))
+        return torch.cat([self.weights.contact * self.feet(part, None, self.standing) for part in points.split(few)])
+
     def _length(self, off: Tensor, lengths: Tensor) -> Tensor:
         """T/2 sum_b log(1 + v_b) of off (H, T, B), (H,).
 
@@ -230,7 +270,7 @@ class Objective:
         return self.rigid / (least + share * self.noise.square())
 
     def __call__(self, depth: Tensor, lengths: Tensor) -> Tensor:
-        """The energy (H,) of depths (H, T, N) and lengths (H, B)."""
+        """The energy (H,) of depths (H, T, N) and lengths (H, B), less that of contacts."""
         return torch.stack(list(self.terms(depth, lengths).values())).sum(0)
 
     def minimise(self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0) -> Refined:
@@ -243,10 +283,14 @@ class Objective:
         parts = zip(depth.split(few), lengths.split(few), strict=True)
         found = [self.refined(*part, num_steps, loose) for part in parts]
         z, size, energy, moved, steps = zip(*found, strict=True)
-        return Refined(torch.cat(z), torch.cat(size), torch.cat(energy), torch.cat(moved), max(steps)).sorted()
+        return self.ranked(Refined(torch.cat(z), torch.cat(size), torch.cat(energy), torch.cat(moved), max(steps)))
+
+    def ranked(self, found: Refined) -> Refined:
+        """Refined hypotheses, best first, with what contacts cost."""
+        return found._replace(energy=found.energy + self.contact(found.depth)).sorted()
 
     def refined(self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0) -> Refined:
-        """As :meth:`minimise`, in the order of the hypotheses."""
+        """As :meth:`minimise`, in the order of the hypotheses, and less what contacts cost."""
         give_back(depth.shape[1])
         goal = copy(self)
         goal.weights = replace(self.weights, length=loose * self.weights.length)
@@ -286,6 +330,7 @@ class Objective:
         out.rigid = first.rigid * out.time[..., None]
         spread = torch.stack([part.posture.deviation for part in parts])[each][:, None]
         out.posture = _altered(first.posture, deviation=spread)
+        out.standing = None  # of each clip by itself, see ranked()
         out.count, out.noisy = gather(frames), any(part.noisy for part in parts)
         out.share = out.time / gather([part.posture.correlation for part in parts])[:, None]
         ratio = [first.foreshortening.correlation / part.foreshortening.correlation for part in parts]

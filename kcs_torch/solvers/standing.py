@@ -1,0 +1,42 @@
+"""How fast a body moves towards the camera, told by feet that stand still."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.tridiagonal import solve_tridiagonal
+
+__all__ = ["RIDGE", "root_velocity"]
+
+RIDGE = 1e-3
+"""Weight by which velocities that no foot tells are drawn to 0, over that of a foot that surely stands."""
+
+
+def root_velocity(move: Tensor, weight: Tensor, slip: float, change: float, *, num_steps: int = 10) -> Tensor:
+    """Return the body's velocity in depth at which standing feet stand still.
+
+    min over v of 1/2 sum_tc w_tc log(1 + ((m_tc + v_t)/s)^2) + 1/2 sum_t ((v_t - v_t-1)/a)^2, by iteratively reweighted
+    least squares.
+
+    Args:
+        move: m (..., T, C), feet's change of depth from a frame to the next, relative to the body.
+        weight: w (..., T, C), how surely each foot stands, 0 to 1.
+        slip: s, standard deviation of a standing foot's velocity.
+        change: a, standard deviation of the change of the body's velocity.
+        num_steps: reweightings.
+
+    Returns:
+        v (..., T), the body's change of depth from a frame to the next.
+
+    >>> move = torch.tensor([[-0.1], [-0.1], [-0.1], [0.3]])  # the foot stands, and then swings
+    >>> root_velocity(move, torch.tensor([[1.0], [1.0], [1.0], [0.0]]), 0.006, 0.004).round(decimals=2).tolist()
+    [0.1, 0.1, 0.1, 0.1]
+    """
+    velocity = torch.zeros_like(move[..., 0])
+    tie = torch.full_like(velocity[..., 1:], -1 / change**2)  # of each to the next
+    own = RIDGE / slip**2 + torch.nn.functional.pad(-tie, (0, 1)) + torch.nn.functional.pad(-tie, (1, 0))
+    for _ in range(num_steps):
+        pull = weight / (1 + ((move + velocity[..., None]) / slip).square()) / slip**2
+        velocity = solve_tridiagonal(own + pull.sum(-1), tie, -(pull * move).sum(-1))
+    return velocity
