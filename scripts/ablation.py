@@ -37,6 +37,7 @@ from kcs_torch.functional.align import similarity
 from kcs_torch.methods.pkc import Weights
 from kcs_torch.methods.pkc.limbs import SignCosts
 from kcs_torch.methods.pkc.trunk import mirror
+from kcs_torch.nn import PostureEnergy
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 PARTS = {
@@ -130,6 +131,16 @@ FIXED_VARIANTS = {
     ),
     "directions as sure as in a clear image": Variant(changes=(constant(OBJECTIVE, "BLUR", 0.0),)),
     "no posture": without("posture", posture=INF),
+    "mirror images of a motion not as likely": Variant(
+        changes=(
+            constant(
+                OBJECTIVE,
+                "usual_posture",
+                lambda body, dtype, device: PostureEnergy(body, symmetric=False).to(device, dtype),
+            ),
+        )
+    ),
+    "standing feet may slide in depth": Variant(changes=weighted(contact=0.0)),
     "no hinges": Variant(changes=(*weighted(hinge=0.0), searched(lambda usual: replace(usual, hinge=0.0)))),
     "limbs may reach across the body": Variant(changes=weighted(adduction=0.0)),
     "no foreshortening": without("foreshortening", foreshortening=INF),

@@ -47,8 +47,9 @@ def lifted(variant, tracks):
 
 
 def same(one, other):
-    """Whether both were found in as many steps and are alike to the last digit."""
-    return one.diagnostics.iterations == other.diagnostics.iterations and torch.equal(one.points, other.points)
+    """Whether both were found in as many steps, are alike to the last digit and cost the same."""
+    alike = one.diagnostics.iterations == other.diagnostics.iterations and torch.equal(one.points, other.points)
+    return alike and one.objective == other.objective
 
 
 def test_a_variant_lasts_as_long_as_its_context(script):
