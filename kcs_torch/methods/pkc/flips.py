@@ -40,6 +40,9 @@ then well."""
 ROWS = 4096
 """Frames of flips that are compared at a time."""
 
+WIDER = 8
+"""By how much more flips are compared at a time where only feet are looked at."""
+
 PASSAGES, ACROSS = 16, 2
 """Passages of a part that are considered, those where a change of sign bends its motion least, and how many of them a
 run within the clip may be long."""
@@ -126,7 +129,7 @@ def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypoth
         return depth - depth.mean(-1, keepdim=True)
 
     near = (energy < best.energy + FIRST[0][0]).nonzero().flatten()  # contacts only add to the cost
-    for some in near.split(few):
+    for some in near.split(WIDER * few):
         energy[some] += objective.contact(depths(some))
     order = energy.argsort()
     owner = which[order].tolist()
