@@ -140,7 +140,7 @@ FIXED_VARIANTS = {
             ),
         )
     ),
-    "standing feet may slide in depth": Variant(changes=weighted(contact=0.0)),
+    "standing feet may slide in depth": Variant({"contacts": False}),
     "no hinges": Variant(changes=(*weighted(hinge=0.0), searched(lambda usual: replace(usual, hinge=0.0)))),
     "limbs may reach across the body": Variant(changes=weighted(adduction=0.0)),
     "no foreshortening": without("foreshortening", foreshortening=INF),

@@ -256,8 +256,9 @@ def test_shifted_tracks_shift_the_result(method):
     shifted = reconstruct(tracks_of(WALK + shift[:2]), method=method)
     assert relative(shifted.points - shift, plain.points) < ROUNDING[method]
     drift = torch.linspace(0, 900, 12)[:, None, None] * shift.double() / 2000  # another shift in each frame
-    moving = reconstruct(tracks_of(WALK + drift[..., :2]), method=method)
-    assert relative(moving.points - drift, plain.points) < ROUNDING[method]
+    method = METHODS[method]().following()  # feet do not stand still in such an image
+    plain, moving = method(CLIP.tracks), method(tracks_of(WALK + drift[..., :2]))
+    assert relative(moving.points - drift, plain.points) < ROUNDING[method.name]
 
 
 ORDER = torch.randperm(17, generator=torch.Generator().manual_seed(3)).tolist()

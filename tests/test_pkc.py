@@ -8,7 +8,7 @@ import torch
 from numerics import count_operations
 from torch.testing import assert_close
 
-from kcs_torch import PKC, ConvergenceWarning, KcsWarning, OptionError, Skeleton, Tracks
+from kcs_torch import PKC, ConvergenceWarning, KcsWarning, OptionError, SfAM, Skeleton, Tracks
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_lengths
 from kcs_torch.methods.lockstep import run
@@ -75,6 +75,8 @@ def test_feet_do_not_stand_before_a_camera_that_goes_round(frames, yaw):
     assert standing_feet(clip.tracks) is not None
     result = PKC()(clip.tracks)
     assert error(result.points, clip.points) < 0.05
+    known = PKC().following()
+    assert known == PKC(contacts=False) and SfAM().following() == SfAM()
     body = Body(result.skeleton, clip.tracks.points - clip.tracks.points.mean(1, keepdim=True), 30.0,
                 torch.zeros(frames, 17).double(), standing_feet(clip.tracks))  # fmt: skip
     depth = torch.stack([clip.points[..., 2], 0.5 * clip.points[..., 2]]) * body.factor
@@ -83,6 +85,13 @@ def test_feet_do_not_stand_before_a_camera_that_goes_round(frames, yaw):
     found = Hypotheses(depth, torch.ones(2, 16).double(), torch.tensor([0.0, 1.0]).double() + cost)
     assert_close(body.without_contacts(found).energy, torch.tensor([0.0, 1.0]).double())
     assert not body.objective.contact(depth).any()
+
+
+def test_contacts_are_an_option(still):
+    clip, result = still
+    plain = PKC(contacts=False)(clip.tracks)
+    assert plain.objective < result.objective - 1  # which holds what contacts cost
+    assert error(plain.points, result.points) < 0.05
 
 
 def test_image_is_kept(still, turning):

@@ -54,6 +54,10 @@ class Method(ABC):
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Reconstruct normalised tracks; ``cameras`` (T, 2, 3) are given or to be found."""
 
+    def following(self) -> Method:
+        """The method for tracks of a camera that turns after the body, by which nothing stands still in the image."""
+        return self
+
     def __call__(self, tracks: Tracks, cameras: Tensor | None = None) -> Reconstruction:
         """Reconstruct one body.
 

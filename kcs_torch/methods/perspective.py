@@ -114,7 +114,7 @@ def reconstruct_perspective(
     for _ in range(rounds):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)
-            lifted = method(_straighten(tracks, rays, distance, depth), cameras)
+            lifted = method.following()(_straighten(tracks, rays, distance, depth), cameras)
         with torch.no_grad():
             found = _refine(lifted, distance, depth, rate, steps, mirror=cameras is None)
         moved = float((found.depth[0] - depth).square().mean().sqrt()) / found.unit

@@ -72,7 +72,8 @@ class PinholeEnergy:
         self.complete = skeleton.complete(observed)[0].mT  # virtual joints follow their sources
         self.anatomy = len(trunk_joints(skeleton)) >= 3
         if self.anatomy:
-            self.posture = PostureEnergy(skeleton, correlation=POSTURE / slow).to(rays)
+            posture = PostureEnergy(skeleton, correlation=POSTURE / slow, symmetric=False)  # its weight is set for this
+            self.posture = posture.to(rays)
             self.foreshortening = ForeshorteningEnergy(skeleton, correlation=FORESHORTENING / slow).to(rays)
             self.proportions = ProportionEnergy(skeleton).to(rays)
             self.hinges = HingeEnergy(skeleton).to(rays)

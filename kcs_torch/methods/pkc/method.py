@@ -94,6 +94,8 @@ class PKC(Method):
         rounds: of discrete moves of the fixed viewpoint's solver.
         steps: L-BFGS steps of each of its refinements.
         alternatives: further solutions to return.
+        contacts: rank solutions by feet that stand still in the image, and so in space, too, unless the camera goes
+            round the body; to be switched off for one that follows it.
         seed: of the random starts.
 
     Raises:
@@ -109,12 +111,17 @@ class PKC(Method):
     rounds: int = 1
     steps: int = 30
     alternatives: int = 4
+    contacts: bool = True
     seed: int = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for field, least in (("lifts", 1), ("rounds", 0), ("steps", 1), ("alternatives", 0)):
             self._expect(getattr(self, field) >= least, field, f"at least {least}")
+
+    def following(self) -> PKC:
+        """The same without contacts: what stands still in space does not in the image."""
+        return replace(self, contacts=False)
 
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Clean the tracks, try both viewpoints, rank what they give."""
@@ -144,7 +151,8 @@ class PKC(Method):
             raise OptionError(
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
-        feet = standing_feet(tracks) if cameras is None and self.viewpoint != "moving" else None
+        still = self.contacts and cameras is None and self.viewpoint != "moving"
+        feet = standing_feet(tracks) if still else None
         body = Body(skeleton, image, tracks.fps or 30.0, noise, feet) if has_trunk else None
         enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
         if body is None:
