@@ -16,11 +16,11 @@ RIDGE = 1e-3
 def root_velocity(move: Tensor, weight: Tensor, slip: float, change: float, *, num_steps: int = 10) -> Tensor:
     """Return the body's velocity in depth at which standing feet stand still.
 
-    min over v of 1/2 sum_tc w_tc log(1 + ((m_tc + v_t)/s)^2) + 1/2 sum_t ((v_t - v_t-1)/a)^2, by iteratively reweighted
-    least squares.
+    min over v of 1/2 sum_tc w_tc log(1 + ((m_tc + v_t)/s)^2) + 1/2 sum_t ((v_t - v_t-1)/a)^2 + RIDGE/2 sum_t (v_t/s)^2,
+    by iteratively reweighted least squares.
 
     Args:
-        move: m (..., T, C), feet's change of depth from a frame to the next, relative to the body.
+        move: m (..., T, C), change of the feet's depth from a frame to the next, relative to the body.
         weight: w (..., T, C), how surely each foot stands, 0 to 1.
         slip: s, standard deviation of a standing foot's velocity.
         change: a, standard deviation of the change of the body's velocity.

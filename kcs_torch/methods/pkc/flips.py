@@ -128,9 +128,10 @@ def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypoth
         depth = turned(own, sign[some], member[which[some]]) @ objective.tree.to(own).mT
         return depth - depth.mean(-1, keepdim=True)
 
-    near = (energy < best.energy + FIRST[0][0]).nonzero().flatten()  # contacts only add to the cost
-    for some in near.split(WIDER * few):
-        energy[some] += objective.contact(depths(some))
+    if objective.standing is not None:  # contacts only add to the cost: what is hopeless without them stays so
+        near = (energy < best.energy + FIRST[0][0]).nonzero().flatten()
+        for some in near.split(WIDER * few):
+            energy[some] += objective.contact(depths(some))
     order = energy.argsort()
     owner = which[order].tolist()
     order = order[[k for k, part in enumerate(owner) if part not in owner[:k]]]

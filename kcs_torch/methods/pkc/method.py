@@ -151,9 +151,11 @@ class PKC(Method):
             raise OptionError(
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
-        still = self.contacts and cameras is None and self.viewpoint != "moving"
-        feet = standing_feet(tracks) if still else None
-        body = Body(skeleton, image, tracks.fps or 30.0, noise, feet) if has_trunk else None
+        body = None
+        if has_trunk:
+            still = self.contacts and cameras is None and self.viewpoint != "moving"
+            feet = standing_feet(tracks) if still else None
+            body = Body(skeleton, image, tracks.fps or 30.0, noise, feet)
         enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
         if body is None:
             moving, first = yield from self._moving(tracks, image, noise, cameras, enough)
