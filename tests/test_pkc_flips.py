@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from numerics import normal
+from numerics import count_operations, normal
 from samples import walk_in_template_units as walk
 from torch.testing import assert_close
 
@@ -13,7 +13,8 @@ from kcs_torch.methods.pkc.batch import Task, minimise_all
 from kcs_torch.methods.pkc.flips import flipped, flipped_runs, parts_of, turned, turned_over
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
-from kcs_torch.methods.pkc.objective import Objective, Weights
+from kcs_torch.methods.pkc.objective import Objective, Weights, usual_posture
+from kcs_torch.methods.pkc.run_costs import RunCosts
 from kcs_torch.skeleton import SKELETONS
 
 BODY = SKELETONS["h36m17"]
@@ -41,8 +42,9 @@ def bones_of(frames=40, seed=0):
 
 def every_flip(depth, parts):
     """All flips of a solution's runs, as depths (K, T, B), and their parts."""
-    sign, which = flipped_runs(depth, parts, ACCELERATION)
-    return turned(depth, sign, module._members(parts, depth)[which]), which
+    member = module._members(parts, depth)
+    starts, ends, which = flipped_runs(depth, member, ACCELERATION)
+    return turned(depth, starts, ends, member[which]), which
 
 
 PARTS = [(0,), (1,), (0, 1), (2, 3, 4), (5,)]
@@ -110,6 +112,61 @@ def test_large_flips_may_cost_more_than_small_ones():
     best = Hypotheses(flat[:1], torch.ones(1, 2).double(), torch.zeros(1).double())
     assert module._promising(flips, best, ((15.0, 2), (5.0, 1))).tolist() == [2, 3, 0]
     assert module._promising(flips, best, ((1.0, 2), (0.05, 1))).tolist() == []
+
+
+def odd_body(name, frames, noise=0.0, anchored=False):
+    """An objective, and a solution of it that is far from good: depths of bones, lengths, and the body's parts."""
+    body = SKELETONS[name]
+    usual = usual_posture(body, torch.float64, torch.device("cpu"))
+    sway = normal(frames, body.num_joints, 3).cumsum(0) / frames**0.5
+    points = body.template_points(dtype=torch.float64) + 0.15 * sway
+    points = points - points.mean(1, keepdim=True)
+    blur = noise * normal(frames, body.num_joints, seed=1).abs()
+    anchor = 1.02 * usual.rest_lengths if anchored else None
+    objective = Objective(body, points[..., :2], Weights(), blur, anchor)
+    own = bone_vectors(points, objective.bones)[..., 2]
+    own = bone_vectors(objective.joints(own)[..., None], objective.bones)[..., 0]
+    parts = parts_of(body, limbs_of(body, objective.posture.trunk.tolist()))
+    return objective, own, 1.05 * usual.rest_lengths, module._members(parts, own)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 4, 5, 30])
+@pytest.mark.parametrize(("name", "noise"), [("h36m17", 0.0), ("body25", 0.02), ("hand21", 0.0)])
+def test_runs_cost_what_the_objective_says(name, noise, frames, monkeypatch):
+    """From sums over frames, for every part and run; body25 has virtual joints, hand21 no twins and no hinges."""
+    monkeypatch.setattr(module, "SHARP", 1e3)
+    objective, own, lengths, member = odd_body(name, frames, noise, anchored=noise > 0)
+    starts, ends, which = flipped_runs(own, member, ACCELERATION)
+    assert len(which) >= len(member) / 2
+    depth = objective.joints(turned(own, starts, ends, member[which]))
+    expected = objective(depth, lengths.expand(len(depth), -1))
+    assert_close(RunCosts(objective, own, lengths)(member, starts, ends, which), expected, rtol=1e-10, atol=1e-9)
+
+
+def test_all_runs_of_a_part_cost_little_more_than_one():
+    """Per frame: what a part costs is counted once for all of its runs."""
+    objective, own, lengths, member = odd_body("h36m17", 200)
+    costs = RunCosts(objective, own, lengths)
+
+    def operations(runs):
+        starts = torch.arange(runs) * 4
+        return count_operations(lambda: costs(member[:1], starts, starts + 8, torch.zeros_like(starts))).total
+
+    assert operations(40) == operations(1)
+
+
+@pytest.mark.parametrize("name", ["h36m17", "mediapipe33"])
+def test_feet_are_asked_only_of_parts_that_carry_them(name):
+    """Arms may swing: the trunk moves as before, and so do the legs."""
+    objective, own, _, member = odd_body(name, 30)
+    body = objective.skeleton
+    objective.standing = torch.ones(30, len(body.contacts)).double()
+    starts = torch.zeros(len(member), dtype=torch.long)
+    energy = objective.contact(objective.joints(turned(own, starts, starts + 15, member)))
+    same = (energy - objective.contact(objective.joints(own[None]))).abs() < 1e-9
+    carries = objective.carries(member)
+    assert 0 < carries.sum() < len(member) and same[~carries].all()
+    assert (~same[carries]).float().mean() > 0.9
 
 
 @pytest.mark.parametrize("stands", [False, True])

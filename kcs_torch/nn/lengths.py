@@ -75,10 +75,12 @@ class ForeshorteningEnergy(SkeletonModule):
         vectors = known(bone_vectors(wide(points), self.bones), bone_weights)
         if lengths is None:
             lengths = usual_size(vectors.square().sum(-1), bone_weights)
-        each = self.free.to(vectors) * foreshortening(vectors[..., 2], wide(lengths)[..., None, :], self.eps)
-        if bone_weights is not None:
-            each = each * bone_weights
-        return narrow(each.sum((-2, -1)) / self.correlation, points)
+        return narrow(self.each(vectors[..., 2], wide(lengths), bone_weights).sum((-2, -1)), points)
+
+    def each(self, depth: Tensor, lengths: Tensor, bone_weights: Tensor | None = None) -> Tensor:
+        """What each bone adds in each frame, (..., T, B), of depths (..., T, B) and lengths (..., B)."""
+        each = self.free.to(depth) * foreshortening(depth, lengths[..., None, :], self.eps)
+        return (each if bone_weights is None else each * bone_weights) / self.correlation
 
 
 class ProportionEnergy(SkeletonModule):

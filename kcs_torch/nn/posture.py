@@ -181,10 +181,14 @@ class PostureEnergy(SkeletonModule):
             pull = (count * self.kappa / (count + self.kappa))[..., None, None, None]
         off, mean = (rows[..., None, :, :] @ self.halves.to(local).mT for rows in (off, mean))  # (..., S, T or 1, K)
         scatter = (off * each).mT @ off + pull * (mean.mT @ mean)
-        eye = torch.eye(scatter.shape[-1], dtype=local.dtype, device=local.device)
+        each = count[..., None] if isinstance(count, Tensor) else count
+        return narrow(self.of_scatter(scatter, each).sum(-1), points)
+
+    def of_scatter(self, scatter: Tensor, count: Tensor | float) -> Tensor:
+        """(n + nu)/2 log det(I + S / nu), (...), of scatters S (..., K, K) of n independent frames, (...) or one."""
+        eye = torch.eye(scatter.shape[-1], dtype=scatter.dtype, device=scatter.device)
         factor, _ = torch.linalg.cholesky_ex(eye + scatter / self.strength)
-        log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum((-2, -1))
-        return narrow((count + self.strength) / 2 * log_det, points)
+        return (count + self.strength) * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
 def trunk_joints(skeleton: Skeleton) -> list[int]:

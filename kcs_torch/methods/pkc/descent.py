@@ -100,18 +100,15 @@ class Descent:
         unknowns = self.unknowns.rows(index)
         return Descent(unknowns.objective, unknowns)
 
-    def at(self, own: Tensor, lengths: Tensor, *, steep: bool = True) -> tuple[Tensor, Tensor, Tensor]:
-        """Value (H,) of bones' depths (H, B, T) and lengths (H, B), its derivatives in depths and log lengths.
-
-        Without ``steep`` those of the posture, most of the work, are left out.
-        """
+    def at(self, own: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Value (H,) of bones' depths (H, B, T) and lengths (H, B), its derivatives in depths and log lengths."""
         count = len(own)
         dz = own if self.mix is None else self.mix @ own
         value, slope, growth = self._lengths(dz, lengths)
         lines = self.lines @ dz
         back = torch.zeros_like(lines)
         value = value + self._smoothness(dz, slope)
-        value = value + self._posture(dz, lengths, lines[:, :2], slope, growth, back[:, :2], steep)
+        value = value + self._posture(dz, lengths, lines[:, :2], slope, growth, back[:, :2])
         if len(self.lines) > 2:
             value = value + self._hinges(lengths, lines[:, 2:], growth, back[:, 2:])
         value = value + self._foreshortening(dz, lengths, slope, growth)
@@ -172,7 +169,7 @@ class Descent:
         return (bend * pull).sum((1, 2)) / 2
 
     def _posture(
-        self, dz: Tensor, lengths: Tensor, depths: Tensor, slope: Tensor, growth: Tensor, back: Tensor, steep: bool
+        self, dz: Tensor, lengths: Tensor, depths: Tensor, slope: Tensor, growth: Tensor, back: Tensor
     ) -> Tensor:
         obj, posture = self.objective, self.objective.posture
         count, bones, frames = dz.shape
@@ -214,8 +211,6 @@ class Descent:
         firm = amount + posture.strength
         log_det = torch.where(failed, torch.inf, factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)).view(-1, count).sum(0)
         value = log_det * (firm[:, 0, 0] if isinstance(firm, Tensor) else firm)
-        if not steep:
-            return value
         inverse = torch.cholesky_inverse(factor)
         pull = sides.joined(torch.bmm(halves, inverse) if few else torch.bmm(inverse, halves), count)  # (H, 3B, T)
         moved = (pull * seen).sum(-1, keepdim=True)

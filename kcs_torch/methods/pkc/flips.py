@@ -12,10 +12,10 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.methods.lockstep import Search
-from kcs_torch.methods.pkc.descent import Descent
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.limbs import Limb
 from kcs_torch.methods.pkc.objective import Objective
+from kcs_torch.methods.pkc.run_costs import RunCosts
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["flipped", "flipped_runs", "parts_of", "turned", "turned_over"]
@@ -37,11 +37,8 @@ FIRST, THEN = ((15.0, 6), (5.0, 4)), ((5.0, 2), (GAIN, 1))
 """How much dearer than the best large flips may be, and small ones, and how many of each are refined: at first, and
 then well."""
 
-ROWS = 4096
-"""Frames of flips that are compared at a time."""
-
-WIDER = 8
-"""By how much more flips are compared at a time where only feet are looked at."""
+ROWS = 32768
+"""Frames of flips whose feet are looked at at a time."""
 
 PASSAGES, ACROSS = 16, 2
 """Passages of a part that are considered, those where a change of sign bends its motion least, and how many of them a
@@ -116,32 +113,30 @@ def _change(flips: Hypotheses, best: Hypotheses) -> Tensor:
 def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypotheses) -> Hypotheses:
     """The best flips of one run of a solution, at most one a part, best first; they are not refined yet."""
     own = bone_vectors(best.depth[0, ..., None], objective.bones)[..., 0]
-    sign, which = flipped_runs(own, parts, objective.weights.acceleration)
     member = _members(parts, own)
-    cost, few = Descent(objective), max(1, ROWS // len(own))
-    energy = own.new_empty(len(which))
-    for k in range(0, len(which), few):  # what all of them would take in memory is for long blocks too much
-        run = turned(own, sign[k : k + few], member[which[k : k + few]]).mT.contiguous()
-        energy[k : k + few] = cost.at(run, best.lengths.expand(len(run), -1), steep=False)[0]
+    starts, ends, which = flipped_runs(own, member, objective.weights.acceleration)
+    energy = RunCosts(objective, own, best.lengths[0])(member, starts, ends, which)
 
     def depths(some: Tensor) -> Tensor:
-        depth = turned(own, sign[some], member[which[some]]) @ objective.tree.to(own).mT
-        return depth - depth.mean(-1, keepdim=True)
+        return objective.joints(turned(own, starts[some], ends[some], member[which[some]]))
 
     if objective.standing is not None:  # contacts only add to the cost: what is hopeless without them stays so
-        near = (energy < best.energy + FIRST[0][0]).nonzero().flatten()
-        for some in near.split(WIDER * few):
+        walks = objective.carries(member)[which]
+        energy[~walks] += objective.contact(best.depth)
+        near = (walks & (energy < best.energy + FIRST[0][0])).nonzero().flatten()
+        for some in near.split(max(1, ROWS // len(own))):  # all of them would for long blocks take much memory
             energy[some] += objective.contact(depths(some))
     order = energy.argsort()
     owner = which[order].tolist()
     order = order[[k for k, part in enumerate(owner) if part not in owner[:k]]]
-    depth = depths(order)
-    return Hypotheses(depth, best.lengths.expand(len(order), -1), energy[order], best.steps)
+    return Hypotheses(depths(order), best.lengths.expand(len(order), -1), energy[order], best.steps)
 
 
-def turned(depth: Tensor, sign: Tensor, member: Tensor) -> Tensor:
-    """Bones' depths (K, T, B) of depths (T, B), with signs (K, T) for the bones that are members (K, B)."""
-    return depth * (1 + (sign - 1)[..., None] * member[:, None])
+def turned(depth: Tensor, starts: Tensor, ends: Tensor, member: Tensor) -> Tensor:
+    """Depths (T, B) with other signs over runs of frames (K,), for the bones that are members (K, B): (K, T, B)."""
+    time = torch.arange(len(depth), device=depth.device)
+    inside = (time >= starts[:, None]) & (time < ends[:, None])
+    return depth * (1 - 2 * inside.to(depth)[..., None] * member[:, None])
 
 
 def _members(parts: Sequence[tuple[int, ...]], depth: Tensor) -> Tensor:
@@ -152,31 +147,28 @@ def _members(parts: Sequence[tuple[int, ...]], depth: Tensor) -> Tensor:
     return member
 
 
-def flipped_runs(depth: Tensor, parts: Sequence[tuple[int, ...]], acceleration: float) -> tuple[Tensor, Tensor]:
-    """Signs that change over one run of frames, -1 there and 1 elsewhere, and the part that they are for.
+def flipped_runs(depth: Tensor, member: Tensor, acceleration: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Runs of frames over which signs may be wrong.
 
-    Runs are from a passage to one of the next, from the clip's start to a passage, from there to its end, or the whole
+    They are from a passage to one of the next, from the clip's start to a passage, from there to its end, or the whole
     clip. Those that would bend the motion too much, or change hardly anything, are left out.
 
     Args:
         depth: (T, B) depths of the bones.
-        parts: indices of bones.
+        member: (P, B), 1 for the bones of each part.
         acceleration: standard deviation of a bone's second difference in depth.
 
     Returns:
-        (K, T) and (K,).
+        First frames (K,), the frames after the last ones, and the part that each run is of.
     """
-    frames, bones = depth.shape
-    member = _members(parts, depth)
     bend = _bends(depth, member.mT) / (2 * acceleration**2)
     starts, ends, which = _runs(bend)
     costs = torch.nn.functional.pad(bend, (0, 1))  # to the end of the clip nothing bends
     sharp = costs[which, starts] + costs[which, ends]
-    time = torch.arange(frames, device=depth.device)
-    sign = 1 - 2 * ((time >= starts[:, None]) & (time < ends[:, None])).to(depth)  # (K, T)
-    change = 2 * (((1 - sign) @ depth.square()) * member[which]).sum(1) / (frames * bones)
+    size = torch.nn.functional.pad((depth.square() @ member.mT).cumsum(0), (0, 0, 1, 0))  # (T + 1, P)
+    change = 4 * (size[ends, which] - size[starts, which]) / depth.numel()
     keep = (sharp < SHARP) & (change > SLIGHT**2)
-    return sign[keep], which[keep]
+    return starts[keep], ends[keep], which[keep]
 
 
 def _bends(depth: Tensor, member: Tensor) -> Tensor:
@@ -213,6 +205,7 @@ def _runs(bend: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     runs = [(i, j) for i, j in combinations(range(last + 1), 2) if j <= i + ACROSS or i == 0 or j == last]
     first, second = (at[:, list(side)] for side in zip(*runs, strict=True))
     closes = torch.tensor([j == last for _, j in runs], device=bend.device)
-    real = (first < second) & (closes | (second < frames))  # passages that there are not lie at the end
+    long = second - first >= min(2, frames)  # passages that there are not lie at the end
+    real = long & (closes | (second < frames))
     which = torch.arange(parts, device=bend.device)[:, None].expand_as(first)
     return first[real], second[real], which[real]

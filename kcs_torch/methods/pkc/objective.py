@@ -214,45 +214,64 @@ class Objective:
         w = self.weights
         points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
         dz = depth[..., self.bones[:, 1]] - depth[..., self.bones[:, 0]]  # (H, T, B)
-        off = (self.flat + dz.square() - lengths[:, None].square()) / (2 * lengths[:, None])
         bend = dz.diff(n=2, dim=1).square()
         if self.time is not None:
             bend = bend * self.time[:, 2:, None]
         out = {
-            "length": self._length(off, lengths),
+            "length": self.length_value(self.strayed(dz, lengths).sum(1), lengths),
             "smoothness": bend.sum((1, 2)) / (2 * w.acceleration**2),
             "posture": self.posture(points, lengths, self.share),
             "hinges": w.hinge / w.sine**2 * self.hinges(points, lengths, self.time).sum(-1),
             "adduction": w.adduction / w.sine**2 * self.adduction(points, lengths, self.time).sum(-1),
             "foreshortening": self.foreshortening(points, lengths, bone_weights=self.clear),
-            "proportions": self.proportions(lengths),
         }
+        return out | self.length_terms(lengths)
+
+    def length_terms(self, lengths: Tensor) -> dict[str, Tensor]:
+        """Values (H,) of the terms that know lengths (H, B) alone."""
+        out = {"proportions": self.proportions(lengths)}
         if self.anchor is not None:
             out["anchor"] = self.held * ((lengths / self.anchor).log() / ANCHOR).square().sum(-1) / 2
         return out
 
-    def contact(self, depth: Tensor) -> Tensor:
-        """What feet that should stand still cost, (H,), of depths (H, T, N) centred per frame.
+    def joints(self, own: Tensor) -> Tensor:
+        """Depths (..., T, N), centred, virtual joints among them, of bones' depths (..., T, B)."""
+        depth = own @ self.tree[: self.skeleton.num_observed].mT @ self.complete
+        return depth - depth.mean(-1, keepdim=True)
 
-        It ranks solutions but does not pull on them: it ties the depths of both legs to each other, so stiffly that a
-        descent with it gets stuck.
+    def contact(self, depth: Tensor) -> Tensor:
+        """What feet that should stand still cost, (H,), of depths (H, T, N).
+
+        It is the trunk that moves steadily, whatever the arms do. The term ranks solutions but does not pull on them:
+        it ties the depths of both legs to each other, so stiffly that a descent with it gets stuck.
         """
         if self.standing is None:
             return depth.new_zeros(len(depth))
         few = max(1, MOST // depth.shape[1])
+        depth = depth - depth[..., self.posture.trunk].mean(-1, keepdim=True)
         points = torch.nn.functional.pad(depth[..., None], (2, 0))
         return torch.cat([self.weights.contact * self.feet(part, None, self.standing) for part in points.split(few)])
 
-    def _length(self, off: Tensor, lengths: Tensor) -> Tensor:
-        """T/2 sum_b log(1 + v_b) of off (H, T, B), (H,).
+    def carries(self, member: Tensor) -> Tensor:
+        """Which parts (P,) move feet against the trunk, for members (P, B) that are 1 for a part's bones."""
+        lines = self.joints(torch.eye(member.shape[1], dtype=member.dtype, device=member.device))  # (B, N)
+        moves = lines[:, list(self.skeleton.contacts)] - lines[:, self.posture.trunk].mean(-1, keepdim=True)
+        return member @ (moves.abs() > 1e-9).any(-1).to(member) > 0
 
-        v_b is the mean over time of c log(1 + off^2 / (c s^2)), less what noise alone leaves of it: depths that explain
-        the noise away would have to be large, and the body with them.
+    def strayed(self, dz: Tensor, lengths: Tensor) -> Tensor:
+        """How far bones of depths (H, T, B) are from lengths (H, B): c log(1 + off^2 / (c s^2)), (H, T, B)."""
+        off = (self.flat + dz.square() - lengths[:, None].square()) / (2 * lengths[:, None])
+        return HEAVY * torch.log1p(self.precision(lengths) * off.square() / HEAVY)
+
+    def length_value(self, strayed: Tensor, lengths: Tensor) -> Tensor:
+        """T/2 sum_b log(1 + v_b), (H,), of sums over time (H, B) of what bones stray from their lengths (H, B).
+
+        v_b is the mean over time, less what noise alone leaves of it: depths that explain the noise away would have to
+        be large, and the body with them.
         """
-        precision = self.precision(lengths)
-        spread = self._mean(HEAVY * torch.log1p(precision * off.square() / HEAVY))  # (H, B)
+        spread = strayed / wide(self.count, 1)
         if self.noisy:
-            noise = NOISE * self._mean(self.rigid - wide(self.weights.length, 2) ** 2 * precision)
+            noise = NOISE * self._mean(self.rigid - wide(self.weights.length, 2) ** 2 * self.precision(lengths))
             over = spread - noise
             spread = (over + (over.square() + (CORNER * noise).square() + 1e-12).sqrt()) / 2
         return self.count / 2 * torch.log1p(spread).sum(-1)

@@ -54,13 +54,10 @@ class Unknowns:
 
     def __call__(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Depths (H, T, N), centred, virtual joints among them, and lengths (H, B), of unknowns (H, B T + B)."""
-        obj = self.objective
         _, bones, frames = self.dz.shape
         part, grown = (state * self.scale).split([bones * frames, bones], 1)
         dz = self.dz + part.unflatten(1, (bones, frames)) + self.shear * grown[..., None]
-        own = dz.mT @ obj.tree[: obj.skeleton.num_observed].mT
-        depth = own @ obj.complete
-        return depth - depth.mean(-1, keepdim=True), self.lengths * grown.exp()
+        return self.objective.joints(dz.mT), self.lengths * grown.exp()
 
     def rows(self, index: Tensor) -> Unknowns:
         """Those of some hypotheses."""
