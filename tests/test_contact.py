@@ -9,6 +9,7 @@ from numerics import finite, gradcheck, normal, same_as_loop
 from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
+from kcs_torch.errors import ShapeError
 from kcs_torch.functional import standing
 from kcs_torch.nn import ContactEnergy
 from kcs_torch.skeleton import SKELETONS
@@ -53,6 +54,24 @@ def test_contact_gradient_batches_and_no_contacts():
         finite(energy, normal(frames, 17, 3), normal(frames), stands[:frames])
     same_as_loop(lambda p, v, s: energy(p, v, s.sigmoid()), (4, 17, 3), (4,), (4, 2))
     assert ContactEnergy("hand21")(normal(4, 21, 3), torch.zeros(4).double(), torch.zeros(4, 0).double()) == 0
+
+
+def test_frames_that_pad_a_clip_and_shapes_that_do_not_fit():
+    """Weights of frames are those, and not of the joints that have the contacts' numbers."""
+    energy = ContactEnergy(MAN)
+    points, stands = 0.01 * normal(9, 17, 3), normal(9, 2, seed=2).sigmoid()
+    padded = torch.cat([points, torch.full((3, 17, 3), math.nan).double()])
+    share, more = torch.tensor([1.0] * 9 + [0.0] * 3).double(), torch.cat([stands, torch.ones(3, 2).double()])
+    for weights in (share, share[:, None].expand(12, 17)):
+        assert_close(energy(padded, None, more, weights), energy(points, None, stands))
+    for bad, named in (
+        ((points[..., :2], None, stands), r"points: expected \(..., N, 3\)"),
+        ((points, None, stands[:, :1]), r"standing: expected \(..., T, C\) = \(..., 9, 2\), got \(9, 1\)"),
+        ((points, normal(8), stands), r"velocity: expected \(..., T\)"),
+        ((points, None, stands, torch.ones(5).double()), "expected weights"),
+    ):
+        with pytest.raises(ShapeError, match=named):
+            energy(*bad)
 
 
 def test_the_best_velocity_is_found():

@@ -4,7 +4,7 @@ import pytest
 import torch
 from test_procrustean import BONES, swinging_body
 
-from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.errors import KcsWarning, OptionError, ShapeError
 from kcs_torch.methods.found import find_skeleton
 from kcs_torch.types import Tracks
 
@@ -35,6 +35,12 @@ def test_takes_tracks_and_results():
     tracks = Tracks.from_arrays(points[..., :2], joint_names=list("abcdef"))
     body = find_skeleton(tracks)
     assert body.joints == tuple("abcdef") and body.num_bones == 5
+
+
+def test_joints_that_nothing_holds_together_are_warned_of():
+    with pytest.warns(KcsWarning, match=r"no two joints keep their distance within 5 %.*give the skeleton"):
+        body = find_skeleton(torch.randn(40, 5, 3, generator=torch.Generator().manual_seed(0)))
+    assert not body.rigid and body.is_tree
 
 
 def test_bad_input():

@@ -532,7 +532,40 @@ def test_bones_that_do_not_keep_their_length_are_warned_of():
     found, told = caught_from(Breathing())
     assert found.bone_variation == pytest.approx(20, rel=1e-3)
     assert len(told) == 1 and "walking_person: bone lengths vary by 20.0 %: joints may be wrong" in told[0]
-    assert any("bone lengths vary by more than 5 %" in note for note in found.notes)
+    assert any("bone lengths vary by 20.0 %" in note for note in found.notes)
+
+
+def test_a_rigid_bone_that_changes_its_length_is_named():
+    """The median over bones would not tell: all others keep theirs."""
+
+    class Stretching(Breathing):
+        def solve(self, tracks, cameras):
+            points = CLIP.points / 1000
+            wrist = points[:, 16] + 0.4 * torch.tensor([1.0, -1.0]).double().repeat(6)[:, None] * (
+                points[:, 16] - points[:, 15]
+            )
+            points = torch.cat([points[:, :16], wrist[:, None]], 1)
+            return Estimate(points, CLIP.cameras, torch.ones(12).double(), True, 3)
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = Stretching()(CLIP.tracks).diagnostics
+    assert found.bone_variation < 0.1
+    (told,) = [str(w.message) for w in caught if "rigid bones vary" in str(w.message)]
+    assert "walking_person: lengths of rigid bones vary: right_elbow-right_wrist by 40 %: joints may" in told
+    assert any("right_elbow-right_wrist by 40 %" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(("method", "rests"), [("pkc", "the template and lengths"), ("sfam", "constant lengths alone")])
+def test_what_depth_rests_on_before_a_camera_that_stands_still(method, rests):
+    """SfAM knows no template: the user is warned, and told of methods that do."""
+    clip = walking_person(40, turn=0.0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = METHODS[method]()(clip.tracks).diagnostics
+    assert any(f"depth rests on {rests}" in note for note in found.notes)
+    told = [str(w.message) for w in caught if "has nothing else that tells depth" in str(w.message)]
+    assert len(told) == (method == "sfam") and all("'pkc' and 'kcs' use the skeleton's template" in t for t in told)
 
 
 def test_bones_that_nearly_keep_it_or_are_not_held_or_not_found_yet_are_not():

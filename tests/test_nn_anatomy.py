@@ -1,5 +1,6 @@
 """Energies of a body's joints: values by hand, gradients with degenerate inputs, bodies that move as they should."""
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -89,6 +90,30 @@ def test_thighs_that_reach_across_by_hand():
     assert_close(AdductionEnergy(LEGS, limit=0)(spread(-30, -30)), torch.tensor([0.25]).double())
     lengths = torch.tensor([0.2, 0.8, 0.5, 0.4, 0.5]).double()  # in place of the clip's
     assert_close(energy.abduction(spread(30, -30), lengths), torch.tensor([[0.25, -0.5]]).double())
+
+
+def test_a_limb_with_two_hinges_at_its_end_counts_once():
+    """A marker on the shin bends at the knee as the ankle does."""
+    man = SKELETONS["cmu21"]
+    hinge = next(h for h in man.hinges if h.parent in (h.left, h.right))
+    shin = dataclasses.replace(hinge, child=man.num_joints)
+    more = dataclasses.replace(
+        man,
+        joints=(*man.joints, "shin"),
+        bones=(*man.bones, (hinge.joint, man.num_joints)),
+        hinges=(*man.hinges, shin),
+        template=None,
+        spread=None,
+        proportions=None,
+        name="marked",
+    )
+    assert torch.equal(AdductionEnergy(more).joints, AdductionEnergy(man).joints)
+    assert len(HingeEnergy(more).joints) == len(man.hinges) + 1
+
+
+def test_weights_that_are_tiny_weigh_alike():
+    energy, points = AdductionEnergy(LEGS), normal(5, 6, 3)
+    assert_close(energy.abduction(points, None, torch.full((5, 6), 1e-12).double()), energy.abduction(points))
 
 
 def test_only_limbs_from_twins_reach_across():

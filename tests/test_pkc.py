@@ -58,7 +58,7 @@ def test_fixed_camera(still):
     assert error(result.points, clip.points) < 0.15
     assert error(result.points * FLIP, clip.points) > 1  # and the right one of the mirror images
     assert result.diagnostics.bone_variation < 2
-    assert any("rests on the skeleton's template" in note for note in result.diagnostics.notes)
+    assert any("rests on the template and lengths" in note for note in result.diagnostics.notes)
 
 
 def test_turning_camera(turning):

@@ -14,7 +14,7 @@ from kcs_torch.methods.pkc.flips import flipped, flipped_runs, parts_of, turned,
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
 from kcs_torch.methods.pkc.objective import Objective, Weights, usual_posture
-from kcs_torch.methods.pkc.run_costs import RunCosts
+from kcs_torch.methods.pkc.run_costs import RunCosts, Runs
 from kcs_torch.skeleton import SKELETONS
 
 BODY = SKELETONS["h36m17"]
@@ -43,8 +43,8 @@ def bones_of(frames=40, seed=0):
 def every_flip(depth, parts):
     """All flips of a solution's runs, as depths (K, T, B), and their parts."""
     member = module._members(parts, depth)
-    starts, ends, which = flipped_runs(depth, member, ACCELERATION)
-    return turned(depth, starts, ends, member[which]), which
+    runs = flipped_runs(depth, member, ACCELERATION)
+    return turned(depth, runs, member), runs.part
 
 
 PARTS = [(0,), (1,), (0, 1), (2, 3, 4), (5,)]
@@ -136,23 +136,25 @@ def test_runs_cost_what_the_objective_says(name, noise, frames, monkeypatch):
     """From sums over frames, for every part and run; body25 has virtual joints, hand21 no twins and no hinges."""
     monkeypatch.setattr(module, "SHARP", 1e3)
     objective, own, lengths, member = odd_body(name, frames, noise, anchored=noise > 0)
-    starts, ends, which = flipped_runs(own, member, ACCELERATION)
-    assert len(which) >= len(member) / 2
-    depth = objective.joints(turned(own, starts, ends, member[which]))
+    runs = flipped_runs(own, member, ACCELERATION)
+    assert len(runs.part) >= len(member) / 2
+    depth = objective.joints(turned(own, runs, member))
     expected = objective(depth, lengths.expand(len(depth), -1))
-    assert_close(RunCosts(objective, own, lengths)(member, starts, ends, which), expected, rtol=1e-10, atol=1e-9)
+    assert_close(RunCosts(objective, own, lengths)(member, runs), expected, rtol=1e-10, atol=1e-9)
 
 
-def test_all_runs_of_a_part_cost_little_more_than_one():
-    """Per frame: what a part costs is counted once for all of its runs."""
+def test_many_runs_take_no_more_operations_than_one():
+    """What a part costs in each frame is counted once for all of its runs."""
     objective, own, lengths, member = odd_body("h36m17", 200)
     costs = RunCosts(objective, own, lengths)
 
-    def operations(runs):
-        starts = torch.arange(runs) * 4
-        return count_operations(lambda: costs(member[:1], starts, starts + 8, torch.zeros_like(starts))).total
+    places = torch.arange(0, 204, 4).expand(len(member), -1)
 
-    assert operations(40) == operations(1)
+    def operations(count):
+        first, part = torch.arange(count) % 48, torch.arange(count) % len(member)
+        return count_operations(lambda: costs(member, Runs(places, part, first, first + 2))).total
+
+    assert operations(400) == operations(1)
 
 
 @pytest.mark.parametrize("name", ["h36m17", "mediapipe33"])
@@ -161,8 +163,9 @@ def test_feet_are_asked_only_of_parts_that_carry_them(name):
     objective, own, _, member = odd_body(name, 30)
     body = objective.skeleton
     objective.standing = torch.ones(30, len(body.contacts)).double()
-    starts = torch.zeros(len(member), dtype=torch.long)
-    energy = objective.contact(objective.joints(turned(own, starts, starts + 15, member)))
+    part = torch.arange(len(member))
+    runs = Runs(torch.tensor([[0, 15]]).expand(len(member), -1), part, 0 * part, 0 * part + 1)
+    energy = objective.contact(objective.joints(turned(own, runs, member)))
     same = (energy - objective.contact(objective.joints(own[None]))).abs() < 1e-9
     carries = objective.carries(member)
     assert 0 < carries.sum() < len(member) and same[~carries].all()

@@ -226,6 +226,19 @@ def test_frames_of_no_weight_may_be_anything(given):
     assert POSTURE(padded, lengths, 0 * weights).item() == 0
 
 
+def test_no_frames_cost_nothing():
+    for weights in (None, torch.ones(2, 0).double(), torch.ones(2, 0, 17).double()):
+        assert POSTURE(torch.zeros(2, 0, 17, 3).double(), None, weights).tolist() == [0.0, 0.0]
+
+
+def test_points_in_other_units_than_lengths_are_finite_in_single_precision():
+    """Millimetres against metres: rounding alone would leave scatters without a Cholesky factor."""
+    points = 1000 * normal(8, 30, 17, 3, seed=3).float()
+    finite(POSTURE, points, POSTURE.rest_lengths.float())
+    usual = WALK.float()
+    assert POSTURE(usual).item() == pytest.approx(POSTURE(WALK).item(), rel=1e-3)
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_in_millimetres(dtype):
     points = (1000 * WALK[:6]).to(dtype)

@@ -18,9 +18,18 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ConvergenceWarning, KcsWarning, OptionError, ShapeError, unknown, users_level
+from kcs_torch.errors import (
+    ConvergenceWarning,
+    KcsWarning,
+    OptionError,
+    ShapeError,
+    counted,
+    unknown,
+    users_level,
+)
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.finish import LOOSE, WEAK_TURN, WHY_LOOSE, Estimate, finish, rms
+from kcs_torch.methods.finish import WEAK_TURN, WHY_LOOSE, Estimate, finish, loose_bones, rms
+from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
 
 __all__ = ["WEAK_TURN", "Estimate", "Method"]
@@ -53,6 +62,10 @@ class Method(ABC):
     @abstractmethod
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Reconstruct normalised tracks; ``cameras`` (T, 2, 3) are given or to be found."""
+
+    def knows_template(self, skeleton: Skeleton) -> bool:
+        """Whether a template tells depth that the viewpoint's turn does not."""
+        return False
 
     def following(self) -> Method:
         """The method for tracks of a camera that turns after the body, by which nothing stands still in the image."""
@@ -133,6 +146,13 @@ class Method(ABC):
         tracks, found = result.tracks, result.diagnostics
         if doubt:
             warnings.warn(f"{tracks.source}: {doubt}", KcsWarning, stacklevel=users_level())
+        elif not (self.learned or found.viewpoint_turn >= WEAK_TURN or self.knows_template(tracks.skeleton)):
+            others = ", while 'pkc' and 'kcs' use the skeleton's template" if tracks.skeleton.template else ""
+            message = (
+                f"{tracks.source}: the viewpoint turned by only {counted(round(found.viewpoint_turn), 'degree')}, and "
+                f"'{self.name}' has nothing else that tells depth: it is little more than a guess{others}"
+            )
+            warnings.warn(message, KcsWarning, stacklevel=users_level())
         if not found.converged:
             message = f"{tracks.source}: {self.unsettled(found.iterations)}"
             warnings.warn(message, ConvergenceWarning, stacklevel=users_level())
@@ -144,9 +164,9 @@ class Method(ABC):
                 stacklevel=users_level(),
             )
 
-        if found.bone_variation > LOOSE and self.keeps_lengths and found.converged:
-            message = f"{tracks.source}: bone lengths vary by {found.bone_variation:.1f} %: {WHY_LOOSE}"
-            warnings.warn(message, KcsWarning, stacklevel=users_level())
+        loose = loose_bones(result.points, tracks.skeleton) if self.keeps_lengths and found.converged else ""
+        if loose:
+            warnings.warn(f"{tracks.source}: {loose}: {WHY_LOOSE}", KcsWarning, stacklevel=users_level())
 
     def unsettled(self, steps: int) -> str:
         """A sentence for those whose iteration stopped at its limit."""

@@ -15,18 +15,22 @@ from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.root import root_depth
+from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Reconstruction, Tracks
 
 if TYPE_CHECKING:
     from kcs_torch.methods.base import Method
 
-__all__ = ["LOOSE", "WEAK_TURN", "WHY_LOOSE", "Estimate", "finish", "rms"]
+__all__ = ["WEAK_TURN", "WHY_LOOSE", "Estimate", "finish", "loose_bones", "rms"]
 
 WEAK_TURN = 30.0
 """Degrees of viewpoint turn below which depth is weakly determined."""
 
 LOOSE = 5.0
 """Per cent of bone variation from which on the tracks are hardly those of a body of this skeleton."""
+
+PART = 2.0
+"""Per cent of the body's size by which a bone's length has to vary as well to be told by name: short bones vary."""
 
 FAR_STEPS = 2
 """How often joints are weighed anew by their distance, when the body is put in its place."""
@@ -97,6 +101,35 @@ def finish(
     return replace(results[0], alternatives=tuple(results[1:]))
 
 
+def _rest(method: Method, body: Skeleton) -> str:
+    """What depth rests on where the viewpoint does not turn."""
+    if method.knows_template(body):
+        return "the template and lengths"
+    return "constant lengths alone" if body.rigid and method.keeps_lengths else "nothing"
+
+
+def loose_bones(points: Tensor, body: Skeleton) -> str:
+    """Which rigid bones of points (T, N, 3) change their length, for the user; empty where none does."""
+    rigid = list(body.rigid)
+    if not rigid or not len(points):
+        return ""
+    bones = bone_lengths(points, body.bone_index(device=points.device))[:, rigid]
+    mean, spread = bones.mean(0), bones.std(0, correction=0)
+    share = 100 * torch.where(mean > 0, spread / torch.where(mean > 0, mean, 1), 0)
+    if float(share.median()) > LOOSE:
+        return f"bone lengths vary by {float(share.median()):.1f} %"
+    if not body.is_tree:  # links between markers, say, of which some bend
+        return ""
+    size = (points - points.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()
+    found = ((share > LOOSE) & (100 * spread > PART * size)).nonzero().flatten().tolist()
+    if not found:
+        return ""
+    worst = sorted(found, key=lambda b: -float(share[b]))
+    named = [f"{body.bone_names[rigid[b]]} by {float(share[b]):.0f} %" for b in worst[:3]]
+    more = f" and {counted(len(worst) - 3, 'more bone')}" if len(worst) > 3 else ""
+    return f"lengths of rigid bones vary: {', '.join(named)}{more}"
+
+
 def _placed(tracks: Tracks, found: Estimate, size: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
     """Points (T, N, 3) in the tracks' units and place, and their images (T, N, 2)."""
     points = found.points * size
@@ -128,15 +161,17 @@ def _reconstruction(
     turn = float(viewpoint_turn(found.cameras))
     notes = list(found.notes)
     if turn < WEAK_TURN and not method.learned:
-        rest = "the skeleton's template and lengths" if body.template is not None else "constant lengths alone"
-        notes.append(f"the viewpoint turned by only {counted(round(turn), 'degree')}: depth rests on {rest}")
+        notes.append(
+            f"the viewpoint turned by only {counted(round(turn), 'degree')}: depth rests on {_rest(method, body)}"
+        )
     if found.doubt:
         notes.append(found.doubt)
     if not found.converged:
         notes.append(method.unsettled(found.iterations))
     percent = float(100 * variation[rigid].median()) if rigid else math.nan
-    if percent > LOOSE and method.keeps_lengths:
-        notes.append(f"bone lengths vary by more than {LOOSE:g} %: {WHY_LOOSE}")
+    loose = loose_bones(points, body) if method.keeps_lengths else ""
+    if loose:
+        notes.append(f"{loose}: {WHY_LOOSE}")
     if not rigid:
         kind = "no bones" if not body.num_bones else "no rigid bones"
         notes.append(f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown")

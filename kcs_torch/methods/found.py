@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.errors import KcsWarning, OptionError, ShapeError, users_level
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.methods.sfam import SfAM
@@ -74,10 +75,18 @@ def find_skeleton(
     size = bone_lengths(source, bones)
     ratio = spread[bones[:, 0], bones[:, 1]] / mean[bones[:, 0], bones[:, 1]].clamp_min(torch.finfo(mean.dtype).tiny)
     lengths = size.median(0).values
+    flexible = tuple((ratio > rigid_below).nonzero().flatten().tolist())
+    if len(flexible) == len(bones):
+        warnings.warn(
+            f"find_skeleton: no two joints keep their distance within {100 * rigid_below:g} %, so that no lengths hold "
+            "the joints together: give the skeleton, if you know it, or tracks in which the viewpoint turns further",
+            KcsWarning,
+            stacklevel=users_level(),
+        )
     return Skeleton(
         joints=tuple(joints) if joints is not None else tuple(f"joint{i}" for i in range(source.shape[1])),
         bones=tuple((int(a), int(b)) for a, b in bones.tolist()),
         name="found",
         proportions=tuple(lengths.tolist()) if bool((lengths > 0).all()) else None,
-        flexible=tuple((ratio > rigid_below).nonzero().flatten().tolist()),
+        flexible=flexible,
     )

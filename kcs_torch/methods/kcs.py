@@ -88,6 +88,9 @@ class KCS(Method):
         self._expect(self.continuity >= 0, "continuity", "a number >= 0")
         self._expect(self.bone_steps >= 0, "bone_steps", "at least 0")
 
+    def knows_template(self, skeleton: Skeleton) -> bool:
+        return self.template is not None or skeleton.template is not None
+
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Alternate cameras and shape until the cameras stand still."""
         return self._solve([tracks], cameras)[0]

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.nn.energies import check_lengths
 from kcs_torch.nn.layers import SkeletonModule, wide
-from kcs_torch.nn.masks import known_points, weighs_joints
+from kcs_torch.nn.masks import known_points, some, weighs_joints
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["AdductionEnergy", "HingeEnergy"]
@@ -147,14 +147,15 @@ class AdductionEnergy(_JointEnergy):
         if not 0 <= limit <= 1:
             raise OptionError(f"AdductionEnergy: limit: expected a sine within 0..1, got {limit}")
         self.limit = limit
-        twins = {frozenset(pair) for pair in self.skeleton.mirror}
-        limbs = [
-            h for h in self.skeleton.hinges if h.parent in (h.left, h.right) and frozenset((h.left, h.right)) in twins
-        ]
         where = _bone_places(self.skeleton)
-        joints = [(h.parent, h.joint, h.left, h.right) for h in limbs]
-        self._take(joints, [[where[frozenset(h.bones[0])]] for h in limbs], [1.0] * len(limbs), 4)
-        side = [1.0 if h.parent == h.left else -1.0 for h in limbs]
+        twins = {frozenset(pair) for pair in self.skeleton.mirror}
+        limbs = {  # each once, however many hinges are at its end
+            (h.parent, h.joint, h.left, h.right): where[frozenset(h.bones[0])]
+            for h in self.skeleton.hinges
+            if h.parent in (h.left, h.right) and frozenset((h.left, h.right)) in twins
+        }
+        self._take(list(limbs), [[bone] for bone in limbs.values()], [1.0] * len(limbs), 4)
+        side = [1.0 if parent == left else -1.0 for parent, _, left, _ in limbs]
         self.register_buffer("side", torch.tensor(side), persistent=False)
 
     def _wrong(self, points: Tensor, lengths: Tensor | None, weights: Tensor | None) -> Tensor:
@@ -186,7 +187,7 @@ def _to_size(vectors: Tensor, weights: Tensor | None) -> Tensor:
         square = square.mean(-3, keepdim=True)
     else:
         share = weights.to(square)[..., None]
-        square = (share * square).sum(-3, keepdim=True) / share.sum(-3, keepdim=True).clamp_min(1e-9)
+        square = (share * square).sum(-3, keepdim=True) / some(share.sum(-3, keepdim=True))
     return _divide(vectors, torch.where(square > 0, square, torch.ones_like(square)).sqrt())
 
 

@@ -7,7 +7,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from kcs_torch.errors import ShapeError
 from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
+from kcs_torch.nn.masks import weighs_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.standing import RIDGE, root_velocity
 
@@ -22,7 +24,7 @@ class ContactEnergy(SkeletonModule):
     small multiple of sum_t (v_t/s)^2 settles what no standing foot tells.
 
     Args:
-        skeleton: with contacts; without them the energy is 0.
+        skeleton: with contacts; without them only a velocity that is given costs anything.
         slip: s, in units of the points per frame.
         change: a, of the root's velocity from frame to frame.
         num_steps: reweightings that find the best velocity where none is given.
@@ -46,13 +48,18 @@ class ContactEnergy(SkeletonModule):
         Args:
             points: (..., T, N, 3), depth relative to the root or the body's middle.
             velocity: v (..., T), the first frame's does not count; None takes the best one
-                (:func:`kcs_torch.solvers.standing.root_velocity`), at which the energy has no slope in v.
+                (:func:`kcs_torch.solvers.standing.root_velocity`), at which the energy has hardly any slope in v.
             standing: c (..., T, C).
-            weights: (..., T, N) of the joints: a foot stands no more than it is seen.
+            weights: (..., T, N) of the joints: a foot stands no more than it is seen; or (..., T) of the frames, 0 for
+                one that pads a shorter clip.
+
+        Raises:
+            ShapeError: the shapes do not fit.
         """
-        self.check(points, clip=True)
+        self._check(points, velocity, standing)
         if weights is not None:
-            standing = torch.minimum(standing, weights[..., self.contacts])
+            seen = weights[..., self.contacts] if weighs_joints(weights, points, self) else weights[..., None]
+            standing = torch.minimum(standing, seen)
         depth = wide(points)[..., self.contacts, 2]
         both = torch.minimum(standing[..., 1:, :], standing[..., :-1, :])
         step = known((depth[..., 1:, :] - depth[..., :-1, :])[..., None], both)[..., 0]
@@ -61,6 +68,19 @@ class ContactEnergy(SkeletonModule):
         slip = (both * torch.log1p((move / self.slip).square())).sum((-2, -1)) / 2
         steady = ((velocity[..., 2:] - velocity[..., 1:-1]) / self.change).square().sum(-1) / 2
         return narrow(slip + steady + RIDGE / 2 * (velocity[..., 1:] / self.slip).square().sum(-1), points)
+
+    def _check(self, points: Tensor, velocity: Tensor | None, standing: Tensor) -> None:
+        self.check(points, clip=True)
+        frames = points.shape[-3]
+        wanted = (
+            ("points", points, (points.shape[-2], 3), 2, "N, 3"),
+            ("velocity", velocity, (frames,), 1, "T"),
+            ("standing", standing, (frames, len(self.contacts)), 2, "T, C"),
+        )
+        for name, value, shape, dims, letters in wanted:
+            if value is not None and value.shape[-dims:] != shape:
+                expected = f"(..., {letters}) = (..., {', '.join(map(str, shape))})"
+                raise ShapeError(f"ContactEnergy: {name}: expected {expected}, got {tuple(value.shape)}")
 
     @torch.no_grad()
     def _best(self, step: Tensor, standing: Tensor) -> Tensor:

@@ -151,7 +151,7 @@ def free_bones(skeleton: Skeleton) -> Tensor:
 def usual_size(square: Tensor, share: Tensor | None) -> Tensor:
     """Root mean square (..., B) over the frames of squared lengths (..., T, B) that have a share (..., T, B or 1)."""
     if share is None:
-        square = square.mean(-2)
+        square = square.sum(-2) / max(square.shape[-2], 1)
     else:
         seen = (share > 0).to(square)
         square = (square * seen).sum(-2) / seen.sum(-2).clamp_min(1)

@@ -21,6 +21,9 @@ __all__ = ["PostureEnergy", "trunk_joints"]
 TRUNK_SPREAD = 18.0
 """Bones that stray from the template by less than this, in degrees, are of the trunk."""
 
+ROUNDING = 1.0
+"""Rounding of a scatter's eigenvalues, over its trace and the machine precision, that is allowed for."""
+
 BEND = (0.15, 0.3)
 """How far a hinge's upper and lower bone hang from the template on average, as a share of their length."""
 
@@ -163,7 +166,7 @@ class PostureEnergy(SkeletonModule):
         each: Tensor | float = 1.0
         pull: Tensor | float = 1.0
         if weights is None:
-            count, mean = y.shape[-2] / self.correlation, y.mean(-2, keepdim=True)
+            count, mean = y.shape[-2] / self.correlation, y.sum(-2, keepdim=True) / max(y.shape[-2], 1)
             off, each = y - mean, 1 / self.correlation
             pull = count * self.kappa / (count + self.kappa)
         elif weighs_joints(weights, points, self):
@@ -179,15 +182,25 @@ class PostureEnergy(SkeletonModule):
             mean = (share * y).sum(-2, keepdim=True) / torch.where(count > 0, count, 1)[..., None, None]
             off, each = y - mean, share[..., None, :, :]
             pull = (count * self.kappa / (count + self.kappa))[..., None, None, None]
-        off, mean = (rows[..., None, :, :] @ self.halves.to(local).mT for rows in (off, mean))  # (..., S, T or 1, K)
+        off, mean = (self.taken_apart(rows) for rows in (off, mean))  # (..., S, T or 1, K)
         scatter = (off * each).mT @ off + pull * (mean.mT @ mean)
         each = count[..., None] if isinstance(count, Tensor) else count
         return narrow(self.of_scatter(scatter, each).sum(-1), points)
 
+    def taken_apart(self, rows: Tensor) -> Tensor:
+        """Bones' coordinates (..., T, 3B) in each of the halves, (..., S, T, K)."""
+        rows = rows[..., None, :, :]
+        return rows if len(self.halves) == 1 else rows @ self.halves.to(rows).mT
+
     def of_scatter(self, scatter: Tensor, count: Tensor | float) -> Tensor:
-        """(n + nu)/2 log det(I + S / nu), (...), of scatters S (..., K, K) of n independent frames, (...) or one."""
+        """(n + nu)/2 log det(I + S / nu), (...), of scatters S (..., K, K) of n independent frames, (...) or one.
+
+        What rounding may take from the eigenvalues of a large S is added, so that there always is a factor.
+        """
+        ratio = scatter / self.strength
+        least = 1 + ROUNDING * torch.finfo(ratio.dtype).eps * ratio.diagonal(dim1=-2, dim2=-1).sum(-1)
         eye = torch.eye(scatter.shape[-1], dtype=scatter.dtype, device=scatter.device)
-        factor, _ = torch.linalg.cholesky_ex(eye + scatter / self.strength)
+        factor, _ = torch.linalg.cholesky_ex(ratio + least[..., None, None] * eye)
         return (count + self.strength) * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 

@@ -15,7 +15,7 @@ from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.limbs import Limb
 from kcs_torch.methods.pkc.objective import Objective
-from kcs_torch.methods.pkc.run_costs import RunCosts
+from kcs_torch.methods.pkc.run_costs import RunCosts, Runs, inside
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["flipped", "flipped_runs", "parts_of", "turned", "turned_over"]
@@ -114,29 +114,27 @@ def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypoth
     """The best flips of one run of a solution, at most one a part, best first; they are not refined yet."""
     own = bone_vectors(best.depth[0, ..., None], objective.bones)[..., 0]
     member = _members(parts, own)
-    starts, ends, which = flipped_runs(own, member, objective.weights.acceleration)
-    energy = RunCosts(objective, own, best.lengths[0])(member, starts, ends, which)
+    runs = flipped_runs(own, member, objective.weights.acceleration)
+    energy = RunCosts(objective, own, best.lengths[0])(member, runs)
 
     def depths(some: Tensor) -> Tensor:
-        return objective.joints(turned(own, starts[some], ends[some], member[which[some]]))
+        return objective.joints(turned(own, runs.some(some), member))
 
     if objective.standing is not None:  # contacts only add to the cost: what is hopeless without them stays so
-        walks = objective.carries(member)[which]
+        walks = objective.carries(member)[runs.part]
         energy[~walks] += objective.contact(best.depth)
         near = (walks & (energy < best.energy + FIRST[0][0])).nonzero().flatten()
         for some in near.split(max(1, ROWS // len(own))):  # all of them would for long blocks take much memory
             energy[some] += objective.contact(depths(some))
     order = energy.argsort()
-    owner = which[order].tolist()
+    owner = runs.part[order].tolist()
     order = order[[k for k, part in enumerate(owner) if part not in owner[:k]]]
     return Hypotheses(depths(order), best.lengths.expand(len(order), -1), energy[order], best.steps)
 
 
-def turned(depth: Tensor, starts: Tensor, ends: Tensor, member: Tensor) -> Tensor:
-    """Depths (T, B) with other signs over runs of frames (K,), for the bones that are members (K, B): (K, T, B)."""
-    time = torch.arange(len(depth), device=depth.device)
-    inside = (time >= starts[:, None]) & (time < ends[:, None])
-    return depth * (1 - 2 * inside.to(depth)[..., None] * member[:, None])
+def turned(depth: Tensor, runs: Runs, member: Tensor) -> Tensor:
+    """Depths (T, B) with other signs over runs of frames, for the bones that are members (P, B) of parts: (K, T, B)."""
+    return depth * (1 - 2 * inside(runs, len(depth)).to(depth)[..., None] * member[runs.part][:, None])
 
 
 def _members(parts: Sequence[tuple[int, ...]], depth: Tensor) -> Tensor:
@@ -147,7 +145,7 @@ def _members(parts: Sequence[tuple[int, ...]], depth: Tensor) -> Tensor:
     return member
 
 
-def flipped_runs(depth: Tensor, member: Tensor, acceleration: float) -> tuple[Tensor, Tensor, Tensor]:
+def flipped_runs(depth: Tensor, member: Tensor, acceleration: float) -> Runs:
     """Runs of frames over which signs may be wrong.
 
     They are from a passage to one of the next, from the clip's start to a passage, from there to its end, or the whole
@@ -157,18 +155,15 @@ def flipped_runs(depth: Tensor, member: Tensor, acceleration: float) -> tuple[Te
         depth: (T, B) depths of the bones.
         member: (P, B), 1 for the bones of each part.
         acceleration: standard deviation of a bone's second difference in depth.
-
-    Returns:
-        First frames (K,), the frames after the last ones, and the part that each run is of.
     """
     bend = _bends(depth, member.mT) / (2 * acceleration**2)
-    starts, ends, which = _runs(bend)
+    runs = _runs(bend)
+    part, starts, ends = runs.part, runs.starts, runs.ends
     costs = torch.nn.functional.pad(bend, (0, 1))  # to the end of the clip nothing bends
-    sharp = costs[which, starts] + costs[which, ends]
+    sharp = costs[part, starts] + costs[part, ends]
     size = torch.nn.functional.pad((depth.square() @ member.mT).cumsum(0), (0, 0, 1, 0))  # (T + 1, P)
-    change = 4 * (size[ends, which] - size[starts, which]) / depth.numel()
-    keep = (sharp < SHARP) & (change > SLIGHT**2)
-    return starts[keep], ends[keep], which[keep]
+    change = 4 * (size[ends, part] - size[starts, part]) / depth.numel()
+    return runs.some((sharp < SHARP) & (change > SLIGHT**2))
 
 
 def _bends(depth: Tensor, member: Tensor) -> Tensor:
@@ -188,8 +183,8 @@ def _bends(depth: Tensor, member: Tensor) -> Tensor:
     return out.mT
 
 
-def _runs(bend: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Starts, ends and parts (K,) of runs between the frames from which on signs change most cheaply, of (P, T)."""
+def _runs(bend: Tensor) -> Runs:
+    """Runs between the frames from which on signs change most cheaply, of what it bends (P, T)."""
     parts, frames = bend.shape
     ends = torch.full((parts, 1), frames, device=bend.device)
     places = [torch.zeros_like(ends), ends]
@@ -202,10 +197,10 @@ def _runs(bend: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         places.insert(1, torch.where(value < torch.inf, place, frames).sort(1).values)
     at = torch.cat(places, 1)  # (P, passages + 2)
     last = at.shape[1] - 1
-    runs = [(i, j) for i, j in combinations(range(last + 1), 2) if j <= i + ACROSS or i == 0 or j == last]
-    first, second = (at[:, list(side)] for side in zip(*runs, strict=True))
-    closes = torch.tensor([j == last for _, j in runs], device=bend.device)
-    long = second - first >= min(2, frames)  # passages that there are not lie at the end
-    real = long & (closes | (second < frames))
-    which = torch.arange(parts, device=bend.device)[:, None].expand_as(first)
-    return first[real], second[real], which[real]
+    pairs = [(i, j) for i, j in combinations(range(last + 1), 2) if j <= i + ACROSS or i == 0 or j == last]
+    first, second = torch.tensor(pairs, device=bend.device).T.expand(parts, 2, -1).unbind(1)  # (P, pairs) each
+    start, end = at.gather(1, first), at.gather(1, second)
+    # Passages that there are not lie at the end: the clip's end is the last place only.
+    real = (end - start >= min(2, frames)) & ((second == last) | (end < frames))
+    part = torch.arange(parts, device=bend.device)[:, None].expand_as(first)
+    return Runs(at, part[real], first[real], second[real])

@@ -13,6 +13,7 @@ from kcs_torch.errors import OptionError, counted
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import WEAK_TURN, Estimate, Method
+from kcs_torch.methods.finish import loose_bones
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.batch import Noisy, Sized, serve
@@ -25,6 +26,7 @@ from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.unseen import gap_deviation, place_unseen
 from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.procrustean import COARSE, FINE, align_rotations
 from kcs_torch.types import Tracks
 
@@ -71,6 +73,9 @@ guess. Before cameras that turn by 180 degrees it is above .95 for people, dogs 
 LEAD = 6.0
 """Lead of a solution whose bones are held to their lengths (see :class:`MovingView`) that is as sure as full agreement:
 of 47 views of robot arms, real and random, 14 had one, and 12 of these had a tenth of a flat guess's error or less."""
+
+BROKEN = 0.5
+"""How sure a solution is at most, 1 being full agreement, that does not keep the lengths of rigid bones."""
 
 LEAST_FRAMES = 12
 """Frames from which on the viewpoint may have turned."""
@@ -119,6 +124,9 @@ class PKC(Method):
         for field, least in (("lifts", 1), ("rounds", 0), ("steps", 1), ("alternatives", 0)):
             self._expect(getattr(self, field) >= least, field, f"at least {least}")
 
+    def knows_template(self, skeleton: Skeleton) -> bool:
+        return len(trunk_joints(skeleton)) >= 3
+
     def following(self) -> PKC:
         """The same without contacts: what stands still in space does not in the image."""
         return replace(self, contacts=False)
@@ -162,7 +170,7 @@ class PKC(Method):
             if moving is None:
                 why = "so few frames or joints are" if not enough else "with known cameras, bones that are no tree are"
                 return replace(first, notes=(*notes, f"{why} solved by sfam", *first.notes))
-            return self._from_moving(moving, first, cameras, notes)
+            return self._from_moving(moving, first, skeleton, cameras, notes)
         found = None
         moves = enough and self.viewpoint != "fixed"
         # Cameras that turn tell the sign of depth: what the template says might contradict them.
@@ -240,13 +248,19 @@ class PKC(Method):
         return MovingView(pose, bones, bones, 1.0), first
 
     def _from_moving(
-        self, moving: MovingView, first: Estimate, cameras: Tensor | None, notes: tuple[str, ...]
+        self,
+        moving: MovingView,
+        first: Estimate,
+        skeleton: Skeleton,
+        cameras: Tensor | None,
+        notes: tuple[str, ...],
     ) -> Estimate:
         """The estimate and its mirror image, which nothing but known cameras tells apart.
 
         Where the viewpoint hardly turns the objective has many minima. SfAM, which looks for depth in another way, then
         finds other depths: how far both agree is how far depth is to be believed. Of few bones that are held to their
-        lengths, many solutions have been compared: one that leads by far needs no other witness.
+        lengths, many solutions have been compared: one that leads by far needs no other witness. Where bones that are
+        rigid change their length all the same, the solution is wrong.
         """
         points = moving.pose.points[0]
         path = moving.cameras()[0] if cameras is None else complete_rotation(cameras)
@@ -258,6 +272,8 @@ class PKC(Method):
             agree = _agreement(points[..., 2], first.points[..., 2])
             size = points[..., 2].square().mean().sqrt()
             sure = max(agree / SURE, moving.lead / LEAD)
+            if loose_bones(points, skeleton):
+                sure = min(sure, BROKEN)
             spread = (spread.square() + (size * max(0.0, 1 - sure)).square()).sqrt()
             if sure < DOUBT / SURE:
                 doubt = (

@@ -61,7 +61,7 @@ class Weights:
         twins: usual difference between left and right, as a share.
         contact: weight of feet that stand still, in a frame.
         slip: standard deviation of a standing foot's change of depth from a frame to the next.
-        change: standard deviation of the second difference of the body's own.
+        change: standard deviation of the second difference of the trunk's own.
     """
 
     length: float = 0.003
@@ -76,7 +76,7 @@ class Weights:
     twins: float = 0.03
     contact: float = 1.0
     slip: float = 0.009
-    change: float = 0.006
+    change: float = 0.009
 
 
 def at_pace(weights: Weights, rate: float, pace: float = 1.0) -> Weights:

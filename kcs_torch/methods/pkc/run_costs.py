@@ -9,10 +9,46 @@ from torch import Tensor
 
 from kcs_torch.methods.pkc.objective import Objective
 
-__all__ = ["RunCosts"]
+__all__ = ["RunCosts", "Runs", "inside"]
 
-ROWS = 4096
+ROWS = 1024
 """Frames of changed solutions that are looked at together."""
+
+
+class Runs(NamedTuple):
+    """Runs of frames over which parts of a body change their signs.
+
+    Attributes:
+        places: (P, M) frames from which on each part's signs may change, ascending; T where there are fewer.
+        part: (K,) that each run is of.
+        first: (K,) index of the place at which it starts.
+        last: (K,) index of the place at which it has ended.
+    """
+
+    places: Tensor
+    part: Tensor
+    first: Tensor
+    last: Tensor
+
+    @property
+    def starts(self) -> Tensor:
+        """First frames (K,)."""
+        return self.places[self.part, self.first]
+
+    @property
+    def ends(self) -> Tensor:
+        """The frames after the last ones (K,)."""
+        return self.places[self.part, self.last]
+
+    def some(self, index: Tensor) -> Runs:
+        """Some of the runs."""
+        return Runs(self.places, self.part[index], self.first[index], self.last[index])
+
+    def of(self, parts: slice) -> tuple[Runs, Tensor]:
+        """The runs of some parts, which are numbered anew, and their indices."""
+        found = ((self.part >= parts.start) & (self.part < parts.stop)).nonzero().flatten()
+        runs = self.some(found)
+        return runs._replace(places=self.places[parts], part=runs.part - parts.start), found
 
 
 class _Frames(NamedTuple):
@@ -29,10 +65,6 @@ class _Frames(NamedTuple):
     poses: Tensor
     reach: Tensor
     dz: Tensor
-
-    def one(self, index: int) -> _Frames:
-        """Those of one solution, without their first dimension."""
-        return _Frames(*(values[index] for values in self))
 
 
 class RunCosts:
@@ -53,26 +85,13 @@ class RunCosts:
         self.base = self._frames(own[None])
         self.fixed = torch.cat(list(objective.length_terms(lengths[None]).values())).sum()
 
-    def __call__(self, member: Tensor, starts: Tensor, ends: Tensor, which: Tensor) -> Tensor:
-        """Energies (K,) of runs of at least two frames, or of the whole clip.
-
-        Args:
-            member: (P, B), 1 for the bones of each part.
-            starts: (K,) first frames of runs.
-            ends: (K,) the frames after their last ones.
-            which: (K,) part that each is of.
-        """
-        energy = self.own.new_empty(len(which))
+    def __call__(self, member: Tensor, runs: Runs) -> Tensor:
+        """Energies (K,) of runs of at least two frames, or of the whole clip; members (P, B) are 1 for parts' bones."""
+        energy = self.own.new_empty(len(runs.part))
         few = max(1, ROWS // len(self.own))
         for k in range(0, len(member), few):
-            frames = self._frames(self.own * (1 - 2 * member[k : k + few, None]))
-            bends = _Bends(self.base.dz, frames.dz)
-            for i in range(len(frames.sums)):
-                some = (which == k + i).nonzero().flatten()
-                if len(some):
-                    first, last = starts[some], ends[some]
-                    smooth = bends(i, first, last) / (2 * self.objective.weights.acceleration**2)
-                    energy[some] = smooth + self._energy(frames.one(i), first, last)
+            some, index = runs.of(slice(k, k + few))
+            energy[index] = self._energy(self._frames(self.own * (1 - 2 * member[k : k + few, None])), some)
         return energy
 
     def _frames(self, own: Tensor) -> _Frames:
@@ -91,73 +110,73 @@ class RunCosts:
         )
         posture = obj.posture
         y = (posture.directions(points, lengths) - posture.mean.to(own)) / posture.deviation.to(own)
-        poses = y.flatten(-2)[:, None] @ posture.halves.to(own).mT
-        return _Frames(torch.cat(parts, -1), poses, reach[0], dz)
+        return _Frames(torch.cat(parts, -1), posture.taken_apart(y.flatten(-2)), reach[0], dz)
 
-    def _energy(self, frames: _Frames, starts: Tensor, ends: Tensor) -> Tensor:
-        """All but smoothness, (R,), of runs of one part, with the frames that are changed throughout."""
-        obj, base = self.objective, self.base.one(0)
+    def _energy(self, frames: _Frames, runs: Runs) -> Tensor:
+        """(K,) of runs of parts, with the frames of solutions in which these are changed throughout."""
+        obj, base = self.objective, self.base
         count, w = len(self.own), obj.weights
-        inside = frames.sums - base.sums
-        total = base.sums.sum(0) + _between(inside, starts, ends)
+        total = base.sums.sum(1) + _between(frames.sums - base.sums, runs.part, runs.starts, runs.ends)
         hinges, limbs = len(obj.hinges.joints), len(obj.adduction.joints)
         strayed, wrong, axes, sides, short = total.split([len(self.lengths), hinges, hinges, limbs, 1], -1)
         value = self.fixed + obj.length_value(strayed, self.lengths[None]) + short[:, 0]
         value = value + w.hinge / w.sine**2 / 2 * (wrong / _known(axes / count)).sum(-1)
-        time = torch.arange(count, device=starts.device)
-        within = (time >= starts[:, None]) & (time < ends[:, None])
-        reach = torch.where(within[..., None], frames.reach, base.reach) / _known(sides / count).sqrt()[:, None]
-        over = (reach - obj.adduction.limit).clamp_min(0).square() * obj.adduction.firm.to(reach)
-        return value + w.adduction / w.sine**2 / 2 * over.sum((1, 2)) + self._posture(frames.poses, starts, ends)
+        reach = torch.where(inside(runs, count)[..., None], frames.reach[runs.part], base.reach)
+        over = (reach / _known(sides / count).sqrt()[:, None] - obj.adduction.limit).clamp_min(0).square()
+        value = value + w.adduction / w.sine**2 / 2 * (over * obj.adduction.firm.to(over)).sum((1, 2))
+        bends = _bends(base.dz, frames.dz, runs.part, runs.starts, runs.ends)
+        return value + bends / (2 * w.acceleration**2) + self._posture(frames.poses, runs)
 
-    def _posture(self, poses: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
-        """The posture's energy (R,), from sums and scatters of poses (S, T, K) up to where runs start and end."""
-        posture, base = self.objective.posture, self.base.poses[0]
-        places, at = torch.cat([starts, ends]).unique(return_inverse=True)
-        before = (torch.arange(poses.shape[1], device=places.device) < places[:, None]).to(poses)  # (M, T)
-        both, sign = torch.cat([poses, base], 1), torch.cat([before, -before], 1)
-        first, last = at.split(len(starts))
-        # Up to each place, (S, M, K, K): what the change adds to the scatter.
-        added = ((both.mT[:, None] * sign[:, None]).flatten(1, 2) @ both).unflatten(1, (len(places), -1))
-        scatter = (base.mT @ base)[:, None] + added[:, last] - added[:, first]  # (S, R, K, K)
-        added = sign @ both
-        mean = (base.sum(1)[:, None] + added[:, last] - added[:, first]) / poses.shape[1]  # (S, R, K)
-        count = poses.shape[1] / posture.correlation
+    def _posture(self, poses: Tensor, runs: Runs) -> Tensor:
+        """The posture's energy (K,), from sums and scatters of poses (V, S, T, K) up to each place."""
+        posture, base = self.objective.posture, self.base.poses
+        frames = poses.shape[2]
+        before = (torch.arange(frames, device=poses.device) < runs.places[..., None]).to(poses)  # (V, M, T)
+        both, sign = torch.cat([poses, base.expand_as(poses)], 2), torch.cat([before, -before], 2)[:, None]
+        # Up to each place, (V, S, M, K, K): what the change adds to the scatter.
+        added = ((both.mT[:, :, None] * sign[..., None, :]).flatten(2, 3) @ both).unflatten(2, (sign.shape[2], -1))
+        scatter = base.mT @ base + _across(added, runs)  # (K, S, K, K)
+        mean = (base.sum(2) + _across(sign @ both, runs)) / frames  # (K, S, K)
+        count = frames / posture.correlation
         pull = count * posture.kappa / (count + posture.kappa)
         scatter = scatter / posture.correlation + (pull - count) * mean[..., None] * mean[..., None, :]
-        return posture.of_scatter(scatter, count).sum(0)
+        return posture.of_scatter(scatter, count).sum(-1)
 
 
-class _Bends:
-    """Sums of squared second differences (T, B) of a solution that is another one (V, T, B) over a run."""
-
-    def __init__(self, base: Tensor, other: Tensor) -> None:
-        def cost(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-            """Of sequences whose frames before a middle one, it and those after it are of different solutions."""
-            if other.shape[1] < 3:
-                return other.new_zeros(other.shape[:2])
-            bend = a[:, :-2] - 2 * b[:, 1:-1] + c[:, 2:]
-            return torch.nn.functional.pad(bend.square().sum(-1), (1, 1))
-
-        old = cost(base, base, base)
-        after, before = (1, 0), (0, 1)  # the frame is the last one before a change, or the first one after it
-        pad = torch.nn.functional.pad
-        self.begin = pad(cost(base, base, other) - old, after) + pad(cost(base, other, other) - old, before)
-        self.end = pad(cost(other, other, base) - old, after) + pad(cost(other, base, base) - old, before)
-        self.inside = cost(other, other, other) - old
-        self.total = old.sum()
-
-    def __call__(self, index: int, starts: Tensor, ends: Tensor) -> Tensor:
-        """(R,) of runs of the solution with this index."""
-        least = torch.minimum(starts + 1, ends)
-        inner = _between(self.inside[index, :, None], least, torch.maximum(ends - 1, least))[:, 0]
-        return self.total + self.begin[index, starts] + inner + self.end[index, ends]
+def inside(runs: Runs, frames: int) -> Tensor:
+    """Which of the frames are within each run, (K, T)."""
+    time = torch.arange(frames, device=runs.part.device)
+    return (time >= runs.starts[:, None]) & (time < runs.ends[:, None])
 
 
-def _between(values: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
-    """Sums (R, C) of values (T, C) over runs."""
-    summed = torch.nn.functional.pad(values.cumsum(0), (0, 0, 1, 0))
-    return summed[ends] - summed[starts]
+def _bends(base: Tensor, other: Tensor, part: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
+    """Sums (K,) of squared second differences of a solution (1, T, B) that is another one (V, T, B) over runs."""
+    if other.shape[1] < 3:
+        return other.new_zeros(len(part))
+
+    def cost(before: Tensor, middle: Tensor, after: Tensor) -> Tensor:
+        """(V, T) of frames that are of one solution each with those before and after them."""
+        bend = before[:, :-2] - 2 * middle[:, 1:-1] + after[:, 2:]
+        return torch.nn.functional.pad(bend.square().sum(-1), (1, 1))
+
+    old, pad = cost(base, base, base), torch.nn.functional.pad
+    later, sooner = (1, 0), (0, 1)  # the frame is the last one before a change, or the first one after it
+    begin = pad(cost(base, base, other) - old, later) + pad(cost(base, other, other) - old, sooner)
+    end = pad(cost(other, other, base) - old, later) + pad(cost(other, base, base) - old, sooner)
+    least = torch.minimum(starts + 1, ends)
+    inner = _between((cost(other, other, other) - old)[..., None], part, least, torch.maximum(ends - 1, least))
+    return old.sum() + begin[part, starts] + inner[:, 0] + end[part, ends]
+
+
+def _between(values: Tensor, part: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
+    """Sums (K, C) of values (V, T, C) over runs."""
+    summed = torch.nn.functional.pad(values.cumsum(1), (0, 0, 1, 0))
+    return summed[part, ends] - summed[part, starts]
+
+
+def _across(values: Tensor, runs: Runs) -> Tensor:
+    """Differences (K, S, ...) of values (V, S, M, ...) between the places at which runs end and start."""
+    return values[runs.part, :, runs.last] - values[runs.part, :, runs.first]
 
 
 def _sized(sine: Tensor, points: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
