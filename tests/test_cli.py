@@ -199,7 +199,11 @@ MISTAKES = {
     "method": (["lift", "IN", "-o", "OUT.npz", "-m", "sfma"], "OptionError", "did you mean 'sfam'"),
     "field": (["lift", "IN", "-o", "OUT.npz", "-m", "sfam", "--set", "betta=1"], "OptionError", "did you mean 'beta'"),
     "no value": (["lift", "IN", "-o", "OUT.npz", "-m", "sfam", "--set", "beta"], "OptionError", "name=value"),
-    "bad value": (["lift", "IN", "-o", "OUT.npz", "-m", "sfam", "--set", "beta=much"], "OptionError", "a number"),
+    "bad value": (
+        ["lift", "IN", "-o", "OUT.npz", "-m", "sfam", "--set", "beta=much"],
+        "OptionError",
+        "a finite number",
+    ),
     "skeleton": (["lift", "IN", "-o", "OUT.npz", "--skeleton", "body52"], "SkeletonError", "did you mean 'body25'"),
     "wrong skeleton": (["lift", "IN", "-o", "OUT.npz", "--skeleton", "hand21"], "SkeletonError", "hand21"),
     "format": (["lift", "IN", "-o", "OUT.npz", "--format", "opnpose"], "OptionError", "did you mean 'openpose'"),

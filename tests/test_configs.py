@@ -13,6 +13,7 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 import kcs_torch as kt
+from kcs_torch.training.configured import check_values
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 PROGRAMS = sorted(path.stem for path in CONFIGS.glob("*.yaml"))
@@ -36,6 +37,7 @@ def made(config: DictConfig) -> Any:
         OmegaConf.update(config, key, "somewhere")
     if OmegaConf.select(config, "trainer.accelerator") == "gpu" and not torch.cuda.is_available():
         config.trainer.accelerator = "cpu"
+    check_values(OmegaConf.to_container(config, resolve=True))
     return instantiate(config, _convert_="all")
 
 

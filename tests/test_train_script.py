@@ -277,6 +277,10 @@ class TestCommandLine:
             ("+trainer.accumulate_grad_batches=2", r"accumulate_grad_batches: .*data\.batch_size"),
             ("+data.noisy=1", "data: .*unexpected keyword argument 'noisy'"),
             ("+module.lr=-1", "lr: expected a positive number"),
+            ("+module.lr=abc", "error: module.lr: expected a finite number, got 'abc'"),
+            ("trainer.max_epochs=hello", "error: trainer.max_epochs: expected a whole number or none, got 'hello'"),
+            ("data.fresh_cameras=maybe", "error: data.fresh_cameras: expected true or false, got 'maybe'"),
+            ("optimise=???", "error: optimise: expected a value, got none: add optimise="),
             ("+trainer.acelerator=cpu", "trainer: .*unexpected keyword argument 'acelerator'"),
             ("trainer.accelerator=abacus", "abacus"),
             ("data=cmu shared=/nowhere", "/nowhere/data/cmu, found none"),
@@ -287,7 +291,7 @@ class TestCommandLine:
     )
     def test_wrong_arguments(self, tmp_path, capsys, argument, told):
         code, _, err = called(capsys, *SMALL, *argument.split(), f"hydra.run.dir={tmp_path}")
-        assert code == 1 and re.search(told, err), err
+        assert code == 2 and re.search(told, err), err
         assert "Traceback" not in err
 
     def test_settings_of_ones_own_may_be_added(self, capsys):
@@ -361,7 +365,7 @@ class TestSweeps:
     def test_a_run_that_fails_does_not_take_the_others_along(self, tmp_path, monkeypatch, capsys):
         monkeypatch.chdir(tmp_path)
         code, _, err = called(capsys, *SWEEP, "+module.lr=1e-3,-1,1e-4")
-        assert code == 1 and "lr: expected a positive number" in err and "Traceback" not in err
+        assert code == 2 and "lr: expected a positive number" in err and "Traceback" not in err
         assert [row["run"] for row in rows(tmp_path / "sweep" / "results.csv")] == ["0", "2"]
 
     def test_the_table_is_that_of_all_who_have_ended(self, tmp_path):

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from kcs_torch.errors import OptionError, unknown
+from kcs_torch.types.hints import spoken
 
 __all__ = ["parse_settings"]
 
@@ -42,7 +43,7 @@ def parse_settings(settings: Iterable[str], methods: Sequence[type]) -> dict[str
         try:
             values[name] = _convert(value.strip(), hints[name])
         except (KeyError, TypeError, ValueError):
-            raise OptionError(f"--set {name}: expected {_spoken(hints[name])}, got {value.strip()!r}") from None
+            raise OptionError(f"--set {name}: expected {spoken(hints[name])}, got {value.strip()!r}") from None
     return values
 
 
@@ -100,16 +101,3 @@ def _sequence(value: Any, inner: Sequence[Any], kind: type) -> Any:
         return tuple(_convert(v, h) for v, h in zip(value, inner, strict=True))
     item = inner[0] if inner else Any
     return kind(_convert(v, item) for v in value)
-
-
-def _spoken(hint: Any) -> str:
-    """A type in words a user knows."""
-    origin, inner = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        return " or ".join(_spoken(h) for h in inner)
-    if origin is typing.Literal:
-        return " or ".join(map(str, inner))
-    words = {int: "a whole number", float: "a number", bool: "true or false", str: "text", types.NoneType: "none"}
-    if hint in words:
-        return words[hint]
-    return "a list such as [[left_wrist, right_wrist]]" if origin else str(hint)

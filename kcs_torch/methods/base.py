@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
-import numbers
 import time
-import types
 import typing
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -31,6 +28,7 @@ from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.finish import WEAK_TURN, WHY_LOOSE, Estimate, finish, loose_bones, rms
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
+from kcs_torch.types.hints import is_a, spoken
 
 __all__ = ["WEAK_TURN", "Estimate", "Method"]
 
@@ -57,7 +55,8 @@ class Method(ABC):
     def __post_init__(self) -> None:
         hints = typing.get_type_hints(type(self))
         for field in dataclasses.fields(self):
-            self._expect(_is_a(getattr(self, field.name), hints[field.name]), field.name, str(field.type))
+            hint = hints[field.name]
+            self._expect(is_a(getattr(self, field.name), hint), field.name, spoken(hint))
 
     @abstractmethod
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
@@ -210,25 +209,3 @@ def check_cameras(cameras: Tensor, frames: int) -> Tensor:
             f"{int(off.argmax())}; a scale belongs to the tracks"
         )
     return cameras
-
-
-def _is_a(value: Any, hint: Any) -> bool:
-    """Whether a value is what a field's annotation says; whole numbers pass for numbers, NaN does not."""
-    origin, inner = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        return any(_is_a(value, h) for h in inner)
-    if origin is typing.Literal:
-        return isinstance(value, str) and value in inner
-    if origin in (Sequence, tuple):  # or a tensor or array that stands for one
-        listed = value.tolist() if hasattr(value, "tolist") else value
-        if not isinstance(listed, Sequence) or isinstance(listed, str):
-            return False
-        fixed = origin is tuple and Ellipsis not in inner
-        if fixed and len(listed) != len(inner):
-            return False
-        return all(_is_a(v, h) for v, h in zip(listed, inner if fixed else [inner[0]] * len(listed), strict=True))
-    if hint in (int, float):
-        if isinstance(value, bool) or not isinstance(value, numbers.Integral if hint is int else numbers.Real):
-            return False
-        return not math.isnan(value)
-    return isinstance(value, hint) if isinstance(hint, type) else True

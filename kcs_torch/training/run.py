@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 import re
 import sys
 import warnings
@@ -19,7 +18,7 @@ import hydra
 import lightning
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import CompactHydraException, HydraException, InstantiationException
+from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
@@ -27,10 +26,11 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from kcs_torch.errors import KcsError, KcsWarning, NotFiniteError, OptionError, unknown
+from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.training.callbacks import Best, Diverged, Last, Watch
 from kcs_torch.training.checkpoint import describe, save_lifter
+from kcs_torch.training.configured import check_values, in_one_line
 from kcs_torch.training.sweep import RESULT, tabulate
 
 __all__ = ["Outcome", "configs", "job", "main", "train"]
@@ -43,10 +43,6 @@ QUIET = (
     r".*could not find the monitored key.*",  # there was no validation, which is told in other words
 )
 """Beginnings of warnings of packages that say nothing to whoever trains."""
-
-
-class WrongConfiguration(CompactHydraException):
-    """What is wrong with the configuration of a run; Hydra prints it without a traceback."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +80,7 @@ def train(config: DictConfig, folder: Path) -> Outcome:
     """
     plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
     _check(plain)
+    check_values(plain)
     torch.set_num_threads(config.threads)
     resumed = None if config.resume is None else _checkpoint(Path(config.resume), plain)
     with _quiet():
@@ -216,13 +213,8 @@ def job(config: DictConfig) -> float:
     """Train in the folder that Hydra gives a run, tell what it came to, and return what a sweep optimises."""
     settings = HydraConfig.get()
     folder = Path(settings.runtime.output_dir)
-    try:
-        with _said():
-            outcome = train(config, folder)
-    except Exception as error:
-        if (text := _told(error)) is None or os.environ.get("HYDRA_FULL_ERROR") == "1":
-            raise
-        raise WrongConfiguration(f"error: {text}") from None
+    with in_one_line(MisconfigurationException), _said():
+        outcome = train(config, folder)
     figures = {config.optimise: outcome.value} | dict(outcome.metrics)
     result = {name: figure if math.isfinite(figure) else None for name, figure in figures.items()}
     with atomic_path(folder / RESULT) as temporary:
@@ -231,18 +223,6 @@ def job(config: DictConfig) -> float:
     if settings.mode == RunMode.MULTIRUN:
         tabulate(Path(settings.sweep.dir))
     return outcome.value
-
-
-def _told(error: Exception) -> str | None:
-    """What is wrong with the configuration, or None if the program is wrong."""
-    told = (KcsError, HydraException, OmegaConfBaseException, MisconfigurationException)
-    if isinstance(error, InstantiationException):
-        cause, place = error.__cause__, re.search(r"full_key: (\S+)", str(error))
-        if isinstance(cause, (TypeError, ValueError, *told)):
-            return str(cause) if isinstance(cause, KcsError) or place is None else f"{place.group(1)}: {cause}"
-        if cause is not None and "Error locating target" not in str(error):
-            return None
-    return str(error) if isinstance(error, told) else None
 
 
 def _check_names(arguments: Sequence[str]) -> None:
@@ -263,12 +243,12 @@ def _check_names(arguments: Sequence[str]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train as a command line says, by default that of this process; Hydra exits with 1 where it is wrong."""
+    """Train as a command line says, by default that of this process; exit with 2 where it is wrong."""
     try:
         _check_names(sys.argv[1:] if arguments is None else arguments)
     except OptionError as error:
         print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
+        raise SystemExit(2) from None
     entry = hydra.main(version_base="1.3", config_path=str(configs()), config_name="train")(job)
     before = sys.argv
     if arguments is not None:
@@ -277,5 +257,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sys.argv = [sys.argv[0], *flags, *(a for a in sys.argv[1:] if a not in flags)]
     try:
         entry()
+    except SystemExit as end:  # Hydra leaves with 1 whatever it was; what it was is the context
+        wrong = isinstance(end.__context__, (HydraException, OmegaConfBaseException))
+        raise SystemExit(2 if wrong and not isinstance(end.__context__, InstantiationException) else end.code) from None
     finally:
         sys.argv = before
