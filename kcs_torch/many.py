@@ -23,7 +23,7 @@ from kcs_torch.io.folders import natural_key
 from kcs_torch.io.load import load_people
 from kcs_torch.io.write import save, takes_up, writer_for
 from kcs_torch.methods.base import Method
-from kcs_torch.reconstruct import reconstruct_all
+from kcs_torch.reconstruct import reconstruct_all, with_found_bones
 from kcs_torch.types import Reconstruction, Tracks
 from kcs_torch.types.size import parse_size
 
@@ -163,7 +163,8 @@ def reconstruct_folder(
         units: as of :func:`kcs_torch.save`.
         intrinsics: of the camera that saw them all, as of :func:`kcs_torch.reconstruct`.
         progress: gets a line every few seconds.
-        **reading: options of :func:`kcs_torch.load_tracks`, such as ``fps`` and ``skeleton``.
+        **reading: options of :func:`kcs_torch.load_tracks`, such as ``fps`` and ``skeleton``; ``skeleton="auto"`` finds
+            every body's bones from how its joints move.
 
     Returns:
         What became of the clips of this part.
@@ -190,13 +191,16 @@ def reconstruct_folder(
     clips = [clip for clip in clips_of(source, output, pattern) if clip.share_of(shards) == shard]
     workplace = Path(output) / f".part_{shard}_of_{shards}"
     _sweep(Path(output), workplace)
-    work = _Work(method, suffixes, everybody, workplace, size, up, units, intrinsics, reading)
+    find = reading.get("skeleton") == "auto"
+    if find:
+        del reading["skeleton"]
+    work = _Work(method, suffixes, everybody, workplace, size, up, units, intrinsics, find, reading)
     todo, skipped, failed = [], 0, []
     for clip in clips:
-        if clip.failure.exists() and not retry:
-            failed.append((clip.source, clip.failure.read_text("utf-8", "replace").partition("\n")[0]))
-        elif work.is_done(clip):
+        if work.is_done(clip):  # perhaps but those of another call's suffixes, which failed
             skipped += 1
+        elif clip.failure.exists() and not retry:
+            failed.append((clip.source, clip.failure.read_text("utf-8", "replace").partition("\n")[0]))
         else:
             todo.append(clip)
     done = frames = 0
@@ -227,6 +231,7 @@ class _Work:
     up: str | None
     units: str | None
     intrinsics: Any
+    find: bool
     reading: dict[str, object]
 
     def is_done(self, clip: Clip) -> bool:
@@ -258,7 +263,8 @@ class _Work:
 
     def _people(self, clip: Clip) -> list[Tracks]:
         people = load_people(clip.source, **self.reading)  # type: ignore[arg-type]
-        return people if self.everybody else people[:1]
+        people = people if self.everybody else people[:1]
+        return [with_found_bones(one) for one in people] if self.find else people
 
     def _lift(self, people: list[Tracks]) -> list[Reconstruction]:
         return reconstruct_all(people, method=self.method, intrinsics=self.intrinsics)

@@ -24,16 +24,19 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import hydra
+try:
+    import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+    from omegaconf import DictConfig, OmegaConf
+except ModuleNotFoundError as error:
+    raise SystemExit(f"error: {error.name} is missing: pip install hydra-core") from None
 import numpy as np
 import torch
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
 
 import kcs_torch as kt
 from kcs_torch.methods import METHODS
+from kcs_torch.training.configured import in_one_line, method_of
 
 FACTS = (
     *("suite", "case", "method", "options", "cameras", "frames", "joints"),
@@ -161,7 +164,8 @@ def main(config: DictConfig) -> None:
         make_papers(config.paper, shared, folder)
         return
     protocol = load_protocol(shared)
-    method = instantiate(config.method, _convert_="all")
+    with in_one_line():
+        method = method_of(config.method)
     options = {k: v for k, v in OmegaConf.to_container(config.method).items() if k != "_target_"}
     name = job.runtime.choices.method
     text = " ".join(f"{k}={v}" for k, v in options.items())

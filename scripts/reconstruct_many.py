@@ -18,19 +18,23 @@ from __future__ import annotations
 
 import sys
 
-import hydra
+try:
+    import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.errors import CompactHydraException
+    from hydra.types import RunMode
+    from omegaconf import DictConfig, OmegaConf
+except ModuleNotFoundError as error:
+    raise SystemExit(f"error: {error.name} is missing: pip install hydra-core") from None
 import torch
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
 
-from kcs_torch import KcsError
+from kcs_torch.errors import counted
 from kcs_torch.many import reconstruct_folder
+from kcs_torch.training.configured import in_one_line, method_of
 
 
-class ClipsFailed(Exception):
-    """Some clips of a shard failed; the others are done."""
+class ClipsFailed(CompactHydraException):
+    """Some clips of a shard failed; the others are done. Hydra prints it without a traceback."""
 
 
 failed = 0  # clips of all jobs run in this process; Hydra hands no exit code through
@@ -45,26 +49,26 @@ def main(config: DictConfig) -> None:
         "pattern", "suffixes", "everybody", "shard", "shards", "batch", "retry", "scale", "up", "units", "intrinsics",
     )  # fmt: skip
     options = OmegaConf.to_container(config, resolve=True)
-    try:
+    with in_one_line():
         outcome = reconstruct_folder(
             config.input,
             config.output,
-            method=instantiate(config.method, _convert_="all"),
+            method=method_of(config.method),
             progress=lambda line: print(f"shard {config.shard}: {line}", file=sys.stderr, flush=True),
             **{name: options[name] for name in names},
             **options["reading"],
         )
-    except KcsError as error:
-        raise SystemExit(f"error: {error}") from None
     for path, reason in outcome.failed:
         print(f"failed: {path}: {reason}")
+    if outcome.failed:
+        print("options of reading, such as skeleton=..., go in as +reading.skeleton=...; retry=true tries them again")
     rate = outcome.done / outcome.seconds if outcome.seconds else 0.0
-    made = f"{outcome.done} made ({outcome.frames} frames) in {outcome.seconds:.1f} s, {rate:.1f} a second"
+    made = f"{outcome.done} made ({counted(outcome.frames, 'frame')}) in {outcome.seconds:.1f} s, {rate:.1f} a second"
     rest = f"{outcome.skipped} were there, {len(outcome.failed)} failed"
-    print(f"shard {config.shard} of {config.shards}: {outcome.clips} clips, {made}; {rest}")
+    print(f"shard {config.shard} of {config.shards}: {counted(outcome.clips, 'clip')}, {made}; {rest}")
     failed += len(outcome.failed)
     if outcome.failed and HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise ClipsFailed(f"{len(outcome.failed)} clips failed")  # of another process only an error is heard
+        raise ClipsFailed(f"{counted(len(outcome.failed), 'clip')} failed")  # of another process only an error is heard
 
 
 if __name__ == "__main__":

@@ -100,6 +100,28 @@ def test_wrong_choices(script, folder):
         list(script.chosen(protocol, ["turn", "walks"], "*"))
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["method=sfam", "+method.foo=3"], "error: unknown option of method 'sfam' 'foo': choices are "),
+        (["method=sfam", "+method.beta=much"], "error: sfam: beta: expected a finite number, got 'much'"),
+    ],
+)
+def test_wrong_fields_of_the_method(root, folder, words, told):
+    done = benchmark(root, folder, "suite=turn", *words)
+    assert done.returncode == 1 and told in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["benchmark", "reconstruct_many"])
+def test_hydra_is_missed_in_one_line(root, folder, name):
+    code = (
+        "import runpy, sys; sys.modules['hydra'] = None\n"
+        f"runpy.run_path({str(root / 'scripts' / name)!r} + '.py', run_name='__main__')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "error: hydra is missing: pip install hydra-core\n")
+
+
 def test_no_case_is_an_error(root, folder):
     done = benchmark(root, folder, "suite=turn", "case=x*")
     assert done.returncode == 1 and "matches no case" in done.stderr

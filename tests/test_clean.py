@@ -422,7 +422,7 @@ MISTAKES = {
     "cutoff 0": (lambda t: kt.clean.smooth(t, cutoff=0), "above 0"),
     "cutoff NaN": (lambda t: kt.clean.smooth(t, cutoff=math.nan), "got nan"),
     "cutoff text": (lambda t: kt.clean.smooth(t, cutoff="6"), "got '6'"),
-    "no rate": (lambda t: kt.clean.smooth(replace(t, fps=None)), r"give fps=\.\.\. \(on the command line --fps\)"),
+    "no rate": (lambda t: kt.clean.smooth(replace(t, fps=None)), r"give fps=\.\.\. \(kcs-torch: --fps\)"),
     "bad rate": (lambda t: kt.clean.smooth(t, fps=-1), "smooth: fps: expected a positive number"),
     "gate": (lambda t: kt.clean.gate(t, threshold=0), "gate: threshold"),
     "gate's floor": (lambda t: kt.clean.gate(t, floor=-1), "gate: floor"),

@@ -138,4 +138,4 @@ def test_an_unknown_rate_is_told_with_the_option(tmp_path):
     tracks = tmp_path / "walk.npz"
     np.savez(tracks, points2d=np.random.default_rng(0).normal(size=(30, 17, 2)))
     done = run("lift", tracks, "-o", tmp_path / "a.npz", "--skeleton", "coco17", "--smooth", "savgol=5", code=2)
-    assert "give fps=... (on the command line --fps)" in done.stderr
+    assert "give fps=... (kcs-torch: --fps)" in done.stderr

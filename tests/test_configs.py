@@ -142,6 +142,12 @@ def test_fields_can_be_set_on_the_command_line(name):
     assert method == kind(**{field.name: value})
 
 
+@pytest.mark.parametrize("program", ["benchmark", "reconstruct_many"])
+def test_help_names_the_methods_and_no_groups_that_are_not_used(program):
+    text = composed(program, return_hydra_config=True).hydra.help.template
+    assert f"a method: {', '.join(sorted(kt.METHODS))}\n" in text and "$APP_CONFIG_GROUPS" not in text
+
+
 @pytest.mark.parametrize("program", ["benchmark", "train"])
 def test_settings_are_those_that_the_program_reads(program):
     path = "scripts/benchmark.py" if program == "benchmark" else "kcs_torch/training/run.py"

@@ -39,7 +39,7 @@ def same(tracks, points):
 
 def test_shares_of_the_image_need_its_size(tmp_path):
     path = write_json(tmp_path / "a.json", mediapipe_frames())
-    with pytest.raises(FormatError, match=r"a\.json: .*image_size=\(width, height\), .*--image-size 1920x1080"):
+    with pytest.raises(FormatError, match=r"a\.json: .*image_size=\(width, height\) .*--image-size 1920x1080"):
         load_tracks(path)
     tracks = load_tracks(path, image_size=(1000, 500), fps=30)
     assert np.allclose(tracks.points[:, :33], POSE[..., :2] * [1, 0.5])

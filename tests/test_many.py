@@ -130,6 +130,28 @@ def test_up_goes_to_the_files_that_hold_it(tmp_path):
         run(source, tmp_path / "none", up="z")
 
 
+def test_bones_are_found_where_that_is_asked_for(tmp_path):
+    (tmp_path / "in").mkdir()
+    tracks = random_motion("coco17", 40, turn=180).tracks
+    kt.save(kt.Tracks.from_arrays(tracks.points), tmp_path / "in" / "a.npz")
+    assert run(tmp_path / "in", tmp_path / "out").failed == ()
+    assert run(tmp_path / "in", tmp_path / "found", skeleton="auto").failed == ()
+    without, found = (load_reconstruction(tmp_path / name / "a.npz") for name in ("out", "found"))
+    assert without.tracks.skeleton.num_bones == 0 < found.tracks.skeleton.num_bones
+
+
+def test_what_was_written_before_another_file_failed_is_there(tmp_path):
+    """A graph goes to .npz, not to .bvh: the clip failed, but not for those who ask for .npz alone."""
+    (tmp_path / "in").mkdir()
+    tracks = random_motion("coco17", 20).tracks
+    kt.save(kt.Tracks.from_arrays(tracks.points), tmp_path / "in" / "a.npz")
+    both = run(tmp_path / "in", tmp_path / "out", suffixes=[".npz", ".bvh"])
+    assert len(both.failed) == 1 and "tree" in both.failed[0][1] and "--skeleton" in both.failed[0][1]
+    assert len(run(tmp_path / "in", tmp_path / "out", suffixes=[".npz", ".bvh"]).failed) == 1
+    alone = run(tmp_path / "in", tmp_path / "out")
+    assert (alone.skipped, alone.failed) == (1, ())
+
+
 def test_everybody(tmp_path):
     shared = walking_person(8, skeleton="coco17").tracks
     lists = []
@@ -247,5 +269,22 @@ def test_a_multirun_says_that_clips_failed(clips, tmp_path, root):
         f"hydra.sweep.dir={tmp_path / 'sweep'}",
     ]  # fmt: skip
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 1 and "1 clips failed" in done.stderr
+    assert done.returncode == 1 and "1 clip failed" in done.stderr and "Traceback" not in done.stderr
     assert (tmp_path / "out" / "good.npz").exists() and (tmp_path / "out" / "bad.failed.txt").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["output=out"], "error: input: expected a value, got none: add input=..."),
+        (["input=nowhere", "output=out"], "error: nowhere: expected a folder of tracks"),
+        (["input=in", "output=out", "+reading.fsp=25"], "error: unknown reading option 'fsp': did you mean 'fps'"),
+        (["input=in", "output=out", "method=sfam", "+method.foo=3"], "error: unknown option of method 'sfam' 'foo'"),
+    ],
+)
+def test_a_wrong_call_of_the_script_is_a_line(tmp_path, root, words, told):
+    pytest.importorskip("hydra")
+    (tmp_path / "in").mkdir()
+    command = [sys.executable, str(root / "scripts" / "reconstruct_many.py"), *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1 and told in done.stderr and "Traceback" not in done.stderr

@@ -40,7 +40,7 @@ def frame_rate(own: float | None, given: float | None, what: str, source: str) -
     """
     if given is None and own is None:
         raise OptionError(
-            f"{what}: {source} does not say how many frames a second it has: give fps=... (on the command line --fps)"
+            f"{what}: {source} does not say how many frames a second it has: give fps=... (kcs-torch: --fps)"
         )
     return number(own if given is None else given, f"{what}: fps", "a positive number of frames a second")
 

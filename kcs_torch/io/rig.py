@@ -72,7 +72,7 @@ def fit_rig(points: Tensor, body: Skeleton, *, up: str = "y") -> Rig:
             reason = "closes a chain"
         raise OutputError(
             f"expected a skeleton whose bones are one tree, got '{body.name}', which {reason}: "
-            "give one with skeleton=..., on the command line --skeleton"
+            "give one with skeleton=... (kcs-torch: --skeleton)"
         )
     rest = points[0]
     if body.template is not None:

@@ -176,7 +176,7 @@ def _reconstruction(
         kind = "no bones" if not body.num_bones else "no rigid bones"
         notes.append(f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown")
     if tracks.fps is None and method.reckons_in_seconds:
-        notes.append("30 frames a second assumed, as the rate is not known: give fps=..., on the command line --fps")
+        notes.append("30 frames a second assumed, as the rate is not known: give fps=... (kcs-torch: --fps)")
     if pointlike:
         notes.append("all joints lie at one point in every frame: there is no pose to find")
     if remark:

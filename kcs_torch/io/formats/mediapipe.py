@@ -93,7 +93,7 @@ def _settle(found: Landmarks, path: Path, options: Options) -> None:
     elif size is None:
         raise FormatError(
             f"{path}: its coordinates are shares of the image, which needs the video's size: give "
-            "image_size=(width, height), on the command line --image-size 1920x1080"
+            "image_size=(width, height) (kcs-torch: --image-size 1920x1080)"
         )
     seen = everything[:, 2]
     known = bool((seen[np.isfinite(seen)] > 0).any())  # hands have 0 everywhere

@@ -40,7 +40,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
         raise FormatError(
             f"{path}: VideoPose3D keeps its tracks as a pickle, a kind of file that can run code as it is read. This "
             "reader takes nothing but arrays, lists and numbers from it and runs no code; if you trust where the file "
-            "comes from, say so with trust=True, on the command line --trust"
+            "comes from, say so with trust=True (kcs-torch: --trust)"
         )
     sequences = list(_sequences(file.objects(_KEY), str(path)))
     if not sequences:
