@@ -21,7 +21,7 @@ from kcs_torch.errors import KcsError, KcsWarning, OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.folders import natural_key
 from kcs_torch.io.load import load_people
-from kcs_torch.io.write import save, takes_up, writer_for
+from kcs_torch.io.write import ready_writer, save, takes_up
 from kcs_torch.methods.base import Method
 from kcs_torch.reconstruct import reconstruct_all, with_found_bones
 from kcs_torch.types import Reconstruction, Tracks
@@ -179,7 +179,7 @@ def reconstruct_folder(
         raise OptionError(f"batch: expected at least 1 clip, got {batch}")
     suffixes = [s if s.startswith(".") else f".{s}" for s in suffixes]
     for suffix in suffixes:
-        writer_for(Path(f"x{suffix}"))
+        ready_writer(Path(f"NAME{suffix}"))
     for name in reading:
         if name not in _READING:
             raise unknown("reading option", name, _READING)

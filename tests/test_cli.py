@@ -212,6 +212,8 @@ MISTAKES = {
     "threshold": (["lift", "IN", "-o", "OUT.npz", "--threshold", "2"], "OptionError", "0 to 1"),
     "fps": (["lift", "IN", "-o", "OUT.npz", "--fps", "-5"], "OptionError", "fps"),
     "suffix": (["lift", "IN", "-o", "OUT.doc"], "OutputError", ".npz"),
+    "unit": (["lift", "IN", "-o", "OUT.bvh", "--units", "parsec"], "OptionError", "unknown unit of length 'parsec'"),
+    "unit of an unknown size": (["lift", "IN", "-o", "OUT.bvh", "--units", "m"], "OptionError", "--scale height="),
     "no suffix": (["lift", "IN", "-o", "OUT"], "OutputError", ".npz"),
     "output is a folder": (["lift", "IN", "-o", "FOLDER.npz"], "OutputError", "folder"),
     "info": (["info", "absent.json"], "FormatError", "absent.json"),
@@ -231,6 +233,30 @@ def test_mistakes_get_one_line_and_write_nothing(name, openpose_folder, tmp_path
     assert answer["type"] == kind
     assert hint in answer["error"] and hint in done.stderr
     assert [p.name for p in tmp_path.rglob("*")] == ["FOLDER.npz"]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "package", "told"),
+    [
+        (".c3d", "ezc3d", "out.c3d: C3D: needs the package ezc3d"),
+        (".rrd", "rerun", "out.rrd: a recording needs the package rerun-sdk"),
+        (".mp4", "imageio_ffmpeg", "out.mp4: an MP4 needs ffmpeg"),
+    ],
+)
+def test_what_cannot_be_written_is_told_before_the_lift(openpose_folder, tmp_path, monkeypatch, suffix, package, told):
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(kt, "reconstruct_all", lambda *a, **k: pytest.fail("lifted before it was told"))
+    done = run("lift", openpose_folder, "-o", tmp_path / f"out{suffix}", code=2)
+    assert told in done.stderr and not list(tmp_path.iterdir())
+    run("lift", openpose_folder, "-o", tmp_path / "out.npz", "--units", "parsec", code=2)
+    run("lift", openpose_folder, "-o", tmp_path / "out.npz", "--scale", "height=2m", "--units", "parsec", code=2)
+
+
+def test_an_output_that_is_named_twice_is_written_once(lifted, tmp_path):
+    path, same = tmp_path / "a.csv", tmp_path / "b" / ".." / "a.csv"
+    assert run("convert", lifted[0] / "walk.npz", path, same, path).stdout == f"wrote {path}\n"
+    assert run("view", lifted[0] / "walk.npz", "-o", path, "-o", path).stdout == f"wrote {path}\n"
 
 
 def test_a_late_mistake_leaves_earlier_outputs_alone(openpose_folder, tmp_path):

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -126,6 +127,13 @@ def test_a_link_is_followed(tmp_path, result):
     save(result, tmp_path / "link.csv")
     assert (tmp_path / "link.csv").is_symlink()
     assert (tmp_path / "target.csv").read_text().startswith("frame")
+
+
+def test_an_error_of_a_writer_names_the_file_that_was_asked_for(tmp_path, result, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ezc3d", None)
+    with pytest.raises(OutputError, match=rf"^{tmp_path}/a\.c3d: needs the package ezc3d"):
+        save(result, tmp_path / "a.c3d")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["w", "w.bvx", "w.npz.gz", ".npz"])

@@ -77,7 +77,7 @@ def convert(
         from kcs_torch.io import load_any
         from kcs_torch.types import Reconstruction, Tracks
 
-        check_outputs(output, source=source)
+        output = check_outputs(output, source=source)
         true_size = parse_scale(scale)
         with progress(f"reading {source}"):
             data = load_any(

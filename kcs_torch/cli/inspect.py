@@ -172,7 +172,7 @@ def view(
                 "--units: expected one RESULT; several are shown in their own unit, or in that of --scale"
             )
         for result in results:
-            check_outputs(outputs, source=str(result))
+            outputs = check_outputs(outputs, source=str(result))
         people = []
         for result in results:
             with progress(f"reading {result}"):

@@ -23,7 +23,7 @@ from kcs_torch.cli.options import (
     person_number,
     use_one_thread,
 )
-from kcs_torch.cli.outputs import Scale, Units, Up, check_up, parse_scale, sized, write_files
+from kcs_torch.cli.outputs import Scale, Units, Up, check_units, check_up, parse_scale, sized, write_files
 from kcs_torch.cli.report import answer, describe, one_line, print_json, progress, summary
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ def lift(
         from kcs_torch.types.people import shared
         from kcs_torch.types.size import check_size
 
-        check_outputs(output, source=tracks)
+        output = check_outputs(output, source=tracks)
         learned = _learned(method, settings) if method.endswith(LEARNED) else None
         fields = {} if learned is not None else method_fields(method, settings)
         if intrinsics is not None:
@@ -152,6 +152,7 @@ def lift(
         find, skeleton = skeleton == "auto", None if skeleton == "auto" else skeleton
         if format is None and _is_video(tracks):
             clean = cleaner(SEEN if frames == SEEN else None, gate, fill, smooth, resample)
+            check_units(units, "px", size_of)
             people = people_of(
                 tracks,
                 person,
@@ -185,6 +186,7 @@ def lift(
             together = []
         for number, one in people:
             check_outputs([numbered(path, number) for path in output] if person == "all" else [], source=tracks)
+            check_units(units, one.units, size_of)
             if size_of is not None and not find:
                 check_size(one.skeleton, next(name for name in size_of if name != "units"), "--scale")
             share = float(one.seen.any(1).double().mean())

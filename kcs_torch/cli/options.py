@@ -65,18 +65,24 @@ class _NothingWritten(Exception):
     pass
 
 
-def check_outputs(outputs: Sequence[Path], source: str | None = None) -> None:
+def check_outputs(outputs: Sequence[Path], source: str | None = None) -> list[Path]:
     """Make sure that results can be written, before time is spent on them.
 
+    Returns:
+        the outputs, each once.
+
     Raises:
-        OutputError: a suffix is unknown, a place cannot be written to, or an output would replace the input.
+        OutputError: a suffix is unknown, a package is missing that it needs, a place cannot be written to, or an
+            output would replace the input.
     """
     from kcs_torch.errors import OutputError
-    from kcs_torch.io import writer_for
     from kcs_torch.io.atomic import atomic_path
+    from kcs_torch.io.write import ready_writer
 
+    once: dict[Path, Path] = {}
     for path in outputs:
-        writer_for(path)
+        ready_writer(path)
+        once.setdefault(path.resolve(), path)
         if source is not None and path.exists() and path.resolve() == Path(source).resolve():
             raise OutputError(f"{path}: expected another file than the tracks, which it would replace")
         try:
@@ -84,6 +90,7 @@ def check_outputs(outputs: Sequence[Path], source: str | None = None) -> None:
                 raise _NothingWritten
         except _NothingWritten:
             pass
+    return list(once.values())
 
 
 def new_folders(outputs: Sequence[Path]) -> list[Path]:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _Sized = TypeVar("_Sized", "Motion", "Reconstruction")
 
-__all__ = ["Scale", "Units", "Up", "check_up", "parse_scale", "sized", "write_files"]
+__all__ = ["Scale", "Units", "Up", "check_units", "check_up", "parse_scale", "sized", "write_files"]
 
 Up = Annotated[
     str | None,
@@ -81,6 +81,23 @@ def check_up(up: str | None, paths: Sequence[Path]) -> None:
         raise unknown("axis for --up", up, UP)
     if not any(map(takes_up, paths)):
         raise OptionError(f"--up: expected a .bvh, .c3d, .csv or .trc file to write, got {', '.join(map(str, paths))}")
+
+
+def check_units(units: str | None, own: str, scale: dict[str, Any] | None) -> None:
+    """Make sure that a motion can be written in a unit of length.
+
+    Args:
+        units: as asked for.
+        own: the unit of the tracks that it will be made of.
+        scale: as of :func:`parse_scale`.
+
+    Raises:
+        OptionError: the unit is unknown, or the true size is.
+    """
+    from kcs_torch.io.write import units_ratio
+
+    if units is not None:
+        units_ratio(own if scale is None else scale["units"], units)
 
 
 def write_files(

@@ -18,7 +18,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Give a temporary path beside ``path``, which takes its place when the block ends well.
 
     Missing parent folders are created. Whatever goes wrong, the temporary file and the folders made for it are
-    removed again, and what was at ``path`` before stays as it was. A link is followed: its target is replaced.
+    removed again, and what was at ``path`` before stays as it was. A link is followed: its target is replaced. An
+    OutputError of the block that names the temporary path names ``path`` instead.
 
     Raises:
         OutputError: ``path`` is a folder or a device, or cannot be written to.
@@ -43,6 +44,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         done = True
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
+    except OutputError as error:  # who wrote knows the temporary name only
+        raise OutputError(str(error).replace(str(temporary), str(path))) from None
     finally:
         if not done:
             with contextlib.suppress(OSError):

@@ -14,7 +14,7 @@ from kcs_torch.io.registry import Saving, Writer
 from kcs_torch.types import Motion, Reconstruction, Tracks
 from kcs_torch.types.size import METRES, unit_ratio
 
-__all__ = ["save", "save_people", "takes_up", "writer_for"]
+__all__ = ["ready_writer", "save", "save_people", "takes_up", "units_ratio", "writer_for"]
 
 UP = ("y", "z")
 
@@ -69,7 +69,7 @@ def save(
         if up is not None:
             raise OptionError(f"{path}: up is for {_suffixes('turns')}; this one holds results in the camera's axes")
         if units is not None:
-            data = data.scaled(units=units, factor=_ratio(data.units, units))
+            data = data.scaled(units=units, factor=units_ratio(data.units, units))
         with atomic_path(path) as temporary:
             writer.write(data, temporary)
         return Path(path)
@@ -86,7 +86,7 @@ def save(
         )
     wanted = units or writer.unit
     if units is not None or (wanted and motion.units in METRES):
-        motion = motion.scaled(units=wanted, factor=_ratio(motion.units, wanted))
+        motion = motion.scaled(units=wanted, factor=units_ratio(motion.units, wanted))
     elif wanted:
         saving.warnings.append(
             f"the true size is not known: lengths are in {motion.units or 'an unknown unit'}; set it with "
@@ -140,8 +140,23 @@ def writer_for(path: str | Path) -> Writer:
     return WRITERS[suffix]
 
 
-def _ratio(old: str, new: str) -> float:
-    """How many new units an old one has.
+def ready_writer(path: str | Path) -> Writer:
+    """Return the writer that the suffix of a path chooses, if what it needs is there.
+
+    Raises:
+        OutputError: there is no such writer, or it needs a package or a program that is not installed.
+    """
+    writer = writer_for(path)
+    if writer.ready is not None:
+        try:
+            writer.ready()
+        except OutputError as error:
+            raise OutputError(f"{path}: {error}") from None
+    return writer
+
+
+def units_ratio(old: str, new: str) -> float:
+    """How many new units of length an old one has.
 
     Raises:
         OptionError: that is not known.

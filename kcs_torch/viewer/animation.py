@@ -114,7 +114,7 @@ def save_mp4(results: Reconstruction | Sequence[Reconstruction], path: Path) -> 
     Raises:
         OutputError: there is no ffmpeg, it fails, or nothing can be drawn.
     """
-    program = _ffmpeg()
+    program = find_ffmpeg()
     pictures, _, rate = animation(results, MP4)
     first = next(pictures)
     height, width = first.shape[:2]
@@ -143,7 +143,12 @@ def save_mp4(results: Reconstruction | Sequence[Reconstruction], path: Path) -> 
             raise OutputError(f"ffmpeg could not make an MP4: {words[-1]}")
 
 
-def _ffmpeg() -> str:
+def find_ffmpeg() -> str:
+    """The program that makes an MP4.
+
+    Raises:
+        OutputError: there is none.
+    """
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
 

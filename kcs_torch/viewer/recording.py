@@ -13,7 +13,7 @@ from kcs_torch.types import Reconstruction
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.names import person_names, printable
 
-__all__ = ["save_recording"]
+__all__ = ["need_rerun", "save_recording"]
 
 
 def save_recording(results: Reconstruction | Sequence[Reconstruction], path: str | Path) -> None:
@@ -29,11 +29,7 @@ def save_recording(results: Reconstruction | Sequence[Reconstruction], path: str
     people = [results] if isinstance(results, Reconstruction) else list(results)
     if not people:
         raise OptionError("save_recording: expected at least one result, got none")
-    try:
-        import rerun as rr
-        import rerun.blueprint as rrb
-    except ImportError as error:
-        raise OutputError(f"a recording needs the package rerun-sdk ({error}): pip install rerun-sdk") from None
+    rr, rrb = need_rerun()
     layout = rrb.Horizontal(
         rrb.Spatial3DView(origin="/space", name="3D"),
         rrb.Vertical(
@@ -52,6 +48,20 @@ def save_recording(results: Reconstruction | Sequence[Reconstruction], path: str
         recording.disconnect()
     except (OSError, RuntimeError) as error:
         raise OutputError(f"rerun could not write the recording: {error}") from None
+
+
+def need_rerun() -> tuple[Any, Any]:
+    """The modules rerun and rerun.blueprint.
+
+    Raises:
+        OutputError: they are not installed.
+    """
+    try:
+        import rerun as rr
+        import rerun.blueprint as rrb
+    except ImportError as error:
+        raise OutputError(f"a recording needs the package rerun-sdk ({error}): pip install rerun-sdk") from None
+    return rr, rrb
 
 
 def _log(recording: Any, rr: Any, name: str, result: Reconstruction) -> None:

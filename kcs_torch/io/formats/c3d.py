@@ -6,6 +6,7 @@ its time and memory; that costs a fraction of a second.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,4 +101,13 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
 
 
 MOTION_READERS = (MotionReader("c3d", "C3D of motion capture: markers (needs ezc3d)", recognises, read),)
-WRITERS = (Writer(".c3d", "C3D: markers in millimetres, y up, for biomechanics (needs ezc3d)", None, write, unit="mm"),)
+WRITERS = (
+    Writer(
+        ".c3d",
+        "C3D: markers in millimetres, y up, for biomechanics (needs ezc3d)",
+        None,
+        write,
+        unit="mm",
+        ready=partial(need, "ezc3d", "C3D", OutputError),
+    ),
+)

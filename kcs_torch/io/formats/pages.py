@@ -60,6 +60,18 @@ def write_rrd(results: Results, path: Path) -> None:
     save_recording(results, path)
 
 
+def _mp4_ready() -> None:
+    from kcs_torch.viewer.animation import find_ffmpeg
+
+    find_ffmpeg()
+
+
+def _rrd_ready() -> None:
+    from kcs_torch.viewer.recording import need_rerun
+
+    need_rerun()
+
+
 def as_result(motion: Motion) -> Reconstruction:
     """Motion as a camera sees it that stands a little to the side and above: what pages and films show."""
     points = motion.in_camera(yaw=20.0, pitch=8.0)
@@ -120,6 +132,14 @@ WRITERS = (
         write_mp4,
         _shown(write_mp4),
         write_people=write_mp4,
+        ready=_mp4_ready,
     ),
-    Writer(".rrd", "a recording for the rerun viewer", write_rrd, _shown(write_rrd), write_people=write_rrd),
+    Writer(
+        ".rrd",
+        "a recording for the rerun viewer",
+        write_rrd,
+        _shown(write_rrd),
+        write_people=write_rrd,
+        ready=_rrd_ready,
+    ),
 )
