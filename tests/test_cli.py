@@ -211,6 +211,16 @@ MISTAKES = {
     "person's name": (["lift", "IN", "-o", "OUT.npz", "--person", "-1"], "OptionError", "a number from 0, or all"),
     "threshold": (["lift", "IN", "-o", "OUT.npz", "--threshold", "2"], "OptionError", "0 to 1"),
     "fps": (["lift", "IN", "-o", "OUT.npz", "--fps", "-5"], "OptionError", "fps"),
+    "frames beyond": (
+        ["lift", "IN", "-o", "OUT.npz", "--frames", "500:600"],
+        "OptionError",
+        "--frames: expected",
+    ),
+    "no frame rate": (
+        ["lift", "IN", "-o", "OUT.npz", "--fps", "0"],
+        "OptionError",
+        "fps (--fps): expected a positive number, got 0",
+    ),
     "suffix": (["lift", "IN", "-o", "OUT.doc"], "OutputError", ".npz"),
     "unit": (["lift", "IN", "-o", "OUT.bvh", "--units", "parsec"], "OptionError", "unknown unit of length 'parsec'"),
     "unit of an unknown size": (["lift", "IN", "-o", "OUT.bvh", "--units", "m"], "OptionError", "--scale height="),

@@ -3,6 +3,7 @@
 import io
 import os
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -248,7 +249,8 @@ def test_a_line_with_the_name_of_the_index_is_no_frame(tmp_path):
         (lambda t: t.replace("\n1,", "\n1,2,x", 1).replace(",0.9\n", "\n", 2), "line 5: expected numbers"),
         (lambda t: t.replace("\n1,", "\n1,99999999999", 1), "frame 1, joint 'snout': expected pixels, got 1e[+]14"),
         (lambda t: t.replace("bodyparts,snout", "bodyparts", 1), "as many cells in each line"),
-        (lambda t: t.replace("0.9", "0.1"), "lower the threshold"),
+        (lambda t: t.replace("0.9", "0.1"), "of 0.3 or more, only 0.1: lower the threshold"),
+        (lambda t: re.sub(r"\d+[.]\d+", "nan", t), "no joint is seen in any frame: nothing to reconstruct"),
         (lambda t: t.replace("0.9", "-0.9", 1), "is negative"),
         (lambda t: t.replace("0.9", "90"), "divide by the largest"),
         (lambda t: t + '4,"' + 200_000 * "1", "damaged text"),
@@ -454,7 +456,7 @@ def test_edges_need_not_be_a_tree(tmp_path):
         ({}, ["track", "xy", "node", "time"], "expected dims such as"),
         ({}, ["track", "node", "xy", "frame"], "expected dimensions track, node, xy, frame of 3 nodes"),
         ({"tracks": np.full((1, 2, 3, 4), 1e12)}, None, "expected pixels, got 1e[+]12"),
-        ({"tracks": np.full((1, 2, 3, 4), np.nan)}, None, "lower the threshold"),
+        ({"tracks": np.full((1, 2, 3, 4), np.nan)}, None, "no joint is seen in any frame: nothing to reconstruct"),
     ],
 )
 def test_damaged_sleap_files_are_told(tmp_path, others, dims, message):

@@ -129,6 +129,13 @@ def test_a_link_is_followed(tmp_path, result):
     assert (tmp_path / "target.csv").read_text().startswith("frame")
 
 
+@pytest.mark.parametrize("path", [None, 3, b"w.npz"])
+def test_what_is_no_path_is_told(result, path):
+    for write_to in (result.save, lambda path: save(result, path)):
+        with pytest.raises(OutputError, match=r"^path: expected the name of a file, such as 'motion\.npz', got"):
+            write_to(path)
+
+
 def test_an_error_of_a_writer_names_the_file_that_was_asked_for(tmp_path, result, monkeypatch):
     monkeypatch.setitem(sys.modules, "ezc3d", None)
     with pytest.raises(OutputError, match=rf"^{tmp_path}/a\.c3d: needs the package ezc3d"):

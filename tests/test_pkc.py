@@ -446,7 +446,10 @@ def test_poses_are_held_where_nobody_is_seen():
     found = PKC()(replace(clip.tracks, points=torch.where(weights[..., None] > 0, points, 0), weights=weights))
     size = bone_lengths(found.points, clip.tracks.skeleton.bone_index())
     assert (size[:12] < 1.3 * size.median(0).values).all() and (size[-9:] < 1.3 * size.median(0).values).all()
-    assert any("21 frames at the clip's ends" in note for note in found.diagnostics.notes)
+    assert any("21 frames at the clip's ends show nobody" in note for note in found.diagnostics.notes)
+    weights[:-1] = clip.tracks.weights[:-1]
+    one = PKC(rounds=0, steps=3)(replace(clip.tracks, weights=weights))
+    assert any("1 frame at the clip's ends shows nobody" in note for note in one.diagnostics.notes)
 
 
 @pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")

@@ -263,6 +263,13 @@ def test_nothing_finite_is_told(result, view):
         view(replace(result, points=torch.full_like(result.points, torch.nan)))
 
 
+@pytest.mark.filterwarnings("error")
+def test_numbers_beyond_single_precision_are_told(result):
+    assert "<html" in player(replace(result, points=result.points / result.points.abs().max() * 1e29))
+    with pytest.raises(OutputError, match=r"walk.* coordinates up to 1e\+30, got .*e\+302"):
+        player(replace(result, points=result.points * 1e300))
+
+
 @pytest.mark.parametrize("view", [player, sheet])
 def test_unusual_motions_can_be_seen(result, view):
     still = replace(result, points=torch.zeros_like(result.points))

@@ -40,7 +40,8 @@ def trim(tracks: Tracks, start: int | None = None, stop: int | None = None) -> T
             raise OptionError(f"trim: {name}: expected a frame counted from 0, or None, got {value!r}")
     first, end = start or 0, frames if stop is None else min(stop, frames)
     if not first < end:
-        raise OptionError(f"trim: expected frames within 0:{frames} of {tracks.source}, got {first}:{stop}")
+        asked = f"{first}:{'' if stop is None else stop}"
+        raise OptionError(f"trim: expected frames within 0:{frames} of {tracks.source}, got {asked}")
     cut = tracks.frames(first, end)
     if not bool(cut.seen.any()):
         raise ShapeError(f"{tracks.source}: no joint is seen in frames {first} to {end - 1}")

@@ -91,13 +91,17 @@ def cleaner(
 
     def clean(tracks: Tracks) -> Tracks:
         from kcs_torch import clean as step
+        from kcs_torch.errors import OptionError
 
         if frames == SEEN:
             seen = tracks.seen.any(1).nonzero().flatten()
             tracks = step.trim(tracks, int(seen[0]), int(seen[-1]) + 1)
             tracks = replace(tracks, notes=tuple(note for note in tracks.notes if "--frames seen" not in note))
         elif frames is not None:
-            tracks = step.trim(tracks, start, stop)
+            try:
+                tracks = step.trim(tracks, start, stop)
+            except OptionError as error:
+                raise OptionError(f"--frames: {str(error).removeprefix('trim: ')}") from None
         if gate:
             tracks = step.gate(tracks)
         if fill is not None:

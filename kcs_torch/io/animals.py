@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kcs_torch.errors import FormatError, ShapeError
-from kcs_torch.io.build import build_tracks
+from kcs_torch.errors import FormatError
+from kcs_torch.io.build import build_tracks, nothing_seen
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.registry import Options, brief
 from kcs_torch.types import Tracks
@@ -127,7 +127,8 @@ def build_animals(
         _check(animal, path)
     seen = [a for a in whole if _seen(a, options.threshold).any()]
     if not seen:
-        raise ShapeError(f"{path}: no joint has a confidence of {options.threshold:g} or more: lower the threshold")
+        faint = [a.confidence[_seen(a, 0.0)] for a in whole if a.confidence is not None]
+        raise nothing_seen(str(path), options.threshold, max((float(c.max()) for c in faint if len(c)), default=0.0))
     if len(seen) < len(whole):
         missing = [a.name for a in whole if not any(a is s for s in seen)]
         shown = ", ".join(map(brief, missing[:5])) + (", ..." if len(missing) > 5 else "")

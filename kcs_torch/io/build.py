@@ -8,11 +8,12 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from kcs_torch.errors import ShapeError
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
 
-__all__ = ["build_tracks"]
+__all__ = ["build_tracks", "nothing_seen"]
 
 
 def build_tracks(
@@ -69,3 +70,12 @@ def build_tracks(
         notes=remarks,
     )
     return replace(tracks, notes=tuple(dict.fromkeys(tracks.notes)))  # a result read again already has some
+
+
+def nothing_seen(source: str, threshold: float, highest: float) -> ShapeError:
+    """The error for tracks none of whose joints reaches the threshold; ``highest`` is 0 where none has a place."""
+    if not highest > 0:
+        return ShapeError(f"{source}: no joint is seen in any frame: nothing to reconstruct")
+    return ShapeError(
+        f"{source}: no joint has a confidence of {threshold:g} or more, only {highest:.2g}: lower the threshold"
+    )

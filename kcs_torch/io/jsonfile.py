@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kcs_torch.errors import FormatError
 from kcs_torch.io.registry import read_error
 
-__all__ = ["as_frame_number", "as_joints", "as_text", "entries", "outline", "read_json", "short"]
+__all__ = ["as_frame_number", "as_joints", "as_text", "entries", "kind", "outline", "read_json", "short"]
 
 LIMIT = 2**30  # bytes of one file; Python needs several times as much
 FARTHEST = 1e9  # pixels
@@ -108,10 +108,10 @@ def entries(value: Any, where: str) -> Iterator[tuple[str, dict[str, Any]]]:
         FormatError: it is no list, or holds something else.
     """
     if not isinstance(value, list):
-        raise FormatError(f"{where}: expected a list, got {_kind(value)}")
+        raise FormatError(f"{where}: expected a list, got {kind(value)}")
     for i, entry in enumerate(value):
         if not isinstance(entry, dict):
-            raise FormatError(f"{where}: entry {i}: expected an object with keys, got {_kind(entry)}")
+            raise FormatError(f"{where}: entry {i}: expected an object with keys, got {kind(entry)}")
         yield f"{where}: entry {i}", entry
 
 
@@ -127,7 +127,7 @@ def as_joints(values: Any, where: str, scores: Any = None) -> NDArray[np.float64
         FormatError: these are no joints.
     """
     if not isinstance(values, list) or not values:
-        raise FormatError(f"{where}: expected a list of numbers x, y, score, got {_kind(values)}")
+        raise FormatError(f"{where}: expected a list of numbers x, y, score, got {kind(values)}")
     if isinstance(values[0], list):
         width = len(values[0])
         if not all(isinstance(row, list) and len(row) == width for row in values):
@@ -146,7 +146,7 @@ def as_joints(values: Any, where: str, scores: Any = None) -> NDArray[np.float64
     joints[:, : min(width, 3)] = rows[:, :3]
     if scores is not None:
         if _length(scores) != len(rows):
-            raise FormatError(f"{where}: expected {len(rows)} scores, one a joint, got {_kind(scores)}")
+            raise FormatError(f"{where}: expected {len(rows)} scores, one a joint, got {kind(scores)}")
         joints[:, 2] = _numbers(scores, where)
     return joints
 
@@ -162,7 +162,7 @@ def _numbers(values: list[Any], where: str) -> list[float]:
         if v is None:
             v = math.nan
         elif type(v) not in (int, float):
-            raise FormatError(f"{where}: number {i}: expected a number, got {_kind(v)}")
+            raise FormatError(f"{where}: number {i}: expected a number, got {kind(v)}")
         elif abs(v) > FARTHEST:
             raise FormatError(f"{where}: number {i} is {short(v)}: expected pixels and confidences")
         out.append(float(v))
@@ -188,7 +188,7 @@ def as_frame_number(value: Any) -> int | None:
     return int(value)
 
 
-def _kind(value: Any) -> str:
+def kind(value: Any) -> str:
     """What a JSON value is, in a few words."""
     if isinstance(value, list):
         return f"a list of {len(value)}"

@@ -73,7 +73,7 @@ def load_people(
     if not 0 <= threshold <= 1:
         raise OptionError(f"threshold: expected a number from 0 to 1, got {threshold}")
     if fps is not None and not 0 < fps < float("inf"):
-        raise OptionError(f"fps: expected a positive number or None, got {fps}")
+        raise OptionError(f"fps (--fps): expected a positive number, got {fps}; leave it out where it is not known")
     if image_size is not None:
         image_size = _size(image_size)
     probe = Probe(path)

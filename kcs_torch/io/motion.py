@@ -68,7 +68,7 @@ def load_motion(
     if up is not None and up not in AXES:
         raise unknown("axis for up", up, AXES)
     if fps is not None and not 0 < fps < float("inf"):
-        raise OptionError(f"fps: expected a positive number or None, got {fps}")
+        raise OptionError(f"fps (--fps): expected a positive number, got {fps}; leave it out where it is not known")
     probe = Probe(path)
     reader = MOTION_READERS[detect_motion_format(path) if format is None else format]
     return reader.read(probe.path, MotionOptions(skeleton, fps, up, units))

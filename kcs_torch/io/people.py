@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kcs_torch.errors import FormatError, ShapeError
-from kcs_torch.io.build import build_tracks
+from kcs_torch.errors import FormatError
+from kcs_torch.io.build import build_tracks, nothing_seen
 from kcs_torch.io.layout import choose_layout
 from kcs_torch.io.link import follow_people
 from kcs_torch.io.registry import Options
@@ -85,7 +85,7 @@ def people_tracks(
     least = max(options.threshold, 1e-12)
     visible = [seen for seen in people if any((frames[t][i].joints[:, 2] >= least).any() for t, i in seen)]
     if not visible:
-        raise ShapeError(f"{source}: no joint has a confidence of {options.threshold:g} or more: lower the threshold")
+        raise nothing_seen(source, options.threshold, max(float(joints[:, 2].max()) for joints in everybody))
     if len(visible) < len(people):
         remarks.append(f"{len(people) - len(visible)} people never reach the confidence threshold: left out")
     most = max(int(_MOST_NUMBERS / (len(frames) * everybody[0].size)), 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -133,6 +134,8 @@ def writer_for(path: str | Path) -> Writer:
     Raises:
         OutputError: there is none; the message lists the suffixes.
     """
+    if not isinstance(path, (str, os.PathLike)):
+        raise OutputError(f"path: expected the name of a file, such as 'motion.npz', got {path!r}")
     suffix = Path(path).suffix.lower()
     if suffix not in WRITERS:
         got = f"'{suffix}'" if suffix else "none"

@@ -16,9 +16,9 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton, map_joints
 
-__all__ = ["Intake", "as_floats", "as_number", "choose_skeleton", "joint_order", "no_bones", "take_in"]
+__all__ = ["FARTHEST", "Intake", "as_floats", "as_number", "choose_skeleton", "joint_order", "no_bones", "take_in"]
 
-_SPARE = 1e6  # coordinates are smaller than the largest number by this factor, so that their sums are finite
+FARTHEST = 1e30  # of coordinates: their sums are finite in single precision, in which pages are written
 
 
 def as_floats(value: Any, what: str, ndim: int) -> Tensor:
@@ -84,7 +84,10 @@ def choose_skeleton(
     if edges is None:
         if known is not None:
             return known
-        return Skeleton.from_edges([], names or num_joints, name="points", tree=False)
+        try:
+            return Skeleton.from_edges([], names or num_joints, name="points", tree=False)
+        except SkeletonError as error:
+            raise SkeletonError(f"{source}: {error}") from None
     try:
         try:
             pairs = np.asarray(edges)
@@ -189,7 +192,7 @@ def take_in(
         raise ShapeError(f"{source}: expected at least 2 joints, got {num_joints}")
     rate = as_number(fps)
     if fps is not None and (rate is None or rate <= 0):
-        raise ShapeError(f"{source}: fps: expected a positive number or None, got {fps!r}")
+        raise ShapeError(f"{source}: fps: expected a positive number, got {fps!r}; leave it out where it is not known")
     if rate is not None and not math.isfinite(rate):
         rate = None
     least = as_number(threshold)
@@ -210,10 +213,10 @@ def take_in(
         raise ShapeError(
             f"{source}: points: {label(*infinite.nonzero()[0])} is infinite; write NaN where a joint is unseen"
         )
-    large = (xy.abs() > torch.finfo(xy.dtype).max / _SPARE).any(-1)
+    large = (xy.abs() > FARTHEST).any(-1)
     if large.any():
         where, most = label(*large.nonzero()[0]), float(xy[large].abs().nan_to_num().max())
-        raise ShapeError(f"{source}: points: {where}: expected coordinates whose sums are finite, got {most:.3g}")
+        raise ShapeError(f"{source}: points: {where}: expected coordinates up to {FARTHEST:g}, got {most:.3g}")
     seen = torch.isfinite(xy).all(-1)
     if confidence is None:
         weights = seen.to(xy.dtype)

@@ -92,5 +92,6 @@ class Tracks(Trajectories):
         if blank:
             shown = ", ".join(map(str, blank[:8])) + (", ..." if len(blank) > 8 else "")
             frames = counted(len(blank), "frame")
-            remarks.append(f"{frames} without any seen joint (frame {shown}): filled from their neighbours")
+            whose = "its" if len(blank) == 1 else "their"
+            remarks.append(f"{frames} without any seen joint (frame {shown}): filled from {whose} neighbours")
         return cls(xy, weights, body, taken.fps, units, source, tuple(remarks))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.types import Reconstruction
+from kcs_torch.types.intake import FARTHEST
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.names import person_names
 from kcs_torch.viewer.summary import summarise
@@ -51,6 +52,8 @@ def scene_of(results: Sequence[Reconstruction], names: Sequence[str] | None = No
     for name, known in zip(names, finite, strict=True):
         if not len(known):
             raise OutputError(f"{name}: an HTML page needs at least one joint at a finite place")
+        if (most := float(np.abs(known).max())) > FARTHEST:
+            raise OutputError(f"{name}: an HTML page needs coordinates up to {FARTHEST:g}, got {most:.3g}: scale them")
     middle = np.median(np.concatenate(finite), axis=0)
     seen = [r.tracks.points.double().cpu().numpy()[r.tracks.seen.cpu().numpy()] for r in results]
     together = np.concatenate(seen)

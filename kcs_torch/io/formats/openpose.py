@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
-from kcs_torch.io.jsonfile import FARTHEST, outline, read_json, short
+from kcs_torch.io.jsonfile import FARTHEST, kind, outline, read_json, short
 from kcs_torch.io.layout import mean_bone
 from kcs_torch.io.people import Sighting, people_tracks
 from kcs_torch.io.registry import Options, Probe, Reader
@@ -128,11 +128,13 @@ def _numbers(values: Any, file: Path) -> list[float]:
     """The numbers of one person, checked one by one: JSON may hold anything in their place."""
     if values is None:
         return []
-    if not isinstance(values, list) or not all(type(v) in (int, float) for v in values):
-        raise FormatError(f"{file}: '{_BODY}': expected a list of numbers x, y, confidence, got something else")
+    if not isinstance(values, list):
+        raise FormatError(f"{file}: '{_BODY}': expected a list of numbers x, y, confidence, got {kind(values)}")
     if len(values) % 3:
         raise FormatError(f"{file}: '{_BODY}': expected 3 numbers a joint, got {len(values)} numbers")
     for i, v in enumerate(values):
+        if type(v) not in (int, float):
+            raise FormatError(f"{file}: '{_BODY}': number {i}: expected a number, got {kind(v)}")
         if abs(v) > FARTHEST:
             raise FormatError(f"{file}: '{_BODY}': number {i} is {short(v)}: expected pixels and confidences")
         if i % 3 == 2 and v < 0:

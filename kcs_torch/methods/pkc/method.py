@@ -222,7 +222,9 @@ class PKC(Method):
         away = held != torch.arange(len(held), device=held.device)
         if bool(away.any()):  # nothing tells what goes on there, and a model of motion would run off
             points, noise = points[held], torch.where(away[:, None], points.new_full((), HELD), noise)
-            notes.append(f"{counted(int(away.sum()), 'frame')} at the clip's ends show nobody: nearest pose held")
+            count = int(away.sum())
+            show = "shows" if count == 1 else "show"
+            notes.append(f"{counted(count, 'frame')} at the clip's ends {show} nobody: nearest pose held")
         return points - points.mean(-2, keepdim=True), noise, tuple(notes)
 
     def _moving(
