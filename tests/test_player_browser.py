@@ -97,6 +97,25 @@ def test_both_pictures_show_both_sides(page, result, width, height, mobile):
     assert min(charts) > 0
 
 
+def test_a_long_solution_menu_stays_within_a_phone(page, result):
+    browser = page(result, width=400, height=844, mobile=True)
+    browser.run("document.getElementById('solution').options[1].textContent = '2 other depth of '.repeat(6)")
+    browser.settle()
+    assert browser.run("document.getElementById('solution').getBoundingClientRect().right") <= 400
+
+
+def test_lengths_beyond_the_axis_run_along_its_end(page, result):
+    points = result.points.clone()
+    points[20, 9] *= 50  # for one frame of 40, fewer than the quantile that the axis shows
+    browser = page(replace(result, points=points, uncertainty=None))
+    drawn = picture(browser, "lengths")
+    box = browser.run("document.querySelector('#lengths canvas').getBoundingClientRect().toJSON()")
+    whole = browser.run("document.getElementById('lengths').getBoundingClientRect().toJSON()")
+    top, left = round(box["y"] - whole["y"]), round(box["x"] - whole["x"]) + 50
+    coloured = np.ptp(drawn[:, left:-9], axis=-1) > 0.2
+    assert coloured[top + 4 : top + 10].any() and not coloured[top : top + 3].any()
+
+
 def test_everything_is_on_one_screen(page, result):
     browser = page(result, width=1280, height=720)
     assert browser.run("document.documentElement.scrollHeight") <= 720

@@ -29,9 +29,9 @@ class Chart {
   }
 
   x(t, width) { return MARGIN.left + (width - MARGIN.left - MARGIN.right) * t / Math.max(frames - 1, 1); }
-  y(value, height) {
-    const low = this.both ? -this.top : 0;
-    return height - MARGIN.bottom - (height - MARGIN.top - MARGIN.bottom) * (value - low) / (this.top - low);
+  y(value, height) {  // what is beyond the axis runs along its end
+    const low = this.both ? -this.top : 0, share = (Math.min(Math.max(value, low), this.top) - low) / (this.top - low);
+    return height - MARGIN.bottom - (height - MARGIN.top - MARGIN.bottom) * share;
   }
 
   keep(width, height) {
