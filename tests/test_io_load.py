@@ -138,7 +138,7 @@ def test_a_wrong_threshold_is_told(samples, options):
 
 @pytest.mark.parametrize("fps", [0, -25, float("inf"), float("nan")])
 def test_a_wrong_rate_is_told(samples, fps):
-    with pytest.raises(OptionError, match="fps: expected a positive number"):
+    with pytest.raises(OptionError, match=r"^fps \(--fps\): expected a positive number, got .*; leave it out where"):
         load_people(samples["npz"], fps=fps)
 
 

@@ -243,7 +243,7 @@ def test_options_are_checked(tmp_path):
     for options, message in [
         ({"format": "bvg"}, "did you mean 'bvh'"),
         ({"up": "w"}, "axis for up"),
-        ({"fps": 0}, "fps: expected a positive number"),
+        ({"fps": 0}, r"fps \(--fps\): expected a positive number"),
     ]:
         with pytest.raises(OptionError, match=message):
             load_motion(path, **options)
