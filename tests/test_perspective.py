@@ -204,6 +204,37 @@ def test_any_skeleton():
     check_sound(reconstruct(free, method="sfam", intrinsics=LENS))
 
 
+# ---------------------------------------------------------------------- autograd
+
+
+@pytest.mark.parametrize("method", ["kcs", "pkc"])
+@pytest.mark.parametrize("known", [False, True], ids=["free", "known cameras"])
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+def test_inference_mode_changes_nothing(method, known):
+    points = filmed(frames=12)[0].points
+    cameras = torch.eye(3, dtype=points.dtype)[:2].expand(12, -1, -1)
+    call = lambda: kt.reconstruct(  # noqa: E731
+        points.clone(), skeleton="h36m17", intrinsics=LENS, method=method, cameras=cameras.clone() if known else None
+    )
+    expected = call()
+    with torch.inference_mode():
+        found = call()
+    assert torch.equal(found.points, expected.points)
+    assert not found.points.is_inference() and not found.distance.is_inference()
+
+
+@pytest.mark.parametrize("method", ["kcs", "pkc"])
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+def test_nothing_of_the_result_hangs_on_the_tracks_graph(method):
+    points = filmed(frames=12)[0].points.requires_grad_()
+    cameras = torch.eye(3, dtype=points.dtype)[:2].repeat(12, 1, 1).requires_grad_()
+    for given in (None, cameras):
+        found = kt.reconstruct(points, skeleton="h36m17", intrinsics=LENS, method=method, cameras=given)
+        for one in (found, *found.alternatives):
+            for tensor in (one.points, one.cameras, one.scales, one.lengths, one.root_depth, one.distance):
+                assert not tensor.requires_grad
+
+
 # ---------------------------------------------------------------------- degenerate input
 
 

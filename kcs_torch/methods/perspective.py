@@ -14,7 +14,7 @@ from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.base import Method, check_cameras
+from kcs_torch.methods.base import Method, _home, check_cameras
 from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
 from kcs_torch.methods.size import slow_waves, weak_perspective
 from kcs_torch.nn.posture import PostureEnergy, trunk_joints
@@ -92,6 +92,18 @@ def reconstruct_perspective(
         KcsWarning: the field of view would be so wide that the focal length is hardly true.
     """
     begin = time.perf_counter()
+    # As in Method.__call__; the refinement differentiates even where the method does not.
+    with torch.inference_mode(False), torch.no_grad(), _home([tracks]):
+        result = _reconstruct(method, tracks, intrinsics, cameras, rounds, steps)
+    result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
+    method._warn(result, "")
+    return result
+
+
+def _reconstruct(
+    method: Method, tracks: Tracks, intrinsics: Intrinsics, cameras: Tensor | None, rounds: int, steps: int
+) -> Reconstruction:
+    """:func:`reconstruct_perspective` without autograd, on the tracks' device."""
     rate = tracks.fps or 30.0
     rays = intrinsics.rays(tracks.points)
     if bool(tracks.seen.any()) and float(rays[tracks.seen][:, :2].norm(dim=-1).median()) > WIDE:
@@ -115,8 +127,7 @@ def reconstruct_perspective(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)
             lifted = method.following()(_straighten(tracks, rays, distance, depth), cameras)
-        with torch.no_grad():
-            found = _refine(lifted, distance, depth, rate, steps, mirror=cameras is None)
+        found = _refine(lifted, distance, depth, rate, steps, mirror=cameras is None)
         moved = float((found.depth[0] - depth).square().mean().sqrt()) / found.unit
         if best is None or not float(found.energy[0]) > float(best.energy[0]):
             best = found
@@ -124,10 +135,7 @@ def reconstruct_perspective(
             break
         distance, depth = found.distance[0], found.depth[0]
     assert best is not None
-    result = _assemble(tracks, intrinsics, look, best)
-    result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
-    method._warn(result, "")
-    return result
+    return _assemble(tracks, intrinsics, look, best)
 
 
 def _line_of_sight(rays: Tensor, weights: Tensor, rate: float) -> Tensor:
