@@ -128,13 +128,43 @@ def test_gradients(translation, huber):
     assert gradcheck(energy, at, tracks, K, weights, fast=True)
 
 
+@pytest.mark.parametrize("translation", [True, False])
+@pytest.mark.parametrize("place", ["one joint behind", "one joint near", "all behind"])
+def test_gradients_of_what_lies_behind(translation, place):
+    """The nearest depth hangs on all joints."""
+    points, where, tracks = scene(frames=3, noise=5.0)
+    at = points if translation else points + where[:, None]
+    if place == "all behind":
+        at, tracks = at - torch.tensor([0, 0, 8.0]).double(), 2 * K[2:] - tracks  # upside down, as it were behind
+    else:
+        at[:, 2, 2] -= 4.5 if place == "one joint behind" else 3.8
+    weights = torch.rand(3, 7, generator=torch.Generator().manual_seed(0)).double() + 0.1
+    energy = PerspectiveEnergy(translation=translation)
+    assert energy(at, tracks, LENS).max() > 1e4
+    assert gradcheck(energy, at, tracks, K, weights, fast=True)
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize("z", [-4.0, -1e-6, 0.0])
+def test_one_joint_behind_has_a_finite_slope(z, dtype):
+    """It has no size, whose root has none; nor is there rounding that takes the place of a size."""
+    points, tracks = torch.full((5, 7, 3), z, dtype=dtype), torch.full((5, 7, 2), 300.0, dtype=dtype)
+    weights, energy = torch.zeros(5, 7, dtype=dtype), PerspectiveEnergy(translation=False)
+    for seen in (1, 3):  # at one point
+        weights[:, :seen] = 0.3
+        finite(lambda x, y, w: energy(x, y, LENS, w), points, tracks, weights)
+        assert energy(points, tracks, LENS, weights).max() < 1e13
+
+
 def test_what_lies_behind_is_charged_and_pushed_ahead():
     _, _, tracks = scene()
     energy = PerspectiveEnergy(translation=False)
     points = (scene()[0] - torch.tensor([0, 0, 4.0]).double()).requires_grad_()
     before = energy(points, tracks, LENS)
     (grad,) = torch.autograd.grad(before.sum(), points)
-    assert torch.isfinite(grad).all() and (grad[..., 2] < 0).all() and before.min() > 1e6
+    assert torch.isfinite(grad).all() and (grad[..., 2].sum(-1) < 0).all() and before.min() > 1e6
+    nearer = [energy(points + points.new_tensor([0, 0, z]), tracks, LENS) for z in (-4.0, 0.0, 1.0, 2.0, 3.0, 4.0, 8.0)]
+    assert (torch.stack(nearer).diff(dim=0) < 0).all()
     one = torch.tensor([[[0.0, 0, 1.0], [0, 0, 1.0], [0, 0, 0.1]]]).double()  # nearest: 0.15 of the distance of 0.7
     near = 0.15 * 0.7
     expected = 0.5 * LENS[0] * LENS[1] * ((near - 0.1) / near) ** 2

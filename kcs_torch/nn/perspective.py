@@ -12,10 +12,13 @@ from kcs_torch.functional.camera import perspective, pinhole_translation
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_clip, check_weights, huber_square
 from kcs_torch.nn.layers import check_tensor, full_precision, known, narrow, seen_weights, wide
-from kcs_torch.nn.masks import some
+from kcs_torch.nn.masks import safe_root, some
 from kcs_torch.types.intrinsics import Intrinsics
 
 __all__ = ["PerspectiveEnergy"]
+
+BEHIND = 0.01
+"""What a distance behind the camera counts for, beside the body's size: one joint has none."""
 
 
 class PerspectiveEnergy(nn.Module):
@@ -29,7 +32,8 @@ class PerspectiveEnergy(nn.Module):
     Args:
         translation: False leaves t at 0: points are where they are before the camera.
         huber: residuals above this length count linearly, in the unit of the tracks; None is plain least squares.
-        nearest: share of the body's distance (or of its size, where that is more) that joints keep from the camera.
+        nearest: share of the body's distance before the camera (or of its size, where that is more) that joints keep
+            from the camera.
 
     Raises:
         OptionError: ``huber`` or ``nearest`` is not positive.
@@ -83,7 +87,7 @@ class PerspectiveEnergy(nn.Module):
             share = weights.to(at.dtype).expand(at.shape[:-1])
             if self.translation:
                 at = at + pinhole_translation(at, (seen - lens[..., 2:]) / lens[..., :2], share)[..., None, :]
-            near = self.nearest * _reach(at.detach(), share.detach())[..., None]
+            near = self.nearest * _reach(at, share)[..., None]
             behind = (near - at[..., 2]).clamp_min(0) / near
             ahead = torch.cat([at[..., :2], torch.maximum(at[..., 2], near)[..., None]], -1)
             square = huber_square((perspective(ahead, lens) - seen).square().sum(-1), self.huber)
@@ -102,8 +106,13 @@ def lens_tensor(intrinsics: Any, like: Tensor) -> Tensor:
 
 
 def _reach(points: Tensor, share: Tensor) -> Tensor:
-    """Distance of a body (..., N, 3) along z, or its size, where that is more, (...)."""
+    """Distance of a body (..., N, 3) before the camera along z, or its size, where that is more, (...).
+
+    Were the distance behind the camera to count like that before it, what lies behind would cost the same however far:
+    nothing would push it ahead.
+    """
     total = some(share.sum(-1, keepdim=True))[..., None]
     middle = (share[..., None] * points).sum(-2, keepdim=True) / total
-    size = (share[..., None] * (points - middle).square() / total).sum((-2, -1)).sqrt()
-    return some(torch.maximum(middle[..., 0, 2].abs(), size))
+    size = safe_root((share[..., None] * (points - middle).square() / total).sum((-2, -1)))
+    far = middle[..., 0, 2]
+    return some(torch.maximum(torch.maximum(far, -BEHIND * far), size))
