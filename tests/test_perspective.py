@@ -15,6 +15,7 @@ import kcs_torch as kt
 from kcs_torch.cli import app
 from kcs_torch.io import load_reconstruction
 from kcs_torch.methods import perspective
+from kcs_torch.methods.root import ABSENT, FOUND
 from kcs_torch.types import Intrinsics
 
 LENS = (1500.0, 1480.0, 960.0, 540.0)
@@ -342,3 +343,22 @@ def test_what_was_done_to_the_tracks_is_told_whichever_solution_wins(monkeypatch
         found = kt.reconstruct(tracks, method=Noted(), intrinsics=lens)
         assert "tracks smoothed" in found.diagnostics.notes
         assert not any("mirror image" in note for one in (found, *found.alternatives) for note in one.diagnostics.notes)
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+def test_nothing_is_said_of_the_root_depth_that_the_distance_replaces():
+    """Whether feet stand still, hardly ever do, or are none."""
+    walk = kt.data.walking_person(30, turn=0.0)
+    sway = 30.0 * torch.sin(torch.arange(30) / 8.0)[:, None, None] * torch.linspace(-1, 1, 17)[:, None].double()
+    feet = torch.zeros(17, 1).double()
+    feet[list(walk.skeleton.contacts)] = 1
+    stands = walk.points[:1] + sway * (1 - feet)
+    bare = replace(walk.skeleton, contacts=())
+    for points, skeleton, remark in ((stands, walk.skeleton, FOUND), (walk.points, bare, ABSENT)):
+        scene = points + points.new_tensor([0.0, 0.0, 4000.0])
+        tracks = kt.Tracks.from_arrays(Intrinsics.of(LENS).project(scene), skeleton=skeleton, fps=30.0)
+        plain, found = kt.PKC()(tracks), kt.reconstruct(tracks, intrinsics=LENS)
+        assert any(note.startswith(remark) for note in plain.diagnostics.notes)  # what there is to leave out
+        for one in (found, *found.alternatives):
+            assert not any(note.startswith((ABSENT, FOUND)) for note in one.diagnostics.notes)
+            torch.testing.assert_close(one.root_depth, one.distance - one.distance[0])

@@ -16,6 +16,7 @@ from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import Method, _home, check_cameras
 from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
+from kcs_torch.methods.root import ABSENT, FOUND
 from kcs_torch.methods.size import slow_waves, weak_perspective
 from kcs_torch.nn.posture import PostureEnergy, trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -251,7 +252,7 @@ def _in_camera(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Fou
     ratio = bones[:, list(body.rigid)] / bones.mean(0).clamp_min(torch.finfo(bones.dtype).tiny)[list(body.rigid)]
     spread = (ratio - 1).square().mean(0).sqrt()
     told = () if k else found.notes  # the best solution's; "the mirror image", say, is true of none any more
-    notes = [n for n in told if "root depth" not in n and "weak perspective" not in n]
+    notes = [n for n in told if not n.startswith((ABSENT, FOUND)) and "weak perspective" not in n]
     notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
     facts = replace(
         lifted.diagnostics,

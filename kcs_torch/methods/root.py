@@ -9,7 +9,13 @@ from kcs_torch.functional.temporal import standing
 from kcs_torch.solvers.standing import root_velocity
 from kcs_torch.types import Tracks
 
-__all__ = ["root_depth", "standing_feet"]
+__all__ = ["ABSENT", "FOUND", "root_depth", "standing_feet"]
+
+ABSENT = "no root depth: "
+"""How the sentence begins that says why feet do not tell the root's depth."""
+
+FOUND = "motion in depth found from feet that stand still, from the first frame on: right only for a fixed camera"
+"""The sentence that says that they do."""
 
 SLIP, CHANGE = 0.012, 0.008
 """Standard deviations of a standing foot's speed, and of the root's acceleration: shares of the body's radius per
@@ -43,13 +49,13 @@ def root_depth(points: Tensor, tracks: Tracks) -> tuple[Tensor | None, str]:
     """
     contacts = list(tracks.skeleton.contacts)
     if not contacts:
-        return None, f"no root depth: skeleton '{tracks.skeleton.name}' has no contact points"
+        return None, f"{ABSENT}skeleton '{tracks.skeleton.name}' has no contact points"
     if points.shape[-3] < 3:
-        return None, "no root depth: too few frames"
+        return None, f"{ABSENT}too few frames"
     slow = 30.0 / (tracks.fps or 30.0)
     sure = standing_feet(tracks)
     if sure is None:
-        return None, "no root depth: the feet hardly ever stand still in the image"
+        return None, f"{ABSENT}the feet hardly ever stand still in the image"
     body = points - points.mean(-2, keepdim=True)
     top = body.abs().amax().clamp_min(torch.finfo(points.dtype).tiny)  # squares must not overflow
     radius = ((body / top).square().sum(-1).mean((-2, -1)).sqrt().clamp_min(1e-3) * top)[..., None]
@@ -57,7 +63,4 @@ def root_depth(points: Tensor, tracks: Tracks) -> tuple[Tensor | None, str]:
     weight = torch.minimum(sure[1:], sure[:-1])
     speed = root_velocity(move, weight, SLIP * slow, CHANGE * slow**2)
     path = torch.nn.functional.pad(speed.cumsum(-1), (1, 0)) * radius
-    return (
-        path,
-        "motion in depth found from feet that stand still, from the first frame on: right only for a fixed camera",
-    )
+    return path, FOUND
