@@ -16,9 +16,10 @@ from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import Method, _home, check_cameras
 from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
+from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.methods.root import ABSENT, FOUND
 from kcs_torch.methods.size import slow_waves, weak_perspective
-from kcs_torch.nn.posture import PostureEnergy, trunk_joints
+from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
@@ -218,7 +219,7 @@ def _refine(
 def _unit(lifted: Reconstruction) -> float:
     """The unit in which the body is about as large as a person of 1.75."""
     if len(trunk_joints(lifted.skeleton)) >= 3:
-        usual = PostureEnergy(lifted.skeleton).rest_lengths.to(lifted.lengths)
+        usual = usual_posture(lifted.skeleton, lifted.lengths.dtype, lifted.lengths.device).rest_lengths
         unit = float((lifted.lengths / usual).median())
     else:
         points = lifted.points - lifted.points.mean(1, keepdim=True)

@@ -63,8 +63,7 @@ class PinholeEnergy:
         self.slow = slow = 30.0 / rate  # more frames a second tell no more, and move less from one to the next
         self.skeleton, self.rays, self.distance, self.rate = skeleton, rays, distance, rate
         self.bones = skeleton.bone_index(device=rays.device)
-        self.near = self._dz(near)
-        self.rigid = list(skeleton.rigid)
+        self.rigid = torch.tensor(skeleton.rigid, dtype=torch.long, device=rays.device)
         self.slack = math.hypot(LENGTH, noise)
         self.waves = slow_waves(len(rays), rate, rays)
         self.waves = self.waves - self.waves.mean(0)
@@ -77,6 +76,8 @@ class PinholeEnergy:
             self.foreshortening = ForeshorteningEnergy(skeleton, correlation=FORESHORTENING / slow).to(rays)
             self.proportions = ProportionEnergy(skeleton).to(rays)
             self.hinges = HingeEnergy(skeleton).to(rays)
+        else:
+            self.near = bone_vectors(near[..., None], self.bones)[..., 0]
 
     def points(self, depth: Tensor, distance: Tensor) -> Tensor:
         """(..., T, N, 3) of depths (..., T, N) and distances (..., T)."""
@@ -106,9 +107,10 @@ class PinholeEnergy:
         depth, lengths, shares = self.unpack(state)
         distance = self.path(shares)
         points = self.points(depth, distance)
-        off = (bone_vectors(points, self.bones).square().sum(-1) - lengths[:, None].square()) / (2 * lengths[:, None])
-        dz = self._dz(depth)
-        each = HEAVY * torch.log1p(off[..., self.rigid].square() / (HEAVY * self.slack**2))
+        vectors = bone_vectors(points, self.bones)
+        off = (vectors.square().sum(-1) - lengths[:, None].square()) / (2 * lengths[:, None])
+        off, dz = off.index_select(-1, self.rigid), vectors[..., 2]
+        each = HEAVY * torch.log1p(off.square() / (HEAVY * self.slack**2))
         total = len(self.rays) / 2 * torch.log1p(each.mean(1)).sum(-1)
         total = total + dz.diff(n=2, dim=1).square().sum((1, 2)) / (2 * (ACCELERATION * self.slow**2) ** 2)
         total = total + 100 * depth.mean(-1).square().sum(-1)
@@ -119,7 +121,3 @@ class PinholeEnergy:
         total = total + self.posture(points, lengths) + self.foreshortening(points, lengths)
         hinges = HINGE * self.slow / SINE**2 * self.hinges(points, lengths).sum(-1)
         return total + self.proportions(lengths) + hinges
-
-    def _dz(self, depth: Tensor) -> Tensor:
-        """Bones' depths (..., B)."""
-        return depth[..., self.bones[:, 1]] - depth[..., self.bones[:, 0]]
