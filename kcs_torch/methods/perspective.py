@@ -13,13 +13,14 @@ from torch import Tensor
 from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.chain import bone_lengths
-from kcs_torch.functional.temporal import interpolate
+from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.base import Method, _home, check_cameras
 from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
 from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.methods.root import ABSENT, FOUND
 from kcs_torch.methods.size import slow_waves, weak_perspective
 from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
@@ -33,6 +34,9 @@ FLAT = 0.001
 
 APART = 0.04
 """Root mean square difference in depth, for a body of 1.75, from which on solutions count as two."""
+
+BLOCK, OVERLAP = 2000, 100
+"""Frames of a long clip that are refined together, and by how many blocks overlap."""
 
 WIDE = 3.0
 """Tangent of the angle off the optical axis from which on the focal length is hardly true."""
@@ -203,17 +207,56 @@ def _refine(
         return _Found(rays, exact.expand(len(start), -1), start, energy, others, unit, lifted.diagnostics.notes)
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
-    distance = _slow(exact.log()[:, None], rate)[:, 0].exp()
     off = (flat - tracks.points).square().sum(-1)[tracks.seen]
     noise = math.sqrt(float(off.median()) / 1.39) / unit / 2 if len(off) else 0.0  # whatever outliers there are
-    pinhole = PinholeEnergy(lifted.skeleton, rays, distance / unit, start / unit, rate, noise)
-    solution = lbfgs(pinhole, pinhole.pack(start / unit), num_steps=steps, tolerance=1e-6)
-    energy = pinhole(solution.value)
+    depth, far, energy = _descend(lifted.skeleton, rays, exact, start, unit, rate, noise, steps)
     order = energy.argsort()
-    z, _, shares = pinhole.unpack(solution.value[order])
-    z = z - z.mean(-1, keepdim=True)
     found = tuple(others[i] for i in order.tolist())
-    return _Found(rays, pinhole.path(shares) * unit, z * unit, energy[order], found, unit, lifted.diagnostics.notes)
+    return _Found(rays, far[order], depth[order], energy[order], found, unit, lifted.diagnostics.notes)
+
+
+def _descend(
+    skeleton: Skeleton,
+    rays: Tensor,
+    distance: Tensor,
+    start: Tensor,
+    unit: float,
+    rate: float,
+    noise: float,
+    steps: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Depths (H, T, N), distances (H, T) and energies (H,) of least :class:`PinholeEnergy`, each from its own start.
+
+    Memory is for as much as a block of a long clip. The liveliest block tells the lengths of the others, whose
+    distances follow; blocks are blended, and their energies summed.
+
+    Args:
+        skeleton: of the body.
+        rays: (T, N, 2).
+        distance: (T,), of which the slow part counts.
+        start: (H, T, N) depths.
+        unit: of the energy, in that of distance and depths.
+        rate: frames a second.
+        noise: standard deviation of joints in the image, in units of the energy.
+        steps: of L-BFGS.
+    """
+    size = min(BLOCK, len(rays))
+    begins = window_starts(len(rays), size, min(OVERLAP, size - 1))
+    image = (rays * distance[:, None, None]).unfold(0, size, 1)[begins]  # (W, N, 2, T)
+    lively = image.diff(dim=-1).square().sum((1, 2))
+    depth, far = start.new_empty(len(begins), size, *start[:, 0].shape), start.new_empty(len(begins), size, len(start))
+    energy, lengths = start.new_zeros(len(start)), None
+    for i in lively.median(-1).values.argsort(descending=True).tolist() if len(begins) > 1 else [0]:
+        some = slice(begins[i], begins[i] + size)
+        near, slow = start[:, some] / unit, _slow(distance[some].log()[:, None], rate)[:, 0].exp() / unit
+        pinhole = PinholeEnergy(skeleton, rays[some], slow, near, rate, noise, lengths)
+        solution = lbfgs(pinhole, pinhole.pack(near), num_steps=steps, tolerance=1e-6)
+        z, own, shares = pinhole.unpack(solution.value)
+        lengths = own if lengths is None else lengths
+        energy = energy + pinhole(solution.value)
+        depth[i], far[i] = ((z - z.mean(-1, keepdim=True)) * unit).transpose(0, 1), (pinhole.path(shares) * unit).mT
+    depth, far = (x[0] if len(begins) == 1 else blend_windows(x, begins, len(rays)) for x in (depth, far))
+    return depth.transpose(0, 1), far.mT, energy
 
 
 def _unit(lifted: Reconstruction) -> float:

@@ -46,7 +46,8 @@ class PinholeEnergy:
 
     Points lie at (u, v, 1) (D + z). Bones keep their length and move smoothly; the distance changes slowly. Where the
     skeleton has a trunk come the energies of anatomy; elsewhere bones stay near the depths that the
-    method found.
+    method found. Of a part of a clip whose other part told the lengths, these are given, and the distance may differ by
+    a factor: it is what lengths and image leave.
 
     Args:
         skeleton: of the body.
@@ -55,18 +56,28 @@ class PinholeEnergy:
         near: (H, T, N) the method's depths, in this unit.
         rate: frames a second.
         noise: standard deviation of joints in the image, in this unit.
+        lengths: (H, B) known, or None.
     """
 
     def __init__(
-        self, skeleton: Skeleton, rays: Tensor, distance: Tensor, near: Tensor, rate: float, noise: float
+        self,
+        skeleton: Skeleton,
+        rays: Tensor,
+        distance: Tensor,
+        near: Tensor,
+        rate: float,
+        noise: float,
+        lengths: Tensor | None = None,
     ) -> None:
         self.slow = slow = 30.0 / rate  # more frames a second tell no more, and move less from one to the next
-        self.skeleton, self.rays, self.distance, self.rate = skeleton, rays, distance, rate
+        self.skeleton, self.rays, self.distance, self.rate, self.lengths = skeleton, rays, distance, rate, lengths
         self.bones = skeleton.bone_index(device=rays.device)
         self.rigid = torch.tensor(skeleton.rigid, dtype=torch.long, device=rays.device)
         self.slack = math.hypot(LENGTH, noise)
         self.waves = slow_waves(len(rays), rate, rays)
         self.waves = self.waves - self.waves.mean(0)
+        if lengths is not None:
+            self.waves = torch.cat([torch.ones_like(self.waves[:, :1]), self.waves], -1)
         observed = torch.eye(skeleton.num_observed, dtype=rays.dtype, device=rays.device)
         self.complete = skeleton.complete(observed)[0].mT  # virtual joints follow their sources
         self.anatomy = len(trunk_joints(skeleton)) >= 3
@@ -86,17 +97,22 @@ class PinholeEnergy:
         return torch.cat([(flat.mT @ self.complete).mT, depth[..., None]], -1)
 
     def pack(self, depth: Tensor) -> Tensor:
-        """Unknowns (H, D) of depths (H, T, N), at the distances given."""
-        lengths = bone_lengths(self.points(depth, self.distance), self.bones).median(1).values
-        own = depth[..., : self.skeleton.num_observed].flatten(1)
-        path = depth.new_zeros(len(depth), self.waves.shape[1])
-        return torch.cat([own, lengths.clamp_min(1e-6).log(), path], 1)
+        """Unknowns (H, D) of depths (H, T, N), at the distances given; where lengths are known, at those they tell."""
+        own = bone_lengths(self.points(depth, self.distance), self.bones).median(1).values.clamp_min(1e-6)
+        shares = depth.new_zeros(len(depth), self.waves.shape[1])
+        observed = depth[..., : self.skeleton.num_observed].flatten(1)
+        if self.lengths is None:
+            return torch.cat([observed, own.log(), shares], 1)
+        ratio = (self.lengths / own).median(-1, keepdim=True).values
+        shares[:, :1] = ratio.log()
+        return torch.cat([observed * ratio, shares], 1)
 
     def unpack(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Depths (H, T, N), lengths (H, B) and the slow waves' shares in the distance (H, K)."""
-        count, bones = len(self.rays) * self.skeleton.num_observed, len(self.bones)
+        count, waves = len(self.rays) * self.skeleton.num_observed, self.waves.shape[1]
         own = state[:, :count].view(len(state), len(self.rays), -1)
-        return own @ self.complete, state[:, count : count + bones].exp(), state[:, count + bones :]
+        lengths = state[:, count : state.shape[1] - waves].exp() if self.lengths is None else self.lengths
+        return own @ self.complete, lengths, state[:, state.shape[1] - waves :]
 
     def path(self, shares: Tensor) -> Tensor:
         """Distances (H, T) of the waves' shares (H, K)."""
@@ -120,4 +136,4 @@ class PinholeEnergy:
             return total + (dz - self.near).square().sum((1, 2)) / (2 * CLOSE**2)
         total = total + self.posture(points, lengths) + self.foreshortening(points, lengths)
         hinges = HINGE * self.slow / SINE**2 * self.hinges(points, lengths).sum(-1)
-        return total + self.proportions(lengths) + hinges
+        return total + hinges if self.lengths is not None else total + self.proportions(lengths) + hinges
