@@ -205,6 +205,63 @@ def test_any_skeleton():
     check_sound(reconstruct(free, method="sfam", intrinsics=LENS))
 
 
+# ---------------------------------------------------------------------- long clips
+
+
+def to_and_fro(frames):
+    """Tracks of a person who walks on the spot while the distance changes by a half, and the true points (mm)."""
+    clip = kt.data.walking_person(frames, turn=0, yaw=60)
+    points = clip.points - clip.points.mean(1, keepdim=True)
+    points[..., 2] += (3500 + 700 * torch.sin(torch.arange(frames) / 25.0).double())[:, None]
+    return kt.Tracks.from_arrays(Intrinsics.of(LENS).project(points), skeleton=clip.skeleton, fps=30.0), points
+
+
+def test_a_long_clip_is_refined_in_blocks_that_share_lengths(monkeypatch):
+    tracks, truth = to_and_fro(260)
+    seen = []
+
+    def watched(energy, start, **options):
+        seen.append(energy)
+        return real(energy, start, **options)
+
+    real = perspective.lbfgs
+    monkeypatch.setattr(perspective, "lbfgs", watched)
+    monkeypatch.setattr(perspective, "BLOCK", 100)
+    monkeypatch.setattr(perspective, "OVERLAP", 20)
+    result = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    check_sound(result)
+    assert len(seen) in (3, 6) and {len(energy.rays) for energy in seen} == {100}
+    for first, *others in (seen[:3], seen[3:] or seen[:3]):
+        assert first.lengths is None and all(torch.equal(x.lengths, others[0].lengths) for x in others)
+    assert error(result.points, truth) < 40
+    path = result.distance / truth[..., 2].mean(1)
+    assert float((path / path.mean() - 1).abs().mean()) < 0.02
+    bones = kt.functional.bone_lengths(result.points, result.skeleton.bones)
+    parts = torch.stack([part.median(0).values for part in bones.split(65)])
+    assert float((parts / parts.mean(0) - 1).abs().median()) < 0.0012
+    step = result.points.diff(dim=0).norm(dim=-1)
+    assert float(step.amax(1).max()) < 4 * float(step.amax(1).median())  # no seam
+
+
+def test_a_clip_of_one_block_is_one_problem(monkeypatch):
+    tracks, _ = filmed(frames=40)
+    whole = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    monkeypatch.setattr(perspective, "BLOCK", 40)
+    assert torch.equal(reconstruct(tracks, method="kcs", intrinsics=LENS).points, whole.points)
+
+
+def test_blocks_in_which_nobody_is_seen_or_nothing_moves(monkeypatch):
+    monkeypatch.setattr(perspective, "BLOCK", 20)
+    monkeypatch.setattr(perspective, "OVERLAP", 5)
+    tracks, _ = filmed(frames=50)
+    hidden, still = tracks.points.clone(), tracks.points.clone()
+    hidden[15:40] = math.nan
+    still[20:] = still[20]
+    for points in (hidden, still):
+        given = kt.Tracks.from_arrays(points, skeleton=tracks.skeleton, fps=30.0)
+        check_sound(reconstruct(given, method="kcs", intrinsics=LENS))
+
+
 # ---------------------------------------------------------------------- autograd
 
 

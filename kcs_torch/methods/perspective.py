@@ -36,7 +36,7 @@ APART = 0.04
 """Root mean square difference in depth, for a body of 1.75, from which on solutions count as two."""
 
 BLOCK, OVERLAP = 2000, 100
-"""Frames of a long clip that are refined together, and by how many blocks overlap."""
+"""Frames of a long clip that are refined together, at most, and by how many blocks overlap."""
 
 WIDE = 3.0
 """Tangent of the angle off the optical axis from which on the focal length is hardly true."""
@@ -240,7 +240,8 @@ def _descend(
         noise: standard deviation of joints in the image, in units of the energy.
         steps: of L-BFGS.
     """
-    size = min(BLOCK, len(rays))
+    count = max(1, math.ceil((len(rays) - OVERLAP) / (BLOCK - OVERLAP)))
+    size = math.ceil((len(rays) + (count - 1) * OVERLAP) / count)
     begins = window_starts(len(rays), size, min(OVERLAP, size - 1))
     image = (rays * distance[:, None, None]).unfold(0, size, 1)[begins]  # (W, N, 2, T)
     lively = image.diff(dim=-1).square().sum((1, 2))
