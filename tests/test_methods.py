@@ -556,6 +556,16 @@ def test_a_rigid_bone_that_changes_its_length_is_named():
     assert any("right_elbow-right_wrist by 40 %" in note for note in found.notes)
 
 
+def test_joints_in_another_order_are_warned_of():
+    """As many joints, but those of another skeleton: no body of this one looks like it."""
+    points = walking_person(60, skeleton="coco17", turn=0.0).tracks.points[:, :17]
+    with pytest.warns(
+        KcsWarning, match=r"hardly a body of skeleton 'h36m17': bones are .* joints may be wrong, swapped"
+    ):
+        result = METHODS["pkc"]()(Tracks.from_arrays(points, skeleton="h36m17", fps=30))
+    assert any("hardly a body of skeleton 'h36m17'" in note for note in result.diagnostics.notes)
+
+
 @pytest.mark.parametrize(("method", "rests"), [("pkc", "the template and lengths"), ("sfam", "constant lengths alone")])
 def test_what_depth_rests_on_before_a_camera_that_stands_still(method, rests):
     """SfAM knows no template: the user is warned, and told of methods that do."""

@@ -25,7 +25,7 @@ from kcs_torch.errors import (
     users_level,
 )
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.finish import WEAK_TURN, WHY_LOOSE, Estimate, finish, loose_bones, rms
+from kcs_torch.methods.finish import WEAK_TURN, WHY_LOOSE, Estimate, finish, rms, what_is_wrong
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
 from kcs_torch.types.hints import is_a, spoken
@@ -163,9 +163,8 @@ class Method(ABC):
                 stacklevel=users_level(),
             )
 
-        loose = loose_bones(result.points, tracks.skeleton) if self.keeps_lengths and found.converged else ""
-        if loose:
-            warnings.warn(f"{tracks.source}: {loose}: {WHY_LOOSE}", KcsWarning, stacklevel=users_level())
+        for wrong in what_is_wrong(self, result.points, tracks.skeleton) if found.converged else ():
+            warnings.warn(f"{tracks.source}: {wrong}: {WHY_LOOSE}", KcsWarning, stacklevel=users_level())
 
     def unsettled(self, steps: int) -> str:
         """A sentence for those whose iteration stopped at its limit."""

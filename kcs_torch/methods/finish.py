@@ -21,7 +21,7 @@ from kcs_torch.types import Diagnostics, Reconstruction, Tracks
 if TYPE_CHECKING:
     from kcs_torch.methods.base import Method
 
-__all__ = ["WEAK_TURN", "WHY_LOOSE", "Estimate", "finish", "loose_bones", "rms"]
+__all__ = ["WEAK_TURN", "WHY_LOOSE", "Estimate", "finish", "loose_bones", "rms", "what_is_wrong"]
 
 WEAK_TURN = 30.0
 """Degrees of viewpoint turn below which depth is weakly determined."""
@@ -31,6 +31,10 @@ LOOSE = 5.0
 
 PART = 2.0
 """Per cent of the body's size by which a bone's length has to vary as well to be told by name: short bones vary."""
+
+ODD, DEEP = 0.4, 1.0
+"""Root mean square of the logarithms of lengths over the skeleton's, and depth over the size in the image, beyond which
+a body is another: people in odd postures, seen by detectors, come to .4 and .5."""
 
 FAR_STEPS = 2
 """How often joints are weighed anew by their distance, when the body is put in its place."""
@@ -108,6 +112,13 @@ def _rest(method: Method, body: Skeleton) -> str:
     return "constant lengths alone" if body.rigid and method.keeps_lengths else "nothing"
 
 
+def what_is_wrong(method: Method, points: Tensor, body: Skeleton) -> list[str]:
+    """What about points (T, N, 3) tells that they are not the body's, for the user."""
+    told = [loose_bones(points, body) if method.keeps_lengths else ""]
+    told.append(odd_body(points, body) if method.knows_template(body) else "")
+    return [sentence for sentence in told if sentence]
+
+
 def loose_bones(points: Tensor, body: Skeleton) -> str:
     """Which rigid bones of points (T, N, 3) change their length, for the user; empty where none does."""
     rigid = list(body.rigid)
@@ -128,6 +139,26 @@ def loose_bones(points: Tensor, body: Skeleton) -> str:
     named = [f"{body.bone_names[rigid[b]]} by {float(share[b]):.0f} %" for b in worst[:3]]
     more = f" and {counted(len(worst) - 3, 'more bone')}" if len(worst) > 3 else ""
     return f"lengths of rigid bones vary: {', '.join(named)}{more}"
+
+
+def odd_body(points: Tensor, body: Skeleton) -> str:
+    """How points (T, N, 3) are unlike any body of the skeleton, for the user; empty where they are not."""
+    usual = body.relative_lengths(dtype=points.dtype, device=points.device)
+    rigid = list(body.rigid)
+    if usual is None or not rigid or not len(points):
+        return ""
+    known = usual[rigid] > 0
+    own = bone_lengths(points, body.bone_index(device=points.device)).median(0).values[rigid]
+    log = (own[known].clamp_min(torch.finfo(own.dtype).tiny) / usual[rigid][known]).log()
+    odd = float((log - log.median()).square().mean().sqrt()) if len(log) else 0.0
+    middle = points - points.mean(1, keepdim=True)
+    deep = float(middle[..., 2].norm() / middle[..., :2].norm().clamp_min(torch.finfo(points.dtype).tiny))
+    if odd <= ODD or deep <= DEEP:
+        return ""
+    return (
+        f"this is hardly a body of skeleton '{body.name}': bones are {math.exp(odd):.1f} times as long or as short as "
+        f"usual, and it is {deep:.1f} times as deep as it is large in the image"
+    )
 
 
 def _placed(tracks: Tracks, found: Estimate, size: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
@@ -169,9 +200,8 @@ def _reconstruction(
     if not found.converged:
         notes.append(method.unsettled(found.iterations))
     percent = float(100 * variation[rigid].median()) if rigid else math.nan
-    loose = loose_bones(points, body) if method.keeps_lengths else ""
-    if loose:
-        notes.append(f"{loose}: {WHY_LOOSE}")
+    for wrong in what_is_wrong(method, points, body):
+        notes.append(f"{wrong}: {WHY_LOOSE}")
     if not rigid:
         kind = "no bones" if not body.num_bones else "no rigid bones"
         notes.append(f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown")
