@@ -11,6 +11,7 @@ from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths
 from kcs_torch.methods import pinhole
 from kcs_torch.methods.pinhole import PinholeEnergy
+from kcs_torch.nn import AdductionEnergy
 from kcs_torch.solvers.lbfgs import lbfgs
 
 
@@ -108,3 +109,16 @@ def test_lengths_count_once_where_they_are_known():
         state[:, count : count + len(size)] = size.log()
         same = torch.cat([state[:, :count], state.new_zeros(1, held.waves.shape[1])], 1)
         assert_close(free(state) - held(same), free.proportions(size[None]))
+
+
+def test_an_arm_that_reaches_across_the_body_costs(monkeypatch):
+    skeleton, rays, depth, far, _ = walk()
+    start = 3 * normal(1, *depth.shape)  # limbs anywhere
+    energy = PinholeEnergy(skeleton, rays, far, start, 60.0, 0.0)
+    state = energy.pack(start)
+    z, lengths, shares = energy.unpack(state)
+    across = AdductionEnergy(skeleton)(energy.points(z, energy.path(shares)), lengths).sum(-1)
+    assert float(across) > 1
+    total = energy(state)
+    monkeypatch.setattr(pinhole, "ADDUCTION", 0.0)
+    assert_close(total - energy(state), 0.03 / 2 / 0.05**2 * across)  # at 60 frames a second each counts half

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.methods.size import slow_waves
-from kcs_torch.nn.anatomy import HingeEnergy
+from kcs_torch.nn.anatomy import AdductionEnergy, HingeEnergy
 from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy
 from kcs_torch.nn.posture import PostureEnergy, trunk_joints
 from kcs_torch.skeleton import Skeleton
@@ -22,8 +22,9 @@ NEAREST = 0.15
 LENGTH, ACCELERATION = 0.003, 0.05
 """Standard deviations of a bone's length and of the second difference of its depth at 30 frames a second."""
 
-HINGE, SINE = 0.08, 0.05
-"""Weight of a hinge in a frame at 30 frames a second, and the sine of a wrong bend that costs half of it."""
+HINGE, ADDUCTION, SINE = 0.08, 0.03, 0.05
+"""Weights of a hinge, and of an arm or a leg that reaches across the body, in a frame at 30 frames a second; and the
+sine of a wrong bend, or beyond the limit, that costs half of them."""
 
 POSTURE, FORESHORTENING = 6.0, 10.0
 """Frames that count as one for these energies at 30 frames a second."""
@@ -87,6 +88,7 @@ class PinholeEnergy:
             self.foreshortening = ForeshorteningEnergy(skeleton, correlation=FORESHORTENING / slow).to(rays)
             self.proportions = ProportionEnergy(skeleton).to(rays)
             self.hinges = HingeEnergy(skeleton).to(rays)
+            self.adduction = AdductionEnergy(skeleton).to(rays)
         else:
             self.near = bone_vectors(near[..., None], self.bones)[..., 0]
 
@@ -135,5 +137,6 @@ class PinholeEnergy:
         if not self.anatomy:
             return total + (dz - self.near).square().sum((1, 2)) / (2 * CLOSE**2)
         total = total + self.posture(points, lengths) + self.foreshortening(points, lengths)
-        hinges = HINGE * self.slow / SINE**2 * self.hinges(points, lengths).sum(-1)
-        return total + hinges if self.lengths is not None else total + self.proportions(lengths) + hinges
+        total = total + HINGE * self.slow / SINE**2 * self.hinges(points, lengths).sum(-1)
+        total = total + ADDUCTION * self.slow / SINE**2 * self.adduction(points, lengths).sum(-1)
+        return total if self.lengths is not None else total + self.proportions(lengths)
