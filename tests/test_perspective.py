@@ -159,6 +159,7 @@ def test_body_off_the_optical_axis():
     assert error(second.points, truth) < 0.7 * error(reconstruct(other, method="kcs").points, truth)
 
 
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")  # SfAM sees a turn of 27 degrees
 @pytest.mark.parametrize("method", ["kcs", "sfam", "pkc"])
 def test_a_very_long_focal_length_changes_nothing(method):
     clip = kt.data.walking_person(20, turn=60)

@@ -249,8 +249,9 @@ class Objective:
             return depth.new_zeros(len(depth))
         few = max(1, MOST // depth.shape[1])
         depth = depth - depth[..., self.posture.trunk].mean(-1, keepdim=True)
-        points = torch.nn.functional.pad(depth[..., None], (2, 0))
-        return torch.cat([self.weights.contact * self.feet(part, None, self.standing) for part in points.split(few)])
+        pad = torch.nn.functional.pad
+        parts = (pad(part[..., None], (2, 0)) for part in depth.split(few))
+        return torch.cat([self.weights.contact * self.feet(part, None, self.standing) for part in parts])
 
     def carries(self, member: Tensor) -> Tensor:
         """Which parts (P,) move feet against the trunk, for members (P, B) that are 1 for a part's bones."""
