@@ -146,7 +146,8 @@ class Method(ABC):
         if doubt:
             warnings.warn(f"{tracks.source}: {doubt}", KcsWarning, stacklevel=users_level())
         elif not (self.learned or found.viewpoint_turn >= WEAK_TURN or self.knows_template(tracks.skeleton)):
-            others = ", while 'pkc' and 'kcs' use the skeleton's template" if tracks.skeleton.template else ""
+            told = tracks.skeleton.template is not None and self.name not in ("pkc", "kcs")
+            others = ", while 'pkc' and 'kcs' use the skeleton's template" if told else ""
             message = (
                 f"{tracks.source}: the viewpoint turned by only {counted(round(found.viewpoint_turn), 'degree')}, and "
                 f"'{self.name}' has nothing else that tells depth: it is little more than a guess{others}"
