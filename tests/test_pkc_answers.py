@@ -11,7 +11,8 @@ from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.methods.pkc import answers
 from kcs_torch.methods.pkc.answers import angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
-from kcs_torch.methods.pkc.objective import Objective, Weights
+from kcs_torch.methods.pkc.objective import Objective
+from kcs_torch.methods.pkc.weights import Weights
 from kcs_torch.skeleton import SKELETONS
 
 

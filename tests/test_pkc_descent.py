@@ -11,8 +11,9 @@ from torch.testing import assert_close
 
 from kcs_torch.functional import bone_lengths
 from kcs_torch.methods.pkc.descent import Descent
-from kcs_torch.methods.pkc.objective import Objective, Weights
+from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.unknowns import Unknowns
+from kcs_torch.methods.pkc.weights import Weights
 from kcs_torch.skeleton import SKELETONS
 
 

@@ -13,8 +13,9 @@ from kcs_torch.methods.pkc.batch import Task, minimise_all
 from kcs_torch.methods.pkc.flips import flipped, flipped_runs, parts_of, turned, turned_over
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
-from kcs_torch.methods.pkc.objective import Objective, Weights, usual_posture
+from kcs_torch.methods.pkc.objective import Objective, usual_posture
 from kcs_torch.methods.pkc.run_costs import RunCosts, Runs
+from kcs_torch.methods.pkc.weights import Weights
 from kcs_torch.skeleton import SKELETONS
 
 BODY = SKELETONS["h36m17"]
@@ -133,7 +134,7 @@ def odd_body(name, frames, noise=0.0, anchored=False):
 @pytest.mark.parametrize("frames", [1, 2, 3, 4, 5, 30])
 @pytest.mark.parametrize(("name", "noise"), [("h36m17", 0.0), ("body25", 0.02), ("hand21", 0.0)])
 def test_runs_cost_what_the_objective_says(name, noise, frames, monkeypatch):
-    """From sums over frames, for every part and run; body25 has virtual joints, hand21 no twins and no hinges."""
+    """From sums over frames, for every part and run; body25 has virtual joints, hand21 no twins."""
     monkeypatch.setattr(module, "SHARP", 1e3)
     objective, own, lengths, member = odd_body(name, frames, noise, anchored=noise > 0)
     runs = flipped_runs(own, member, ACCELERATION)

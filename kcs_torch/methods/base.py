@@ -8,7 +8,7 @@ import time
 import typing
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -30,7 +30,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
 from kcs_torch.types.hints import is_a, spoken
 
-__all__ = ["WEAK_TURN", "Estimate", "Method"]
+__all__ = ["WEAK_TURN", "Estimate", "Method", "apart"]
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Method(ABC):
         if cameras is not None:
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         # Solvers differentiate, which inference mode forbids.
-        with torch.inference_mode(False), torch.no_grad(), _home([tracks]):
+        with apart([tracks]):
             inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
             result = finish(self, tracks, found, size, known, time.perf_counter() - begin)
@@ -113,7 +113,7 @@ class Method(ABC):
             ConvergenceWarning: as a call does.
         """
         begin = time.perf_counter()
-        with torch.inference_mode(False), torch.no_grad(), _home(tracks):
+        with apart(tracks):
             parts = [self._normalised(one) for one in tracks]
             found = self.solve_all([inner for inner, _, _ in parts])
             each = (time.perf_counter() - begin) / max(len(tracks), 1)
@@ -190,12 +190,16 @@ class Method(ABC):
             raise OptionError(f"{self.name}: {field}: expected {expected}, got {getattr(self, field)!r}")
 
 
-def _home(tracks: Sequence[Tracks]) -> contextlib.AbstractContextManager[object]:
-    """Make on the tracks' device what is made anew; a context costs each operation, so there is none without need."""
+@contextlib.contextmanager
+def apart(tracks: Sequence[Tracks]) -> Iterator[None]:
+    """Leave the caller's autograd and inference mode alone, and make on the tracks' device what is made anew."""
     devices = {one.points.device for one in tracks}
-    if len(devices) != 1 or devices == {torch.get_default_device()}:
-        return contextlib.nullcontext()
-    return devices.pop()
+    with torch.inference_mode(False), torch.no_grad():
+        if len(devices) != 1 or devices == {torch.get_default_device()}:
+            yield  # a device's context costs each operation, so there is none without need
+        else:
+            with devices.pop():
+                yield
 
 
 def check_cameras(cameras: Tensor, frames: int) -> Tensor:

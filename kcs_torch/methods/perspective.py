@@ -14,7 +14,7 @@ from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
-from kcs_torch.methods.base import Method, _home, check_cameras
+from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
 from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.methods.root import ABSENT, FOUND
@@ -98,8 +98,7 @@ def reconstruct_perspective(
         KcsWarning: the field of view would be so wide that the focal length is hardly true.
     """
     begin = time.perf_counter()
-    # As in Method.__call__; the refinement differentiates even where the method does not.
-    with torch.inference_mode(False), torch.no_grad(), _home([tracks]):
+    with apart([tracks]):
         result = _reconstruct(method, tracks, intrinsics, cameras, rounds, steps)
     result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
     method._warn(result, "")

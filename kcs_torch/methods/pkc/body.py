@@ -14,8 +14,9 @@ from kcs_torch.functional.temporal import blend_windows, interpolate, window_sta
 from kcs_torch.methods.lockstep import Search, together
 from kcs_torch.methods.pkc.fixed_view import searching
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
-from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, bone_noise, pace_of, usual_posture
+from kcs_torch.methods.pkc.objective import Objective, bone_noise, usual_posture
 from kcs_torch.methods.pkc.trunk import image_scale
+from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lm import fit_bones
 

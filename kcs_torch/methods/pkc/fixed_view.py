@@ -17,9 +17,10 @@ from kcs_torch.methods.pkc.batch import serve
 from kcs_torch.methods.pkc.flips import flipped, parts_of, turned_over
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limbs_of, waves
-from kcs_torch.methods.pkc.objective import Objective, Weights, at_pace, pace_of
+from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.placing import placing
 from kcs_torch.methods.pkc.trunk import TURN, Trunk, longest_image, siblings, trunk_misfit, trunk_path, trunk_turns
+from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.nn.lengths import free_bones
 from kcs_torch.skeleton import Skeleton
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -15,15 +15,16 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.methods.pkc.descent import ANCHOR, CORNER, HEAVY, NOISE, Descent, wide
 from kcs_torch.methods.pkc.unknowns import Unknowns
+from kcs_torch.methods.pkc.weights import Weights
 from kcs_torch.nn.anatomy import AdductionEnergy, HingeEnergy
 from kcs_torch.nn.contact import ContactEnergy
-from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy, free_bones
+from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.memory import give_back
 
-__all__ = ["Objective", "Refined", "Weights", "at_pace", "bone_noise", "pace_of", "usual_posture"]
+__all__ = ["Objective", "Refined", "bone_noise", "usual_posture"]
 
 BLUR = 2.0
 """By how much a bone's direction strays, over its noise in the image per length: the trunk's frame is noisy as well."""
@@ -37,88 +38,8 @@ STEADY = 5
 SHORT = 0.001
 """Bones are no shorter than this, a standing person being about 1.75 tall."""
 
-WALK = 4.3
-"""Frames in which a walking person's bones change in the image by as much as they stray, at 30 frames a second."""
-
 MOST = 40_000
 """Frames of a clip's hypotheses that are refined together: memory is for few of a very long clip."""
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights of the objective's terms, for a body of 1.75 and 30 frames a second.
-
-    Attributes:
-        length: standard deviation of a bone's length about its mean.
-        acceleration: standard deviation of a bone's second difference in depth.
-        posture: frames that count as one for the posture.
-        kappa: independent frames that the template's directions are worth.
-        foreshortening: frames that count as one for the foreshortening.
-        hinge: weight of a hinge in a frame.
-        adduction: weight of an arm or a leg that reaches across the body, in a frame.
-        sine: sine of a wrong bend, or beyond the limit, that costs half its weight.
-        proportions: usual deviation of a length, as a share.
-        twins: usual difference between left and right, as a share.
-        contact: weight of feet that stand still, in a frame.
-        slip: standard deviation of a standing foot's change of depth from a frame to the next.
-        change: standard deviation of the second difference of the trunk's own.
-    """
-
-    length: float = 0.003
-    acceleration: float = 0.08
-    posture: float = 6.0
-    kappa: float = 20.0
-    foreshortening: float = 10.0
-    hinge: float = 0.08
-    adduction: float = 0.03
-    sine: float = 0.05
-    proportions: float = 0.08
-    twins: float = 0.03
-    contact: float = 1.0
-    slip: float = 0.009
-    change: float = 0.009
-
-
-def at_pace(weights: Weights, rate: float, pace: float = 1.0) -> Weights:
-    """Weights for another frame rate, and for a body that moves slowly.
-
-    More frames a second move less from one to the next; and frames tell no more for being many, but for being
-    different: see :func:`pace_of`.
-    """
-    slow = 30.0 / rate
-    return replace(
-        weights,
-        acceleration=weights.acceleration * slow**2,
-        posture=weights.posture * pace,
-        foreshortening=weights.foreshortening * pace,
-        hinge=weights.hinge / pace,
-        adduction=weights.adduction / pace,
-        contact=weights.contact / pace,
-        slip=weights.slip * slow,
-        change=weights.change * slow**2,
-    )
-
-
-def pace_of(image: Tensor, skeleton: Skeleton, rate: float) -> float:
-    """How many frames tell as much as one of a walking person's at 30 frames a second, at least ``rate / 30``.
-
-    The deviation of the bones' images over that of their changes: the time in which a pose changes into another.
-
-    Args:
-        image: (T, N, 2).
-        skeleton: with a template or proportions.
-        rate: frames a second.
-    """
-    least = rate / 30
-    usual = skeleton.relative_lengths(dtype=image.dtype, device=image.device)
-    if len(image) < 3 or usual is None:
-        return least
-    vectors = bone_vectors(image, skeleton.bone_index(device=image.device))
-    vectors = (vectors / usual.to(image).clamp_min(1e-3)[:, None])[:, free_bones(skeleton).to(image.device) > 0]
-    moved = float(vectors.diff(dim=0).square().sum((1, 2)).mean().sqrt())
-    spread = float((vectors - vectors.mean(0)).square().sum((1, 2)).mean().sqrt())
-    time = spread / moved if moved > spread / len(image) else float(len(image))
-    return max(least, time / WALK)
 
 
 def bone_noise(noise: Tensor, bones: Tensor) -> Tensor:
