@@ -464,7 +464,7 @@ def wild_tracks(draw):
     """Tracks of any length, with any gaps, weights and sizes."""
     frames, joints = draw(st.integers(1, 40)), draw(st.integers(2, 4))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    points = rng.normal(size=(frames, joints, 2)) * 10.0 ** draw(st.integers(-30, 30))
+    points = rng.normal(size=(frames, joints, 2)) * 10.0 ** draw(st.integers(-30, 29))  # up to what tracks may hold
     if draw(st.booleans()):
         points = np.round(points / np.abs(points).max())  # many equal values
     weights = rng.uniform(size=(frames, joints)) * (rng.uniform(size=(frames, joints)) < draw(st.floats(0.05, 1)))
