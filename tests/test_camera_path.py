@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional import nearest_rotation
 from kcs_torch.solvers import constant_path
-from kcs_torch.solvers.camera_path import _left_jacobian, choose_path, settle_path, smooth_path
+from kcs_torch.solvers.camera_path import _left_jacobian, choose_path, settle_path, smooth_path, view_energy
 
 
 def path(frames, degrees, axis=(0.2, 1.0, -0.1), seed=0):
@@ -160,3 +160,23 @@ def test_settle_path_finds_axis_and_speed():
     assert gauge(off) > 0.03
     assert gauge(found) < 0.005
     assert settle_path(world[:2], off[:2]).shape == (2, 3, 3)
+
+
+def test_view_energy_tells_mirror_images_apart():
+    """A rigid body seen from all sides: whatever its size and place, the mirror image varies more."""
+    true = path(40, 30)
+    points = normal(5, 3)[None] @ true.mT
+    both = torch.stack([points, points * torch.tensor([1.0, 1.0, -1.0])])
+    right, wrong = view_energy(both, true)
+    assert wrong > right + 10
+    for other in (1e-4 * both, 1e6 * both, both + normal(40, 1, 3)):
+        assert_close(view_energy(other, true), torch.stack([right, wrong]))
+    assert_close(view_energy(both, true, correlation=12.0), torch.stack([right, wrong]) / 2)
+    assert view_energy(0 * both, true).isfinite().all()
+
+
+def test_view_energy_of_cameras_that_stand_still():
+    still = rotations()[None].expand(20, 3, 3)
+    points = normal(20, 5, 3)
+    right, wrong = view_energy(torch.stack([points, points * torch.tensor([1.0, 1.0, -1.0])]), still)
+    assert_close(right, wrong)

@@ -15,7 +15,7 @@ from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.functional.spectral import dct_basis
 from kcs_torch.solvers.lbfgs import lbfgs
 
-__all__ = ["CameraPath", "choose_path", "constant_path", "settle_path", "smooth_path"]
+__all__ = ["CameraPath", "choose_path", "constant_path", "settle_path", "smooth_path", "view_energy"]
 
 CameraPath = Literal["auto", "free", "smooth", "constant"]
 
@@ -194,6 +194,27 @@ def settle_path(
         u = lbfgs(energy, u, num_steps=num_steps, first_step=1e-2).value
     found = turned(u)
     return found @ nearest_rotation((found.mT @ path).sum(0))
+
+
+def view_energy(points: Tensor, path: Tensor, *, correlation: float = 6.0, eps: float = 1e-3) -> Tensor:
+    """How much poses vary in the world of known cameras: n/2 log det of their scatter there, n = T / correlation.
+
+    Depths of the wrong sign seem to turn with the camera, twice as fast: of a pose and its mirror image the right one
+    varies less, whatever the body itself does, unless it turns in time with the camera.
+
+    Args:
+        points: (..., T, N, 3) in the camera frame; the middle of each frame's joints does not count.
+        path: (T, 3, 3) world to camera.
+        correlation: frames that count as one.
+        eps: variance that is not looked below, a share of the points' mean square.
+
+    Returns:
+        (...). Only differences mean something, between points of the same clip.
+    """
+    points = points - points.mean(-2, keepdim=True)
+    size = points[..., :2].square().mean((-3, -2, -1), keepdim=True).sqrt()
+    world = (points / size.clamp_min(torch.finfo(size.dtype).tiny) @ path).flatten(-2)
+    return scatter_log_det(world - world.mean(-2, keepdim=True), eps) / correlation
 
 
 def _sum_unturned(rotations: Tensor, factors: Tensor, time: Tensor, turn: Tensor) -> Tensor:

@@ -18,9 +18,10 @@ from kcs_torch.methods.pkc.objective import Objective, bone_noise, usual_posture
 from kcs_torch.methods.pkc.trunk import image_scale
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.solvers.camera_path import view_energy
 from kcs_torch.solvers.lm import fit_bones
 
-__all__ = ["Body"]
+__all__ = ["TOLD", "Body"]
 
 BLOCK, OVERLAP = 400, 40
 """Frames of a long clip that are searched together, and by how many blocks overlap."""
@@ -34,6 +35,9 @@ joints have to move (a heel, a finger) turns back and forth and never settles.""
 
 FRAMES = 4096
 """Frames of hypotheses whose bones are made constant at a time."""
+
+TOLD = 3.0
+"""By how much a mirror image must be dearer for known cameras to rule it out."""
 
 FAST = 45.0
 """Frames a second from which on the search leaves frames out."""
@@ -104,6 +108,25 @@ class Body:
         energy = found.energy - self.objective.contact(found.depth)
         self.objective.standing = None
         return replace(found, energy=energy)[energy.argsort()]
+
+    def seen_from(self, found: Hypotheses, cameras: Tensor, steps: int) -> Search[Any, Any, Hypotheses]:
+        """What known cameras (T, 3, 3) leave of hypotheses and the mirror image of the best, ranked by them as well.
+
+        Left out is what must be a mirror image, however well it goes with the template. A body without left and right,
+        such as a hand, may be the mirror image of its template: then all that was found is turned over as it is.
+        """
+        other = replace(found, depth=-found.depth, steps=0)
+        if self.skeleton.mirror:
+            other = yield from refined(self.objective, other[:1], steps)
+        found = found.joined(other)
+        points = torch.cat([self.image.expand(*found.depth.shape, 2), found.depth[..., None]], -1)
+        flip = points.new_tensor([1.0, 1.0, -1.0])
+        frames = self.objective.weights.posture
+        own, mirrored = (view_energy(p, cameras, correlation=frames) for p in (points, points * flip))
+        found = replace(found, energy=found.energy + own)
+        order = found.energy.argsort()
+        left = (own - mirrored)[order] <= TOLD
+        return found[order[left] if bool(left.any()) else order]
 
     def search(self, rounds: int, steps: int) -> Search[Any, Any, Hypotheses]:
         """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best."""

@@ -12,22 +12,23 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, counted
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.base import WEAK_TURN, Estimate, Method
+from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.finish import loose_bones
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.batch import Noisy, Sized, serve
-from kcs_torch.methods.pkc.body import Body
+from kcs_torch.methods.pkc.body import TOLD, Body
 from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
-from kcs_torch.methods.pkc.moving_view import Descent, MovingView
+from kcs_torch.methods.pkc.moving_view import MovingView
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.unseen import gap_deviation, place_unseen
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.solvers.procrustean import COARSE, FINE, align_rotations
+from kcs_torch.solvers.camera_path import view_energy
+from kcs_torch.solvers.procrustean import COARSE, FINE
 from kcs_torch.types import Tracks
 
 __all__ = ["PKC"]
@@ -77,6 +78,9 @@ of 47 views of robot arms, real and random, 14 had one, and 12 of these had a te
 BROKEN = 0.5
 """How sure a solution is at most, 1 being full agreement, that does not keep the lengths of rigid bones."""
 
+TELLING = 2.0
+"""Degrees of the turn of known cameras from which on they tell the sign of depth."""
+
 LEAST_FRAMES = 12
 """Frames from which on the viewpoint may have turned."""
 
@@ -93,7 +97,7 @@ class PKC(Method):
 
     Args:
         viewpoint: "fixed" lifts by the template, "moving" by the viewpoint's turn; "auto" by the template if there is
-            one. Known cameras always bring in the turn.
+            one. Known cameras tell the sign of depth, and rank solutions.
         denoise: smooth noisy tracks, fill gaps and reject outliers first (:func:`kcs_torch.solvers.denoise_tracks`).
         lifts: random starts of the moving viewpoint's solver, for skeletons without a template.
         rounds: of discrete moves of the fixed viewpoint's solver.
@@ -161,32 +165,33 @@ class PKC(Method):
             )
         body = None
         if has_trunk:
-            still = self.contacts and cameras is None and self.viewpoint != "moving"
+            still = self.contacts and not _turns(cameras) and self.viewpoint != "moving"
             feet = standing_feet(tracks) if still else None
             body = Body(skeleton, image, tracks.fps or 30.0, noise, feet)
         enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
         if body is None:
-            moving, first = yield from self._moving(tracks, image, noise, cameras, enough)
-            if moving is None:
-                why = "so few frames or joints are" if not enough else "with known cameras, bones that are no tree are"
-                return replace(first, notes=(*notes, f"{why} solved by sfam", *first.notes))
+            if not enough:
+                seen = _complete(tracks, image)
+                (first,) = (yield [seen]) if cameras is None else [SfAM().solve(seen, cameras)]
+                return replace(first, notes=(*notes, "so few frames or joints are solved by sfam", *first.notes))
+            moving, first = yield from self._moving(tracks, image, noise)
             return self._from_moving(moving, first, skeleton, cameras, notes)
         found = None
         moves = enough and self.viewpoint != "fixed"
-        # Cameras that turn tell the sign of depth: what the template says might contradict them.
-        told = cameras is not None and float(viewpoint_turn(cameras)) >= WEAK_TURN
-        if not moves or (self.viewpoint == "auto" and not told):
+        if not moves or self.viewpoint == "auto":
             found = yield from body.search(self.rounds, self.steps)
             turn = float(viewpoint_turn(body.frames(found.depth[0])[:, :2]))
-            moves = moves and (cameras is not None or turn >= TURNING)
+            moves = moves and turn >= TURNING
         if moves:
-            moving = (yield from self._moving(tracks, image, noise, cameras, enough))[0]
-            if found is not None and moving is not None and cameras is None:
+            moving = (yield from self._moving(tracks, image, noise))[0]
+            if found is not None and cameras is None:
                 path, kind = moving.cameras()
                 if kind != "free" and float(viewpoint_turn(path[:, :2])) >= TURNING:
                     found = body.without_contacts(found)
-            found = yield from self._ranked(body, moving, cameras, found)
+            found = yield from self._ranked(body, moving, found)
         assert found is not None
+        if cameras is not None and _turns(cameras):
+            found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
         return self._from_hypotheses(found, body, cameras, notes, detected(tracks.weights))
 
     def _clean(self, tracks: Tracks) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
@@ -227,27 +232,12 @@ class PKC(Method):
             notes.append(f"{counted(count, 'frame')} at the clip's ends {show} nobody: nearest pose held")
         return points - points.mean(-2, keepdim=True), noise, tuple(notes)
 
-    def _moving(
-        self, tracks: Tracks, image: Tensor, noise: Tensor, cameras: Tensor | None, enough: bool
-    ) -> Search[Any, Any, tuple[MovingView | None, Estimate]]:
-        """Solutions of the moving viewpoint, and SfAM's first guess; the guess alone where there is too little."""
-        seen = replace(tracks, points=image, weights=torch.ones_like(tracks.weights))
-        (first,) = (yield [seen]) if cameras is None else [SfAM().solve(seen, cameras)]
-        if not enough:
-            return None, first
-        rotations = complete_rotation(first.cameras)
-        if cameras is None:
-            lifts = 0 if self.viewpoint == "auto" and len(trunk_joints(tracks.skeleton)) >= 3 else self.lifts
-            exact = float(noise.median()) == 0
-            search = turning(image, tracks.skeleton, first.points, rotations, lifts=lifts, exact=exact, seed=self.seed)
-            return (yield from search), first
-        bones = tracks.skeleton.bone_index(device=image.device)
-        if not tracks.skeleton.is_tree:
-            return None, first
-        start = torch.cat([image, first.points[..., 2:] - first.points[..., 2:].mean(1, keepdim=True)], -1)[None]
-        turned = align_rotations(start, rotations[None], bones)
-        (pose,) = yield [Descent(image, start, turned, bones, None, bones, 1.0, 0.0, (*COARSE[-1:], *FINE))]
-        return MovingView(pose, bones, bones, 1.0), first
+    def _moving(self, tracks: Tracks, image: Tensor, noise: Tensor) -> Search[Any, Any, tuple[MovingView, Estimate]]:
+        """Solutions of the moving viewpoint, and SfAM's first guess."""
+        (first,) = yield [_complete(tracks, image)]
+        lifts = 0 if self.viewpoint == "auto" and len(trunk_joints(tracks.skeleton)) >= 3 else self.lifts
+        start, exact = (first.points, complete_rotation(first.cameras)), float(noise.median()) == 0
+        return (yield from turning(image, tracks.skeleton, *start, lifts=lifts, exact=exact, seed=self.seed)), first
 
     def _from_moving(
         self,
@@ -264,40 +254,40 @@ class PKC(Method):
         lengths, many solutions have been compared: one that leads by far needs no other witness. Where bones that are
         rigid change their length all the same, the solution is wrong.
         """
-        points = moving.pose.points[0]
-        path = moving.cameras()[0] if cameras is None else complete_rotation(cameras)
+        points, turned = moving.pose.points[0], moving.cameras()[0]
+        path, told, flip = turned, False, points.new_tensor([1.0, 1.0, -1.0])
+        if cameras is not None:
+            path = complete_rotation(cameras)
+            right, wrong = view_energy(torch.stack([points, points * flip]), path).tolist()
+            points, told = points if right <= wrong else points * flip, abs(right - wrong) > TOLD
         one = torch.ones_like(points[:, 0, 0])
         value = float(moving.pose.objective[0])
         settled = bool(moving.pose.moved[0] <= STILL)
-        spread, doubt = moving.deviation(path), ""
-        if cameras is None:
-            agree = _agreement(points[..., 2], first.points[..., 2])
-            size = points[..., 2].square().mean().sqrt()
-            sure = max(agree / SURE, moving.lead / LEAD)
-            if loose_bones(points, skeleton):
-                sure = min(sure, BROKEN)
-            spread = (spread.square() + (size * max(0.0, 1 - sure)).square()).sqrt()
-            if sure < DOUBT / SURE:
-                doubt = (
-                    "depth is little more than a guess: two methods find depths that hardly agree "
-                    f"(correlation {agree:.2f}). The viewpoint should turn about the body by 60 degrees or more, or "
-                    "the skeleton have a template"
-                )
+        agree = _agreement(points[..., 2], first.points[..., 2])
+        size = points[..., 2].square().mean().sqrt()
+        sure = witnessed = max(agree / SURE, moving.lead / LEAD)
+        if loose_bones(points, skeleton):  # of which another warning tells
+            sure = min(sure, BROKEN)
+        spread = (moving.deviation(turned).square() + (size * max(0.0, 1 - sure)).square()).sqrt()
+        doubt = ""
+        if witnessed < DOUBT / SURE:
+            doubt = (
+                "depth is little more than a guess: two methods find depths that hardly agree "
+                f"(correlation {agree:.2f}). The viewpoint should turn about the body by 60 degrees or more, or "
+                "the skeleton have a template"
+            )
         main = Estimate(points, path[:, :2], one, settled, MOVING_STEPS, notes, spread, value, doubt=doubt)
-        if cameras is not None or not self.alternatives:
+        if told or not self.alternatives:
             return main
-        flip = points.new_tensor([1.0, 1.0, -1.0])
+        seen = path[:, :2] if cameras is not None else path[:, :2] * flip
         said = ("the mirror image in depth",)
-        other = replace(main, points=points * flip, cameras=path[:, :2] * flip, notes=said, doubt="")
+        other = replace(main, points=points * flip, cameras=seen, notes=said, doubt="")
         return replace(main, alternatives=(other,))
 
-    def _ranked(
-        self, body: Body, moving: MovingView | None, cameras: Tensor | None, found: Hypotheses | None
-    ) -> Search[Any, Any, Hypotheses]:
+    def _ranked(self, body: Body, moving: MovingView, found: Hypotheses | None) -> Search[Any, Any, Hypotheses]:
         """All hypotheses of a body with a template, best first."""
-        assert moving is not None
         depth = moving.pose.points[:1, ..., 2] * body.factor
-        ranked = yield from body.rank(depth if cameras is not None else torch.cat([depth, -depth]), self.steps)
+        ranked = yield from body.rank(torch.cat([depth, -depth]), self.steps)
         for _ in range(AGAIN):  # depths found under another objective may have far to go
             if ranked.moved is None or bool(ranked.moved[0] <= STILL):
                 break
@@ -319,14 +309,23 @@ class PKC(Method):
         for k, (depth, points) in enumerate(zip(found.depth, body.bodies(found), strict=True)):
             one = torch.ones_like(points[:, 0, 0])
             value = float(found.energy[k])
-            path = body.frames(depth)[:, :2] if cameras is None else cameras
-            unsure = angle_doubt(body.objective, depth, found.lengths[k], float(viewpoint_turn(path)))
+            turned = body.frames(depth)[:, :2]
+            unsure = angle_doubt(body.objective, depth, found.lengths[k], float(viewpoint_turn(turned)))
             spread = depth_deviation(found[k:], body.noise, body.skeleton, doubt=unsure, image=image) / body.factor
             settled = self.steps >= 10 and found.moved is not None and bool(found.moved[k] <= STILL)
-            made.append(
-                Estimate(points, path, one, settled, found.steps, () if k else notes, spread, value, still=True)
-            )
+            path, said = turned if cameras is None else cameras, () if k else notes
+            made.append(Estimate(points, path, one, settled, found.steps, said, spread, value, still=True))
         return replace(made[0], alternatives=tuple(made[1:]))
+
+
+def _complete(tracks: Tracks, image: Tensor) -> Tracks:
+    """The tracks with all joints seen at (T, N, 2)."""
+    return replace(tracks, points=image, weights=torch.ones_like(tracks.weights))
+
+
+def _turns(cameras: Tensor | None) -> bool:
+    """Whether known cameras turn far enough to tell the sign of depth."""
+    return cameras is not None and float(viewpoint_turn(cameras)) >= TELLING
 
 
 def _agreement(depth: Tensor, other: Tensor) -> float:
