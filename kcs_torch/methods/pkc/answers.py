@@ -20,7 +20,7 @@ APART = 0.04
 CLOSE = 10.0
 """Objective by which another solution may be worse and still be a rival."""
 
-ANGLE = 0.2
+ANGLE = 0.165
 """Standard deviation, in radians, of a bone's angle to the image plane where it is nearest to it: what postures, hinges
 and proportions tell of a length that no crossing of the plane tells."""
 
@@ -47,7 +47,7 @@ POSTURE = 0.15
 """Energy of usual postures, for each bone and frame that counts. Deviations grow with it: the further postures stray,
 the less the template tells of them."""
 
-TURN, POWER = 22.0, 0.6
+TURN, POWER = 22.0, 0.9
 """Degrees of the viewpoint's turn that tell as much as the template, and the power of the turn that deviations fall
 with, as those of the moving viewpoint do."""
 

@@ -9,17 +9,20 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.align import nearest_rotation
+from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.lockstep import Search, together
 from kcs_torch.methods.pkc.fixed_view import searching
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
+from kcs_torch.methods.pkc.moving_view import TIGHT, Descent, soften
 from kcs_torch.methods.pkc.objective import Objective, bone_noise, usual_posture
 from kcs_torch.methods.pkc.trunk import image_scale
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.solvers.camera_path import view_energy
+from kcs_torch.solvers.camera_path import choose_path, view_energy
 from kcs_torch.solvers.lm import fit_bones
+from kcs_torch.solvers.procrustean import COARSE, FINE, align_rotations
 
 __all__ = ["TOLD", "Body"]
 
@@ -35,6 +38,18 @@ joints have to move (a heel, a finger) turns back and forth and never settles.""
 
 FRAMES = 4096
 """Frames of hypotheses whose bones are made constant at a time."""
+
+CLOSE, RIVALS = 10.0, 3
+"""By how much solutions may be dearer than the best to be polished as well, and how many are."""
+
+LEVEL = 0.001
+"""Least noise, a share of the body's size, of tracks that are not exact throughout."""
+
+LONG = 2000
+"""Frames of a clip that are polished together."""
+
+TURNING = 60.0
+"""Degrees of the trunk's turn, as the template tells it, from which on the viewpoint's turn tells depth better."""
 
 TOLD = 3.0
 """By how much a mirror image must be dearer for known cameras to rule it out."""
@@ -127,6 +142,64 @@ class Body:
         order = found.energy.argsort()
         left = (own - mirrored)[order] <= TOLD
         return found[order[left] if bool(left.any()) else order]
+
+    def turns(self, found: Hypotheses) -> bool:
+        """Whether the trunk of the best hypothesis turns far enough to tell depth."""
+        return float(viewpoint_turn(self.frames(found.depth[0])[:, :2])) >= TURNING
+
+    def seen_from_around(self, found: Hypotheses) -> bool:
+        """Whether a camera that goes round the body explains how the best hypothesis turns."""
+        path, kind, _ = choose_path(self.frames(found.depth[0]))
+        return kind != "free" and float(viewpoint_turn(path[:, :2])) >= TURNING
+
+    def polished(self, found: Hypotheses, other: Tensor | None = None) -> Search[Any, Any, Hypotheses]:
+        """Hypotheses, the best refined on the log-determinant of aligned bones' changes, and of the bones themselves.
+
+        What the objective counts for a few frames only, these count for all. Changes take away what moves each bone by
+        itself. Before a viewpoint that turns, aligned bones tell depth better than the template does, and which of
+        close rivals is best; ``other`` depths (T, N), or their mirror image, are a rival then. Energies stay those of
+        the objective before, in their order.
+        """
+        skeleton, bones = self.skeleton, self.objective.bones
+        if not skeleton.is_tree or skeleton.num_bones != skeleton.num_joints - 1:
+            return found
+        around = self.turns(found)
+        count = int((found.energy - found.energy[0] < CLOSE).sum().clamp_max(RIVALS)) if around else 1
+        rivals = found[:count]
+        if around and other is not None:
+            other = other * (other * found.depth[0]).sum().sign()
+            depth = torch.cat([rivals.depth, other[None]])
+            rivals = replace(rivals, depth=depth, energy=depth.new_zeros(count + 1))
+        size = self.image.square().mean().sqrt()
+        if not bool(size > 0):  # all joints lie at one point
+            return found
+        level = float(self.noise.median() / size)
+        if self.objective.noisy:  # where gaps were filled, at least
+            level = max(level, LEVEL)
+        sure = (level * size / self.noise.clamp_min(level * size)).square() if level > 0 else None
+        stages = tuple(soften(stage, level) for stage in ((*COARSE[-1:], *FINE) if around else FINE))
+        points = torch.cat([self.image.expand(*rivals.depth.shape, 2), rivals.depth[..., None]], -1) / size
+        turned = torch.stack([self.frames(depth) for depth in rivals.depth])
+        turned = align_rotations(points, turned, bones)
+        starts = window_starts(len(self.image), min(LONG, len(self.image)), min(OVERLAP, len(self.image) - 1))
+        depths, value = [], torch.zeros_like(rivals.energy)
+        for some in (slice(first, first + LONG) for first in starts):
+            weights, rigid = None if sure is None else sure[some], bones[list(skeleton.rigid)]
+            one = points[:, some], turned[:, some], bones, weights, rigid, TIGHT, level, stages
+            (pose,) = yield [Descent(self.image[some] / size, *one)]
+            depths.append(pose.points[..., 2].transpose(0, 1) * size)  # (T, H, N)
+            value = value + pose.objective
+        depth = blend_windows(torch.stack(depths), starts, len(self.image)).transpose(0, 1)
+        depth = depth[..., : skeleton.num_observed] @ self.objective.complete
+        depth = depth - depth.mean(-1, keepdim=True)
+        points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
+        lengths = bone_lengths(points, bones).median(1).values
+        order = value.argsort()[:count]
+        return replace(
+            found,
+            depth=torch.cat([depth[order], found.depth[count:]]),
+            lengths=torch.cat([lengths[order], found.lengths[count:]]),
+        )
 
     def search(self, rounds: int, steps: int) -> Search[Any, Any, Hypotheses]:
         """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best."""

@@ -20,7 +20,7 @@ from kcs_torch.methods.pkc.batch import Noisy, Sized, serve
 from kcs_torch.methods.pkc.body import TOLD, Body
 from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
-from kcs_torch.methods.pkc.moving_view import MovingView
+from kcs_torch.methods.pkc.moving_view import TURNS, MovingView
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
@@ -55,9 +55,6 @@ last seen, and the largest in gaps."""
 
 MOVING_STEPS = sum(stage.num_steps for stage in (*COARSE, *FINE))
 """L-BFGS steps of the moving viewpoint's solver, at most."""
-
-TURNING = 90.0
-"""Degrees of the trunk's turn, as the template tells it, from which on the viewpoint's turn is asked as well."""
 
 STILL = 0.01
 """A solution has settled where the last ten steps (fewer tell nothing) moved depths by no more than so much, root mean
@@ -97,7 +94,7 @@ class PKC(Method):
 
     Args:
         viewpoint: "fixed" lifts by the template, "moving" by the viewpoint's turn; "auto" by the template if there is
-            one. Known cameras tell the sign of depth, and rank solutions.
+            one, and by both where the trunk turns. Known cameras tell the sign of depth, and rank solutions.
         denoise: smooth noisy tracks, fill gaps and reject outliers first (:func:`kcs_torch.solvers.denoise_tracks`).
         lifts: random starts of the moving viewpoint's solver, for skeletons without a template.
         rounds: of discrete moves of the fixed viewpoint's solver.
@@ -176,22 +173,21 @@ class PKC(Method):
                 return replace(first, notes=(*notes, "so few frames or joints are solved by sfam", *first.notes))
             moving, first = yield from self._moving(tracks, image, noise)
             return self._from_moving(moving, first, skeleton, cameras, notes)
-        found = None
-        moves = enough and self.viewpoint != "fixed"
-        if not moves or self.viewpoint == "auto":
+        if enough and self.viewpoint == "moving":
+            moving, _ = yield from self._moving(tracks, image, noise)
+            found = yield from self._ranked(body, moving)
+        else:
             found = yield from body.search(self.rounds, self.steps)
-            turn = float(viewpoint_turn(body.frames(found.depth[0])[:, :2]))
-            moves = moves and turn >= TURNING
-        if moves:
-            moving = (yield from self._moving(tracks, image, noise))[0]
-            if found is not None and cameras is None:
-                path, kind = moving.cameras()
-                if kind != "free" and float(viewpoint_turn(path[:, :2])) >= TURNING:
-                    found = body.without_contacts(found)
-            found = yield from self._ranked(body, moving, found)
-        assert found is not None
+            if cameras is None and body.seen_from_around(found):
+                found = body.without_contacts(found)
         if cameras is not None and _turns(cameras):
             found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
+        if enough and not detected(tracks.weights):  # a detector's errors last, and would be taken for motion
+            other = None
+            if self.viewpoint == "auto" and body.turns(found):
+                moving, _ = yield from self._moving(tracks, image, noise, turns=())
+                other = moving.pose.points[0, ..., 2] * body.factor
+            found = yield from body.polished(found, other)
         return self._from_hypotheses(found, body, cameras, notes, detected(tracks.weights))
 
     def _clean(self, tracks: Tracks) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
@@ -232,12 +228,16 @@ class PKC(Method):
             notes.append(f"{counted(count, 'frame')} at the clip's ends {show} nobody: nearest pose held")
         return points - points.mean(-2, keepdim=True), noise, tuple(notes)
 
-    def _moving(self, tracks: Tracks, image: Tensor, noise: Tensor) -> Search[Any, Any, tuple[MovingView, Estimate]]:
+    def _moving(
+        self, tracks: Tracks, image: Tensor, noise: Tensor, turns: Sequence[float] = TURNS
+    ) -> Search[Any, Any, tuple[MovingView, Estimate]]:
         """Solutions of the moving viewpoint, and SfAM's first guess."""
         (first,) = yield [_complete(tracks, image)]
         lifts = 0 if self.viewpoint == "auto" and len(trunk_joints(tracks.skeleton)) >= 3 else self.lifts
         start, exact = (first.points, complete_rotation(first.cameras)), float(noise.median()) == 0
-        return (yield from turning(image, tracks.skeleton, *start, lifts=lifts, exact=exact, seed=self.seed)), first
+        return (
+            yield from turning(image, tracks.skeleton, *start, turns=turns, lifts=lifts, exact=exact, seed=self.seed)
+        ), first
 
     def _from_moving(
         self,
@@ -284,16 +284,15 @@ class PKC(Method):
         other = replace(main, points=points * flip, cameras=seen, notes=said, doubt="")
         return replace(main, alternatives=(other,))
 
-    def _ranked(self, body: Body, moving: MovingView, found: Hypotheses | None) -> Search[Any, Any, Hypotheses]:
-        """All hypotheses of a body with a template, best first."""
+    def _ranked(self, body: Body, moving: MovingView) -> Search[Any, Any, Hypotheses]:
+        """The moving viewpoint's solution and its mirror image, of a body with a template."""
         depth = moving.pose.points[:1, ..., 2] * body.factor
         ranked = yield from body.rank(torch.cat([depth, -depth]), self.steps)
         for _ in range(AGAIN):  # depths found under another objective may have far to go
             if ranked.moved is None or bool(ranked.moved[0] <= STILL):
                 break
             ranked = yield from refined(body.objective, ranked, self.steps)
-        ranked = replace(ranked, steps=ranked.steps + MOVING_STEPS)
-        return ranked if found is None else found.joined(ranked)
+        return replace(ranked, steps=ranked.steps + MOVING_STEPS)
 
     def _from_hypotheses(
         self, found: Hypotheses, body: Body, cameras: Tensor | None, notes: tuple[str, ...], detections: bool

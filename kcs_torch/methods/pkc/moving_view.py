@@ -31,7 +31,7 @@ from kcs_torch.solvers.procrustean import (
     procrustean,
 )
 
-__all__ = ["Descent", "MovingView", "descend_all", "moving_view", "searching"]
+__all__ = ["TIGHT", "Descent", "MovingView", "descend_all", "moving_view", "searching", "soften"]
 
 TURNS = (30.0, 60.0, 90.0, 120.0, 180.0, 360.0)
 """Degrees that the cameras of the starts turn, evenly, about the image's vertical."""
@@ -230,7 +230,7 @@ def searching(
     first = torch.cat([image, start[..., 2:] - start[..., 2:].mean(1, keepdim=True)], -1)[None]
     spread = lambda points: rigid_tree(distance_spread(points)[1])  # noqa: E731
     bones = skeleton.bone_index(device=image.device) if is_tree else spread(first[0])
-    coarse, fine = (tuple(_soften(s, noise) for s in stages) for stages in (COARSE, FINE))
+    coarse, fine = (tuple(soften(s, noise) for s in stages) for stages in (COARSE, FINE))
     tight = (1.0, TIGHT) if is_tree else (LOOSE, LOOSER)
 
     def descend(
@@ -241,7 +241,7 @@ def searching(
 
     def value(pose: Pose) -> Tensor:
         """How solutions are ranked, (H,)."""
-        stage = _soften(RANKING, noise)
+        stage = soften(RANKING, noise)
         pull = image.new_full((len(rigid),), TIGHT if held else tight[0])
         total = motion_energy(pose.points, pose.rotations, bones, stage)
         total = total + length_energy(pose.points, rigid, pull, stage.slack)
@@ -296,7 +296,7 @@ def searching(
     return MovingView(pose[value(pose).argsort()], bones, rigid, tight[0], lead)
 
 
-def _soften(stage: Stage, noise: float) -> Stage:
+def soften(stage: Stage, noise: float) -> Stage:
     """The stage, with no scale far below the noise."""
     return replace(stage, eps=max(stage.eps, 0.1 * noise**2), slack=max(stage.slack, 0.3 * noise))
 
