@@ -164,12 +164,14 @@ class Body:
         if not skeleton.is_tree or skeleton.num_bones != skeleton.num_joints - 1:
             return found
         around = self.turns(found)
-        count = int((found.energy - found.energy[0] < CLOSE).sum().clamp_max(RIVALS)) if around else 1
-        rivals = found[:count]
+        close = (found.energy - found.energy[0] < CLOSE) & ((found.depth * found.depth[0]).sum((1, 2)) > 0)
+        close[0] = True  # of mirror images, which cost the same here, only the objective tells the right one
+        pick = close.nonzero().flatten()[: RIVALS if around else 1]
+        rivals = found[pick]
         if around and other is not None:
             other = other * (other * found.depth[0]).sum().sign()
             depth = torch.cat([rivals.depth, other[None]])
-            rivals = replace(rivals, depth=depth, energy=depth.new_zeros(count + 1))
+            rivals = replace(rivals, depth=depth, energy=depth.new_zeros(len(depth)))
         size = self.image.square().mean().sqrt()
         if not bool(size > 0):  # all joints lie at one point
             return found
@@ -194,11 +196,11 @@ class Body:
         depth = depth - depth.mean(-1, keepdim=True)
         points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
         lengths = bone_lengths(points, bones).median(1).values
-        order = value.argsort()[:count]
+        best = value.argsort()[: len(pick)]
         return replace(
             found,
-            depth=torch.cat([depth[order], found.depth[count:]]),
-            lengths=torch.cat([lengths[order], found.lengths[count:]]),
+            depth=found.depth.index_copy(0, pick, depth[best]),
+            lengths=found.lengths.index_copy(0, pick, lengths[best]),
         )
 
     def search(self, rounds: int, steps: int) -> Search[Any, Any, Hypotheses]:
