@@ -12,6 +12,7 @@ from kcs_torch import PKC, ConvergenceWarning, KcsWarning, OptionError, SfAM, Sk
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_lengths, complete_rotation
 from kcs_torch.methods.lockstep import run
+from kcs_torch.methods.pkc import body as body_module
 from kcs_torch.methods.pkc import method as module
 from kcs_torch.methods.pkc.batch import Noisy, clean_all, serve
 from kcs_torch.methods.pkc.body import Body
@@ -221,6 +222,42 @@ def test_known_cameras_are_those_of_every_solution(turning):
     for one in (result, *result.alternatives):
         assert torch.equal(one.cameras, clip.cameras)
         assert error(one.points * FLIP, clip.points) > 1  # none is the mirror image
+
+
+@pytest.mark.parametrize("turn", [0.0, 120.0])
+def test_polish(turn, monkeypatch):
+    """Bones that would move in depth each by itself move together, in blocks of long clips, too."""
+    clip = walking_person(90, turn=turn, yaw=40.0)
+    polished = PKC()(clip.tracks)
+    monkeypatch.setattr(body_module, "LONG", 60)
+    blocks = PKC()(clip.tracks)
+    monkeypatch.setattr(Body, "polished", lambda self, found, other=None: left(found))
+    plain = PKC()(clip.tracks)
+    share = 0.9 if turn == 0 else 0.5
+    assert error(polished.points, clip.points) < share * error(plain.points, clip.points)
+    assert error(blocks.points, clip.points) < share * error(plain.points, clip.points)
+    assert polished.diagnostics.bone_variation < 0.5 and blocks.diagnostics.bone_variation < 0.5
+
+
+def left(found):
+    yield from ()
+    return found
+
+
+def test_polish_takes_no_mirror_image(turning):
+    """It costs the same there: only the template tells which is right, however close the two are."""
+    clip, _ = turning
+    tracks = replace(
+        clip.tracks, points=centred(clip.tracks.points) / centred(clip.tracks.points).square().mean().sqrt()
+    )
+    body = Body(tracks.skeleton, tracks.points, 30.0, torch.zeros_like(tracks.weights))
+    depth = centred(clip.points)[..., 2] / centred(clip.points)[..., :2].square().mean().sqrt() * body.factor
+    lengths = bone_lengths(torch.cat([body.image, depth[..., None]], -1), tracks.skeleton.bone_index()).median(0).values
+    both = Hypotheses(torch.stack([depth, -depth]), lengths.expand(2, -1), torch.tensor([0.0, 0.1]).double())
+    for found, sign in ((both, 1), (replace(both, depth=-both.depth), -1)):
+        polished = run(body.polished(found), serve)
+        assert_close(polished.depth[0], sign * depth, rtol=0, atol=0.02)
+        assert_close(polished.depth[1], -sign * depth, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("turn", [15.0, 60.0])
