@@ -169,7 +169,7 @@ class Body:
         pick = close.nonzero().flatten()[: RIVALS if around else 1]
         rivals = found[pick]
         if around and other is not None:
-            other = other * (other * found.depth[0]).sum().sign()
+            other = torch.where((other * found.depth[0]).sum() < 0, -other, other)
             depth = torch.cat([rivals.depth, other[None]])
             rivals = replace(rivals, depth=depth, energy=depth.new_zeros(len(depth)))
         size = self.image.square().mean().sqrt()
