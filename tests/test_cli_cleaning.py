@@ -139,3 +139,15 @@ def test_an_unknown_rate_is_told_with_the_option(tmp_path):
     np.savez(tracks, points2d=np.random.default_rng(0).normal(size=(30, 17, 2)))
     done = run("lift", tracks, "-o", tmp_path / "a.npz", "--skeleton", "coco17", "--smooth", "savgol=5", code=2)
     assert "give fps=... (kcs-torch: --fps)" in done.stderr
+
+
+def test_sides_are_swapped_back_before_anything_else(file, tmp_path):
+    tracks = kt.load_tracks(file)
+    left, right = torch.tensor(tracks.skeleton.mirror).T
+    tracks.points[20:30, torch.cat([left, right])] = tracks.points[20:30, torch.cat([right, left])]
+    tracks.weights[20:30, torch.cat([left, right])] = tracks.weights[20:30, torch.cat([right, left])]
+    given = torch.where(tracks.seen[..., None], tracks.points, torch.nan)[:, :17].numpy()
+    np.savez(tmp_path / "swapped.npz", points2d=given, joint_names=np.array(tracks.skeleton.joints[:17]), fps=30.0)
+    got, _, person = lifted(tmp_path / "swapped.npz", tmp_path, "--unswap", "--gate")
+    same(got, kt.clean.gate(kt.clean.unswap(kt.load_tracks(tmp_path / "swapped.npz"))))
+    assert [note.split(":")[0] for note in person["cleaning"]] == ["unswap", "gate"]

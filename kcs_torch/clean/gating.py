@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcs_torch.clean.common import frame_rate, number, rebuilt, share
+from kcs_torch.clean.common import body_size, frame_rate, number, rebuilt, share
 from kcs_torch.types import Tracks
 
 __all__ = ["gate"]
@@ -65,7 +65,7 @@ def gate(tracks: Tracks, *, threshold: float = 6.0, floor: float = 0.2, reach: f
     points, seen = tracks.points[:, :count].double(), tracks.seen[:, :count]
     side = 3 if tracks.fps is None else max(3, round(reach * frame_rate(tracks.fps, None, "gate", tracks.source)))
     offsets = sorted({round(1 + i * (side - 1) / (_SIDE - 1)) for i in range(_SIDE)})
-    size = _body_size(points, seen)
+    size = body_size(points, seen)
     kept = seen
     for _ in range(_ROUNDS):
         error = (points - _line(points, kept, offsets)).norm(dim=-1)
@@ -108,10 +108,3 @@ def _usual(error: Tensor, seen: Tensor) -> Tensor:
     around = torch.nn.functional.pad(known.mT, (_AROUND, _AROUND), value=math.nan).unfold(-1, 2 * _AROUND + 1, 1)
     near = around.nanmedian(-1).values.mT.nan_to_num(0.0)
     return torch.maximum(clip, torch.minimum(near, 4 * clip)).nan_to_num(0.0)
-
-
-def _body_size(points: Tensor, seen: Tensor) -> Tensor:
-    """Median distance of the seen joints from the middle of those of their frame."""
-    kept = seen[..., None].to(points.dtype)
-    middle = (points * kept).sum(1, keepdim=True) / kept.sum(1, keepdim=True).clamp_min(1)
-    return (points - middle).norm(dim=-1)[seen].median()

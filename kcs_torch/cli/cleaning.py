@@ -27,6 +27,14 @@ Frames = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
+Unswap = Annotated[
+    bool,
+    typer.Option(
+        "--unswap",
+        help="Swap left and right back where the detector mistook them (pkc does so by itself).",
+        rich_help_panel=_PANEL,
+    ),
+]
 Gate = Annotated[
     bool,
     typer.Option("--gate", help="Drop detections that jump away from their joint's path.", rich_help_panel=_PANEL),
@@ -79,9 +87,9 @@ def frame_range(text: str | None) -> tuple[int, int | None]:
 
 
 def cleaner(
-    frames: str | None, gate: bool, fill: int | None, smooth: str | None, resample: float | None
+    frames: str | None, unswap: bool, gate: bool, fill: int | None, smooth: str | None, resample: float | None
 ) -> Callable[[Tracks], Tracks]:
-    """What the options ask for, in the order in which it makes sense: cut, gate, fill, smooth, resample.
+    """What the options ask for, in the order in which it makes sense: cut, unswap, gate, fill, smooth, resample.
 
     Raises:
         OptionError: an option cannot be read.
@@ -102,6 +110,8 @@ def cleaner(
                 tracks = step.trim(tracks, start, stop)
             except OptionError as error:
                 raise OptionError(f"--frames: {str(error).removeprefix('trim: ')}") from None
+        if unswap:
+            tracks = step.unswap(tracks)
         if gate:
             tracks = step.gate(tracks)
         if fill is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kcs_torch.cli.cleaning import SEEN, Fill, Frames, Gate, Resample, Smooth, Smooth3D, cleaner, finisher
+from kcs_torch.cli.cleaning import SEEN, Fill, Frames, Gate, Resample, Smooth, Smooth3D, Unswap, cleaner, finisher
 from kcs_torch.cli.detect import DetectorName, Models, What, numbered, people_of
 from kcs_torch.cli.options import (
     AsJson,
@@ -121,6 +121,7 @@ def lift(
         ),
     ] = 1,
     frames: Frames = None,
+    unswap: Unswap = False,
     gate: Gate = False,
     fill: Fill = None,
     smooth: Smooth = None,
@@ -151,7 +152,7 @@ def lift(
         check_up(up, output)
         find, skeleton = skeleton == "auto", None if skeleton == "auto" else skeleton
         if format is None and _is_video(tracks):
-            clean = cleaner(SEEN if frames == SEEN else None, gate, fill, smooth, resample)
+            clean = cleaner(SEEN if frames == SEEN else None, unswap, gate, fill, smooth, resample)
             check_units(units, "px", size_of)
             people = people_of(
                 tracks,
@@ -165,7 +166,7 @@ def lift(
                 threshold=threshold,
             )
         else:
-            clean = cleaner(frames, gate, fill, smooth, resample)
+            clean = cleaner(frames, unswap, gate, fill, smooth, resample)
             with progress(f"reading {tracks}"):
                 people = _people(
                     tracks,

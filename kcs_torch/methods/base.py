@@ -66,6 +66,10 @@ class Method(ABC):
         """Whether a template tells depth that the viewpoint's turn does not."""
         return False
 
+    def prepared(self, tracks: Tracks) -> Tracks:
+        """The tracks that are solved, and that the result names as its own: those given, or mended ones."""
+        return tracks
+
     def following(self) -> Method:
         """The method for tracks of a camera that turns after the body, by which nothing stands still in the image."""
         return self
@@ -92,6 +96,7 @@ class Method(ABC):
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         # Solvers differentiate, which inference mode forbids.
         with apart([tracks]):
+            tracks = self.prepared(tracks)
             inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
             result = finish(self, tracks, found, size, known, time.perf_counter() - begin)
@@ -114,6 +119,7 @@ class Method(ABC):
         """
         begin = time.perf_counter()
         with apart(tracks):
+            tracks = [self.prepared(one) for one in tracks]
             parts = [self._normalised(one) for one in tracks]
             found = self.solve_all([inner for inner, _, _ in parts])
             each = (time.perf_counter() - begin) / max(len(tracks), 1)

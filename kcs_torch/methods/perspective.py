@@ -99,6 +99,7 @@ def reconstruct_perspective(
     """
     begin = time.perf_counter()
     with apart([tracks]):
+        tracks = method.prepared(tracks)
         result = _reconstruct(method, tracks, intrinsics, cameras, rounds, steps)
     result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
     method._warn(result, "")

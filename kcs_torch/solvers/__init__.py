@@ -13,6 +13,7 @@ from kcs_torch.solvers.procrustean import procrustean
 from kcs_torch.solvers.sign_filter import SignFilter
 from kcs_torch.solvers.signs import SignPath, sign_costs, sign_table, smooth_signs
 from kcs_torch.solvers.standing import root_velocity
+from kcs_torch.solvers.swaps import swapped_frames
 
 __all__ = [
     "Denoised",
@@ -41,4 +42,5 @@ __all__ = [
     "smooth_path",
     "smooth_signs",
     "svt",
+    "swapped_frames",
 ]

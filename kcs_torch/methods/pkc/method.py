@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
+from kcs_torch.clean.sides import unswap
 from kcs_torch.errors import OptionError, counted
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.temporal import interpolate
@@ -95,7 +96,8 @@ class PKC(Method):
     Args:
         viewpoint: "fixed" lifts by the template, "moving" by the viewpoint's turn; "auto" by the template if there is
             one, and by both where the trunk turns. Known cameras tell the sign of depth, and rank solutions.
-        denoise: smooth noisy tracks, fill gaps and reject outliers first (:func:`kcs_torch.solvers.denoise_tracks`).
+        denoise: first swap left and right back where a detector mistakes them (:func:`kcs_torch.clean.unswap`), smooth
+            noisy tracks, fill gaps and reject outliers (:func:`kcs_torch.solvers.denoise_tracks`).
         lifts: random starts of the moving viewpoint's solver, for skeletons without a template.
         rounds: of discrete moves of the fixed viewpoint's solver.
         steps: L-BFGS steps of each of its refinements.
@@ -127,6 +129,9 @@ class PKC(Method):
 
     def knows_template(self, skeleton: Skeleton) -> bool:
         return len(trunk_joints(skeleton)) >= 3
+
+    def prepared(self, tracks: Tracks) -> Tracks:
+        return unswap(tracks) if self.denoise else tracks
 
     def following(self) -> PKC:
         """The same without contacts: what stands still in space does not in the image."""

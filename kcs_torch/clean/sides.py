@@ -1,0 +1,73 @@
+"""Left and right that a detector mistakes for each other, swapped back."""
+
+from __future__ import annotations
+
+import torch
+
+from kcs_torch.clean.common import body_size, rebuilt, share
+from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.skeleton.graph import find_pieces
+from kcs_torch.solvers.swaps import swapped_frames
+from kcs_torch.types import Tracks
+
+__all__ = ["unswap"]
+
+_BODY, _LIMB = 16.0, 8.0
+"""What a change costs that all pairs of joints make, and those of a limb."""
+
+_FEWEST = 2
+"""Pairs of joints of which a limb consists, at least: one pair by itself may be an outlier."""
+
+
+def unswap(tracks: Tracks) -> Tracks:
+    """Swap left and right back where a detector mistakes them for each other; a note says in how many frames.
+
+    First all pairs of joints together, then the arms, the legs and other limbs by themselves, without the joints of the
+    trunk (:func:`kcs_torch.solvers.swapped_frames`). A pair that is mistaken jumps to the other side, while legs that
+    cross move on evenly. Where a clip is half swapped, the longer part is taken to be right.
+
+    Args:
+        tracks: of a skeleton that has a left and a right; those of others are returned as they are.
+
+    Returns:
+        Tracks whose joints have changed places, weights included; the very same tracks if nothing is swapped.
+
+    >>> from kcs_torch.data.synthetic import walking_person
+    >>> tracks = walking_person(60, yaw=20).tracks
+    >>> left, right = torch.tensor(tracks.skeleton.mirror).T
+    >>> both = torch.cat([left, right])
+    >>> tracks.points[20:25, both] = tracks.points[20:25, torch.cat([right, left])]
+    >>> unswap(tracks).notes[-1]
+    'unswap: left and right swapped back in 5 of 60 (8.3 %) frames'
+    """
+    body, count = tracks.skeleton, tracks.skeleton.num_observed
+    pairs = [pair for pair in body.mirror if max(pair) < count]
+    if len(pairs) < _FEWEST:
+        return tracks
+    points, weights = tracks.points[:, :count].clone(), tracks.weights[:, :count].clone()
+    size = float(body_size(points, weights > 0))
+    found = []
+    for name, some in (("", pairs), *_limbs(body, pairs)):
+        left, right = torch.tensor(some, device=points.device).T
+        seen = (weights[:, left] > 0) & (weights[:, right] > 0)
+        penalty = _LIMB if name else _BODY
+        frames = swapped_frames(points[:, left], points[:, right], seen, size, penalty).nonzero()  # (F, 1)
+        if not len(frames):
+            continue
+        for values in (points, weights):
+            values[frames, left], values[frames, right] = values[frames, right], values[frames, left]
+        found.append(f"{share(len(frames), tracks.num_frames)} frames" + (f" ({name})" if name else ""))
+    if not found:
+        return tracks
+    return rebuilt(tracks, points, weights, f"unswap: left and right swapped back in {', in '.join(found)}")
+
+
+def _limbs(body: Skeleton, pairs: list[tuple[int, int]]) -> list[tuple[str, list[tuple[int, int]]]]:
+    """Pairs of joints outside the trunk that are connected, by the first joints' names."""
+    parent = {b: a for a, b in body.bones}
+    trunk = set(trunk_joints(body)) or {a for a, _ in pairs if body.side(parent.get(a, a)) != "left"}
+    twin = {a: b for a, b in pairs if a not in trunk}
+    pieces = find_pieces(body.num_joints, [bone for bone in body.bones if twin.keys() >= set(bone)])
+    limbs = [[(a, twin[a]) for a in piece if a in twin] for piece in pieces]
+    return [(f"from {body.joints[limb[0][0]]} on", limb) for limb in limbs if len(limb) >= _FEWEST]

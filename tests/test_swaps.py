@@ -1,0 +1,199 @@
+"""Left and right swapped back: exactly where they were swapped, and nowhere else."""
+
+import itertools
+import math
+
+import pytest
+import torch
+
+import kcs_torch as kt
+from kcs_torch.data.synthetic import walking_person
+from kcs_torch.solvers import swapped_frames
+from kcs_torch.solvers.swaps import LEAST, MEMORY, MOST, PAIRS, USUAL
+
+LIMBS = {
+    "arms": ["left_elbow", "left_wrist"],
+    "legs": ["left_knee", "left_ankle"],
+}
+
+
+def swap(tracks, frames, joints=None):
+    """The tracks with left and right exchanged in some frames, of all pairs or of those of some left joints."""
+    body = tracks.skeleton
+    pairs = [p for p in body.mirror if max(p) < body.num_observed and (joints is None or body.joints[p[0]] in joints)]
+    left, right = torch.tensor(pairs).T
+    points, weights = tracks.points[:, : body.num_observed].clone(), tracks.weights[:, : body.num_observed].clone()
+    frames = torch.tensor(frames)[:, None]
+    for values in (points, weights):
+        values[frames, left], values[frames, right] = values[frames, right], values[frames, left]
+    points, weights = body.complete(points, weights)
+    return kt.Tracks(points, weights, body, fps=tracks.fps, units=tracks.units)
+
+
+def walk(frames=90, yaw=40):
+    generator = torch.Generator().manual_seed(3)
+    one = walking_person(frames, yaw=yaw, skeleton="coco17", noise=3.0, generator=generator).tracks
+    confidence = 0.5 + 0.5 * torch.rand(one.weights.shape, generator=generator, dtype=one.weights.dtype)
+    points, weights = one.skeleton.complete(
+        one.points[:, : one.skeleton.num_observed], confidence[:, : one.skeleton.num_observed]
+    )
+    return kt.Tracks(points, weights, one.skeleton, fps=one.fps)
+
+
+def same(a, b):
+    torch.testing.assert_close(a.points, b.points)
+    torch.testing.assert_close(a.weights, b.weights)
+
+
+def naive(left, right, seen, size, penalty):
+    """The least cost of all signs, by trying all, and those signs."""
+    apart = left - right
+    frames, pairs = seen.shape
+    memory = min(MEMORY, frames - 1)
+    spans = [(a, b) for b in range(2, memory + 1) for a in range(1, b)]
+
+    def error(t, a, b, x, y):
+        line = (a * x * apart[t - b] + (b - a) * y * apart[t]) / b
+        return (apart[t - a] - line).norm(dim=-1)
+
+    usual = {}
+    for a, b in spans:
+        for p in range(pairs):
+            plain = [float(error(t, a, b, 1, 1)[p]) for t in range(b, frames) if seen[[t - b, t - a, t], p].all()]
+            middle = sorted(plain)[(len(plain) - 1) // 2] if plain else 0.0
+            usual[a, b, p] = max(USUAL * middle, LEAST * size)
+    best = math.inf, None
+    for signs in itertools.product((1, -1), repeat=frames):
+        cost = penalty * sum(s != t for s, t in itertools.pairwise(signs))
+        for a, b in spans:
+            for t in range(b, frames):
+                far = error(t, a, b, signs[t - b] * signs[t - a], signs[t] * signs[t - a])
+                for p in range(pairs):
+                    if seen[[t - b, t - a, t], p].all():
+                        e = min(float(far[p]) / usual[a, b, p], MOST)
+                        cost += 3 / len(spans) * min(1, PAIRS / pairs) * math.log1p(e * e)
+        best = min(best, (cost, signs))
+    return best
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_signs_are_the_best_of_all(seed):
+    generator = torch.Generator().manual_seed(seed)
+    frames, pairs = 4 + seed % 6, 2 + seed % 4
+    left = torch.randn(frames, pairs, 2, generator=generator, dtype=torch.float64).cumsum(0) / 3 + 1
+    right = torch.randn(frames, pairs, 2, generator=generator, dtype=torch.float64) / 5
+    seen = torch.rand(frames, pairs, generator=generator) > 0.15
+    seen[:, 0] = True  # no frame is left out, as the naive twin knows no gaps
+    turned = torch.rand(frames, generator=generator) > 0.7
+    left[turned], right[turned] = right[turned], left[turned]
+    cost, signs = naive(left, right, seen, 1.0, 1.5)
+    found = swapped_frames(left, right, seen, 1.0, 1.5)
+    expected = torch.tensor(signs) < 0
+    expected = ~expected if 2 * int(expected.sum()) > frames else expected
+    other = ~expected if 2 * int(expected.sum()) == frames else expected
+    assert torch.equal(found, expected) or torch.equal(found, other), cost
+
+
+@pytest.mark.parametrize("frames", [[30], [40, 41], list(range(10, 50)), [5, 7, 11, 12, 13, 60], list(range(80, 90))])
+@pytest.mark.parametrize("joints", [None, *LIMBS.values()], ids=["body", *LIMBS])
+def test_what_was_swapped_is_swapped_back(frames, joints):
+    tracks = walk()
+    mended = kt.clean.unswap(swap(tracks, frames, joints))
+    same(mended, tracks)
+    (note,) = mended.notes
+    assert f"swapped back in {len(frames)} of 90" in note
+    assert ("left_" in note) == (joints is not None)
+
+
+def test_both_at_once_and_while_nobody_is_seen():
+    tracks = walk()
+    weights = tracks.weights[:, :17].clone()
+    weights[48:52] = 0
+    points, weights = tracks.skeleton.complete(torch.where(weights[..., None] > 0, tracks.points[:, :17], 0), weights)
+    tracks = kt.Tracks(points, weights, tracks.skeleton, fps=tracks.fps)
+    mended = kt.clean.unswap(swap(swap(tracks, list(range(20, 31))), list(range(52, 70)), LIMBS["legs"]))
+    same(mended, tracks)
+
+
+@pytest.mark.parametrize("yaw", [0, 45, 90, 170])
+@pytest.mark.parametrize("rate", [1, 2])
+def test_a_walk_is_left_alone(yaw, rate):
+    tracks = walk(120, yaw=yaw)
+    tracks = kt.Tracks(tracks.points[::rate], tracks.weights[::rate], tracks.skeleton, fps=30 / rate)
+    assert kt.clean.unswap(tracks) is tracks  # seen from the side legs and arms cross at every step
+
+
+def test_outliers_are_no_swaps():
+    tracks = walk()
+    generator = torch.Generator().manual_seed(1)
+    hit = torch.rand(90, 17, generator=generator) < 0.05
+    tracks.points[:, :17][hit] += 150 * torch.randn(int(hit.sum()), 2, generator=generator, dtype=torch.float64)
+    points, weights = tracks.skeleton.complete(tracks.points[:, :17], tracks.weights[:, :17])
+    tracks = kt.Tracks(points, weights, tracks.skeleton, fps=tracks.fps)
+    assert kt.clean.unswap(tracks) is tracks
+
+
+def test_a_body_that_turns_about_itself_is_left_alone():
+    tracks = walking_person(90, turn=1080).tracks
+    assert kt.clean.unswap(tracks) is tracks
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 4])
+def test_hardly_any_frames(frames):
+    tracks = walk(frames)
+    assert kt.clean.unswap(tracks).num_frames == frames
+
+
+def test_nothing_to_tell():
+    still = walk(1)
+    still = kt.Tracks(still.points.expand(20, -1, -1), still.weights.expand(20, -1), still.skeleton)
+    assert kt.clean.unswap(still) is still
+    one_sided = walk()
+    one_sided.weights[:, [i for i in range(17) if one_sided.skeleton.side(i) == "left"]] = 0
+    assert kt.clean.unswap(one_sided) is one_sided
+    chain = kt.Tracks.from_arrays(torch.rand(10, 3, 2), skeleton=kt.Skeleton.from_edges([(0, 1), (1, 2)], 3))
+    assert kt.clean.unswap(chain) is chain
+    point = kt.Tracks(torch.zeros_like(still.points), still.weights, still.skeleton)
+    assert kt.clean.unswap(point) is point
+
+
+def test_single_precision_and_what_is_given_stay():
+    tracks = swap(walk(), [20, 21, 22])
+    before = tracks.points.clone()
+    kt.clean.unswap(tracks)
+    assert torch.equal(tracks.points, before)
+    small = kt.Tracks(tracks.points.float(), tracks.weights.float(), tracks.skeleton, fps=tracks.fps)
+    mended = kt.clean.unswap(small)
+    assert mended.points.dtype == mended.weights.dtype == torch.float32
+    torch.testing.assert_close(mended.points.double(), kt.clean.unswap(tracks).points, rtol=1e-5, atol=1e-3)
+
+
+def test_pkc_does_so_by_itself():
+    tracks = walk(60)
+    frames = list(range(20, 32))
+    wrong = swap(tracks, frames)
+    right, result = kt.reconstruct(tracks), kt.reconstruct(wrong)
+    torch.testing.assert_close(result.points, right.points)
+    same(result.tracks, tracks)
+    assert "unswap: left and right swapped back in 12 of 60 (20 %) frames" in result.tracks.notes
+    assert result.diagnostics.reprojection_rms == pytest.approx(right.diagnostics.reprojection_rms)
+    (many,) = kt.reconstruct_all([wrong])
+    same(many.tracks, tracks)
+    lens = (50000.0, 50000.0, 0.0, 0.0)  # pixels of a lens so long that rays are parallel
+    same(kt.reconstruct(wrong, intrinsics=lens).tracks, tracks)
+    assert kt.reconstruct(wrong, denoise=False).tracks is wrong
+    with pytest.warns(kt.KcsWarning, match="joints may be wrong, swapped"):
+        assert kt.reconstruct(wrong, method="sfam").tracks is wrong
+
+
+def test_a_detector_that_mistook_a_person(shared, protocol):
+    (case,) = [c for c in protocol.suites()["real_mediapipe"] if c["camera"] == 1]
+    given, _ = protocol.build(shared / "data", case)
+    tracks = kt.Tracks.from_arrays(
+        given["points2d"], given["confidence"], skeleton="mediapipe33", fps=float(given["fps"])
+    )
+    wrong = [60, 61, 63, 65, *range(67, 75)]  # from 41 on all the time, then to and fro; seen in the pictures
+    mended = kt.clean.unswap(tracks)
+    wrist, other = (mended.skeleton.index(f"{side}_wrist") for side in ("left", "right"))
+    swapped = (mended.points[:, wrist] == tracks.points[:, other]).all(-1)
+    assert swapped.nonzero().flatten().tolist() == [*range(41, 60), *wrong, 81]
