@@ -17,6 +17,7 @@ from kcs_torch.methods.pkc import method as module
 from kcs_torch.methods.pkc.batch import Noisy, clean_all, serve
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
+from kcs_torch.methods.pkc.moving_view import Descent
 from kcs_torch.methods.root import standing_feet
 
 # Many tests take few steps, after which nothing has settled.
@@ -231,7 +232,7 @@ def test_polish(turn, monkeypatch):
     polished = PKC()(clip.tracks)
     monkeypatch.setattr(body_module, "LONG", 60)
     blocks = PKC()(clip.tracks)
-    monkeypatch.setattr(Body, "polished", lambda self, found, other=None: left(found))
+    monkeypatch.setattr(Body, "polished", lambda self, found, steps, other=None: left(found))
     plain = PKC()(clip.tracks)
     share = 0.9 if turn == 0 else 0.5
     assert error(polished.points, clip.points) < share * error(plain.points, clip.points)
@@ -255,9 +256,36 @@ def test_polish_takes_no_mirror_image(turning):
     lengths = bone_lengths(torch.cat([body.image, depth[..., None]], -1), tracks.skeleton.bone_index()).median(0).values
     both = Hypotheses(torch.stack([depth, -depth]), lengths.expand(2, -1), torch.tensor([0.0, 0.1]).double())
     for found, sign in ((both, 1), (replace(both, depth=-both.depth), -1)):
-        polished = run(body.polished(found), serve)
+        polished = run(body.polished(found, 0), serve)
         assert_close(polished.depth[0], sign * depth, rtol=0, atol=0.02)
         assert_close(polished.depth[1], -sign * depth, rtol=0, atol=0)
+
+
+def test_polish_takes_nothing_that_the_template_rules_out(turning, monkeypatch):
+    """Bones whose lengths and changes fit better than the truth's are no rival where the body would be no body."""
+    clip, _ = turning
+    tracks = replace(
+        clip.tracks, points=centred(clip.tracks.points) / centred(clip.tracks.points).square().mean().sqrt()
+    )
+    body = Body(tracks.skeleton, tracks.points, 30.0, torch.zeros_like(tracks.weights))
+    depth = centred(clip.points)[..., 2] / centred(clip.points)[..., :2].square().mean().sqrt() * body.factor
+    asked = []
+
+    def answer(requests):
+        asked.extend(one for one in requests if isinstance(one, Descent))
+        return serve(requests)
+
+    found = run(body.rank(depth[None], 30), serve)
+    assert_close(found.depth[0], depth, rtol=0, atol=0.05)
+    near = depth + 0.02 * torch.sin(torch.arange(len(depth)).double() / 9)[:, None]
+    knee = [tracks.skeleton.index(name) for name in ("right_ankle", "left_ankle", "right_knee", "left_knee")]
+    wrong = depth.clone()
+    wrong[:, knee] *= -1
+    for other, count in ((near, 2), (-near, 2), (wrong, 1), (None, 1)):
+        asked.clear()
+        polished = run(body.polished(found, 30, other), answer)
+        assert [len(one.points) for one in asked] == [count]
+        assert_close(polished.depth[0], depth, rtol=0, atol=0.05)
 
 
 @pytest.mark.parametrize("turn", [15.0, 60.0])

@@ -47,7 +47,7 @@ POSTURE = 0.15
 """Energy of usual postures, for each bone and frame that counts. Deviations grow with it: the further postures stray,
 the less the template tells of them."""
 
-TURN, POWER = 22.0, 0.9
+TURN, POWER = 22.0, 1.1
 """Degrees of the viewpoint's turn that tell as much as the template, and the power of the turn that deviations fall
 with, as those of the moving viewpoint do."""
 

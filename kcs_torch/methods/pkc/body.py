@@ -22,7 +22,7 @@ from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.camera_path import choose_path, view_energy
 from kcs_torch.solvers.lm import fit_bones
-from kcs_torch.solvers.procrustean import COARSE, FINE, align_rotations
+from kcs_torch.solvers.procrustean import COARSE, Stage, align_rotations
 
 __all__ = ["TOLD", "Body"]
 
@@ -39,8 +39,11 @@ joints have to move (a heel, a finger) turns back and forth and never settles.""
 FRAMES = 4096
 """Frames of hypotheses whose bones are made constant at a time."""
 
+POLISH = Stage(1e-5, 60, 0.01, 1.0, 0.003)
+"""The moving viewpoint's last stage, with more steps: what is polished has been found already."""
+
 CLOSE, RIVALS = 10.0, 3
-"""By how much solutions may be dearer than the best to be polished as well, and how many are."""
+"""By how much solutions may be dearer than the best to be polished as well, and how many of its own kind are."""
 
 LEVEL = 0.001
 """Least noise, a share of the body's size, of tracks that are not exact throughout."""
@@ -152,13 +155,13 @@ class Body:
         path, kind, _ = choose_path(self.frames(found.depth[0]))
         return kind != "free" and float(viewpoint_turn(path[:, :2])) >= TURNING
 
-    def polished(self, found: Hypotheses, other: Tensor | None = None) -> Search[Any, Any, Hypotheses]:
+    def polished(self, found: Hypotheses, steps: int, other: Tensor | None = None) -> Search[Any, Any, Hypotheses]:
         """Hypotheses, the best refined on the log-determinant of aligned bones' changes, and of the bones themselves.
 
         What the objective counts for a few frames only, these count for all. Changes take away what moves each bone by
         itself. Before a viewpoint that turns, aligned bones tell depth better than the template does, and which of
-        close rivals is best; ``other`` depths (T, N), or their mirror image, are a rival then. Energies stay those of
-        the objective before, in their order.
+        close rivals is best; ``other`` depths (T, N), or their mirror image, are a rival then if ``steps`` on the
+        objective bring them as near. Energies stay those of the objective before, in their order.
         """
         skeleton, bones = self.skeleton, self.objective.bones
         if not skeleton.is_tree or skeleton.num_bones != skeleton.num_joints - 1:
@@ -169,9 +172,10 @@ class Body:
         pick = close.nonzero().flatten()[: RIVALS if around else 1]
         rivals = found[pick]
         if around and other is not None:
-            other = torch.where((other * found.depth[0]).sum() < 0, -other, other)
-            depth = torch.cat([rivals.depth, other[None]])
-            rivals = replace(rivals, depth=depth, energy=depth.new_zeros(len(depth)))
+            other = torch.where((other * found.depth[0]).sum() < 0, -other, other)[None]
+            ranked = yield from self.rank(other, steps)
+            if bool(ranked.energy[0] - found.energy[0] < CLOSE):
+                rivals = replace(rivals, depth=torch.cat([rivals.depth, other]))
         size = self.image.square().mean().sqrt()
         if not bool(size > 0):  # all joints lie at one point
             return found
@@ -179,12 +183,12 @@ class Body:
         if self.objective.noisy:  # where gaps were filled, at least
             level = max(level, LEVEL)
         sure = (level * size / self.noise.clamp_min(level * size)).square() if level > 0 else None
-        stages = tuple(soften(stage, level) for stage in ((*COARSE[-1:], *FINE) if around else FINE))
+        stages = tuple(soften(stage, level) for stage in ((COARSE[-1], POLISH) if around else (POLISH,)))
         points = torch.cat([self.image.expand(*rivals.depth.shape, 2), rivals.depth[..., None]], -1) / size
         turned = torch.stack([self.frames(depth) for depth in rivals.depth])
         turned = align_rotations(points, turned, bones)
         starts = window_starts(len(self.image), min(LONG, len(self.image)), min(OVERLAP, len(self.image) - 1))
-        depths, value = [], torch.zeros_like(rivals.energy)
+        depths, value = [], rivals.depth.new_zeros(len(rivals.depth))
         for some in (slice(first, first + LONG) for first in starts):
             weights, rigid = None if sure is None else sure[some], bones[list(skeleton.rigid)]
             one = points[:, some], turned[:, some], bones, weights, rigid, TIGHT, level, stages

@@ -192,7 +192,7 @@ class PKC(Method):
             if self.viewpoint == "auto" and body.turns(found):
                 moving, _ = yield from self._moving(tracks, image, noise, turns=())
                 other = moving.pose.points[0, ..., 2] * body.factor
-            found = yield from body.polished(found, other)
+            found = yield from body.polished(found, self.steps, other)
         return self._from_hypotheses(found, body, cameras, notes, detected(tracks.weights))
 
     def _clean(self, tracks: Tracks) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
