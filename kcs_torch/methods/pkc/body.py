@@ -22,7 +22,7 @@ from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.camera_path import choose_path, view_energy
 from kcs_torch.solvers.lm import fit_bones
-from kcs_torch.solvers.procrustean import COARSE, Stage, align_rotations
+from kcs_torch.solvers.procrustean import COARSE, FINE, Stage, align_rotations
 
 __all__ = ["TOLD", "Body"]
 
@@ -39,11 +39,14 @@ joints have to move (a heel, a finger) turns back and forth and never settles.""
 FRAMES = 4096
 """Frames of hypotheses whose bones are made constant at a time."""
 
-POLISH = Stage(1e-5, 60, 0.01, 1.0, 0.003)
-"""The moving viewpoint's last stage, with more steps: what is polished has been found already."""
+POLISH = (FINE[0], Stage(1e-5, 60, 0.01, 1.0, 0.003))
+"""The moving viewpoint's fine stages without the middle one, and with more steps in the last."""
 
 CLOSE, RIVALS = 10.0, 3
 """By how much solutions may be dearer than the best to be polished as well, and how many of its own kind are."""
+
+ONE = 20.0
+"""Frames that count as one in what rivals are chosen by: errors of the changes last."""
 
 LEVEL = 0.001
 """Least noise, a share of the body's size, of tracks that are not exact throughout."""
@@ -159,12 +162,13 @@ class Body:
         """Hypotheses, the best refined on the log-determinant of aligned bones' changes, and of the bones themselves.
 
         What the objective counts for a few frames only, these count for all. Changes take away what moves each bone by
-        itself. Before a viewpoint that turns, aligned bones tell depth better than the template does, and which of
-        close rivals is best; ``other`` depths (T, N), or their mirror image, are a rival then if ``steps`` on the
-        objective bring them as near. Energies stay those of the objective before, in their order.
+        itself. Before a viewpoint that turns, aligned bones tell depth better than the template does, and together with
+        it which of close rivals is best; ``other`` depths (T, N), or their mirror image, are a rival then, too, if they
+        come as near in ``steps`` on the objective. Energies stay those of the objective before, in their order.
         """
         skeleton, bones = self.skeleton, self.objective.bones
-        if not skeleton.is_tree or skeleton.num_bones != skeleton.num_joints - 1:
+        spans = skeleton.is_tree and skeleton.num_bones == skeleton.num_joints - 1
+        if not spans or not bool(self.image.any()):  # or all joints lie at one point
             return found
         around = self.turns(found)
         close = (found.energy - found.energy[0] < CLOSE) & ((found.depth * found.depth[0]).sum((1, 2)) > 0)
@@ -175,37 +179,39 @@ class Body:
             other = torch.where((other * found.depth[0]).sum() < 0, -other, other)[None]
             ranked = yield from self.rank(other, steps)
             if bool(ranked.energy[0] - found.energy[0] < CLOSE):
-                rivals = replace(rivals, depth=torch.cat([rivals.depth, other]))
-        size = self.image.square().mean().sqrt()
-        if not bool(size > 0):  # all joints lie at one point
-            return found
-        level = float(self.noise.median() / size)
-        if self.objective.noisy:  # where gaps were filled, at least
-            level = max(level, LEVEL)
-        sure = (level * size / self.noise.clamp_min(level * size)).square() if level > 0 else None
-        stages = tuple(soften(stage, level) for stage in ((COARSE[-1], POLISH) if around else (POLISH,)))
-        points = torch.cat([self.image.expand(*rivals.depth.shape, 2), rivals.depth[..., None]], -1) / size
-        turned = torch.stack([self.frames(depth) for depth in rivals.depth])
-        turned = align_rotations(points, turned, bones)
-        starts = window_starts(len(self.image), min(LONG, len(self.image)), min(OVERLAP, len(self.image) - 1))
-        depths, value = [], rivals.depth.new_zeros(len(rivals.depth))
-        for some in (slice(first, first + LONG) for first in starts):
-            weights, rigid = None if sure is None else sure[some], bones[list(skeleton.rigid)]
-            one = points[:, some], turned[:, some], bones, weights, rigid, TIGHT, level, stages
-            (pose,) = yield [Descent(self.image[some] / size, *one)]
-            depths.append(pose.points[..., 2].transpose(0, 1) * size)  # (T, H, N)
-            value = value + pose.objective
-        depth = blend_windows(torch.stack(depths), starts, len(self.image)).transpose(0, 1)
-        depth = depth[..., : skeleton.num_observed] @ self.objective.complete
-        depth = depth - depth.mean(-1, keepdim=True)
+                rivals = rivals.joined(replace(ranked, depth=other))
+        depth, value = yield from self._descended(rivals.depth, (COARSE[-1], *POLISH) if around else POLISH)
         points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
         lengths = bone_lengths(points, bones).median(1).values
-        best = value.argsort()[: len(pick)]
+        best = (rivals.energy + value / ONE).argsort()[: len(pick)]
         return replace(
             found,
             depth=found.depth.index_copy(0, pick, depth[best]),
             lengths=found.lengths.index_copy(0, pick, lengths[best]),
         )
+
+    def _descended(self, depth: Tensor, stages: tuple[Stage, ...]) -> Search[Any, Any, tuple[Tensor, Tensor]]:
+        """Depths (H, T, N) after stages of the moving viewpoint's descent, in blocks of long clips, and its values."""
+        skeleton, bones, frames = self.skeleton, self.objective.bones, len(self.image)
+        size = self.image.square().mean().sqrt()
+        level = float(self.noise.median() / size)
+        if self.objective.noisy:  # where gaps were filled, at least
+            level = max(level, LEVEL)
+        sure = (level * size / self.noise.clamp_min(level * size)).square() if level > 0 else None
+        points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1) / size
+        turned = align_rotations(points, torch.stack([self.frames(one) for one in depth]), bones)
+        settings = bones[list(skeleton.rigid)], TIGHT, level, tuple(soften(stage, level) for stage in stages)
+        starts = window_starts(frames, min(LONG, frames), min(OVERLAP, frames - 1))
+        depths, value = [], depth.new_zeros(len(depth))
+        for some in (slice(first, first + LONG) for first in starts):
+            weights = None if sure is None else sure[some]
+            one = Descent(self.image[some] / size, points[:, some], turned[:, some], bones, weights, *settings)
+            (pose,) = yield [one]
+            depths.append(pose.points[..., 2].transpose(0, 1) * size)  # (T, H, N)
+            value = value + pose.objective
+        depth = blend_windows(torch.stack(depths), starts, frames).transpose(0, 1)
+        depth = depth[..., : skeleton.num_observed] @ self.objective.complete
+        return depth - depth.mean(-1, keepdim=True), value
 
     def search(self, rounds: int, steps: int) -> Search[Any, Any, Hypotheses]:
         """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best."""
