@@ -39,7 +39,7 @@ joints have to move (a heel, a finger) turns back and forth and never settles.""
 FRAMES = 4096
 """Frames of hypotheses whose bones are made constant at a time."""
 
-POLISH = (FINE[0], Stage(1e-5, 60, 0.01, 1.0, 0.003))
+POLISH = (FINE[0], Stage(1e-5, 100, 0.01, 1.0, 0.003))
 """The moving viewpoint's fine stages without the middle one, and with more steps in the last."""
 
 CLOSE, RIVALS = 10.0, 3
