@@ -10,7 +10,7 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors, incidence, safe_norm
 from kcs_torch.functional.scatter import inverse_scatter
 
-__all__ = ["Curvature", "Levels", "block_roots", "frame_curvature", "whitening"]
+__all__ = ["Curvature", "Levels", "block_roots", "frame_curvature", "shown", "whitening"]
 
 Levels = list[tuple[float, Tensor, float, int]]
 """(weight, rows (H, T, 3B), eps, frames that a row links) of each log-determinant."""
@@ -64,6 +64,7 @@ def whitening(
     slack: float,
     reach: float,
     precision: Tensor | None = None,
+    counts: Tensor | None = None,
 ) -> Tensor:
     """Return roots (H, T, D, D) of the inverse of each frame's Hessian, of lengths and log-determinants.
 
@@ -78,13 +79,18 @@ def whitening(
         slack: standard deviation of a length.
         reach: slacks from which on nothing pulls.
         precision: curvature (H, T, N) of the residuals of x and of y, where they are free.
+        counts: (H,) frames of each start, where some are padded.
     """
     hypotheses, frames, joints, _ = points.shape
     inverse = points.new_zeros(hypotheses, 3 * len(bones), 3 * len(bones))
     for weight, rows, eps, linked in levels:
         inverse = inverse + linked * weight * inverse_scatter(rows, eps)
     length = safe_norm(bone_vectors(points, rigid))
-    spread = (length - length.mean(-2, keepdim=True)).square().mean(-2)  # var() warns where no pair is rigid
+    if counts is None:
+        spread = (length - length.mean(-2, keepdim=True)).square().mean(-2)  # var() warns where no pair is rigid
+    else:
+        off = (length - length.sum(-2, keepdim=True) / counts[:, None, None]) * shown(counts, frames)[..., None]
+        spread = off.square().sum(-2) / counts[:, None]
     pull = stiffness * (1 / (spread + slack**2) - 1 / (spread + (reach * slack) ** 2))
     size = free * joints + 3
     out = points.new_empty(hypotheses, frames, size, size)
@@ -96,6 +102,11 @@ def whitening(
             curvature.add_tracks(precision[:, part])
         out[:, part] = block_roots(curvature)
     return out
+
+
+def shown(counts: Tensor, frames: int) -> Tensor:
+    """(H, T) ones in the frames that each start has, zeros in those that pad it."""
+    return (torch.arange(frames, device=counts.device) < counts[:, None]).to(counts)
 
 
 def frame_curvature(points: Tensor, rotations: Tensor, bones: Tensor, precision: Tensor, free: int) -> Curvature:

@@ -23,7 +23,7 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors, safe_norm
 from kcs_torch.functional.scatter import scatter_log_det
-from kcs_torch.solvers.curvature import Levels, whitening
+from kcs_torch.solvers.curvature import Levels, shown, whitening
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.memory import give_back
 from kcs_torch.solvers.procrustean_descent import Descent
@@ -114,6 +114,7 @@ def procrustean(
     noise: float = 0.0,
     stages: Sequence[Stage] = COARSE + FINE,
     extra: Callable[[Tensor], Tensor] | None = None,
+    counts: Tensor | None = None,
 ) -> Pose:
     """Descend F from H starts at once, by L-BFGS in coordinates that whiten each frame's curvature.
 
@@ -129,14 +130,17 @@ def procrustean(
             leaves one unknown a joint; else there are three.
         stages: scales and weights, in order.
         extra: further energy (H,) of points (H, T, N, 3), differentiable.
+        counts: (H,) frames of each start, of clips that are padded with zeros to T; not with ``noise``. All if None.
 
     Returns:
         The :class:`Pose` of each start.
 
     Raises:
-        ShapeError: the shapes do not fit.
+        ShapeError: the shapes do not fit, or clips of several lengths are noisy.
     """
     _check(tracks, points, rotations, bones)
+    if counts is not None and noise > 0:
+        raise ShapeError("procrustean: counts: expected exact tracks (noise=0) of clips that are padded")
     hypotheses, frames, joints, _ = points.shape
     rigid = bones if rigid is None else rigid
     stiff = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device).expand(len(rigid))
@@ -144,7 +148,7 @@ def procrustean(
     zero = points.new_zeros(hypotheses)
     pose = Pose(points, rotations, zero, zero)
     for stage in stages:
-        pose = _descend(pose, tracks, bones, rigid, stiff, stage, share, noise, extra)
+        pose = _descend(pose, tracks, bones, rigid, stiff, stage, share, noise, extra, counts)
     return pose
 
 
@@ -158,19 +162,21 @@ def _descend(
     weights: Tensor,
     noise: float,
     extra: Callable[[Tensor], Tensor] | None,
+    counts: Tensor | None,
 ) -> Pose:
     """One stage, of which nothing large is left behind."""
     give_back(tracks.shape[0])
     points, rotations = pose.points, pose.rotations
-    levels = aligned_levels(points, rotations, bones, stage)
+    levels = aligned_levels(points, rotations, bones, stage, counts)
     precision = _precision(points, tracks, weights, noise) if noise > 0 else None
     roots = whitening(
-        points, rotations, bones, levels, 3 if noise > 0 else 1, rigid, stiffness, stage.slack, REACH, precision
+        points, rotations, bones, levels, 3 if noise > 0 else 1, rigid, stiffness, stage.slack, REACH, precision, counts
     )
     del levels
     descent = Descent(
         points, rotations, roots, bones, rigid, stiffness, stage,
         change=CHANGE, reach=REACH, tracks=tracks, weights=weights, noise=noise, extra=extra,
+        counts=counts,
     )  # fmt: skip
     start = points.new_zeros(len(points), roots[0, ..., 0].numel())
     solution = lbfgs(
@@ -179,7 +185,8 @@ def _descend(
     )  # fmt: skip
     assert solution.before is not None and solution.energy is not None
     points, rotations = descent.moved(solution.value)
-    moved = (points - descent.moved(solution.before)[0]).square().sum(-1).mean((-2, -1)).sqrt()
+    moved = (points - descent.moved(solution.before)[0]).square().sum(-1).mean(-1).sum(-1)
+    moved = (moved / (points.shape[1] if counts is None else counts)).sqrt()
     return Pose(points, nearest_rotation(rotations), solution.energy, moved)  # rounding would add up
 
 
@@ -224,15 +231,30 @@ def depth_deviation(
     return local * scale[:, None, None]
 
 
-def aligned_levels(points: Tensor, rotations: Tensor, bones: Tensor, stage: Stage) -> Levels:
-    """The rows whose scatter counts: (weight, rows (H, T', 3B), eps, frames that a row links)."""
+def aligned_levels(
+    points: Tensor, rotations: Tensor, bones: Tensor, stage: Stage, counts: Tensor | None = None
+) -> Levels:
+    """The rows whose scatter counts: (weight, rows (H, T', 3B), eps, frames that a row links).
+
+    Rows of clips of fewer frames are larger, so that the mean square over all T' is theirs.
+    """
     aligned = (bone_vectors(points, bones) @ rotations).flatten(-2)
-    aligned = aligned - aligned.mean(-2, keepdim=True)
+    frames = aligned.shape[-2]
+    if counts is None:
+        aligned = aligned - aligned.mean(-2, keepdim=True)
+        changes = aligned.diff(dim=-2)
+        poses = aligned
+    else:
+        within = shown(counts, frames)[..., None]
+        many = counts[:, None, None]
+        aligned = (aligned - aligned.sum(-2, keepdim=True) / many) * within
+        changes = aligned.diff(dim=-2) * within[:, 1:] * ((frames - 1) / (many - 1).clamp_min(1)).sqrt()
+        poses = aligned * (frames / many).sqrt()
     levels: Levels = []
     if stage.still > 0:
-        levels.append((stage.still, aligned, stage.eps, 1))
-    if stage.moving > 0 and aligned.shape[-2] > 2:
-        levels.append((stage.moving, aligned.diff(dim=-2), CHANGE * stage.eps, 2))
+        levels.append((stage.still, poses, stage.eps, 1))
+    if stage.moving > 0 and frames > 2:
+        levels.append((stage.moving, changes, CHANGE * stage.eps, 2))
     return levels
 
 

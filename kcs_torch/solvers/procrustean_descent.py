@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import incidence
+from kcs_torch.solvers.curvature import shown
 
 if TYPE_CHECKING:
     from kcs_torch.solvers.procrustean import Stage
@@ -44,6 +45,7 @@ class Descent:
         weights: (T, N) of them.
         noise: of them; 0 holds x and y.
         extra: further energy (H,) of points (H, T, N, 3), whose gradient autograd tells.
+        counts: (H,) frames of each start, where some are padded with zeros.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class Descent:
         weights: Tensor,
         noise: float,
         extra: Callable[[Tensor], Tensor] | None = None,
+        counts: Tensor | None = None,
     ) -> None:
         joints = points.shape[-2]
         self.slack, self.reach, self.noise, self.extra = stage.slack, reach, noise, extra
@@ -83,9 +86,11 @@ class Descent:
         self.cross = cross_matrix(points)
         frames = points.shape[1]
         self.still, self.moving = stage.still > 0, stage.moving > 0 and frames > 2
-        levels = [(stage.still, stage.eps, frames)] if self.still else []
-        levels += [(stage.moving, change * stage.eps, frames - 1)] if self.moving else []
-        # weights, eps and frames of the log-determinants: (levels, 1, 1, 1) each
+        self.counts = points.new_tensor([float(frames)]) if counts is None else counts  # (1,) or (H,)
+        self.within = None if counts is None else shown(counts, frames)[:, None]  # (H, 1, T)
+        levels = [(stage.still, stage.eps, 0)] if self.still else []
+        levels += [(stage.moving, change * stage.eps, 1)] if self.moving else []
+        # weights, eps and frames less than the clip's of the log-determinants: (levels, 1, 1, 1) each
         self.levels = points.new_tensor(levels).view(len(levels), 3, 1, 1, 1).unbind(1)
 
     def rows(self, index: Tensor) -> Descent:
@@ -93,6 +98,8 @@ class Descent:
         out = copy(self)
         for name in ("points", "rotations", "roots", "bones", "links", "flat"):
             setattr(out, name, getattr(self, name)[index])
+        if self.within is not None:
+            out.within, out.counts = self.within[index], self.counts[index]
         return out
 
     def moved(self, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -159,15 +166,21 @@ class Descent:
         Of few frames, Y^T Y is the smaller matrix: it has the eigenvalues of Y Y^T but for zeros, and
         (Y Y^T + e I)^-1 Y = Y (Y^T Y + e I)^-1.
         """
-        weights, eps, frames = self.levels
+        weights, eps, less = self.levels
+        frames = (self.counts[:, None, None] - less).clamp_min(1)  # (levels, 1 or H, 1, 1)
         last = aligned.shape[-1]
         zeros = max(0, aligned.shape[1] - last)
-        aligned -= aligned.mean(-1, keepdim=True)
+        aligned -= aligned.sum(-1, keepdim=True) / self.counts[:, None, None]
+        if self.within is not None:
+            aligned *= self.within
 
         def changes(run: slice) -> Tensor:
             """To the next frame, 0 from the last one on."""
             some = aligned[..., run.start : run.stop + 1].diff()
-            return some if run.stop < last else torch.nn.functional.pad(some, (0, 1))
+            some = some if run.stop < last else torch.nn.functional.pad(some, (0, 1))
+            if self.within is not None:  # 0 in its last frame, too
+                some *= torch.nn.functional.pad(self.within[..., 1:], (0, 1))[..., run]
+            return some
 
         kept = changes(slice(0, last)) if self.moving and last <= RUN else None
         poses = lambda run: aligned[..., run]  # noqa: E731
@@ -200,14 +213,16 @@ class Descent:
 
     def _lengths(self, loose: Tensor) -> tuple[Tensor, Tensor]:
         """The energy (H,) of lengths that vary, and its gradient (H, free, P, T) in the pairs' free coordinates."""
-        frames, least = loose.shape[-1], self.slack**2
+        least = self.slack**2
         size = (self.flat + loose.square().sum(1)).sqrt_()  # (H, P, T)
-        off = size - size.mean(-1, keepdim=True)
-        spread = off.square().mean(-1)
+        off = size - size.sum(-1, keepdim=True) / self.counts[:, None, None]
+        if self.within is not None:
+            off *= self.within
+        spread = off.square().sum(-1) / self.counts[:, None]
         low, high = spread + least, spread + self.reach**2 * least
         pull = self.stiffness * (1 / low - 1 / high)
         along = off.mul_(pull[..., None]).div_(size.clamp_min_(torch.finfo(size.dtype).tiny ** 0.5))
-        value = frames / 2 * (self.stiffness * (low / high).log()).sum(-1)
+        value = self.counts / 2 * (self.stiffness * (low / high).log()).sum(-1)
         return value, along[:, None] * loose
 
     def _tracks(self, points: Tensor, slope: Tensor) -> Tensor:

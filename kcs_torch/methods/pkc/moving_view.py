@@ -57,6 +57,9 @@ OTHER = 0.1
 TOGETHER = 1200
 """Frames of starts that are descended from as one batch; more would only fall out of the processor's cache."""
 
+PADDED = 1.5
+"""By how much clips that are padded to one length differ, at most."""
+
 WORTH = 20.0
 """Weight of how likely the path of each bone is by itself: a bone keeps its direction for about so many frames, which
 the other terms count one by one."""
@@ -128,40 +131,53 @@ class Descent:
 
     @property
     def kind(self) -> object:
-        """What descents must share to be made as one: exact tracks of one length, and all settings."""
+        """What descents must share to be made as one: exact tracks, and all settings."""
         if self.noise > 0 or self.weights is not None:
             return id(self)
         links = tuple(self.bones.flatten().tolist()), tuple(self.rigid.flatten().tolist())
-        return self.points.shape[1:], self.points.dtype, self.points.device, links, self.stiffness, self.stages
+        return self.points.shape[2:], self.points.dtype, self.points.device, links, self.stiffness, self.stages
 
 
 def descend_all(tasks: Sequence[Descent]) -> list[Pose]:
-    """:func:`procrustean` from each task's starts; those of one kind are descended from together."""
+    """:func:`procrustean` from each task's starts; those of one kind and of similar length together."""
     groups: dict[object, list[int]] = {}
-    for i, task in enumerate(tasks):
-        groups.setdefault(task.kind, []).append(i)
+    for i in sorted(range(len(tasks)), key=lambda i: tasks[i].points.shape[1]):
+        groups.setdefault(tasks[i].kind, []).append(i)
     out: dict[int, Pose] = {}
     for group in groups.values():
-        frames = tasks[group[0]].points.shape[1]
-        while group:
-            run, rows = [group.pop(0)], 0
-            rows = len(tasks[run[0]].points)
-            while group and (rows + len(tasks[group[0]].points)) * frames <= TOGETHER:
-                run.append(group.pop(0))
-                rows += len(tasks[run[-1]].points)
-            out |= zip(run, _descend([tasks[i] for i in run]), strict=True)
+        run: list[int] = []
+        rows = 0
+        for i in group:
+            count, frames = tasks[i].points.shape[:2]
+            shortest = tasks[run[0]].points.shape[1] if run else frames
+            if run and ((rows + count) * frames > TOGETHER or frames > PADDED * shortest):
+                out |= zip(run, _descend([tasks[i] for i in run]), strict=True)
+                run, rows = [], 0
+            run.append(i)
+            rows += count
+        out |= zip(run, _descend([tasks[i] for i in run]), strict=True)
     return [out[i] for i in range(len(tasks))]
 
 
 def _descend(tasks: list[Descent]) -> list[Pose]:
-    first = tasks[0]
-    points, rotations = torch.cat([t.points for t in tasks]), torch.cat([t.rotations for t in tasks])
+    """Tasks of one kind, the longest last, padded to its length."""
+    last, counts = tasks[-1], [len(task.points) for task in tasks]
+    frames = [task.points.shape[1] for task in tasks]
+    within = None
+    if frames[0] < frames[-1]:
+        within = torch.tensor(frames).repeat_interleave(torch.tensor(counts)).to(last.points)
+    held = torch.arange(frames[-1], device=last.points.device)
+    padded = [torch.nn.functional.pad(task.points, (0, 0, 0, 0, 0, frames[-1] - len(task.tracks))) for task in tasks]
+    turned = [task.rotations[:, held.clamp_max(len(task.tracks) - 1)] for task in tasks]
     pose = procrustean(
-        first.tracks, points, rotations, first.bones, weights=first.weights, rigid=first.rigid,
-        stiffness=first.stiffness, noise=first.noise, stages=first.stages,
+        last.tracks, torch.cat(padded), torch.cat(turned), last.bones, weights=last.weights, rigid=last.rigid,
+        stiffness=last.stiffness, noise=last.noise, stages=last.stages, counts=within,
     )  # fmt: skip
-    parts = (x.split([len(t.points) for t in tasks]) for x in (pose.points, pose.rotations, pose.objective, pose.moved))
-    return [Pose(*part) for part in zip(*parts, strict=True)]
+    parts = (x.split(counts) for x in (pose.points, pose.rotations, pose.objective, pose.moved))
+    return [
+        Pose(points[:, :count], rotations[:, :count], objective, moved)
+        for count, points, rotations, objective, moved in zip(frames, *parts, strict=True)
+    ]
 
 
 def moving_view(
