@@ -11,7 +11,16 @@ from torch.testing import assert_close
 
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.solvers import procrustean_descent as module
-from kcs_torch.solvers.procrustean import CHANGE, REACH, Stage, length_energy, motion_energy, track_energy
+from kcs_torch.solvers.curvature import whitening
+from kcs_torch.solvers.procrustean import (
+    CHANGE,
+    REACH,
+    Stage,
+    aligned_levels,
+    length_energy,
+    motion_energy,
+    track_energy,
+)
 from kcs_torch.solvers.procrustean_descent import Descent, Turn, cross_matrix
 
 STAGES = {
@@ -98,6 +107,60 @@ def test_pairs_that_are_no_bones(body, pairs, noise):
     rigid = torch.tensor(pairs, dtype=torch.long).reshape(-1, 2)
     descent, move, energy, start = problem(body, rigid=rigid, noise=noise)
     agree(descent, move, energy, normal(*start.shape))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_held_depths(noise):
+    """A pull on each depth, as autograd's of the same."""
+    descent, move, energy, start = problem(noise=noise)
+    held = normal(2, 12, BODY.num_joints, seed=8)
+    pulled = Descent(
+        descent.points.permute(0, 3, 2, 1), descent.rotations.permute(0, 3, 1, 2), descent.roots, BODY.bone_index(),
+        BODY.bone_index(), descent.stiffness, STAGES["changes"], change=CHANGE, reach=REACH,
+        tracks=normal(12, BODY.num_joints, 2, seed=2), weights=normal(12, BODY.num_joints, seed=3).abs(),
+        noise=noise, anchor=(held, 3.0),
+    )  # fmt: skip
+    both = lambda u: energy(u) + 1.5 * (move(u)[0][..., 2] - held).square().sum((-2, -1))  # noqa: E731
+    agree(pulled, move, both, normal(*start.shape))
+    agree(pulled.rows(torch.tensor([1])), lambda u: [x[1:] for x in move(torch.cat([u, u]))],
+          lambda u: both(torch.cat([u, u]))[1:], normal(*start.shape)[1:])  # fmt: skip
+
+
+@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("frames", [(12, 9), (40, 31, 27), (5, 5, 3)])
+def test_padded_clips_are_as_alone(frames, stage):
+    """Values, slopes and whitening of clips that are padded to one length; what pads them has no slope."""
+    longest, bones, stiff = max(frames), BODY.bone_index(), torch.ones(BODY.num_bones).double()
+    at = STAGES[stage]
+    counts = torch.tensor(frames).double()
+    points, turn = normal(len(frames), longest, BODY.num_joints, 3), rotations(len(frames), longest)
+    for one, count in zip(points, frames, strict=True):
+        one[count:] = 0
+    size = BODY.num_joints + 3
+    unused = {"tracks": points[0, ..., :2], "weights": points[0, ..., 0], "noise": 0.0}
+    given = {"change": CHANGE, "reach": REACH, "anchor": None} | unused
+    levels = lambda x, r, n: aligned_levels(x, r, bones, at, n)  # noqa: E731
+    roots = whitening(
+        points, turn, bones, levels(points, turn, counts), 1, bones, stiff, at.slack, REACH, counts=counts
+    )
+    assert roots.isfinite().all()
+    step = 0.1 * normal(len(frames), longest * size, seed=6)
+    for one, count in zip(step, frames, strict=True):
+        one[count * size :] = 0  # as there is no slope, nothing moves there
+    many = Descent(points, turn, roots, bones, bones, stiff, at, counts=counts, **given)
+    value, slope = many(step)
+    for i, count in enumerate(frames):
+        x, r = points[i : i + 1, :count], turn[i : i + 1, :count]
+        own = whitening(x, r, bones, levels(x, r, None), 1, bones, stiff, at.slack, REACH)
+        if count > 2:
+            assert_close(roots[i : i + 1, :count], own)
+        alone = Descent(x, r, roots[i : i + 1, :count], bones, bones, stiff, at, **given)
+        expected, slopes = alone(step[i : i + 1, : count * size])
+        assert_close(value[i : i + 1], expected)
+        assert_close(slope[i : i + 1, : count * size], slopes, rtol=1e-8, atol=1e-8 * float(slopes.abs().amax()))
+        assert not slope[i, count * size :].any()
+        (part,) = many.rows(torch.tensor([i]))(step[i : i + 1])[:1]
+        assert_close(part, expected)
 
 
 def test_further_energies():

@@ -115,6 +115,7 @@ def procrustean(
     stages: Sequence[Stage] = COARSE + FINE,
     extra: Callable[[Tensor], Tensor] | None = None,
     counts: Tensor | None = None,
+    anchor: float = 0.0,
 ) -> Pose:
     """Descend F from H starts at once, by L-BFGS in coordinates that whiten each frame's curvature.
 
@@ -131,6 +132,7 @@ def procrustean(
         stages: scales and weights, in order.
         extra: further energy (H,) of points (H, T, N, 3), differentiable.
         counts: (H,) frames of each start, of clips that are padded with zeros to T; not with ``noise``. All if None.
+        anchor: weight of half the squared distance of each depth from its start.
 
     Returns:
         The :class:`Pose` of each start.
@@ -147,8 +149,9 @@ def procrustean(
     share = tracks.new_ones(frames, joints) if weights is None else weights
     zero = points.new_zeros(hypotheses)
     pose = Pose(points, rotations, zero, zero)
+    pull = (points[..., 2], anchor) if anchor > 0 else None
     for stage in stages:
-        pose = _descend(pose, tracks, bones, rigid, stiff, stage, share, noise, extra, counts)
+        pose = _descend(pose, tracks, bones, rigid, stiff, stage, share, noise, extra, counts, pull)
     return pose
 
 
@@ -163,6 +166,7 @@ def _descend(
     noise: float,
     extra: Callable[[Tensor], Tensor] | None,
     counts: Tensor | None,
+    anchor: tuple[Tensor, float] | None,
 ) -> Pose:
     """One stage, of which nothing large is left behind."""
     give_back(tracks.shape[0])
@@ -170,13 +174,14 @@ def _descend(
     levels = aligned_levels(points, rotations, bones, stage, counts)
     precision = _precision(points, tracks, weights, noise) if noise > 0 else None
     roots = whitening(
-        points, rotations, bones, levels, 3 if noise > 0 else 1, rigid, stiffness, stage.slack, REACH, precision, counts
-    )
+        points, rotations, bones, levels, 3 if noise > 0 else 1, rigid, stiffness, stage.slack, REACH,
+        precision, counts, anchor[1] if anchor else 0.0,
+    )  # fmt: skip
     del levels
     descent = Descent(
         points, rotations, roots, bones, rigid, stiffness, stage,
         change=CHANGE, reach=REACH, tracks=tracks, weights=weights, noise=noise, extra=extra,
-        counts=counts,
+        counts=counts, anchor=anchor,
     )  # fmt: skip
     start = points.new_zeros(len(points), roots[0, ..., 0].numel())
     solution = lbfgs(

@@ -46,6 +46,7 @@ class Descent:
         noise: of them; 0 holds x and y.
         extra: further energy (H,) of points (H, T, N, 3), whose gradient autograd tells.
         counts: (H,) frames of each start, where some are padded with zeros.
+        anchor: depths (H, T, N) that hold each depth, and by what weight; or None.
     """
 
     def __init__(
@@ -65,12 +66,16 @@ class Descent:
         noise: float,
         extra: Callable[[Tensor], Tensor] | None = None,
         counts: Tensor | None = None,
+        anchor: tuple[Tensor, float] | None = None,
     ) -> None:
         joints = points.shape[-2]
         self.slack, self.reach, self.noise, self.extra = stage.slack, reach, noise, extra
         self.free = 3 if noise > 0 else 1
         self.points = points.permute(0, 3, 2, 1).contiguous()  # (H, 3, N, T)
         self.rotations = rotations.permute(0, 2, 3, 1).contiguous()  # (H, 3, 3, T)
+        self.away, self.anchor = None, 0.0
+        if anchor is not None:
+            self.away, self.anchor = (points[..., 2] - anchor[0]).mT.contiguous(), anchor[1]  # (H, N, T)
         self.roots = roots
         self.ends = incidence(bones, joints, dtype=points.dtype).mT  # (B, N)
         self.pairs = None if torch.equal(bones, rigid) else incidence(rigid, joints, dtype=points.dtype).mT
@@ -91,7 +96,8 @@ class Descent:
         levels = [(stage.still, stage.eps, 0)] if self.still else []
         levels += [(stage.moving, change * stage.eps, 1)] if self.moving else []
         # weights, eps and frames less than the clip's of the log-determinants: (levels, 1, 1, 1) each
-        self.levels = points.new_tensor(levels).view(len(levels), 3, 1, 1, 1).unbind(1)
+        *self.levels, less = points.new_tensor(levels).view(len(levels), 3, 1, 1, 1).unbind(1)
+        self.frames = (self.counts[:, None, None] - less).clamp_min_(1)  # (levels, 1 or H, 1, 1)
 
     def rows(self, index: Tensor) -> Descent:
         """That of some hypotheses."""
@@ -99,7 +105,9 @@ class Descent:
         for name in ("points", "rotations", "roots", "bones", "links", "flat"):
             setattr(out, name, getattr(self, name)[index])
         if self.within is not None:
-            out.within, out.counts = self.within[index], self.counts[index]
+            out.within, out.counts, out.frames = self.within[index], self.counts[index], self.frames[:, index]
+        if self.away is not None:
+            out.away = self.away[index]
         return out
 
     def moved(self, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -149,6 +157,10 @@ class Descent:
             value, slope = value + cost, self.ends.mT @ drawn + self.pairs.mT @ along
         if self.noise > 0:
             value = value + self._tracks(self.points + shift, slope)
+        if self.away is not None:
+            off = self.away + shift[:, -1]
+            value = value + self.anchor / 2 * off.square().sum((-2, -1))
+            slope[:, -1] += self.anchor * off
         if self.extra is not None:
             with torch.enable_grad():
                 leaf = self._placed(shift).requires_grad_()
@@ -166,11 +178,10 @@ class Descent:
         Of few frames, Y^T Y is the smaller matrix: it has the eigenvalues of Y Y^T but for zeros, and
         (Y Y^T + e I)^-1 Y = Y (Y^T Y + e I)^-1.
         """
-        weights, eps, less = self.levels
-        frames = (self.counts[:, None, None] - less).clamp_min(1)  # (levels, 1 or H, 1, 1)
+        weights, eps = self.levels
         last = aligned.shape[-1]
         zeros = max(0, aligned.shape[1] - last)
-        aligned -= aligned.sum(-1, keepdim=True) / self.counts[:, None, None]
+        aligned -= self._mean(aligned)
         if self.within is not None:
             aligned *= self.within
 
@@ -191,12 +202,12 @@ class Descent:
         square = lambda y: torch.bmm(y.mT, y) if zeros else torch.bmm(y, y.mT)  # noqa: E731
         # (levels, H, 3 B, 3 B) or (levels, H, T, T)
         parts = (torch.stack([square(rows(run)) for rows in levels]) for run in _runs(last))
-        scatter = functools.reduce(Tensor.add_, parts).div_(frames)
+        scatter = functools.reduce(Tensor.add_, parts).div_(self.frames)
         scatter.diagonal(dim1=-2, dim2=-1).add_(eps[..., 0])
         factor, info = torch.linalg.cholesky_ex(scatter)
         factor.masked_fill_((info != 0)[..., None, None], torch.nan)  # where nothing is left of eps
         half = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        value = ((weights * frames)[..., 0, 0] * (half + zeros / 2 * eps[..., 0, 0].log())).sum(0)
+        value = ((weights * self.frames)[..., 0, 0] * (half + zeros / 2 * eps[..., 0, 0].log())).sum(0)
         inverse = torch.cholesky_inverse(factor).mul_(weights)
         times = lambda y, part: torch.bmm(y, part) if zeros else torch.bmm(part, y)  # noqa: E731
 
@@ -211,14 +222,20 @@ class Descent:
 
         return value, slopes
 
+    def _mean(self, values: Tensor) -> Tensor:
+        """Over the frames of each clip, (H, D, 1) of (H, D, T) that are zero beyond them."""
+        if self.within is None:
+            return values.mean(-1, keepdim=True)
+        return values.sum(-1, keepdim=True) / self.counts[:, None, None]
+
     def _lengths(self, loose: Tensor) -> tuple[Tensor, Tensor]:
         """The energy (H,) of lengths that vary, and its gradient (H, free, P, T) in the pairs' free coordinates."""
         least = self.slack**2
         size = (self.flat + loose.square().sum(1)).sqrt_()  # (H, P, T)
-        off = size - size.sum(-1, keepdim=True) / self.counts[:, None, None]
+        off = size - self._mean(size)
         if self.within is not None:
             off *= self.within
-        spread = off.square().sum(-1) / self.counts[:, None]
+        spread = self._mean(off.square())[..., 0]
         low, high = spread + least, spread + self.reach**2 * least
         pull = self.stiffness * (1 / low - 1 / high)
         along = off.mul_(pull[..., None]).div_(size.clamp_min_(torch.finfo(size.dtype).tiny ** 0.5))

@@ -45,6 +45,9 @@ POLISH = (FINE[0], Stage(1e-5, 100, 0.01, 1.0, 0.003))
 CLOSE, RIVALS = 10.0, 3
 """By how much solutions may be dearer than the best to be polished as well, and how many of its own kind are."""
 
+HELD = 0.08
+"""Standard deviation by which polishing may move a depth, for a body of 1.75, each joint in each frame by itself."""
+
 ONE = 20.0
 """Frames that count as one in what rivals are chosen by: errors of the changes last."""
 
@@ -200,12 +203,16 @@ class Body:
         sure = (level * size / self.noise.clamp_min(level * size)).square() if level > 0 else None
         points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1) / size
         turned = align_rotations(points, torch.stack([self.frames(one) for one in depth]), bones)
-        settings = bones[list(skeleton.rigid)], TIGHT, level, tuple(soften(stage, level) for stage in stages)
+        rigid, soft = bones[list(skeleton.rigid)], tuple(soften(stage, level) for stage in stages)
+        anchor = float(size / HELD) ** 2
         starts = window_starts(frames, min(LONG, frames), min(OVERLAP, frames - 1))
         depths, value = [], depth.new_zeros(len(depth))
         for some in (slice(first, first + LONG) for first in starts):
             weights = None if sure is None else sure[some]
-            one = Descent(self.image[some] / size, points[:, some], turned[:, some], bones, weights, *settings)
+            one = Descent(
+                self.image[some] / size, points[:, some], turned[:, some], bones, weights, rigid,
+                TIGHT, level, soft, anchor,
+            )  # fmt: skip
             (pose,) = yield [one]
             depths.append(pose.points[..., 2].transpose(0, 1) * size)  # (T, H, N)
             value = value + pose.objective

@@ -128,6 +128,7 @@ class Descent:
     stiffness: float
     noise: float
     stages: tuple[Stage, ...]
+    anchor: float = 0.0
 
     @property
     def kind(self) -> object:
@@ -135,7 +136,15 @@ class Descent:
         if self.noise > 0 or self.weights is not None:
             return id(self)
         links = tuple(self.bones.flatten().tolist()), tuple(self.rigid.flatten().tolist())
-        return self.points.shape[2:], self.points.dtype, self.points.device, links, self.stiffness, self.stages
+        return (
+            self.points.shape[2:],
+            self.points.dtype,
+            self.points.device,
+            links,
+            self.stiffness,
+            self.stages,
+            self.anchor,
+        )
 
 
 def descend_all(tasks: Sequence[Descent]) -> list[Pose]:
@@ -172,6 +181,7 @@ def _descend(tasks: list[Descent]) -> list[Pose]:
     pose = procrustean(
         last.tracks, torch.cat(padded), torch.cat(turned), last.bones, weights=last.weights, rigid=last.rigid,
         stiffness=last.stiffness, noise=last.noise, stages=last.stages, counts=within,
+        anchor=last.anchor,
     )  # fmt: skip
     parts = (x.split(counts) for x in (pose.points, pose.rotations, pose.objective, pose.moved))
     return [
