@@ -568,13 +568,10 @@ def test_too_little_for_the_moving_viewpoint_is_told():
 
 
 def test_many_clips_take_few_more_operations_than_one():
-    """Counts, which no busy machine changes: what polishes clips joins only those of one length, and here are none.
-
-    Without polishing it is 2.4 times.
-    """
+    """Counts, which no busy machine changes: eight clips of eight lengths, padded to few batches."""
     clips = [walking_person(24 + i, turn=20.0 * (i % 3), yaw=40.0 * i).tracks for i in range(8)]
     one, many = (count_operations(lambda c=some: PKC().many(c)).total for some in (clips[3:4], clips))
-    assert many < 4.5 * one
+    assert many < 3.3 * one
 
 
 def test_several_clips_at_once():

@@ -113,14 +113,14 @@ def test_pairs_that_are_no_bones(body, pairs, noise):
 def test_held_depths(noise):
     """A pull on each depth, as autograd's of the same."""
     descent, move, energy, start = problem(noise=noise)
-    held = normal(2, 12, BODY.num_joints, seed=8)
+    held, weights = normal(2, 12, BODY.num_joints, seed=8), torch.tensor([3.0, 0.5]).double()
     pulled = Descent(
         descent.points.permute(0, 3, 2, 1), descent.rotations.permute(0, 3, 1, 2), descent.roots, BODY.bone_index(),
         BODY.bone_index(), descent.stiffness, STAGES["changes"], change=CHANGE, reach=REACH,
         tracks=normal(12, BODY.num_joints, 2, seed=2), weights=normal(12, BODY.num_joints, seed=3).abs(),
-        noise=noise, anchor=(held, 3.0),
+        noise=noise, anchor=(held, weights),
     )  # fmt: skip
-    both = lambda u: energy(u) + 1.5 * (move(u)[0][..., 2] - held).square().sum((-2, -1))  # noqa: E731
+    both = lambda u: energy(u) + weights / 2 * (move(u)[0][..., 2] - held).square().sum((-2, -1))  # noqa: E731
     agree(pulled, move, both, normal(*start.shape))
     agree(pulled.rows(torch.tensor([1])), lambda u: [x[1:] for x in move(torch.cat([u, u]))],
           lambda u: both(torch.cat([u, u]))[1:], normal(*start.shape)[1:])  # fmt: skip

@@ -65,7 +65,7 @@ def whitening(
     reach: float,
     precision: Tensor | None = None,
     counts: Tensor | None = None,
-    anchor: float = 0.0,
+    anchor: Tensor | None = None,
 ) -> Tensor:
     """Return roots (H, T, D, D) of the inverse of each frame's Hessian, of lengths and log-determinants.
 
@@ -81,7 +81,7 @@ def whitening(
         reach: slacks from which on nothing pulls.
         precision: curvature (H, T, N) of the residuals of x and of y, where they are free.
         counts: (H,) frames of each start, where some are padded.
-        anchor: curvature of what pulls on each depth.
+        anchor: (H,) curvature of what pulls on each depth.
     """
     hypotheses, frames, joints, _ = points.shape
     inverse = points.new_zeros(hypotheses, 3 * len(bones), 3 * len(bones))
@@ -102,8 +102,8 @@ def whitening(
         curvature.add_lengths(points[:, part], rigid, pull)
         if precision is not None:
             curvature.add_tracks(precision[:, part])
-        if anchor > 0:
-            curvature.matrix.diagonal(dim1=-2, dim2=-1)[..., (free - 1) * joints : free * joints] += anchor
+        if anchor is not None:
+            curvature.matrix.diagonal(dim1=-2, dim2=-1)[..., (free - 1) * joints : -3] += anchor[:, None, None]
         out[:, part] = block_roots(curvature)
     return out
 

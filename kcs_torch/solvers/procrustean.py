@@ -115,7 +115,7 @@ def procrustean(
     stages: Sequence[Stage] = COARSE + FINE,
     extra: Callable[[Tensor], Tensor] | None = None,
     counts: Tensor | None = None,
-    anchor: float = 0.0,
+    anchor: Tensor | float = 0.0,
 ) -> Pose:
     """Descend F from H starts at once, by L-BFGS in coordinates that whiten each frame's curvature.
 
@@ -132,7 +132,7 @@ def procrustean(
         stages: scales and weights, in order.
         extra: further energy (H,) of points (H, T, N, 3), differentiable.
         counts: (H,) frames of each start, of clips that are padded with zeros to T; not with ``noise``. All if None.
-        anchor: weight of half the squared distance of each depth from its start.
+        anchor: (H,) or a number, weight of half the squared distance of each depth from its start.
 
     Returns:
         The :class:`Pose` of each start.
@@ -149,7 +149,8 @@ def procrustean(
     share = tracks.new_ones(frames, joints) if weights is None else weights
     zero = points.new_zeros(hypotheses)
     pose = Pose(points, rotations, zero, zero)
-    pull = (points[..., 2], anchor) if anchor > 0 else None
+    weight = torch.as_tensor(anchor, dtype=points.dtype, device=points.device).expand(hypotheses)
+    pull = (points[..., 2], weight) if isinstance(anchor, Tensor) or anchor > 0 else None
     for stage in stages:
         pose = _descend(pose, tracks, bones, rigid, stiff, stage, share, noise, extra, counts, pull)
     return pose
@@ -166,7 +167,7 @@ def _descend(
     noise: float,
     extra: Callable[[Tensor], Tensor] | None,
     counts: Tensor | None,
-    anchor: tuple[Tensor, float] | None,
+    anchor: tuple[Tensor, Tensor] | None,
 ) -> Pose:
     """One stage, of which nothing large is left behind."""
     give_back(tracks.shape[0])
@@ -175,7 +176,7 @@ def _descend(
     precision = _precision(points, tracks, weights, noise) if noise > 0 else None
     roots = whitening(
         points, rotations, bones, levels, 3 if noise > 0 else 1, rigid, stiffness, stage.slack, REACH,
-        precision, counts, anchor[1] if anchor else 0.0,
+        precision, counts, anchor[1] if anchor else None,
     )  # fmt: skip
     del levels
     descent = Descent(

@@ -46,7 +46,7 @@ class Descent:
         noise: of them; 0 holds x and y.
         extra: further energy (H,) of points (H, T, N, 3), whose gradient autograd tells.
         counts: (H,) frames of each start, where some are padded with zeros.
-        anchor: depths (H, T, N) that hold each depth, and by what weight; or None.
+        anchor: depths (H, T, N) that hold each depth, and by what weights (H,); or None.
     """
 
     def __init__(
@@ -66,16 +66,16 @@ class Descent:
         noise: float,
         extra: Callable[[Tensor], Tensor] | None = None,
         counts: Tensor | None = None,
-        anchor: tuple[Tensor, float] | None = None,
+        anchor: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         joints = points.shape[-2]
         self.slack, self.reach, self.noise, self.extra = stage.slack, reach, noise, extra
         self.free = 3 if noise > 0 else 1
         self.points = points.permute(0, 3, 2, 1).contiguous()  # (H, 3, N, T)
         self.rotations = rotations.permute(0, 2, 3, 1).contiguous()  # (H, 3, 3, T)
-        self.away, self.anchor = None, 0.0
+        self.away: Tensor | None = None
         if anchor is not None:
-            self.away, self.anchor = (points[..., 2] - anchor[0]).mT.contiguous(), anchor[1]  # (H, N, T)
+            self.away, self.anchor = (points[..., 2] - anchor[0]).mT.contiguous(), anchor[1]  # (H, N, T) and (H,)
         self.roots = roots
         self.ends = incidence(bones, joints, dtype=points.dtype).mT  # (B, N)
         self.pairs = None if torch.equal(bones, rigid) else incidence(rigid, joints, dtype=points.dtype).mT
@@ -107,7 +107,7 @@ class Descent:
         if self.within is not None:
             out.within, out.counts, out.frames = self.within[index], self.counts[index], self.frames[:, index]
         if self.away is not None:
-            out.away = self.away[index]
+            out.away, out.anchor = self.away[index], self.anchor[index]
         return out
 
     def moved(self, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -160,7 +160,7 @@ class Descent:
         if self.away is not None:
             off = self.away + shift[:, -1]
             value = value + self.anchor / 2 * off.square().sum((-2, -1))
-            slope[:, -1] += self.anchor * off
+            slope[:, -1] += self.anchor[:, None, None] * off
         if self.extra is not None:
             with torch.enable_grad():
                 leaf = self._placed(shift).requires_grad_()

@@ -20,7 +20,7 @@ APART = 0.04
 CLOSE = 10.0
 """Objective by which another solution may be worse and still be a rival."""
 
-ANGLE = 0.165
+ANGLE = 0.15
 """Standard deviation, in radians, of a bone's angle to the image plane where it is nearest to it: what postures, hinges
 and proportions tell of a length that no crossing of the plane tells."""
 

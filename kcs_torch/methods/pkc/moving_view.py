@@ -132,19 +132,12 @@ class Descent:
 
     @property
     def kind(self) -> object:
-        """What descents must share to be made as one: exact tracks, and all settings."""
+        """What descents must share to be made as one: exact tracks, and all settings but how depths are held."""
         if self.noise > 0 or self.weights is not None:
             return id(self)
         links = tuple(self.bones.flatten().tolist()), tuple(self.rigid.flatten().tolist())
-        return (
-            self.points.shape[2:],
-            self.points.dtype,
-            self.points.device,
-            links,
-            self.stiffness,
-            self.stages,
-            self.anchor,
-        )
+        settings = links, self.stiffness, self.stages, self.anchor > 0
+        return self.points.shape[2:], self.points.dtype, self.points.device, settings
 
 
 def descend_all(tasks: Sequence[Descent]) -> list[Pose]:
@@ -175,13 +168,14 @@ def _descend(tasks: list[Descent]) -> list[Pose]:
     within = None
     if frames[0] < frames[-1]:
         within = torch.tensor(frames).repeat_interleave(torch.tensor(counts)).to(last.points)
+    anchor = torch.cat([task.points.new_full((len(task.points),), task.anchor) for task in tasks])
     held = torch.arange(frames[-1], device=last.points.device)
     padded = [torch.nn.functional.pad(task.points, (0, 0, 0, 0, 0, frames[-1] - len(task.tracks))) for task in tasks]
     turned = [task.rotations[:, held.clamp_max(len(task.tracks) - 1)] for task in tasks]
     pose = procrustean(
         last.tracks, torch.cat(padded), torch.cat(turned), last.bones, weights=last.weights, rigid=last.rigid,
         stiffness=last.stiffness, noise=last.noise, stages=last.stages, counts=within,
-        anchor=last.anchor,
+        anchor=anchor if last.anchor > 0 else 0.0,
     )  # fmt: skip
     parts = (x.split(counts) for x in (pose.points, pose.rotations, pose.objective, pose.moved))
     return [
