@@ -7,7 +7,8 @@ import torch
 
 from kcs_torch.data.synthetic import random_motion, walking_person
 from kcs_torch.functional import bone_lengths, complete_rotation, viewpoint_turn
-from kcs_torch.methods.pkc.moving_view import Descent, descend_all, moving_view
+from kcs_torch.methods.pkc.descents import Descent, descend_all
+from kcs_torch.methods.pkc.moving_view import moving_view
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.procrustean import Stage, align_rotations
 

@@ -16,8 +16,8 @@ from kcs_torch.methods.pkc import body as body_module
 from kcs_torch.methods.pkc import method as module
 from kcs_torch.methods.pkc.batch import Noisy, clean_all, serve
 from kcs_torch.methods.pkc.body import Body
+from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
-from kcs_torch.methods.pkc.moving_view import Descent
 from kcs_torch.methods.root import standing_feet
 
 # Many tests take few steps, after which nothing has settled.

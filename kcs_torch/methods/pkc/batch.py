@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kcs_torch.methods.pkc.moving_view import Descent, descend_all
+from kcs_torch.methods.pkc.descents import Descent, descend_all
 from kcs_torch.methods.pkc.objective import Objective, Refined
 from kcs_torch.methods.pkc.placing import Placing, limb_paths
 from kcs_torch.methods.pkc.trunk import Facing, facings

@@ -14,13 +14,13 @@ from kcs_torch.errors import OptionError, counted
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import Estimate, Method
-from kcs_torch.methods.finish import loose_bones
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.batch import Noisy, Sized, serve
-from kcs_torch.methods.pkc.body import TOLD, Body
+from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
+from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
 from kcs_torch.methods.pkc.moving_view import TURNS, MovingView
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.root import standing_feet
@@ -28,8 +28,6 @@ from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.unseen import gap_deviation, place_unseen
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.solvers.camera_path import view_energy
-from kcs_torch.solvers.procrustean import COARSE, FINE
 from kcs_torch.types import Tracks
 
 __all__ = ["PKC"]
@@ -54,27 +52,8 @@ HELD = 0.1
 """Standard deviation, a share of the body's size, of joints in frames before the body is first seen and after it was
 last seen, and the largest in gaps."""
 
-MOVING_STEPS = sum(stage.num_steps for stage in (*COARSE, *FINE))
-"""L-BFGS steps of the moving viewpoint's solver, at most."""
-
-STILL = 0.01
-"""A solution has settled where the last ten steps (fewer tell nothing) moved depths by no more than so much, root mean
-square: a share of the body's size."""
-
 AGAIN = 3
 """How often depths of the moving viewpoint are refined anew until they settle."""
-
-SURE, DOUBT = 0.8, 0.6
-"""Correlation with SfAM's depths from which on those of the moving viewpoint are sure, and below which they are a
-guess. Before cameras that turn by 180 degrees it is above .95 for people, dogs and hands, by 60 about .8, by none
-.3 and less; of robots, whose joints turn about fixed axes, it says little."""
-
-LEAD = 6.0
-"""Lead of a solution whose bones are held to their lengths (see :class:`MovingView`) that is as sure as full agreement:
-of 47 views of robot arms, real and random, 14 had one, and 12 of these had a tenth of a flat guess's error or less."""
-
-BROKEN = 0.5
-"""How sure a solution is at most, 1 being full agreement, that does not keep the lengths of rigid bones."""
 
 TELLING = 2.0
 """Degrees of the turn of known cameras from which on they tell the sign of depth."""
@@ -177,7 +156,7 @@ class PKC(Method):
                 (first,) = (yield [seen]) if cameras is None else [SfAM().solve(seen, cameras)]
                 return replace(first, notes=(*notes, "so few frames or joints are solved by sfam", *first.notes))
             moving, first = yield from self._moving(tracks, image, noise)
-            return self._from_moving(moving, first, skeleton, cameras, notes)
+            return from_moving(moving, first, skeleton, cameras, notes, mirrored=self.alternatives > 0)
         if enough and self.viewpoint == "moving":
             moving, _ = yield from self._moving(tracks, image, noise)
             found = yield from self._ranked(body, moving)
@@ -244,51 +223,6 @@ class PKC(Method):
             yield from turning(image, tracks.skeleton, *start, turns=turns, lifts=lifts, exact=exact, seed=self.seed)
         ), first
 
-    def _from_moving(
-        self,
-        moving: MovingView,
-        first: Estimate,
-        skeleton: Skeleton,
-        cameras: Tensor | None,
-        notes: tuple[str, ...],
-    ) -> Estimate:
-        """The estimate and its mirror image, which nothing but known cameras tells apart.
-
-        Where the viewpoint hardly turns the objective has many minima. SfAM, which looks for depth in another way, then
-        finds other depths: how far both agree is how far depth is to be believed. Of few bones that are held to their
-        lengths, many solutions have been compared: one that leads by far needs no other witness. Where bones that are
-        rigid change their length all the same, the solution is wrong.
-        """
-        points, turned = moving.pose.points[0], moving.cameras()[0]
-        path, told, flip = turned, False, points.new_tensor([1.0, 1.0, -1.0])
-        if cameras is not None:
-            path = complete_rotation(cameras)
-            right, wrong = view_energy(torch.stack([points, points * flip]), path).tolist()
-            points, told = points if right <= wrong else points * flip, abs(right - wrong) > TOLD
-        one = torch.ones_like(points[:, 0, 0])
-        value = float(moving.pose.objective[0])
-        settled = bool(moving.pose.moved[0] <= STILL)
-        agree = _agreement(points[..., 2], first.points[..., 2])
-        size = points[..., 2].square().mean().sqrt()
-        sure = witnessed = max(agree / SURE, moving.lead / LEAD)
-        if loose_bones(points, skeleton):  # of which another warning tells
-            sure = min(sure, BROKEN)
-        spread = (moving.deviation(turned).square() + (size * max(0.0, 1 - sure)).square()).sqrt()
-        doubt = ""
-        if witnessed < DOUBT / SURE:
-            doubt = (
-                "depth is little more than a guess: two methods find depths that hardly agree "
-                f"(correlation {agree:.2f}). The viewpoint should turn about the body by 60 degrees or more, or "
-                "the skeleton have a template"
-            )
-        main = Estimate(points, path[:, :2], one, settled, MOVING_STEPS, notes, spread, value, doubt=doubt)
-        if told or not self.alternatives:
-            return main
-        seen = path[:, :2] if cameras is not None else path[:, :2] * flip
-        said = ("the mirror image in depth",)
-        other = replace(main, points=points * flip, cameras=seen, notes=said, doubt="")
-        return replace(main, alternatives=(other,))
-
     def _ranked(self, body: Body, moving: MovingView) -> Search[Any, Any, Hypotheses]:
         """The moving viewpoint's solution and its mirror image, of a body with a template."""
         depth = moving.pose.points[:1, ..., 2] * body.factor
@@ -330,12 +264,6 @@ def _complete(tracks: Tracks, image: Tensor) -> Tracks:
 def _turns(cameras: Tensor | None) -> bool:
     """Whether known cameras turn far enough to tell the sign of depth."""
     return cameras is not None and float(viewpoint_turn(cameras)) >= TELLING
-
-
-def _agreement(depth: Tensor, other: Tensor) -> float:
-    """Correlation of two solutions' depths (T, N), whichever mirror images they are."""
-    a, b = (z - z.mean(-1, keepdim=True) for z in (depth, other))
-    return float((a * b).sum().abs() / (a.norm() * b.norm()).clamp_min(torch.finfo(a.dtype).tiny))
 
 
 def detected(weights: Tensor) -> bool:

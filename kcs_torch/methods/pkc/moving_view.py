@@ -14,6 +14,7 @@ from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.lockstep import Search, run
 from kcs_torch.methods.pkc.assembly import Assembly, followed
+from kcs_torch.methods.pkc.descents import Descent, descend_all
 from kcs_torch.nn.unrolled import UnrolledFPC
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.bone_paths import bone_paths, path_energy
@@ -28,10 +29,9 @@ from kcs_torch.solvers.procrustean import (
     depth_deviation,
     length_energy,
     motion_energy,
-    procrustean,
 )
 
-__all__ = ["TIGHT", "Descent", "MovingView", "descend_all", "moving_view", "searching", "soften"]
+__all__ = ["TIGHT", "MovingView", "moving_view", "searching", "soften"]
 
 TURNS = (30.0, 60.0, 90.0, 120.0, 180.0, 360.0)
 """Degrees that the cameras of the starts turn, evenly, about the image's vertical."""
@@ -53,12 +53,6 @@ SAME = 0.05
 
 OTHER = 0.1
 """Root mean square difference of depths from which on solutions are different bodies."""
-
-TOGETHER = 1200
-"""Frames of starts that are descended from as one batch; more would only fall out of the processor's cache."""
-
-PADDED = 1.5
-"""By how much clips that are padded to one length differ, at most."""
 
 WORTH = 20.0
 """Weight of how likely the path of each bone is by itself: a bone keeps its direction for about so many frames, which
@@ -113,75 +107,6 @@ class MovingView:
         return depth_deviation(
             pose.points, pose.rotations, self.bones, turn=travel, rigid=self.rigid, stiffness=self.stiffness
         )[0]
-
-
-@dataclass(frozen=True)
-class Descent:
-    """Starts that are to be descended from, as :func:`procrustean` does; its arguments."""
-
-    tracks: Tensor
-    points: Tensor
-    rotations: Tensor
-    bones: Tensor
-    weights: Tensor | None
-    rigid: Tensor
-    stiffness: float
-    noise: float
-    stages: tuple[Stage, ...]
-    anchor: float = 0.0
-
-    @property
-    def kind(self) -> object:
-        """What descents must share to be made as one: exact tracks, and all settings but how depths are held."""
-        if self.noise > 0 or self.weights is not None:
-            return id(self)
-        links = tuple(self.bones.flatten().tolist()), tuple(self.rigid.flatten().tolist())
-        settings = links, self.stiffness, self.stages, self.anchor > 0
-        return self.points.shape[2:], self.points.dtype, self.points.device, settings
-
-
-def descend_all(tasks: Sequence[Descent]) -> list[Pose]:
-    """:func:`procrustean` from each task's starts; those of one kind and of similar length together."""
-    groups: dict[object, list[int]] = {}
-    for i in sorted(range(len(tasks)), key=lambda i: tasks[i].points.shape[1]):
-        groups.setdefault(tasks[i].kind, []).append(i)
-    out: dict[int, Pose] = {}
-    for group in groups.values():
-        run: list[int] = []
-        rows = 0
-        for i in group:
-            count, frames = tasks[i].points.shape[:2]
-            shortest = tasks[run[0]].points.shape[1] if run else frames
-            if run and ((rows + count) * frames > TOGETHER or frames > PADDED * shortest):
-                out |= zip(run, _descend([tasks[i] for i in run]), strict=True)
-                run, rows = [], 0
-            run.append(i)
-            rows += count
-        out |= zip(run, _descend([tasks[i] for i in run]), strict=True)
-    return [out[i] for i in range(len(tasks))]
-
-
-def _descend(tasks: list[Descent]) -> list[Pose]:
-    """Tasks of one kind, the longest last, padded to its length."""
-    last, counts = tasks[-1], [len(task.points) for task in tasks]
-    frames = [task.points.shape[1] for task in tasks]
-    within = None
-    if frames[0] < frames[-1]:
-        within = torch.tensor(frames).repeat_interleave(torch.tensor(counts)).to(last.points)
-    anchor = torch.cat([task.points.new_full((len(task.points),), task.anchor) for task in tasks])
-    held = torch.arange(frames[-1], device=last.points.device)
-    padded = [torch.nn.functional.pad(task.points, (0, 0, 0, 0, 0, frames[-1] - len(task.tracks))) for task in tasks]
-    turned = [task.rotations[:, held.clamp_max(len(task.tracks) - 1)] for task in tasks]
-    pose = procrustean(
-        last.tracks, torch.cat(padded), torch.cat(turned), last.bones, weights=last.weights, rigid=last.rigid,
-        stiffness=last.stiffness, noise=last.noise, stages=last.stages, counts=within,
-        anchor=anchor if last.anchor > 0 else 0.0,
-    )  # fmt: skip
-    parts = (x.split(counts) for x in (pose.points, pose.rotations, pose.objective, pose.moved))
-    return [
-        Pose(points[:, :count], rotations[:, :count], objective, moved)
-        for count, points, rotations, objective, moved in zip(frames, *parts, strict=True)
-    ]
 
 
 def moving_view(
