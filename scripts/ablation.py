@@ -47,9 +47,9 @@ PARTS = {
 SYNTHETIC = ("walk", "walk, 15 mm noise", "tree", "arm")
 YAWS = (0.0, 45.0, 90.0, 135.0)
 # import_module, as the package's functions have the names of these modules
-BODY, FIXED, FLIPS, MOVING, OBJECTIVE, DESCENT = (
+BODY, FIXED, FLIPS, MOVING, OBJECTIVE, DESCENT, DESCENTS = (
     import_module(f"kcs_torch.methods.pkc.{name}")
-    for name in ("body", "fixed_view", "flips", "moving_view", "objective", "descent")
+    for name in ("body", "fixed_view", "flips", "moving_view", "objective", "descent", "descents")
 )
 WRITTEN_OUT = {"posture": "_posture", "foreshortening": "_foreshortening", "proportions": "_sizes"}
 """Terms of the objective, and the methods of its descent that hold them once more, gradients and all."""
@@ -111,7 +111,7 @@ def first_alone(start: Callable[..., Any]) -> Callable[..., Any]:
     return search
 
 
-def as_found(body: Any, found: Any, other: Any = None) -> Any:
+def as_found(body: Any, found: Any, steps: int, other: Any = None) -> Any:
     """A polish that leaves all as it is."""
     yield from ()
     return found
@@ -181,7 +181,7 @@ MOVING_VARIANTS = {
     ),
     "lengths free": Variant(
         changes=(
-            (MOVING, "procrustean", lambda solve: lambda *args, **more: solve(*args, **more | {"stiffness": 0.0})),
+            (DESCENTS, "procrustean", lambda solve: lambda *args, **more: solve(*args, **more | {"stiffness": 0.0})),
             constant(MOVING, "length_energy", lambda points, *_: points.new_zeros(len(points))),
         )
     ),
