@@ -335,14 +335,29 @@ def test_known_cameras_and_markers():
 # ---------------------------------------------------------------------- units, types
 
 
-@pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e4])
+@pytest.mark.parametrize("factor", [2.0**-20, 2.0**13])
 def test_units_scale_the_result(still, factor):
+    """Powers of two are not rounded, so that not a bit of the result may change."""
+    clip, _ = still
+    points = clip.tracks.points
+    plain, other = (PKC(**QUICK)(replace(clip.tracks, points=p)) for p in (points, factor * points))
+    for found, expected in zip((other, *other.alternatives), (plain, *plain.alternatives), strict=True):
+        assert torch.equal(found.points / factor, expected.points)
+        assert torch.equal(found.uncertainty / factor, expected.uncertainty)
+        assert torch.equal(found.lengths / factor, expected.lengths)
+        assert found.objective == expected.objective
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e4])
+def test_rounding_changes_little(still, factor):
+    """Polishing stops on its way along a shallow valley, where rounding moves a joint or two by a millimetre."""
     clip, _ = still
     points = clip.tracks.points
     plain, other = (PKC(**QUICK)(replace(clip.tracks, points=p)) for p in (points, factor * points - 5 * factor))
     for found, expected in zip((other, *other.alternatives), (plain, *plain.alternatives), strict=True):
-        assert_close(centred(found.points) / factor, centred(expected.points), rtol=0, atol=1.0)  # mm
-        assert_close(found.uncertainty / factor, expected.uncertainty, rtol=0.01, atol=1.0)
+        moved = centred(found.points) / factor - centred(expected.points)
+        assert float(moved.square().mean().sqrt()) < 0.5 and float(moved.abs().amax()) < 3.0  # mm
+        assert_close(found.uncertainty / factor, expected.uncertainty, rtol=0.02, atol=1.0)
         assert_close(found.lengths / factor, expected.lengths, rtol=0, atol=1.0)
         assert found.objective == pytest.approx(expected.objective, abs=0.1)
 
