@@ -2,12 +2,13 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 import kcs_torch as kt
-from kcs_torch.data.synthetic import walking_person
+from kcs_torch.data.synthetic import random_motion, walking_person
 from kcs_torch.solvers import swapped_frames
 from kcs_torch.solvers.swaps import LEAST, MEMORY, MOST, PAIRS, USUAL
 
@@ -101,8 +102,8 @@ def test_what_was_swapped_is_swapped_back(frames, joints):
     mended = kt.clean.unswap(swap(tracks, frames, joints))
     same(mended, tracks)
     (note,) = mended.notes
-    assert f"swapped back in {len(frames)} of 90" in note
-    assert ("left_" in note) == (joints is not None)
+    whole, limb = (len(frames), "") if joints is None else (0, f", and of limbs alone (from {joints[0]} {len(frames)})")
+    assert f"swapped back in {whole} of 90" in note and note.endswith(f"frames{limb}")
 
 
 def test_both_at_once_and_while_nobody_is_seen():
@@ -196,3 +197,18 @@ def test_a_detector_that_mistook_a_person(shared, protocol):
     wrist, other = (mended.skeleton.index(f"{side}_wrist") for side in ("left", "right"))
     swapped = (mended.points[:, wrist] == tracks.points[:, other]).all(-1)
     assert swapped.nonzero().flatten().tolist() == [*range(41, 60), *wrong, 81]
+
+
+def test_legs_of_an_animal():
+    """Without a template, the pairs that hang on the body's middle line are its trunk."""
+    body = replace(kt.SKELETONS["ap10k"], template=None, spread=None)
+    clip = random_motion(body, 80, turn=60.0, swing=20.0, generator=torch.Generator().manual_seed(2))
+    tracks = kt.Tracks(clip.tracks.points, clip.tracks.weights, body, fps=30.0)
+    assert kt.clean.unswap(tracks) is tracks
+    leg = [body.joints[a] for a, _ in body.mirror if "paw" in body.joints[a] or "elbow" in body.joints[a]]
+    assert len(leg) >= 2
+    same(kt.clean.unswap(swap(tracks, [*range(20, 33), 50])), tracks)
+    front = [name for name in leg if "front" in name or "elbow" in name]
+    mended = kt.clean.unswap(swap(tracks, list(range(20, 33)), front))
+    assert "13" in mended.notes[-1]
+    same(mended, tracks)

@@ -47,20 +47,20 @@ def unswap(tracks: Tracks) -> Tracks:
         return tracks
     points, weights = tracks.points[:, :count].clone(), tracks.weights[:, :count].clone()
     size = float(body_size(points, weights > 0))
-    found = []
+    counts = {}
     for name, some in (("", pairs), *_limbs(body, pairs)):
         left, right = torch.tensor(some, device=points.device).T
         seen = (weights[:, left] > 0) & (weights[:, right] > 0)
         penalty = _LIMB if name else _BODY
         frames = swapped_frames(points[:, left], points[:, right], seen, size, penalty).nonzero()  # (F, 1)
-        if not len(frames):
-            continue
         for values in (points, weights):
             values[frames, left], values[frames, right] = values[frames, right], values[frames, left]
-        found.append(f"{share(len(frames), tracks.num_frames)} frames" + (f" ({name})" if name else ""))
-    if not found:
+        counts[name] = len(frames)
+    if not any(counts.values()):
         return tracks
-    return rebuilt(tracks, points, weights, f"unswap: left and right swapped back in {', in '.join(found)}")
+    note = f"unswap: left and right swapped back in {share(counts.pop(''), tracks.num_frames)} frames"
+    limbs = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+    return rebuilt(tracks, points, weights, note + (f", and of limbs alone (from {limbs})" if limbs else ""))
 
 
 def _limbs(body: Skeleton, pairs: list[tuple[int, int]]) -> list[tuple[str, list[tuple[int, int]]]]:
@@ -70,4 +70,4 @@ def _limbs(body: Skeleton, pairs: list[tuple[int, int]]) -> list[tuple[str, list
     twin = {a: b for a, b in pairs if a not in trunk}
     pieces = find_pieces(body.num_joints, [bone for bone in body.bones if twin.keys() >= set(bone)])
     limbs = [[(a, twin[a]) for a in piece if a in twin] for piece in pieces]
-    return [(f"from {body.joints[limb[0][0]]} on", limb) for limb in limbs if len(limb) >= _FEWEST]
+    return [(body.joints[limb[0][0]], limb) for limb in limbs if len(limb) >= _FEWEST]
