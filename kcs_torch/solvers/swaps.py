@@ -34,12 +34,12 @@ def swapped_frames(left: Tensor, right: Tensor, seen: Tensor, size: float, penal
 
         3/n min(1, 4/P) sum_t sum_ab sum_pairs log(1 + min(e^2, 10^2)) + penalty * (changes of s)
 
-    over the n = 10 spans (a, b) of 1 <= a < b <= 5 and P pairs of joints, where e is the distance of s_{t-a} d_{t-a} from the straight line
-    between s_{t-b} d_{t-b} and s_t d_t, in units of three times the pair's median, at least 3 % of the body's size. A span
-    counts for the pairs that are seen in its three frames.
-    What moves evenly may pass through zero, as legs do that cross; what jumps to the other side is swapped. As frames
-    are compared over up to five others, a few in which everything lies somewhere between do no harm. Signs of all
-    frames cost the same if they are all turned over: most frames are taken to be right.
+    over the n = 10 spans (a, b) of 1 <= a < b <= 5 and P pairs of joints, where e is the distance of s_{t-a} d_{t-a}
+    from the straight line between s_{t-b} d_{t-b} and s_t d_t, in units of three times the pair's median, at least 3
+    % of the body's size. A span counts for the pairs that are seen in its three frames. What moves evenly may pass
+    through zero, as legs do that cross; what jumps to the other side is swapped. As frames are compared over up to
+    five others, a few in which everything lies somewhere between do no harm. Signs cost the same if all of them are
+    turned over: most frames are taken to be right.
 
     Args:
         left: (T, P, 2) joints in the image.
