@@ -1,6 +1,7 @@
 """Sides, twins and templates are read from joint names in any usual spelling."""
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kcs_torch.anatomy import canonical_name, mirror_name, side_of, template_by_names
+from kcs_torch.anatomy import (
+    canonical_name,
+    hinges_by_names,
+    mirror_name,
+    quadruped_places,
+    side_of,
+    spread_by_names,
+    template_by_names,
+)
 from kcs_torch.errors import SkeletonError
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -222,3 +231,65 @@ def test_two_axis_thumb_has_length():
         names, edges = [str(n) for n in data["joint_names"]], data["edges"]
     points = template_by_names("hand", names)
     assert min(math.dist(points[a], points[b]) for a, b in edges) > 0.005
+
+
+FRONT, HIND = ("shoulder", "upperarm", "elbow", "wrist", "forepaw"), ("hip", "knee", "hock", "hindpaw")
+DOG = [
+    *("root", "spine", "chest", "neck", "head"),
+    *(f"{side}_{part}" for side in "rl" for part in (*FRONT, *HIND)),
+    *("tail1", "tail2", "tail_tip"),
+]
+
+
+def test_animal_on_four_legs_faces_the_viewer():
+    body = place(*DOG, kind="quadruped")
+    assert body["head"][2] < body["chest"][2] < body["spine"][2] < body["root"][2] < body["tail_tip"][2]  # z away
+    assert body["head"][1] < body["neck"][1] < body["l_elbow"][1] < body["l_wrist"][1] < body["l_forepaw"][1]  # y down
+    for part in (*FRONT, *HIND):
+        x, y, z = body[f"l_{part}"]
+        assert x > 0 and body[f"r_{part}"] == (-x, y, z)
+    assert abs(body["l_forepaw"][1] - body["l_hindpaw"][1]) < 0.02  # on one floor
+    tail = [np.array(body[n]) for n in ("tail1", "tail2", "tail_tip")]
+    assert np.linalg.norm(tail[1] - tail[0]) > 0.05 and np.linalg.norm(tail[2] - tail[1]) > 0.05
+
+
+def test_template_of_an_animal_bends_as_its_hinges_do():
+    chains = [["chest", *(f"{s}_{p}" for p in FRONT)] for s in "rl"]
+    chains += [["root", *(f"{s}_{p}" for p in HIND)] for s in "rl"]
+    chains += [["root", "spine", "chest", "neck", "head"], ["root", "tail1", "tail2", "tail_tip"]]
+    bones = [(DOG.index(a), DOG.index(b)) for chain in chains for a, b in pairwise(chain)]
+    points = np.array(template_by_names("quadruped", DOG))
+    hinges = hinges_by_names(DOG, bones)
+    assert sorted(DOG[h.joint] for h in hinges) == sorted(f"{s}_{p}" for s in "lr" for p in ("elbow", "knee", "hock"))
+    for h in hinges:
+        bend = np.cross(points[h.joint] - points[h.parent], points[h.child] - points[h.joint])
+        assert h.sign * bend @ (points[h.left] - points[h.right]) > 0, DOG[h.joint]
+    spread = dict(zip(((DOG[a], DOG[b]) for a, b in bones), spread_by_names(DOG, bones), strict=True))
+    assert spread["root", "spine"] < spread["l_hip", "l_knee"] < spread["l_hock", "l_hindpaw"] < spread["root", "tail1"]
+
+
+def test_animals_of_motion_capture():
+    names = ["Hips", "Spine", "Spine1", "Neck", "Head", "Tail", "Tail1"]
+    limbs = ["Shoulder", "Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "Toe"]
+    names += [side + part for side in ("Left", "Right") for part in limbs]
+    places = dict(zip(names, [place for _, place, _ in quadruped_places(names)], strict=True))
+    assert [places[f"Left{part}"] for part in limbs] == [
+        *("clavicle", "shoulder", "elbow", "forepaw", "hip", "knee", "hock", "hindpaw")
+    ]
+    assert len(set(template_by_names("quadruped", names))) == len(names)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["pelvis", "left_hip", "left_knee", "left_ankle", "left_shoulder", "left_elbow"],  # as people have
+        ["snout", "leftear", "rightear", "tailbase"],  # no limbs
+        ["root", "left_hip", "left_knee", "tail"],  # a bird, say
+        ["root", "left_hip", "left_shoulder", "tail", "wing"],
+        ["left_hip", "left_shoulder", "left_paw", "tail"],  # of which foot?
+    ],
+)
+def test_no_animal_where_there_is_none(names):
+    assert quadruped_places(names) is None
+    with pytest.raises(SkeletonError, match="a front and a hind limb"):
+        template_by_names("quadruped", names)

@@ -288,6 +288,27 @@ def test_polish_takes_nothing_that_the_template_rules_out(turning, monkeypatch):
         assert_close(polished.depth[0], depth, rtol=0, atol=0.05)
 
 
+def test_a_template_of_another_body_rules_little_out(turning):
+    """What the viewpoint's turn tells is believed, though it costs more than such a template allows otherwise."""
+    clip, _ = turning
+    skeleton = clip.tracks.skeleton
+    other = torch.tensor(skeleton.template) * torch.tensor([1.0, 0.6, 1.0])
+    other[[skeleton.index(name) for name in ("left_wrist", "right_wrist", "left_knee", "right_knee")]] *= 1.3
+    strange = replace(skeleton, template=tuple(map(tuple, other.tolist())))
+    points = centred(clip.tracks.points) / centred(clip.tracks.points).square().mean().sqrt()
+    depth = centred(clip.points)[..., 2] / centred(clip.points)[..., :2].square().mean().sqrt()
+    legs = [skeleton.index(name) for name in ("right_ankle", "left_ankle", "right_knee", "left_knee")]
+    for known, odd in ((skeleton, False), (strange, True)):
+        body = Body(known, points, 30.0, torch.zeros_like(clip.tracks.weights))
+        truth, wrong = depth * body.factor, depth.clone() * body.factor
+        wrong[:, legs] *= -1
+        found = run(body.rank(wrong[None], 30), serve)
+        cheaper = run(body.rank(truth[None], 30), serve).energy - 30
+        polished = run(body.polished(replace(found, energy=cheaper), 30, truth), serve)
+        assert body.is_odd(found) == odd
+        assert bool((polished.depth[0] - truth).abs().mean() < 0.02) == odd
+
+
 @pytest.mark.parametrize("turn", [15.0, 60.0])
 def test_known_cameras_make_nothing_worse(turn):
     """A little turn tells the sign of depth, but hardly depth: that still comes from the template."""

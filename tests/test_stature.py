@@ -68,3 +68,10 @@ def test_without_a_head_or_a_foot_that_bones_join_to_it_there_is_none(bones):
 @pytest.mark.parametrize("name", ["ap10k", "hand21"])
 def test_animals_and_hands_have_none(name):
     assert stature_weights(get_skeleton(name)) is None
+
+
+def test_an_animal_named_as_people_are_has_none():
+    bones = [("Hips", "Head"), ("Hips", "LeftFoot"), ("Hips", "LeftHand"), ("Hips", "Tail")]
+    names = list(dict.fromkeys(n for bone in bones for n in bone))
+    assert stature_weights(Skeleton.from_names(names[:4], bones[:3])) is not None
+    assert stature_weights(Skeleton.from_names(names, bones)) is None

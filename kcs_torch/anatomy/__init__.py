@@ -2,11 +2,13 @@
 
 from kcs_torch.anatomy.limbs import BENDS, Hinge, contacts_by_names, hinges_by_names
 from kcs_torch.anatomy.names import canonical_name, mirror_name, side_of
+from kcs_torch.anatomy.quadruped import quadruped_places
 from kcs_torch.anatomy.spread import UNKNOWN_SPREAD, spread_by_names
-from kcs_torch.anatomy.template import places_by_names, places_of_known, share_of_stature, template_by_names
+from kcs_torch.anatomy.template import KINDS, places_by_names, places_of_known, share_of_stature, template_by_names
 
 __all__ = [
     "BENDS",
+    "KINDS",
     "UNKNOWN_SPREAD",
     "Hinge",
     "canonical_name",
@@ -15,6 +17,7 @@ __all__ = [
     "mirror_name",
     "places_by_names",
     "places_of_known",
+    "quadruped_places",
     "share_of_stature",
     "side_of",
     "spread_by_names",

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from kcs_torch.anatomy.names import part_of, side_of
+from kcs_torch.anatomy.quadruped import quadruped_places
 from kcs_torch.anatomy.template import places_of_known
 
 __all__ = ["BENDS", "Hinge", "contacts_by_names", "hinges_by_names"]
@@ -71,6 +72,8 @@ _LIMBS: tuple[tuple[str, tuple[str, ...], tuple[str, ...], str, str, float], ...
 # A knuckle or thumb also bends backward, by 30 degrees and more; the outer two joints of a finger hardly do.
 _FINGER_JOINTS = (("mcp", "pip", "dip"), ("pip", "dip", "tip"))
 _FINGER_FIRM = 0.5
+_ANIMAL_ELBOW = 0.7
+"""How firm an elbow of an animal on four legs is: its limbs swing beside its body and hardly turn about themselves."""
 
 _GROUND = {"heel", "ball", "bigtoe", "smalltoe", "toetip", "forepaw", "hindpaw", "paw"}
 
@@ -92,11 +95,13 @@ def hinges_by_names(names: Sequence[str], bones: Sequence[Pair]) -> tuple[Hinge,
         joined[b].append(a)
     places = _places(names)
     hands = [(side_of(n), part_of(n, "hand") or "") for n in names]
+    on_four_legs = quadruped_places(names) is not None
     found = []
     for joint, place in enumerate(places):
         for what, above, below, axis, bends, firm in _LIMBS:
             if place is not None and place[1] == what and place[0] != "centre":
                 ends = (("left", axis), ("right", axis))
+                firm = _ANIMAL_ELBOW if on_four_legs and what == "elbow" else firm
                 hinge = _hinge(places, joined[joint], joint, above, below, ends, bends, firm)
                 found += [] if hinge is None else [hinge]
     for joint, (side, part) in enumerate(hands):
@@ -150,6 +155,9 @@ def _hinge(
 
 def _places(names: Sequence[str]) -> list[tuple[str, str] | None]:
     """(side, place) of each joint, None where its name means nothing."""
+    on_four_legs = quadruped_places(names)
+    if on_four_legs is not None:
+        return [(side, place) for side, place, _ in on_four_legs]
     animal = ((side_of(n), part_of(n, "animal")) for n in names)
     known = zip(places_of_known(names), animal, strict=True)
     return [place or (None if part is None else (side, part)) for place, (side, part) in known]

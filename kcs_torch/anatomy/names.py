@@ -85,6 +85,12 @@ _ANIMAL_NAMES = _spellings(
         "forepaw": "forepaw frontpaw forehoof fronthoof forefoot frontfoot",
         "hindpaw": "hindpaw backpaw rearpaw hindhoof backhoof rearhoof hindfoot backfoot rearfoot",
         "paw": "paw hoof",
+        "withers": "withers",
+        "nose": "snout muzzle",
+        "tailbase": "tailbase tailroot rootoftail tailstart tail0",
+        "tailmid": "tailmid tailmiddle midtail",
+        "tailtip": "tailtip tailend endoftail",
+        **{tail: tail for tail in ("tail", "tail1", "tail2", "tail3", "tail4", "tail5", "tail6")},
     }
 )
 

@@ -14,9 +14,13 @@ import math
 from collections.abc import Sequence
 
 from kcs_torch.anatomy.names import FINGER_JOINTS, part_of, side_of
+from kcs_torch.anatomy.quadruped import PLACES, quadruped_places
 from kcs_torch.errors import SkeletonError, unknown
 
-__all__ = ["places_by_names", "places_of_known", "share_of_stature", "template_by_names"]
+__all__ = ["KINDS", "places_by_names", "places_of_known", "share_of_stature", "template_by_names"]
+
+KINDS = ("human", "hand", "quadruped")
+"""Bodies whose template the names of joints tell."""
 
 STATURE = 1.75
 
@@ -114,7 +118,7 @@ _ABOVE_HANDS = frozenset(["hip", "knee", "ankle", "shoulder", "arm", "elbow"])
 
 
 def template_by_names(kind: str, names: Sequence[str]) -> tuple[Point, ...]:
-    """Place joints by their names: a relaxed person, or an open hand, that faces the viewer.
+    """Place joints by their names: a relaxed person, an open hand, or a standing animal, that faces the viewer.
 
     Some words depend on their neighbours: a ``foot`` beside an ``ankle`` is the ball of the foot and the ankle
     otherwise; a ``shoulder`` above an ``arm`` is the collar bone; ``pelvis`` is the middle of the hips, but the
@@ -122,23 +126,26 @@ def template_by_names(kind: str, names: Sequence[str]) -> tuple[Point, ...]:
     a ``thorax``.
 
     Args:
-        kind: "human" or "hand". A hand of unknown side is a right one.
+        kind: one of KINDS. A hand of unknown side is a right one; an animal on four legs is of a large dog's build.
         names: N joint names, in any usual spelling.
 
     Returns:
-        N positions (x right, y down, z away from the viewer) in metres; the person's left is at +x. The origin
-        is the middle of the hips, or the wrist.
+        N positions (x right, y down, z away from the viewer) in metres; the body's left is at +x. The origin is the
+        middle of the hips, or the wrist.
 
     Raises:
-        SkeletonError: a name is not known as part of the body, or no name is of a limb or finger.
+        SkeletonError: a name is not known as part of the body, or no name is of a limb or finger; of an animal: not of
+            both its front and its hind limbs.
 
     >>> template_by_names("human", ["pelvis", "left_hip", "LKnee"])
     ((0.0, 0.0, 0.0), (0.095, 0.0, 0.0), (0.095, 0.423, -0.03))
     """
-    if kind not in ("human", "hand"):
-        raise unknown("template", kind, ["human", "hand"], SkeletonError)
+    if kind not in KINDS:
+        raise unknown("template", kind, KINDS, SkeletonError)
     if kind == "hand":
         return _place_hand(_known_parts(kind, names))
+    if kind == "quadruped":
+        return _place_quadruped(names)
     out = []
     for side, place in places_by_names(names):
         x, height, forward = _CENTRE[place] if side == "centre" else (_LEFT | _LEFT_FINGERS)[place]
@@ -245,3 +252,15 @@ def _place_hand(parts: Sequence[tuple[str, str]]) -> tuple[Point, ...]:
         x, up, forward = _HAND[part]
         out.append((apart - x if side == "left" else x - apart, -up if up else 0.0, -forward if forward else 0.0))
     return tuple(out)
+
+
+def _place_quadruped(names: Sequence[str]) -> tuple[Point, ...]:
+    """An animal on four legs that faces the viewer."""
+    places = quadruped_places(names)
+    if places is None:
+        raise SkeletonError(
+            "template 'quadruped': expected joints of a front and a hind limb, and a tail, paw or hock, all by known "
+            f"names, got {', '.join(map(repr, names))}. Rename them, or give a position for every joint."
+        )
+    hips = PLACES["hip"]
+    return tuple((x, round(hips[1] - up, 6), round(hips[2] - forward, 6)) for _, _, (x, up, forward) in places)

@@ -10,6 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from kcs_torch.anatomy import quadruped_places
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import centre, nearest_rotation
 from kcs_torch.functional.camera import complete_rotation
@@ -26,6 +27,10 @@ from kcs_torch.solvers.pose import CameraFit, fit_cameras, steady_cameras
 from kcs_torch.types import Tracks, as_floats
 
 __all__ = ["KCS"]
+
+DEEP = 0.3
+"""Least extent of the tracks' best rigid shape, over its middle one, from which on it is solid: the viewpoint turns.
+Seen without a turn it is flat."""
 
 
 @dataclass(frozen=True)
@@ -171,6 +176,11 @@ class KCS(Method):
         if rest is None:
             note = f"skeleton '{tracks.skeleton.name}' has no template: the tracks' best rigid shape serves"
             return centre(rigid_shape(tracks, cameras))[0], (note,)
+        if self.template is None and quadruped_places(tracks.skeleton.joints) is not None:
+            own = centre(rigid_shape(tracks, cameras))[0]
+            least, middle, _ = torch.linalg.eigvalsh(own.mT @ own).tolist()
+            if least > DEEP**2 * middle:
+                return own, ("the viewpoint turns: the tracks' best rigid shape serves, not a template of any animal",)
         return centre(rest)[0], ()
 
     def _cameras(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from kcs_torch.anatomy import (
     BENDS,
+    KINDS,
     Hinge,
     contacts_by_names,
     hinges_by_names,
@@ -121,7 +122,7 @@ def facts_by_names(names: Sequence[str], bones: Sequence[Pair], known: Skeleton 
         known: a skeleton whose observed joints have these names; what it says goes before what the names say.
     """
     template = None if known is None or known.template is None else known.template[: len(names)]
-    for kind in ("human", "hand"):
+    for kind in KINDS:
         if template is None:
             try:
                 template = template_by_names(kind, names)

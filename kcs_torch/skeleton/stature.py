@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcs_torch.anatomy import places_of_known, share_of_stature, side_of
+from kcs_torch.anatomy import places_of_known, quadruped_places, share_of_stature, side_of
 from kcs_torch.skeleton.core import Skeleton
 
 __all__ = ["stature_weights"]
@@ -35,7 +35,7 @@ def stature_weights(body: Skeleton) -> Tensor | None:
     Nothing of the skull counts twice: bones to the face are left out where a joint of the head is higher.
 
     Returns:
-        (K, B), a row for each leg; None where there is no head, or no leg that bones join to it.
+        (K, B), a row for each leg; None where there is no head, or no leg that bones join to it, or an animal's.
 
     >>> from kcs_torch.skeleton import get_skeleton
     >>> body = get_skeleton("coco17")  # its template is of a person of 1.75 m
@@ -43,6 +43,8 @@ def stature_weights(body: Skeleton) -> Tensor | None:
     >>> stature_weights(body) @ (ends[:, 1] - ends[:, 0]).norm(dim=-1)
     tensor([1.7500, 1.7500])
     """
+    if quadruped_places(body.joints) is not None:
+        return None
     places = _places(body)
     top, height = next(((i, place) for place in _TOPS for i, (_, p) in enumerate(places) if p == place), (-1, ""))
     if not height:

@@ -47,6 +47,10 @@ POSTURE = 0.15
 """Energy of usual postures, for each bone and frame that counts. Deviations grow with it: the further postures stray,
 the less the template tells of them."""
 
+ODDITY = 0.09
+"""By how much a usual body's lengths stray from the template's. One of twice that is told by it half as well, and so
+the viewpoint's turn tells as much where it is half as far."""
+
 TURN, POWER = 22.0, 1.1
 """Degrees of the viewpoint's turn that tell as much as the template, and the power of the turn that deviations fall
 with, as those of the moving viewpoint do."""
@@ -87,7 +91,8 @@ def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: floa
     points = torch.cat([objective.image, depth[..., None]], -1)
     counted = (len(depth) / posture.correlation + posture.strength) * len(lengths)
     strange = float(posture(points[None], lengths[None])) / counted / POSTURE
-    return strange / math.sqrt(1 + (turn / TURN) ** (2 * POWER))
+    odd = max(1.0, objective.oddity(lengths) / ODDITY)
+    return odd * strange / math.sqrt(1 + (odd * turn / TURN) ** (2 * POWER))
 
 
 def depth_deviation(

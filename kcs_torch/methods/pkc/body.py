@@ -61,6 +61,13 @@ LONG = 2000
 TURNING = 60.0
 """Degrees of the trunk's turn, as the template tells it, from which on the viewpoint's turn tells depth better."""
 
+ODD, LITTLE = 0.115, 30.0
+"""Root mean square, of the logarithm, by which lengths stray from the template's where it is of another body: people
+stray by .07 to .105. The viewpoint's turn tells depth better than such a template from so many degrees on."""
+
+LEAD, LESS = 10.0, 3.0
+"""By how much what was found without a template of another body must be better, and how much less that one counts."""
+
 TOLD = 3.0
 """By how much a mirror image must be dearer for known cameras to rule it out."""
 
@@ -154,8 +161,13 @@ class Body:
         return found[order[left] if bool(left.any()) else order]
 
     def turns(self, found: Hypotheses) -> bool:
-        """Whether the trunk of the best hypothesis turns far enough to tell depth."""
-        return float(viewpoint_turn(self.frames(found.depth[0])[:, :2])) >= TURNING
+        """Whether the trunk of the best hypothesis turns far enough to tell depth better than the template does."""
+        least = LITTLE if self.is_odd(found) else TURNING
+        return float(viewpoint_turn(self.frames(found.depth[0])[:, :2])) >= least
+
+    def is_odd(self, found: Hypotheses) -> bool:
+        """Whether the best hypothesis is a body of other proportions than the template's."""
+        return self.objective.oddity(found.lengths[0]) > ODD
 
     def seen_from_around(self, found: Hypotheses) -> bool:
         """Whether a camera that goes round the body explains how the best hypothesis turns."""
@@ -182,7 +194,10 @@ class Body:
         if around and other is not None:
             other = torch.where((other * found.depth[0]).sum() < 0, -other, other)[None]
             ranked = yield from self.rank(other, steps)
-            if bool(ranked.energy[0] - found.energy[0] < CLOSE):
+            dearer = ranked.energy - found.energy[0]
+            if self.is_odd(found):
+                rivals = rivals.joined(replace(ranked, depth=other, energy=found.energy[0] + LEAD + dearer / LESS))
+            elif bool(dearer[0] < CLOSE):
                 rivals = rivals.joined(replace(ranked, depth=other))
         depth, value = yield from self._descended(rivals.depth, (COARSE[-1], *POLISH) if around else POLISH)
         points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)

@@ -169,7 +169,8 @@ class PKC(Method):
         if enough and not detected(tracks.weights):  # a detector's errors last, and would be taken for motion
             other = None
             if self.viewpoint == "auto" and body.turns(found):
-                moving, _ = yield from self._moving(tracks, image, noise, turns=())
+                quick = not body.is_odd(found)
+                moving, _ = yield from self._moving(tracks, image, noise, quick=quick)
                 other = moving.pose.points[0, ..., 2] * body.factor
             found = yield from body.polished(found, self.steps, other)
         return self._from_hypotheses(found, body, cameras, notes, detected(tracks.weights))
@@ -213,11 +214,11 @@ class PKC(Method):
         return points - points.mean(-2, keepdim=True), noise, tuple(notes)
 
     def _moving(
-        self, tracks: Tracks, image: Tensor, noise: Tensor, turns: Sequence[float] = TURNS
+        self, tracks: Tracks, image: Tensor, noise: Tensor, quick: bool = False
     ) -> Search[Any, Any, tuple[MovingView, Estimate]]:
-        """Solutions of the moving viewpoint, and SfAM's first guess."""
+        """Solutions of the moving viewpoint, from no start but the first guess if ``quick``; and that guess, SfAM's."""
         (first,) = yield [_complete(tracks, image)]
-        lifts = 0 if self.viewpoint == "auto" and len(trunk_joints(tracks.skeleton)) >= 3 else self.lifts
+        turns, lifts = ((), 0) if quick else (TURNS, self.lifts)
         start, exact = (first.points, complete_rotation(first.cameras)), float(noise.median()) == 0
         return (
             yield from turning(image, tracks.skeleton, *start, turns=turns, lifts=lifts, exact=exact, seed=self.seed)

@@ -174,6 +174,13 @@ class Objective:
         parts = (pad(part[..., None], (2, 0)) for part in depth.split(few))
         return torch.cat([self.weights.contact * self.feet(part, None, self.standing) for part in parts])
 
+    def oddity(self, lengths: Tensor) -> float:
+        """How far lengths (B,) of rigid bones stray from the template's: root mean square of the logarithm."""
+        usual = self.posture.rest_lengths
+        known = (self.rigid > 0).reshape(-1, len(usual))[0] & (usual > 0)
+        log = (lengths / usual)[known].log()
+        return float((log - log.median()).square().mean().sqrt()) if len(log) else 0.0
+
     def carries(self, member: Tensor) -> Tensor:
         """Which parts (P,) move feet against the trunk, for members (P, B) that are 1 for a part's bones."""
         lines = self.joints(torch.eye(member.shape[1], dtype=member.dtype, device=member.device))  # (B, N)
