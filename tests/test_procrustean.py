@@ -194,11 +194,31 @@ def test_extra_term_takes_part():
     assert (raised.points[0, :, 3, 2] - 2).abs().mean() < 0.05
 
 
+def views(degrees, frames=60):
+    """Directions of view (1, T, 3) that turn evenly."""
+    angle = torch.deg2rad(torch.linspace(0, degrees, frames, dtype=torch.float64))
+    return torch.stack([angle.sin(), 0 * angle, angle.cos()], -1)[None]
+
+
 def test_deviation_grows_as_the_viewpoint_turns_less():
     points, cameras = swinging_body()
-    near, far = (depth_deviation(points[None], cameras[None], BONES, turn=t) for t in (360.0, 36.0))
-    assert near.shape == (1, 60, 6) and (near > 0).all()
-    assert torch.allclose(far, near * 10**0.6)
+    deviation = lambda seen: depth_deviation(points[None], cameras[None], BONES, views=seen)  # noqa: E731
+    less = lambda found: (found**-2 - 0.5**-2).rsqrt()  # noqa: E731  # without the limit
+    once, twice = deviation(views(360.0)), deviation(views(720.0))
+    assert once.shape == (1, 60, 6) and (once > 0).all()
+    torch.testing.assert_close(less(once), less(twice) * 2**0.6, rtol=0.01, atol=0)  # as spread out, half as far
+    sides = views(90.0)
+    fro = torch.cat([sides[:, ::2], sides.flip(1)[:, ::2]], 1)  # to and fro: as spread out, about twice as far
+    torch.testing.assert_close(less(deviation(sides)), less(deviation(fro)) * 2**0.6, rtol=0.02, atol=0)
+    variance = [1 - v.mean(1).square().sum() for v in (views(90.0), views(180.0))]
+    ratio = 2**0.6 * (variance[1] / variance[0]) ** 0.75
+    torch.testing.assert_close(less(deviation(views(90.0))), less(deviation(views(180.0))) * ratio)
+
+
+def test_deviation_is_never_more_than_a_guess_s():
+    points, cameras = swinging_body()
+    found = depth_deviation(points[None], cameras[None], BONES, views=views(0.0))
+    assert torch.isfinite(found).all() and 0.1 < found.amax() <= 0.5
 
 
 def test_deviation_is_smaller_where_lengths_are_constant():
@@ -206,7 +226,7 @@ def test_deviation_is_smaller_where_lengths_are_constant():
     stretched = points.clone()
     stretched[::2, 5] += 0.02 * (points[::2, 5] - points[::2, 4])  # one bone of five, in every other frame
     constant, less, none = (
-        depth_deviation(p[None], cameras[None], BONES, turn=90.0, rigid=r)
+        depth_deviation(p[None], cameras[None], BONES, views=views(90.0), rigid=r)
         for p, r in ((points, None), (stretched, None), (points, BONES[:0]))
     )
     assert (constant < 0.5 * less).all() and torch.isfinite(none).all()

@@ -101,11 +101,9 @@ class MovingView:
 
     def deviation(self, cameras: Tensor, index: int = 0) -> Tensor:
         """Standard deviation (T, N) of the depths of one solution, for camera rotations (T, 3, 3)."""
-        view = cameras[:, 2]
-        travel = torch.rad2deg((view[1:] * view[:-1]).sum(-1).clamp(-1, 1).arccos().sum())
-        pose = self.pose[index : index + 1]
+        pose, views = self.pose[index : index + 1], cameras[None, :, 2]
         return depth_deviation(
-            pose.points, pose.rotations, self.bones, turn=travel, rigid=self.rigid, stiffness=self.stiffness
+            pose.points, pose.rotations, self.bones, views=views, rigid=self.rigid, stiffness=self.stiffness
         )[0]
 
 
