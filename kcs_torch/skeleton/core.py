@@ -104,7 +104,7 @@ class Skeleton:
             name: what to call it.
             mirror: (left, right) names; found from the names if None ("left_hip"/"right_hip", "LHip"/"RHip").
             virtual: ``{joint: sources}``, each the mean of its sources; appended after ``joints``.
-            template: ``"human"`` (positions by joint name), ``{joint: (x, y, z)}``, or None.
+            template: ``"human"``, ``"hand"`` or ``"quadruped"`` (by joint names), ``{joint: (x, y, z)}``, or None.
             proportions: ``{"parent-child": relative length}`` for every bone.
             flexible: bones that may change their length.
             tree: False admits cycles and separate pieces.

@@ -43,9 +43,9 @@ NOISE, LASTING = 0.6, 1.0
 """What a bone's depth takes on of its image's noise in a frame, which its neighbours make good in part, and of the
 noise of usual frames, which its length takes on."""
 
-POSTURE = 0.15
-"""Energy of usual postures, for each bone and frame that counts. Deviations grow with it: the further postures stray,
-the less the template tells of them."""
+POSTURE, STRANGE = 0.167, 1.5
+"""Energy of usual postures, for each bone and frame that counts, and the power of a larger one that deviations go with:
+the further postures stray, the less the template tells of them. Those with a smaller one go with it as it is."""
 
 ODDITY = 0.09
 """By how much a usual body's lengths stray from the template's. One of twice that is told by it half as well, and so
@@ -92,6 +92,7 @@ def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: floa
     counted = (len(depth) / posture.correlation + posture.strength) * len(lengths)
     strange = float(posture(points[None], lengths[None])) / counted / POSTURE
     odd = max(1.0, objective.oddity(lengths) / ODDITY)
+    strange = max(strange, strange**STRANGE)
     return odd * strange / math.sqrt(1 + (odd * turn / TURN) ** (2 * POWER))
 
 
