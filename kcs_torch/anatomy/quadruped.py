@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from kcs_torch.anatomy.names import part_of, side_of
 
-__all__ = ["PLACES", "SPREAD", "TAIL_SPREAD", "quadruped_places"]
+__all__ = ["PLACES", "SPREAD", "quadruped_places"]
 
 Point = tuple[float, float, float]
 
@@ -66,12 +66,10 @@ SPREAD: dict[str, float] = {
     "elbow": 25.0,
     "wrist": 35.0,
     "forepaw": 45.0,
+    "tail": 40.0,
 }
 """Degrees by which the bone that leads to a place strays from the template: about a fifth of the arc of walking and
 running limbs. A bone is known by whichever of its ends comes later here, farther from the trunk."""
-
-TAIL_SPREAD = 40.0
-"""The same, of the bones of a tail."""
 
 _FRONT, _HIND = {"shoulder", "elbow", "wrist", "forepaw"}, {"hip", "knee", "hock", "hindpaw"}
 _TAIL_ORDER = ("tailbase", "tail", "tail1", "tail2", "tail3", "tail4", "tail5", "tail6", "tailmid", "tailtip")
@@ -129,7 +127,6 @@ def _resolve(part: str, side: str, present: set[str]) -> str:
             "neck2": "head",
         }.get(part, part)
     return {
-        "clavicle": "clavicle",
         "shoulder": "clavicle" if "arm" in present else "shoulder",
         "arm": "shoulder",
         "humerus": "elbow",  # bones named by their far end

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from kcs_torch.anatomy.names import FINGER_JOINTS, part_of
-from kcs_torch.anatomy.quadruped import SPREAD, TAIL_SPREAD, quadruped_places
+from kcs_torch.anatomy.quadruped import SPREAD, quadruped_places
 from kcs_torch.anatomy.template import places_of_known
 
 __all__ = ["UNKNOWN_SPREAD", "spread_by_names"]
@@ -67,8 +67,7 @@ def spread_by_names(names: Sequence[str], bones: Sequence[tuple[int, int]]) -> t
     animal = quadruped_places(names)
     if animal is not None:
         parts = [place for _, place, _ in animal]
-        table = SPREAD | {"tail": TAIL_SPREAD}
-        return tuple(_farther(table, [parts[i] for i in bone]) or UNKNOWN_SPREAD for bone in bones)
+        return tuple(_farther(SPREAD, [parts[i] for i in bone]) or UNKNOWN_SPREAD for bone in bones)
     places = [None if place is None else place[1] for place in places_of_known(names)]
     fingers = [part_of(n, "hand") for n in names]
     # Fingers of a whole person go where the arm goes.

@@ -15,6 +15,7 @@ from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.root import root_depth
+from kcs_torch.nn.lengths import oddity
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Reconstruction, Tracks
 
@@ -147,10 +148,8 @@ def odd_body(points: Tensor, body: Skeleton) -> str:
     rigid = list(body.rigid)
     if usual is None or not rigid or not len(points):
         return ""
-    known = usual[rigid] > 0
-    own = bone_lengths(points, body.bone_index(device=points.device)).median(0).values[rigid]
-    log = (own[known].clamp_min(torch.finfo(own.dtype).tiny) / usual[rigid][known]).log()
-    odd = float((log - log.median()).square().mean().sqrt()) if len(log) else 0.0
+    own = bone_lengths(points, body.bone_index(device=points.device)).median(0).values
+    odd = oddity(own[rigid], usual[rigid])
     middle = points - points.mean(1, keepdim=True)
     deep = float(middle[..., 2].norm() / middle[..., :2].norm().clamp_min(torch.finfo(points.dtype).tiny))
     if odd <= ODD or deep <= DEEP:

@@ -10,7 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from kcs_torch.anatomy import quadruped_places
+from kcs_torch.anatomy import quadruped_places, template_by_names
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import centre, nearest_rotation
 from kcs_torch.functional.camera import complete_rotation
@@ -176,7 +176,7 @@ class KCS(Method):
         if rest is None:
             note = f"skeleton '{tracks.skeleton.name}' has no template: the tracks' best rigid shape serves"
             return centre(rigid_shape(tracks, cameras))[0], (note,)
-        if self.template is None and quadruped_places(tracks.skeleton.joints) is not None:
+        if self.template is None and _is_guessed(tracks.skeleton):
             own = centre(rigid_shape(tracks, cameras))[0]
             least, middle, _ = torch.linalg.eigvalsh(own.mT @ own).tolist()
             if least > DEEP**2 * middle:
@@ -252,3 +252,9 @@ def _same(clips: Clips, before: Tensor, after: Tensor) -> Tensor:
 
 CHECK = 5
 """Steps from one look at whether a clip has settled to the next."""
+
+
+def _is_guessed(body: Skeleton) -> bool:
+    """Whether the template is an animal's by the names of its joints, and not one that somebody gave."""
+    names = body.joints
+    return quadruped_places(names) is not None and body.template == template_by_names("quadruped", names)

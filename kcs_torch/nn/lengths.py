@@ -14,7 +14,7 @@ from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
 from kcs_torch.nn.masks import bone_share, some
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["ForeshorteningEnergy", "ProportionEnergy", "foreshortening", "free_bones", "usual_size"]
+__all__ = ["ForeshorteningEnergy", "ProportionEnergy", "foreshortening", "free_bones", "oddity", "usual_size"]
 
 LIMB_SPREAD = 26.0
 """Bones that stray from the template by more than this, in degrees, are of the limbs."""
@@ -156,3 +156,13 @@ def usual_size(square: Tensor, share: Tensor | None) -> Tensor:
         seen = (share > 0).to(square)
         square = (square * seen).sum(-2) / seen.sum(-2).clamp_min(1)
     return square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
+
+
+def oddity(lengths: Tensor, usual: Tensor) -> float:
+    """How far lengths (B,) stray from usual ones (B,), whatever the size: root mean square of the ratio's logarithm.
+
+    0 where no usual length is known, which is then 0.
+    """
+    known = usual > 0
+    log = (lengths[known].clamp_min(torch.finfo(lengths.dtype).tiny) / usual[known]).log()
+    return float((log - log.median()).square().mean().sqrt()) if len(log) else 0.0

@@ -63,7 +63,7 @@ TURNING = 60.0
 
 ODD, LITTLE = 0.115, 30.0
 """Root mean square, of the logarithm, by which lengths stray from the template's where it is of another body: people
-stray by .07 to .105. The viewpoint's turn tells depth better than such a template from so many degrees on."""
+stray by .07 to .11. The viewpoint's turn tells depth better than such a template from so many degrees on."""
 
 LEAD, LESS = 10.0, 3.0
 """By how much what was found without a template of another body must be better, and how much less that one counts."""

@@ -18,7 +18,7 @@ from kcs_torch.methods.pkc.unknowns import Unknowns
 from kcs_torch.methods.pkc.weights import Weights
 from kcs_torch.nn.anatomy import AdductionEnergy, HingeEnergy
 from kcs_torch.nn.contact import ContactEnergy
-from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy
+from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy, oddity
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -176,10 +176,8 @@ class Objective:
 
     def oddity(self, lengths: Tensor) -> float:
         """How far lengths (B,) of rigid bones stray from the template's: root mean square of the logarithm."""
-        usual = self.posture.rest_lengths
-        known = (self.rigid > 0).reshape(-1, len(usual))[0] & (usual > 0)
-        log = (lengths / usual)[known].log()
-        return float((log - log.median()).square().mean().sqrt()) if len(log) else 0.0
+        rigid = list(self.skeleton.rigid)
+        return oddity(lengths[rigid], self.posture.rest_lengths[rigid])
 
     def carries(self, member: Tensor) -> Tensor:
         """Which parts (P,) move feet against the trunk, for members (P, B) that are 1 for a part's bones."""
