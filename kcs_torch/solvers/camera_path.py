@@ -25,6 +25,8 @@ EVEN = 0.05
 NEAR = math.radians(30)
 """... and below this angle, as a path that races through all directions has length enough for any deviation."""
 
+WAVES, ROUNDS = 6, 20
+"""Cosines of a smooth path, and rounds of weights that fit it."""
 
 RUN = 2000
 """Frames whose waves are summed together: more would only take memory."""
@@ -86,7 +88,7 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | No
     return path.view(*batch, frames, 3, 3), angle.view(*batch, frames)
 
 
-def smooth_path(rotations: Tensor, *, waves: int = 6, num_steps: int = 20) -> tuple[Tensor, Tensor]:
+def smooth_path(rotations: Tensor, *, waves: int = WAVES, num_steps: int = ROUNDS) -> tuple[Tensor, Tensor]:
     """Fit a path whose deviation from a constant angular velocity is a sum of ``waves`` slow cosines, robustly.
 
     Args:
@@ -100,7 +102,11 @@ def smooth_path(rotations: Tensor, *, waves: int = 6, num_steps: int = 20) -> tu
     Raises:
         ShapeError: ``rotations`` is not (T, 3, 3) with T >= 2.
     """
-    base, angle = constant_path(rotations)
+    return _smoothed(rotations, *constant_path(rotations), waves, num_steps)
+
+
+def _smoothed(rotations: Tensor, base: Tensor, angle: Tensor, waves: int, num_steps: int) -> tuple[Tensor, Tensor]:
+    """As :func:`smooth_path`, about a constant path and its angles."""
     frames = len(rotations)
     basis = dct_basis(frames, min(waves, frames), dtype=base.dtype, device=base.device)  # (T, K)
     deviation = (rotations @ base.mT).flatten(-2)
@@ -128,11 +134,10 @@ def choose_path(rotations: Tensor, kind: CameraPath = "auto") -> tuple[Tensor, C
     zero = rotations.new_zeros(len(rotations))
     if kind == "free" or len(rotations) < 10:
         return rotations, "free", zero
-    if kind != "smooth":
-        path, angle = constant_path(rotations)
-        if kind == "constant" or _explains(path, angle):
-            return path, "constant", angle
-    path, angle = smooth_path(rotations)
+    path, angle = constant_path(rotations)
+    if kind != "smooth" and (kind == "constant" or _explains(path, angle)):
+        return path, "constant", angle
+    path, angle = _smoothed(rotations, path, angle, WAVES, ROUNDS)
     if kind == "smooth" or _explains(path, angle):
         return path, "smooth", angle
     return rotations, "free", zero

@@ -171,7 +171,10 @@ class Body:
 
     def seen_from_around(self, found: Hypotheses) -> bool:
         """Whether a camera that goes round the body explains how the best hypothesis turns."""
-        path, kind, _ = choose_path(self.frames(found.depth[0]))
+        frames = self.frames(found.depth[0])
+        if float(viewpoint_turn(frames[:, :2])) < TURNING / 2:  # no path that explains them turns twice as far
+            return False
+        path, kind, _ = choose_path(frames)
         return kind != "free" and float(viewpoint_turn(path[:, :2])) >= TURNING
 
     def polished(self, found: Hypotheses, steps: int, other: Tensor | None = None) -> Search[Any, Any, Hypotheses]:

@@ -14,6 +14,9 @@ __all__ = ["RunCosts", "Runs", "inside"]
 ROWS = 1024
 """Frames of changed solutions that are looked at together."""
 
+BLOCK = 16
+"""Frames whose scatter is summed at once: what a run's end cuts off is summed for itself."""
+
 
 class Runs(NamedTuple):
     """Runs of frames over which parts of a body change their signs.
@@ -131,12 +134,11 @@ class RunCosts:
         """The posture's energy (K,), from sums and scatters of poses (V, S, T, K) up to each place."""
         posture, base = self.objective.posture, self.base.poses
         frames = poses.shape[2]
-        before = (torch.arange(frames, device=poses.device) < runs.places[..., None]).to(poses)  # (V, M, T)
-        both, sign = torch.cat([poses, base.expand_as(poses)], 2), torch.cat([before, -before], 2)[:, None]
-        # Up to each place, (V, S, M, K, K): what the change adds to the scatter.
-        added = ((both.mT[:, :, None] * sign[..., None, :]).flatten(2, 3) @ both).unflatten(2, (sign.shape[2], -1))
+        added = _scatters(poses, runs.places) - _scatters(base, runs.places)
         scatter = base.mT @ base + _across(added, runs)  # (K, S, K, K)
-        mean = (base.sum(2) + _across(sign @ both, runs)) / frames  # (K, S, K)
+        change = (poses - base).transpose(1, 2).flatten(2)  # (V, T, S K)
+        moved = _between(change, runs.part, runs.starts, runs.ends).unflatten(1, base.shape[1::2])
+        mean = (base.sum(2) + moved) / frames  # (K, S, K)
         count = frames / posture.correlation
         pull = count * posture.kappa / (count + posture.kappa)
         scatter = scatter / posture.correlation + (pull - count) * mean[..., None] * mean[..., None, :]
@@ -174,9 +176,20 @@ def _between(values: Tensor, part: Tensor, starts: Tensor, ends: Tensor) -> Tens
     return summed[part, ends] - summed[part, starts]
 
 
+def _scatters(rows: Tensor, places: Tensor) -> Tensor:
+    """Scatters (V, M, S, K, K) of rows (V or 1, S, T, K) in the frames before places (V, M)."""
+    short = BLOCK - rows.shape[2] % BLOCK  # one block more than there are, or less: the last place is T
+    blocks = torch.nn.functional.pad(rows, (0, 0, 0, short)).unflatten(2, (-1, BLOCK)).transpose(1, 2)
+    whole = torch.nn.functional.pad((blocks.mT @ blocks).cumsum(1)[:, :-1], (0, 0) * 3 + (1, 0))  # (V, T', S, K, K)
+    index = torch.arange(len(rows), device=rows.device)[:, None], places // BLOCK
+    within = torch.arange(BLOCK, device=rows.device) < (places % BLOCK)[..., None]
+    last = blocks[index] * within[:, :, None, :, None]
+    return whole[index] + last.mT @ last
+
+
 def _across(values: Tensor, runs: Runs) -> Tensor:
-    """Differences (K, S, ...) of values (V, S, M, ...) between the places at which runs end and start."""
-    return values[runs.part, :, runs.last] - values[runs.part, :, runs.first]
+    """Differences (K, ...) of values (V, M, ...) between the places at which runs end and start."""
+    return values[runs.part, runs.last] - values[runs.part, runs.first]
 
 
 def _sized(sine: Tensor, points: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
