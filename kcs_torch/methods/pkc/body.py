@@ -160,6 +160,12 @@ class Body:
         left = (own - mirrored)[order] <= TOLD
         return found[order[left] if bool(left.any()) else order]
 
+    @property
+    def spanned(self) -> bool:
+        """Whether bones link all joints, and these do not all lie at one point: what :meth:`polished` needs."""
+        skeleton = self.skeleton
+        return skeleton.is_tree and skeleton.num_bones == skeleton.num_joints - 1 and bool(self.image.any())
+
     def turns(self, found: Hypotheses) -> bool:
         """Whether the trunk of the best hypothesis turns far enough to tell depth better than the template does."""
         least = LITTLE if self.is_odd(found) else TURNING
@@ -185,10 +191,7 @@ class Body:
         it which of close rivals is best; ``other`` depths (T, N), or their mirror image, are a rival then, too, if they
         come as near in ``steps`` on the objective. Energies stay those of the objective before, in their order.
         """
-        skeleton, bones = self.skeleton, self.objective.bones
-        spans = skeleton.is_tree and skeleton.num_bones == skeleton.num_joints - 1
-        if not spans or not bool(self.image.any()):  # or all joints lie at one point
-            return found
+        bones = self.objective.bones
         around = self.turns(found)
         close = (found.energy - found.energy[0] < CLOSE) & ((found.depth * found.depth[0]).sum((1, 2)) > 0)
         close[0] = True  # of mirror images, which cost the same here, only the objective tells the right one

@@ -21,7 +21,7 @@ from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
-from kcs_torch.methods.pkc.moving_view import TURNS, MovingView
+from kcs_torch.methods.pkc.moving_view import MovingView, settled
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
@@ -166,14 +166,14 @@ class PKC(Method):
                 found = body.without_contacts(found)
         if cameras is not None and _turns(cameras):
             found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
-        if enough and not detected(tracks.weights):  # a detector's errors last, and would be taken for motion
+        detections = detected(tracks.weights)  # their errors last, and would be taken for motion
+        if enough and body.spanned and not detections:
             other = None
             if self.viewpoint == "auto" and body.turns(found):
-                quick = not body.is_odd(found)
-                moving, _ = yield from self._moving(tracks, image, noise, quick=quick)
-                other = moving.pose.points[0, ..., 2] * body.factor
+                other = yield from self._rival(tracks, image, noise, far=body.is_odd(found))
+                other = other * body.factor
             found = yield from body.polished(found, self.steps, other)
-        return self._from_hypotheses(found, body, cameras, notes, detected(tracks.weights))
+        return self._from_hypotheses(found, body, cameras, notes, detections)
 
     def _clean(self, tracks: Tracks) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
         """Complete tracks (T, N, 2), centred per frame, the noise (T, N) left in them, and what was done."""
@@ -213,16 +213,20 @@ class PKC(Method):
             notes.append(f"{counted(count, 'frame')} at the clip's ends {show} nobody: nearest pose held")
         return points - points.mean(-2, keepdim=True), noise, tuple(notes)
 
-    def _moving(
-        self, tracks: Tracks, image: Tensor, noise: Tensor, quick: bool = False
-    ) -> Search[Any, Any, tuple[MovingView, Estimate]]:
-        """Solutions of the moving viewpoint, from no start but the first guess if ``quick``; and that guess, SfAM's."""
+    def _moving(self, tracks: Tracks, image: Tensor, noise: Tensor) -> Search[Any, Any, tuple[MovingView, Estimate]]:
+        """Solutions of the moving viewpoint; and the first guess, SfAM's."""
         (first,) = yield [_complete(tracks, image)]
-        turns, lifts = ((), 0) if quick else (TURNS, self.lifts)
         start, exact = (first.points, complete_rotation(first.cameras)), float(noise.median()) == 0
-        return (
-            yield from turning(image, tracks.skeleton, *start, turns=turns, lifts=lifts, exact=exact, seed=self.seed)
-        ), first
+        moving = yield from turning(image, tracks.skeleton, *start, lifts=self.lifts, exact=exact, seed=self.seed)
+        return moving, first
+
+    def _rival(self, tracks: Tracks, image: Tensor, noise: Tensor, far: bool) -> Search[Any, Any, Tensor]:
+        """Depths (T, N) that the moving viewpoint's turn tells, from many starts if ``far``, else from SfAM's guess."""
+        if far:
+            moving, _ = yield from self._moving(tracks, image, noise)
+            return moving.pose.points[0, ..., 2]
+        (first,) = yield [_complete(tracks, image)]
+        return (yield from settled(image, tracks.skeleton, first.points, complete_rotation(first.cameras)))
 
     def _ranked(self, body: Body, moving: MovingView) -> Search[Any, Any, Hypotheses]:
         """The moving viewpoint's solution and its mirror image, of a body with a template."""

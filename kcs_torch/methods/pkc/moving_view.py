@@ -31,7 +31,7 @@ from kcs_torch.solvers.procrustean import (
     motion_energy,
 )
 
-__all__ = ["TIGHT", "MovingView", "moving_view", "searching", "soften"]
+__all__ = ["TIGHT", "MovingView", "moving_view", "searching", "settled", "soften"]
 
 TURNS = (30.0, 60.0, 90.0, 120.0, 180.0, 360.0)
 """Degrees that the cameras of the starts turn, evenly, about the image's vertical."""
@@ -237,6 +237,16 @@ def searching(
         bones = spread(pose.points[0])
     pose = yield from descend(image, pose, tight[1], fine, weights)
     return MovingView(pose[value(pose).argsort()], bones, rigid, tight[0], lead)
+
+
+def settled(image: Tensor, skeleton: Skeleton, start: Tensor, rotations: Tensor) -> Search[Descent, Pose, Tensor]:
+    """Depths (T, N) that the coarse stages make of a first guess of a tree; arguments as of :func:`moving_view`."""
+    bones = skeleton.bone_index(device=image.device)
+    rigid = bones[list(skeleton.rigid)]
+    first = torch.cat([image, start[..., 2:] - start[..., 2:].mean(1, keepdim=True)], -1)[None]
+    turned = align_rotations(first, rotations[None], bones)
+    (pose,) = yield [Descent(image, first, turned, bones, None, rigid, 1.0, 0.0, COARSE)]
+    return pose.points[0, ..., 2]
 
 
 def soften(stage: Stage, noise: float) -> Stage:
