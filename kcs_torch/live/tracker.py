@@ -109,6 +109,8 @@ class Tracker:
             raise OptionError(f"Tracker: fps: expected a positive number, got {fps!r}")
         if least is None or not 0 <= least <= 1:
             raise OptionError(f"Tracker: threshold: expected a confidence within 0..1, got {threshold!r}")
+        if method is not None and not isinstance(method, PKC):
+            raise OptionError(f"Tracker: method: expected a kcs_torch.PKC, or None for its defaults, got {method!r}")
         window = max(2 * LEAST, round(LENGTH * rate)) if window is None else window
         period = max(window, round(AGAIN * rate)) if period is None else period
         for name, value in (("window", window), ("period", period)):

@@ -210,8 +210,12 @@ def apart(tracks: Sequence[Tracks]) -> Iterator[None]:
 
 def check_cameras(cameras: Tensor, frames: int) -> Tensor:
     """The cameras themselves, if they are (T, 2, 3) with orthonormal rows."""
-    if cameras.shape != (frames, 2, 3) or not torch.isfinite(cameras).all():
+    if cameras.shape != (frames, 2, 3):
         raise ShapeError(f"cameras: expected finite ({frames}, 2, 3), got {tuple(cameras.shape)}")
+    lost = (~cameras.isfinite()).any(-1).any(-1).nonzero().flatten()
+    if len(lost):
+        where = f"{counted(len(lost), 'frame')}, the first of which is {int(lost[0])}"
+        raise ShapeError(f"cameras: expected finite numbers, got NaN or infinity in {where}")
     off = (cameras @ cameras.mT - torch.eye(2).to(cameras)).abs().amax((-2, -1))
     if bool((off > 0.01).any()):
         raise ShapeError(

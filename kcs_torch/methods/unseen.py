@@ -6,12 +6,16 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.align import centre, procrustes
+from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["gap_deviation", "place_unseen"]
 
 LEAST = 0.001
 """Least standard deviation of a place that was filled in, a share of the body's size, and that of others at rest."""
+
+LONGEST = 0.95
+"""Share of the frames in which a bone looks no longer than what is taken for its length."""
 
 BEND = 0.3
 """Share of its usual acceleration, over a second, by which a joint strays from the path that fills a gap."""
@@ -56,7 +60,9 @@ def place_unseen(points: Tensor, known: Tensor, skeleton: Skeleton) -> Tensor:
     """Place joints that are never seen where the template has them, seen from their nearest seen neighbour.
 
     The template is turned onto each frame's seen joints, at one scale for the clip, and mirrored in depth where that
-    fits the clip better. Without a template a joint takes its neighbour's place, without a neighbour the middle.
+    fits the clip better. The scale is that at which most seen bones are as long as they look at their longest: a pose
+    unlike the template's would shrink what is fitted to it. Without a template a joint takes its neighbour's place,
+    without a neighbour the middle.
 
     Args:
         points: (T, N, 3).
@@ -73,11 +79,13 @@ def place_unseen(points: Tensor, known: Tensor, skeleton: Skeleton) -> Tensor:
     offsets = torch.zeros_like(points)
     if skeleton.template is not None:
         rest, _ = centre(skeleton.template_points(dtype=points.dtype, device=points.device), weights)
+        size = _size(points, known, rest, skeleton)
         fits = []
         for depth in (1.0, -1.0):
             body = (rest * torch.tensor([1.0, 1.0, depth]).to(points)).expand_as(local)
-            rotation, scale = procrustes(body, local, weights)
-            placed = scale.median() * body @ rotation
+            rotation, fitted = procrustes(body, local, weights)
+            scale = fitted.median() if size is None else size
+            placed = scale * body @ rotation
             fits.append((((placed - local).square().sum(-1) * weights).sum(), placed))
         offsets = min(fits, key=lambda f: float(f[0]))[1]
     placed = torch.where(known[:, None], local, torch.zeros_like(local))
@@ -91,3 +99,13 @@ def place_unseen(points: Tensor, known: Tensor, skeleton: Skeleton) -> Tensor:
                                        (placed[:, near] + offsets[:, joint] - offsets[:, near])[:, None])  # fmt: skip
             done[joint] = True
     return torch.where(known[:, None], points, placed + middle)
+
+
+def _size(points: Tensor, known: Tensor, rest: Tensor, skeleton: Skeleton) -> Tensor | None:
+    """Size of the body beside the template's, by the longest that seen bones look; None where no bone is seen."""
+    bones = skeleton.bone_index(device=points.device)
+    bones = bones[known[bones].all(-1)]
+    usual, longest = bone_lengths(rest, bones), bone_lengths(points, bones)
+    longest = longest.kthvalue(round(LONGEST * (len(points) - 1)) + 1, 0).values if len(bones) else usual
+    use = (usual > 0) & (longest > 0)
+    return (longest[use] / usual[use]).median() if bool(use.any()) else None

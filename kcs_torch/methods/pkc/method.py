@@ -58,6 +58,9 @@ AGAIN = 3
 TELLING = 2.0
 """Degrees of the turn of known cameras from which on they tell the sign of depth."""
 
+RIVALS = 4
+"""Further solutions that tell how sure depths are, whether they are returned or not."""
+
 LEAST_FRAMES = 12
 """Frames from which on the viewpoint may have turned."""
 
@@ -243,21 +246,22 @@ class PKC(Method):
     ) -> Estimate:
         """Estimates of the distinct hypotheses, in the tracks' units."""
         image = body.image if detections else None
-        found = distinct(found, self.alternatives + 1, APART)
+        found = distinct(found, max(self.alternatives, RIVALS) + 1, APART)
         told = told_by_prior(found, body.skeleton)
         if told:
             doubtful = f"forward or backward is uncertain for {', '.join(told)}, decided by usual postures"
             notes = (*notes, f"{doubtful}: see the alternatives")
         made = []
-        for k, (depth, points) in enumerate(zip(found.depth, body.bodies(found), strict=True)):
+        wanted = found[: self.alternatives + 1]
+        for k, (depth, points) in enumerate(zip(wanted.depth, body.bodies(wanted), strict=True)):
             one = torch.ones_like(points[:, 0, 0])
             value = float(found.energy[k])
             turned = body.frames(depth)[:, :2]
             unsure = angle_doubt(body.objective, depth, found.lengths[k], float(viewpoint_turn(turned)))
             spread = depth_deviation(found[k:], body.noise, body.skeleton, doubt=unsure, image=image) / body.factor
             settled = self.steps >= 10 and found.moved is not None and bool(found.moved[k] <= STILL)
-            path, said = turned if cameras is None else cameras, () if k else notes
-            made.append(Estimate(points, path, one, settled, found.steps, said, spread, value, still=True))
+            path, said, still = turned if cameras is None else cameras, () if k else notes, not _turns(cameras)
+            made.append(Estimate(points, path, one, settled, found.steps, said, spread, value, still=still))
         return replace(made[0], alternatives=tuple(made[1:]))
 
 
