@@ -278,7 +278,7 @@ def test_closing_ends_the_thread_and_keeps_the_window(clip):
 
 
 def test_bad_options():
-    for options in ({"fps": 0}, {"fps": "fast"}, {"window": 3}, {"period": 0.5}, {"threshold": 2}):
+    for options in ({"fps": 0}, {"fps": "fast"}, {"window": 3}, {"period": 0.5}, {"threshold": 2}, {"method": "kcs"}):
         with pytest.raises(kt.OptionError, match=next(iter(options))):
             kt.Tracker("coco17", **{"fps": 30, **options})
     loop = kt.SKELETONS["coco17"].with_links([("left_wrist", "right_wrist")])

@@ -216,9 +216,34 @@ def test_known_cameras_tell_the_mirror_images_apart(turning):
     assert torch.equal(result.cameras, clip.cameras) and result.alternatives == ()
 
 
+def test_deviations_do_not_depend_on_the_alternatives_asked_for(still):
+    clip, result = still
+    assert len(result.alternatives) > 1
+    for count in (0, 1):
+        few = PKC(alternatives=count)(clip.tracks)
+        assert len(few.alternatives) == count
+        assert_close(few.points, result.points)
+        assert_close(few.uncertainty, result.uncertainty)
+
+
+@pytest.mark.filterwarnings("ignore:.*never seen, so placed:kcs_torch.KcsWarning")
+@pytest.mark.parametrize("joint", ["right_wrist", "left_ankle", "left_knee"])
+def test_a_joint_never_seen_spoils_no_other(joint):
+    clip = walking_person(60, turn=0.0, yaw=70.0)
+    missing = clip.skeleton.index(joint)
+    points = clip.tracks.points.clone()
+    points[:, missing] = NAN
+    hidden = PKC()(Tracks.from_arrays(points, skeleton=clip.skeleton, fps=30))
+    others = [j for j in range(clip.skeleton.num_observed) if j != missing]
+    whole = PKC()(clip.tracks)
+    figures = [error(found.points[:, others], clip.points[:, others]) for found in (whole, hidden)]
+    assert figures[1] < figures[0] + 0.1, figures
+
+
 def test_known_cameras_are_those_of_every_solution(turning):
     clip, _ = turning
     result = PKC()(clip.tracks, clip.cameras)
+    assert result.root_depth is None  # feet that stand still do not do so in the image
     assert error(result.points, clip.points) < 0.1
     for one in (result, *result.alternatives):
         assert torch.equal(one.cameras, clip.cameras)

@@ -510,3 +510,22 @@ def test_searches_in_lockstep():
     for task, rounds, energies in zip(tasks, (2, 0, 3), found, strict=True):
         assert_close(energies, run(search(task, rounds), minimise_all), rtol=1e-6, atol=1e-6)
     assert run(together([]), minimise_all) == []
+
+
+def test_joints_never_seen_are_no_evidence():
+    clip = walking_person(20)
+    body = clip.skeleton
+    knee, ankle = body.index("left_knee"), body.index("left_ankle")
+    noise = torch.zeros(20, body.num_joints).double()
+    noise[:, ankle] = 0.1
+    image = clip.points[..., :2] / 1000
+    plain, found = (Objective(body, image, Weights(), each) for each in (0 * noise, noise))
+    shank = body.bones.index((knee, ankle))
+    assert not plain.hinges.firm.eq(0).any()
+    lost = [bool(shank in pair) for pair in found.hinges.limbs.tolist()]
+    assert found.hinges.firm.eq(0).tolist() == lost and any(lost)
+    assert found.clear[:, shank].max() < 0.01 and (plain.clear == 1).all()
+    seen = noise.clone()
+    seen[5, ankle] = 0
+    assert torch.equal(Objective(body, image, Weights(), seen).hinges.firm, plain.hinges.firm)
+    assert torch.equal(Objective(body, image, Weights(), noise.clamp_min(0.05)).hinges.firm, plain.hinges.firm)

@@ -41,7 +41,7 @@ def test_a_body_like_the_template_is_completed_exactly(unseen, mirror):
 
 
 def test_seen_joints_stay_and_unseen_ones_keep_their_bones():
-    points = turned_template() + 30 * normal(8, 17, 3, seed=2)
+    points = turned_template() + 6 * normal(8, 17, 3, seed=2)  # 35 mm for a person of 1.75 m
     known = known_but(KNEE, ANKLE)
     found = place_unseen(spoiled(points, known), known, BODY)
     assert torch.equal(found[:, known], points[:, known])
@@ -50,6 +50,17 @@ def test_seen_joints_stay_and_unseen_ones_keep_their_bones():
     assert_close(length, length[:1].expand(8))  # one scale for the clip
     assert length[0] / (rest[KNEE] - rest[ANKLE]).norm() == pytest.approx(300, rel=0.1)
     assert_close(found, place_unseen(points, known, BODY))  # whatever stood there
+
+
+def test_a_pose_unlike_the_templates_does_not_shrink_what_is_unseen():
+    points, known = turned_template(), known_but(KNEE, ANKLE)
+    bent = points.clone()
+    for joint in (BODY.index("left_wrist"), BODY.index("right_wrist"), BODY.index("head")):
+        near = next(a for a, b in BODY.bones if b == joint)
+        bent[:, joint] = 2 * points[:, near] - points[:, joint]  # turned back, of the same length
+    before, after = (place_unseen(p, known, BODY) for p in (points, bent))
+    length = [(found[:, KNEE] - found[:, ANKLE]).norm(dim=-1) for found in (before, after)]
+    assert_close(length[1], length[0])
 
 
 def test_nothing_unseen_and_nothing_seen():

@@ -14,7 +14,7 @@ __all__ = ["gap_deviation", "place_unseen"]
 LEAST = 0.001
 """Least standard deviation of a place that was filled in, a share of the body's size, and that of others at rest."""
 
-LONGEST = 0.95
+LONGEST = 0.8
 """Share of the frames in which a bone looks no longer than what is taken for its length."""
 
 BEND = 0.3

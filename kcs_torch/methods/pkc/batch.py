@@ -108,7 +108,8 @@ def minimise_all(tasks: Sequence[Task]) -> list[Refined]:
 
 def _kind(task: Task) -> object:
     """What tasks must share to be refined together."""
-    return task.objective.skeleton, task.num_steps, task.loose, task.depth.dtype, task.depth.device
+    firm = tuple(task.objective.hinges.firm.tolist())  # hinges of joints never seen are of no use
+    return task.objective.skeleton, firm, task.num_steps, task.loose, task.depth.dtype, task.depth.device
 
 
 def _runs(order: list[int], tasks: Sequence[Task]) -> list[list[int]]:

@@ -32,6 +32,9 @@ BLUR = 2.0
 SHAKY = 2.0
 """By how much a standing foot strays in depth, over its noise in the image: it hangs on a chain of bones."""
 
+NEVER = 3.5
+"""A bone's least noise, over that of the clearest bone, from which on a joint of it is a guess in all frames."""
+
 STEADY = 5
 """Reweightings by which the body's velocity is found; more change what contacts cost by .02 on average."""
 
@@ -119,7 +122,11 @@ class Objective:
         self.tree = chain_inverse(incidence(self.bones, skeleton.num_joints, dtype=image.dtype))  # (N, B)
         self.noise = bone_noise(noise, self.bones)  # (T, B)
         self.noisy = bool((self.noise > 0).any())
-        least = self.noise.amin(0).square() + weights.length**2
+        quiet = self.noise.amin(0)
+        usual = quiet.amin()
+        never = quiet > NEVER * usual  # bones of joints that no frame shows
+        self.hinges.firm[never[self.hinges.limbs].any(-1)] = 0
+        least = torch.where(never, usual, quiet).square() + weights.length**2
         self.clear = least / (weights.length**2 + self.noise.square())  # a guessed image is no evidence
         observed = torch.eye(skeleton.num_observed, dtype=image.dtype, device=image.device)
         self.complete = skeleton.complete(observed)[0].mT  # (No, N): virtual joints follow their sources
