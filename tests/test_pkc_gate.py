@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+import kcs_torch as kt
 from kcs_torch.data import walking_person
-from kcs_torch.methods.pkc.gate import SELDOM, plausible
+from kcs_torch.methods.pkc.gate import SELDOM, elsewhere, plausible, without_others
 from kcs_torch.skeleton import SKELETONS
 
 BODY = SKELETONS["h36m17"]
@@ -96,3 +97,55 @@ def test_clips_that_tell_nothing(case):
     if case == "one frame":
         points, seen = points[:1], seen[:1]
     assert torch.equal(plausible(points, seen, BODY), seen)
+
+
+# ------------------------------------------------------------------------------ frames of somebody else
+
+
+def visited(frames=60, first=25, count=8, scale=1.5, aside=1500.0):
+    """A walk during which the tracker takes somebody else for some frames; and which frames are the walker's."""
+    clip, other = walking_person(frames, turn=0.0), walking_person(frames, turn=0.0, yaw=130.0)
+    points, own = clip.tracks.points.clone(), torch.ones(frames, dtype=torch.bool)
+    points[first : first + count] = (
+        scale * other.tracks.points[first : first + count] + torch.tensor([aside, 0.0]).double()
+    )
+    own[first : first + count] = False
+    return clip, points, own
+
+
+@pytest.mark.parametrize(("count", "scale", "aside"), [(8, 1.5, 1500.0), (1, 1.0, -900.0), (12, 0.7, 2000.0)])
+def test_frames_of_somebody_else_are_found(count, scale, aside):
+    clip, points, own = visited(count=count, scale=scale, aside=aside)
+    seen = torch.ones(points.shape[:2], dtype=torch.bool)
+    assert torch.equal(elsewhere(points, seen), ~own)
+    assert torch.equal(elsewhere(1e-3 * points + 7, seen), ~own)
+    seen[20:40, ::2] = False
+    seen[30] = False
+    assert torch.equal(elsewhere(points, seen), ~own)
+    assert not elsewhere(clip.tracks.points, seen).any()
+
+
+def test_what_is_no_visit():
+    clip, points, _ = visited()
+    everywhere = torch.ones(points.shape[:2], dtype=torch.bool)
+    points[33:] += torch.tensor([5000.0, 0.0]).double()  # it never comes back: a cut, and nobody knows to whom
+    assert not elsewhere(points, everywhere).any()
+    shaken = clip.tracks.points + 2000 * (torch.arange(60) % 2).double()[:, None, None]
+    assert not elsewhere(shaken, everywhere).any()
+    _, long, _ = visited(count=20)  # a third of the clip
+    assert not elsewhere(long, everywhere).any()
+    for degenerate in (0 * points, points[:3], points[:0]):
+        assert not elsewhere(degenerate, everywhere[: len(degenerate)]).any()
+    assert not elsewhere(points, 0 * everywhere > 0).any()
+
+
+def test_somebody_elses_frames_do_not_spoil_a_clip():
+    clip, points, own = visited()
+    tracks = replace(clip.tracks, points=points)
+    assert without_others(clip.tracks) is clip.tracks
+    left = without_others(tracks)
+    assert torch.equal(left.seen.any(-1), own)
+    assert left.notes[-1].endswith("left out as somebody else's: 8 of 60 (13 %) frames, from frame 25 on")
+    result = kt.reconstruct(tracks)
+    assert left.notes[-1] in result.tracks.notes
+    assert float(kt.metrics.mpjpe(result.points[own], clip.points[own], align="rigid")) < 10

@@ -1,20 +1,74 @@
-"""Detections that no body of usual proportions could make."""
+"""Detections that no body of usual proportions, or not this body, could make."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from kcs_torch.clean.common import rebuilt, share
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.types import Tracks
 
-__all__ = ["plausible"]
+__all__ = ["elsewhere", "plausible", "without_others"]
 
 LONG = 2.0
 """An image longer than so many usual lengths is no bone's."""
 
 SELDOM = 3
 """Joints that are seen in fewer frames tell nothing of their bones' lengths."""
+
+LEAP, SUDDEN, NEAR = 1.0, 4.0, 5
+"""From one frame to the next the whole body leaps where it moves by more than so many times its size, the median
+distance of joints from their middle, and by so many times what is usual within so many frames."""
+
+BACK, PART = 0.5, 0.25
+"""What leaps away and back ends where it began, but for this share of its leaps, and is away for this share of the
+clip at most."""
+
+
+def elsewhere(points: Tensor, seen: Tensor) -> Tensor:
+    """Frames (T,) in which the whole body has leapt away and not yet back: most likely those of somebody else.
+
+    A tracker that takes two people for each other, say, shows the other one for some frames. How far the body moves
+    is told by the joints that both frames show. A leap without return is left: nobody knows which side is right.
+
+    Args:
+        points: (T, N, 2).
+        seen: (T, N) bool.
+    """
+    away = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    shown = (seen.sum(-1) > 1).nonzero().flatten()
+    if len(shown) < 4:
+        return away
+    known = torch.where(seen[..., None], points, torch.nan)[shown]  # (K, N, 2)
+    size = (known - known.nanmedian(1, keepdim=True).values).norm(dim=-1).nanmedian()
+    step = (known[1:] - known[:-1]).nanmedian(1).values.norm(dim=-1).nan_to_num()
+    near = torch.nn.functional.pad(step[None, None], (NEAR, NEAR), mode="replicate")[0, 0].unfold(0, 2 * NEAR + 1, 1)
+    leaps = (step > torch.maximum(LEAP * size, SUDDEN * near.median(-1).values)).nonzero().flatten().tolist()
+    if not size > 0 or len(leaps) > PART * len(shown):  # a camera that shakes, or tracks of no one
+        return away
+    k = 0
+    while k + 1 < len(leaps):
+        first, last = leaps[k], leaps[k + 1]
+        gap = (known[last + 1] - known[first]).nanmedian(0).values.norm()
+        if last - first <= PART * len(shown) and bool(gap < BACK * torch.minimum(step[first], step[last])):
+            away[shown[first] + 1 : shown[last] + 1] = True
+            k += 1
+        k += 1
+    return away
+
+
+def without_others(tracks: Tracks) -> Tracks:
+    """Tracks in which frames of somebody else (:func:`elsewhere`) show nothing; a note says which."""
+    away = elsewhere(tracks.points, tracks.seen)
+    if not bool(away.any()):
+        return tracks
+    count = tracks.skeleton.num_observed
+    weights = torch.where(away[:, None], 0, tracks.weights)[:, :count]
+    which = f"{share(int(away.sum()), len(away))} frames, from frame {int(away.nonzero()[0])} on"
+    note = f"the whole body leaps away and back: left out as somebody else's: {which}"
+    return rebuilt(tracks, tracks.points[:, :count], weights, note)
 
 
 def plausible(points: Tensor, seen: Tensor, skeleton: Skeleton) -> Tensor:

@@ -18,7 +18,7 @@ from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.batch import Noisy, Sized, serve
 from kcs_torch.methods.pkc.body import Body
-from kcs_torch.methods.pkc.gate import plausible
+from kcs_torch.methods.pkc.gate import plausible, without_others
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
 from kcs_torch.methods.pkc.moving_view import MovingView, settled
@@ -78,8 +78,9 @@ class PKC(Method):
     Args:
         viewpoint: "fixed" lifts by the template, "moving" by the viewpoint's turn; "auto" by the template if there is
             one, and by both where the trunk turns. Known cameras tell the sign of depth, and rank solutions.
-        denoise: first swap left and right back where a detector mistakes them (:func:`kcs_torch.clean.unswap`), smooth
-            noisy tracks, fill gaps and reject outliers (:func:`kcs_torch.solvers.denoise_tracks`).
+        denoise: first leave out frames in which the whole body leaps away, to somebody else, and back; swap left and
+            right back where a detector mistakes them (:func:`kcs_torch.clean.unswap`); smooth noisy tracks, fill gaps
+            and reject outliers (:func:`kcs_torch.solvers.denoise_tracks`).
         lifts: random starts of the moving viewpoint's solver, for skeletons without a template.
         rounds: of discrete moves of the fixed viewpoint's solver.
         steps: L-BFGS steps of each of its refinements.
@@ -113,7 +114,7 @@ class PKC(Method):
         return len(trunk_joints(skeleton)) >= 3
 
     def prepared(self, tracks: Tracks) -> Tracks:
-        return unswap(tracks) if self.denoise else tracks
+        return unswap(without_others(tracks)) if self.denoise else tracks
 
     def following(self) -> PKC:
         """The same without contacts: what stands still in space does not in the image."""
