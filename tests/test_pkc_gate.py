@@ -132,6 +132,14 @@ def test_what_is_no_visit():
     assert not elsewhere(points, everywhere).any()
     shaken = clip.tracks.points + 2000 * (torch.arange(60) % 2).double()[:, None, None]
     assert not elsewhere(shaken, everywhere).any()
+    for frames in (2, 3):  # a snap aside and back that takes so many frames
+        snap = clip.tracks.points.clone()
+        way = torch.ones(60).double()
+        way[:25] = way[38:] = 0
+        for k in range(1, frames):
+            way[24 + k] = way[38 - k] = k / frames
+        snap[..., 0] += 3000 * way[:, None]
+        assert not elsewhere(snap, everywhere).any()
     _, long, _ = visited(count=20)  # a third of the clip
     assert not elsewhere(long, everywhere).any()
     for degenerate in (0 * points, points[:3], points[:0]):

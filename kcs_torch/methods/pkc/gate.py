@@ -18,9 +18,10 @@ LONG = 2.0
 SELDOM = 3
 """Joints that are seen in fewer frames tell nothing of their bones' lengths."""
 
-LEAP, SUDDEN, NEAR = 1.0, 4.0, 5
+LEAP, SUDDEN = 1.0, 4.0
 """From one frame to the next the whole body leaps where it moves by more than so many times its size, the median
-distance of joints from their middle, and by so many times what is usual within so many frames."""
+distance of joints from their middle, and by so many times what it moves in the frames beside: a hand that snaps aside
+takes several frames to do so."""
 
 BACK, PART = 0.5, 0.25
 """What leaps away and back ends where it began, but for this share of its leaps, and is away for this share of the
@@ -44,15 +45,16 @@ def elsewhere(points: Tensor, seen: Tensor) -> Tensor:
     known = torch.where(seen[..., None], points, torch.nan)[shown]  # (K, N, 2)
     size = (known - known.nanmedian(1, keepdim=True).values).norm(dim=-1).nanmedian()
     step = (known[1:] - known[:-1]).nanmedian(1).values.norm(dim=-1).nan_to_num()
-    near = torch.nn.functional.pad(step[None, None], (NEAR, NEAR), mode="replicate")[0, 0].unfold(0, 2 * NEAR + 1, 1)
-    leaps = (step > torch.maximum(LEAP * size, SUDDEN * near.median(-1).values)).nonzero().flatten().tolist()
+    leaps = (step > LEAP * size).nonzero().flatten().tolist()
     if not size > 0 or len(leaps) > PART * len(shown):  # a camera that shakes, or tracks of no one
         return away
     k = 0
     while k + 1 < len(leaps):
         first, last = leaps[k], leaps[k + 1]
-        gap = (known[last + 1] - known[first]).nanmedian(0).values.norm()
-        if last - first <= PART * len(shown) and bool(gap < BACK * torch.minimum(step[first], step[last])):
+        gap, least = (known[last + 1] - known[first]).nanmedian(0).values.norm(), torch.minimum(step[first], step[last])
+        beside = [step[i] for i in (first - 1, first + 1, last - 1, last + 1) if i not in (first, last, -1, len(step))]
+        sudden = all(bool(least > SUDDEN * one) for one in beside)
+        if last - first <= PART * len(shown) and sudden and bool(gap < BACK * least):
             away[shown[first] + 1 : shown[last] + 1] = True
             k += 1
         k += 1

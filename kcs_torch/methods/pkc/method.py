@@ -58,7 +58,7 @@ AGAIN = 3
 TELLING = 2.0
 """Degrees of the turn of known cameras from which on they tell the sign of depth."""
 
-RIVALS = 4
+OTHERS = 4
 """Further solutions that tell how sure depths are, whether they are returned or not."""
 
 LEAST_FRAMES = 12
@@ -247,7 +247,7 @@ class PKC(Method):
     ) -> Estimate:
         """Estimates of the distinct hypotheses, in the tracks' units."""
         image = body.image if detections else None
-        found = distinct(found, max(self.alternatives, RIVALS) + 1, APART)
+        found = distinct(found, max(self.alternatives, OTHERS) + 1, APART)
         told = told_by_prior(found, body.skeleton)
         if told:
             doubtful = f"forward or backward is uncertain for {', '.join(told)}, decided by usual postures"
@@ -259,7 +259,10 @@ class PKC(Method):
             value = float(found.energy[k])
             turned = body.frames(depth)[:, :2]
             unsure = angle_doubt(body.objective, depth, found.lengths[k], float(viewpoint_turn(turned)))
-            spread = depth_deviation(found[k:], body.noise, body.skeleton, doubt=unsure, image=image) / body.factor
+            spread = (
+                depth_deviation(found[k : k + OTHERS + 1], body.noise, body.skeleton, doubt=unsure, image=image)
+                / body.factor
+            )
             settled = self.steps >= 10 and found.moved is not None and bool(found.moved[k] <= STILL)
             path, said, still = turned if cameras is None else cameras, () if k else notes, not _turns(cameras)
             made.append(Estimate(points, path, one, settled, found.steps, said, spread, value, still=still))
