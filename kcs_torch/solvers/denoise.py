@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -30,7 +31,10 @@ _TINY = 1e-30
 # The floor of a spectrum is motion where less than the first share of its power is every joint's own, and noise from
 # the second on.
 _SHARED = (0.15, 0.35)
-_ENOUGH = 20  # quick modes from which on that can be told
+# Noise that lasts for several frames begins where a band's deviation that is not shared is the first share of all.
+_LASTS = (0.13, 0.2)
+_MORE = 2.0  # how much of its power there is for what can be told: slower modes have more
+_ENOUGH, _FEW = 20, 12  # modes from which on white noise can be told, and noise that lasts
 _COMMON, _RATIO = 0.7, 1.318  # a quantile of distances, and what it is over the median for a Gaussian in the plane
 
 
@@ -48,6 +52,7 @@ class Denoised(NamedTuple):
     weights: Tensor
     noise: Tensor
     outliers: Tensor
+    left: Tensor
 
 
 def denoise_tracks(
@@ -116,18 +121,19 @@ def denoise_tracks(
         for _ in range(rounds):
             model.fit(y, x, w)
             parts = zip(y.split(_CHUNK, 1), x.split(_CHUNK, 1), w.split(_CHUNK, 1), strict=True)
-            x = torch.cat([model.solve(*part, steps) for part in parts], 1)
+            x = torch.cat([model.still(model.solve(*part, steps)) for part in parts], 1)
         points = blend_windows(x.unflatten(-1, (joints, 2)).movedim(0, 2), starts, frames).movedim(1, 0) + mean
         if last == 0:
             break
         error = (values - points).norm(dim=-1) / (1 - model.leverage()[:, None] * live).clamp_min(1e-3)
         outliers = _each_joint(_far, error, given > 0, threshold, floor)
-    noise = (model.measured.sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints)
+    noise = ((model.measured + model.lasting.mean(1)).sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints)
     return Denoised(
         (points * unit).reshape(shape).to(tracks.dtype),
         torch.where(outliers.reshape(weights.shape), torch.zeros_like(weights), weights),
         noise.reshape(*shape[:-3], joints).to(tracks.dtype),
         outliers.reshape(weights.shape),
+        (model.left.sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints).reshape(*shape[:-3], joints).to(tracks.dtype),
     )
 
 
@@ -146,12 +152,14 @@ class _Model:
         z = self.basis.mT @ (x + w * (y - x))
         typical = z.square().movedim(2, 1).flatten(2).median(-1).values / 0.4549  # of chi-square: blind to impacts
         floor = _spectrum_floor(typical)
-        alone = _apart(z[:, :, length // 2 :].flatten(1, 2))
+        alone, _ = _apart(z[:, :, length // 2 :].flatten(1, 2), _ENOUGH)
         alone = torch.where(alone.isfinite(), alone, floor)
         own = ((alone / floor.clamp_min(_TINY) - _SHARED[0]) / (_SHARED[1] - _SHARED[0])).clamp(0, 1)
         self.measured = torch.lerp(alone, torch.maximum(alone, floor), own) / self.share.flatten()
         self.noise = self.measured.clamp_min(_LEAST_NOISE**2)
-        left = (self.noise * self.share.flatten())[:, None]  # noise power in a mode: what is filled has none
+        share = self.share.flatten()[:, None]
+        self.lasting = self._lasting(z, self.measured * self.share.flatten()) / share
+        left = (self.noise[:, None] + self.lasting) * share  # noise power in a mode: what is filled has none
         order = torch.arange(1, length + 1, dtype=y.dtype, device=y.device)
         near = torch.exp(-0.5 * ((order.log()[:, None] - order.log()) / 0.15) ** 2)
         near = near / near.sum(1, keepdim=True)
@@ -179,7 +187,29 @@ class _Model:
             variance = variance / variance.mean(-1, keepdim=True)
             self.axes.append(axes[:, None])
             variances.append(spectrum[:, a:b, None] * variance[:, None])
-        self.ratio = (self.noise[:, None, None] / torch.cat(variances, 1).clamp_min(_TINY))[:, None]  # (K, 1, L, M)
+        motion = torch.cat(variances, 1).clamp_min(_TINY)  # (K, L, M)
+        both = motion + self.lasting[..., None]
+        self.ratio = (self.noise[:, None, None] / both)[:, None]  # (K, 1, L, M)
+        self.moving = (motion / both)[:, None]
+        white = self.noise[:, None, None] + self.lasting[..., None]
+        self.left = (motion * white / (motion + white)).mean((1, 2))
+
+    def _lasting(self, z: Tensor, white: Tensor) -> Tensor:
+        """Power (K, L) of noise in modes z (K, H, L, M) beyond white noise of the power (K,).
+
+        Quick modes tell it for slower ones, in which motion hides it.
+        """
+        level, out = white, []
+        for a, b in reversed(self.bands):
+            if a >= _BANDS[2]:
+                part = z[:, :, a:b].flatten(1, 2)
+                own, surely = _apart(part, _FEW)
+                among = (surely / part.square().mean((1, 2)).clamp_min(_TINY)).sqrt()
+                noisy = ((among - _LASTS[0]) / (_LASTS[1] - _LASTS[0])).clamp(0, 1)
+                known = torch.where(own.isfinite(), own, level)
+                level = torch.lerp(torch.minimum(known, level), known, noisy)
+            out.append((_MORE * (level - white).clamp_min(0))[:, None].expand(-1, b - a))
+        return torch.cat(out[::-1], 1)
 
     def solve(self, y: Tensor, x: Tensor, w: Tensor, steps: int, tolerance: float = 1e-10) -> Tensor:
         """Minimise over x by preconditioned conjugate gradients, every window for itself, from the given x."""
@@ -201,6 +231,10 @@ class _Model:
             before, energy = energy, dot(rest, towards)
             step = towards + energy / before.clamp_min(_TINY**2) * step
         return x
+
+    def still(self, x: Tensor) -> Tensor:
+        """What of it is motion."""
+        return self._from_modes(self.moving * self._to_modes(x)) if bool((self.lasting > 0).any()) else x
 
     def leverage(self) -> Tensor:
         """(K, N) mean weight of a joint's measurement in its own estimate."""
@@ -251,21 +285,29 @@ def _spectrum_floor(power: Tensor) -> Tensor:
     return (scale * level[:, 0]).flatten(1).gather(1, best)[:, 0]
 
 
-def _apart(quick: Tensor) -> Tensor:
-    """Variance (K,) of what the quickest modes (K, n, M) do not share: white noise is every joint's own, motion is not.
+def _apart(modes: Tensor, enough: int) -> tuple[Tensor, Tensor]:
+    """Variance (K,) of what modes (K, n, M) do not share, and a cautious guess: noise is every joint's own, motion not.
 
     The smaller eigenvalues of the coordinates' covariance, over those of as much white noise of variance 1; infinite
-    where there are too few modes to tell.
+    where there are too few modes to tell. The guess takes fewer of them.
     """
-    count, size = quick.shape[1:]
-    if count < _ENOUGH or size < 8:
-        return torch.full_like(quick[:, 0, 0], math.inf)
-    noise = torch.randn(count, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64, device="cpu")
-    noise = noise.to(quick)
+    count, size = modes.shape[1:]
+    if count < enough or size < 8:
+        return (torch.full_like(modes[:, 0, 0], math.inf),) * 2
+    usual, found = _white_spectrum(count, size).to(modes), torch.linalg.eigvalsh(modes.mT @ modes)
     rank = min(size, count)
-    low = slice(size - rank + rank // 8, size - rank + rank // 2)  # virtual joints are no measurements
-    usual = torch.linalg.eigvalsh(noise.mT @ noise)[..., low].mean(-1)
-    return torch.linalg.eigvalsh(quick.mT @ quick)[..., low].mean(-1).clamp_min(0) / usual.clamp_min(_TINY)
+    first = size - rank + rank // 8  # virtual joints are no measurements
+    low = [slice(first, size - rank + last) for last in (rank // 2, 3 * rank // 8)]
+    half, less = (found[..., i].mean(-1).clamp_min(0) / usual[..., i].mean(-1).clamp_min(_TINY) for i in low)
+    return half, less
+
+
+@lru_cache(maxsize=64)
+def _white_spectrum(count: int, size: int) -> Tensor:
+    """Eigenvalues (M,) of the scatter of as many modes (n, M) of white noise."""
+    with torch.inference_mode(False):
+        noise = torch.randn(count, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64, device="cpu")
+        return torch.linalg.eigvalsh(noise.mT @ noise)
 
 
 def _fill(values: Tensor, seen: Tensor) -> Tensor:

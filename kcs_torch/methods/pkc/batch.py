@@ -41,10 +41,11 @@ class Task:
 
 
 class Noisy(NamedTuple):
-    """Tracks (T, N, 2) of weights (T, N) that are to be cleaned by :func:`denoise_tracks`."""
+    """Tracks (T, N, 2) of weights (T, N) that are to be cleaned by :func:`denoise_tracks`, in windows of L frames."""
 
     points: Tensor
     weights: Tensor
+    window: int = 64
 
 
 class Sized(NamedTuple):
@@ -83,13 +84,14 @@ def serve(requests: Sequence[Task | Placing | Facing | Descent | Noisy | Sized |
 def clean_all(tasks: Sequence[Noisy]) -> list[Denoised]:
     """:func:`denoise_tracks` of each task; those of equal size together."""
     groups: dict[object, list[int]] = {}
-    for i, (points, _) in enumerate(tasks):
-        groups.setdefault((points.shape, points.dtype, points.device), []).append(i)
+    for i, (points, _, window) in enumerate(tasks):
+        groups.setdefault((points.shape, points.dtype, points.device, window), []).append(i)
     out: dict[int, Denoised] = {}
     for group in groups.values():
         few = max(1, TOGETHER // tasks[group[0]].points.shape[0])
         for run in (group[first : first + few] for first in range(0, len(group), few)):
-            found = denoise_tracks(*(torch.stack(part) for part in zip(*(tasks[i] for i in run), strict=True)))
+            points, weights = (torch.stack(part) for part in zip(*(tasks[i][:2] for i in run), strict=True))
+            found = denoise_tracks(points, weights, window=tasks[run[0]].window)
             out |= {i: Denoised(*row) for i, row in zip(run, zip(*found, strict=True), strict=True)}
     return [out[i] for i in range(len(tasks))]
 

@@ -35,8 +35,8 @@ __all__ = ["PKC"]
 CLEAN = 0.003
 """Noise below this share of the body's size is left in the tracks."""
 
-LEFT = 0.45
-"""Share of the noise that smoothing leaves."""
+WINDOW = 64
+"""Frames, at 30 a second, of which motion and noise are told apart: quicker clips need as many seconds."""
 
 DETECTED = 0.027
 """Standard deviation of a joint that a detector is sure of, a share of the body's size, however smooth: what it gets
@@ -181,19 +181,22 @@ class PKC(Method):
 
     def _clean(self, tracks: Tracks) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
         """Complete tracks (T, N, 2), centred per frame, the noise (T, N) left in them, and what was done."""
-        level, keep = 0.0, tracks.seen
+        level, left, keep = 0.0, 0.0, tracks.seen
         points, notes = tracks.points, []
         if self.denoise:
             keep = plausible(points, keep, tracks.skeleton)
-            (clean,) = yield [Noisy(points, torch.where(keep, tracks.weights, 0))]
-            level = float(clean.noise.median())
+            window = WINDOW * round(min(max((tracks.fps or 30.0) / 30, 1), 4))
+            (clean,) = yield [Noisy(points, torch.where(keep, tracks.weights, 0), window)]
+            level, left = float(clean.noise.median()), float(clean.left.median())
             wrong = int((clean.outliers & keep).sum()) + int((tracks.seen & ~keep).sum())
             if wrong:
                 share = wrong / int(tracks.seen.sum())
                 notes.append(f"{counted(wrong, 'detection')} ({100 * share:.1f} %) rejected as outliers")
             keep = keep & ~clean.outliers
             exact = keep
-            if level > CLEAN:
+            if level <= CLEAN:
+                left = 0.0
+            else:
                 exact = torch.zeros_like(keep)
                 notes.append(f"tracks smoothed: noise of {100 * level:.1f} % of the body's size")
             points = torch.where(exact[..., None], points, clean.points)
@@ -203,7 +206,6 @@ class PKC(Method):
         if not bool(known.all()):
             flat = torch.nn.functional.pad(points, (0, 1))
             points = place_unseen(flat, known, tracks.skeleton)[..., :2]
-        left = LEFT * level if level > CLEAN else 0.0
         noise = (gap_deviation(points, keep, tracks.fps or 30.0, HELD).square() + left**2).sqrt()
         if detected(tracks.weights):
             noise = noise.maximum(DETECTED / tracks.weights.clamp_min(UNSURE).sqrt())
