@@ -53,7 +53,32 @@ def test_noise_is_measured_and_taken_away(share):
     found = denoise_tracks(tracks + noise * normal(*tracks.shape), torch.ones(tracks.shape[:2]))
     assert_close(found.noise.mean(), torch.tensor(noise, dtype=torch.float64), rtol=0.1, atol=0)
     assert rms(found.points - tracks) < 0.6 * noise
+    assert_close(float(found.left[0]), rms(found.points - tracks), rtol=0.25, atol=0)
     assert not found.outliers.any()
+
+
+@pytest.mark.parametrize("kind", ["averaged", "interpolated", "persistent"])
+def test_noise_that_lasts_is_told(kind):
+    """Filters, interpolation and detectors leave noise that is not white, and spectra without a floor."""
+    tracks = walk(200)
+    size = rms(tracks - tracks.mean(1, keepdim=True))
+    white = normal(*tracks.shape)
+    if kind == "averaged":
+        noise = (white[2:] + white[1:-1] + white[:-2]) / 3
+        noise = torch.cat([noise[:1], noise, noise[-1:]])
+    elif kind == "interpolated":
+        noise = white.clone()
+        noise[1:-1:2] = (noise[:-2:2] + noise[2::2]) / 2
+    else:
+        noise = white.clone()
+        for k in range(1, len(noise)):
+            noise[k] = 0.6 * noise[k - 1] + 0.8 * white[k]
+    level = 0.02 * size
+    found = denoise_tracks(tracks + level * noise / rms(noise), torch.ones(tracks.shape[:2]))
+    assert 0.5 * level < float(found.noise[0]) < 1.5 * level
+    error = rms(found.points - tracks)
+    assert error < 0.95 * level
+    assert 0.4 * error < float(found.left[0]) < 1.3 * error
 
 
 def test_gaps_are_filled_better_than_by_time_or_rank_alone():

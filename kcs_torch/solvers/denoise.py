@@ -32,9 +32,10 @@ _TINY = 1e-30
 # the second on.
 _SHARED = (0.15, 0.35)
 # Noise that lasts for several frames begins where a band's deviation that is not shared is the first share of all.
-_LASTS = (0.13, 0.2)
+_LASTS = (0.08, 0.13)
+_QUICK = 12  # slower modes of a window never tell noise
 _MORE = 2.0  # how much of its power there is for what can be told: slower modes have more
-_ENOUGH, _FEW = 20, 12  # modes from which on white noise can be told, and noise that lasts
+_ENOUGH = 20  # modes from which on noise can be told
 _COMMON, _RATIO = 0.7, 1.318  # a quantile of distances, and what it is over the median for a Gaussian in the plane
 
 
@@ -46,6 +47,7 @@ class Denoised(NamedTuple):
         weights: (..., T, N) as given, 0 at outliers.
         noise: (..., N) standard deviation of the measurement noise of a coordinate, in the tracks' units.
         outliers: (..., T, N), True where a seen joint was rejected and its place filled.
+        left: (..., N) standard deviation of what the noise leaves in the points, by the model.
     """
 
     points: Tensor
@@ -61,16 +63,19 @@ def denoise_tracks(
     r"""Smooth 2D tracks, fill what is unseen and reject outliers; all parameters come from the clip itself.
 
     In windows of L frames, with temporal modes u_i (eigenvectors of the third-difference penalty, polynomials first),
-    the tracks' coordinates x_i = u_i^T X about their mean follow a Gaussian, and measurements add white noise:
+    the tracks' coordinates x_i = u_i^T X about their mean follow a Gaussian, and measurements add white noise and noise
+    that lasts for several frames, as a filter's or a detector's does:
 
-        x_i ~ N(0, g_i Q_b(i)),    y_tn = x_tn + e_tn,    e_tn ~ N(0, s^2 / w_tn I_2)
+        x_i ~ N(0, g_i Q_b(i)),    y_tn = x_tn + r_tn + e_tn,    r_i ~ N(0, c_i I),    e_tn ~ N(0, s^2 / w_tn I_2)
 
     g_i is the clip's spectrum and Q_b its covariance between the 2N coordinates, for every octave b of modes, both
     estimated from the clip (moments, with shrinkage to independent joints). s^2 is the level at which the spectrum
     stops falling, unless joints move together there, and at least what quick modes do not share: clean tracks come back
-    as they are but for their own jitter. Given these, x is the minimum of
-    sum w_tn |y_tn - x_tn|^2 / s^2 + sum_i x_i^T (g_i Q_b)^-1 x_i, by conjugate gradients with the solution for even
-    weights as preconditioner. Cost is linear in T.
+    as they are but for their own jitter. s^2 + c_i is what the modes of an octave do not share where that is more than
+    motion leaves unshared, about a tenth of an octave's deviation; slower modes, which motion fills, have what quicker
+    ones tell. Given these, v = x + r is the minimum of
+    sum w_tn |y_tn - v_tn|^2 / s^2 + sum_i v_i^T (g_i Q_b + c_i)^-1 v_i, by conjugate gradients with the solution for
+    even weights as preconditioner, and x_i = g_i Q_b (g_i Q_b + c_i)^-1 v_i. Cost is linear in T.
 
     A joint is an outlier where it is further from what the rest of the clip predicts than ``threshold`` times the
     usual distance (the median of the joint's clip, or up to four times that where its surroundings have more) plus
@@ -127,13 +132,16 @@ def denoise_tracks(
             break
         error = (values - points).norm(dim=-1) / (1 - model.leverage()[:, None] * live).clamp_min(1e-3)
         outliers = _each_joint(_far, error, given > 0, threshold, floor)
-    noise = ((model.measured + model.lasting.mean(1)).sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints)
+    noise, left = (
+        (power.sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints).reshape(*shape[:-3], joints).to(tracks.dtype)
+        for power in (model.measured + model.lasting.mean(1), model.left)
+    )
     return Denoised(
         (points * unit).reshape(shape).to(tracks.dtype),
         torch.where(outliers.reshape(weights.shape), torch.zeros_like(weights), weights),
-        noise.reshape(*shape[:-3], joints).to(tracks.dtype),
+        noise,
         outliers.reshape(weights.shape),
-        (model.left.sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints).reshape(*shape[:-3], joints).to(tracks.dtype),
+        left,
     )
 
 
@@ -152,14 +160,14 @@ class _Model:
         z = self.basis.mT @ (x + w * (y - x))
         typical = z.square().movedim(2, 1).flatten(2).median(-1).values / 0.4549  # of chi-square: blind to impacts
         floor = _spectrum_floor(typical)
-        alone, _ = _apart(z[:, :, length // 2 :].flatten(1, 2), _ENOUGH)
+        alone, _ = _apart(z[:, :, length // 2 :].flatten(1, 2))
         alone = torch.where(alone.isfinite(), alone, floor)
         own = ((alone / floor.clamp_min(_TINY) - _SHARED[0]) / (_SHARED[1] - _SHARED[0])).clamp(0, 1)
         self.measured = torch.lerp(alone, torch.maximum(alone, floor), own) / self.share.flatten()
         self.noise = self.measured.clamp_min(_LEAST_NOISE**2)
-        share = self.share.flatten()[:, None]
-        self.lasting = self._lasting(z, self.measured * self.share.flatten()) / share
-        left = (self.noise[:, None] + self.lasting) * share  # noise power in a mode: what is filled has none
+        among = self.share.flatten()
+        self.lasting = self._lasting(z, self.measured * among) / among[:, None]
+        left = (self.noise[:, None] + self.lasting) * among[:, None]  # noise power in a mode: what is filled has none
         order = torch.arange(1, length + 1, dtype=y.dtype, device=y.device)
         near = torch.exp(-0.5 * ((order.log()[:, None] - order.log()) / 0.15) ** 2)
         near = near / near.sum(1, keepdim=True)
@@ -188,11 +196,11 @@ class _Model:
             self.axes.append(axes[:, None])
             variances.append(spectrum[:, a:b, None] * variance[:, None])
         motion = torch.cat(variances, 1).clamp_min(_TINY)  # (K, L, M)
-        both = motion + self.lasting[..., None]
-        self.ratio = (self.noise[:, None, None] / both)[:, None]  # (K, 1, L, M)
-        self.moving = (motion / both)[:, None]
-        white = self.noise[:, None, None] + self.lasting[..., None]
-        self.left = (motion * white / (motion + white)).mean((1, 2))
+        white, lasting = self.noise[:, None, None], self.lasting[..., None]
+        self.ratio = (white / (motion + lasting))[:, None]  # (K, 1, L, M)
+        self.moving = (motion / (motion + lasting))[:, None]
+        spoilt = white + lasting
+        self.left = (motion * spoilt / (motion + spoilt)).mean((1, 2))  # of the posterior, were all seen
 
     def _lasting(self, z: Tensor, white: Tensor) -> Tensor:
         """Power (K, L) of noise in modes z (K, H, L, M) beyond white noise of the power (K,).
@@ -201,9 +209,9 @@ class _Model:
         """
         level, out = white, []
         for a, b in reversed(self.bands):
-            if a >= _BANDS[2]:
+            if a >= _QUICK:
                 part = z[:, :, a:b].flatten(1, 2)
-                own, surely = _apart(part, _FEW)
+                own, surely = _apart(part)
                 among = (surely / part.square().mean((1, 2)).clamp_min(_TINY)).sqrt()
                 noisy = ((among - _LASTS[0]) / (_LASTS[1] - _LASTS[0])).clamp(0, 1)
                 known = torch.where(own.isfinite(), own, level)
@@ -285,14 +293,14 @@ def _spectrum_floor(power: Tensor) -> Tensor:
     return (scale * level[:, 0]).flatten(1).gather(1, best)[:, 0]
 
 
-def _apart(modes: Tensor, enough: int) -> tuple[Tensor, Tensor]:
+def _apart(modes: Tensor) -> tuple[Tensor, Tensor]:
     """Variance (K,) of what modes (K, n, M) do not share, and a cautious guess: noise is every joint's own, motion not.
 
     The smaller eigenvalues of the coordinates' covariance, over those of as much white noise of variance 1; infinite
     where there are too few modes to tell. The guess takes fewer of them.
     """
     count, size = modes.shape[1:]
-    if count < enough or size < 8:
+    if count < _ENOUGH or size < 8:
         return (torch.full_like(modes[:, 0, 0], math.inf),) * 2
     usual, found = _white_spectrum(count, size).to(modes), torch.linalg.eigvalsh(modes.mT @ modes)
     rank = min(size, count)
