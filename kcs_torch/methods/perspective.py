@@ -18,7 +18,7 @@ from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
 from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.methods.root import ABSENT, FOUND
-from kcs_torch.methods.size import slow_waves, weak_perspective
+from kcs_torch.methods.size import size_path, slow_waves
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -122,8 +122,8 @@ def _reconstruct(
     look = _line_of_sight(rays, tracks.weights, rate)  # (T, 3, 3)
     rays = rays @ look.mT
     rays = rays[..., :2] / rays[..., 2:].clamp_min(NEAREST)
-    size = weak_perspective(rays, tracks.seen, tracks.skeleton, rate)
-    distance = torch.full_like(rays[:, 0, 0], intrinsics.focal) / (1 if size is None else size)
+    size, _ = size_path(rays, tracks.seen, tracks.skeleton, rate)
+    distance = intrinsics.focal / (size / size.mean())
     depth = torch.zeros_like(rays[..., 0])
     if cameras is not None:
         known = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from kcs_torch.methods.clips import Clips, in_batches, padded
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
-__all__ = ["size_path", "slow_waves", "weak_perspective", "weak_perspectives"]
+__all__ = ["Size", "size_path", "slow_waves", "weak_perspective", "weak_perspectives"]
 
 QUANTILE = 0.8
 """Of a bone's images, over its length: what follows the body's size."""
@@ -24,11 +25,27 @@ FLOOR = 0.02
 SECONDS = 1.5
 """Half a period of the fastest change of size; slower than steps and turns."""
 
-
 LEAST_RANGE, LEAST_GAIN = 1.08, 0.3
 """Largest over smallest size, and share of the bones' deviation that it must explain (the median over bones), for a
 changing size to be believed. Before a distant camera the latter stays below 0.12 on all clips tried; it is above 0.6
 where a person walks towards a camera some metres away."""
+
+
+class Size(NamedTuple):
+    """The relative size of a body in the image over time.
+
+    Attributes:
+        path: (T,), of mean 1.
+        sure: whether the tracks clearly ask for it.
+    """
+
+    path: Tensor
+    sure: bool
+
+    @property
+    def range(self) -> float:
+        """The largest size over the smallest."""
+        return float(self.path.amax() / self.path.amin())
 
 
 def slow_waves(frames: int, rate: float, like: Tensor, *, most: int = 12) -> Tensor:
@@ -69,28 +86,28 @@ def size_path(image: Tensor, seen: Tensor, skeleton: Skeleton, rate: float) -> t
 
 def weak_perspective(image: Tensor, seen: Tensor, skeleton: Skeleton, rate: float) -> Tensor | None:
     """The size of :func:`size_path` (T,), of mean 1, if the tracks clearly ask for it, else None."""
-    return _believed(*size_path(image, seen, skeleton, rate))
+    size = _judged(*size_path(image, seen, skeleton, rate))
+    return size.path if size.sure else None
 
 
-def weak_perspectives(tracks: Sequence[Tracks]) -> list[Tensor | None]:
-    """:func:`weak_perspective` of several clips, batch by batch; their points are the images."""
+def weak_perspectives(tracks: Sequence[Tracks]) -> list[Size]:
+    """The size over time of several clips, batch by batch; their points are the images."""
 
-    def solve(some: list[Tracks]) -> list[Tensor | None]:
+    def solve(some: list[Tracks]) -> list[Size]:
         clips = Clips.of(some)
         waves = [slow_waves(one.num_frames, one.fps or 30.0, one.points) for one in some]
         most = max(each.shape[1] for each in waves)
         wide = [torch.nn.functional.pad(each, (0, most - each.shape[1])) for each in waves]
         paths, gains = _paths(clips.points, clips.weights > 0, some[0].skeleton, padded(wide), clips.counts)
-        return [_believed(path, gain) for path, gain in zip(clips.cut(paths), gains, strict=True)]
+        return [_judged(path, gain) for path, gain in zip(clips.cut(paths), gains, strict=True)]
 
     return in_batches(tracks, solve)
 
 
-def _believed(path: Tensor, gain: Tensor) -> Tensor | None:
-    """A path (T,) of mean 1, if what it explains (P,) of the bones' deviations is worth it."""
-    if float(path.amax() / path.amin()) < LEAST_RANGE or float(gain.median()) < LEAST_GAIN:
-        return None
-    return path / path.mean()
+def _judged(path: Tensor, gain: Tensor) -> Size:
+    """A path (T,), and whether what it explains (P,) of the bones' deviations is worth it."""
+    sure = float(path.amax() / path.amin()) >= LEAST_RANGE and float(gain.median()) >= LEAST_GAIN
+    return Size(path / path.mean(), sure)
 
 
 def _paths(

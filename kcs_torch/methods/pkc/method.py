@@ -25,6 +25,7 @@ from kcs_torch.methods.pkc.moving_view import MovingView, settled
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
+from kcs_torch.methods.size import Size
 from kcs_torch.methods.unseen import gap_deviation, place_unseen
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
@@ -60,6 +61,14 @@ TELLING = 2.0
 
 OTHERS = 4
 """Further solutions that tell how sure depths are, whether they are returned or not."""
+
+TRIED, FAR = 1.012, 1.04
+"""Largest over smallest size in the image from which on a change of size is tried, and from which on it is tried from
+the start."""
+
+BETTER, HOPEFUL, FEW = 5.0, 2.5, 2
+"""By how much the objective must fall for it, by how much where what was found without it is refined, and how many
+hypotheses tell that."""
 
 LEAST_FRAMES = 12
 """Frames from which on the viewpoint may have turned."""
@@ -131,53 +140,74 @@ class PKC(Method):
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
         image, noise, notes = yield from self._clean(tracks)
         (size,) = yield [Sized(replace(tracks, points=image))]
-        if size is None:
-            return (yield from self._solve(tracks, image, noise, cameras, notes))
-        share = float(size.amax() / size.amin())
-        notes = (*notes, f"weak perspective: the body's size in the image varies by a factor of {share:.2f}")
-        found = yield from self._solve(tracks, image / size[:, None, None], noise, cameras, notes)
-        return _with_size(found, size)
+        return (yield from self._solve(tracks, image, noise, cameras, notes, size))
 
     def _solve(
-        self, tracks: Tracks, image: Tensor, noise: Tensor, cameras: Tensor | None, notes: tuple[str, ...]
+        self, tracks: Tracks, image: Tensor, noise: Tensor, cameras: Tensor | None, notes: tuple[str, ...], size: Size
     ) -> Search[Any, Any, Estimate]:
-        """Solve complete tracks (T, N, 2) of a body whose size in the image does not change."""
+        """Solve complete tracks (T, N, 2) of a body that may have a changing size in the image."""
         skeleton = tracks.skeleton
         has_trunk = len(trunk_joints(skeleton)) >= 3
         if self.viewpoint == "fixed" and not has_trunk:
             raise OptionError(
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
-        body = None
-        if has_trunk:
-            still = self.contacts and not _turns(cameras) and self.viewpoint != "moving"
-            feet = standing_feet(tracks) if still else None
-            body = Body(skeleton, image, tracks.fps or 30.0, noise, feet)
         enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
-        if body is None:
-            if not enough:
+        changing, plain = size.sure, image
+        if changing:
+            image = plain / size.path[:, None, None]
+        if not has_trunk:
+            if enough:
+                moving, first = yield from self._moving(tracks, image, noise)
+                made = from_moving(moving, first, skeleton, cameras, notes, mirrored=self.alternatives > 0)
+            else:
                 seen = _complete(tracks, image)
                 (first,) = (yield [seen]) if cameras is None else [SfAM().solve(seen, cameras)]
-                return replace(first, notes=(*notes, "so few frames or joints are solved by sfam", *first.notes))
-            moving, first = yield from self._moving(tracks, image, noise)
-            return from_moving(moving, first, skeleton, cameras, notes, mirrored=self.alternatives > 0)
+                said = (*notes, "so few frames or joints are solved by sfam", *first.notes)
+                made = replace(first, notes=said)
+            return _with_size(made, size) if changing else made
+        still = self.contacts and not _turns(cameras) and self.viewpoint != "moving"
+        feet = standing_feet(tracks) if still else None
+        body = Body(skeleton, image, tracks.fps or 30.0, noise, feet)
         if enough and self.viewpoint == "moving":
             moving, _ = yield from self._moving(tracks, image, noise)
             found = yield from self._ranked(body, moving)
         else:
             found = yield from body.search(self.rounds, self.steps)
+            if enough and not changing and size.range >= TRIED:
+                other = Body(skeleton, plain / size.path[:, None, None], tracks.fps or 30.0, noise, feet)
+                better = yield from self._resized(found, body, other, size)
+                if better is not None:
+                    changing, body, found, image = True, other, better, plain / size.path[:, None, None]
             if cameras is None and body.seen_from_around(found):
                 found = body.without_contacts(found)
         if cameras is not None and _turns(cameras):
             found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
         detections = detected(tracks.weights)  # their errors last, and would be taken for motion
         if enough and body.spanned and not detections:
-            other = None
+            rival = None
             if self.viewpoint == "auto" and body.turns(found):
-                other = yield from self._rival(tracks, image, noise, far=body.is_odd(found))
-                other = other * body.factor
-            found = yield from body.polished(found, self.steps, other)
-        return self._from_hypotheses(found, body, cameras, notes, detections)
+                rival = yield from self._rival(tracks, image, noise, far=body.is_odd(found))
+                rival = rival * body.factor
+            found = yield from body.polished(found, self.steps, rival)
+        made = self._from_hypotheses(found, body, cameras, notes, detections)
+        return _with_size(made, size) if changing else made
+
+    def _resized(self, found: Hypotheses, body: Body, other: Body, size: Size) -> Search[Any, Any, Hypotheses | None]:
+        """Hypotheses of a body whose size in the image changes, if they explain the tracks better; else None.
+
+        A small change is tried on what was found without it first.
+        """
+        before = found.energy[0]
+        if size.range < FAR:
+            ratio = other.factor / body.factor
+            few = found[:FEW]
+            start = replace(few, depth=few.depth * ratio / size.path[:, None], lengths=few.lengths * ratio)
+            tried = yield from refined(other.objective, start, self.steps)
+            if not bool(tried.energy[0] < before - HOPEFUL):
+                return None
+        new = yield from other.search(self.rounds, self.steps)
+        return new if bool(new.energy[0] < before - BETTER) else None
 
     def _clean(self, tracks: Tracks) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
         """Complete tracks (T, N, 2), centred per frame, the noise (T, N) left in them, and what was done."""
@@ -295,7 +325,12 @@ def _nearest_shown(seen: Tensor) -> Tensor:
     return index if not len(shown) else index.clamp(int(shown[0]), int(shown[-1]))
 
 
-def _with_size(found: Estimate, size: Tensor) -> Estimate:
-    """An estimate of tracks that were divided by the size (T,)."""
-    others = tuple(_with_size(other, size) for other in found.alternatives)
-    return replace(found, scales=found.scales * size, alternatives=others)
+def _with_size(found: Estimate, size: Size) -> Estimate:
+    """An estimate of tracks that were divided by the size over time."""
+    others = tuple(_scaled(other, size.path) for other in found.alternatives)
+    note = f"weak perspective: the body's size in the image varies by a factor of {size.range:.2f}"
+    return replace(_scaled(found, size.path), alternatives=others, notes=(*found.notes, note))
+
+
+def _scaled(found: Estimate, size: Tensor) -> Estimate:
+    return replace(found, scales=found.scales * size)
