@@ -500,6 +500,19 @@ def test_noise_that_was_filtered_is_noise_still(prepare, turn):
     assert (off - off.mean(1, keepdim=True)).norm(dim=-1).mean() < 20
 
 
+@pytest.mark.parametrize("metres", [30, 120])
+def test_small_changes_of_size_are_told(metres):
+    """Of a walk towards a distant camera; taken for constant, they cost 95 and 35 mm."""
+    clip = walking_person(120, turn=0, yaw=45.0)
+    ahead = clip.points + clip.points.new_tensor([0.0, 0, 1000 * metres])
+    result = PKC()(replace(clip.tracks, points=ahead[..., :2] / ahead[..., 2:] * 1000 * metres))
+    assert any("weak perspective" in note for note in result.diagnostics.notes)
+    assert error(result.points, clip.points) < 0.12  # 14 mm
+    far = result.scales.log() + ahead[..., 2].mean(-1).log()
+    assert (far - far.mean()).abs().max() < 0.01
+    assert not any("weak perspective" in note for note in PKC()(clip.tracks).diagnostics.notes)
+
+
 def test_noise_gaps_and_wrong_detections_are_cleaned_first():
     clip = walking_person(60, turn=0.0, noise=20.0, missing=0.05, generator=torch.Generator().manual_seed(1))
     points = clip.tracks.points.clone()

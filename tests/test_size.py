@@ -31,7 +31,7 @@ def test_finds_how_a_walker_grows():
 @pytest.mark.parametrize("yaw", [0.0, 90.0])
 def test_a_distant_camera_keeps_its_scale(yaw, turn):
     clip = walking_person(100, turn=turn, yaw=yaw, noise=5, generator=torch.Generator().manual_seed(0))
-    assert weak_perspective(clip.tracks.points, clip.tracks.seen, clip.skeleton, 30.0) is None
+    assert not weak_perspective(clip.tracks.points, clip.tracks.seen, clip.skeleton, 30.0).sure
 
 
 def test_gaps_and_outliers_do_not_change_the_size():
@@ -41,9 +41,9 @@ def test_gaps_and_outliers_do_not_change_the_size():
     seen = torch.rand(image.shape[:2], generator=random) > 0.2
     wrong = torch.rand(image.shape[:2], generator=random) < 0.03
     image = torch.where(seen[..., None], image, torch.zeros_like(image)) + 200 * wrong[..., None]
-    path = weak_perspective(image, seen, clip.skeleton, 30.0)
-    assert path is not None
-    torch.testing.assert_close(path, size / size.mean(), rtol=0.03, atol=0)
+    found = weak_perspective(image, seen, clip.skeleton, 30.0)
+    assert found.sure
+    torch.testing.assert_close(found.path, size / size.mean(), rtol=0.03, atol=0)
 
 
 def test_clips_together_as_alone():
@@ -59,12 +59,11 @@ def test_clips_together_as_alone():
     clips += [replace(clips[0], weights=hidden), replace(clips[1], weights=0 * hidden[:80])]
     clips.append(replace(clips[4], points=clips[4].points[:1], weights=clips[4].weights[:1]))
     alone = [weak_perspective(one.points, one.seen, one.skeleton, one.fps) for one in clips]
-    assert 2 < sum(path is not None for path in alone) < len(clips)
+    assert 2 < sum(other.sure for other in alone) < len(clips)
     for one, other in zip(weak_perspectives(clips), alone, strict=True):
-        if other is None:
-            assert one is None
-        else:
-            torch.testing.assert_close(one, other, rtol=1e-9, atol=0)
+        assert one.sure == other.sure
+        assert one.range == float(one.path.amax() / one.path.amin())
+        torch.testing.assert_close(one.path, other.path, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 8])

@@ -18,7 +18,7 @@ from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
 from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.methods.root import ABSENT, FOUND
-from kcs_torch.methods.size import size_path, slow_waves
+from kcs_torch.methods.size import slow_waves, weak_perspective
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -31,6 +31,13 @@ SETTLED = 0.01
 
 FLAT = 0.001
 """Root mean square parallax, for a body of 1.75, below which there is no perspective to speak of."""
+
+LEAD = 20.0
+"""By how much dearer here the method's best solution may be than others and still be the best."""
+
+TELLING = 0.004
+"""Root mean square tangent between joints and the line of sight from which on changes of distance show surely, if they
+are small: a person's some 100 metres away."""
 
 APART = 0.04
 """Root mean square difference in depth, for a body of 1.75, from which on solutions count as two."""
@@ -71,7 +78,7 @@ def reconstruct_perspective(
     intrinsics: Intrinsics,
     cameras: Tensor | None = None,
     *,
-    rounds: int = 2,
+    rounds: int = 3,
     steps: int = 100,
 ) -> Reconstruction:
     """Reconstruct a body before a pinhole camera by a method made for parallel rays.
@@ -122,8 +129,11 @@ def _reconstruct(
     look = _line_of_sight(rays, tracks.weights, rate)  # (T, 3, 3)
     rays = rays @ look.mT
     rays = rays[..., :2] / rays[..., 2:].clamp_min(NEAREST)
-    size, _ = size_path(rays, tracks.seen, tracks.skeleton, rate)
-    distance = intrinsics.focal / (size / size.mean())
+    size = weak_perspective(rays, tracks.seen, tracks.skeleton, rate)
+    wide = float(rays[tracks.seen].square().sum(-1).mean().sqrt()) if bool(tracks.seen.any()) else 0.0
+    distance = torch.full_like(rays[:, 0, 0], intrinsics.focal)
+    if size.sure or wide > TELLING:
+        distance = distance / size.path
     depth = torch.zeros_like(rays[..., 0])
     if cameras is not None:
         known = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
@@ -210,7 +220,7 @@ def _refine(
     off = (flat - tracks.points).square().sum(-1)[tracks.seen]
     noise = math.sqrt(float(off.median()) / 1.39) / unit / 2 if len(off) else 0.0  # whatever outliers there are
     depth, far, energy = _descend(lifted.skeleton, rays, exact, start, unit, rate, noise, steps)
-    order = energy.argsort()
+    order = (energy - energy.new_tensor([LEAD, *[0.0] * (len(energy) - 1)])).argsort()
     found = tuple(others[i] for i in order.tolist())
     return _Found(rays, far[order], depth[order], energy[order], found, unit, lifted.diagnostics.notes)
 

@@ -84,14 +84,13 @@ def size_path(image: Tensor, seen: Tensor, skeleton: Skeleton, rate: float) -> t
     return path[0], gain[0]
 
 
-def weak_perspective(image: Tensor, seen: Tensor, skeleton: Skeleton, rate: float) -> Tensor | None:
-    """The size of :func:`size_path` (T,), of mean 1, if the tracks clearly ask for it, else None."""
-    size = _judged(*size_path(image, seen, skeleton, rate))
-    return size.path if size.sure else None
+def weak_perspective(image: Tensor, seen: Tensor, skeleton: Skeleton, rate: float) -> Size:
+    """The :class:`Size` that :func:`size_path` finds, and whether the tracks clearly ask for it."""
+    return _judged(*size_path(image, seen, skeleton, rate))
 
 
 def weak_perspectives(tracks: Sequence[Tracks]) -> list[Size]:
-    """The size over time of several clips, batch by batch; their points are the images."""
+    """:func:`weak_perspective` of several clips, batch by batch; their points are the images."""
 
     def solve(some: list[Tracks]) -> list[Size]:
         clips = Clips.of(some)

@@ -195,7 +195,7 @@ def _size(tracks: Tracks) -> Tensor:
     """Size (T,) of the body in the image, of mean 1, where it clearly changes: networks know bodies of one size."""
     image = interpolate(tracks.points, tracks.seen)
     size = weak_perspective(image, tracks.seen, tracks.skeleton, tracks.fps or 30.0)
-    return torch.ones_like(image[:, 0, 0]) if size is None else size
+    return size.path if size.sure else torch.ones_like(image[:, 0, 0])
 
 
 def _match(own: Skeleton, body: Skeleton, source: str) -> _Match:
