@@ -243,3 +243,21 @@ def test_what_joints_do_together_is_no_noise():
     assert rms(denoise_tracks(shaken, ones).points - shaken) < 0.003 * size
     both = denoise_tracks(shaken + 0.02 * size * normal(120, 17, 2, seed=1), ones)
     assert float(both.noise.mean()) > 0.016 * size
+
+
+def test_what_is_left_counts_weights():
+    """Tracks of weight w have noise of variance s^2 / w, of which as much is left as of the same noise at weight 1."""
+    tracks = walk(120)
+    noisy = tracks + 5 * normal(*tracks.shape)
+    one, other = (denoise_tracks(noisy, torch.full(tracks.shape[:2], w, dtype=torch.float64)).left for w in (1.0, 0.3))
+    assert_close(other, one, rtol=0.1, atol=0)
+    assert float(denoise_tracks(tracks, torch.ones(tracks.shape[:2])).left.max()) < 1e-3
+
+
+def test_slow_modes_tell_noise_only_where_they_may():
+    """Of a motion that joints share little of, in a clip of few frames a second."""
+    time = torch.arange(100, dtype=torch.float64)[:, None, None]
+    own = torch.rand(3, 1, 12, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    tracks = 100 * torch.sin(2 * math.pi * (0.1 + 0.12 * own[0]) * time + 6 * own[1]) + 1000 * own[2]  # 6 to 14 periods
+    told = [float(denoise_tracks(tracks, torch.ones(tracks.shape[:2]), quick=quick).noise.mean()) for quick in (12, 24)]
+    assert told[0] > 10 and told[1] < 1

@@ -172,6 +172,24 @@ def test_a_very_long_focal_length_changes_nothing(method):
     assert float(result.distance.log().mean().exp()) == pytest.approx(1e8)
 
 
+def test_solutions_are_ranked_by_their_objective():
+    """A method without a template cannot tell mirror images: its first solution may be the wrong one."""
+    bare = replace(kt.data.random_motion("coco17", 5).skeleton, template=None)
+    draw = torch.Generator().manual_seed(3)
+    clip = kt.data.random_motion(bare, 30, turn=30, noise=1.0, size=4000.0, generator=draw)
+    ahead = clip.points + clip.points.new_tensor([0.0, 0.0, 10000.0])
+    tracks = replace(clip.tracks, points=1500 * ahead[..., :2] / ahead[..., 2:])
+    for method in ("sfam", "pkc"):
+        result = reconstruct(tracks, method=method, intrinsics=(1500.0, 1500.0, 0.0, 0.0))
+        assert all(result.objective <= other.objective for other in result.alternatives)
+
+
+def test_nobody_seen_is_finite():
+    tracks, _ = filmed(frames=15)
+    result = reconstruct(replace(tracks, weights=0 * tracks.weights), intrinsics=LENS)
+    assert result.points.isfinite().all() and result.distance.isfinite().all()
+
+
 def test_known_cameras_are_kept():
     tracks, truth = filmed(yaw=30, turn=60, frames=90)
     clip = kt.data.walking_person(90, yaw=30, turn=60)

@@ -33,11 +33,11 @@ FLAT = 0.001
 """Root mean square parallax, for a body of 1.75, below which there is no perspective to speak of."""
 
 LEAD = 20.0
-"""By how much dearer here the method's best solution may be than others and still be the best."""
+"""By how much the best solution of a method that knows a template may cost more than another and still come first."""
 
-TELLING = 0.004
-"""Root mean square tangent between joints and the line of sight from which on changes of distance show surely, if they
-are small: a person's some 100 metres away."""
+APPARENT = 0.004
+"""Root mean square tangent between joints and the line of sight from which on distances follow the size over time, even
+if it is not sure to change: that of a person some 100 metres away."""
 
 APART = 0.04
 """Root mean square difference in depth, for a body of 1.75, from which on solutions count as two."""
@@ -87,7 +87,8 @@ def reconstruct_perspective(
     relative depth z lies at (u, v) (D_t + z): its image under parallel rays. Starting from z = 0 and D_t from the
     body's apparent size, each round lifts these tracks by the method, then refines depths, lengths and distances of all
     its solutions and of a mirror image together under perspective (:class:`PinholeEnergy`); bones' constant lengths
-    tell mirror images apart.
+    tell mirror images apart. What a method that knows a template finds best comes first unless another solution is
+    better by 20, which its ``objective`` has taken off.
 
     Args:
         method: any.
@@ -132,18 +133,19 @@ def _reconstruct(
     size = weak_perspective(rays, tracks.seen, tracks.skeleton, rate)
     wide = float(rays[tracks.seen].square().sum(-1).mean().sqrt()) if bool(tracks.seen.any()) else 0.0
     distance = torch.full_like(rays[:, 0, 0], intrinsics.focal)
-    if size.sure or wide > TELLING:
+    if size.sure or wide > APPARENT:
         distance = distance / size.path
     depth = torch.zeros_like(rays[..., 0])
     if cameras is not None:
         known = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         cameras = (look @ complete_rotation(known))[:, :2]
+    lead = LEAD if method.knows_template(tracks.skeleton) else 0.0
     best: _Found | None = None
     for _ in range(rounds):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)
             lifted = method.following()(_straighten(tracks, rays, distance, depth), cameras)
-        found = _refine(lifted, distance, depth, rate, steps, mirror=cameras is None)
+        found = _refine(lifted, distance, depth, rate, steps, mirror=cameras is None, lead=lead)
         moved = float((found.depth[0] - depth).square().mean().sqrt()) / found.unit
         if best is None or not float(found.energy[0]) > float(best.energy[0]):
             best = found
@@ -160,6 +162,8 @@ def _line_of_sight(rays: Tensor, weights: Tensor, rate: float) -> Tensor:
     middle = (rays * weights[..., None]).sum(-2) / torch.where(count > 0, count, torch.ones_like(count))
     middle = interpolate(middle[:, None], count > 0)[:, 0]
     smooth = _slow(middle, rate, most=60)
+    if not bool((count > 0).any()):
+        smooth = smooth + smooth.new_tensor([0.0, 0.0, 1.0])  # nobody to look at
     ahead = torch.nn.functional.normalize(smooth, dim=-1)
     right = torch.zeros_like(ahead)
     right[:, 0] = 1
@@ -190,7 +194,7 @@ def _ahead(distance: Tensor, depth: Tensor) -> Tensor:
 
 
 def _refine(
-    lifted: Reconstruction, distance: Tensor, depth: Tensor, rate: float, steps: int, *, mirror: bool
+    lifted: Reconstruction, distance: Tensor, depth: Tensor, rate: float, steps: int, *, mirror: bool, lead: float
 ) -> _Found:
     """Refine all solutions of the method under perspective, and the best one's mirror image.
 
@@ -201,6 +205,7 @@ def _refine(
         rate: frames a second.
         steps: of the refinement.
         mirror: whether depth may have the other sign.
+        lead: by how much the method's best solution is believed to be better than its energy here.
     """
     tracks, others = lifted.tracks, (lifted, *lifted.alternatives)
     flat = lifted.points[..., :2]
@@ -220,7 +225,8 @@ def _refine(
     off = (flat - tracks.points).square().sum(-1)[tracks.seen]
     noise = math.sqrt(float(off.median()) / 1.39) / unit / 2 if len(off) else 0.0  # whatever outliers there are
     depth, far, energy = _descend(lifted.skeleton, rays, exact, start, unit, rate, noise, steps)
-    order = (energy - energy.new_tensor([LEAD, *[0.0] * (len(energy) - 1)])).argsort()
+    energy[0] -= lead
+    order = energy.argsort()
     found = tuple(others[i] for i in order.tolist())
     return _Found(rays, far[order], depth[order], energy[order], found, unit, lifted.diagnostics.notes)
 

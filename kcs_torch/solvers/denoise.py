@@ -31,10 +31,10 @@ _TINY = 1e-30
 # The floor of a spectrum is motion where less than the first share of its power is every joint's own, and noise from
 # the second on.
 _SHARED = (0.15, 0.35)
-# Noise that lasts for several frames begins where a band's deviation that is not shared is the first share of all.
+# Noise that lasts for several frames is told where joints do not share the first part of a band's deviation, and surely
+# where not the second.
 _LASTS = (0.08, 0.13)
-_QUICK = 12  # slower modes of a window never tell noise
-_MORE = 2.0  # how much of its power there is for what can be told: slower modes have more
+_MORE = 2.0  # power of noise that lasts, over what can be told of it
 _ENOUGH = 20  # modes from which on noise can be told
 _COMMON, _RATIO = 0.7, 1.318  # a quantile of distances, and what it is over the median for a Gaussian in the plane
 
@@ -45,9 +45,9 @@ class Denoised(NamedTuple):
     Attributes:
         points: (..., T, N, 2) smoothed and filled tracks, in the tracks' units.
         weights: (..., T, N) as given, 0 at outliers.
-        noise: (..., N) standard deviation of the measurement noise of a coordinate, in the tracks' units.
+        noise: (..., N) standard deviation of a coordinate's noise, white and lasting, in the tracks' units.
         outliers: (..., T, N), True where a seen joint was rejected and its place filled.
-        left: (..., N) standard deviation of what the noise leaves in the points, by the model.
+        left: (..., N) standard deviation of what the noise leaves in the points, by the model, were all joints seen.
     """
 
     points: Tensor
@@ -58,7 +58,13 @@ class Denoised(NamedTuple):
 
 
 def denoise_tracks(
-    tracks: Tensor, weights: Tensor, *, window: int = 64, threshold: float = 6.0, floor: float = 0.04
+    tracks: Tensor,
+    weights: Tensor,
+    *,
+    window: int = 64,
+    quick: int = 12,
+    threshold: float = 6.0,
+    floor: float = 0.04,
 ) -> Denoised:
     r"""Smooth 2D tracks, fill what is unseen and reject outliers; all parameters come from the clip itself.
 
@@ -68,12 +74,12 @@ def denoise_tracks(
 
         x_i ~ N(0, g_i Q_b(i)),    y_tn = x_tn + r_tn + e_tn,    r_i ~ N(0, c_i I),    e_tn ~ N(0, s^2 / w_tn I_2)
 
-    g_i is the clip's spectrum and Q_b its covariance between the 2N coordinates, for every octave b of modes, both
+    g_i is the clip's spectrum and Q_b its covariance between the 2N coordinates, for every band b of modes, both
     estimated from the clip (moments, with shrinkage to independent joints). s^2 is the level at which the spectrum
     stops falling, unless joints move together there, and at least what quick modes do not share: clean tracks come back
-    as they are but for their own jitter. s^2 + c_i is what the modes of an octave do not share where that is more than
-    motion leaves unshared, about a tenth of an octave's deviation; slower modes, which motion fills, have what quicker
-    ones tell. Given these, v = x + r is the minimum of
+    as they are but for their own jitter. c_i is twice what the modes of a band do not share beyond s^2, where that is
+    more than motion leaves unshared, about a tenth of the band's deviation; slower modes, which motion fills, have what
+    quicker ones tell. Given these, v = x + r is the minimum of
     sum w_tn |y_tn - v_tn|^2 / s^2 + sum_i v_i^T (g_i Q_b + c_i)^-1 v_i, by conjugate gradients with the solution for
     even weights as preconditioner, and x_i = g_i Q_b (g_i Q_b + c_i)^-1 v_i. Cost is linear in T.
 
@@ -86,6 +92,8 @@ def denoise_tracks(
         tracks: (..., T, N, 2), finite.
         weights: (..., T, N) in [0, 1], 0 where unseen.
         window: L, frames solved together; windows overlap by half.
+        quick: first mode that may tell noise that lasts from motion: mode i has about i / 2 periods in a window. People
+            move together from 2 or 3 Hz on, which is mode 12 of 64 frames at 30 a second.
         threshold: of outliers, in medians of the prediction error.
         floor: of outliers, a share of the body's size (median distance of its joints from their centre).
 
@@ -112,7 +120,7 @@ def denoise_tracks(
     length = min(window, frames)
     starts = window_starts(frames, length, length // 2)
     index = torch.tensor(starts, device=tracks.device)[:, None] + torch.arange(length, device=tracks.device)
-    model = _Model(length, values)
+    model = _Model(length, values, quick)
 
     outliers = _each_joint(_stray_from_neighbours, values, given > 0, threshold, floor)
     points = values
@@ -148,7 +156,8 @@ def denoise_tracks(
 class _Model:
     """The Gaussian of a clip's windows, (K, H, L, M) about the mean: K clips, H windows, L frames, M coordinates."""
 
-    def __init__(self, length: int, like: Tensor) -> None:
+    def __init__(self, length: int, like: Tensor, quick: int = 12) -> None:
+        self.quick = quick
         self.basis = _temporal_modes(length).to(like)
         edges = [*(b for b in _BANDS if b < length), length]
         self.bands = list(itertools.pairwise(edges))
@@ -199,8 +208,9 @@ class _Model:
         white, lasting = self.noise[:, None, None], self.lasting[..., None]
         self.ratio = (white / (motion + lasting))[:, None]  # (K, 1, L, M)
         self.moving = (motion / (motion + lasting))[:, None]
-        spoilt = white + lasting
-        self.left = (motion * spoilt / (motion + spoilt)).mean((1, 2))  # of the posterior, were all seen
+        usual = w.sum((1, 2, 3)) / (w > 0).sum((1, 2, 3)).clamp_min(1)  # weight of what is seen
+        spoilt = (self.measured / usual.clamp_min(1e-3))[:, None, None] + lasting
+        self.left = (motion * spoilt / (motion + spoilt)).mean((1, 2))  # of the posterior
 
     def _lasting(self, z: Tensor, white: Tensor) -> Tensor:
         """Power (K, L) of noise in modes z (K, H, L, M) beyond white noise of the power (K,).
@@ -209,7 +219,7 @@ class _Model:
         """
         level, out = white, []
         for a, b in reversed(self.bands):
-            if a >= _QUICK:
+            if a >= self.quick:
                 part = z[:, :, a:b].flatten(1, 2)
                 own, surely = _apart(part)
                 among = (surely / part.square().mean((1, 2)).clamp_min(_TINY)).sqrt()

@@ -41,11 +41,12 @@ class Task:
 
 
 class Noisy(NamedTuple):
-    """Tracks (T, N, 2) of weights (T, N) that are to be cleaned by :func:`denoise_tracks`, in windows of L frames."""
+    """Tracks (T, N, 2) of weights (T, N) that are to be cleaned by :func:`denoise_tracks`, and its settings."""
 
     points: Tensor
     weights: Tensor
     window: int = 64
+    quick: int = 12
 
 
 class Sized(NamedTuple):
@@ -84,14 +85,15 @@ def serve(requests: Sequence[Task | Placing | Facing | Descent | Noisy | Sized |
 def clean_all(tasks: Sequence[Noisy]) -> list[Denoised]:
     """:func:`denoise_tracks` of each task; those of equal size together."""
     groups: dict[object, list[int]] = {}
-    for i, (points, _, window) in enumerate(tasks):
-        groups.setdefault((points.shape, points.dtype, points.device, window), []).append(i)
+    for i, (points, _, *settings) in enumerate(tasks):
+        groups.setdefault((points.shape, points.dtype, points.device, *settings), []).append(i)
     out: dict[int, Denoised] = {}
     for group in groups.values():
         few = max(1, TOGETHER // tasks[group[0]].points.shape[0])
-        for run in (group[first : first + few] for first in range(0, len(group), few)):
+        for run in (group[begin : begin + few] for begin in range(0, len(group), few)):
             points, weights = (torch.stack(part) for part in zip(*(tasks[i][:2] for i in run), strict=True))
-            found = denoise_tracks(points, weights, window=tasks[run[0]].window)
+            first = tasks[run[0]]
+            found = denoise_tracks(points, weights, window=first.window, quick=first.quick)
             out |= {i: Denoised(*row) for i, row in zip(run, zip(*found, strict=True), strict=True)}
     return [out[i] for i in range(len(tasks))]
 

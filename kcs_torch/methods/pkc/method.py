@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -36,8 +37,9 @@ __all__ = ["PKC"]
 CLEAN = 0.003
 """Noise below this share of the body's size is left in the tracks."""
 
-WINDOW = 64
-"""Frames, at 30 a second, of which motion and noise are told apart: quicker clips need as many seconds."""
+WINDOW, QUICK = 64, 2.2
+"""Frames in which motion and noise are told apart, at 30 a second: two seconds, and up to 120 frames a second about as
+many. And the frequency in Hz from which on what joints do not share is noise rather than motion."""
 
 DETECTED = 0.027
 """Standard deviation of a joint that a detector is sure of, a share of the body's size, however smooth: what it gets
@@ -62,13 +64,13 @@ TELLING = 2.0
 OTHERS = 4
 """Further solutions that tell how sure depths are, whether they are returned or not."""
 
-TRIED, FAR = 1.012, 1.04
-"""Largest over smallest size in the image from which on a change of size is tried, and from which on it is tried from
-the start."""
+TRIED, AT_ONCE = 1.012, 1.04
+"""Largest over smallest size in the image from which on a change of size is tried, and from which on by a new search at
+once."""
 
 BETTER, HOPEFUL, FEW = 5.0, 2.5, 2
-"""By how much the objective must fall for it, by how much where what was found without it is refined, and how many
-hypotheses tell that."""
+"""By how much the objective must fall for a change of size to be believed; by how much, if hypotheses are refined with
+it, for a new search to be made; and how many are."""
 
 LEAST_FRAMES = 12
 """Frames from which on the viewpoint may have turned."""
@@ -199,7 +201,7 @@ class PKC(Method):
         A small change is tried on what was found without it first.
         """
         before = found.energy[0]
-        if size.range < FAR:
+        if size.range < AT_ONCE:
             ratio = other.factor / body.factor
             few = found[:FEW]
             start = replace(few, depth=few.depth * ratio / size.path[:, None], lengths=few.lengths * ratio)
@@ -215,8 +217,10 @@ class PKC(Method):
         points, notes = tracks.points, []
         if self.denoise:
             keep = plausible(points, keep, tracks.skeleton)
-            window = WINDOW * round(min(max((tracks.fps or 30.0) / 30, 1), 4))
-            (clean,) = yield [Noisy(points, torch.where(keep, tracks.weights, 0), window)]
+            rate = tracks.fps or 30.0
+            window = WINDOW * round(min(max(rate / 30, 1), 4))
+            quick = math.ceil(2 * QUICK * window / rate)
+            (clean,) = yield [Noisy(points, torch.where(keep, tracks.weights, 0), window, quick)]
             level, left = float(clean.noise.median()), float(clean.left.median())
             wrong = int((clean.outliers & keep).sum()) + int((tracks.seen & ~keep).sum())
             if wrong:
