@@ -12,7 +12,8 @@ from torch.testing import assert_close
 from kcs_torch.data.synthetic import walking_person
 from kcs_torch.functional import interpolate
 from kcs_torch.solvers import complete_tracks, denoise_tracks
-from kcs_torch.solvers.denoise import _Model, _spectrum_floor, _temporal_modes
+from kcs_torch.solvers.denoise import _Model
+from kcs_torch.solvers.spectrum import spectrum_floor, temporal_modes
 
 
 def walk(frames=90, **fields):
@@ -186,7 +187,7 @@ def test_results_follow_dtype_and_device(dtype, device):
 
 @pytest.mark.parametrize("length", [1, 2, 3, 4, 12, 64])
 def test_temporal_modes_are_orthonormal_and_begin_with_parabolas(length):
-    modes = _temporal_modes(length)
+    modes = temporal_modes(length)
     assert_close(modes.mT @ modes, torch.eye(length, dtype=torch.float64))
     if length > 3:
         assert_close(modes[:, :3].diff(n=3, dim=0), torch.zeros(length - 3, 3, dtype=torch.float64))
@@ -195,7 +196,7 @@ def test_temporal_modes_are_orthonormal_and_begin_with_parabolas(length):
 def test_spectrum_floor_is_the_level_at_the_end():
     order = torch.arange(64, dtype=torch.float64).clamp_min(1)
     power = torch.stack([1e6 * order**-5 + 7, 1e6 * order**-5, torch.full_like(order, 3.0)])
-    floor = _spectrum_floor(power)
+    floor = spectrum_floor(power)
     assert_close(floor[[0, 2]], torch.tensor([7.0, 3.0], dtype=torch.float64), rtol=0.05, atol=0)
     assert floor[1] < 1e-2 * power[1, -1]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.solvers.completion import complete_tracks
+from kcs_torch.solvers.spectrum import spectrum_floor, temporal_modes, unshared
 
 __all__ = ["Denoised", "denoise_tracks"]
 
@@ -35,7 +35,6 @@ _SHARED = (0.15, 0.35)
 # where not the second.
 _LASTS = (0.08, 0.13)
 _MORE = 2.0  # power of noise that lasts, over what can be told of it
-_ENOUGH = 20  # modes from which on noise can be told
 _COMMON, _RATIO = 0.7, 1.318  # a quantile of distances, and what it is over the median for a Gaussian in the plane
 
 
@@ -158,7 +157,7 @@ class _Model:
 
     def __init__(self, length: int, like: Tensor, quick: int = 12) -> None:
         self.quick = quick
-        self.basis = _temporal_modes(length).to(like)
+        self.basis = temporal_modes(length).to(like)
         edges = [*(b for b in _BANDS if b < length), length]
         self.bands = list(itertools.pairwise(edges))
 
@@ -168,8 +167,8 @@ class _Model:
         self.share = w.mean((1, 2, 3)).clamp_min(1e-3)[:, None, None, None]
         z = self.basis.mT @ (x + w * (y - x))
         typical = z.square().movedim(2, 1).flatten(2).median(-1).values / 0.4549  # of chi-square: blind to impacts
-        floor = _spectrum_floor(typical)
-        alone, _ = _apart(z[:, :, length // 2 :].flatten(1, 2))
+        floor = spectrum_floor(typical)
+        alone, _ = unshared(z[:, :, length // 2 :].flatten(1, 2))
         alone = torch.where(alone.isfinite(), alone, floor)
         own = ((alone / floor.clamp_min(_TINY) - _SHARED[0]) / (_SHARED[1] - _SHARED[0])).clamp(0, 1)
         self.measured = torch.lerp(alone, torch.maximum(alone, floor), own) / self.share.flatten()
@@ -221,7 +220,7 @@ class _Model:
         for a, b in reversed(self.bands):
             if a >= self.quick:
                 part = z[:, :, a:b].flatten(1, 2)
-                own, surely = _apart(part)
+                own, surely = unshared(part)
                 among = (surely / part.square().mean((1, 2)).clamp_min(_TINY)).sqrt()
                 noisy = ((among - _LASTS[0]) / (_LASTS[1] - _LASTS[0])).clamp(0, 1)
                 known = torch.where(own.isfinite(), own, level)
@@ -273,59 +272,6 @@ class _Model:
     def _from_modes(self, z: Tensor) -> Tensor:
         x = torch.cat([z[:, :, a:b] @ v.mT for (a, b), v in zip(self.bands, self.axes, strict=True)], 2)
         return self.basis @ x
-
-
-def _temporal_modes(length: int) -> Tensor:
-    """(L, L) orthonormal columns: polynomials up to the second degree, then eigenvectors of the third difference."""
-    time = torch.linspace(-1, 1, length, dtype=torch.float64)
-    smooth = torch.linalg.qr(torch.stack([time**k for k in range(min(3, length))], -1)).Q
-    if length <= 3:
-        return smooth
-    third = torch.eye(length, dtype=torch.float64).diff(n=3, dim=0)
-    rough = torch.linalg.eigh(third.mT @ third).eigenvectors[:, 3:]
-    return torch.linalg.qr(torch.cat([smooth, rough], -1)).Q
-
-
-def _spectrum_floor(power: Tensor) -> Tensor:
-    """Level (K,) at which a spectrum (K, L) stops falling: power_i ~ c ((1 - r) i^-b + r), maximum likelihood."""
-    length = power.shape[1]
-    if length < 12:
-        return torch.zeros_like(power[:, 0])
-    first = max(3, length // 8)
-    order = torch.arange(first, length, dtype=power.dtype, device=power.device) / first
-    slope = torch.tensor([2.0, 3, 4, 5, 6, 8], dtype=power.dtype, device=power.device)[:, None, None]
-    level = torch.cat([torch.zeros(1), torch.logspace(-8, 0, 49)]).to(power)[:, None]
-    shape = (1 - level) * order**-slope + level  # (6, 50, I)
-    power = power[:, None, None, first:].clamp_min(_TINY)
-    scale = (power / shape).mean(-1)
-    misfit = scale.log() * len(order) + shape.log().sum(-1)
-    best = misfit.flatten(1).argmin(1, keepdim=True)
-    return (scale * level[:, 0]).flatten(1).gather(1, best)[:, 0]
-
-
-def _apart(modes: Tensor) -> tuple[Tensor, Tensor]:
-    """Variance (K,) of what modes (K, n, M) do not share, and a cautious guess: noise is every joint's own, motion not.
-
-    The smaller eigenvalues of the coordinates' covariance, over those of as much white noise of variance 1; infinite
-    where there are too few modes to tell. The guess takes fewer of them.
-    """
-    count, size = modes.shape[1:]
-    if count < _ENOUGH or size < 8:
-        return (torch.full_like(modes[:, 0, 0], math.inf),) * 2
-    usual, found = _white_spectrum(count, size).to(modes), torch.linalg.eigvalsh(modes.mT @ modes)
-    rank = min(size, count)
-    first = size - rank + rank // 8  # virtual joints are no measurements
-    low = [slice(first, size - rank + last) for last in (rank // 2, 3 * rank // 8)]
-    half, less = (found[..., i].mean(-1).clamp_min(0) / usual[..., i].mean(-1).clamp_min(_TINY) for i in low)
-    return half, less
-
-
-@lru_cache(maxsize=64)
-def _white_spectrum(count: int, size: int) -> Tensor:
-    """Eigenvalues (M,) of the scatter of as many modes (n, M) of white noise."""
-    with torch.inference_mode(False):
-        noise = torch.randn(count, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64, device="cpu")
-        return torch.linalg.eigvalsh(noise.mT @ noise)
 
 
 def _fill(values: Tensor, seen: Tensor) -> Tensor:

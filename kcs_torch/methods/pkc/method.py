@@ -155,9 +155,9 @@ class PKC(Method):
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
         enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
-        changing, plain = size.sure, image
+        changing, resized = size.sure, image / size.path[:, None, None]
         if changing:
-            image = plain / size.path[:, None, None]
+            image = resized
         if not has_trunk:
             if enough:
                 moving, first = yield from self._moving(tracks, image, noise)
@@ -177,10 +177,10 @@ class PKC(Method):
         else:
             found = yield from body.search(self.rounds, self.steps)
             if enough and not changing and size.range >= TRIED:
-                other = Body(skeleton, plain / size.path[:, None, None], tracks.fps or 30.0, noise, feet)
+                other = Body(skeleton, resized, tracks.fps or 30.0, noise, feet)
                 better = yield from self._resized(found, body, other, size)
                 if better is not None:
-                    changing, body, found, image = True, other, better, plain / size.path[:, None, None]
+                    changing, body, found, image = True, other, better, resized
             if cameras is None and body.seen_from_around(found):
                 found = body.without_contacts(found)
         if cameras is not None and _turns(cameras):

@@ -1,0 +1,69 @@
+"""Temporal modes of motion, and how much noise there is in them."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+__all__ = ["spectrum_floor", "temporal_modes", "unshared"]
+
+ENOUGH = 20
+"""Modes from which on noise can be told from motion."""
+
+TINY = 1e-30
+
+
+def temporal_modes(length: int) -> Tensor:
+    """(L, L) orthonormal columns: polynomials up to the second degree, then eigenvectors of the third difference."""
+    time = torch.linspace(-1, 1, length, dtype=torch.float64)
+    smooth = torch.linalg.qr(torch.stack([time**k for k in range(min(3, length))], -1)).Q
+    if length <= 3:
+        return smooth
+    third = torch.eye(length, dtype=torch.float64).diff(n=3, dim=0)
+    rough = torch.linalg.eigh(third.mT @ third).eigenvectors[:, 3:]
+    return torch.linalg.qr(torch.cat([smooth, rough], -1)).Q
+
+
+def spectrum_floor(power: Tensor) -> Tensor:
+    """Level (K,) at which a spectrum (K, L) stops falling: power_i ~ c ((1 - r) i^-b + r), maximum likelihood."""
+    length = power.shape[1]
+    if length < 12:
+        return torch.zeros_like(power[:, 0])
+    first = max(3, length // 8)
+    order = torch.arange(first, length, dtype=power.dtype, device=power.device) / first
+    slope = torch.tensor([2.0, 3, 4, 5, 6, 8], dtype=power.dtype, device=power.device)[:, None, None]
+    level = torch.cat([torch.zeros(1), torch.logspace(-8, 0, 49)]).to(power)[:, None]
+    shape = (1 - level) * order**-slope + level  # (6, 50, I)
+    power = power[:, None, None, first:].clamp_min(TINY)
+    scale = (power / shape).mean(-1)
+    misfit = scale.log() * len(order) + shape.log().sum(-1)
+    best = misfit.flatten(1).argmin(1, keepdim=True)
+    return (scale * level[:, 0]).flatten(1).gather(1, best)[:, 0]
+
+
+def unshared(modes: Tensor) -> tuple[Tensor, Tensor]:
+    """Variance (K,) of what modes (K, n, M) do not share, and a cautious guess: noise is every joint's own, motion not.
+
+    The smaller eigenvalues of the coordinates' covariance, over those of as much white noise of variance 1; infinite
+    where there are too few modes to tell. The guess takes fewer of them.
+    """
+    count, size = modes.shape[1:]
+    if count < ENOUGH or size < 8:
+        return (torch.full_like(modes[:, 0, 0], math.inf),) * 2
+    usual, found = _white_spectrum(count, size).to(modes), torch.linalg.eigvalsh(modes.mT @ modes)
+    rank = min(size, count)
+    first = size - rank + rank // 8  # virtual joints are no measurements
+    low = [slice(first, size - rank + last) for last in (rank // 2, 3 * rank // 8)]
+    half, less = (found[..., i].mean(-1).clamp_min(0) / usual[..., i].mean(-1).clamp_min(TINY) for i in low)
+    return half, less
+
+
+@lru_cache(maxsize=64)
+def _white_spectrum(count: int, size: int) -> Tensor:
+    """Eigenvalues (M,) of the scatter of as many modes (n, M) of white noise."""
+    with torch.inference_mode(False):
+        noise = torch.randn(count, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64, device="cpu")
+        return torch.linalg.eigvalsh(noise.mT @ noise)
