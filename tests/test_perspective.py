@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import kcs_torch as kt
 from kcs_torch.cli import app
 from kcs_torch.io import load_reconstruction
-from kcs_torch.methods import perspective
+from kcs_torch.methods import perspective, scene
 from kcs_torch.methods.root import ABSENT, FOUND
 from kcs_torch.types import Intrinsics
 
@@ -243,15 +243,15 @@ def test_a_long_clip_is_refined_in_blocks_that_share_lengths(monkeypatch):
         seen.append(energy)
         return real(energy, start, **options)
 
-    real = perspective.lbfgs
-    monkeypatch.setattr(perspective, "lbfgs", watched)
-    monkeypatch.setattr(perspective, "BLOCK", 100)
-    monkeypatch.setattr(perspective, "OVERLAP", 20)
+    real = scene.lbfgs
+    monkeypatch.setattr(scene, "lbfgs", watched)
+    monkeypatch.setattr(scene, "BLOCK", 100)
+    monkeypatch.setattr(scene, "OVERLAP", 20)
     result = reconstruct(tracks, method="kcs", intrinsics=LENS)
     check_sound(result)
     assert len(seen) in (3, 6, 9) and {len(energy.rays) for energy in seen} == {100}
     for first, *others in zip(seen[::3], seen[1::3], seen[2::3], strict=True):
-        assert first.lengths is None and all(torch.equal(x.lengths, others[0].lengths) for x in others)
+        assert not first.known and all(x.known and torch.equal(x.lengths, others[0].lengths) for x in others)
     assert error(result.points, truth) < 40
     path = result.distance / truth[..., 2].mean(1)
     assert float((path / path.mean() - 1).abs().mean()) < 0.02
@@ -265,13 +265,13 @@ def test_a_long_clip_is_refined_in_blocks_that_share_lengths(monkeypatch):
 def test_a_clip_of_one_block_is_one_problem(monkeypatch):
     tracks, _ = filmed(frames=40)
     whole = reconstruct(tracks, method="kcs", intrinsics=LENS)
-    monkeypatch.setattr(perspective, "BLOCK", 40)
+    monkeypatch.setattr(scene, "BLOCK", 40)
     assert torch.equal(reconstruct(tracks, method="kcs", intrinsics=LENS).points, whole.points)
 
 
 def test_blocks_in_which_nobody_is_seen_or_nothing_moves(monkeypatch):
-    monkeypatch.setattr(perspective, "BLOCK", 20)
-    monkeypatch.setattr(perspective, "OVERLAP", 5)
+    monkeypatch.setattr(scene, "BLOCK", 20)
+    monkeypatch.setattr(scene, "OVERLAP", 5)
     tracks, _ = filmed(frames=50)
     hidden, still = tracks.points.clone(), tracks.points.clone()
     hidden[15:40] = math.nan
@@ -406,9 +406,7 @@ def test_what_was_done_to_the_tracks_is_told_whichever_solution_wins(monkeypatch
 
     def others_first(*arguments, **options):
         found = real(*arguments, **options)
-        back = list(range(len(found.depth)))[::-1]
-        rows = {name: getattr(found, name)[back] for name in ("distance", "depth", "energy")}
-        return replace(found, lifted=tuple(found.lifted[i] for i in back), **rows)
+        return replace(found, bodies=found.bodies[torch.arange(len(found.bodies.energy)).flip(0)])
 
     clip = kt.data.walking_person(20, skeleton="coco17", turn=0.0, yaw=50.0)
     lens = Intrinsics.of((1500.0, 1500.0, 0.0, 0.0))

@@ -11,7 +11,8 @@ from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths
 from kcs_torch.methods import pinhole
 from kcs_torch.methods.pinhole import PinholeEnergy
-from kcs_torch.nn import AdductionEnergy
+from kcs_torch.methods.pkc.objective import Objective
+from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.solvers.lbfgs import lbfgs
 
 
@@ -25,100 +26,136 @@ def walk(frames=12, skeleton="h36m17"):
     return clip.skeleton, points[..., :2] / points[..., 2:], points[..., 2] - far[:, None], far, lengths
 
 
+def level(rays, value=0.0):
+    return torch.full_like(rays[..., 0], value)
+
+
 @pytest.mark.parametrize("known", [False, True], ids=["free", "known lengths"])
-def test_unknowns_there_and_back(known):
-    skeleton, rays, depth, far, lengths = walk()
-    energy = PinholeEnergy(skeleton, rays, far, depth[None], 30.0, 0.0, lengths[None] if known else None)
-    state = energy.pack(depth[None])
-    back, size, shares = energy.unpack(state)
-    assert_close(back, depth[None])
-    assert_close(size, lengths[None])
-    assert_close(energy.path(shares), far[None])
-    points = energy.points(back, far)
-    assert_close(points[..., :2], (rays * (far[:, None] + depth)[..., None])[None])
+@pytest.mark.parametrize("skeleton", ["h36m17", "coco17"])
+def test_the_start_is_what_was_given(skeleton, known):
+    skeleton, rays, depth, far, lengths = walk(skeleton=skeleton)
+    energy = PinholeEnergy(skeleton, rays, far, depth[None], 30.0, level(rays), lengths[None] if known else None)
+    body = energy.unpack(energy.start)
+    assert_close(body.depth, depth[None])
+    assert_close(body.lengths, lengths[None])
+    assert_close(body.distance, far[None])
 
 
 def test_energy_of_a_chain_by_hand():
     """Without a trunk: lengths, smoothness, the path and the method's depths."""
     frames, rate = 5, 25.0
-    rays, depth, near = (
-        0.1 * normal(frames, 4, 2),
-        0.1 * normal(1, frames, 4, seed=1),
-        0.1 * normal(1, frames, 4, seed=2),
-    )
+    rays, depth = 0.1 * normal(frames, 4, 2), 0.1 * normal(1, frames, 4, seed=1)
     far = 2 + 0.1 * normal(frames, seed=3)
-    energy = PinholeEnergy(CHAIN, rays, far, near, rate, 0.01)
-    assert not energy.anatomy
-    state = energy.pack(depth) + 0.01 * normal(1, frames * 4 + 3 + energy.waves.shape[1], seed=4)
-    z, lengths, shares = (x[0] for x in energy.unpack(state))
-    path = far * torch.exp(sum(s * w for s, w in zip(shares, energy.waves.T, strict=True)))
+    energy = PinholeEnergy(CHAIN, rays, far, depth, rate, level(rays, 0.01))
+    z, lengths, path = (x[0] for x in energy.unpack(energy.start + normal(*energy.start.shape, seed=4)))
+    assert not torch.allclose(z, depth[0]) and not torch.allclose(path, far)
+    assert_close(z.mean(-1), depth[0].mean(-1))  # the rest is the distance
     points = torch.cat([rays * (path[:, None] + z)[..., None], z[..., None]], -1)
-    slack = math.hypot(pinhole.LENGTH, 0.01)
-    total = 0.0
+    slack, slow = math.hypot(0.003, 0.01), 30 / rate
+    total = (path / far).log().square().mean() / (2 * pinhole.STRAY**2)
+    total += (path.diff() * rate / pinhole.SPEED).square().sum() / (2 * pinhole.INDEPENDENT / slow)
+    total += (path.diff(n=2) / (pinhole.ROOT * slow**2)).square().sum() / 2
     for b, (i, j) in enumerate(CHAIN.bones):
         off = ((points[:, j] - points[:, i]).square().sum(-1) - lengths[b] ** 2) / (2 * lengths[b])
         total += frames / 2 * torch.log1p((4 * torch.log1p(off**2 / (4 * slack**2))).mean())
         dz = z[:, j] - z[:, i]
-        total += (dz[2:] - 2 * dz[1:-1] + dz[:-2]).square().sum() / (2 * (pinhole.ACCELERATION * 1.2**2) ** 2)
-        total += (dz - near[0, :, j] + near[0, :, i]).square().sum() / (2 * pinhole.CLOSE**2)
-    total += 100 * z.mean(-1).square().sum() + (shares / pinhole.STRAY).square().sum() / 2
-    total += (path.diff() * rate / pinhole.SPEED).square().sum() / (2 * pinhole.POSTURE / 1.2)
+        total += (dz[2:] - 2 * dz[1:-1] + dz[:-2]).square().sum() / (2 * (pinhole.ACCELERATION * slow**2) ** 2)
+        total += (dz - depth[0, :, j] + depth[0, :, i]).square().sum() / (2 * pinhole.CLOSE**2)
+    state = energy.start + normal(*energy.start.shape, seed=4)
     assert_close(energy(state), total[None])
+
+
+def test_energy_of_a_person_is_that_of_pkc_for_the_straightened_image():
+    """And that of standing feet which move along their rays, and of the path."""
+    skeleton, rays, depth, far, _ = walk(20)
+    standing = normal(20, len(skeleton.contacts)).abs().clamp_max(1)
+    energy = PinholeEnergy(skeleton, rays, far, depth[None], 30.0, level(rays, 0.01), standing=standing)
+    state = energy.start + normal(*energy.start.shape)
+    z, lengths, path = energy.unpack(state)
+    image = (rays * (path[..., None] + z)[..., None])[0]
+    weights = at_pace(Weights(), 30.0, pace_of(rays * (far[:, None] + depth)[..., None], skeleton, 30.0))
+    alike = Objective(skeleton, image, weights, level(rays, 0.01))
+    same = energy.model.precision(lengths) / alike.precision(lengths)
+    assert 0.5 < float(same.min()) <= float(same.max()) < 2  # noise counts as in the image of the start
+    terms = energy.model.terms(z, lengths, image[None])
+    own = alike.terms(z, lengths)
+    for name in ("smoothness", "posture", "hinges", "adduction", "proportions"):
+        assert_close(terms[name], own[name])
+    assert terms.keys() == own.keys()
+    along = (path[..., None] + z)[0] * (1 + rays.square().sum(-1)).sqrt()
+    feet = along[:, list(skeleton.contacts)].diff(dim=0) / energy.model.feet.slip
+    both = torch.minimum(standing[1:], standing[:-1])
+    slip = weights.contact / 2 * (both * feet.square().log1p()).sum()
+    rest = (path / far).log().square().mean() / (2 * pinhole.STRAY**2)
+    rest += (path.diff() * 30 / pinhole.SPEED).square().sum() / (2 * pinhole.INDEPENDENT)
+    rest += (path.diff(n=2) / pinhole.ROOT).square().sum() / 2
+    assert_close(energy(state), (sum(terms.values()) + slip + rest).reshape(1))
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["free", "known lengths"])
 @pytest.mark.parametrize("skeleton", ["h36m17", "coco17", CHAIN])
 def test_slope(skeleton, known):
     if skeleton is CHAIN:
-        rays, depth, far, lengths = (
-            0.1 * normal(6, 4, 2),
-            0.1 * normal(6, 4, seed=1),
-            2 + 0.1 * normal(6),
-            torch.ones(3),
-        )
+        rays, depth, far = 0.1 * normal(6, 4, 2), 0.1 * normal(6, 4, seed=1), 2 + 0.1 * normal(6)
+        lengths, feet = torch.ones(3), None
     else:
         skeleton, rays, depth, far, lengths = walk(6, skeleton)
+        feet = torch.full((6, len(skeleton.contacts)), 0.7).double()
     given = lengths.double().expand(2, -1) if known else None
     start = torch.stack([depth, -depth])
-    energy = PinholeEnergy(skeleton, rays, far, start, 30.0, 0.01, given)
-    state = energy.pack(start)
-    assert gradcheck(energy, state + 0.01 * normal(*state.shape), fast=True)
+    energy = PinholeEnergy(skeleton, rays, far, start, 30.0, level(rays, 0.01), given, feet)
+    assert gradcheck(energy, energy.start + 0.1 * normal(*energy.start.shape), fast=True)
+
+
+def test_unknowns_are_nearly_a_sphere():
+    """Steps of one unit change the energy by about as much, whatever they move: few steps of a descent are enough."""
+    skeleton, rays, depth, far, _ = walk(30)
+    standing = torch.zeros(30, len(skeleton.contacts)).double()
+    standing[5:15, 0] = standing[15:25, 1] = 1.0
+    energy = PinholeEnergy(skeleton, rays, far, depth[None], 30.0, level(rays), standing=standing)
+    parts = torch.arange(len(energy.start[0])).split(energy._sizes)
+    curves = []
+    for part in parts:
+        some = torch.zeros(20, len(energy.start[0])).double()
+        at = part[torch.randint(len(part), (20,), generator=torch.Generator().manual_seed(0))]
+        some[torch.arange(20), at] = 1e-3
+        value = torch.stack([energy(x[None])[0] + energy(-x[None])[0] for x in some]) - 2 * energy(energy.start)
+        curves.append((value / 1e-6).median())
+    assert all(0.05 < float(curve) < 20 for curve in curves), curves
 
 
 def test_known_lengths_tell_the_distance():
     """A distance that is wrong by a half comes back, depths with it."""
     skeleton, rays, depth, far, lengths = walk(40)
     wrong = 1.5
-    energy = PinholeEnergy(skeleton, rays, wrong * far, wrong * depth[None], 30.0, 0.002, lengths[None])
-    start = energy.pack(wrong * depth[None])
-    assert_close(energy.path(energy.unpack(start)[2]), far[None], rtol=0.02, atol=0)
-    z, own, shares = energy.unpack(lbfgs(energy, start, num_steps=60).value)
-    assert torch.equal(own, lengths[None])
-    assert_close(energy.path(shares), far[None], rtol=0.05, atol=0)
-    assert float((z[0] - depth).square().mean().sqrt()) < 0.03
+    given = wrong * far, wrong * depth[None], 30.0, level(rays, 0.002), lengths[None]
+    energy = PinholeEnergy(skeleton, rays, *given)
+    assert_close(energy.unpack(energy.start).distance, far[None], rtol=0.02, atol=0)
+    found = energy.unpack(lbfgs(energy, energy.start, num_steps=60).value)
+    assert torch.equal(found.lengths, lengths[None])
+    assert_close(found.distance, far[None], rtol=0.05, atol=0)
+    assert float((found.depth[0] - depth).square().mean().sqrt()) < 0.03
 
 
 def test_lengths_count_once_where_they_are_known():
     """What is the same in all blocks of a clip is no reason to prefer a solution in each of them."""
     skeleton, rays, depth, far, lengths = walk()
-    for factor in (1.0, 3.0):
-        size = lengths * torch.where(torch.arange(len(lengths)) == 2, factor, 1.0).double()
-        free, held = (PinholeEnergy(skeleton, rays, far, depth[None], 30.0, 0.01, x) for x in (None, size[None]))
-        state = free.pack(depth[None])
-        count = depth.numel()
-        state[:, count : count + len(size)] = size.log()
-        same = torch.cat([state[:, :count], state.new_zeros(1, held.waves.shape[1])], 1)
-        assert_close(free(state) - held(same), free.proportions(size[None]))
+    free, held = (
+        PinholeEnergy(skeleton, rays, far, depth[None], 30.0, level(rays, 0.01), x) for x in (None, lengths[None])
+    )
+    assert_close(free(free.start) - held(held.start), free.model.proportions(lengths[None]))
 
 
-def test_an_arm_that_reaches_across_the_body_costs(monkeypatch):
-    skeleton, rays, depth, far, _ = walk()
-    start = 3 * normal(1, *depth.shape)  # limbs anywhere
-    energy = PinholeEnergy(skeleton, rays, far, start, 60.0, 0.0)
-    state = energy.pack(start)
-    z, lengths, shares = energy.unpack(state)
-    across = AdductionEnergy(skeleton)(energy.points(z, energy.path(shares)), lengths).sum(-1)
-    assert float(across) > 1
-    total = energy(state)
-    monkeypatch.setattr(pinhole, "ADDUCTION", 0.0)
-    assert_close(total - energy(state), 0.03 / 2 / 0.05**2 * across)  # at 60 frames a second each counts half
+def test_standing_feet_cost_what_they_slide():
+    """A person who stands still on the spot: only the feet tell that the distance does not change."""
+    skeleton, rays, depth, far, _ = walk(30)
+    rays, depth, far = rays[:1].expand(30, -1, -1), depth[:1].expand(1, 30, -1), far[:1].expand(30)
+    sure = torch.ones(30, len(skeleton.contacts)).double()
+    rests, moves = far, far * torch.linspace(1, 1.3, 30, dtype=torch.float64)
+    costs = []
+    for path in (rests, moves):
+        plain, stood = (
+            PinholeEnergy(skeleton, rays, path, depth, 30.0, level(rays), standing=feet) for feet in (None, sure)
+        )
+        costs.append(float(stood(stood.start) - plain(plain.start)))
+    assert abs(costs[0]) < 1e-9 and costs[1] > 20

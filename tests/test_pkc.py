@@ -12,6 +12,7 @@ from kcs_torch import PKC, ConvergenceWarning, KcsWarning, OptionError, SfAM, Sk
 from kcs_torch.clean import resample, smooth
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_lengths, complete_rotation
+from kcs_torch.methods import detector
 from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pkc import body as body_module
 from kcs_torch.methods.pkc import method as module
@@ -551,12 +552,12 @@ def test_confidences_that_vary_are_a_detector_s():
     weights = torch.rand(clip.tracks.weights.shape, generator=torch.Generator().manual_seed(0)).double() * 0.8 + 0.2
     unsure = replace(clip.tracks, weights=weights)
     _, noise, notes = run(method._clean(unsure), serve)
-    assert_close(noise, module.DETECTED / weights.sqrt())
+    assert_close(noise, detector.DETECTED / weights.sqrt())
     assert any("detector" in note for note in notes)
     chosen = torch.where(weights > 0.6, 1.0, 0.3)
     for sure in (torch.ones_like(weights), torch.full_like(weights, 0.5), (weights > 0.4).double(), chosen):
-        assert not module.detected(sure)
-    assert module.detected(weights) and not module.detected(torch.zeros_like(weights))
+        assert not detector.detected(sure)
+    assert detector.detected(weights) and not detector.detected(torch.zeros_like(weights))
     spread = method(unsure).uncertainty.mean()
     assert spread > method(clip.tracks).uncertainty.mean()
 

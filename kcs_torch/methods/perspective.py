@@ -11,17 +11,19 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import KcsWarning, users_level
-from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
-from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
+from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import Method, apart, check_cameras
-from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
+from kcs_torch.methods.detector import detector_deviation
+from kcs_torch.methods.finish import rms
+from kcs_torch.methods.pinhole import NEAREST
 from kcs_torch.methods.pkc.objective import usual_posture
-from kcs_torch.methods.root import ABSENT, FOUND
+from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
+from kcs_torch.methods.scene import Bodies, Scene, ahead
 from kcs_torch.methods.size import slow_waves, weak_perspective
+from kcs_torch.methods.unseen import gap_deviation
 from kcs_torch.nn.posture import trunk_joints
-from kcs_torch.skeleton import Skeleton
-from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
 __all__ = ["reconstruct_perspective"]
@@ -32,9 +34,6 @@ SETTLED = 0.01
 FLAT = 0.001
 """Root mean square parallax, for a body of 1.75, below which there is no perspective to speak of."""
 
-LEAD = 20.0
-"""By how much the best solution of a method that knows a template may cost more than another and still come first."""
-
 APPARENT = 0.004
 """Root mean square tangent between joints and the line of sight from which on distances follow the size over time, even
 if it is not sure to change: that of a person some 100 metres away."""
@@ -42,8 +41,8 @@ if it is not sure to change: that of a person some 100 metres away."""
 APART = 0.04
 """Root mean square difference in depth, for a body of 1.75, from which on solutions count as two."""
 
-BLOCK, OVERLAP = 2000, 100
-"""Frames of a long clip that are refined together, at most, and by how many blocks overlap."""
+STILL = 2.0
+"""Degrees of the turn of known cameras from which on feet that stand still in the image need not stand still."""
 
 WIDE = 3.0
 """Tangent of the angle off the optical axis from which on the focal length is hardly true."""
@@ -51,24 +50,18 @@ WIDE = 3.0
 
 @dataclass(frozen=True)
 class _Found:
-    """Solutions in the virtual camera's frame, best first: points are rays (u, v, 1) times distance + depth.
+    """Solutions of one round, best first.
 
     Attributes:
-        rays: (T, N, 2), of all joints.
-        distance: (H, T).
-        depth: (H, T, N).
-        energy: (H,).
+        bodies: of the solutions.
         lifted: the method's solutions that they came from, perhaps mirrored.
-        unit: the length that 1 stands for in a body of 1.75, in units of the distance.
+        scene: that they explain.
         notes: of the method on the tracks, whichever of its solutions is best here.
     """
 
-    rays: Tensor
-    distance: Tensor
-    depth: Tensor
-    energy: Tensor
+    bodies: Bodies
     lifted: tuple[Reconstruction, ...]
-    unit: float
+    scene: Scene
     notes: tuple[str, ...] = ()
 
 
@@ -79,7 +72,7 @@ def reconstruct_perspective(
     cameras: Tensor | None = None,
     *,
     rounds: int = 3,
-    steps: int = 100,
+    steps: int = 60,
 ) -> Reconstruction:
     """Reconstruct a body before a pinhole camera by a method made for parallel rays.
 
@@ -87,8 +80,8 @@ def reconstruct_perspective(
     relative depth z lies at (u, v) (D_t + z): its image under parallel rays. Starting from z = 0 and D_t from the
     body's apparent size, each round lifts these tracks by the method, then refines depths, lengths and distances of all
     its solutions and of a mirror image together under perspective (:class:`PinholeEnergy`); bones' constant lengths
-    tell mirror images apart. What a method that knows a template finds best comes first unless another solution is
-    better by 20, which its ``objective`` has taken off.
+    tell mirror images apart, and so do feet that stand still. Of bodies with a template, runs of signs are turned over
+    (:meth:`Scene.turned_over`).
 
     Args:
         method: any.
@@ -139,19 +132,20 @@ def _reconstruct(
     if cameras is not None:
         known = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         cameras = (look @ complete_rotation(known))[:, :2]
-    lead = LEAD if method.knows_template(tracks.skeleton) else 0.0
+    feet = standing_feet(tracks) if cameras is None or float(viewpoint_turn(cameras)) < STILL else None
     best: _Found | None = None
     for _ in range(rounds):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)
             lifted = method.following()(_straighten(tracks, rays, distance, depth), cameras)
-        found = _refine(lifted, distance, depth, rate, steps, mirror=cameras is None, lead=lead)
-        moved = float((found.depth[0] - depth).square().mean().sqrt()) / found.unit
-        if best is None or not float(found.energy[0]) > float(best.energy[0]):
+        found = _refine(lifted, distance, depth, rate, feet, steps, mirror=cameras is None)
+        bodies = found.bodies
+        moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
+        if best is None or not float(bodies.energy[0]) > float(best.bodies.energy[0]):
             best = found
-        if moved < SETTLED or not len(found.energy.isfinite().nonzero()):
+        if moved < SETTLED or not bool(bodies.energy.isfinite().any()):
             break
-        distance, depth = found.distance[0], found.depth[0]
+        distance, depth = bodies.distance[0], bodies.depth[0]
     assert best is not None
     return _assemble(tracks, intrinsics, look, best)
 
@@ -183,18 +177,20 @@ def _slow(values: Tensor, rate: float, *, most: int = 12) -> Tensor:
 def _straighten(tracks: Tracks, rays: Tensor, distance: Tensor, depth: Tensor) -> Tracks:
     """The tracks under parallel rays, of a body at distances (T,) with relative depths (T, N)."""
     n = tracks.skeleton.num_observed
-    own = torch.where(tracks.seen[..., None], rays * _ahead(distance, depth)[..., None], torch.zeros_like(rays))
+    own = torch.where(tracks.seen[..., None], rays * ahead(distance, depth)[..., None], torch.zeros_like(rays))
     points, weights = tracks.skeleton.complete(own[:, :n], tracks.weights[:, :n])
     return replace(tracks, points=points, weights=weights)
 
 
-def _ahead(distance: Tensor, depth: Tensor) -> Tensor:
-    """Distance + depth (..., T, N), positive."""
-    return torch.maximum(distance[..., None] + depth, NEAREST * distance[..., None])
-
-
 def _refine(
-    lifted: Reconstruction, distance: Tensor, depth: Tensor, rate: float, steps: int, *, mirror: bool, lead: float
+    lifted: Reconstruction,
+    distance: Tensor,
+    depth: Tensor,
+    rate: float,
+    standing: Tensor | None,
+    steps: int,
+    *,
+    mirror: bool,
 ) -> _Found:
     """Refine all solutions of the method under perspective, and the best one's mirror image.
 
@@ -203,77 +199,35 @@ def _refine(
         distance: (T,) by which they were straightened.
         depth: (T, N) by which they were straightened.
         rate: frames a second.
+        standing: (T, C) how surely contact points stand still, or None.
         steps: of the refinement.
         mirror: whether depth may have the other sign.
-        lead: by how much the method's best solution is believed to be better than its energy here.
     """
     tracks, others = lifted.tracks, (lifted, *lifted.alternatives)
     flat = lifted.points[..., :2]
     middle = flat.mean(1, keepdim=True)
     flat = middle + lifted.scales[:, None, None] * (flat - middle)  # the method's parallel image, clean and complete
-    rays = flat / _ahead(distance, depth)[..., None]
+    rays = flat / ahead(distance, depth)[..., None]
     start = torch.stack([o.points[..., 2] for o in others])
     start = start - start.mean(-1, keepdim=True)
-    energy = start.new_tensor([o.objective for o in others])
     unit = _unit(lifted)
     exact = distance / lifted.scales
+    size = rms(flat - middle, torch.ones_like(depth)) / unit
+    off = (flat - tracks.points).square().sum(-1)[tracks.seen]
+    level = math.sqrt(float(off.median()) / 1.39) / unit / 2 if len(off) else 0.0  # whatever outliers there are
+    share = gap_deviation((flat - middle) / (size * unit), tracks.seen, rate)
+    share = share.maximum(detector_deviation(tracks.weights))
+    scene = Scene(lifted.skeleton, rays, (size * share).clamp_min(level), rate, unit, standing)
     parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / unit
     if parallax < FLAT or not lifted.skeleton.num_bones:
-        return _Found(rays, exact.expand(len(start), -1), start, energy, others, unit, lifted.diagnostics.notes)
+        energy = start.new_tensor([o.objective for o in others])
+        number = torch.arange(len(start), device=start.device)
+        bodies = Bodies(start, exact.expand(len(start), -1), energy, number)
+        return _Found(bodies, others, scene, lifted.diagnostics.notes)
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
-    off = (flat - tracks.points).square().sum(-1)[tracks.seen]
-    noise = math.sqrt(float(off.median()) / 1.39) / unit / 2 if len(off) else 0.0  # whatever outliers there are
-    depth, far, energy = _descend(lifted.skeleton, rays, exact, start, unit, rate, noise, steps)
-    energy[0] -= lead
-    order = energy.argsort()
-    found = tuple(others[i] for i in order.tolist())
-    return _Found(rays, far[order], depth[order], energy[order], found, unit, lifted.diagnostics.notes)
-
-
-def _descend(
-    skeleton: Skeleton,
-    rays: Tensor,
-    distance: Tensor,
-    start: Tensor,
-    unit: float,
-    rate: float,
-    noise: float,
-    steps: int,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Depths (H, T, N), distances (H, T) and energies (H,) of least :class:`PinholeEnergy`, each from its own start.
-
-    Memory is for as much as a block of a long clip. The liveliest block tells the lengths of the others, whose
-    distances follow; blocks are blended, and their energies summed.
-
-    Args:
-        skeleton: of the body.
-        rays: (T, N, 2).
-        distance: (T,), of which the slow part counts.
-        start: (H, T, N) depths.
-        unit: of the energy, in that of distance and depths.
-        rate: frames a second.
-        noise: standard deviation of joints in the image, in units of the energy.
-        steps: of L-BFGS.
-    """
-    count = max(1, math.ceil((len(rays) - OVERLAP) / (BLOCK - OVERLAP)))
-    size = math.ceil((len(rays) + (count - 1) * OVERLAP) / count)
-    begins = window_starts(len(rays), size, min(OVERLAP, size - 1))
-    image = (rays * distance[:, None, None]).unfold(0, size, 1)[begins]  # (W, N, 2, T)
-    lively = image.diff(dim=-1).square().sum((1, 2))
-    depth, far = start.new_empty(len(begins), size, *start[:, 0].shape), start.new_empty(len(begins), size, len(start))
-    energy, lengths = start.new_zeros(len(start)), None
-    for i in lively.median(-1).values.argsort(descending=True).tolist() if len(begins) > 1 else [0]:
-        some = slice(begins[i], begins[i] + size)
-        near, slow = start[:, some] / unit, _slow(distance[some].log()[:, None], rate)[:, 0].exp() / unit
-        pinhole = PinholeEnergy(skeleton, rays[some], slow, near, rate, noise, lengths)
-        solution = lbfgs(pinhole, pinhole.pack(near), num_steps=steps, tolerance=1e-6)
-        z, own, shares = pinhole.unpack(solution.value)
-        lengths = own if lengths is None else lengths
-        energy = energy + pinhole(solution.value)
-        depth[i], far[i] = ((z - z.mean(-1, keepdim=True)) * unit).transpose(0, 1), (pinhole.path(shares) * unit).mT
-    depth, far = (x[0] if len(begins) == 1 else blend_windows(x, begins, len(rays)) for x in (depth, far))
-    return depth.transpose(0, 1), far.mT, energy
+    bodies = scene.turned_over(scene.refined(exact, start, steps), steps)
+    return _Found(bodies, others, scene, lifted.diagnostics.notes)
 
 
 def _unit(lifted: Reconstruction) -> float:
@@ -289,10 +243,11 @@ def _unit(lifted: Reconstruction) -> float:
 
 def _assemble(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Found) -> Reconstruction:
     """The best solution in the camera's frame, with those of the others that differ from it."""
+    bodies, unit = found.bodies, found.scene.unit
     keep: list[int] = []
-    for k, depth in enumerate(found.depth):
-        apart = [float((depth - found.depth[j]).square().mean().sqrt()) for j in keep]
-        if len(keep) <= max(1, len(found.lifted[0].alternatives)) and all(a > APART * found.unit for a in apart):
+    for k, depth in enumerate(bodies.depth):
+        apart = [float((depth - bodies.depth[j]).square().mean().sqrt()) for j in keep]
+        if len(keep) <= max(1, len(found.lifted[0].alternatives)) and all(a > APART * unit for a in apart):
             keep.append(k)
     made = [_in_camera(tracks, intrinsics, look, found, k) for k in keep]
     return replace(made[0], alternatives=tuple(made[1:]))
@@ -300,9 +255,10 @@ def _assemble(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Foun
 
 def _in_camera(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Found, k: int) -> Reconstruction:
     """Solution number ``k`` in the camera's frame."""
-    lifted, body = found.lifted[k], tracks.skeleton
-    far = _ahead(found.distance[k], found.depth[k])[..., None]
-    points = torch.cat([found.rays * far, far], -1) @ look
+    bodies, body = found.bodies, tracks.skeleton
+    lifted = found.lifted[int(bodies.origin[k])]
+    far = ahead(bodies.distance[k], bodies.depth[k])[..., None]
+    points = torch.cat([found.scene.rays * far, far], -1) @ look
     points = body.complete(points[:, : body.num_observed])[0]
     root = points[..., 2].mean(-1)
     factor = intrinsics.focal / root.log().mean().exp()
@@ -330,7 +286,7 @@ def _in_camera(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Fou
         tracks=tracks,
         diagnostics=facts,
         uncertainty=None if lifted.uncertainty is None else lifted.uncertainty * factor,
-        objective=float(found.energy[k]),
+        objective=float(bodies.energy[k]),
         root_depth=root - root[0],
         distance=root,
         alternatives=(),

@@ -18,7 +18,7 @@ from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.run_costs import RunCosts, Runs, inside
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["flipped", "flipped_runs", "parts_of", "turned", "turned_over"]
+__all__ = ["flipped", "flipped_runs", "parts_of", "promising", "turned", "turned_over"]
 
 TIMES = 8
 """How often flips are tried at most."""
@@ -78,7 +78,7 @@ def turned_over(
         tried = flipped(objective, parts, best)
         before = tried.steps
         for limits, count in ((FIRST, max(steps // 3, 1)), (THEN, steps)):
-            tried = tried[_promising(tried, best, limits)]
+            tried = tried[promising(tried, best, limits)]
             if not len(tried.energy):
                 return found
             tried = yield from refined(objective, tried, count)
@@ -95,7 +95,9 @@ def turned_over(
     return found
 
 
-def _promising(flips: Hypotheses, best: Hypotheses, limits: tuple[tuple[float, int], tuple[float, int]]) -> Tensor:
+def promising(
+    flips: Hypotheses, best: Hypotheses, limits: tuple[tuple[float, int], tuple[float, int]] = FIRST
+) -> Tensor:
     """Indices of the large flips, and of the small ones, that cost little more than the best; so many of each."""
     large, dearer = _change(flips, best) > LARGE, flips.energy - best.energy
     some = [

@@ -15,6 +15,7 @@ from kcs_torch.errors import OptionError, counted
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import Estimate, Method
+from kcs_torch.methods.detector import detected, detector_deviation
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.batch import Noisy, Sized, serve
@@ -40,16 +41,6 @@ CLEAN = 0.003
 WINDOW, QUICK = 64, 2.2
 """Frames in which motion and noise are told apart, at 30 a second: two seconds, and up to 120 frames a second about as
 many. And the frequency in Hz from which on what joints do not share is noise rather than motion."""
-
-DETECTED = 0.027
-"""Standard deviation of a joint that a detector is sure of, a share of the body's size, however smooth: what it gets
-wrong it gets wrong for many frames."""
-
-UNSURE = 0.05
-"""Least confidence that counts."""
-
-PARTLY, GRADES = 0.05, 10
-"""Share of confidences below 1, and number of different ones, from which on they are a detector's."""
 
 HELD = 0.1
 """Standard deviation, a share of the body's size, of joints in frames before the body is first seen and after it was
@@ -242,7 +233,7 @@ class PKC(Method):
             points = place_unseen(flat, known, tracks.skeleton)[..., :2]
         noise = (gap_deviation(points, keep, tracks.fps or 30.0, HELD).square() + left**2).sqrt()
         if detected(tracks.weights):
-            noise = noise.maximum(DETECTED / tracks.weights.clamp_min(UNSURE).sqrt())
+            noise = noise.maximum(detector_deviation(tracks.weights))
             notes.append("confidences vary as a detector's do: joints may be off by a centimetre or more")
         held = _nearest_shown(keep)
         away = held != torch.arange(len(held), device=held.device)
@@ -313,13 +304,6 @@ def _complete(tracks: Tracks, image: Tensor) -> Tracks:
 def _turns(cameras: Tensor | None) -> bool:
     """Whether known cameras turn far enough to tell the sign of depth."""
     return cameras is not None and float(viewpoint_turn(cameras)) >= TELLING
-
-
-def detected(weights: Tensor) -> bool:
-    """Whether confidences (T, N) are a detector's: between 0 and 1, and of many values, which nobody would choose."""
-    seen = weights[weights > 0]
-    partly = seen[seen < 1]
-    return len(partly) > PARTLY * len(seen) and len(partly.unique()) > GRADES
 
 
 def _nearest_shown(seen: Tensor) -> Tensor:

@@ -137,16 +137,21 @@ class Objective:
         self.share: Tensor | None = None
         self.held: Tensor | float = 1.0
 
-    def terms(self, depth: Tensor, lengths: Tensor) -> dict[str, Tensor]:
-        """Each term's value, (H,), of depths (H, T, N) and lengths (H, B)."""
+    def terms(self, depth: Tensor, lengths: Tensor, image: Tensor | None = None) -> dict[str, Tensor]:
+        """Each term's value, (H,), of depths (H, T, N) and lengths (H, B).
+
+        Another image (H, T, N, 2) than the objective's own may go with them; its noise and gaps are taken to be those.
+        """
         w = self.weights
-        points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
+        own = self.image if image is None else image
+        flat = self.flat if image is None else bone_vectors(image, self.bones).square().sum(-1)
+        points = torch.cat([own.expand(*depth.shape, 2), depth[..., None]], -1)
         dz = depth[..., self.bones[:, 1]] - depth[..., self.bones[:, 0]]  # (H, T, B)
         bend = dz.diff(n=2, dim=1).square()
         if self.time is not None:
             bend = bend * self.time[:, 2:, None]
         out = {
-            "length": self.length_value(self.strayed(dz, lengths).sum(1), lengths),
+            "length": self.length_value(self.strayed(dz, lengths, flat).sum(1), lengths),
             "smoothness": bend.sum((1, 2)) / (2 * w.acceleration**2),
             "posture": self.posture(points, lengths, self.share),
             "hinges": w.hinge / w.sine**2 * self.hinges(points, lengths, self.time).sum(-1),
@@ -192,9 +197,12 @@ class Objective:
         moves = lines[:, list(self.skeleton.contacts)] - lines[:, self.posture.trunk].mean(-1, keepdim=True)
         return member @ (moves.abs() > 1e-9).any(-1).to(member) > 0
 
-    def strayed(self, dz: Tensor, lengths: Tensor) -> Tensor:
-        """How far bones of depths (H, T, B) are from lengths (H, B): c log(1 + off^2 / (c s^2)), (H, T, B)."""
-        off = (self.flat + dz.square() - lengths[:, None].square()) / (2 * lengths[:, None])
+    def strayed(self, dz: Tensor, lengths: Tensor, flat: Tensor) -> Tensor:
+        """How far bones of depths (H, T, B) are from lengths (H, B): c log(1 + off^2 / (c s^2)), (H, T, B).
+
+        ``flat`` (T, B) or (H, T, B) are their squared images.
+        """
+        off = (flat + dz.square() - lengths[:, None].square()) / (2 * lengths[:, None])
         return HEAVY * torch.log1p(self.precision(lengths) * off.square() / HEAVY)
 
     def length_value(self, strayed: Tensor, lengths: Tensor) -> Tensor:

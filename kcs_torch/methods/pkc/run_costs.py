@@ -105,7 +105,7 @@ class RunCosts:
         hinges = _sized(obj.hinges.bend(points, lengths), points, obj.hinges.joints)
         reach = _sized(-obj.adduction.abduction(points, lengths), points, obj.adduction.joints)
         parts = (
-            obj.strayed(dz, lengths),
+            obj.strayed(dz, lengths, obj.flat),
             obj.hinges.firm.to(own) * hinges[0].clamp_max(0).square(),
             hinges[1],
             reach[1],

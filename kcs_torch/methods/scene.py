@@ -1,0 +1,161 @@
+"""A body before a pinhole camera, and what is found of it: :class:`Scene` and :class:`Bodies`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.temporal import blend_windows, window_starts
+from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
+from kcs_torch.methods.pkc.flips import flipped, parts_of, promising
+from kcs_torch.methods.pkc.hypotheses import Hypotheses
+from kcs_torch.methods.pkc.limbs import limbs_of
+from kcs_torch.methods.pkc.objective import Objective
+from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
+from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.solvers.lbfgs import lbfgs
+
+__all__ = ["Bodies", "Scene", "ahead"]
+
+BLOCK, OVERLAP = 2000, 100
+"""Frames of a long clip that are refined together, at most, and by how many blocks overlap."""
+
+TIMES, FEW, DEARER, GAIN = 6, 2, 5.0, 5.0
+"""How often flips are tried at most; how many are refined well, and how much dearer than the best they may be then; and
+how much cheaper one must be to be taken."""
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Solutions in the virtual camera's frame: points are rays (u, v, 1) times distance + depth.
+
+    Attributes:
+        depth: (H, T, N).
+        distance: (H, T).
+        energy: (H,).
+        origin: (H,) number of the start that each came from.
+    """
+
+    depth: Tensor
+    distance: Tensor
+    energy: Tensor
+    origin: Tensor
+
+    def __getitem__(self, index: Tensor | slice) -> Bodies:
+        return Bodies(self.depth[index], self.distance[index], self.energy[index], self.origin[index])
+
+    def joined(self, other: Bodies) -> Bodies:
+        """Both together, best first."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        both = Bodies(*(torch.cat(pair) for pair in pairs))
+        return both[both.energy.argsort()]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A body seen along rays.
+
+    Attributes:
+        skeleton: of the body.
+        rays: (T, N, 2), complete.
+        noise: (T, N) standard deviation of joints in the image, for a body of 1.75.
+        rate: frames a second.
+        unit: the length that 1 stands for in a body of 1.75, in units of the distance.
+        standing: (T, C) how surely the skeleton's contact points stand still, or None where nothing tells.
+    """
+
+    skeleton: Skeleton
+    rays: Tensor
+    noise: Tensor
+    rate: float
+    unit: float
+    standing: Tensor | None
+
+    def refined(self, distance: Tensor, depth: Tensor, steps: int) -> Bodies:
+        """Bodies of least :class:`PinholeEnergy`, each from its own start, best first.
+
+        Memory is for as much as a block of a long clip. The liveliest block tells the lengths of the others, whose
+        distances follow; blocks are blended, and their energies summed.
+
+        Args:
+            distance: (T,) that the starts were found with.
+            depth: (H, T, N) starts.
+            steps: of L-BFGS.
+        """
+        frames = len(self.rays)
+        count = max(1, math.ceil((frames - OVERLAP) / (BLOCK - OVERLAP)))
+        size = math.ceil((frames + (count - 1) * OVERLAP) / count)
+        begins = window_starts(frames, size, min(OVERLAP, size - 1))
+        image = (self.rays * distance[:, None, None]).unfold(0, size, 1)[begins]  # (W, N, 2, T)
+        lively = image.diff(dim=-1).square().sum((1, 2))
+        z = depth.new_empty(len(begins), size, *depth[:, 0].shape)
+        far = depth.new_empty(len(begins), size, len(depth))
+        energy, lengths = depth.new_zeros(len(depth)), None
+        for i in lively.median(-1).values.argsort(descending=True).tolist() if len(begins) > 1 else [0]:
+            some = slice(begins[i], begins[i] + size)
+            feet = None if self.standing is None else self.standing[some]
+            pinhole = PinholeEnergy(
+                self.skeleton, self.rays[some], distance[some] / self.unit, depth[:, some] / self.unit, self.rate,
+                self.noise[some], lengths, feet,
+            )  # fmt: skip
+            solution = lbfgs(pinhole, pinhole.start, num_steps=steps, tolerance=1e-6)
+            with torch.no_grad():
+                body = pinhole.unpack(solution.value)
+            assert solution.energy is not None
+            lengths = body.lengths if lengths is None else lengths
+            energy = energy + solution.energy
+            middle = body.depth.mean(-1, keepdim=True)
+            z[i] = ((body.depth - middle) * self.unit).transpose(0, 1)
+            far[i] = ((body.distance + middle[..., 0]) * self.unit).mT
+        z, far = (x[0] if len(begins) == 1 else blend_windows(x, begins, frames) for x in (z, far))
+        order = energy.argsort()
+        return Bodies(z.transpose(0, 1), far.mT, energy, torch.arange(len(energy), device=z.device))[order]
+
+    def turned_over(self, found: Bodies, steps: int) -> Bodies:
+        """Bodies, best first, whose best one no flip of a run of its signs makes better.
+
+        Straightened tracks agree with what is wrong in the depths that straightened them, so that no method finds it.
+        Flips of these tracks' solution (:func:`kcs_torch.methods.pkc.flips.flipped`) are therefore refined under
+        perspective. Bodies without a template, and clips of several blocks, are left as they are.
+        """
+        if len(trunk_joints(self.skeleton)) < 3 or len(self.rays) > BLOCK or not bool(found.energy[0].isfinite()):
+            return found
+        for _ in range(TIMES):
+            best, origin = found[:1], found.origin[:1]
+            distance = best.distance[0]
+            flips = self._flips(best)
+            if not len(flips):
+                break
+            tried = self.refined(distance, flips, max(steps // 3, 1))[:FEW]
+            tried = tried[tried.energy < best.energy + DEARER]
+            if not len(tried.energy):
+                break
+            better = self.refined(distance, tried.depth, steps)[:1]
+            if not bool(better.energy[0] < best.energy[0] - GAIN):
+                break
+            found = found.joined(Bodies(better.depth, better.distance, better.energy, origin))
+        return found
+
+    def _flips(self, best: Bodies) -> Tensor:
+        """Depths (H, T, N) of one body with promising runs of signs turned over."""
+        depth, distance = best.depth / self.unit, best.distance / self.unit
+        image = (self.rays * ahead(distance, depth)[..., None])[0]
+        image = image - image.mean(-2, keepdim=True)
+        weights = at_pace(Weights(), self.rate, pace_of(image, self.skeleton, self.rate))
+        objective = Objective(self.skeleton, image, weights, self.noise, standing=self.standing)
+        points = torch.cat([image[None], depth[..., None]], -1)
+        lengths = bone_lengths(points, objective.bones).median(1).values
+        now = Hypotheses(depth, lengths, objective(depth, lengths) + objective.contact(depth))
+        parts = parts_of(self.skeleton, limbs_of(self.skeleton, objective.posture.trunk.tolist()))
+        tried = flipped(objective, parts, now)
+        return tried.depth[promising(tried, now)] * self.unit
+
+
+def ahead(distance: Tensor, depth: Tensor) -> Tensor:
+    """Distance + depth (..., T, N), positive."""
+    return torch.maximum(distance[..., None] + depth, NEAREST * distance[..., None])
