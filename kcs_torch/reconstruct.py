@@ -6,13 +6,14 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from kcs_torch.errors import KcsWarning, OptionError, unknown, users_level
 from kcs_torch.methods import METHODS
 from kcs_torch.methods.base import Method
 from kcs_torch.methods.found import find_skeleton
 from kcs_torch.methods.perspective import reconstruct_perspective
+from kcs_torch.methods.uncalibrated import reconstruct_uncalibrated
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.intake import no_bones
@@ -48,6 +49,7 @@ def reconstruct(
         cameras: (T, 2, 3) camera rows, world to camera, where they are known.
         intrinsics: (fx, fy, cx, cy) or a matrix K (3, 3) in the unit of the tracks, where it is known. Perspective is
             then taken into account, and ``result.in_space()`` lies before the camera and projects onto the tracks.
+            "auto" finds the focal length from the tracks of a body with a template, which takes several solutions.
         **fields: of the method, such as ``beta=2.0``.
 
     Returns:
@@ -66,7 +68,7 @@ def reconstruct(
     >>> result.points.shape, result.method
     (torch.Size([60, 17, 3]), 'sfam')
     """
-    lens = None if intrinsics is None else Intrinsics.of(intrinsics)
+    lens = None if intrinsics is None else _lens(intrinsics)
     find = isinstance(skeleton, str) and skeleton == "auto"
     if find:
         skeleton = None
@@ -83,9 +85,7 @@ def reconstruct(
     lacking = no_bones(tracks.skeleton.num_joints)
     if chosen.knows_bones and lacking in tracks.notes:
         warnings.warn(f"{tracks.source}: {lacking}", KcsWarning, stacklevel=users_level())
-    if lens is not None:
-        return reconstruct_perspective(chosen, tracks, lens, cameras)
-    return chosen(tracks, cameras)
+    return chosen(tracks, cameras) if lens is None else _before(lens, chosen, tracks, cameras)
 
 
 def reconstruct_all(
@@ -117,8 +117,8 @@ def reconstruct_all(
             raise OptionError(f"reconstruct_all: item {i}: expected Tracks (see Tracks.from_arrays), got {type(one)}")
     chosen = _method(method, fields)
     if intrinsics is not None:
-        lens = Intrinsics.of(intrinsics)
-        return [reconstruct_perspective(chosen, one, lens) for one in people]
+        lens = _lens(intrinsics)
+        return [_before(lens, chosen, one) for one in people]
     return chosen.many(people)
 
 
@@ -130,6 +130,18 @@ def with_found_bones(tracks: Tracks) -> Tracks:
     """
     said = no_bones(tracks.skeleton.num_joints)
     return replace(tracks, skeleton=find_skeleton(tracks), notes=tuple(note for note in tracks.notes if note != said))
+
+
+def _lens(value: Any) -> Intrinsics | Literal["auto"]:
+    """Intrinsics, or "auto" where they are to be found."""
+    return "auto" if isinstance(value, str) and value == "auto" else Intrinsics.of(value)
+
+
+def _before(lens: Intrinsics | Literal["auto"], method: Method, tracks: Tracks, cameras: Any = None) -> Reconstruction:
+    """Reconstruct one body before a pinhole camera."""
+    if lens == "auto":
+        return reconstruct_uncalibrated(method, tracks, cameras)
+    return reconstruct_perspective(method, tracks, lens, cameras)
 
 
 def _method(method: str | Method, fields: dict[str, Any]) -> Method:

@@ -89,7 +89,23 @@ def test_energy_of_a_person_is_that_of_pkc_for_the_straightened_image():
     rest = (path / far).log().square().mean() / (2 * pinhole.STRAY**2)
     rest += (path.diff() * 30 / pinhole.SPEED).square().sum() / (2 * pinhole.INDEPENDENT)
     rest += (path.diff(n=2) / pinhole.ROOT).square().sum() / 2
-    assert_close(energy(state), (sum(terms.values()) + slip + rest).reshape(1))
+    free = alike.foreshortening
+    share = energy.model.clear * free.free.double() / free.correlation
+    middle = (path[..., None] + z)[0][:, skeleton.bone_index()].mean(-1) / far.mean()
+    near = 2 * (share * middle.log()).sum()  # an image at half the distance is four times as likely
+    assert_close(energy(state), (sum(terms.values()) + slip + rest - near).reshape(1))
+
+
+def test_images_say_nothing_for_a_small_body_near_by():
+    """What foreshortening costs is the same for a body of any size whose image is the same."""
+    skeleton, rays, depth, far, lengths = walk(20)
+    energy = PinholeEnergy(skeleton, rays, far, depth[None], 30.0, level(rays))
+    costs = []
+    for size in (1.0, 0.5):
+        z, path, own = size * depth[None], size * far[None], size * lengths[None]
+        image = rays * (path[..., None] + z)[..., None]
+        costs.append(energy.model.terms(z, own, image)["foreshortening"] - energy._nearness(z, path))
+    assert_close(costs[0], costs[1])
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["free", "known lengths"])

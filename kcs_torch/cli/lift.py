@@ -102,8 +102,9 @@ def lift(
     intrinsics: Annotated[
         str | None,
         typer.Option(
-            metavar="FX,FY,CX,CY",
-            help="Focal lengths and principal point of the camera in pixels; perspective is then modelled.",
+            metavar="FX,FY,CX,CY|auto",
+            help="Focal lengths and principal point of the camera in pixels, or auto: the focal length is found from "
+            "the tracks. Perspective is then modelled.",
             show_default=False,
         ),
     ] = None,
@@ -253,16 +254,18 @@ def _learned(path: str, settings: list[str]) -> Method:
     return replace(load_lifter(path), **parse_settings(settings, [Lifter]))
 
 
-def _lens(text: str) -> Intrinsics:
-    """The camera that ``--intrinsics`` names."""
+def _lens(text: str) -> Intrinsics | str:
+    """The camera that ``--intrinsics`` names, or "auto"."""
     from kcs_torch.errors import KcsError, OptionError
     from kcs_torch.types import Intrinsics
 
+    if text == "auto":
+        return text
     try:
         return Intrinsics.of([float(x) for x in text.split(",")])
     except (ValueError, KcsError):
         raise OptionError(
-            "--intrinsics: expected FX,FY,CX,CY in pixels, focal lengths positive, such as 1500,1500,960,540, "
+            "--intrinsics: expected FX,FY,CX,CY in pixels, focal lengths positive, such as 1500,1500,960,540, or auto, "
             f"got {text!r}"
         ) from None
 

@@ -153,7 +153,7 @@ class PinholeEnergy:
             return total + self._plain(points, lengths)
         terms = self.model.terms(depth, lengths, points[..., :2])
         total = total + sum(value for name, value in terms.items() if name != "proportions" or not self.known)
-        return total + self._contact(depth, distance)
+        return total + self._contact(depth, distance) - self._nearness(depth, distance)
 
     def _points(self, depth: Tensor, distance: Tensor) -> Tensor:
         """(H, T, N, 3) of depths (H, T, N) and distances (H, T)."""
@@ -179,6 +179,19 @@ class PinholeEnergy:
         along = (distance[..., None] + depth) * (1 + self.rays.square().sum(-1)).sqrt()
         feet = torch.nn.functional.pad(along[..., None], (2, 0))
         return model.weights.contact * model.feet(feet, torch.zeros_like(distance), model.standing)
+
+    def _nearness(self, depth: Tensor, distance: Tensor) -> Tensor:
+        """By how much less likely foreshortened images are along rays than under parallel ones, (H,).
+
+        A direction drawn evenly has an image of density 1 / (2 pi L |d|) under parallel rays, and of (D + z)^2 times
+        that along rays: without it a body would cost less for being small, and near to the camera.
+        """
+        assert self.model is not None
+        free = self.model.foreshortening
+        share = self.model.clear * (free.free.to(distance) / free.correlation)  # (T, B)
+        ends = torch.maximum(distance[..., None] + depth, NEAREST * distance[..., None])[..., self.bones]
+        far = ends.mean(-1) / self.distance.mean(-1)[:, None, None]
+        return 2 * (share * far.log()).sum((1, 2))
 
     @property
     def _sizes(self) -> list[int]:
