@@ -224,6 +224,35 @@ def test_any_skeleton():
     check_sound(reconstruct(free, method="sfam", intrinsics=LENS))
 
 
+@pytest.mark.parametrize("yaw", [20, 60])
+def test_walks_before_a_near_camera_are_nearly_as_exact_as_under_parallel_rays(yaw):
+    tracks, truth = filmed(nearest=2000.0, yaw=yaw, frames=60)
+    result = reconstruct(tracks, method="pkc", intrinsics=LENS)
+    far = reconstruct(kt.data.walking_person(60, turn=0, yaw=yaw).tracks, method="pkc")
+    assert error(result.points, truth) < error(far.points, truth) + 8
+    path = result.distance / truth[..., 2].mean(1)
+    assert float((path / path.mean() - 1).abs().max()) < 0.01
+
+
+def test_a_limb_that_points_the_wrong_way_is_turned_over_under_perspective():
+    """Straightened by wrong depths, tracks agree with them; perspective does not."""
+    tracks, truth = filmed(nearest=2000.0, yaw=60, frames=40)
+    body, lens = tracks.skeleton, Intrinsics.of(LENS)
+    far = truth[..., 2].mean(1)
+    depth = truth[..., 2] - far[:, None]
+    rays = lens.rays(tracks.points)[..., :2]
+    wrong = depth.clone()
+    knee, ankle = body.index("right_knee"), body.index("right_ankle")
+    wrong[:20, ankle] = 2 * depth[:20, knee] - depth[:20, ankle]
+    view = scene.Scene(body, rays, torch.zeros_like(depth), 30.0, 1000.0, None)
+    found = view.refined(far, wrong[None], 40)
+    better = view.turned_over(found, 40)
+    assert float(better.energy[0]) < float(found.energy[0]) - scene.GAIN
+    off = [float((x.depth[0] - depth)[:, ankle].square().mean().sqrt()) for x in (found, better)]
+    assert off[1] < 0.5 * off[0]
+    assert torch.equal(better.origin, torch.zeros_like(better.origin))  # whatever came of the one start
+
+
 # ---------------------------------------------------------------------- long clips
 
 

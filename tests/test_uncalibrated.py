@@ -67,6 +67,7 @@ def quick(monkeypatch):
     return asked
 
 
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
 @pytest.mark.parametrize("method", ["kcs", "pkc"])
 def test_pkc_judges_and_the_method_solves(quick, method):
     tracks, _ = filmed(3500.0, 12)

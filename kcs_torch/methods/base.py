@@ -49,6 +49,8 @@ class Method(ABC):
     """Whether the result depends on the skeleton's bones: then a user who gives none should know."""
     learned: ClassVar[bool] = False
     """Whether depth comes from examples: then it does not rest on the viewpoint's turn."""
+    turns_over: ClassVar[bool] = False
+    """Whether it looks for runs of depths with the wrong sign, so that they are looked for under perspective, too."""
     reckons_in_seconds: ClassVar[bool] = False
     """Whether the frame rate matters; 30 frames a second are assumed where it is unknown."""
 

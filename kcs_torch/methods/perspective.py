@@ -80,8 +80,8 @@ def reconstruct_perspective(
     relative depth z lies at (u, v) (D_t + z): its image under parallel rays. Starting from z = 0 and D_t from the
     body's apparent size, each round lifts these tracks by the method, then refines depths, lengths and distances of all
     its solutions and of a mirror image together under perspective (:class:`PinholeEnergy`); bones' constant lengths
-    tell mirror images apart, and so do feet that stand still. Of bodies with a template, runs of signs are turned over
-    (:meth:`Scene.turned_over`).
+    tell mirror images apart, and so do feet that stand still. Where the method looks for runs of wrong signs, and the
+    body has a template, they are turned over (:meth:`Scene.turned_over`).
 
     Args:
         method: any.
@@ -138,7 +138,8 @@ def _reconstruct(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)
             lifted = method.following()(_straighten(tracks, rays, distance, depth), cameras)
-        found = _refine(lifted, distance, depth, rate, feet, steps, mirror=cameras is None)
+        given = lifted, distance, depth, rate, feet, steps
+        found = _refine(*given, mirror=cameras is None, flips=method.turns_over)
         bodies = found.bodies
         moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
         if best is None or not float(bodies.energy[0]) > float(best.bodies.energy[0]):
@@ -191,6 +192,7 @@ def _refine(
     steps: int,
     *,
     mirror: bool,
+    flips: bool,
 ) -> _Found:
     """Refine all solutions of the method under perspective, and the best one's mirror image.
 
@@ -202,6 +204,7 @@ def _refine(
         standing: (T, C) how surely contact points stand still, or None.
         steps: of the refinement.
         mirror: whether depth may have the other sign.
+        flips: whether runs of depths may have.
     """
     tracks, others = lifted.tracks, (lifted, *lifted.alternatives)
     flat = lifted.points[..., :2]
@@ -226,7 +229,9 @@ def _refine(
         return _Found(bodies, others, scene, lifted.diagnostics.notes)
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
-    bodies = scene.turned_over(scene.refined(exact, start, steps), steps)
+    bodies = scene.refined(exact, start, steps)
+    if flips:
+        bodies = scene.turned_over(bodies, steps)
     return _Found(bodies, others, scene, lifted.diagnostics.notes)
 
 
