@@ -15,7 +15,7 @@ from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import Method, apart, check_cameras
-from kcs_torch.methods.detector import detector_deviation
+from kcs_torch.methods.detector import detected, detector_deviation
 from kcs_torch.methods.finish import rms
 from kcs_torch.methods.pinhole import NEAREST
 from kcs_torch.methods.pkc.objective import usual_posture
@@ -56,12 +56,14 @@ class _Found:
         bodies: of the solutions.
         lifted: the method's solutions that they came from, perhaps mirrored.
         scene: that they explain.
+        flat: whether there was no perspective to speak of, so that they are the method's own.
         notes: of the method on the tracks, whichever of its solutions is best here.
     """
 
     bodies: Bodies
     lifted: tuple[Reconstruction, ...]
     scene: Scene
+    flat: bool
     notes: tuple[str, ...] = ()
 
 
@@ -148,6 +150,9 @@ def _reconstruct(
             break
         distance, depth = bodies.distance[0], bodies.depth[0]
     assert best is not None
+    known = len(trunk_joints(tracks.skeleton)) >= 3 and not detected(tracks.weights)
+    if method.turns_over and known and not best.flat:
+        best = replace(best, bodies=best.scene.polished(best.bodies, steps))
     return _assemble(tracks, intrinsics, look, best)
 
 
@@ -226,13 +231,13 @@ def _refine(
         energy = start.new_tensor([o.objective for o in others])
         number = torch.arange(len(start), device=start.device)
         bodies = Bodies(start, exact.expand(len(start), -1), energy, number)
-        return _Found(bodies, others, scene, lifted.diagnostics.notes)
+        return _Found(bodies, others, scene, True, lifted.diagnostics.notes)
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
     bodies = scene.refined(exact, start, steps)
     if flips:
         bodies = scene.turned_over(bodies, steps)
-    return _Found(bodies, others, scene, lifted.diagnostics.notes)
+    return _Found(bodies, others, scene, False, lifted.diagnostics.notes)
 
 
 def _unit(lifted: Reconstruction) -> float:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import blend_windows, window_starts
+from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
+from kcs_torch.methods.pkc.batch import serve
+from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.flips import flipped, parts_of, promising
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
@@ -141,11 +144,30 @@ class Scene:
             found = found.joined(Bodies(better.depth, better.distance, better.energy, origin))
         return found
 
+    def polished(self, found: Bodies, steps: int) -> Bodies:
+        """Bodies, the best polished on the image that its own depths make (:meth:`Body.polished`).
+
+        Polishing moves joints by a few centimetres at most, of the image hardly more than a thousandth of that.
+        """
+        best = found[:1]
+        body = Body(self.skeleton, self._image(best), self.rate, self.noise)
+        if not body.spanned or not bool(best.depth.any()):
+            return found
+        depth = best.depth / self.unit * body.factor
+        points = torch.cat([body.image[None], depth[..., None]], -1)
+        lengths = bone_lengths(points, body.objective.bones).median(1).values
+        now = Hypotheses(depth, lengths, body.objective(depth, lengths))
+        better = run(body.polished(now, steps), serve).depth / body.factor * self.unit
+        return replace(found, depth=torch.cat([better, found.depth[1:]]))
+
+    def _image(self, best: Bodies) -> Tensor:
+        """The image (T, N, 2) of a single body under parallel rays, in its unit."""
+        image = (self.rays * ahead(best.distance, best.depth)[..., None])[0] / self.unit
+        return image - image.mean(-2, keepdim=True)
+
     def _flips(self, best: Bodies) -> Tensor:
         """Depths (H, T, N) of one body with promising runs of signs turned over."""
-        depth, distance = best.depth / self.unit, best.distance / self.unit
-        image = (self.rays * ahead(distance, depth)[..., None])[0]
-        image = image - image.mean(-2, keepdim=True)
+        depth, image = best.depth / self.unit, self._image(best)
         weights = at_pace(Weights(), self.rate, pace_of(image, self.skeleton, self.rate))
         objective = Objective(self.skeleton, image, weights, self.noise, standing=self.standing)
         points = torch.cat([image[None], depth[..., None]], -1)
