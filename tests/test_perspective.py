@@ -154,9 +154,11 @@ def test_body_off_the_optical_axis():
     c, s, o = turn.cos(), turn.sin(), torch.zeros_like(turn)
     aside = truth @ torch.stack([torch.stack([c, o, s]), torch.stack([o, o + 1, o]), torch.stack([-s, o, c])]).mT
     other = kt.Tracks.from_arrays(Intrinsics.of(LENS).project(aside), skeleton=tracks.skeleton, fps=30.0)
-    first, second = (reconstruct(t, method="kcs", intrinsics=LENS) for t in (tracks, other))
+    first, second = (reconstruct(t, intrinsics=LENS) for t in (tracks, other))
     assert error(second.points, truth) == pytest.approx(error(first.points, truth), rel=0.1)
-    assert error(second.points, truth) < 0.7 * error(reconstruct(other, method="kcs").points, truth)
+    for method in ("kcs", "pkc"):
+        found, plain = (reconstruct(other, method=method, intrinsics=lens) for lens in (LENS, None))
+        assert error(found.points, truth) < 0.7 * error(plain.points, truth)
 
 
 @pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")  # SfAM sees a turn of 27 degrees

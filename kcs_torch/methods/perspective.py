@@ -150,8 +150,8 @@ def _reconstruct(
             break
         distance, depth = bodies.distance[0], bodies.depth[0]
     assert best is not None
-    known = len(trunk_joints(tracks.skeleton)) >= 3 and not detected(tracks.weights)
-    if method.turns_over and known and not best.flat:
+    exact = len(trunk_joints(tracks.skeleton)) >= 3 and not detected(tracks.weights)
+    if method.turns_over and exact and not best.flat:
         best = replace(best, bodies=best.scene.polished(best.bodies, steps))
     return _assemble(tracks, intrinsics, look, best)
 
