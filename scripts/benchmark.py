@@ -3,6 +3,7 @@
     python scripts/benchmark.py method=sfam suite=akhter
     python scripts/benchmark.py -m method=kcs,sfam suite=static_walk,orbit
     python scripts/benchmark.py method=sfam suite=akhter cameras=true +method.beta=0
+    python scripts/benchmark.py suite=[real_openpose,real_mediapipe] intrinsics=true
     python scripts/benchmark.py paper.parts=all    # the tables of the two seed papers instead, see papers.py
 
 Writes SUITE/CASE.npz (the prediction) and results.csv (a row a case) to the run's folder under ``outputs/``, and
@@ -39,7 +40,7 @@ from kcs_torch.methods import METHODS
 from kcs_torch.training.configured import in_one_line, method_of
 
 FACTS = (
-    *("suite", "case", "method", "options", "cameras", "frames", "joints"),
+    *("suite", "case", "method", "options", "cameras", "intrinsics", "frames", "joints"),
     *("seconds", "cpu_seconds", "ms_per_frame", "converged"),
 )
 failed = 0  # cases of all jobs; Hydra hands no exit code through
@@ -84,15 +85,32 @@ def true_cameras(protocol: ModuleType, data: Path, case: dict[str, Any]) -> torc
     return torch.from_numpy(source["R"].astype(float)) if "R" in source.files else None
 
 
+def lens_of(protocol: ModuleType, data: Path, case: dict[str, Any], wanted: bool | str | None) -> Any:
+    """What is given as intrinsics: None, "auto", or K (3, 3) of the case's camera, where the data has it."""
+    if wanted not in (None, False, True, "auto"):
+        raise SystemExit(f"intrinsics={wanted}: expected null, true or auto")
+    if not wanted or wanted == "auto":
+        return wanted or None
+    source = protocol.load(data, case["src"])
+    return source["cam_K"][case["camera"]] if "camera" in case and "cam_K" in source.files else None
+
+
 def run_case(
-    protocol: ModuleType, data: Path, case: dict[str, Any], method: kt.Method, target: Path, cameras: bool
+    protocol: ModuleType,
+    data: Path,
+    case: dict[str, Any],
+    method: kt.Method,
+    target: Path,
+    cameras: bool,
+    intrinsics: bool | str | None = None,
 ) -> dict[str, Any]:
     """Reconstruct one case, write the prediction, and return its figures and facts."""
     given, truth = protocol.build(data, case)
     tracks = load_input(given, protocol.case_name(case))
     known = true_cameras(protocol, data, case) if cameras else None
+    lens = lens_of(protocol, data, case, intrinsics)
     start, begin = time.perf_counter(), time.process_time()
-    result = method(tracks) if known is None else method(tracks, cameras=known)
+    result = kt.reconstruct(tracks, method=method, cameras=known, intrinsics=lens)
     seconds, cpu = time.perf_counter() - start, time.process_time() - begin
     prediction = {"points3d": result.observed.numpy(), "cameras": result.cameras.numpy()}
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -102,6 +120,7 @@ def run_case(
     )
     return figures | {
         "cameras": "estimated" if known is None else "true",
+        "intrinsics": "none" if lens is None else "found" if isinstance(lens, str) else "true",
         "frames": tracks.num_frames,
         "joints": tracks.skeleton.num_observed,
         "seconds": round(seconds, 4),
@@ -175,7 +194,8 @@ def main(config: DictConfig) -> None:
         label = protocol.case_name(case)
         row: dict[str, Any] = {"suite": suite, "case": label, "method": name, "options": text}
         try:
-            row |= run_case(protocol, shared / "data", case, method, folder / suite / f"{label}.npz", config.cameras)
+            given = protocol, shared / "data", case, method, folder / suite / f"{label}.npz"
+            row |= run_case(*given, config.cameras, config.intrinsics)
             shown = "  ".join(f"{f} {row[f]:.4f}" for f in protocol.FIGURES if f in row)
             print(f"{suite}/{label}  {shown}  {row['ms_per_frame']:.2f} ms a frame", flush=True)
         except (Exception, SystemExit) as error:  # the protocol leaves by SystemExit where a prediction is no good

@@ -127,6 +127,18 @@ def test_no_case_is_an_error(root, folder):
     assert done.returncode == 1 and "matches no case" in done.stderr
 
 
+def test_real_case_with_its_lens(root, shared, tmp_path):
+    words = ["method=kcs", "suite=real_openpose", "case=*camera1", f"shared={shared}", "hydra.run.dir=out"]
+    plain, lens = benchmark(root, tmp_path, *words), benchmark(root, tmp_path, *words, "intrinsics=true")
+    for done in (plain, lens):
+        assert done.returncode == 0, done.stdout + done.stderr
+    first, second = rows(tmp_path / "out" / "results.csv")
+    assert (first["intrinsics"], second["intrinsics"]) == ("none", "true")
+    assert float(second["pa"]) < float(first["pa"])
+    wrong = benchmark(root, tmp_path, *words, "intrinsics=yes!")
+    assert wrong.returncode == 1 and "intrinsics=yes!: expected null, true or auto" in wrong.stdout + wrong.stderr
+
+
 def test_real_case_with_true_cameras(root, shared, tmp_path):
     words = ["method=sfam", "suite=akhter", "case=*pickup", f"shared={shared}", "cameras=true", "hydra.run.dir=out"]
     done = benchmark(root, tmp_path, *words)

@@ -31,7 +31,7 @@ __all__ = ["reconstruct_perspective"]
 SETTLED = 0.01
 """Root mean square change of depth, for a body of 1.75, below which no further round is made."""
 
-FLAT = 0.001
+FLAT = 0.0003
 """Root mean square parallax, for a body of 1.75, below which there is no perspective to speak of."""
 
 APPARENT = 0.004
@@ -144,7 +144,7 @@ def _reconstruct(
         found = _refine(*given, mirror=cameras is None, flips=method.turns_over)
         bodies = found.bodies
         moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
-        if best is None or not float(bodies.energy[0]) > float(best.bodies.energy[0]):
+        if best is None or (not bool(bodies.energy[0] >= best.bodies.energy[0]) and bool(bodies.energy[0].isfinite())):
             best = found
         if moved < SETTLED or not bool(bodies.energy.isfinite().any()):
             break
@@ -219,7 +219,9 @@ def _refine(
     start = torch.stack([o.points[..., 2] for o in others])
     start = start - start.mean(-1, keepdim=True)
     unit = _unit(lifted)
-    exact = distance / lifted.scales
+    exact = (
+        distance / _slow(lifted.scales.clamp_min(1e-9).log()[:, None], rate)[:, 0].exp()
+    )  # a method's own scales may jump
     size = rms(flat - middle, torch.ones_like(depth)) / unit
     off = (flat - tracks.points).square().sum(-1)[tracks.seen]
     level = math.sqrt(float(off.median()) / 1.39) / unit / 2 if len(off) else 0.0  # whatever outliers there are
@@ -230,7 +232,7 @@ def _refine(
     if parallax < FLAT or not lifted.skeleton.num_bones:
         energy = start.new_tensor([o.objective for o in others])
         number = torch.arange(len(start), device=start.device)
-        bodies = Bodies(start, exact.expand(len(start), -1), energy, number)
+        bodies = Bodies(start, (distance / lifted.scales).expand(len(start), -1), energy, number)
         return _Found(bodies, others, scene, True, lifted.diagnostics.notes)
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
@@ -273,7 +275,8 @@ def _in_camera(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Fou
     root = points[..., 2].mean(-1)
     factor = intrinsics.focal / root.log().mean().exp()
     points, root = points * factor, root * factor
-    off = (intrinsics.project(points) - tracks.points)[tracks.seen]
+    n = body.num_observed  # virtual joints are means of others in the image, too, which no projection is
+    off = (intrinsics.project(points) - tracks.points)[:, :n][tracks.seen[:, :n]]
     points = torch.cat([points[..., :2], points[..., 2:] - root[:, None, None]], -1)
     bones = bone_lengths(points, body.bone_index(device=points.device))
     ratio = bones[:, list(body.rigid)] / bones.mean(0).clamp_min(torch.finfo(bones.dtype).tiny)[list(body.rigid)]

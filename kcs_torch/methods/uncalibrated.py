@@ -12,7 +12,7 @@ from torch import Tensor
 from kcs_torch.errors import KcsWarning, OptionError
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.base import Method
+from kcs_torch.methods.base import Method, apart
 from kcs_torch.methods.perspective import reconstruct_perspective
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.objective import usual_posture
@@ -60,7 +60,8 @@ def reconstruct_uncalibrated(method: Method, tracks: Tracks, cameras: Tensor | N
             f"intrinsics: 'auto' needs a skeleton with a template and a trunk, '{tracks.skeleton.name}' has none: "
             "expected (fx, fy, cx, cy) or a matrix K (3, 3)"
         )
-    middle, unit = _seen(tracks)
+    with apart([tracks]):
+        middle, unit = _seen(tracks)
     judge = method if isinstance(method, PKC) else PKC()
     found: dict[float, Reconstruction] = {}
 
