@@ -236,6 +236,14 @@ def test_walks_before_a_near_camera_are_nearly_as_exact_as_under_parallel_rays(y
     assert float((path / path.mean() - 1).abs().max()) < 0.01
 
 
+def test_bones_keep_their_length_where_the_image_is_noisy():
+    tracks, _ = filmed(nearest=2500.0, frames=30, noise=3.0)
+    result = reconstruct(tracks, intrinsics=LENS)
+    assert result.diagnostics.bone_variation < 0.3  # per cent
+    assert 2.0 < result.diagnostics.reprojection_rms < 8.0  # the noise, which is not explained
+    check_sound(result)
+
+
 def test_a_limb_that_points_the_wrong_way_is_turned_over_under_perspective():
     """Straightened by wrong depths, tracks agree with them; perspective does not."""
     tracks, truth = filmed(nearest=2000.0, yaw=60, frames=40)

@@ -269,8 +269,7 @@ def _in_camera(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Fou
     """Solution number ``k`` in the camera's frame."""
     bodies, body = found.bodies, tracks.skeleton
     lifted = found.lifted[int(bodies.origin[k])]
-    far = ahead(bodies.distance[k], bodies.depth[k])[..., None]
-    points = torch.cat([found.scene.rays * far, far], -1) @ look
+    points = found.scene.points(bodies, k) @ look
     points = body.complete(points[:, : body.num_observed])[0]
     root = points[..., 2].mean(-1)
     factor = intrinsics.focal / root.log().mean().exp()

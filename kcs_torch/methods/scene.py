@@ -13,15 +13,16 @@ from kcs_torch.functional.temporal import blend_windows, window_starts
 from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
 from kcs_torch.methods.pkc.batch import serve
-from kcs_torch.methods.pkc.body import Body
+from kcs_torch.methods.pkc.body import DAMPING, HOLD, Body
 from kcs_torch.methods.pkc.flips import flipped, parts_of, promising
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
-from kcs_torch.methods.pkc.objective import Objective
+from kcs_torch.methods.pkc.objective import Objective, bone_noise
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
+from kcs_torch.solvers.lm import fit_bones
 
 __all__ = ["Bodies", "Scene", "ahead"]
 
@@ -159,6 +160,29 @@ class Scene:
         now = Hypotheses(depth, lengths, body.objective(depth, lengths))
         better = run(body.polished(now, steps), serve).depth / body.factor * self.unit
         return replace(found, depth=torch.cat([better, found.depth[1:]]))
+
+    def points(self, found: Bodies, k: int) -> Tensor:
+        """Joints (T, N, 3) of body number ``k`` before the virtual camera, its bones as constant as noise allows.
+
+        Where the image is exact joints stay on their rays. Else they move by the least that makes rigid bones constant,
+        as :meth:`Body.bodies` does under parallel rays.
+        """
+        far = ahead(found.distance[k], found.depth[k])[..., None]
+        points = torch.cat([self.rays * far, far], -1)
+        rigid = torch.tensor(self.skeleton.rigid, dtype=torch.long, device=points.device)
+        if not len(rigid) or not bool((self.noise > 0).any()):
+            return points
+        bones = self.skeleton.bone_index(device=points.device)[rigid]
+        stiffness = (bone_noise(self.noise, bones) / Weights().length).square()
+        middle = points.mean(-2, keepdim=True)
+        body = (points - middle) / self.unit
+        lengths = bone_lengths(body, bones).median(0).values
+        held = []
+        for some, stiff in zip(body.split(BLOCK), stiffness.split(BLOCK), strict=True):  # each frame by itself
+            goal = lengths.expand(len(some), -1)
+            held.append(fit_bones(some, goal, bones, stiffness=stiff, num_steps=HOLD, damping=DAMPING))
+        body = torch.cat(held)
+        return (body - body.mean(-2, keepdim=True)) * self.unit + middle
 
     def _image(self, best: Bodies) -> Tensor:
         """The image (T, N, 2) of a single body under parallel rays, in its unit."""
