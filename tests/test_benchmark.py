@@ -135,8 +135,8 @@ def test_real_case_with_its_lens(root, shared, tmp_path):
     first, second = rows(tmp_path / "out" / "results.csv")
     assert (first["intrinsics"], second["intrinsics"]) == ("none", "true")
     assert float(second["pa"]) < float(first["pa"])
-    wrong = benchmark(root, tmp_path, *words, "intrinsics=yes!")
-    assert wrong.returncode == 1 and "intrinsics=yes!: expected null, true or auto" in wrong.stdout + wrong.stderr
+    wrong = benchmark(root, tmp_path, *words, "intrinsics=maybe")
+    assert wrong.returncode == 1 and "intrinsics=maybe: expected null, true or auto" in wrong.stdout + wrong.stderr
 
 
 def test_real_case_with_true_cameras(root, shared, tmp_path):

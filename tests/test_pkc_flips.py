@@ -111,8 +111,8 @@ def test_large_flips_may_cost_more_than_small_ones():
     depth = flat + torch.tensor([0.01, 0.01, 0.1, 0.1, 0.1, 0.01])[:, None, None]
     flips = Hypotheses(depth, torch.ones(6, 2).double(), torch.tensor([0.1, 0.5, 3.0, 9.0, 20.0, 8.0]).double())
     best = Hypotheses(flat[:1], torch.ones(1, 2).double(), torch.zeros(1).double())
-    assert module._promising(flips, best, ((15.0, 2), (5.0, 1))).tolist() == [2, 3, 0]
-    assert module._promising(flips, best, ((1.0, 2), (0.05, 1))).tolist() == []
+    assert module.promising(flips, best, ((15.0, 2), (5.0, 1))).tolist() == [2, 3, 0]
+    assert module.promising(flips, best, ((1.0, 2), (0.05, 1))).tolist() == []
 
 
 def odd_body(name, frames, noise=0.0, anchored=False):
