@@ -161,3 +161,39 @@ def test_fewer_operations_than_autograd_takes():
         naive = count_operations(lambda f=found, u=unknowns, s=state: by_autograd(f, u, s))
         assert ours.total < most and ours.total < naive.total / 1.7
         assert ours.elements < naive.elements / 2.9
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("frames", [1, 3, 12, 80])
+@pytest.mark.parametrize("skeleton", ["h36m17", "coco17", "body25"])
+def test_with_an_image_that_goes_with_the_depths(skeleton, frames, noise):
+    """As autograd through the terms, of two images at once, in depths, lengths and the image; arms reach across."""
+    points = walk(frames, skeleton, yaw=90.0)
+    found = objective(points, skeleton, noise=noise)
+    points[..., found.adduction.joints[-1, 1], 2] -= torch.linspace(-0.4, 0.4, frames)
+    two = torch.stack([points, 0.9 * points]) + 0.02 * normal(2, *points.shape)
+    two = found.skeleton.complete(two[:, :, : found.skeleton.num_observed])[0]
+    lengths = lengths_of(found, points) * torch.tensor([[1.0], [1.1]])
+    ends = found.bones.T
+    inside = [(two[:, :, ends[1]] - two[:, :, ends[0]]).detach().permute(0, 3, 2, 1).contiguous(), lengths.log()]
+    tree = found.tree[: found.skeleton.num_observed]
+
+    def value(bones, logs):
+        """Of bones (H, 3, B, T), the image's taken as they are."""
+        joints = (tree @ bones[:, 2]).mT @ found.complete
+        flat = (tree @ bones[:, :2]).permute(0, 3, 2, 1)
+        flat = torch.cat([flat, torch.zeros_like(flat[..., :1])], -1)
+        image = found.skeleton.complete(flat)[0][..., :2]
+        return sum(found.terms(joints, logs.exp(), image).values())
+
+    leaves = [x.clone().requires_grad_() for x in inside]
+    expected = value(*leaves)
+    drawn, grown = torch.autograd.grad(expected.sum(), leaves)
+    mixed = found.complete.mT @ tree @ inside[0][:, :2]  # virtual joints among them
+    image = mixed[:, :, ends[1]] - mixed[:, :, ends[0]]
+    energy, slope, growth, pull = Descent(found).with_image(inside[0][:, 2], lengths, image)
+    assert_close(energy, expected)
+    back = torch.zeros(2, 2, *mixed.shape[2:]).double().index_add_(2, ends[1], pull).index_add_(2, ends[0], -pull)
+    pull = (found.complete.mT @ tree).mT @ back
+    for one, other in ((slope, drawn[:, 2]), (growth, grown), (pull, drawn[:, :2])):
+        assert_close(one, other, rtol=1e-8, atol=1e-8 * float(other.abs().amax()))

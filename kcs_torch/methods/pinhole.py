@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.chain import bone_lengths, bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.spectral import dct_basis
-from kcs_torch.methods.pkc.descent import HEAVY
+from kcs_torch.methods.pkc.descent import HEAVY, Descent
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.nn.posture import trunk_joints
@@ -51,15 +52,41 @@ class Body(NamedTuple):
         depth: (H, T, N) relative to the distance, of mean 0 over the joints unless they started otherwise.
         lengths: (H, B).
         distance: (H, T).
+        focal: (H,) focal length, over that of the rays' camera.
     """
 
     depth: Tensor
     lengths: Tensor
     distance: Tensor
+    focal: Tensor
+
+
+class _Laid(NamedTuple):
+    """Bodies in space, time last, as an evaluation needs them.
+
+    Attributes:
+        depth: (H, N, T).
+        own: (H, B, T) depths of bones.
+        lengths: (H, B).
+        path: (H, T) distances, times the rays' focal length over the true one.
+        wide: (H, 1) that focal length's inverse.
+        far: (H, N, T) what rays are multiplied by, and where that is held (H, N, T).
+        held: (H, N, T).
+        image: (H, 2, B, T) of bones, under parallel rays.
+    """
+
+    depth: Tensor
+    own: Tensor
+    lengths: Tensor
+    path: Tensor
+    wide: Tensor
+    far: Tensor
+    held: Tensor
+    image: Tensor
 
 
 class PinholeEnergy:
-    """Energy of depths z, lengths L and distances D of a body seen along rays.
+    """Energy of depths z, lengths L and distances D of a body seen along rays, and its gradient.
 
     Points lie at (u, v, 1) (D + z). Of a skeleton with a template the terms are those of PKC's
     :class:`kcs_torch.methods.pkc.objective.Objective`, for the image under parallel rays that z and D make of the rays;
@@ -67,9 +94,13 @@ class PinholeEnergy:
     changes smoothly, and feet that stand still in the image stand still in space. Of a part of a clip whose other part
     told the lengths, these are given, and the distance may differ by a factor: it is what lengths and image leave.
 
-    Unknowns are the bones' depths, the logarithms of lengths, and cosines of the distance's logarithm, in coordinates
-    about the start in which the energy is nearly a sphere. What a length or a distance changes in the bones' lengths is
-    made up for by their depths, as lengths are known too well to change alone.
+    Where the focal length is not known, rays are (u, v, 1 / w), of a focal length w times as short: then D = P / w with
+    a path P that the size in the image tells, and points lie at (u (P + w z), v (P + w z), P / w + z). To w = 0 belong
+    parallel rays.
+
+    Unknowns are the bones' depths, the logarithms of lengths, and cosines of the distance's logarithm, and that of w,
+    in coordinates about the start in which the energy is nearly a sphere. What a length, a distance or w changes in the
+    bones' lengths is made up for by their depths, as lengths are known too well to change alone.
 
     Args:
         skeleton: of the body.
@@ -80,6 +111,8 @@ class PinholeEnergy:
         noise: (T, N) standard deviation of joints in the image, in this unit.
         lengths: (H, B) known, or None.
         standing: (T, C) how surely the skeleton's contact points stand still, or None where nothing tells.
+        focal: (H,) where the search for a focal length starts, over that of the rays' camera, and which are free (H,);
+            None where it is known.
 
     Attributes:
         start: (H, D) the unknowns of the start.
@@ -95,22 +128,33 @@ class PinholeEnergy:
         noise: Tensor,
         lengths: Tensor | None = None,
         standing: Tensor | None = None,
+        focal: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         self.slow = 30.0 / rate  # more frames a second tell no more, and move less from one to the next
-        self.skeleton, self.rays, self.rate, self.known = skeleton, rays, rate, lengths is not None
+        self.skeleton, self.rate, self.known = skeleton, rate, lengths is not None
+        self.rays = rays.permute(2, 1, 0).contiguous()  # (2, N, T)
         self.bones = skeleton.bone_index(device=rays.device)
-        observed = torch.eye(skeleton.num_observed, dtype=rays.dtype, device=rays.device)
-        self.complete = skeleton.complete(observed)[0].mT  # virtual joints follow their sources
-        tree = chain_inverse(incidence(self.bones, skeleton.num_joints, dtype=rays.dtype))
-        lines = tree[: skeleton.num_observed].mT @ self.complete
-        self.lines = lines - lines.mean(-1, keepdim=True)  # (B, N)
-        own = bone_lengths(self._points(depth, distance.expand(len(depth), -1)), self.bones)
-        own = own.median(1).values.clamp_min(1e-6)
-        self.distance = distance.expand(len(depth), -1)
+        n = skeleton.num_observed
+        observed = torch.eye(n, dtype=rays.dtype, device=rays.device)
+        complete = skeleton.complete(observed)[0].mT  # (No, N): virtual joints follow their sources
+        ends = incidence(self.bones, skeleton.num_joints, dtype=rays.dtype)  # (N, B)
+        tree = chain_inverse(ends)
+        self.seen = (complete @ ends).mT.contiguous()  # (B, No) bones of observed joints
+        lines = tree[:n].mT @ complete
+        self.lines = (lines - lines.mean(-1, keepdim=True)).mT.contiguous()  # (N, B)
+        self.middle = ends.abs() / 2  # (N, B)
+        path = distance.expand(len(depth), -1)
+        wide = torch.ones_like(depth[:, 0, 0]) if focal is None else 1 / focal[0]
+        self.free = None if focal is None else focal[1]
+        self.path, self.wide, self.depth = path, wide[:, None], depth.mT.contiguous()
+        self.own = bone_vectors(depth[..., None], self.bones)[..., 0].mT.contiguous()
+        own = self._sizes_of(self.own, self._imaged(*self._far(self.depth, path, self.wide)[:1]))
+        own = own.median(-1).values.clamp_min(1e-6)
         if lengths is not None:  # the distance that they tell
             ratio = (lengths / own).median(-1, keepdim=True).values
-            depth, self.distance = depth * ratio[..., None], self.distance * ratio
-        self.depth, self.lengths = depth, own if lengths is None else lengths
+            self.path = path * ratio
+            self.depth, self.own = self.depth * ratio[..., None], self.own * ratio[..., None]
+        self.lengths = own if lengths is None else lengths
         most = math.ceil(2 * FASTEST * len(rays) / rate)
         waves = dct_basis(len(rays), max(1, min(len(rays), most)), dtype=rays.dtype, device=rays.device)
         waves = waves * math.sqrt(len(rays))
@@ -119,125 +163,232 @@ class PinholeEnergy:
         self.rigid[list(skeleton.rigid)] = 1
         self.model: Objective | None = None
         self.acceleration = ACCELERATION * self.slow**2
-        points = self._points(depth, self.distance)
+        image = self._imaged(*self._far(self.depth, self.path, self.wide)[:1])
         if len(trunk_joints(skeleton)) >= 3:
-            image = points[0, ..., :2] - points[0, ..., :2].mean(-2, keepdim=True)
-            weights = at_pace(Weights(), rate, pace_of(image, skeleton, rate))
-            self.model = Objective(skeleton, image, weights, noise, standing=standing)
+            flat = (tree @ image[0]).permute(2, 1, 0)  # (T, N, 2), centred
+            weights = at_pace(Weights(), rate, pace_of(flat, skeleton, rate))
+            self.model = Objective(skeleton, flat, weights, noise, standing=standing)
+            self.descent = Descent(self.model)
             self.acceleration = weights.acceleration
+            free = self.model.foreshortening
+            self.share = (self.model.clear * (free.free.to(rays) / free.correlation)).mT  # (B, T)
         else:
-            self.near = bone_vectors(points, self.bones)[..., 2]
+            self.near = self.own
             self.slack = math.hypot(Weights().length, float(noise.median()) if noise.numel() else 0.0)
-        self.shear, self.drift, self.scale = self._coordinates(points)
+        self.shear, self.drift, self.lean, self.scale = self._coordinates(image)
         self.start = torch.zeros_like(self.scale)
+
+    def rows(self, index: Tensor) -> PinholeEnergy:
+        """That of some hypotheses."""
+        out = copy(self)
+        names = ["path", "wide", "depth", "own", "lengths", "shear", "drift", "lean", "scale", "start"]
+        for name in [*names, "near"] if self.model is None else names:
+            setattr(out, name, getattr(self, name)[index])
+        return out
 
     def unpack(self, state: Tensor) -> Body:
         """The body that unknowns (H, D) stand for."""
-        part, grown, shares = (state * self.scale).split(self._sizes, 1)
-        change = shares @ self.waves.mT  # (H, T) of the distance's logarithm
-        dz = part.view_as(self.shear) - self.drift * change[..., None]
-        lengths = self.lengths
-        if not self.known:
-            dz = dz + self.shear * grown[:, None]
-            lengths = lengths * grown.exp()
-        return Body(self.depth + dz @ self.lines, lengths, self.distance * change.exp())
+        laid = self._laid(state)
+        return Body(laid.depth.mT, laid.lengths, laid.path / laid.wide, 1 / laid.wide[:, 0])
 
-    def __call__(self, state: Tensor) -> Tensor:
-        """The energy of each hypothesis, (H,)."""
-        depth, lengths, distance = self.unpack(state)
-        points = self._points(depth, distance)
-        total = (distance / self.distance).log().square().mean(-1) / (2 * STRAY**2)
-        total = total + (distance.diff(n=2) / (ROOT * self.slow**2)).square().sum(-1) / 2
-        total = total + (distance.diff() * self.rate / SPEED).square().sum(-1) / (2 * INDEPENDENT / self.slow)
+    def __call__(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """The energy of each hypothesis, (H,), and its gradient (H, D)."""
+        laid = self._laid(state)
+        path, wide, far = laid.path, laid.wide, laid.far
+        change = (path / self.path).log()
+        distance = path / wide
+        value, along = self._steady(distance)
+        value = value + change.square().mean(-1) / (2 * STRAY**2)
         if self.model is None:
-            return total + self._plain(points, lengths)
-        terms = self.model.terms(depth, lengths, points[..., :2])
-        total = total + sum(value for name, value in terms.items() if name != "proportions" or not self.known)
-        return total + self._contact(depth, distance) - self._nearness(depth, distance)
+            cost, slope, growth, drawn = self._plain(laid)
+        else:
+            cost, slope, growth, drawn = self.descent.with_image(laid.own, laid.lengths, laid.image)
+            cost = cost - self.model.proportions(laid.lengths) if self.known else cost
+        value = value + cost
+        pull = torch.zeros_like(far)  # in far
+        pull[:, : self.seen.shape[1]] = ((self.seen.mT @ drawn) * self.rays[:, : self.seen.shape[1]]).sum(1)
+        deep = torch.zeros_like(far)  # in the depth
+        shrink = torch.zeros_like(wide[:, 0])  # in w
+        if self.model is not None:
+            value = value - self._nearness(far, pull)
+            if self.model.standing is not None:
+                value = value + self._contact(laid, distance, deep, along, shrink)
+        free = torch.where(laid.held, 0, pull)
+        deep.addcmul_(free, wide[..., None])
+        shrink = shrink + (free * laid.depth).sum((1, 2)) - (along * path).sum(-1) / wide[:, 0].square()
+        along = along / wide + torch.where(laid.held, NEAREST * pull, pull).sum(1)
+        slope = slope + self.lines.mT @ deep
+        along = along * path + change / (STRAY**2 * change.shape[-1]) - (self.drift * slope).sum(1)
+        parts = [slope.flatten(1), along @ self.waves]
+        if not self.known:
+            parts.insert(1, growth + (self.shear * slope).sum(-1))
+        if self.free is not None:
+            parts.append((shrink * wide[:, 0] - (self.lean * slope).sum((1, 2)))[:, None])
+        return value, torch.cat(parts, 1).mul_(self.scale)
 
-    def _points(self, depth: Tensor, distance: Tensor) -> Tensor:
-        """(H, T, N, 3) of depths (H, T, N) and distances (H, T)."""
-        far = torch.maximum(distance[..., None] + depth, NEAREST * distance[..., None])
-        flat = (self.rays * far[..., None])[..., : self.skeleton.num_observed, :]
-        return torch.cat([(flat.mT @ self.complete).mT, depth[..., None]], -1)
+    def _laid(self, state: Tensor) -> _Laid:
+        """Where the unknowns (H, D) lay bodies."""
+        part, grown, shares, focus = (state * self.scale).split(self._sizes, 1)
+        change = shares @ self.waves.mT  # (H, T) of the path's logarithm
+        moved = part.view_as(self.own) - self.drift * change[:, None]
+        lengths, wide = self.lengths, self.wide
+        if not self.known:
+            moved = moved.addcmul_(self.shear, grown[..., None])
+            lengths = lengths * grown.exp()
+        if self.free is not None:
+            moved = moved.addcmul_(self.lean, focus[..., None], value=-1)
+            wide = wide * focus.exp()
+        path, depth = self.path * change.exp(), self.depth + self.lines @ moved
+        far, held = self._far(depth, path, wide)
+        return _Laid(depth, self.own + moved, lengths, path, wide, far, held, self._imaged(far))
 
-    def _plain(self, points: Tensor, lengths: Tensor) -> Tensor:
-        """The energy (H,) of bodies (H, T, N, 3) without a template."""
-        vectors = bone_vectors(points, self.bones)
-        dz = vectors[..., 2]
-        off = (vectors.square().sum(-1) - lengths[:, None].square()) / (2 * lengths[:, None])
-        each = HEAVY * torch.log1p(self.rigid * off.square() / (HEAVY * self.slack**2))
-        total = len(self.rays) / 2 * torch.log1p(each.mean(1)).sum(-1)
-        total = total + dz.diff(n=2, dim=1).square().sum((1, 2)) / (2 * self.acceleration**2)
-        return total + (dz - self.near).square().sum((1, 2)) / (2 * CLOSE**2)
+    def _far(self, depth: Tensor, path: Tensor, wide: Tensor) -> tuple[Tensor, Tensor]:
+        """What rays are multiplied by, (H, N, T), and where joints would come too near."""
+        far, least = torch.addcmul(path[:, None], depth, wide[..., None]), NEAREST * path[:, None]
+        held = far < least
+        return torch.maximum(far, least), held
 
-    def _contact(self, depth: Tensor, distance: Tensor) -> Tensor:
-        """What standing feet cost that move along their rays, (H,)."""
+    def _imaged(self, far: Tensor) -> Tensor:
+        """The image of bones under parallel rays, (H, 2, B, T)."""
+        n = self.seen.shape[1]
+        return self.seen @ (self.rays[:, :n] * far[:, None, :n])
+
+    @staticmethod
+    def _sizes_of(own: Tensor, image: Tensor) -> Tensor:
+        """Lengths (H, B, T) of bones."""
+        return (own.square() + image.square().sum(1)).sqrt()
+
+    def _steady(self, distance: Tensor) -> tuple[Tensor, Tensor]:
+        """What speed and changes of it cost, (H,), and the slope in the distance (H, T)."""
+        slope = torch.zeros_like(distance)
+        value = distance.new_zeros(len(distance))
+        slow, quick = (ROOT * self.slow**2) ** -2, (self.rate / SPEED) ** 2 * self.slow / INDEPENDENT
+        step = distance.diff()
+        if step.shape[-1]:
+            value = value + quick / 2 * step.square().sum(-1)
+            slope[:, 1:] += quick * step
+            slope[:, :-1] -= quick * step
+        bend = step.diff()
+        if bend.shape[-1]:
+            value = value + slow / 2 * bend.square().sum(-1)
+            slope[:, 2:] += slow * bend
+            slope[:, 1:-1] -= 2 * slow * bend
+            slope[:, :-2] += slow * bend
+        return value, slope
+
+    def _plain(self, laid: _Laid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The energy (H,) of bodies without a template; its slopes in bones' depths, log lengths and images."""
+        dz, size, frames = laid.own, laid.lengths[..., None], laid.own.shape[-1]
+        off = (laid.image.square().sum(1) + dz.square() - size.square()) / (2 * size)
+        ratio = self.rigid[:, None] * off / (HEAVY * self.slack**2)
+        each = ratio * off
+        spread = HEAVY * each.log1p().mean(-1)
+        value = frames / 2 * spread.log1p().sum(-1)
+        pull = HEAVY * ratio / (1 + each) / (1 + spread)[..., None]  # in off
+        growth = -(pull * (off + size)).sum(-1)
+        pull = pull / size
+        slope, drawn = pull * dz, pull[:, None] * laid.image
+        away = dz - self.near
+        value = value + away.square().sum((1, 2)) / (2 * CLOSE**2)
+        slope = slope + away / CLOSE**2
+        if frames > 2:
+            bend = dz.diff(n=2)
+            value = value + bend.square().sum((1, 2)) / (2 * self.acceleration**2)
+            bend = bend / self.acceleration**2
+            slope[..., 2:] += bend
+            slope[..., 1:-1] -= 2 * bend
+            slope[..., :-2] += bend
+        return value, slope, growth, drawn
+
+    def _contact(self, laid: _Laid, distance: Tensor, deep: Tensor, along: Tensor, shrink: Tensor) -> Tensor:
+        """What standing feet cost that move along their rays, (H,); adds to slopes in depths, distance and w."""
         model = self.model
-        if model is None or model.standing is None:
+        assert model is not None and model.standing is not None
+        feet = list(self.skeleton.contacts)
+        if not feet or distance.shape[-1] < 2:
             return distance.new_zeros(len(distance))
-        along = (distance[..., None] + depth) * (1 + self.rays.square().sum(-1)).sqrt()
-        feet = torch.nn.functional.pad(along[..., None], (2, 0))
-        return model.weights.contact * model.feet(feet, torch.zeros_like(distance), model.standing)
+        slant = self.rays[:, feet].square().sum(0)  # (C, T)
+        steep = (1 + laid.wide.square()[..., None] * slant).sqrt()
+        where = distance[:, None] + laid.depth[:, feet]
+        step = (where * steep).diff()
+        both = torch.minimum(model.standing[1:], model.standing[:-1]).mT * model.weights.contact
+        ratio = step / model.feet.slip**2
+        value = (both * (ratio * step).log1p()).sum((1, 2)) / 2
+        pull = both * ratio / (1 + ratio * step)
+        drawn = torch.nn.functional.pad(pull, (1, 0)) - torch.nn.functional.pad(pull, (0, 1))
+        shrink += (drawn * where * slant / steep).sum((1, 2)) * laid.wide[:, 0]
+        drawn = drawn * steep
+        deep[:, feet] += drawn
+        along += drawn.sum(1)
+        return value
 
-    def _nearness(self, depth: Tensor, distance: Tensor) -> Tensor:
+    def _nearness(self, far: Tensor, pull: Tensor) -> Tensor:
         """By how much less likely foreshortened images are along rays than under parallel ones, (H,).
 
         A direction drawn evenly has an image of density 1 / (2 pi L |d|) under parallel rays, and of (D + z)^2 times
-        that along rays: without it a body would cost less for being small, and near to the camera.
+        that along rays: without it a body would cost less for being small, and near to the camera. The slope is taken
+        from ``pull``.
         """
-        assert self.model is not None
-        free = self.model.foreshortening
-        share = self.model.clear * (free.free.to(distance) / free.correlation)  # (T, B)
-        ends = torch.maximum(distance[..., None] + depth, NEAREST * distance[..., None])[..., self.bones]
-        far = ends.mean(-1) / self.distance.mean(-1)[:, None, None]
-        return 2 * (share * far.log()).sum((1, 2))
+        middle = self.middle.mT @ far
+        pull -= self.middle @ (2 * self.share / middle)
+        return 2 * (self.share * (middle / self.path.mean(-1)[:, None, None]).log()).sum((1, 2))
 
     @property
     def _sizes(self) -> list[int]:
-        """Of bones' depths, lengths and waves among the unknowns."""
-        frames, bones = len(self.rays), len(self.bones)
-        return [frames * bones, 0 if self.known else bones, self.waves.shape[1]]
+        """Of bones' depths, lengths, waves and the focal length among the unknowns."""
+        frames, bones = self.rays.shape[-1], len(self.bones)
+        return [frames * bones, 0 if self.known else bones, self.waves.shape[1], 0 if self.free is None else 1]
 
-    def _coordinates(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """How bones' depths (H, T, B) go with log lengths and against log distances, and the unknowns' scale (H, D).
+    def _coordinates(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """How bones' depths (H, B, T) go with log lengths, and against log distances and log w, and scales (H, D).
 
         Scales are the roots of the curvature's inverse, roughly: of the lengths', smoothness and posture terms and of
         the distance's own.
         """
         model = self.model
-        vectors, size = bone_vectors(points, self.bones), self.lengths[:, None]
-        dz, flat = vectors[..., 2], vectors[..., :2].square().sum(-1)
+        dz, size, distance = self.own, self.lengths[..., None], self.path / self.wide
+        flat = image.square().sum(1)
         off = (flat + dz.square() - size.square()) / (2 * size)
-        precision = self.rigid / self.slack**2 if model is None else model.precision(self.lengths)
-        spread = HEAVY * torch.log1p(precision * off.square() / HEAVY).mean(1, keepdim=True)
+        precision = self.rigid[:, None] / self.slack**2 if model is None else model.precision(self.lengths).mT
+        spread = HEAVY * torch.log1p(precision * off.square() / HEAVY).mean(-1, keepdim=True)
         pull = precision / (1 + spread.clamp_max(1))
         smooth = 6 / self.acceleration**2  # the mean square of a second difference's coefficients
         if model is None:
             shape = torch.full_like(size, 1 / CLOSE**2)
         else:
-            usual = model.posture.deviation.square().mean(-1)
+            usual = model.posture.deviation.square().mean(-1)[:, None]
             shape = 5 / (model.weights.posture * (usual * size.square()).clamp_min(1e-3))
         curve = pull * (dz / size).square() + smooth + shape
         near = dz.square() + (0.5 * size).square()
-        shear, drift = size.square() * dz / near, flat * dz / near
-        own = (pull * (size - dz * shear / size).square()).sum(1) + 1 / FREE**2
-        own = own + shear.diff(n=2, dim=1).square().sum(1) / self.acceleration**2
-        left = (pull * (flat / size - dz * drift / size).square()).sum(-1)  # (H, T)
+        n = self.seen.shape[1]
+        slid = self.seen @ (self.rays[:, :n] * self.depth[:, None, :n]) * self.wide[..., None, None]
+        slid = (slid * image).sum(1)  # by how much the squared image grows with log w, halved
+        shear, drift, lean = (x * dz / near for x in (size.square(), flat, slid))
+        own = (pull * (size - dz * shear / size).square()).sum(-1) + 1 / FREE**2
+        own = own + shear.diff(n=2).square().sum(-1) / self.acceleration**2
+        left = (pull * (flat / size - dz * drift / size).square()).sum(1)  # (H, T)
         steps = [self.waves.diff(n=n, dim=0).square().sum(0) for n in (1, 2)]  # (K,) each
-        far = self.distance.square().mean(-1, keepdim=True)
         waves = left @ self.waves.square() + 1 / STRAY**2
-        waves = waves + far * steps[1] / (ROOT * self.slow**2) ** 2
-        waves = waves + drift.square().mean(1).sum(-1, keepdim=True) * steps[1] / self.acceleration**2
+        rough = (ROOT * self.slow**2) ** -2
+        waves = waves + distance.square().mean(-1, keepdim=True) * steps[1] * rough
+        waves = waves + drift.square().mean(-1).sum(-1, keepdim=True) * steps[1] / self.acceleration**2
+        focus = (pull * ((slid - dz * lean) / size).square()).sum((1, 2)) + 1 / FREE**2
+        focus = focus + lean.diff(n=2).square().sum((1, 2)) / self.acceleration**2
+        focus = focus + distance.diff(n=2).square().sum(-1) * rough
         if model is not None and model.standing is not None and model.standing.numel():
             firm = model.weights.contact / model.feet.slip**2
             both = torch.minimum(model.standing[1:], model.standing[:-1])
             each = torch.nn.functional.pad(both, (0, 0, 0, 1)) + torch.nn.functional.pad(both, (0, 0, 1, 0))
-            lines = self.lines[:, list(self.skeleton.contacts)]  # (B, C)
-            curve = curve + firm * each @ lines.mT.square()
-            moves = torch.einsum("htb,bc->htcb", shear, lines).diff(dim=1)
-            own = own + firm * torch.einsum("tc,htcb->hb", both, moves.square())
-            moves = (self.distance[..., None] - drift @ lines).square() * each / 2
-            waves = waves + firm * moves.sum(-1).mean(1, keepdim=True) * steps[0]
+            lines = self.lines[list(self.skeleton.contacts)]  # (C, B)
+            curve = curve + firm * lines.mT.square() @ each.mT
+            pulled = torch.einsum("hbt,cb->hbct", shear, lines).diff(dim=-1)
+            own = own + firm * torch.einsum("tc,hbct->hb", both, pulled.square())
+            moves = (distance[:, None] - lines @ drift).square() * each.mT / 2
+            waves = waves + firm * moves.sum(1).mean(-1, keepdim=True) * steps[0]
+            moves = distance[:, None].diff() + (lines @ lean).diff()
+            focus = focus + firm * (both.mT * moves.square()).sum((1, 2))
         parts = [curve.flatten(1), waves] if self.known else [curve.flatten(1), own, waves]
-        return shear, drift, torch.cat(parts, 1).rsqrt()
+        scale = torch.cat(parts, 1).rsqrt()
+        if self.free is not None:
+            scale = torch.cat([scale, (self.free / focus.sqrt())[:, None]], 1)
+        return shear, drift, lean, scale

@@ -107,7 +107,7 @@ class Scene:
                 self.skeleton, self.rays[some], distance[some] / self.unit, depth[:, some] / self.unit, self.rate,
                 self.noise[some], lengths, feet,
             )  # fmt: skip
-            solution = lbfgs(pinhole, pinhole.start, num_steps=steps, tolerance=1e-6)
+            solution = lbfgs(pinhole, pinhole.start, num_steps=steps, tolerance=1e-6, slopes=True, part=pinhole.rows)
             with torch.no_grad():
                 body = pinhole.unpack(solution.value)
             assert solution.energy is not None

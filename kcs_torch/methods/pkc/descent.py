@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,6 +26,30 @@ ANCHOR = 0.01
 """Standard deviation of a length that is known from elsewhere in the clip, as a share."""
 
 
+class Image(NamedTuple):
+    """What the image of bones alone decides; K is 1, or H where each hypothesis has its own.
+
+    Attributes:
+        bones: (K, 2, B, T).
+        flat: (K, B, T) their squared lengths.
+        seen: x and y (K, B, T) in the order of :class:`Sides`.
+        plane: (K, 2, 2, T) of the trunk's two long axes.
+        edges: (K, 2, 3, hinges, T) of the bones above and below hinges, and of their axes.
+        turns: (K, hinges, T) each: (u x v) . a = a_z turns_0 + v_z turns_1 - u_z turns_2.
+        across: (K, hinges, T) squared lengths of the axes.
+        along: (K, limbs, T) of upper arms and thighs along the axes.
+    """
+
+    bones: Tensor
+    flat: Tensor
+    seen: tuple[Tensor, Tensor]
+    plane: Tensor
+    edges: Tensor
+    turns: tuple[Tensor, Tensor, Tensor]
+    across: Tensor
+    along: Tensor
+
+
 class Descent:
     """Energy (H,) and gradient (H, B T + B) over the unknowns, equal to autograd's of :meth:`Objective.terms`.
 
@@ -41,7 +65,6 @@ class Descent:
     def __init__(self, objective: Objective, unknowns: Unknowns | None = None) -> None:
         self.objective, self.unknowns, self.weights = objective, unknowns, objective.weights
         obj, body, like = objective, objective.skeleton, objective.image
-        self.flat = _early(obj.flat)
         self.noise = _early(obj.noise).square() if obj.noisy else None
         self.rigid = obj.rigid[None, :, None] if obj.rigid.ndim == 1 else _early(obj.rigid)
         self.time = None if obj.time is None else obj.time[:, None]  # (H, 1, T)
@@ -51,37 +74,37 @@ class Descent:
         self.mix = None if bool((mix - eye).abs().amax() < 1e-9) else mix
         posture = obj.posture
         affine = posture.affine.to(like)
-        part = obj.image.index_select(-2, posture.trunk)
-        plane = (affine @ (part - part.mean(-2, keepdim=True))).movedim(-3, -1)  # (..., long axes, xy, T)
-        self.plane = plane if plane.ndim == 4 else plane[None]
-        lines = [(affine - affine.mean(-1, keepdim=True)) @ obj.tree[posture.trunk]]  # (2, B): the axes' depths
+        lines = [(affine - affine.mean(-1, keepdim=True)) @ obj.tree[posture.trunk]]  # (2, B): the trunk's long axes
         self.axes = posture.axes.to(like)
         self.sides = sides = Sides(posture)
-        seen = bone_vectors(obj.image, obj.bones)[..., sides.order, :]
-        self.x, self.y = (_early(v) for v in seen.unbind(-1))  # (1 or H, B, T) each
         spread = posture.deviation.to(like).mT[..., sides.order].reshape(-1, 3, body.num_bones)
         self.spread = spread * sides.share.to(like)  # (1 or H, 3, B)
         self.mean = (posture.mean.to(like).mT[:, sides.order] / self.spread).flatten(1)[..., None]  # (1 or H, 3B, 1)
-        hinges = obj.hinges
-        if len(hinges.joints):
-            parent, joint, child, left, right = hinges.joints.unbind(1)
-            pairs = ((joint, parent), (child, joint), (left, right))
-            edges = [obj.image.index_select(-2, a) - obj.image.index_select(-2, b) for a, b in pairs]
-            (ux, uy), (vx, vy), (ax, ay) = ((_early(v) for v in edge.unbind(-1)) for edge in edges)
-            # (u x v) . a = a_z k_0 + v_z k_1 - u_z k_2
-            self.turns = ux * vy - uy * vx, ax * uy - ay * ux, ax * vy - ay * vx
-            self.across = ax.square() + ay.square()
-            self.firm, self.sign = hinges.firm.to(like), hinges.sign.to(like)
-            # Upper arms and thighs, which must not reach far across the body, are bones above hinges.
-            limbs = obj.adduction
-            self.outer = [hinges.joints[:, [0, 1, 3, 4]].tolist().index(limb) for limb in limbs.joints.tolist()]
-            self.along, self.side = (ux * ax + uy * ay)[:, self.outer], limbs.side.to(like)
-            lines += [obj.tree[a] - obj.tree[b] for a, b in pairs]
+        hinges, limbs = obj.hinges, obj.adduction
+        parent, joint, child, left, right = hinges.joints.unbind(1)
+        lines += [obj.tree[a] - obj.tree[b] for a, b in ((joint, parent), (child, joint), (left, right))]
+        self.firm, self.sign = hinges.firm.to(like), hinges.sign.to(like)
+        # Upper arms and thighs, which must not reach far across the body, are bones above hinges.
+        self.outer = [hinges.joints[:, [0, 1, 3, 4]].tolist().index(limb) for limb in limbs.joints.tolist()]
+        self.side = limbs.side.to(like)
         self.lines = torch.cat(lines)  # (2 + 3 hinges, B)
+        own = bone_vectors(obj.image, obj.bones).movedim((-1, -2), (-3, -2))  # (..., 2, B, T)
+        self.image = self.imaged(own if own.ndim == 4 else own[None])
         free = obj.foreshortening
         self.limbs = free.free.nonzero().flatten()
         clear = _early(obj.clear).index_select(1, self.limbs)
         self.clear = clear * (free.free.to(like)[self.limbs, None] / free.correlation)
+
+    def imaged(self, bones: Tensor) -> Image:
+        """What an image of the bones, (K, 2, B, T), decides."""
+        lines = self.lines @ bones  # (K, 2, 2 + 3 hinges, T)
+        edges = lines[:, :, 2:].unflatten(2, (3, -1))
+        (ux, uy), (vx, vy), (ax, ay) = (edge.unbind(1) for edge in edges.unbind(2))
+        turns = ux * vy - uy * vx, ax * uy - ay * ux, ax * vy - ay * vx
+        along = (ux * ax + uy * ay)[:, self.outer]
+        x, y = bones.index_select(2, self.sides.order).unbind(1)
+        plane = lines[:, :, :2].transpose(1, 2)
+        return Image(bones, bones.square().sum(1), (x, y), plane, edges, turns, ax.square() + ay.square(), along)
 
     def __call__(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Value (H,) and gradient (H, B T + B) of unknowns (H, B T + B)."""
@@ -102,33 +125,50 @@ class Descent:
 
     def at(self, own: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Value (H,) of bones' depths (H, B, T) and lengths (H, B), its derivatives in depths and log lengths."""
+        return self._at(own, lengths, self.image, None)
+
+    def with_image(self, own: Tensor, lengths: Tensor, bones: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As :meth:`at`, for another image of the bones, (H, 2, B, T), and the derivative in it.
+
+        Its noise and gaps are taken to be those of the objective's own.
+        """
+        drawn = torch.empty_like(bones)
+        return *self._at(own, lengths, self.imaged(bones), drawn), drawn
+
+    def _at(self, own: Tensor, lengths: Tensor, image: Image, drawn: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         count = len(own)
         dz = own if self.mix is None else self.mix @ own
-        value, slope, growth = self._lengths(dz, lengths)
+        value, slope, growth = self._lengths(dz, lengths, image, drawn)
         lines = self.lines @ dz
         back = torch.zeros_like(lines)
+        pulled = None if drawn is None else back.new_zeros(count, 2, *lines.shape[1:])  # what back is, of x and y
         value = value + self._smoothness(dz, slope)
-        value = value + self._posture(dz, lengths, lines[:, :2], slope, growth, back[:, :2])
+        value = value + self._posture(dz, lengths, image, lines[:, :2], slope, growth, back[:, :2], drawn, pulled)
         if len(self.lines) > 2:
-            value = value + self._hinges(lengths, lines[:, 2:], growth, back[:, 2:])
+            value = value + self._hinges(lengths, image, lines[:, 2:], growth, back[:, 2:], pulled)
         value = value + self._foreshortening(dz, lengths, slope, growth)
         value = value + self._sizes(lengths, growth)
         slope.baddbmm_(self.lines.mT.expand(count, -1, -1), back)
+        if drawn is not None:
+            assert pulled is not None
+            drawn += self.lines.mT @ pulled
         if self.mix is not None:
             slope = self.mix.mT @ slope
         return value, slope, growth
 
     # Each term returns its value (H,) and adds its derivative in dz to slope (H, B, T), that in the logarithms of the
-    # lengths to growth (H, B).
+    # lengths to growth (H, B), and, where it is asked for, that in the image to drawn (H, 2, B, T).
 
-    def _lengths(self, dz: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _lengths(
+        self, dz: Tensor, lengths: Tensor, image: Image, drawn: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         obj, size = self.objective, lengths[..., None]
         least = wide(self.weights.length, 2) ** 2
-        off = torch.addcmul(self.flat, dz, dz).sub_(size.square()).mul_(0.5 / size)
+        off = torch.addcmul(image.flat, dz, dz).sub_(size.square()).mul_(0.5 / size)
         if self.noise is None:
             precision = self.rigid / least
         else:
-            ratio = self.flat / size.square()
+            ratio = self.image.flat / size.square()
             variance = ratio.clamp_max(1).mul_(self.noise)
             total = variance + least
             precision = self.rigid / total
@@ -152,7 +192,10 @@ class Descent:
             steep = 2 * variance / total * (ratio <= 1)  # d log p / d log L
             drift = pull[..., None] * HEAVY * (1 - inverse) - (push * outer)[..., None] * (NOISE * least) * precision
             growth = growth + (steep * drift).sum(-1)
-        slope = bent.mul_((2 * pull / lengths)[..., None]).mul_(dz)
+        bent.mul_((2 * pull / lengths)[..., None])
+        if drawn is not None:
+            torch.mul(bent[:, None], image.bones, out=drawn)
+        slope = bent.mul_(dz)
         return obj.count / 2 * value.log1p().sum(-1), slope, growth
 
     def _smoothness(self, dz: Tensor, slope: Tensor) -> Tensor:
@@ -169,11 +212,20 @@ class Descent:
         return (bend * pull).sum((1, 2)) / 2
 
     def _posture(
-        self, dz: Tensor, lengths: Tensor, depths: Tensor, slope: Tensor, growth: Tensor, back: Tensor
+        self,
+        dz: Tensor,
+        lengths: Tensor,
+        image: Image,
+        depths: Tensor,
+        slope: Tensor,
+        growth: Tensor,
+        back: Tensor,
+        drawn: Tensor | None,
+        pulled: Tensor | None,
     ) -> Tensor:
         obj, posture = self.objective, self.objective.posture
         count, bones, frames = dz.shape
-        first, second = torch.cat([self.plane.expand(count, -1, -1, -1), depths[:, :, None]], 2).unbind(1)  # (H, 3, T)
+        first, second = torch.cat([image.plane.expand(count, -1, -1, -1), depths[:, :, None]], 2).unbind(1)  # (H, 3, T)
         over = (first.square().sum(1, keepdim=True) + 1e-18).rsqrt()
         first = first * over
         along = (second * first).sum(1, keepdim=True)
@@ -191,8 +243,8 @@ class Descent:
         own = dz.index_select(1, sides.order)
         if self.time is not None:
             own = own * self.time
-        y = turn[:, :, 0] * self.x[:, None]
-        y.addcmul_(turn[:, :, 1], self.y[:, None]).addcmul_(turn[:, :, 2], own[:, None])
+        y = turn[:, :, 0] * image.seen[0][:, None]
+        y.addcmul_(turn[:, :, 1], image.seen[1][:, None]).addcmul_(turn[:, :, 2], own[:, None])
         seen = y.view(count, 3 * bones, frames)
         real = wide(obj.count, 2)
         amount = real / wide(self.weights.posture, 2)  # what these frames count
@@ -221,7 +273,7 @@ class Descent:
         self._lower(pull, (1 - part) * total / real)
         pull = pull.view_as(y)
         slope += (pull * turn[:, :, 2]).sum(1).index_select(1, sides.back)
-        turned = [(pull * v[:, None]).sum(2) for v in (self.x, self.y, own)]  # (H, 3, T): of k, for each j
+        turned = [(pull * v[:, None]).sum(2) for v in (*image.seen, own)]  # (H, 3, T): of k, for each j
         into = self.axes.mT @ torch.stack(turned, 2).flatten(2)  # (H, 3, 3 T)
         a, b, c = into.view(count, 3, 3, frames).unbind(1)
         a = a + torch.linalg.cross(up, c, dim=1)
@@ -229,8 +281,13 @@ class Descent:
         b = (b - up * (up * b).sum(1, keepdim=True)) * down
         slant = (b * first).sum(1, keepdim=True)
         a = a - along * b - slant * second
-        back[:, 1] = (b - slant * first)[:, 2]
-        back[:, 0] = ((a - first * (first * a).sum(1, keepdim=True)) * over)[:, 2]
+        b = b - slant * first
+        a = (a - first * (first * a).sum(1, keepdim=True)) * over
+        back[:, 0], back[:, 1] = a[:, 2], b[:, 2]
+        if drawn is not None and pulled is not None:
+            for j in (0, 1):
+                drawn[:, j] += (pull * turn[:, :, j]).sum(1).index_select(1, sides.back)
+            pulled[:, :, 0], pulled[:, :, 1] = a[:, :2], b[:, :2]
         return value
 
     def _lower(self, values: Tensor, by: Tensor) -> None:
@@ -240,29 +297,38 @@ class Descent:
         else:
             values.addcmul_(by, self.time, value=-1)
 
-    def _hinges(self, lengths: Tensor, depths: Tensor, growth: Tensor, back: Tensor) -> Tensor:
+    def _hinges(
+        self, lengths: Tensor, image: Image, depths: Tensor, growth: Tensor, back: Tensor, pulled: Tensor | None
+    ) -> Tensor:
         w, limbs = self.weights, self.objective.hinges.limbs
         upper, lower, axis = depths.unflatten(1, (3, -1)).unbind(1)  # (H, hinges, T) each
         share = 1.0 if self.time is None else self.time
-        total = ((axis.square() + self.across) * share).sum(-1)
+        total = ((axis.square() + image.across) * share).sum(-1)
         known = total > 0
         counted = axis.shape[-1] if self.time is None else self.time.sum(-1).clamp_min(1e-9)
         size = torch.where(known, total / counted, torch.ones_like(total)).sqrt()
         above, below = lengths[:, limbs].unbind(-1)  # (H, hinges)
         scale = (self.sign / (above * below * size))[..., None]
-        tilt, lean, rise = self.turns
+        tilt, lean, rise = image.turns
         wrong = (upper * rise).addcmul_(lower, lean, value=-1).addcmul_(axis, tilt, value=-1).mul_(scale).clamp_min_(0)
         pull = wrong * (wide(w.hinge / w.sine**2, 2) * self.firm[:, None] * share)
         energy = (pull * wrong).sum(-1)  # twice that of each hinge
         pull = pull.mul_(scale)
         back[:] = torch.cat([pull * rise, -pull * lean, -pull * tilt], 1)
+        if pulled is not None:
+            flat = pulled[:, :, 2:].unflatten(2, (3, -1))  # of u, v and a
+            deep = depths.unflatten(1, (3, -1))
+            for k in range(3):  # -(v x a), -(a x u), -(u x v)
+                i, j = (k + 1) % 3, (k + 2) % 3
+                flat[:, 0, k] = pull * (deep[:, i] * image.edges[:, 1, j] - image.edges[:, 1, i] * deep[:, j])
+                flat[:, 1, k] = pull * (image.edges[:, 0, i] * deep[:, j] - deep[:, i] * image.edges[:, 0, j])
         growth.index_add_(1, limbs.flatten(), -energy.repeat_interleave(2, 1))
         value, shrink = energy.sum(-1) / 2, energy
         if self.outer:  # the same for bones that reach across: -(u . a) / (|u| |a|) is at most the limit
             some = slice(None) if len(self.outer) == energy.shape[1] else self.outer
             bound = self.objective.adduction.limit
             scale = (self.side / (above * size)[:, some])[..., None]
-            across = torch.addcmul(self.along, upper[:, some], axis[:, some]).mul_(-scale)
+            across = torch.addcmul(image.along, upper[:, some], axis[:, some]).mul_(-scale)
             wrong = (across - bound).clamp_min_(0)
             pull = wrong * (wide(w.adduction / w.sine**2, 2) * share)
             each = (pull * across).sum(-1)
@@ -271,9 +337,15 @@ class Descent:
             ends = back.unflatten(1, (3, -1))
             ends[:, 0, some] -= pull * axis[:, some]
             ends[:, 2, some] -= pull * upper[:, some]
+            if pulled is not None:
+                flat[:, :, 0, some] -= pull[:, None] * image.edges[:, :, 2, some]
+                flat[:, :, 2, some] -= pull[:, None] * image.edges[:, :, 0, some]
             growth.index_add_(1, limbs[some, 0], -each)
             shrink[:, some] += each
-        back[:, -len(limbs) :] -= torch.where(known, shrink / total, 0)[..., None] * share * axis
+        held = torch.where(known, shrink / total, 0)[..., None] * share
+        back[:, -len(limbs) :] -= held * axis
+        if pulled is not None:
+            flat[:, :, 2] -= held[:, None] * image.edges[:, :, 2]
         return value
 
     def _foreshortening(self, dz: Tensor, lengths: Tensor, slope: Tensor, growth: Tensor) -> Tensor:
