@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from kcs_torch.errors import KcsWarning, OptionError, unknown, users_level
 from kcs_torch.methods import METHODS
@@ -14,6 +14,7 @@ from kcs_torch.methods.base import Method
 from kcs_torch.methods.found import find_skeleton
 from kcs_torch.methods.perspective import reconstruct_perspective
 from kcs_torch.methods.uncalibrated import reconstruct_uncalibrated
+from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.intake import no_bones
@@ -22,6 +23,9 @@ __all__ = ["reconstruct", "reconstruct_all", "with_found_bones"]
 
 DEFAULT = "pkc"
 """What "auto" stands for."""
+
+WITHOUT = ("auto", "parallel")
+"""What may be asked for in place of intrinsics."""
 
 
 def reconstruct(
@@ -49,7 +53,9 @@ def reconstruct(
         cameras: (T, 2, 3) camera rows, world to camera, where they are known.
         intrinsics: (fx, fy, cx, cy) or a matrix K (3, 3) in the unit of the tracks, where it is known. Perspective is
             then taken into account, and ``result.in_space()`` lies before the camera and projects onto the tracks.
-            "auto" finds the focal length from the tracks of a body with a template, which takes several solutions.
+            "auto" finds the focal length from the tracks of a body with a template, if the camera is near; "parallel"
+            takes rays to be parallel. None is "auto" for "pkc", bodies with a template and unknown cameras, else
+            "parallel".
         **fields: of the method, such as ``beta=2.0``.
 
     Returns:
@@ -68,7 +74,7 @@ def reconstruct(
     >>> result.points.shape, result.method
     (torch.Size([60, 17, 3]), 'sfam')
     """
-    lens = None if intrinsics is None else _lens(intrinsics)
+    lens = _lens(intrinsics)
     find = isinstance(skeleton, str) and skeleton == "auto"
     if find:
         skeleton = None
@@ -85,7 +91,7 @@ def reconstruct(
     lacking = no_bones(tracks.skeleton.num_joints)
     if chosen.knows_bones and lacking in tracks.notes:
         warnings.warn(f"{tracks.source}: {lacking}", KcsWarning, stacklevel=users_level())
-    return chosen(tracks, cameras) if lens is None else _before(lens, chosen, tracks, cameras)
+    return _before(lens, chosen, tracks, cameras)
 
 
 def reconstruct_all(
@@ -116,10 +122,10 @@ def reconstruct_all(
         if not isinstance(one, Tracks):
             raise OptionError(f"reconstruct_all: item {i}: expected Tracks (see Tracks.from_arrays), got {type(one)}")
     chosen = _method(method, fields)
-    if intrinsics is not None:
-        lens = _lens(intrinsics)
-        return [_before(lens, chosen, one) for one in people]
-    return chosen.many(people)
+    lens = _lens(intrinsics)
+    if lens == "parallel" or (lens is None and not chosen.turns_over):
+        return chosen.many(people)
+    return [_before(lens, chosen, one) for one in people]
 
 
 def with_found_bones(tracks: Tracks) -> Tracks:
@@ -132,16 +138,19 @@ def with_found_bones(tracks: Tracks) -> Tracks:
     return replace(tracks, skeleton=find_skeleton(tracks), notes=tuple(note for note in tracks.notes if note != said))
 
 
-def _lens(value: Any) -> Intrinsics | Literal["auto"]:
-    """Intrinsics, or "auto" where they are to be found."""
-    return "auto" if isinstance(value, str) and value == "auto" else Intrinsics.of(value)
+def _lens(value: Any) -> Intrinsics | str | None:
+    """Intrinsics, or what is to be done without."""
+    return value if value is None or (isinstance(value, str) and value in WITHOUT) else Intrinsics.of(value)
 
 
-def _before(lens: Intrinsics | Literal["auto"], method: Method, tracks: Tracks, cameras: Any = None) -> Reconstruction:
-    """Reconstruct one body before a pinhole camera."""
-    if lens == "auto":
-        return reconstruct_uncalibrated(method, tracks, cameras)
-    return reconstruct_perspective(method, tracks, lens, cameras)
+def _before(lens: Intrinsics | str | None, method: Method, tracks: Tracks, cameras: Any = None) -> Reconstruction:
+    """Reconstruct one body before a camera."""
+    if lens is None:
+        look = method.turns_over and cameras is None and len(trunk_joints(tracks.skeleton)) >= 3
+        lens = "auto" if look else "parallel"
+    if isinstance(lens, Intrinsics):
+        return reconstruct_perspective(method, tracks, lens, cameras)
+    return method(tracks, cameras) if lens == "parallel" else reconstruct_uncalibrated(method, tracks, cameras)
 
 
 def _method(method: str | Method, fields: dict[str, Any]) -> Method:

@@ -6,6 +6,7 @@ import math
 import time
 import warnings
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -48,6 +49,35 @@ WIDE = 3.0
 """Tangent of the angle off the optical axis from which on the focal length is hardly true."""
 
 
+class View(NamedTuple):
+    """What a virtual camera sees that looks at a body along its line of sight, ray by ray.
+
+    Attributes:
+        lens: of the camera.
+        look: (T, 3, 3) rotations from the camera's frame to the virtual one's.
+        rays: (T, N, 2) of the tracks.
+    """
+
+    lens: Intrinsics
+    look: Tensor
+    rays: Tensor
+
+    @classmethod
+    def of(cls, points: Tensor, weights: Tensor, lens: Intrinsics, rate: float) -> View:
+        """That of tracks (T, N, 2) of weights (T, N)."""
+        rays = lens.rays(points)
+        look = _line_of_sight(rays, weights, rate)
+        return cls(lens, look, _onto(rays @ look.mT))
+
+    def longer(self, by: float, weights: Tensor, rays: Tensor, rate: float) -> tuple[View, Tensor]:
+        """Through a lens of another focal length, and these rays (T, N, 2) of it, too."""
+        lens = replace(self.lens, fx=self.lens.fx * by, fy=self.lens.fy * by)
+        ones = torch.ones_like(rays[..., :1])
+        back = [self.lens.project(torch.cat([x, ones], -1) @ self.look) for x in (self.rays, rays)]
+        view = View.of(back[0], weights, lens, rate)
+        return view, _onto(lens.rays(back[1]) @ view.look.mT)
+
+
 @dataclass(frozen=True)
 class _Found:
     """Solutions of one round, best first.
@@ -56,6 +86,7 @@ class _Found:
         bodies: of the solutions.
         lifted: the method's solutions that they came from, perhaps mirrored.
         scene: that they explain.
+        view: whose rays are the scene's.
         flat: whether there was no perspective to speak of, so that they are the method's own.
         notes: of the method on the tracks, whichever of its solutions is best here.
     """
@@ -63,6 +94,7 @@ class _Found:
     bodies: Bodies
     lifted: tuple[Reconstruction, ...]
     scene: Scene
+    view: View
     flat: bool
     notes: tuple[str, ...] = ()
 
@@ -73,6 +105,7 @@ def reconstruct_perspective(
     intrinsics: Intrinsics,
     cameras: Tensor | None = None,
     *,
+    any_focal: bool = False,
     rounds: int = 3,
     steps: int = 60,
 ) -> Reconstruction:
@@ -90,6 +123,7 @@ def reconstruct_perspective(
         tracks: in pixels, or in whatever unit the intrinsics have.
         intrinsics: of the camera.
         cameras: (T, 2, 3) known camera rows, world to camera.
+        any_focal: the focal length is to be found, from that of the intrinsics on; it makes a note of what it found.
         rounds: of lifting and refining, at most.
         steps: L-BFGS steps of each refinement.
 
@@ -103,14 +137,20 @@ def reconstruct_perspective(
     begin = time.perf_counter()
     with apart([tracks]):
         tracks = method.prepared(tracks)
-        result = _reconstruct(method, tracks, intrinsics, cameras, rounds, steps)
+        result = _reconstruct(method, tracks, intrinsics, cameras, any_focal, rounds, steps)
     result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
     method._warn(result, "")
     return result
 
 
 def _reconstruct(
-    method: Method, tracks: Tracks, intrinsics: Intrinsics, cameras: Tensor | None, rounds: int, steps: int
+    method: Method,
+    tracks: Tracks,
+    intrinsics: Intrinsics,
+    cameras: Tensor | None,
+    any_focal: bool,
+    rounds: int,
+    steps: int,
 ) -> Reconstruction:
     """:func:`reconstruct_perspective` without autograd, on the tracks' device."""
     rate = tracks.fps or 30.0
@@ -122,26 +162,20 @@ def _reconstruct(
             KcsWarning,
             stacklevel=users_level(),
         )
-    look = _line_of_sight(rays, tracks.weights, rate)  # (T, 3, 3)
-    rays = rays @ look.mT
-    rays = rays[..., :2] / rays[..., 2:].clamp_min(NEAREST)
-    size = weak_perspective(rays, tracks.seen, tracks.skeleton, rate)
-    wide = float(rays[tracks.seen].square().sum(-1).mean().sqrt()) if bool(tracks.seen.any()) else 0.0
-    distance = torch.full_like(rays[:, 0, 0], intrinsics.focal)
-    if size.sure or wide > APPARENT:
-        distance = distance / size.path
-    depth = torch.zeros_like(rays[..., 0])
+    view = View.of(tracks.points, tracks.weights, intrinsics, rate)
+    distance = first_distance(view, tracks, rate)
+    depth = torch.zeros_like(view.rays[..., 0])
     if cameras is not None:
-        known = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
-        cameras = (look @ complete_rotation(known))[:, :2]
-    feet = standing_feet(tracks) if cameras is None or float(viewpoint_turn(cameras)) < STILL else None
+        cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
+    feet = feet_on_ground(tracks, cameras)
     best: _Found | None = None
     for _ in range(rounds):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)
-            lifted = method.following()(_straighten(tracks, rays, distance, depth), cameras)
-        given = lifted, distance, depth, rate, feet, steps
-        found = _refine(*given, mirror=cameras is None, flips=method.turns_over)
+            known = None if cameras is None else (view.look @ complete_rotation(cameras))[:, :2]
+            lifted = method.following()(_straighten(tracks, view.rays, distance, depth), known)
+        given = lifted, view, distance, depth, rate, feet, steps
+        found = _refine(*given, mirror=cameras is None, flips=method.turns_over, any_focal=any_focal)
         bodies = found.bodies
         moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
         if best is None or (not bool(bodies.energy[0] >= best.bodies.energy[0]) and bool(bodies.energy[0].isfinite())):
@@ -149,11 +183,27 @@ def _reconstruct(
         if moved < SETTLED or not bool(bodies.energy.isfinite().any()):
             break
         distance, depth = bodies.distance[0], bodies.depth[0]
+        if any_focal:
+            view, _ = view.longer(float(bodies.focal[0]), tracks.weights, view.rays, rate)
     assert best is not None
     exact = len(trunk_joints(tracks.skeleton)) >= 3 and not detected(tracks.weights)
     if method.turns_over and exact and not best.flat:
         best = replace(best, bodies=best.scene.polished(best.bodies, steps))
-    return _assemble(tracks, intrinsics, look, best)
+    return _assemble(tracks, best)
+
+
+def first_distance(view: View, tracks: Tracks, rate: float) -> Tensor:
+    """Distances (T,) that the body's size in the image tells, the focal length on average."""
+    rays = view.rays
+    size = weak_perspective(rays, tracks.seen, tracks.skeleton, rate)
+    wide = float(rays[tracks.seen].square().sum(-1).mean().sqrt()) if bool(tracks.seen.any()) else 0.0
+    distance = torch.full_like(rays[:, 0, 0], view.lens.focal)
+    return distance / size.path if size.sure or wide > APPARENT else distance
+
+
+def feet_on_ground(tracks: Tracks, cameras: Tensor | None) -> Tensor | None:
+    """How surely contact points stand still, (T, C); None where cameras (T, 2, 3) are known to turn."""
+    return standing_feet(tracks) if cameras is None or float(viewpoint_turn(cameras)) < STILL else None
 
 
 def _line_of_sight(rays: Tensor, weights: Tensor, rate: float) -> Tensor:
@@ -169,6 +219,11 @@ def _line_of_sight(rays: Tensor, weights: Tensor, rate: float) -> Tensor:
     right[:, 0] = 1
     right = torch.nn.functional.normalize(right - ahead[:, :1] * ahead, dim=-1)
     return torch.stack([right, torch.linalg.cross(ahead, right), ahead], 1)
+
+
+def _onto(rays: Tensor) -> Tensor:
+    """Rays (T, N, 3) where they pass the plane z = 1."""
+    return rays[..., :2] / rays[..., 2:].clamp_min(NEAREST)
 
 
 def _slow(values: Tensor, rate: float, *, most: int = 12) -> Tensor:
@@ -190,6 +245,7 @@ def _straighten(tracks: Tracks, rays: Tensor, distance: Tensor, depth: Tensor) -
 
 def _refine(
     lifted: Reconstruction,
+    view: View,
     distance: Tensor,
     depth: Tensor,
     rate: float,
@@ -198,11 +254,13 @@ def _refine(
     *,
     mirror: bool,
     flips: bool,
+    any_focal: bool,
 ) -> _Found:
     """Refine all solutions of the method under perspective, and the best one's mirror image.
 
     Args:
         lifted: the method's solutions, of straightened tracks.
+        view: of the tracks.
         distance: (T,) by which they were straightened.
         depth: (T, N) by which they were straightened.
         rate: frames a second.
@@ -210,39 +268,52 @@ def _refine(
         steps: of the refinement.
         mirror: whether depth may have the other sign.
         flips: whether runs of depths may have.
+        any_focal: whether the view's focal length is to be found.
     """
-    tracks, others = lifted.tracks, (lifted, *lifted.alternatives)
-    flat = lifted.points[..., :2]
-    middle = flat.mean(1, keepdim=True)
-    flat = middle + lifted.scales[:, None, None] * (flat - middle)  # the method's parallel image, clean and complete
+    others = (lifted, *lifted.alternatives)
+    flat = clean_image(lifted)
     rays = flat / ahead(distance, depth)[..., None]
     start = torch.stack([o.points[..., 2] for o in others])
     start = start - start.mean(-1, keepdim=True)
-    unit = _unit(lifted)
+    unit = body_unit(lifted)
     exact = (
         distance / _slow(lifted.scales.clamp_min(1e-9).log()[:, None], rate)[:, 0].exp()
     )  # a method's own scales may jump
-    size = rms(flat - middle, torch.ones_like(depth)) / unit
-    off = (flat - tracks.points).square().sum(-1)[tracks.seen]
-    level = math.sqrt(float(off.median()) / 1.39) / unit / 2 if len(off) else 0.0  # whatever outliers there are
-    share = gap_deviation((flat - middle) / (size * unit), tracks.seen, rate)
-    share = share.maximum(detector_deviation(tracks.weights))
-    scene = Scene(lifted.skeleton, rays, (size * share).clamp_min(level), rate, unit, standing)
+    noise = image_noise(lifted, flat, unit, rate)
+    scene = Scene(lifted.skeleton, rays, noise, rate, unit, standing, any_focal)
     parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / unit
     if parallax < FLAT or not lifted.skeleton.num_bones:
         energy = start.new_tensor([o.objective for o in others])
         number = torch.arange(len(start), device=start.device)
-        bodies = Bodies(start, (distance / lifted.scales).expand(len(start), -1), energy, number)
-        return _Found(bodies, others, scene, True, lifted.diagnostics.notes)
+        far = (distance / lifted.scales).expand(len(start), -1)
+        bodies = Bodies(start, far, energy, number, torch.ones_like(energy))
+        return _Found(bodies, others, scene, view, True, lifted.diagnostics.notes)
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
     bodies = scene.refined(exact, start, steps)
     if flips:
         bodies = scene.turned_over(bodies, steps)
-    return _Found(bodies, others, scene, False, lifted.diagnostics.notes)
+    return _Found(bodies, others, scene, view, False, lifted.diagnostics.notes)
 
 
-def _unit(lifted: Reconstruction) -> float:
+def clean_image(lifted: Reconstruction) -> Tensor:
+    """A method's image (T, N, 2) under parallel rays: of all joints, and without noise."""
+    flat = lifted.points[..., :2]
+    middle = flat.mean(1, keepdim=True)
+    return middle + lifted.scales[:, None, None] * (flat - middle)
+
+
+def image_noise(lifted: Reconstruction, flat: Tensor, unit: float, rate: float) -> Tensor:
+    """Standard deviation (T, N) of joints in a clean image (T, N, 2), for a body of 1.75."""
+    tracks, off = lifted.tracks, flat - flat.mean(1, keepdim=True)
+    size = rms(off, torch.ones_like(off[..., 0])) / unit
+    stray = (flat - tracks.points).square().sum(-1)[tracks.seen]
+    level = math.sqrt(float(stray.median()) / 1.39) / unit / 2 if len(stray) else 0.0  # whatever outliers there are
+    share = gap_deviation(off / (size * unit), tracks.seen, rate)
+    return (size * share.maximum(detector_deviation(tracks.weights))).clamp_min(level)
+
+
+def body_unit(lifted: Reconstruction) -> float:
     """The unit in which the body is about as large as a person of 1.75."""
     if len(trunk_joints(lifted.skeleton)) >= 3:
         usual = usual_posture(lifted.skeleton, lifted.lengths.dtype, lifted.lengths.device).rest_lengths
@@ -253,7 +324,7 @@ def _unit(lifted: Reconstruction) -> float:
     return unit if 0 < unit < math.inf else 1.0
 
 
-def _assemble(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Found) -> Reconstruction:
+def _assemble(tracks: Tracks, found: _Found) -> Reconstruction:
     """The best solution in the camera's frame, with those of the others that differ from it."""
     bodies, unit = found.bodies, found.scene.unit
     keep: list[int] = []
@@ -261,15 +332,20 @@ def _assemble(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Foun
         apart = [float((depth - bodies.depth[j]).square().mean().sqrt()) for j in keep]
         if len(keep) <= max(1, len(found.lifted[0].alternatives)) and all(a > APART * unit for a in apart):
             keep.append(k)
-    made = [_in_camera(tracks, intrinsics, look, found, k) for k in keep]
+    made = [_in_camera(tracks, found, k) for k in keep]
     return replace(made[0], alternatives=tuple(made[1:]))
 
 
-def _in_camera(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Found, k: int) -> Reconstruction:
+def _in_camera(tracks: Tracks, found: _Found, k: int) -> Reconstruction:
     """Solution number ``k`` in the camera's frame."""
     bodies, body = found.bodies, tracks.skeleton
     lifted = found.lifted[int(bodies.origin[k])]
-    points = found.scene.points(bodies, k) @ look
+    view, scene = found.view, found.scene
+    if scene.any_focal:
+        view, rays = view.longer(float(bodies.focal[k]), tracks.weights, scene.rays, scene.rate)
+        scene = replace(scene, rays=rays)
+    intrinsics, look = view.lens, view.look
+    points = scene.points(bodies, k) @ look
     points = body.complete(points[:, : body.num_observed])[0]
     root = points[..., 2].mean(-1)
     factor = intrinsics.focal / root.log().mean().exp()
@@ -283,6 +359,9 @@ def _in_camera(tracks: Tracks, intrinsics: Intrinsics, look: Tensor, found: _Fou
     told = () if k else found.notes  # the best solution's; "the mirror image", say, is true of none any more
     notes = [n for n in told if not n.startswith((ABSENT, FOUND)) and "weak perspective" not in n]
     notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
+    if scene.any_focal:
+        focal = f"focal length of {intrinsics.focal:.0f} {tracks.units} found from the tracks"
+        notes.append(f"{focal}, principal point taken to be ({intrinsics.cx:.0f}, {intrinsics.cy:.0f})")
     facts = replace(
         lifted.diagnostics,
         bone_variation=float(100 * spread.median()) if len(spread) else math.nan,

@@ -17,7 +17,7 @@ from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["NEAREST", "Body", "PinholeEnergy"]
+__all__ = ["NEAREST", "USUAL", "Body", "PinholeEnergy"]
 
 NEAREST = 0.15
 """Joints are kept at least this share of the body's distance before the camera."""
@@ -43,6 +43,10 @@ FASTEST = 4.0
 
 FREE = 0.1
 """Usual deviation of a length, as a share: how long steps are."""
+
+
+USUAL, FACTOR = 6.0, 2.0
+"""Usual distance of a camera whose focal length is not known, for a body of 1.75, and by what factor it strays."""
 
 
 class Body(NamedTuple):
@@ -182,7 +186,8 @@ class PinholeEnergy:
         """That of some hypotheses."""
         out = copy(self)
         names = ["path", "wide", "depth", "own", "lengths", "shear", "drift", "lean", "scale", "start"]
-        for name in [*names, "near"] if self.model is None else names:
+        names += ["near"] * (self.model is None) + ["free"] * (self.free is not None)
+        for name in names:
             setattr(out, name, getattr(self, name)[index])
         return out
 
@@ -198,6 +203,9 @@ class PinholeEnergy:
         change = (path / self.path).log()
         distance = path / wide
         value, along = self._steady(distance)
+        firm = 0.0 if self.free is None else self.free / math.log(FACTOR) ** 2
+        usual = (wide * USUAL / self.path.mean(-1, keepdim=True)).log()  # (H, 1)
+        value = value + firm * usual[:, 0].square() / 2
         value = value + change.square().mean(-1) / (2 * STRAY**2)
         if self.model is None:
             cost, slope, growth, drawn = self._plain(laid)
@@ -223,7 +231,7 @@ class PinholeEnergy:
         if not self.known:
             parts.insert(1, growth + (self.shear * slope).sum(-1))
         if self.free is not None:
-            parts.append((shrink * wide[:, 0] - (self.lean * slope).sum((1, 2)))[:, None])
+            parts.append((shrink * wide[:, 0] + firm * usual[:, 0] - (self.lean * slope).sum((1, 2)))[:, None])
         return value, torch.cat(parts, 1).mul_(self.scale)
 
     def _laid(self, state: Tensor) -> _Laid:
@@ -372,7 +380,7 @@ class PinholeEnergy:
         rough = (ROOT * self.slow**2) ** -2
         waves = waves + distance.square().mean(-1, keepdim=True) * steps[1] * rough
         waves = waves + drift.square().mean(-1).sum(-1, keepdim=True) * steps[1] / self.acceleration**2
-        focus = (pull * ((slid - dz * lean) / size).square()).sum((1, 2)) + 1 / FREE**2
+        focus = (pull * ((slid - dz * lean) / size).square()).sum((1, 2)) + 1 / math.log(FACTOR) ** 2
         focus = focus + lean.diff(n=2).square().sum((1, 2)) / self.acceleration**2
         focus = focus + distance.diff(n=2).square().sum(-1) * rough
         if model is not None and model.standing is not None and model.standing.numel():

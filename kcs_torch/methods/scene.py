@@ -43,15 +43,17 @@ class Bodies:
         distance: (H, T).
         energy: (H,).
         origin: (H,) number of the start that each came from.
+        focal: (H,) focal length, over that of the rays: of a longer one rays are narrower.
     """
 
     depth: Tensor
     distance: Tensor
     energy: Tensor
     origin: Tensor
+    focal: Tensor
 
     def __getitem__(self, index: Tensor | slice) -> Bodies:
-        return Bodies(self.depth[index], self.distance[index], self.energy[index], self.origin[index])
+        return Bodies(*(value[index] for value in vars(self).values()))
 
     def joined(self, other: Bodies) -> Bodies:
         """Both together, best first."""
@@ -71,6 +73,7 @@ class Scene:
         rate: frames a second.
         unit: the length that 1 stands for in a body of 1.75, in units of the distance.
         standing: (T, C) how surely the skeleton's contact points stand still, or None where nothing tells.
+        any_focal: whether the focal length is to be found, too.
     """
 
     skeleton: Skeleton
@@ -79,8 +82,9 @@ class Scene:
     rate: float
     unit: float
     standing: Tensor | None
+    any_focal: bool = False
 
-    def refined(self, distance: Tensor, depth: Tensor, steps: int) -> Bodies:
+    def refined(self, distance: Tensor, depth: Tensor, steps: int, focal: Tensor | None = None) -> Bodies:
         """Bodies of least :class:`PinholeEnergy`, each from its own start, best first.
 
         Memory is for as much as a block of a long clip. The liveliest block tells the lengths of the others, whose
@@ -90,11 +94,14 @@ class Scene:
             distance: (T,) that the starts were found with.
             depth: (H, T, N) starts.
             steps: of L-BFGS.
+            focal: (1,) that the starts were found with, over that of the rays; 1 if None.
         """
         frames = len(self.rays)
         count = max(1, math.ceil((frames - OVERLAP) / (BLOCK - OVERLAP)))
         size = math.ceil((frames + (count - 1) * OVERLAP) / count)
         begins = window_starts(frames, size, min(OVERLAP, size - 1))
+        focal = torch.ones_like(depth[:, 0, 0]) if focal is None else focal.expand(len(depth))
+        path = distance / focal[0] / self.unit
         image = (self.rays * distance[:, None, None]).unfold(0, size, 1)[begins]  # (W, N, 2, T)
         lively = image.diff(dim=-1).square().sum((1, 2))
         z = depth.new_empty(len(begins), size, *depth[:, 0].shape)
@@ -103,22 +110,25 @@ class Scene:
         for i in lively.median(-1).values.argsort(descending=True).tolist() if len(begins) > 1 else [0]:
             some = slice(begins[i], begins[i] + size)
             feet = None if self.standing is None else self.standing[some]
+            lens = focal, torch.full_like(focal, self.any_focal and lengths is None, dtype=torch.bool)
             pinhole = PinholeEnergy(
-                self.skeleton, self.rays[some], distance[some] / self.unit, depth[:, some] / self.unit, self.rate,
-                self.noise[some], lengths, feet,
+                self.skeleton, self.rays[some], path[some], depth[:, some] / self.unit, self.rate, self.noise[some],
+                lengths, feet, lens if self.any_focal else None,
             )  # fmt: skip
             solution = lbfgs(pinhole, pinhole.start, num_steps=steps, tolerance=1e-6, slopes=True, part=pinhole.rows)
             with torch.no_grad():
                 body = pinhole.unpack(solution.value)
             assert solution.energy is not None
-            lengths = body.lengths if lengths is None else lengths
+            if lengths is None:
+                lengths, focal = body.lengths, body.focal
             energy = energy + solution.energy
             middle = body.depth.mean(-1, keepdim=True)
             z[i] = ((body.depth - middle) * self.unit).transpose(0, 1)
             far[i] = ((body.distance + middle[..., 0]) * self.unit).mT
         z, far = (x[0] if len(begins) == 1 else blend_windows(x, begins, frames) for x in (z, far))
         order = energy.argsort()
-        return Bodies(z.transpose(0, 1), far.mT, energy, torch.arange(len(energy), device=z.device))[order]
+        number = torch.arange(len(energy), device=z.device)
+        return Bodies(z.transpose(0, 1), far.mT, energy, number, focal)[order]
 
     def turned_over(self, found: Bodies, steps: int) -> Bodies:
         """Bodies, best first, whose best one no flip of a run of its signs makes better.
@@ -135,14 +145,14 @@ class Scene:
             flips = self._flips(best)
             if not len(flips):
                 break
-            tried = self.refined(distance, flips, max(steps // 3, 1))[:FEW]
+            tried = self.refined(distance, flips, max(steps // 3, 1), best.focal)[:FEW]
             tried = tried[tried.energy < best.energy + DEARER]
             if not len(tried.energy):
                 break
-            better = self.refined(distance, tried.depth, steps)[:1]
+            better = self.refined(distance, tried.depth, steps, best.focal)[:1]
             if not bool(better.energy[0] < best.energy[0] - GAIN):
                 break
-            found = found.joined(Bodies(better.depth, better.distance, better.energy, origin))
+            found = found.joined(replace(better, origin=origin))
         return found
 
     def polished(self, found: Bodies, steps: int) -> Bodies:
@@ -162,7 +172,7 @@ class Scene:
         return replace(found, depth=torch.cat([better, found.depth[1:]]))
 
     def points(self, found: Bodies, k: int) -> Tensor:
-        """Joints (T, N, 3) of body number ``k`` before the virtual camera, its bones as constant as noise allows.
+        """Joints (T, N, 3) of body number ``k`` along the scene's rays, its bones as constant as noise allows.
 
         Where the image is exact joints stay on their rays. Else they move by the least that makes rigid bones constant,
         as :meth:`Body.bodies` does under parallel rays.
@@ -186,7 +196,7 @@ class Scene:
 
     def _image(self, best: Bodies) -> Tensor:
         """The image (T, N, 2) of a single body under parallel rays, in its unit."""
-        image = (self.rays * ahead(best.distance, best.depth)[..., None])[0] / self.unit
+        image = (self.rays / best.focal * ahead(best.distance, best.depth)[..., None])[0] / self.unit
         return image - image.mean(-2, keepdim=True)
 
     def _flips(self, best: Bodies) -> Tensor:

@@ -1,47 +1,54 @@
-"""A camera that nobody has calibrated: the focal length under which a body explains its tracks best."""
+"""A camera that nobody has calibrated: whether it is near, and the focal length that explains the tracks best."""
 
 from __future__ import annotations
 
 import math
+import time
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
-from kcs_torch.errors import KcsWarning, OptionError
-from kcs_torch.functional.chain import bone_lengths
-from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.base import Method, apart
-from kcs_torch.methods.perspective import reconstruct_perspective
+from kcs_torch.errors import OptionError, users_level
+from kcs_torch.methods.base import Method, apart, check_cameras
+from kcs_torch.methods.perspective import (
+    View,
+    body_unit,
+    clean_image,
+    feet_on_ground,
+    first_distance,
+    image_noise,
+    reconstruct_perspective,
+)
+from kcs_torch.methods.detector import detected
+from kcs_torch.methods.pinhole import USUAL, PinholeEnergy
 from kcs_torch.methods.pkc import PKC
-from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.nn.posture import trunk_joints
-from kcs_torch.types import Intrinsics, Reconstruction, Tracks
+from kcs_torch.solvers.lbfgs import lbfgs
+from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
-__all__ = ["reconstruct_uncalibrated"]
+__all__ = ["likely_lens", "reconstruct_uncalibrated"]
 
-DISTANCES = tuple(2.0 * 1.5**k for k in range(8))
-"""Distances that are tried, for a body of 1.75: 2 to 34."""
+FAR = 34.0
+"""Distance, for a body of 1.75, from which on rays are taken to be parallel."""
 
 BETTER = 5.0
-"""By how much the objective must be lower than at the largest distance for perspective to be believed."""
+"""By how much the energy must be lower than of a body at this distance for a nearer one to be believed; a detector's
+tracks come from a real camera, which hardly ever is as far away."""
 
-FIRST = 3
-"""Index of the distance that is tried first."""
-
-LONGEST = 0.9
-"""Share of the frames in which a bone looks no longer than what is taken for its length."""
+SECONDS, RATE, STEPS = 5.0, 30.0, 40
+"""How much of a clip tells whether a camera is near, at how many frames a second at most, and in how many steps."""
 
 
 def reconstruct_uncalibrated(method: Method, tracks: Tracks, cameras: Tensor | None = None) -> Reconstruction:
-    """Reconstruct a body before a pinhole camera of unknown focal length.
+    """Reconstruct a body before a camera of which nothing is known.
 
     The nearer a camera is, the more the size of a limb in the image changes with its depth: bones of constant length,
-    the template's posture and feet that stand still tell how much. PKC solves the tracks for focal lengths at which the
-    body is 2 to 34 of its units away (a person is 1.75 tall), from one to the next as long as the objective falls; the
-    minimum of a parabola through the best and its neighbours is the focal length. The principal point is taken to be
-    the tracks' middle.
+    the template's posture and feet that stand still tell how much. PKC solves the tracks as if rays were parallel;
+    where :func:`likely_lens` finds the camera near, the focal length is found together with depths, lengths and
+    distances by :func:`kcs_torch.methods.perspective.reconstruct_perspective`. The principal point is taken to be the
+    tracks' middle.
 
     Args:
         method: any.
@@ -53,77 +60,82 @@ def reconstruct_uncalibrated(method: Method, tracks: Tracks, cameras: Tensor | N
         show no perspective, the method's own solution, for parallel rays.
 
     Raises:
-        OptionError: the skeleton has no template with a trunk, or no bone is seen.
+        OptionError: the skeleton has no template with a trunk.
     """
     if len(trunk_joints(tracks.skeleton)) < 3:
         raise OptionError(
             f"intrinsics: 'auto' needs a skeleton with a template and a trunk, '{tracks.skeleton.name}' has none: "
             "expected (fx, fy, cx, cy) or a matrix K (3, 3)"
         )
-    with apart([tracks]):
-        middle, unit = _seen(tracks)
+    begin = time.perf_counter()
     judge = method if isinstance(method, PKC) else PKC()
-    found: dict[float, Reconstruction] = {}
-
-    def lens(distance: float) -> Intrinsics:
-        return Intrinsics(distance * unit, distance * unit, *middle)
-
-    def solve(distance: float) -> float:
-        """The objective where the body is so far away."""
-        if distance not in found:
-            found[distance] = reconstruct_perspective(judge, tracks, lens(distance), cameras)
-        value = found[distance].objective
-        return value if math.isfinite(value) else math.inf
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", KcsWarning)
-        solve(_descended(solve))
-        best = min(found, key=solve)
-        near = solve(best) < solve(DISTANCES[-1]) - BETTER
-        if near and judge is method:
-            result = found[best]
-        else:
-            result = reconstruct_perspective(method, tracks, lens(best), cameras) if near else method(tracks, cameras)
-    method._warn(result, "")
-    note = "no perspective found in the tracks: rays taken to be parallel"
-    if near:
-        at = ", ".join(f"{x:.0f}" for x in middle)
-        focal = f"focal length of {best * unit:.0f} {tracks.units} found from the tracks"
-        note = f"{focal}, principal point taken to be ({at})"
-    said = replace(result.diagnostics, notes=(*result.diagnostics.notes, note))
-    return replace(result, diagnostics=said)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        result = judge(tracks, cameras)
+    lens = likely_lens(result, cameras)
+    if lens is not None:
+        with warnings.catch_warnings(record=judge is not method):
+            result = reconstruct_perspective(judge, tracks, lens, cameras, any_focal=True)
+        if judge is not method:
+            assert result.distance is not None
+            focal = float(result.distance.log().mean().exp())  # the unit is a pixel there
+            result = reconstruct_perspective(method, tracks, replace(lens, fx=focal, fy=focal), cameras)
+    elif judge is method:
+        for one in told:
+            warnings.warn(one.message, one.category, stacklevel=users_level())
+    else:
+        result = method(tracks, cameras)
+    return replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
 
 
-def _descended(cost: Callable[[float], float]) -> float:
-    """The distance of least cost: the best one tried, or the minimum of a parabola through it and its neighbours."""
-    i = FIRST
-    while True:
-        near = [k for k in (i - 1, i, i + 1) if 0 <= k < len(DISTANCES)]
-        least = min(near, key=lambda k: cost(DISTANCES[k]))
-        if least == i:
-            break
-        i = least
-    if not 0 < i < len(DISTANCES) - 1:
-        return DISTANCES[i]
-    low, here, high = (cost(DISTANCES[k]) for k in (i - 1, i, i + 1))
-    bend = low - 2 * here + high
-    shift = (low - high) / (2 * bend) if 0 < bend < math.inf else 0.0
-    return DISTANCES[i] * (DISTANCES[i + 1] / DISTANCES[i]) ** shift
+def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrinsics | None:
+    """A lens through which a body looks more likely than under the parallel rays that it was solved for.
+
+    The solution is refined twice under perspective (:class:`kcs_torch.methods.pinhole.PinholeEnergy`), at a distance of
+    34 of its units (a person is 1.75 tall), and at any distance. Five seconds of the clip tell.
+
+    Args:
+        lifted: a body with a template, under parallel rays.
+        cameras: (T, 2, 3) that were known.
+
+    Returns:
+        A lens whose principal point is the tracks' middle, or None where rays might as well be parallel.
+    """
+    tracks, unit = lifted.tracks, body_unit(lifted)
+    with apart([tracks]):
+        if cameras is not None:
+            cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
+        every = max(1, round((tracks.fps or RATE) / RATE))
+        flat = clean_image(lifted)
+        some = _liveliest(flat[::every], round(SECONDS * RATE)) * every
+        rate = (tracks.fps or RATE) / every
+        noise, feet = image_noise(lifted, flat, unit, tracks.fps or RATE), feet_on_ground(tracks, cameras)
+        flat, depth = flat[some], lifted.points[some, :, 2] / unit
+        if not (bool(flat.isfinite().all()) and bool(depth.any())):
+            return None
+        x, y = flat.mean((0, 1)).tolist()
+        ones = torch.ones_like(depth)
+        view = View.of(flat, ones, Intrinsics(FAR * unit, FAR * unit, x, y), rate)
+        path = first_distance(view, replace(tracks, points=flat, weights=ones, fps=rate), rate) / unit
+        lens = ones.new_tensor([1.0, USUAL / FAR]), torch.tensor([False, True], device=ones.device)
+        depth = (depth - depth.mean(-1, keepdim=True)).expand(2, -1, -1)
+        standing = None if feet is None else feet[some]
+        energy = PinholeEnergy(
+            tracks.skeleton, view.rays, path, depth, rate, noise[some], standing=standing, focal=lens
+        )
+        found = lbfgs(energy, energy.start, num_steps=STEPS, tolerance=1e-6, slopes=True, part=energy.rows)
+        assert found.energy is not None
+        focal = FAR * unit * float(energy.unpack(found.value).focal[1])
+        better = 0.0 if detected(tracks.weights) else BETTER
+        near = bool(found.energy[1] < found.energy[0] - better) and focal < FAR * unit
+    return Intrinsics(focal, focal, x, y) if near and math.isfinite(focal) else None
 
 
-def _seen(tracks: Tracks) -> tuple[tuple[float, float], float]:
-    """The tracks' middle, and how long the unit of a body of 1.75 looks where its bones lie in the image plane."""
-    body, seen = tracks.skeleton, tracks.seen
-    known = seen.any(0)
-    filled = interpolate(tracks.points, seen)
-    bones = body.bone_index(device=filled.device)[list(body.rigid)]
-    usual = usual_posture(body, filled.dtype, filled.device).rest_lengths[list(body.rigid)]
-    use = known[bones].all(-1) & (usual > 0)
-    if not bool(use.any()):
-        raise OptionError(f"{tracks.source}: intrinsics: 'auto' needs a bone whose joints are seen: expected numbers")
-    look = bone_lengths(filled, bones)[:, use].quantile(LONGEST, 0)
-    unit = float((look / usual[use]).median())
-    if not unit > 0:
-        raise OptionError(f"{tracks.source}: intrinsics: 'auto' needs a body of some size in the image: it has none")
-    x, y = filled[:, known].mean((0, 1)).tolist()
-    return (x, y), unit
+def _liveliest(image: Tensor, count: int) -> Tensor:
+    """The ``count`` frames in a row that move most, of (T, N, 2); all if there are fewer."""
+    begin = 0
+    if len(image) > count:
+        moved = (image - image.mean(1, keepdim=True)).diff(dim=0).square().sum((1, 2)).cumsum(0)
+        before = torch.nn.functional.pad(moved, (1, 0))[: len(image) - count + 1]
+        begin = int((moved[count - 2 :] - before).argmax())
+    return torch.arange(begin, min(begin + count, len(image)), device=image.device)
