@@ -280,7 +280,7 @@ def _refine(
         distance / _slow(lifted.scales.clamp_min(1e-9).log()[:, None], rate)[:, 0].exp()
     )  # a method's own scales may jump
     noise = image_noise(lifted, flat, unit, rate)
-    scene = Scene(lifted.skeleton, rays, noise, rate, unit, standing, any_focal)
+    scene = Scene(lifted.skeleton, rays, noise, rate, unit, standing)
     parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / unit
     if parallax < FLAT or not lifted.skeleton.num_bones:
         energy = start.new_tensor([o.objective for o in others])
@@ -293,6 +293,9 @@ def _refine(
     bodies = scene.refined(exact, start, steps)
     if flips:
         bodies = scene.turned_over(bodies, steps)
+    if any_focal:
+        scene = replace(scene, any_focal=True)
+        bodies = scene.refined(bodies.distance[0], bodies.depth[:1], steps).joined(bodies[1:])
     return _Found(bodies, others, scene, view, False, lifted.diagnostics.notes)
 
 

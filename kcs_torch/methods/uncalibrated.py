@@ -12,6 +12,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, users_level
 from kcs_torch.methods.base import Method, apart, check_cameras
+from kcs_torch.methods.detector import detected
 from kcs_torch.methods.perspective import (
     View,
     body_unit,
@@ -21,7 +22,6 @@ from kcs_torch.methods.perspective import (
     image_noise,
     reconstruct_perspective,
 )
-from kcs_torch.methods.detector import detected
 from kcs_torch.methods.pinhole import USUAL, PinholeEnergy
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.nn.posture import trunk_joints
