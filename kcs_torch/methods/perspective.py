@@ -294,8 +294,11 @@ def _refine(
     if flips:
         bodies = scene.turned_over(bodies, steps)
     if any_focal:
-        scene = replace(scene, any_focal=True)
-        bodies = scene.refined(bodies.distance[0], bodies.depth[:1], steps).joined(bodies[1:])
+        # A foot that comes along its ray seems to stand still, and would make the focal length too short.
+        scene = replace(scene, any_focal=True, standing=None)
+        best = scene.refined(bodies.distance[0], bodies.depth[:1], steps)
+        rest = replace(bodies[1:], energy=bodies.energy[1:] + (best.energy - bodies.energy[:1]))
+        bodies = replace(best, origin=bodies.origin[:1]).joined(rest)
     return _Found(bodies, others, scene, view, False, lifted.diagnostics.notes)
 
 

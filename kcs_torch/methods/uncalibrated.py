@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 import warnings
 from dataclasses import replace
@@ -99,7 +98,8 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
         cameras: (T, 2, 3) that were known.
 
     Returns:
-        A lens whose principal point is the tracks' middle, or None where rays might as well be parallel.
+        A lens of usual distance whose principal point is the tracks' middle, to start from; or None where rays might as
+        well be parallel.
     """
     tracks, unit = lifted.tracks, body_unit(lifted)
     with apart([tracks]):
@@ -125,10 +125,9 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
         )
         found = lbfgs(energy, energy.start, num_steps=STEPS, tolerance=1e-6, slopes=True, part=energy.rows)
         assert found.energy is not None
-        focal = FAR * unit * float(energy.unpack(found.value).focal[1])
         better = 0.0 if detected(tracks.weights) else BETTER
-        near = bool(found.energy[1] < found.energy[0] - better) and focal < FAR * unit
-    return Intrinsics(focal, focal, x, y) if near and math.isfinite(focal) else None
+        near = bool(found.energy[1] < found.energy[0] - better) and bool(energy.unpack(found.value).focal[1] < 1)
+    return Intrinsics(USUAL * unit, USUAL * unit, x, y) if near else None
 
 
 def _liveliest(image: Tensor, count: int) -> Tensor:
