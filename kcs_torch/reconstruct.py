@@ -8,13 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from kcs_torch.errors import KcsWarning, OptionError, unknown, users_level
+from kcs_torch.errors import KcsWarning, OptionError, ShapeError, unknown, users_level
 from kcs_torch.methods import METHODS
 from kcs_torch.methods.base import Method
 from kcs_torch.methods.found import find_skeleton
 from kcs_torch.methods.perspective import reconstruct_perspective
-from kcs_torch.methods.uncalibrated import reconstruct_uncalibrated
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.methods.uncalibrated import may_be_near, reconstruct_uncalibrated
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.intake import no_bones
@@ -123,9 +122,12 @@ def reconstruct_all(
             raise OptionError(f"reconstruct_all: item {i}: expected Tracks (see Tracks.from_arrays), got {type(one)}")
     chosen = _method(method, fields)
     lens = _lens(intrinsics)
-    if lens == "parallel" or (lens is None and not chosen.turns_over):
-        return chosen.many(people)
-    return [_before(lens, chosen, one) for one in people]
+    if isinstance(lens, Intrinsics) or lens == "auto":
+        return [_before(lens, chosen, one) for one in people]
+    found = chosen.many(people)
+    if lens is None and chosen.turns_over:
+        found = [reconstruct_uncalibrated(chosen, x.tracks, lifted=x) if may_be_near(x.tracks) else x for x in found]
+    return found
 
 
 def with_found_bones(tracks: Tracks) -> Tracks:
@@ -140,14 +142,17 @@ def with_found_bones(tracks: Tracks) -> Tracks:
 
 def _lens(value: Any) -> Intrinsics | str | None:
     """Intrinsics, or what is to be done without."""
-    return value if value is None or (isinstance(value, str) and value in WITHOUT) else Intrinsics.of(value)
+    if isinstance(value, str) and value not in WITHOUT:
+        raise ShapeError(
+            f"intrinsics: expected (fx, fy, cx, cy), a matrix K (3, 3), 'auto' or 'parallel', got {value!r}"
+        )
+    return value if value is None or isinstance(value, str) else Intrinsics.of(value)
 
 
 def _before(lens: Intrinsics | str | None, method: Method, tracks: Tracks, cameras: Any = None) -> Reconstruction:
     """Reconstruct one body before a camera."""
     if lens is None:
-        look = method.turns_over and cameras is None and len(trunk_joints(tracks.skeleton)) >= 3
-        lens = "auto" if look else "parallel"
+        lens = "auto" if method.turns_over and cameras is None and may_be_near(tracks) else "parallel"
     if isinstance(lens, Intrinsics):
         return reconstruct_perspective(method, tracks, lens, cameras)
     return method(tracks, cameras) if lens == "parallel" else reconstruct_uncalibrated(method, tracks, cameras)

@@ -86,10 +86,10 @@ def true_cameras(protocol: ModuleType, data: Path, case: dict[str, Any]) -> torc
 
 
 def lens_of(protocol: ModuleType, data: Path, case: dict[str, Any], wanted: bool | str | None) -> Any:
-    """What is given as intrinsics: None, "auto", or K (3, 3) of the case's camera, where the data has it."""
-    if wanted not in (None, False, True, "auto"):
-        raise SystemExit(f"intrinsics={wanted}: expected null, true or auto")
-    if not wanted or wanted == "auto":
+    """What is given as intrinsics: None, a word, or K (3, 3) of the case's camera, where the data has it."""
+    if wanted not in (None, False, True, "auto", "parallel"):
+        raise SystemExit(f"intrinsics={wanted}: expected null, true, auto or parallel")
+    if not wanted or isinstance(wanted, str):
         return wanted or None
     source = protocol.load(data, case["src"])
     return source["cam_K"][case["camera"]] if "camera" in case and "cam_K" in source.files else None
@@ -120,7 +120,7 @@ def run_case(
     )
     return figures | {
         "cameras": "estimated" if known is None else "true",
-        "intrinsics": "none" if lens is None else "found" if isinstance(lens, str) else "true",
+        "intrinsics": "none" if lens is None else lens if isinstance(lens, str) else "true",
         "frames": tracks.num_frames,
         "joints": tracks.skeleton.num_observed,
         "seconds": round(seconds, 4),

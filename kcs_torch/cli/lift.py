@@ -102,9 +102,9 @@ def lift(
     intrinsics: Annotated[
         str | None,
         typer.Option(
-            metavar="FX,FY,CX,CY|auto",
-            help="Focal lengths and principal point of the camera in pixels, or auto: the focal length is found from "
-            "the tracks. Perspective is then modelled.",
+            metavar="FX,FY,CX,CY|auto|parallel",
+            help="Focal lengths and principal point of the camera in pixels; auto: the focal length is found from the "
+            "tracks, if the camera is near (what pkc does unless told otherwise); parallel: the camera is far away.",
             show_default=False,
         ),
     ] = None,
@@ -255,18 +255,19 @@ def _learned(path: str, settings: list[str]) -> Method:
 
 
 def _lens(text: str) -> Intrinsics | str:
-    """The camera that ``--intrinsics`` names, or "auto"."""
+    """The camera that ``--intrinsics`` names, or what is to be done without."""
     from kcs_torch.errors import KcsError, OptionError
+    from kcs_torch.reconstruct import WITHOUT
     from kcs_torch.types import Intrinsics
 
-    if text == "auto":
+    if text in WITHOUT:
         return text
     try:
         return Intrinsics.of([float(x) for x in text.split(",")])
     except (ValueError, KcsError):
         raise OptionError(
-            "--intrinsics: expected FX,FY,CX,CY in pixels, focal lengths positive, such as 1500,1500,960,540, or auto, "
-            f"got {text!r}"
+            "--intrinsics: expected FX,FY,CX,CY in pixels, focal lengths positive, such as 1500,1500,960,540, auto or "
+            f"parallel, got {text!r}"
         ) from None
 
 

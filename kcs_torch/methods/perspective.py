@@ -302,6 +302,12 @@ def _refine(
     return _Found(bodies, others, scene, view, False, lifted.diagnostics.notes)
 
 
+def lens_note(lens: Intrinsics, units: str) -> str:
+    """What is told of a lens that was found."""
+    at = f"({lens.cx:.0f}, {lens.cy:.0f})"
+    return f"focal length of {lens.focal:.0f} {units} found from the tracks, principal point taken to be {at}"
+
+
 def clean_image(lifted: Reconstruction) -> Tensor:
     """A method's image (T, N, 2) under parallel rays: of all joints, and without noise."""
     flat = lifted.points[..., :2]
@@ -366,8 +372,7 @@ def _in_camera(tracks: Tracks, found: _Found, k: int) -> Reconstruction:
     notes = [n for n in told if not n.startswith((ABSENT, FOUND)) and "weak perspective" not in n]
     notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
     if scene.any_focal:
-        focal = f"focal length of {intrinsics.focal:.0f} {tracks.units} found from the tracks"
-        notes.append(f"{focal}, principal point taken to be ({intrinsics.cx:.0f}, {intrinsics.cy:.0f})")
+        notes.append(lens_note(intrinsics, tracks.units))
     facts = replace(
         lifted.diagnostics,
         bone_variation=float(100 * spread.median()) if len(spread) else math.nan,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from dataclasses import replace
@@ -19,6 +20,7 @@ from kcs_torch.methods.perspective import (
     feet_on_ground,
     first_distance,
     image_noise,
+    lens_note,
     reconstruct_perspective,
 )
 from kcs_torch.methods.pinhole import USUAL, PinholeEnergy
@@ -27,7 +29,7 @@ from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
-__all__ = ["likely_lens", "reconstruct_uncalibrated"]
+__all__ = ["likely_lens", "may_be_near", "reconstruct_uncalibrated"]
 
 FAR = 34.0
 """Distance, for a body of 1.75, from which on rays are taken to be parallel."""
@@ -40,7 +42,14 @@ SECONDS, RATE, STEPS = 5.0, 30.0, 40
 """How much of a clip tells whether a camera is near, at how many frames a second at most, and in how many steps."""
 
 
-def reconstruct_uncalibrated(method: Method, tracks: Tracks, cameras: Tensor | None = None) -> Reconstruction:
+def may_be_near(tracks: Tracks) -> bool:
+    """Whether perspective can be told: from a body with a template and a trunk."""
+    return len(trunk_joints(tracks.skeleton)) >= 3
+
+
+def reconstruct_uncalibrated(
+    method: Method, tracks: Tracks, cameras: Tensor | None = None, lifted: Reconstruction | None = None
+) -> Reconstruction:
     """Reconstruct a body before a camera of which nothing is known.
 
     The nearer a camera is, the more the size of a limb in the image changes with its depth: bones of constant length,
@@ -53,6 +62,7 @@ def reconstruct_uncalibrated(method: Method, tracks: Tracks, cameras: Tensor | N
         method: any.
         tracks: of a body with a template.
         cameras: as of :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
+        lifted: what PKC found under parallel rays, if it was asked before.
 
     Returns:
         As :func:`kcs_torch.methods.perspective.reconstruct_perspective`; a note tells the intrinsics. Where the tracks
@@ -61,7 +71,7 @@ def reconstruct_uncalibrated(method: Method, tracks: Tracks, cameras: Tensor | N
     Raises:
         OptionError: the skeleton has no template with a trunk.
     """
-    if len(trunk_joints(tracks.skeleton)) < 3:
+    if not may_be_near(tracks):
         raise OptionError(
             f"intrinsics: 'auto' needs a skeleton with a template and a trunk, '{tracks.skeleton.name}' has none: "
             "expected (fx, fy, cx, cy) or a matrix K (3, 3)"
@@ -70,21 +80,26 @@ def reconstruct_uncalibrated(method: Method, tracks: Tracks, cameras: Tensor | N
     judge = method if isinstance(method, PKC) else PKC()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        result = judge(tracks, cameras)
+        result = judge(tracks, cameras) if lifted is None else lifted
+    before = 0.0 if lifted is None else lifted.diagnostics.seconds
     lens = likely_lens(result, cameras)
     if lens is not None:
         with warnings.catch_warnings(record=judge is not method):
-            result = reconstruct_perspective(judge, tracks, lens, cameras, any_focal=True)
+            near = reconstruct_perspective(judge, tracks, lens, cameras, any_focal=True)
         if judge is not method:
-            assert result.distance is not None
-            focal = float(result.distance.log().mean().exp())  # the unit is a pixel there
-            result = reconstruct_perspective(method, tracks, replace(lens, fx=focal, fy=focal), cameras)
-    elif judge is method:
+            assert near.distance is not None
+            focal = float(near.distance.log().mean().exp())  # the unit is a pixel there
+            lens = replace(lens, fx=focal, fy=focal)
+            near = reconstruct_perspective(method, tracks, lens, cameras)
+            notes = (*near.diagnostics.notes, lens_note(lens, tracks.units))
+            near = replace(near, diagnostics=replace(near.diagnostics, notes=notes))
+        result = near if bool(near.points.isfinite().all()) else result
+    elif judge is not method:
+        result = method(tracks, cameras)
+    else:
         for one in told:
             warnings.warn(one.message, one.category, stacklevel=users_level())
-    else:
-        result = method(tracks, cameras)
-    return replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
+    return replace(result, diagnostics=replace(result.diagnostics, seconds=before + time.perf_counter() - begin))
 
 
 def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrinsics | None:
@@ -107,13 +122,13 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         every = max(1, round((tracks.fps or RATE) / RATE))
         flat = clean_image(lifted)
+        x, y = flat.mean((0, 1)).tolist()
         some = _liveliest(flat[::every], round(SECONDS * RATE)) * every
         rate = (tracks.fps or RATE) / every
         noise, feet = image_noise(lifted, flat, unit, tracks.fps or RATE), feet_on_ground(tracks, cameras)
         flat, depth = flat[some], lifted.points[some, :, 2] / unit
-        if not (bool(flat.isfinite().all()) and bool(depth.any())):
+        if not (math.isfinite(x + y) and bool(depth.isfinite().all()) and bool(depth.any())):
             return None
-        x, y = flat.mean((0, 1)).tolist()
         ones = torch.ones_like(depth)
         view = View.of(flat, ones, Intrinsics(FAR * unit, FAR * unit, x, y), rate)
         path = first_distance(view, replace(tracks, points=flat, weights=ones, fps=rate), rate) / unit
