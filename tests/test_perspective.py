@@ -118,7 +118,7 @@ def test_cameras_that_do_not_fit_are_told():
 @pytest.mark.parametrize("method", ["kcs", "sfam", "pkc"])
 def test_every_method_projects_onto_the_image_and_gets_better(method):
     tracks, truth = filmed(yaw=60, frames=45)
-    plain, result = reconstruct(tracks, method=method), reconstruct(tracks, method=method, intrinsics=LENS)
+    plain, result = (reconstruct(tracks, method=method, intrinsics=lens) for lens in ("parallel", LENS))
     check_sound(result)
     image = Intrinsics.of(LENS).project(result.in_space())
     off = (image - tracks.points)[tracks.seen].square().sum(-1).mean().sqrt()
@@ -155,9 +155,9 @@ def test_body_off_the_optical_axis():
     aside = truth @ torch.stack([torch.stack([c, o, s]), torch.stack([o, o + 1, o]), torch.stack([-s, o, c])]).mT
     other = kt.Tracks.from_arrays(Intrinsics.of(LENS).project(aside), skeleton=tracks.skeleton, fps=30.0)
     first, second = (reconstruct(t, intrinsics=LENS) for t in (tracks, other))
-    assert error(second.points, truth) == pytest.approx(error(first.points, truth), rel=0.1)
+    assert error(second.points, truth) == pytest.approx(error(first.points, truth), rel=0.15)
     for method in ("kcs", "pkc"):
-        found, plain = (reconstruct(other, method=method, intrinsics=lens) for lens in (LENS, None))
+        found, plain = (reconstruct(other, method=method, intrinsics=lens) for lens in (LENS, "parallel"))
         assert error(found.points, truth) < 0.7 * error(plain.points, truth)
 
 
@@ -288,7 +288,7 @@ def test_a_long_clip_is_refined_in_blocks_that_share_lengths(monkeypatch):
     monkeypatch.setattr(scene, "OVERLAP", 20)
     result = reconstruct(tracks, method="kcs", intrinsics=LENS)
     check_sound(result)
-    assert len(seen) in (3, 6, 9) and {len(energy.rays) for energy in seen} == {100}
+    assert len(seen) in (3, 6, 9) and {energy.rays.shape[-1] for energy in seen} == {100}
     for first, *others in zip(seen[::3], seen[1::3], seen[2::3], strict=True):
         assert not first.known and all(x.known and torch.equal(x.lengths, others[0].lengths) for x in others)
     assert error(result.points, truth) < 40

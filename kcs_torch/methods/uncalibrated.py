@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 import warnings
 from dataclasses import replace
@@ -14,6 +13,7 @@ from kcs_torch.errors import OptionError, users_level
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.detector import detected
 from kcs_torch.methods.perspective import (
+    WIDE,
     View,
     body_unit,
     clean_image,
@@ -122,13 +122,15 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         every = max(1, round((tracks.fps or RATE) / RATE))
         flat = clean_image(lifted)
-        x, y = flat.mean((0, 1)).tolist()
+        middle = flat.mean((0, 1))
+        aside = float((flat - middle).square().sum(-1).mean().sqrt())
         some = _liveliest(flat[::every], round(SECONDS * RATE)) * every
         rate = (tracks.fps or RATE) / every
         noise, feet = image_noise(lifted, flat, unit, tracks.fps or RATE), feet_on_ground(tracks, cameras)
         flat, depth = flat[some], lifted.points[some, :, 2] / unit
-        if not (math.isfinite(x + y) and bool(depth.isfinite().all()) and bool(depth.any())):
+        if not (aside < WIDE * USUAL * unit and bool(depth.isfinite().all()) and bool(depth.any())):
             return None
+        x, y = middle.tolist()
         ones = torch.ones_like(depth)
         view = View.of(flat, ones, Intrinsics(FAR * unit, FAR * unit, x, y), rate)
         path = first_distance(view, replace(tracks, points=flat, weights=ones, fps=rate), rate) / unit
