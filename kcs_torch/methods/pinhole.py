@@ -45,7 +45,7 @@ FREE = 0.1
 """Usual deviation of a length, as a share: how long steps are."""
 
 
-USUAL, FACTOR = 6.0, 2.0
+USUAL, FACTOR = 6.0, 1.5
 """Usual distance of a camera whose focal length is not known, for a body of 1.75, and by what factor it strays."""
 
 
