@@ -82,6 +82,41 @@ def test_who_looks_for_a_near_camera():
     assert quietly(dog.tracks).distance is None
 
 
+def test_known_cameras_stay_as_they_are():
+    """Whatever becomes of the focal length on the way."""
+    tracks, _ = filmed(frames=30)
+    known = torch.eye(3, dtype=torch.float64)[:2].expand(30, -1, -1)
+    found = quietly(tracks, cameras=known, intrinsics="auto")
+    assert found.distance is not None
+    assert_close(found.cameras, known)
+
+
+def test_a_person_on_a_treadmill():
+    """Whose size never changes: limbs alone tell that the camera is near."""
+    clip = kt.data.walking_person(300, turn=0.0, yaw=60.0)
+    points = clip.points - clip.points.mean(1, keepdim=True)
+    points = points + points.new_tensor([0.0, 0.0, 4000.0])
+    tracks = kt.Tracks.from_arrays(LENS.project(points), skeleton=clip.skeleton, fps=30.0)
+    assert likely_lens(quietly(tracks, intrinsics="parallel")) is not None
+
+
+def test_units_that_are_no_pixels():
+    tracks, _ = filmed(frames=30)
+    small = quietly(replace(tracks, points=tracks.points / 1920, units="widths"))
+    focal, plain = small.distance.log().mean().exp(), quietly(tracks).distance.log().mean().exp()
+    assert_close(1920 * focal, plain, rtol=0.05, atol=0)
+    assert any(f"focal length of {focal:.4g} widths" in note for note in small.diagnostics.notes)
+
+
+def test_a_warning_is_given_once():
+    tracks, _ = filmed(frames=30)
+    weights = tracks.weights.clone()
+    weights[:, 3] = 0
+    with pytest.warns(kt.KcsWarning) as told:
+        (found,) = kt.reconstruct_all([replace(tracks, weights=weights)])
+    assert found.distance is not None and sum("never seen" in str(one.message) for one in told) == 1
+
+
 def test_several_bodies_as_each_by_itself():
     near, far = filmed(frames=30)[0], kt.data.walking_person(30, turn=0.0, yaw=60.0).tracks
     with warnings.catch_warnings():

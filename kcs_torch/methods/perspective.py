@@ -304,8 +304,8 @@ def _refine(
 
 def lens_note(lens: Intrinsics, units: str) -> str:
     """What is told of a lens that was found."""
-    at = f"({lens.cx:.0f}, {lens.cy:.0f})"
-    return f"focal length of {lens.focal:.0f} {units} found from the tracks, principal point taken to be {at}"
+    focal, x, y = (f"{v:.0f}" if lens.focal > 100 else f"{v:.4g}" for v in (lens.focal, lens.cx, lens.cy))
+    return f"focal length of {focal} {units} found from the tracks, principal point taken to be ({x}, {y})"
 
 
 def clean_image(lifted: Reconstruction) -> Tensor:
@@ -382,7 +382,7 @@ def _in_camera(tracks: Tracks, found: _Found, k: int) -> Reconstruction:
     return replace(
         lifted,
         points=points,
-        cameras=(look.mT @ complete_rotation(lifted.cameras))[:, :2],
+        cameras=(found.view.look.mT @ complete_rotation(lifted.cameras))[:, :2],
         scales=intrinsics.focal / root,
         lengths=bones.median(0).values,
         tracks=tracks,

@@ -17,7 +17,7 @@ from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["NEAREST", "USUAL", "Body", "PinholeEnergy"]
+__all__ = ["NEAREST", "USUAL", "Body", "PinholeEnergy", "unusual"]
 
 NEAREST = 0.15
 """Joints are kept at least this share of the body's distance before the camera."""
@@ -47,6 +47,11 @@ FREE = 0.1
 
 USUAL, FACTOR = 6.0, 1.5
 """Usual distance of a camera whose focal length is not known, for a body of 1.75, and by what factor it strays."""
+
+
+def unusual(distance: float) -> float:
+    """What a distance costs where the focal length is not known."""
+    return math.log(distance / USUAL) ** 2 / (2 * math.log(FACTOR) ** 2)
 
 
 class Body(NamedTuple):

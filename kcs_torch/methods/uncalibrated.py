@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from dataclasses import replace
@@ -23,7 +24,7 @@ from kcs_torch.methods.perspective import (
     lens_note,
     reconstruct_perspective,
 )
-from kcs_torch.methods.pinhole import USUAL, PinholeEnergy
+from kcs_torch.methods.pinhole import USUAL, PinholeEnergy, unusual
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -34,12 +35,16 @@ __all__ = ["likely_lens", "may_be_near", "reconstruct_uncalibrated"]
 FAR = 34.0
 """Distance, for a body of 1.75, from which on rays are taken to be parallel."""
 
-BETTER = 5.0
-"""By how much the energy must be lower than of a body at this distance for a nearer one to be believed; a detector's
-tracks come from a real camera, which hardly ever is as far away."""
+NEAR = 10.0
+"""Distance up to which a camera is near: from there on a wrong focal length does more harm than parallel rays."""
 
-SECONDS, RATE, STEPS = 5.0, 30.0, 40
-"""How much of a clip tells whether a camera is near, at how many frames a second at most, and in how many steps."""
+BETTER, SEEN = 5.0, 1.0
+"""By how much the energy must be lower than of a far body for a near one to be believed; and in a detector's tracks,
+which come from a real camera."""
+
+SECONDS, RATE, STEPS = 5.0, 30.0, 60
+"""How much of a clip tells whether a camera is near, at how many frames a second at most, and in how many steps; as
+many again where these do not find back to a far body."""
 
 
 def may_be_near(tracks: Tracks) -> bool:
@@ -83,8 +88,9 @@ def reconstruct_uncalibrated(
         result = judge(tracks, cameras) if lifted is None else lifted
     before = 0.0 if lifted is None else lifted.diagnostics.seconds
     lens = likely_lens(result, cameras)
+    near: Reconstruction | None = None
     if lens is not None:
-        with warnings.catch_warnings(record=judge is not method):
+        with warnings.catch_warnings(record=judge is not method or lifted is not None):
             near = reconstruct_perspective(judge, tracks, lens, cameras, any_focal=True)
         if judge is not method:
             assert near.distance is not None
@@ -93,7 +99,8 @@ def reconstruct_uncalibrated(
             near = reconstruct_perspective(method, tracks, lens, cameras)
             notes = (*near.diagnostics.notes, lens_note(lens, tracks.units))
             near = replace(near, diagnostics=replace(near.diagnostics, notes=notes))
-        result = near if bool(near.points.isfinite().all()) else result
+    if near is not None and bool(near.points.isfinite().all()):
+        result = near
     elif judge is not method:
         result = method(tracks, cameras)
     else:
@@ -140,10 +147,15 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
         energy = PinholeEnergy(
             tracks.skeleton, view.rays, path, depth, rate, noise[some], standing=standing, focal=lens
         )
-        found = lbfgs(energy, energy.start, num_steps=STEPS, tolerance=1e-6, slopes=True, part=energy.rows)
-        assert found.energy is not None
-        better = 0.0 if detected(tracks.weights) else BETTER
-        near = bool(found.energy[1] < found.energy[0] - better) and bool(energy.unpack(found.value).focal[1] < 1)
+        state, gain = energy.start, -math.inf
+        for _ in range(2):
+            found = lbfgs(energy, state, num_steps=STEPS, tolerance=1e-6, slopes=True, part=energy.rows)
+            assert found.energy is not None
+            state, gain = found.value, float(found.energy[0] - found.energy[1])
+            if gain > -unusual(FAR):  # to be as far away costs no more than that
+                break
+        better = SEEN if detected(tracks.weights) else BETTER
+        near = gain > better and FAR * float(energy.unpack(state).focal[1]) < NEAR
     return Intrinsics(USUAL * unit, USUAL * unit, x, y) if near else None
 
 
