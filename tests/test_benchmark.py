@@ -136,7 +136,7 @@ def test_real_case_with_its_lens(root, shared, tmp_path):
     assert (first["intrinsics"], second["intrinsics"]) == ("none", "true")
     assert float(second["pa"]) < float(first["pa"])
     wrong = benchmark(root, tmp_path, *words, "intrinsics=maybe")
-    assert wrong.returncode == 1 and "intrinsics=maybe: expected null, true or auto" in wrong.stdout + wrong.stderr
+    assert wrong.returncode == 1 and "expected null, true, auto or parallel" in wrong.stdout + wrong.stderr
 
 
 def test_real_case_with_true_cameras(root, shared, tmp_path):
