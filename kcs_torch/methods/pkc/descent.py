@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, incidence
+from kcs_torch.methods.pkc.image import Image, Slopes, bend_cost
 from kcs_torch.methods.pkc.sides import Sides
 
 if TYPE_CHECKING:
@@ -24,30 +25,6 @@ HEAVY = 4.0
 
 ANCHOR = 0.01
 """Standard deviation of a length that is known from elsewhere in the clip, as a share."""
-
-
-class Image(NamedTuple):
-    """What the image of bones alone decides; K is 1, or H where each hypothesis has its own.
-
-    Attributes:
-        bones: (K, 2, B, T).
-        flat: (K, B, T) their squared lengths.
-        seen: x and y (K, B, T) in the order of :class:`Sides`.
-        plane: (K, 2, 2, T) of the trunk's two long axes.
-        edges: (K, 2, 3, hinges, T) of the bones above and below hinges, and of their axes.
-        turns: (K, hinges, T) each: (u x v) . a = a_z turns_0 + v_z turns_1 - u_z turns_2.
-        across: (K, hinges, T) squared lengths of the axes.
-        along: (K, limbs, T) of upper arms and thighs along the axes.
-    """
-
-    bones: Tensor
-    flat: Tensor
-    seen: tuple[Tensor, Tensor]
-    plane: Tensor
-    edges: Tensor
-    turns: tuple[Tensor, Tensor, Tensor]
-    across: Tensor
-    along: Tensor
 
 
 class Descent:
@@ -97,14 +74,7 @@ class Descent:
 
     def imaged(self, bones: Tensor) -> Image:
         """What an image of the bones, (K, 2, B, T), decides."""
-        lines = self.lines @ bones  # (K, 2, 2 + 3 hinges, T)
-        edges = lines[:, :, 2:].unflatten(2, (3, -1))
-        (ux, uy), (vx, vy), (ax, ay) = (edge.unbind(1) for edge in edges.unbind(2))
-        turns = ux * vy - uy * vx, ax * uy - ay * ux, ax * vy - ay * vx
-        along = (ux * ax + uy * ay)[:, self.outer]
-        x, y = bones.index_select(2, self.sides.order).unbind(1)
-        plane = lines[:, :, :2].transpose(1, 2)
-        return Image(bones, bones.square().sum(1), (x, y), plane, edges, turns, ax.square() + ay.square(), along)
+        return Image.of(bones, self.lines, self.sides.order, self.outer)
 
     def __call__(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Value (H,) and gradient (H, B T + B) of unknowns (H, B T + B)."""
@@ -140,24 +110,21 @@ class Descent:
         dz = own if self.mix is None else self.mix @ own
         value, slope, growth = self._lengths(dz, lengths, image, drawn)
         lines = self.lines @ dz
-        back = torch.zeros_like(lines)
-        pulled = None if drawn is None else back.new_zeros(count, 2, *lines.shape[1:])  # what back is, of x and y
-        value = value + self._smoothness(dz, slope)
-        value = value + self._posture(dz, lengths, image, lines[:, :2], slope, growth, back[:, :2], drawn, pulled)
+        out = Slopes.of(slope, growth, lines, drawn)
+        value = value + bend_cost(dz, 1 / wide(self.weights.acceleration, 2) ** 2, slope, self.time)
+        value = value + self._posture(dz, lengths, image, lines[:, :2], out)
         if len(self.lines) > 2:
-            value = value + self._hinges(lengths, image, lines[:, 2:], growth, back[:, 2:], pulled)
-        value = value + self._foreshortening(dz, lengths, slope, growth)
+            value = value + self._hinges(lengths, image, lines[:, 2:], out)
+        value = value + self._foreshortening(dz, lengths, out)
         value = value + self._sizes(lengths, growth)
-        slope.baddbmm_(self.lines.mT.expand(count, -1, -1), back)
+        slope.baddbmm_(self.lines.mT.expand(count, -1, -1), out.lines)
         if drawn is not None:
-            assert pulled is not None
-            drawn += self.lines.mT @ pulled
+            drawn += self.lines.mT @ out.flat_lines
         if self.mix is not None:
             slope = self.mix.mT @ slope
         return value, slope, growth
 
-    # Each term returns its value (H,) and adds its derivative in dz to slope (H, B, T), that in the logarithms of the
-    # lengths to growth (H, B), and, where it is asked for, that in the image to drawn (H, 2, B, T).
+    # Each term returns its value (H,) and adds its derivatives to the slopes.
 
     def _lengths(
         self, dz: Tensor, lengths: Tensor, image: Image, drawn: Tensor | None
@@ -198,31 +165,7 @@ class Descent:
         slope = bent.mul_(dz)
         return obj.count / 2 * value.log1p().sum(-1), slope, growth
 
-    def _smoothness(self, dz: Tensor, slope: Tensor) -> Tensor:
-        if dz.shape[-1] < 3:
-            return dz.new_zeros(len(dz))
-        bend = (dz[..., 2:] + dz[..., :-2]).sub_(dz[..., 1:-1], alpha=2)
-        if self.time is not None:
-            bend = bend * self.time[..., 2:]
-        weight = 1 / wide(self.weights.acceleration, 2) ** 2
-        pull = bend * weight
-        slope[..., 2:] += pull
-        slope[..., :-2] += pull
-        slope[..., 1:-1].sub_(pull, alpha=2)
-        return (bend * pull).sum((1, 2)) / 2
-
-    def _posture(
-        self,
-        dz: Tensor,
-        lengths: Tensor,
-        image: Image,
-        depths: Tensor,
-        slope: Tensor,
-        growth: Tensor,
-        back: Tensor,
-        drawn: Tensor | None,
-        pulled: Tensor | None,
-    ) -> Tensor:
+    def _posture(self, dz: Tensor, lengths: Tensor, image: Image, depths: Tensor, out: Slopes) -> Tensor:
         obj, posture = self.objective, self.objective.posture
         count, bones, frames = dz.shape
         first, second = torch.cat([image.plane.expand(count, -1, -1, -1), depths[:, :, None]], 2).unbind(1)  # (H, 3, T)
@@ -269,10 +212,10 @@ class Descent:
         pull.mul_(firm * root * scale)
         total = pull.sum(-1, keepdim=True)
         grown = (firm * moved + part * total * self.mean / scale).view(count, 3, bones).sum(1)
-        growth -= grown.index_select(1, sides.back)
+        out.growth.sub_(grown.index_select(1, sides.back))
         self._lower(pull, (1 - part) * total / real)
         pull = pull.view_as(y)
-        slope += (pull * turn[:, :, 2]).sum(1).index_select(1, sides.back)
+        out.depth.add_((pull * turn[:, :, 2]).sum(1).index_select(1, sides.back))
         turned = [(pull * v[:, None]).sum(2) for v in (*image.seen, own)]  # (H, 3, T): of k, for each j
         into = self.axes.mT @ torch.stack(turned, 2).flatten(2)  # (H, 3, 3 T)
         a, b, c = into.view(count, 3, 3, frames).unbind(1)
@@ -283,11 +226,11 @@ class Descent:
         a = a - along * b - slant * second
         b = b - slant * first
         a = (a - first * (first * a).sum(1, keepdim=True)) * over
-        back[:, 0], back[:, 1] = a[:, 2], b[:, 2]
-        if drawn is not None and pulled is not None:
+        out.lines[:, 0], out.lines[:, 1] = a[:, 2], b[:, 2]
+        if out.image is not None:
             for j in (0, 1):
-                drawn[:, j] += (pull * turn[:, :, j]).sum(1).index_select(1, sides.back)
-            pulled[:, :, 0], pulled[:, :, 1] = a[:, :2], b[:, :2]
+                out.image[:, j] += (pull * turn[:, :, j]).sum(1).index_select(1, sides.back)
+            out.flat_lines[:, :, 0], out.flat_lines[:, :, 1] = a[:, :2], b[:, :2]
         return value
 
     def _lower(self, values: Tensor, by: Tensor) -> None:
@@ -297,9 +240,7 @@ class Descent:
         else:
             values.addcmul_(by, self.time, value=-1)
 
-    def _hinges(
-        self, lengths: Tensor, image: Image, depths: Tensor, growth: Tensor, back: Tensor, pulled: Tensor | None
-    ) -> Tensor:
+    def _hinges(self, lengths: Tensor, image: Image, depths: Tensor, out: Slopes) -> Tensor:
         w, limbs = self.weights, self.objective.hinges.limbs
         upper, lower, axis = depths.unflatten(1, (3, -1)).unbind(1)  # (H, hinges, T) each
         share = 1.0 if self.time is None else self.time
@@ -314,15 +255,16 @@ class Descent:
         pull = wrong * (wide(w.hinge / w.sine**2, 2) * self.firm[:, None] * share)
         energy = (pull * wrong).sum(-1)  # twice that of each hinge
         pull = pull.mul_(scale)
-        back[:] = torch.cat([pull * rise, -pull * lean, -pull * tilt], 1)
-        if pulled is not None:
-            flat = pulled[:, :, 2:].unflatten(2, (3, -1))  # of u, v and a
+        back = out.lines[:, 2:].unflatten(1, (3, -1))  # of u, v and a
+        back[:] = torch.stack([pull * rise, -pull * lean, -pull * tilt], 1)
+        flat = None if out.image is None else out.flat_lines[:, :, 2:].unflatten(2, (3, -1))
+        if flat is not None:
             deep = depths.unflatten(1, (3, -1))
             for k in range(3):  # -(v x a), -(a x u), -(u x v)
                 i, j = (k + 1) % 3, (k + 2) % 3
                 flat[:, 0, k] = pull * (deep[:, i] * image.edges[:, 1, j] - image.edges[:, 1, i] * deep[:, j])
                 flat[:, 1, k] = pull * (image.edges[:, 0, i] * deep[:, j] - deep[:, i] * image.edges[:, 0, j])
-        growth.index_add_(1, limbs.flatten(), -energy.repeat_interleave(2, 1))
+        out.growth.index_add_(1, limbs.flatten(), -energy.repeat_interleave(2, 1))
         value, shrink = energy.sum(-1) / 2, energy
         if self.outer:  # the same for bones that reach across: -(u . a) / (|u| |a|) is at most the limit
             some = slice(None) if len(self.outer) == energy.shape[1] else self.outer
@@ -334,29 +276,28 @@ class Descent:
             each = (pull * across).sum(-1)
             value = value + (pull * wrong).sum((1, 2)) / 2
             pull = pull.mul_(scale)
-            ends = back.unflatten(1, (3, -1))
-            ends[:, 0, some] -= pull * axis[:, some]
-            ends[:, 2, some] -= pull * upper[:, some]
-            if pulled is not None:
+            back[:, 0, some] -= pull * axis[:, some]
+            back[:, 2, some] -= pull * upper[:, some]
+            if flat is not None:
                 flat[:, :, 0, some] -= pull[:, None] * image.edges[:, :, 2, some]
                 flat[:, :, 2, some] -= pull[:, None] * image.edges[:, :, 0, some]
-            growth.index_add_(1, limbs[some, 0], -each)
+            out.growth.index_add_(1, limbs[some, 0], -each)
             shrink[:, some] += each
         held = torch.where(known, shrink / total, 0)[..., None] * share
-        back[:, -len(limbs) :] -= held * axis
-        if pulled is not None:
+        back[:, 2] -= held * axis
+        if flat is not None:
             flat[:, :, 2] -= held[:, None] * image.edges[:, :, 2]
         return value
 
-    def _foreshortening(self, dz: Tensor, lengths: Tensor, slope: Tensor, growth: Tensor) -> Tensor:
+    def _foreshortening(self, dz: Tensor, lengths: Tensor, out: Slopes) -> Tensor:
         depth, size = dz.index_select(1, self.limbs), lengths[:, self.limbs]
         least = (self.objective.foreshortening.eps * size).square()
         square = depth.square().add_(least[..., None])
         each = self.clear / square
         held = self.clear.sum(-1)
         value = held * size.log() + (self.clear * square.log()).sum(-1) / 2
-        growth.index_add_(1, self.limbs, held + least * each.sum(-1))
-        slope.index_add_(1, self.limbs, each * depth)
+        out.growth.index_add_(1, self.limbs, held + least * each.sum(-1))
+        out.depth.index_add_(1, self.limbs, each * depth)
         return value.sum(-1)
 
     def _sizes(self, lengths: Tensor, growth: Tensor) -> Tensor:
