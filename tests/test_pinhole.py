@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths
-from kcs_torch.methods import pinhole
+from kcs_torch.methods import pinhole, plain_body
 from kcs_torch.methods.pinhole import PinholeEnergy
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
@@ -59,8 +59,8 @@ def test_energy_of_a_chain_by_hand():
         off = ((points[:, j] - points[:, i]).square().sum(-1) - lengths[b] ** 2) / (2 * lengths[b])
         total += frames / 2 * torch.log1p((4 * torch.log1p(off**2 / (4 * slack**2))).mean())
         dz = z[:, j] - z[:, i]
-        total += (dz[2:] - 2 * dz[1:-1] + dz[:-2]).square().sum() / (2 * (pinhole.ACCELERATION * slow**2) ** 2)
-        total += (dz - depth[0, :, j] + depth[0, :, i]).square().sum() / (2 * pinhole.CLOSE**2)
+        total += (dz[2:] - 2 * dz[1:-1] + dz[:-2]).square().sum() / (2 * (plain_body.ACCELERATION * slow**2) ** 2)
+        total += (dz - depth[0, :, j] + depth[0, :, i]).square().sum() / (2 * plain_body.CLOSE**2)
     state = energy.start + normal(*energy.start.shape, seed=4)
     assert_close(energy(state)[0], total[None])
 
@@ -145,7 +145,7 @@ def test_unknowns_are_nearly_a_sphere():
     standing[5:15, 0] = standing[15:25, 1] = 1.0
     lens = torch.ones(1).double(), torch.ones(1, dtype=torch.bool)
     energy = PinholeEnergy(skeleton, rays, far, depth[None], 30.0, level(rays), standing=standing, focal=lens)
-    parts = torch.arange(len(energy.start[0])).split(energy._sizes)
+    parts = torch.arange(len(energy.start[0])).split(energy.sizes)
     curves = []
     for part in parts:
         some = torch.zeros(20, len(energy.start[0])).double()

@@ -11,22 +11,19 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.spectral import dct_basis
-from kcs_torch.methods.pkc.descent import HEAVY, Descent
+from kcs_torch.methods.pinhole_coordinates import FIRM, STRAY, USUAL, coordinates
+from kcs_torch.methods.pkc.descent import Descent
+from kcs_torch.methods.pkc.image import bend_cost
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
+from kcs_torch.methods.plain_body import PlainBody
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["NEAREST", "USUAL", "Body", "PinholeEnergy", "unusual"]
+__all__ = ["NEAREST", "Body", "PinholeEnergy"]
 
 NEAREST = 0.15
 """Joints are kept at least this share of the body's distance before the camera."""
-
-ACCELERATION = 0.05
-"""Standard deviation of the second difference of a bone's depth at 30 frames a second, without a template."""
-
-CLOSE = 0.3
-"""Usual deviation of a bone's depth from the method's, for bodies without a template."""
 
 SPEED, ROOT = 3.0, 0.01
 """Usual speed towards the camera a second, and the standard deviation of the second difference of the distance at 30
@@ -35,23 +32,8 @@ frames a second, for a body of 1.75."""
 INDEPENDENT = 6.0
 """Frames that count as one for the speed at 30 frames a second."""
 
-STRAY = 0.1
-"""Usual deviation of the distance from what is given, as a share, all frames counting as one."""
-
 FASTEST = 4.0
 """Periods a second of the fastest change of the distance."""
-
-FREE = 0.1
-"""Usual deviation of a length, as a share: how long steps are."""
-
-
-USUAL, FACTOR = 6.0, 1.5
-"""Usual distance of a camera whose focal length is not known, for a body of 1.75, and by what factor it strays."""
-
-
-def unusual(distance: float) -> float:
-    """What a distance costs where the focal length is not known."""
-    return math.log(distance / USUAL) ** 2 / (2 * math.log(FACTOR) ** 2)
 
 
 class Body(NamedTuple):
@@ -157,8 +139,8 @@ class PinholeEnergy:
         self.free = None if focal is None else focal[1]
         self.path, self.wide, self.depth = path, wide[:, None], depth.mT.contiguous()
         self.own = bone_vectors(depth[..., None], self.bones)[..., 0].mT.contiguous()
-        own = self._sizes_of(self.own, self._imaged(*self._far(self.depth, path, self.wide)[:1]))
-        own = own.median(-1).values.clamp_min(1e-6)
+        image = self._imaged(self._far(self.depth, path, self.wide)[0])
+        own = (self.own.square() + image.square().sum(1)).sqrt().median(-1).values.clamp_min(1e-6)
         if lengths is not None:  # the distance that they tell
             ratio = (lengths / own).median(-1, keepdim=True).values
             self.path = path * ratio
@@ -168,32 +150,32 @@ class PinholeEnergy:
         waves = dct_basis(len(rays), max(1, min(len(rays), most)), dtype=rays.dtype, device=rays.device)
         waves = waves * math.sqrt(len(rays))
         self.waves = waves if self.known else waves[:, 1:]  # (T, K)
-        self.rigid = torch.zeros_like(self.lengths[0])
-        self.rigid[list(skeleton.rigid)] = 1
+        self.rough = (ROOT * self.slow**2) ** -2
         self.model: Objective | None = None
-        self.acceleration = ACCELERATION * self.slow**2
-        image = self._imaged(*self._far(self.depth, self.path, self.wide)[:1])
+        self.body: Descent | PlainBody
+        image = self._imaged(self._far(self.depth, self.path, self.wide)[0])
         if len(trunk_joints(skeleton)) >= 3:
             flat = (tree @ image[0]).permute(2, 1, 0)  # (T, N, 2), centred
             weights = at_pace(Weights(), rate, pace_of(flat, skeleton, rate))
             self.model = Objective(skeleton, flat, weights, noise, standing=standing)
-            self.descent = Descent(self.model)
-            self.acceleration = weights.acceleration
+            self.body = Descent(self.model)
             free = self.model.foreshortening
             self.share = (self.model.clear * (free.free.to(rays) / free.correlation)).mT  # (B, T)
         else:
-            self.near = self.own
-            self.slack = math.hypot(Weights().length, float(noise.median()) if noise.numel() else 0.0)
-        self.shear, self.drift, self.lean, self.scale = self._coordinates(image)
+            slack = math.hypot(Weights().length, float(noise.median()) if noise.numel() else 0.0)
+            self.body = PlainBody(skeleton, self.own, slack, self.slow)
+        self.shear, self.drift, self.lean, self.scale = coordinates(self, image)
         self.start = torch.zeros_like(self.scale)
 
     def rows(self, index: Tensor) -> PinholeEnergy:
         """That of some hypotheses."""
         out = copy(self)
-        names = ["path", "wide", "depth", "own", "lengths", "shear", "drift", "lean", "scale", "start"]
-        names += ["near"] * (self.model is None) + ["free"] * (self.free is not None)
-        for name in names:
+        for name in ("path", "wide", "depth", "own", "lengths", "shear", "drift", "lean", "scale", "start"):
             setattr(out, name, getattr(self, name)[index])
+        if self.free is not None:
+            out.free = self.free[index]
+        if isinstance(self.body, PlainBody):
+            out.body = self.body.rows(index)
         return out
 
     def unpack(self, state: Tensor) -> Body:
@@ -208,18 +190,17 @@ class PinholeEnergy:
         change = (path / self.path).log()
         distance = path / wide
         value, along = self._steady(distance)
-        firm = 0.0 if self.free is None else self.free / math.log(FACTOR) ** 2
+        firm = 0.0 if self.free is None else FIRM * self.free
         usual = (wide * USUAL / self.path.mean(-1, keepdim=True)).log()  # (H, 1)
         value = value + firm * usual[:, 0].square() / 2
         value = value + change.square().mean(-1) / (2 * STRAY**2)
-        if self.model is None:
-            cost, slope, growth, drawn = self._plain(laid)
-        else:
-            cost, slope, growth, drawn = self.descent.with_image(laid.own, laid.lengths, laid.image)
-            cost = cost - self.model.proportions(laid.lengths) if self.known else cost
+        cost, slope, growth, drawn = self.body.with_image(laid.own, laid.lengths, laid.image)
         value = value + cost
+        if self.model is not None and self.known:
+            value = value - self.model.proportions(laid.lengths)
+        n = self.seen.shape[1]
         pull = torch.zeros_like(far)  # in far
-        pull[:, : self.seen.shape[1]] = ((self.seen.mT @ drawn) * self.rays[:, : self.seen.shape[1]]).sum(1)
+        pull[:, :n] = ((self.seen.mT @ drawn) * self.rays[:, :n]).sum(1)
         deep = torch.zeros_like(far)  # in the depth
         shrink = torch.zeros_like(wide[:, 0])  # in w
         if self.model is not None:
@@ -241,7 +222,7 @@ class PinholeEnergy:
 
     def _laid(self, state: Tensor) -> _Laid:
         """Where the unknowns (H, D) lay bodies."""
-        part, grown, shares, focus = (state * self.scale).split(self._sizes, 1)
+        part, grown, shares, focus = (state * self.scale).split(self.sizes, 1)
         change = shares @ self.waves.mT  # (H, T) of the path's logarithm
         moved = part.view_as(self.own) - self.drift * change[:, None]
         lengths, wide = self.lengths, self.wide
@@ -266,52 +247,13 @@ class PinholeEnergy:
         n = self.seen.shape[1]
         return self.seen @ (self.rays[:, :n] * far[:, None, :n])
 
-    @staticmethod
-    def _sizes_of(own: Tensor, image: Tensor) -> Tensor:
-        """Lengths (H, B, T) of bones."""
-        return (own.square() + image.square().sum(1)).sqrt()
-
     def _steady(self, distance: Tensor) -> tuple[Tensor, Tensor]:
         """What speed and changes of it cost, (H,), and the slope in the distance (H, T)."""
-        slope = torch.zeros_like(distance)
-        value = distance.new_zeros(len(distance))
-        slow, quick = (ROOT * self.slow**2) ** -2, (self.rate / SPEED) ** 2 * self.slow / INDEPENDENT
-        step = distance.diff()
-        if step.shape[-1]:
-            value = value + quick / 2 * step.square().sum(-1)
-            slope[:, 1:] += quick * step
-            slope[:, :-1] -= quick * step
-        bend = step.diff()
-        if bend.shape[-1]:
-            value = value + slow / 2 * bend.square().sum(-1)
-            slope[:, 2:] += slow * bend
-            slope[:, 1:-1] -= 2 * slow * bend
-            slope[:, :-2] += slow * bend
-        return value, slope
-
-    def _plain(self, laid: _Laid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The energy (H,) of bodies without a template; its slopes in bones' depths, log lengths and images."""
-        dz, size, frames = laid.own, laid.lengths[..., None], laid.own.shape[-1]
-        off = (laid.image.square().sum(1) + dz.square() - size.square()) / (2 * size)
-        ratio = self.rigid[:, None] * off / (HEAVY * self.slack**2)
-        each = ratio * off
-        spread = HEAVY * each.log1p().mean(-1)
-        value = frames / 2 * spread.log1p().sum(-1)
-        pull = HEAVY * ratio / (1 + each) / (1 + spread)[..., None]  # in off
-        growth = -(pull * (off + size)).sum(-1)
-        pull = pull / size
-        slope, drawn = pull * dz, pull[:, None] * laid.image
-        away = dz - self.near
-        value = value + away.square().sum((1, 2)) / (2 * CLOSE**2)
-        slope = slope + away / CLOSE**2
-        if frames > 2:
-            bend = dz.diff(n=2)
-            value = value + bend.square().sum((1, 2)) / (2 * self.acceleration**2)
-            bend = bend / self.acceleration**2
-            slope[..., 2:] += bend
-            slope[..., 1:-1] -= 2 * bend
-            slope[..., :-2] += bend
-        return value, slope, growth, drawn
+        quick = (self.rate / SPEED) ** 2 * self.slow / INDEPENDENT
+        pull = quick * distance.diff()
+        slope = _gathered(pull)
+        value = (pull * distance.diff()).sum(-1) / 2
+        return value + bend_cost(distance[:, None], self.rough, slope[:, None]), slope
 
     def _contact(self, laid: _Laid, distance: Tensor, deep: Tensor, along: Tensor, shrink: Tensor) -> Tensor:
         """What standing feet cost that move along their rays, (H,); adds to slopes in depths, distance and w."""
@@ -328,7 +270,7 @@ class PinholeEnergy:
         ratio = step / model.feet.slip**2
         value = (both * (ratio * step).log1p()).sum((1, 2)) / 2
         pull = both * ratio / (1 + ratio * step)
-        drawn = torch.nn.functional.pad(pull, (1, 0)) - torch.nn.functional.pad(pull, (0, 1))
+        drawn = _gathered(pull)
         shrink += (drawn * where * slant / steep).sum((1, 2)) * laid.wide[:, 0]
         drawn = drawn * steep
         deep[:, feet] += drawn
@@ -347,61 +289,12 @@ class PinholeEnergy:
         return 2 * (self.share * (middle / self.path.mean(-1)[:, None, None]).log()).sum((1, 2))
 
     @property
-    def _sizes(self) -> list[int]:
+    def sizes(self) -> list[int]:
         """Of bones' depths, lengths, waves and the focal length among the unknowns."""
         frames, bones = self.rays.shape[-1], len(self.bones)
         return [frames * bones, 0 if self.known else bones, self.waves.shape[1], 0 if self.free is None else 1]
 
-    def _coordinates(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """How bones' depths (H, B, T) go with log lengths, and against log distances and log w, and scales (H, D).
 
-        Scales are the roots of the curvature's inverse, roughly: of the lengths', smoothness and posture terms and of
-        the distance's own.
-        """
-        model = self.model
-        dz, size, distance = self.own, self.lengths[..., None], self.path / self.wide
-        flat = image.square().sum(1)
-        off = (flat + dz.square() - size.square()) / (2 * size)
-        precision = self.rigid[:, None] / self.slack**2 if model is None else model.precision(self.lengths).mT
-        spread = HEAVY * torch.log1p(precision * off.square() / HEAVY).mean(-1, keepdim=True)
-        pull = precision / (1 + spread.clamp_max(1))
-        smooth = 6 / self.acceleration**2  # the mean square of a second difference's coefficients
-        if model is None:
-            shape = torch.full_like(size, 1 / CLOSE**2)
-        else:
-            usual = model.posture.deviation.square().mean(-1)[:, None]
-            shape = 5 / (model.weights.posture * (usual * size.square()).clamp_min(1e-3))
-        curve = pull * (dz / size).square() + smooth + shape
-        near = dz.square() + (0.5 * size).square()
-        n = self.seen.shape[1]
-        slid = self.seen @ (self.rays[:, :n] * self.depth[:, None, :n]) * self.wide[..., None, None]
-        slid = (slid * image).sum(1)  # by how much the squared image grows with log w, halved
-        shear, drift, lean = (x * dz / near for x in (size.square(), flat, slid))
-        own = (pull * (size - dz * shear / size).square()).sum(-1) + 1 / FREE**2
-        own = own + shear.diff(n=2).square().sum(-1) / self.acceleration**2
-        left = (pull * (flat / size - dz * drift / size).square()).sum(1)  # (H, T)
-        steps = [self.waves.diff(n=n, dim=0).square().sum(0) for n in (1, 2)]  # (K,) each
-        waves = left @ self.waves.square() + 1 / STRAY**2
-        rough = (ROOT * self.slow**2) ** -2
-        waves = waves + distance.square().mean(-1, keepdim=True) * steps[1] * rough
-        waves = waves + drift.square().mean(-1).sum(-1, keepdim=True) * steps[1] / self.acceleration**2
-        focus = (pull * ((slid - dz * lean) / size).square()).sum((1, 2)) + 1 / math.log(FACTOR) ** 2
-        focus = focus + lean.diff(n=2).square().sum((1, 2)) / self.acceleration**2
-        focus = focus + distance.diff(n=2).square().sum(-1) * rough
-        if model is not None and model.standing is not None and model.standing.numel():
-            firm = model.weights.contact / model.feet.slip**2
-            both = torch.minimum(model.standing[1:], model.standing[:-1])
-            each = torch.nn.functional.pad(both, (0, 0, 0, 1)) + torch.nn.functional.pad(both, (0, 0, 1, 0))
-            lines = self.lines[list(self.skeleton.contacts)]  # (C, B)
-            curve = curve + firm * lines.mT.square() @ each.mT
-            pulled = torch.einsum("hbt,cb->hbct", shear, lines).diff(dim=-1)
-            own = own + firm * torch.einsum("tc,hbct->hb", both, pulled.square())
-            moves = (distance[:, None] - lines @ drift).square() * each.mT / 2
-            waves = waves + firm * moves.sum(1).mean(-1, keepdim=True) * steps[0]
-            moves = distance[:, None].diff() + (lines @ lean).diff()
-            focus = focus + firm * (both.mT * moves.square()).sum((1, 2))
-        parts = [curve.flatten(1), waves] if self.known else [curve.flatten(1), own, waves]
-        scale = torch.cat(parts, 1).rsqrt()
-        if self.free is not None:
-            scale = torch.cat([scale, (self.free / focus.sqrt())[:, None]], 1)
-        return shear, drift, lean, scale
+def _gathered(pull: Tensor) -> Tensor:
+    """The slope (..., T) in values whose differences have the slope (..., T - 1)."""
+    return torch.nn.functional.pad(pull, (1, 0)) - torch.nn.functional.pad(pull, (0, 1))

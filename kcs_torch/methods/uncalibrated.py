@@ -24,7 +24,8 @@ from kcs_torch.methods.perspective import (
     lens_note,
     reconstruct_perspective,
 )
-from kcs_torch.methods.pinhole import USUAL, PinholeEnergy, unusual
+from kcs_torch.methods.pinhole import PinholeEnergy
+from kcs_torch.methods.pinhole_coordinates import USUAL, unusual
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
