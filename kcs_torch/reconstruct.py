@@ -126,7 +126,8 @@ def reconstruct_all(
         return [_before(lens, chosen, one) for one in people]
     found = chosen.many(people)
     if lens is None and chosen.turns_over:
-        found = [reconstruct_uncalibrated(chosen, x.tracks, lifted=x) if may_be_near(x.tracks) else x for x in found]
+        pairs = zip(people, found, strict=True)
+        found = [reconstruct_uncalibrated(chosen, one, lifted=x) if may_be_near(one) else x for one, x in pairs]
     return found
 
 

@@ -6,7 +6,6 @@ import math
 import time
 import warnings
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,30 +13,22 @@ from torch import Tensor
 from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
-from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import Method, apart, check_cameras
-from kcs_torch.methods.detector import detected, detector_deviation
-from kcs_torch.methods.finish import rms
-from kcs_torch.methods.pinhole import NEAREST
-from kcs_torch.methods.pkc.objective import usual_posture
+from kcs_torch.methods.detector import detected
+from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
 from kcs_torch.methods.scene import Bodies, Scene, ahead
-from kcs_torch.methods.size import slow_waves, weak_perspective
-from kcs_torch.methods.unseen import gap_deviation
+from kcs_torch.methods.view import View, lens_note, slow_part, zoomed
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
-__all__ = ["reconstruct_perspective"]
+__all__ = ["WIDE", "feet_on_ground", "reconstruct_perspective"]
 
 SETTLED = 0.01
 """Root mean square change of depth, for a body of 1.75, below which no further round is made."""
 
 FLAT = 0.0003
 """Root mean square parallax, for a body of 1.75, below which there is no perspective to speak of."""
-
-APPARENT = 0.004
-"""Root mean square tangent between joints and the line of sight from which on distances follow the size over time, even
-if it is not sure to change: that of a person some 100 metres away."""
 
 APART = 0.04
 """Root mean square difference in depth, for a body of 1.75, from which on solutions count as two."""
@@ -47,35 +38,6 @@ STILL = 2.0
 
 WIDE = 3.0
 """Tangent of the angle off the optical axis from which on the focal length is hardly true."""
-
-
-class View(NamedTuple):
-    """What a virtual camera sees that looks at a body along its line of sight, ray by ray.
-
-    Attributes:
-        lens: of the camera.
-        look: (T, 3, 3) rotations from the camera's frame to the virtual one's.
-        rays: (T, N, 2) of the tracks.
-    """
-
-    lens: Intrinsics
-    look: Tensor
-    rays: Tensor
-
-    @classmethod
-    def of(cls, points: Tensor, weights: Tensor, lens: Intrinsics, rate: float) -> View:
-        """That of tracks (T, N, 2) of weights (T, N)."""
-        rays = lens.rays(points)
-        look = _line_of_sight(rays, weights, rate)
-        return cls(lens, look, _onto(rays @ look.mT))
-
-    def longer(self, by: float, weights: Tensor, rays: Tensor, rate: float) -> tuple[View, Tensor]:
-        """Through a lens of another focal length, and these rays (T, N, 2) of it, too."""
-        lens = replace(self.lens, fx=self.lens.fx * by, fy=self.lens.fy * by)
-        ones = torch.ones_like(rays[..., :1])
-        back = [self.lens.project(torch.cat([x, ones], -1) @ self.look) for x in (self.rays, rays)]
-        view = View.of(back[0], weights, lens, rate)
-        return view, _onto(lens.rays(back[1]) @ view.look.mT)
 
 
 @dataclass(frozen=True)
@@ -162,8 +124,8 @@ def _reconstruct(
             KcsWarning,
             stacklevel=users_level(),
         )
-    view = View.of(tracks.points, tracks.weights, intrinsics, rate)
-    distance = first_distance(view, tracks, rate)
+    view = View.of(tracks, intrinsics, rate)
+    distance = view.first_distance(tracks, rate)
     depth = torch.zeros_like(view.rays[..., 0])
     if cameras is not None:
         cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
@@ -184,7 +146,7 @@ def _reconstruct(
             break
         distance, depth = bodies.distance[0], bodies.depth[0]
         if any_focal:
-            view, _ = view.longer(float(bodies.focal[0]), tracks.weights, view.rays, rate)
+            view = View.of(tracks, zoomed(view.lens, float(bodies.focal[0])), rate)
     assert best is not None
     exact = len(trunk_joints(tracks.skeleton)) >= 3 and not detected(tracks.weights)
     if method.turns_over and exact and not best.flat:
@@ -192,47 +154,9 @@ def _reconstruct(
     return _assemble(tracks, best)
 
 
-def first_distance(view: View, tracks: Tracks, rate: float) -> Tensor:
-    """Distances (T,) that the body's size in the image tells, the focal length on average."""
-    rays = view.rays
-    size = weak_perspective(rays, tracks.seen, tracks.skeleton, rate)
-    wide = float(rays[tracks.seen].square().sum(-1).mean().sqrt()) if bool(tracks.seen.any()) else 0.0
-    distance = torch.full_like(rays[:, 0, 0], view.lens.focal)
-    return distance / size.path if size.sure or wide > APPARENT else distance
-
-
 def feet_on_ground(tracks: Tracks, cameras: Tensor | None) -> Tensor | None:
     """How surely contact points stand still, (T, C); None where cameras (T, 2, 3) are known to turn."""
     return standing_feet(tracks) if cameras is None or float(viewpoint_turn(cameras)) < STILL else None
-
-
-def _line_of_sight(rays: Tensor, weights: Tensor, rate: float) -> Tensor:
-    """Rotations (T, 3, 3) from the camera's frame to one that looks at the body, turning slowly."""
-    count = weights.sum(-1, keepdim=True)
-    middle = (rays * weights[..., None]).sum(-2) / torch.where(count > 0, count, torch.ones_like(count))
-    middle = interpolate(middle[:, None], count > 0)[:, 0]
-    smooth = _slow(middle, rate, most=60)
-    if not bool((count > 0).any()):
-        smooth = smooth + smooth.new_tensor([0.0, 0.0, 1.0])  # nobody to look at
-    ahead = torch.nn.functional.normalize(smooth, dim=-1)
-    right = torch.zeros_like(ahead)
-    right[:, 0] = 1
-    right = torch.nn.functional.normalize(right - ahead[:, :1] * ahead, dim=-1)
-    return torch.stack([right, torch.linalg.cross(ahead, right), ahead], 1)
-
-
-def _onto(rays: Tensor) -> Tensor:
-    """Rays (T, N, 3) where they pass the plane z = 1."""
-    return rays[..., :2] / rays[..., 2:].clamp_min(NEAREST)
-
-
-def _slow(values: Tensor, rate: float, *, most: int = 12) -> Tensor:
-    """The slow part of (T, D)."""
-    waves = slow_waves(len(values), rate, values, most=most)
-    basis = torch.cat([torch.ones_like(waves[:, :1]), waves], -1)
-    ridge = 1e-6 * len(values) * torch.eye(basis.shape[1], dtype=values.dtype, device=values.device)
-    mean = values.mean(0)
-    return mean + basis @ torch.linalg.solve(basis.mT @ basis + ridge, basis.mT @ (values - mean))
 
 
 def _straighten(tracks: Tracks, rays: Tensor, distance: Tensor, depth: Tensor) -> Tracks:
@@ -276,9 +200,7 @@ def _refine(
     start = torch.stack([o.points[..., 2] for o in others])
     start = start - start.mean(-1, keepdim=True)
     unit = body_unit(lifted)
-    exact = (
-        distance / _slow(lifted.scales.clamp_min(1e-9).log()[:, None], rate)[:, 0].exp()
-    )  # a method's own scales may jump
+    scales = slow_part(lifted.scales.clamp_min(1e-9).log()[:, None], rate)[:, 0].exp()  # a method's own may jump
     noise = image_noise(lifted, flat, unit, rate)
     scene = Scene(lifted.skeleton, rays, noise, rate, unit, standing)
     parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / unit
@@ -290,7 +212,7 @@ def _refine(
         return _Found(bodies, others, scene, view, True, lifted.diagnostics.notes)
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
-    bodies = scene.refined(exact, start, steps)
+    bodies = scene.refined(distance / scales, start, steps)
     if flips:
         bodies = scene.turned_over(bodies, steps)
     if any_focal:
@@ -300,40 +222,6 @@ def _refine(
         rest = replace(bodies[1:], energy=bodies.energy[1:] + (best.energy - bodies.energy[:1]))
         bodies = replace(best, origin=bodies.origin[:1]).joined(rest)
     return _Found(bodies, others, scene, view, False, lifted.diagnostics.notes)
-
-
-def lens_note(lens: Intrinsics, units: str) -> str:
-    """What is told of a lens that was found."""
-    focal, x, y = (f"{v:.0f}" if lens.focal > 100 else f"{v:.4g}" for v in (lens.focal, lens.cx, lens.cy))
-    return f"focal length of {focal} {units} found from the tracks, principal point taken to be ({x}, {y})"
-
-
-def clean_image(lifted: Reconstruction) -> Tensor:
-    """A method's image (T, N, 2) under parallel rays: of all joints, and without noise."""
-    flat = lifted.points[..., :2]
-    middle = flat.mean(1, keepdim=True)
-    return middle + lifted.scales[:, None, None] * (flat - middle)
-
-
-def image_noise(lifted: Reconstruction, flat: Tensor, unit: float, rate: float) -> Tensor:
-    """Standard deviation (T, N) of joints in a clean image (T, N, 2), for a body of 1.75."""
-    tracks, off = lifted.tracks, flat - flat.mean(1, keepdim=True)
-    size = rms(off, torch.ones_like(off[..., 0])) / unit
-    stray = (flat - tracks.points).square().sum(-1)[tracks.seen]
-    level = math.sqrt(float(stray.median()) / 1.39) / unit / 2 if len(stray) else 0.0  # whatever outliers there are
-    share = gap_deviation(off / (size * unit), tracks.seen, rate)
-    return (size * share.maximum(detector_deviation(tracks.weights))).clamp_min(level)
-
-
-def body_unit(lifted: Reconstruction) -> float:
-    """The unit in which the body is about as large as a person of 1.75."""
-    if len(trunk_joints(lifted.skeleton)) >= 3:
-        usual = usual_posture(lifted.skeleton, lifted.lengths.dtype, lifted.lengths.device).rest_lengths
-        unit = float((lifted.lengths / usual).median())
-    else:
-        points = lifted.points - lifted.points.mean(1, keepdim=True)
-        unit = 2 * float(points.square().sum(-1).mean().sqrt())
-    return unit if 0 < unit < math.inf else 1.0
 
 
 def _assemble(tracks: Tracks, found: _Found) -> Reconstruction:
@@ -354,8 +242,8 @@ def _in_camera(tracks: Tracks, found: _Found, k: int) -> Reconstruction:
     lifted = found.lifted[int(bodies.origin[k])]
     view, scene = found.view, found.scene
     if scene.any_focal:
-        view, rays = view.longer(float(bodies.focal[k]), tracks.weights, scene.rays, scene.rate)
-        scene = replace(scene, rays=rays)
+        view = View.of(tracks, zoomed(view.lens, float(bodies.focal[k])), scene.rate)
+        scene = replace(scene, rays=view.seen_from(found.view, scene.rays))
     intrinsics, look = view.lens, view.look
     points = scene.points(bodies, k) @ look
     points = body.complete(points[:, : body.num_observed])[0]

@@ -13,20 +13,12 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, users_level
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.detector import detected
-from kcs_torch.methods.perspective import (
-    WIDE,
-    View,
-    body_unit,
-    clean_image,
-    feet_on_ground,
-    first_distance,
-    image_noise,
-    lens_note,
-    reconstruct_perspective,
-)
+from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
+from kcs_torch.methods.perspective import WIDE, feet_on_ground, reconstruct_perspective
 from kcs_torch.methods.pinhole import PinholeEnergy
 from kcs_torch.methods.pinhole_coordinates import USUAL, unusual
 from kcs_torch.methods.pkc import PKC
+from kcs_torch.methods.view import View, lens_note
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
@@ -34,7 +26,7 @@ from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 __all__ = ["likely_lens", "may_be_near", "reconstruct_uncalibrated"]
 
 FAR = 34.0
-"""Distance, for a body of 1.75, from which on rays are taken to be parallel."""
+"""Distance, for a body of 1.75, of the far body that a near one is compared with."""
 
 NEAR = 10.0
 """Distance up to which a camera is near: from there on a wrong focal length does more harm than parallel rays."""
@@ -140,8 +132,9 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
             return None
         x, y = middle.tolist()
         ones = torch.ones_like(depth)
-        view = View.of(flat, ones, Intrinsics(FAR * unit, FAR * unit, x, y), rate)
-        path = first_distance(view, replace(tracks, points=flat, weights=ones, fps=rate), rate) / unit
+        clean = replace(tracks, points=flat, weights=ones, fps=rate)
+        view = View.of(clean, Intrinsics(FAR * unit, FAR * unit, x, y), rate)
+        path = view.first_distance(clean, rate) / unit
         lens = ones.new_tensor([1.0, USUAL / FAR]), torch.tensor([False, True], device=ones.device)
         depth = (depth - depth.mean(-1, keepdim=True)).expand(2, -1, -1)
         standing = None if feet is None else feet[some]
