@@ -28,6 +28,33 @@ def test_foreshortening_is_a_density_of_images():
         assert total == pytest.approx(2 * math.pi, rel=1e-6)
 
 
+@pytest.mark.parametrize("noise", [0.005, 0.02, 0.08])
+def test_foreshortening_of_noisy_images_is_the_density_blurred(noise):
+    """Depths up to L are equally likely; the image is sqrt(L^2 - dz^2) and noise, its density over its length."""
+    length = torch.tensor(2.0, dtype=torch.float64)
+    bone = lambda dz: math.sqrt(4.0 - dz * dz)  # noqa: E731
+    for seen, within in ((2.0, 0.02), (1.99, 0.3), (1.9, 0.3), (1.6, 0.3), (1.2, 0.3)):
+        gauss = lambda dz: math.exp(-(((seen - bone(dz)) / noise) ** 2) / 2) / (noise * math.sqrt(2 * math.pi))  # noqa: B023, E731
+        near = math.sqrt(4.0 - seen**2)
+        density = scipy.integrate.quad(gauss, 0, 2.0, points=[near], limit=500)[0] / (2.0 * seen)
+        dz = torch.tensor(near, dtype=torch.float64)
+        ours = foreshortening(dz, length, 0.0, torch.tensor(noise).double())
+        assert float(ours) == pytest.approx(-math.log(density), abs=within)
+    assert float(foreshortening(dz, length, 0.1, torch.tensor(0.0))) == pytest.approx(
+        float(foreshortening(dz, length, 0.1))
+    )
+
+
+def test_foreshortening_of_noisy_images_gradient_and_shapes():
+    energy, noise = ForeshorteningEnergy(MAN), normal(len(WALK), 16, seed=3).abs() * 0.02
+    lengths = bone_lengths(WALK, BONES).mean(0)
+    assert gradcheck(lambda p, size: energy(p, size, bone_noise=noise), WALK, lengths, fast=True)
+    for still in (noise, 0 * noise):
+        finite(lambda p, size: energy(p, size, bone_noise=still.to(p)), WALK.float() * 0, lengths.float())  # noqa: B023
+    with pytest.raises(ShapeError, match=r"expected bone_noise .*16"):
+        energy(WALK, lengths, bone_noise=noise[:, :5])
+
+
 def test_foreshortening_by_hand():
     energy = ForeshorteningEnergy(BODY, correlation=4.0, eps=0.2)
     points, lengths = normal(5, 7, 3), normal(6, seed=1).abs() + 0.1

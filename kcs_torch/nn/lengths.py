@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import torch
@@ -19,13 +20,18 @@ __all__ = ["ForeshorteningEnergy", "ProportionEnergy", "foreshortening", "free_b
 LIMB_SPREAD = 26.0
 """Bones that stray from the template by more than this, in degrees, are of the limbs."""
 
+BLUR = 2 * math.pi / (math.gamma(1.25) ** 2 * math.sqrt(8))
+"""How large squared depths have to be to be told from 0, over noise of the image times length: 2.7. Where a bone of
+length L looks as long as it is, noise n makes of 1 / |dz| the density Gamma(5/4) 8^(1/4) / sqrt(2 pi L n)."""
+
 
 class ForeshorteningEnergy(SkeletonModule):
     """sum_tb w_b/tau [log L_b + 1/2 log(dz_tb^2 + (eps L_b)^2)]: bones point anywhere, and are as often seen long.
 
     A direction drawn evenly from the sphere has an image of density 1 / (L |dz|): a bone that is longer than any of its
     images would have to avoid the image plane all the time. This keeps lengths down where smoothness, which prefers
-    long bones that hardly turn, would let them grow.
+    long bones that hardly turn, would let them grow. In an image with noise n, sqrt(dz^4 + (2.7 n L)^2) takes the place
+    of dz^2: a smaller depth cannot be told from 0, and noise would make bones short if it counted.
 
     Args:
         skeleton: bones of its trunk, where it has one, do not count.
@@ -47,6 +53,7 @@ class ForeshorteningEnergy(SkeletonModule):
         weights: Tensor | None = None,
         *,
         bone_weights: Tensor | None = None,
+        bone_noise: Tensor | None = None,
     ) -> Tensor:
         """Return the energy of each clip.
 
@@ -55,6 +62,7 @@ class ForeshorteningEnergy(SkeletonModule):
             lengths: (..., B); None takes each bone's root mean square over the frames in which it counts.
             weights: (..., T, N) of the joints: a bone weighs as much as the lesser of its two ends.
             bone_weights: (..., T, B) in place of ``weights``.
+            bone_noise: (..., T, B) standard deviation of the bones' lengths in the image, in the points' unit.
 
         Returns:
             (...).
@@ -72,14 +80,20 @@ class ForeshorteningEnergy(SkeletonModule):
         elif bone_weights is not None and bone_weights.shape[-1] not in (1, len(self.bones)):
             expected = f"(..., {points.shape[-3]}, {len(self.bones)})"
             raise ShapeError(f"ForeshorteningEnergy: expected bone_weights {expected}, got {tuple(bone_weights.shape)}")
+        if bone_noise is not None and bone_noise.shape[-2:] != (points.shape[-3], len(self.bones)):
+            expected = f"(..., {points.shape[-3]}, {len(self.bones)})"
+            raise ShapeError(f"ForeshorteningEnergy: expected bone_noise {expected}, got {tuple(bone_noise.shape)}")
         vectors = known(bone_vectors(wide(points), self.bones), bone_weights)
         if lengths is None:
             lengths = usual_size(vectors.square().sum(-1), bone_weights)
-        return narrow(self.each(vectors[..., 2], wide(lengths), bone_weights).sum((-2, -1)), points)
+        each = self.each(vectors[..., 2], wide(lengths), bone_weights, bone_noise)
+        return narrow(each.sum((-2, -1)), points)
 
-    def each(self, depth: Tensor, lengths: Tensor, bone_weights: Tensor | None = None) -> Tensor:
+    def each(
+        self, depth: Tensor, lengths: Tensor, bone_weights: Tensor | None = None, bone_noise: Tensor | None = None
+    ) -> Tensor:
         """What each bone adds in each frame, (..., T, B), of depths (..., T, B) and lengths (..., B)."""
-        each = self.free.to(depth) * foreshortening(depth, lengths[..., None, :], self.eps)
+        each = self.free.to(depth) * foreshortening(depth, lengths[..., None, :], self.eps, bone_noise)
         return (each if bone_weights is None else each * bone_weights) / self.correlation
 
 
@@ -135,10 +149,16 @@ class ProportionEnergy(SkeletonModule):
         return torch.log1p((off / self.spread).square() / 2) + (off / self.excess).clamp_min(0).square() / 2
 
 
-def foreshortening(depth: Tensor, length: Tensor, eps: float) -> Tensor:
-    """Log L + 1/2 log(dz^2 + (eps L)^2), elementwise: -log density of an image of an evenly drawn direction."""
+def foreshortening(depth: Tensor, length: Tensor, eps: float, noise: Tensor | None = None) -> Tensor:
+    """Log L + 1/2 log(dz^2 + (eps L)^2), elementwise: -log density of an image of an evenly drawn direction.
+
+    With noise n of the image, sqrt(dz^4 + (2.7 n L)^2) takes the place of dz^2.
+    """
     tiny = torch.finfo(depth.dtype).tiny
-    return length.clamp_min(tiny).log() + 0.5 * (depth.square() + (eps * length).square()).clamp_min(tiny).log()
+    square = depth.square()
+    if noise is not None:
+        square = torch.hypot(square, (BLUR * noise * length).clamp_min(tiny**0.5))
+    return length.clamp_min(tiny).log() + 0.5 * (square + (eps * length).square()).clamp_min(tiny).log()
 
 
 def free_bones(skeleton: Skeleton) -> Tensor:

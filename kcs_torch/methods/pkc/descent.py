@@ -10,6 +10,7 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors, incidence
 from kcs_torch.methods.pkc.image import Image, Slopes, bend_cost
 from kcs_torch.methods.pkc.sides import Sides
+from kcs_torch.nn.lengths import BLUR
 
 if TYPE_CHECKING:
     from kcs_torch.methods.pkc.objective import Objective
@@ -71,6 +72,7 @@ class Descent:
         self.limbs = free.free.nonzero().flatten()
         clear = _early(obj.clear).index_select(1, self.limbs)
         self.clear = clear * (free.free.to(like)[self.limbs, None] / free.correlation)
+        self.blur = BLUR * _early(obj.noise).index_select(1, self.limbs).clamp_min(torch.finfo(like.dtype).tiny ** 0.25)
 
     def imaged(self, bones: Tensor) -> Image:
         """What an image of the bones, (K, 2, B, T), decides."""
@@ -291,12 +293,18 @@ class Descent:
 
     def _foreshortening(self, dz: Tensor, lengths: Tensor, out: Slopes) -> Tensor:
         depth, size = dz.index_select(1, self.limbs), lengths[:, self.limbs]
-        least = (self.objective.foreshortening.eps * size).square()
-        square = depth.square().add_(least[..., None])
+        least = (self.objective.foreshortening.eps * size).square()[..., None]
+        square, grown = depth.square(), least
+        if self.objective.noisy:
+            blur = self.blur * size[..., None]
+            far = torch.hypot(square, blur)
+            depth, grown = depth * (square / far), least + blur * (blur / far) / 2
+            square = far
+        square = square + least
         each = self.clear / square
         held = self.clear.sum(-1)
         value = held * size.log() + (self.clear * square.log()).sum(-1) / 2
-        out.growth.index_add_(1, self.limbs, held + least * each.sum(-1))
+        out.growth.index_add_(1, self.limbs, held + (grown * each).sum(-1))
         out.depth.index_add_(1, self.limbs, each * depth)
         return value.sum(-1)
 

@@ -156,7 +156,7 @@ class Objective:
             "posture": self.posture(points, lengths, self.share),
             "hinges": w.hinge / w.sine**2 * self.hinges(points, lengths, self.time).sum(-1),
             "adduction": w.adduction / w.sine**2 * self.adduction(points, lengths, self.time).sum(-1),
-            "foreshortening": self.foreshortening(points, lengths, bone_weights=self.clear),
+            "foreshortening": self.foreshortening(points, lengths, bone_weights=self.clear, bone_noise=self.noise),
         }
         return out | self.length_terms(lengths)
 

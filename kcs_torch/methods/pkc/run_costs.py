@@ -109,7 +109,7 @@ class RunCosts:
             obj.hinges.firm.to(own) * hinges[0].clamp_max(0).square(),
             hinges[1],
             reach[1],
-            obj.foreshortening.each(dz, lengths, obj.clear).sum(-1, keepdim=True),
+            obj.foreshortening.each(dz, lengths, obj.clear, obj.noise).sum(-1, keepdim=True),
         )
         posture = obj.posture
         y = (posture.directions(points, lengths) - posture.mean.to(own)) / posture.deviation.to(own)
