@@ -51,6 +51,7 @@ BODY, FIXED, FLIPS, MOVING, OBJECTIVE, DESCENT, DESCENTS = (
     import_module(f"kcs_torch.methods.pkc.{name}")
     for name in ("body", "fixed_view", "flips", "moving_view", "objective", "descent", "descents")
 )
+LENGTHS = import_module("kcs_torch.nn.lengths")
 WRITTEN_OUT = {"posture": "_posture", "foreshortening": "_foreshortening", "proportions": "_sizes"}
 """Terms of the objective, and the methods of its descent that hold them once more, gradients and all."""
 
@@ -136,6 +137,9 @@ FIXED_VARIANTS = {
         changes=tuple(constant(owner, "NOISE", 0.0) for owner in (OBJECTIVE, DESCENT))
     ),
     "directions as sure as in a clear image": Variant(changes=(constant(OBJECTIVE, "BLUR", 0.0),)),
+    "images as likely as clear ones": Variant(
+        changes=tuple(constant(owner, "HIDDEN", 1e-9) for owner in (LENGTHS, DESCENT))
+    ),
     "no posture": without("posture", posture=INF),
     "mirror images of a motion not as likely": Variant(
         changes=(

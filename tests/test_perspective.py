@@ -157,7 +157,7 @@ def test_body_off_the_optical_axis(method):
     other = kt.Tracks.from_arrays(Intrinsics.of(LENS).project(aside), skeleton=tracks.skeleton, fps=30.0)
     first, second = (reconstruct(t, method=method, intrinsics=LENS) for t in (tracks, other))
     spread = lambda x: (x - x.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()  # noqa: E731
-    assert error(second.points, first.points * (spread(truth) / spread(first.points))) < 5.0  # mm
+    assert error(second.points, first.points * (spread(truth) / spread(first.points))) < 10.0  # mm
     plain = reconstruct(other, method=method, intrinsics="parallel")
     assert error(second.points, truth) < 0.7 * error(plain.points, truth)
 

@@ -117,8 +117,26 @@ def test_angles_are_surer_where_the_viewpoint_turns_and_postures_are_usual():
         found[name] = [angle_doubt(goal, body[..., 2], lengths, turn) for turn in (0.0, 22.0, 180.0)]
     still, little, much = found["usual"]
     assert still > little > much > 0
-    assert little == pytest.approx(still / 2**0.5)
+    told = [(still / one) ** 2 - 1 for one in (little, much)]  # by the turn, over what a view from the front tells
+    assert told[1] / told[0] == pytest.approx((180 / 22.0) ** (2 * answers.POWER))
     assert found["odd"][0] > still
+
+
+@pytest.mark.parametrize("degrees", [10.0, 30.0, 90.0])
+def test_angles_are_surer_of_a_body_that_is_seen_from_aside(degrees):
+    """From the front nobody sees how far a body leans."""
+    skeleton = SKELETONS["h36m17"]
+    rest = skeleton.template_points(dtype=torch.float64)
+    rest = (rest - rest.mean(0)).expand(30, -1, -1)
+    doubts = []
+    for angle in (0.0, degrees):
+        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        body = rest @ torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]).double().mT
+        goal = Objective(skeleton, body[..., :2], Weights(), torch.zeros(30, 17).double())
+        lengths = bone_lengths(body, goal.bones).mean(0)
+        doubts.append(angle_doubt(goal, body[..., 2], lengths, 0.0))
+    front, aside = doubts
+    assert front / aside == pytest.approx(math.sqrt(1 + (s / answers.ASIDE) ** 2), rel=0.02)
 
 
 def test_noise_in_one_frame_is_that_frame_s():

@@ -20,7 +20,7 @@ __all__ = ["ForeshorteningEnergy", "ProportionEnergy", "foreshortening", "free_b
 LIMB_SPREAD = 26.0
 """Bones that stray from the template by more than this, in degrees, are of the limbs."""
 
-BLUR = 2 * math.pi / (math.gamma(1.25) ** 2 * math.sqrt(8))
+HIDDEN = 2 * math.pi / (math.gamma(1.25) ** 2 * math.sqrt(8))
 """How large squared depths have to be to be told from 0, over noise of the image times length: 2.7. Where a bone of
 length L looks as long as it is, noise n makes of 1 / |dz| the density Gamma(5/4) 8^(1/4) / sqrt(2 pi L n)."""
 
@@ -157,7 +157,7 @@ def foreshortening(depth: Tensor, length: Tensor, eps: float, noise: Tensor | No
     tiny = torch.finfo(depth.dtype).tiny
     square = depth.square()
     if noise is not None:
-        square = torch.hypot(square, (BLUR * noise * length).clamp_min(tiny**0.5))
+        square = torch.hypot(square, (HIDDEN * noise * length).clamp_min(tiny**0.5))
     return length.clamp_min(tiny).log() + 0.5 * (square + (eps * length).square()).clamp_min(tiny).log()
 
 

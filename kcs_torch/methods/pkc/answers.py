@@ -24,6 +24,10 @@ ANGLE = 0.15
 """Standard deviation, in radians, of a bone's angle to the image plane where it is nearest to it: what postures, hinges
 and proportions tell of a length that no crossing of the plane tells."""
 
+FRONT, ASIDE = 2.0, 0.25
+"""How much less sure angles are of a body that is seen exactly from the front or from behind, and the sine of the
+direction from which on this is over: a body that leans moves in the image only if it is seen from aside."""
+
 USUAL = 0.12
 """Standard deviation of a length of which the image tells nothing, as a share: bodies differ by so much."""
 
@@ -51,7 +55,7 @@ ODDITY = 0.09
 """By how much a usual body's lengths stray from the template's. One of twice that is told by it half as well, and so
 the viewpoint's turn tells as much where it is half as far."""
 
-TURN, POWER = 22.0, 1.1
+TURN, POWER = 26.0, 1.2
 """Degrees of the viewpoint's turn that tell as much as the template, and the power of the turn that deviations fall
 with, as those of the moving viewpoint do."""
 
@@ -85,7 +89,8 @@ def told_by_prior(found: Hypotheses, skeleton: Skeleton) -> list[str]:
 def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: float) -> float:
     """How uncertain angles of a solution (T, N), (B,) are, over those of usual postures before a camera at rest.
 
-    More where postures stray from the template, and less where the viewpoint turned by ``turn`` degrees.
+    More where postures stray from the template, or the body is seen from the front, and less where it is seen from
+    aside or the viewpoint turned by ``turn`` degrees.
     """
     posture = objective.posture
     points = torch.cat([objective.image, depth[..., None]], -1)
@@ -93,7 +98,9 @@ def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: floa
     strange = float(posture(points[None], lengths[None])) / counted / POSTURE
     odd = max(1.0, objective.oddity(lengths) / ODDITY)
     strange = max(strange, strange**STRANGE)
-    return odd * strange / math.sqrt(1 + (odd * turn / TURN) ** (2 * POWER))
+    aside = float(posture.frame(points)[..., 0, 2].square().mean())
+    told = (1 + aside / ASIDE**2) / FRONT**2 + (odd * turn / TURN) ** (2 * POWER)
+    return odd * strange / math.sqrt(told)
 
 
 def depth_deviation(

@@ -10,7 +10,7 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors, incidence
 from kcs_torch.methods.pkc.image import Image, Slopes, bend_cost
 from kcs_torch.methods.pkc.sides import Sides
-from kcs_torch.nn.lengths import BLUR
+from kcs_torch.nn.lengths import HIDDEN
 
 if TYPE_CHECKING:
     from kcs_torch.methods.pkc.objective import Objective
@@ -72,7 +72,7 @@ class Descent:
         self.limbs = free.free.nonzero().flatten()
         clear = _early(obj.clear).index_select(1, self.limbs)
         self.clear = clear * (free.free.to(like)[self.limbs, None] / free.correlation)
-        self.blur = BLUR * _early(obj.noise).index_select(1, self.limbs).clamp_min(torch.finfo(like.dtype).tiny ** 0.25)
+        self.blur = HIDDEN * _early(obj.noise).index_select(1, self.limbs).clamp_min(torch.finfo(like.dtype).tiny ** 0.25)
 
     def imaged(self, bones: Tensor) -> Image:
         """What an image of the bones, (K, 2, B, T), decides."""
