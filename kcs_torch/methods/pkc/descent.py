@@ -72,7 +72,8 @@ class Descent:
         self.limbs = free.free.nonzero().flatten()
         clear = _early(obj.clear).index_select(1, self.limbs)
         self.clear = clear * (free.free.to(like)[self.limbs, None] / free.correlation)
-        self.blur = HIDDEN * _early(obj.noise).index_select(1, self.limbs).clamp_min(torch.finfo(like.dtype).tiny ** 0.25)
+        least = torch.finfo(like.dtype).tiny ** 0.25  # squares of it are not 0
+        self.blur = HIDDEN * _early(obj.noise).index_select(1, self.limbs).clamp_min(least)
 
     def imaged(self, bones: Tensor) -> Image:
         """What an image of the bones, (K, 2, B, T), decides."""
