@@ -71,6 +71,17 @@ def test_terms_by_hand():
     assert anchor.item() == pytest.approx(16 * (torch.tensor(1.05).log().item() / 0.01) ** 2 / 2, rel=1e-5)
 
 
+def test_smoothness_counts_less_in_noise():
+    points = walk(6)
+    noise = 0.006 * (1 + normal(6, 17).abs())
+    clear, found = objective(points), Objective(SKELETONS["h36m17"], points[..., :2], Weights(), noise)
+    state = points[None, ..., 2] * 0.9, lengths_of(found, points)[None]
+    share = 1 + (float(found.noise.median()) / 0.0008) ** 2
+    assert_close(found.terms(*state)["smoothness"] * share, clear.terms(*state)["smoothness"])
+    few = noise * (torch.arange(6) < 2)[:, None]  # a gap that was filled
+    assert Objective(SKELETONS["h36m17"], points[..., :2], Weights(), few).weights == Weights()
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.004, 0.03])
 def test_length_term_by_hand(noise):
     points = walk(6)

@@ -15,7 +15,7 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.methods.pkc.descent import ANCHOR, CORNER, HEAVY, NOISE, Descent, wide
 from kcs_torch.methods.pkc.unknowns import Unknowns
-from kcs_torch.methods.pkc.weights import Weights
+from kcs_torch.methods.pkc.weights import Weights, in_noise
 from kcs_torch.nn.anatomy import AdductionEnergy, HingeEnergy
 from kcs_torch.nn.contact import ContactEnergy
 from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy, oddity
@@ -101,10 +101,14 @@ class Objective:
         anchor: Tensor | None = None,
         standing: Tensor | None = None,
     ) -> None:
-        self.skeleton, self.image, self.weights, self.anchor = skeleton, image, weights, anchor
+        self.skeleton, self.image, self.anchor = skeleton, image, anchor
+        self.bones = skeleton.bone_index(device=image.device)
+        self.noise = bone_noise(noise, self.bones)  # (T, B)
+        self.noisy = bool((self.noise > 0).any())
+        self.weights = in_noise(weights, float(self.noise.median())) if self.noisy else weights
         make = lambda module: module.to(image)  # noqa: E731
         plain = usual_posture(skeleton, image.dtype, image.device)
-        blur = BLUR * bone_noise(noise, plain.bones).median(0).values / plain.rest_lengths.clamp_min(SHORT)
+        blur = BLUR * self.noise.median(0).values / plain.rest_lengths.clamp_min(SHORT)
         spread = (plain.deviation.square() + blur.square()[:, None]).sqrt()
         self.posture = _altered(plain, kappa=weights.kappa, correlation=weights.posture, deviation=spread)
         self.foreshortening = make(ForeshorteningEnergy(skeleton, correlation=weights.foreshortening))
@@ -115,13 +119,10 @@ class Objective:
         shaken = SHAKY * float(noise[:, list(skeleton.contacts)].median()) if skeleton.contacts else 0.0
         slip = math.hypot(weights.slip, shaken)
         self.feet = make(ContactEnergy(skeleton, slip=slip, change=weights.change, num_steps=STEADY))
-        self.bones = skeleton.bone_index(device=image.device)
         self.flat = bone_vectors(image, self.bones).square().sum(-1)  # (T, B)
         self.rigid = torch.zeros(skeleton.num_bones, dtype=image.dtype, device=image.device)
         self.rigid[list(skeleton.rigid)] = 1
         self.tree = chain_inverse(incidence(self.bones, skeleton.num_joints, dtype=image.dtype))  # (N, B)
-        self.noise = bone_noise(noise, self.bones)  # (T, B)
-        self.noisy = bool((self.noise > 0).any())
         quiet = self.noise.amin(0)
         usual = quiet.amin()
         never = quiet > NEVER * usual  # bones of joints that no frame shows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from torch import Tensor
@@ -10,10 +11,14 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.nn.lengths import free_bones
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["Weights", "at_pace", "pace_of"]
+__all__ = ["Weights", "at_pace", "in_noise", "pace_of"]
 
 WALK = 4.3
 """Frames in which a walking person's bones change in the image by as much as they stray, at 30 frames a second."""
+
+CALM = 0.0008
+"""Noise of bones' images, for a body of 1.75, at which smoothness counts half: the tracks were smoothed before, and
+where noise lets lengths hold depths only loosely, the smoothest depths are those that move least."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +27,7 @@ class Weights:
 
     Attributes:
         length: standard deviation of a bone's length about its mean.
-        acceleration: standard deviation of a bone's second difference in depth.
+        acceleration: standard deviation of a bone's second difference in depth, without noise.
         posture: frames that count as one for the posture.
         kappa: independent frames that the template's directions are worth.
         foreshortening: frames that count as one for the foreshortening.
@@ -69,6 +74,11 @@ def at_pace(weights: Weights, rate: float, pace: float = 1.0) -> Weights:
         slip=weights.slip * slow,
         change=weights.change * slow**2,
     )
+
+
+def in_noise(weights: Weights, noise: float) -> Weights:
+    """Weights for bones whose images are off by ``noise``: there smoothness would take motion away."""
+    return replace(weights, acceleration=weights.acceleration * math.hypot(1.0, noise / CALM))
 
 
 def pace_of(image: Tensor, skeleton: Skeleton, rate: float) -> float:
