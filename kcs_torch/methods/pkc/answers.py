@@ -70,7 +70,7 @@ NEAR = 0.016
 """Standard deviation of a detector's joint, a standing person being about 1.75 tall, beyond what the objective allows
 for: the camera is a few metres away, and joints are defined in another way than bones are."""
 
-HEADING = 0.2
+HEADING = 0.15
 """Standard deviation, in radians, of the direction from which a detector's joints are seen: without intrinsics nobody
 knows how far from the image's middle that is, and what is nearer looks larger, as if the body leant."""
 
