@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -25,7 +26,10 @@ from kcs_torch.solvers.camera_path import choose_path, view_energy
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.procrustean import COARSE, FINE, Stage, align_rotations
 
-__all__ = ["TOLD", "Body"]
+__all__ = ["TOLD", "Body", "Turned"]
+
+Turned = Callable[[bool], Search[Any, Any, Tensor]]
+"""Depths (T, N) that the viewpoint's turn tells, in the template's units; from many starts if so, else from one."""
 
 BLOCK, OVERLAP = 400, 40
 """Frames of a long clip that are searched together, and by how many blocks overlap."""
@@ -71,6 +75,10 @@ LEAD, LESS = 10.0, 3.0
 TOLD = 3.0
 """By how much a mirror image must be dearer for known cameras to rule it out."""
 
+AGREE = 0.12
+"""Root mean square difference, over the depths', of what the template and the viewpoint's turn tell, up to which each
+confirms the other."""
+
 FAST = 45.0
 """Frames a second from which on the search leaves frames out."""
 
@@ -105,9 +113,10 @@ class Body:
         weights = at_pace(Weights(), rate, pace_of(image, skeleton, rate))
         self.objective = Objective(skeleton, self.image, weights, self.noise, standing=standing)
 
-    def frames(self, depth: Tensor) -> Tensor:
-        """The trunk's rotations (T, 3, 3), template to camera, of depths (T, N)."""
-        return nearest_rotation(self.objective.posture.frame(torch.cat([self.image, depth[..., None]], -1)))
+    def frames(self, depth: Tensor, image: Tensor | None = None) -> Tensor:
+        """The trunk's rotations (T, 3, 3), template to camera, of depths (T, N), for all or for some frames' image."""
+        image = self.image if image is None else image
+        return nearest_rotation(self.objective.posture.frame(torch.cat([image, depth[..., None]], -1)))
 
     def bodies(self, found: Hypotheses) -> Tensor:
         """Joints (H, T, N, 3) of hypotheses, in units of the image; bones keep their lengths as far as noise allows.
@@ -198,7 +207,7 @@ class Body:
         pick = close.nonzero().flatten()[: RIVALS if around else 1]
         rivals = found[pick]
         if around and other is not None:
-            other = torch.where((other * found.depth[0]).sum() < 0, -other, other)[None]
+            other = alike(other, found.depth[0])[None]
             ranked = yield from self.rank(other, steps)
             dearer = ranked.energy - found.energy[0]
             if self.is_odd(found):
@@ -242,8 +251,12 @@ class Body:
         depth = depth[..., : skeleton.num_observed] @ self.objective.complete
         return depth - depth.mean(-1, keepdim=True), value
 
-    def search(self, rounds: int, steps: int) -> Search[Any, Any, Hypotheses]:
-        """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best."""
+    def search(self, rounds: int, steps: int, turned: Turned | None = None) -> Search[Any, Any, Hypotheses]:
+        """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best.
+
+        Where the viewpoint turns, those that agree with what it tells, depths (T, N) of ``turned``, are not looked
+        over.
+        """
         stride = max(1, round(self.rate / 30)) if self.rate >= FAST else 1
         image = self.image[::stride]
         rate = self.rate / stride
@@ -254,7 +267,19 @@ class Body:
 
         def lift(some: slice, anchor: Tensor | None = None) -> Search[Any, Any, Hypotheses]:
             noise, feet = self.noise[::stride][some], None if standing is None else standing[::stride][some]
-            return searching(self.skeleton, image[some], rate, noise, rounds, steps, anchor, standing=feet)
+
+            def confirmed(found: Hypotheses) -> Search[Any, Any, bool]:
+                if turned is None or self.is_odd(found):
+                    return False
+                depth = found.depth[0]
+                if float(viewpoint_turn(self.frames(depth, image[some])[:, :2])) < TURNING:
+                    return False
+                other = (yield from turned(False))[::stride][some]
+                off = (alike(other, depth) - depth).square().sum()
+                return bool(off <= AGREE**2 * depth.square().sum())
+
+            lifted = image[some], rate, noise, rounds, steps, anchor
+            return searching(self.skeleton, *lifted, standing=feet, confirmed=confirmed)
 
         if len(starts) == 1:
             found = yield from lift(slice(None))
@@ -286,3 +311,8 @@ class Body:
         full[:, ::stride] = found.depth[:, :, None]
         depth = interpolate(full, known)[:, :, 0]
         return (yield from refined(self.objective, replace(found, depth=depth), steps))
+
+
+def alike(depth: Tensor, other: Tensor) -> Tensor:
+    """Depths, or their mirror image if that is more like the others."""
+    return torch.where((depth * other).sum() < 0, -depth, depth)

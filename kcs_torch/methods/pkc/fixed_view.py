@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -101,8 +101,12 @@ def searching(
     anchor: Tensor | None = None,
     weights: Weights | None = None,
     standing: Tensor | None = None,
+    confirmed: Callable[[Hypotheses], Search[Any, Any, bool]] | None = None,
 ) -> Search[Any, Any, Hypotheses]:
-    """:func:`fixed_view` as a search, which may run beside others; arguments as there."""
+    """:func:`fixed_view` as a search, which may run beside others; arguments as there.
+
+    It ends early with hypotheses that are ``confirmed`` from elsewhere.
+    """
     slow = 30.0 / rate
     pace = pace_of(image, skeleton, rate)
     weights = at_pace(weights or Weights(), rate, pace)
@@ -119,6 +123,8 @@ def searching(
     search = _Search(skeleton, image, objective, costs, TURN * slow)
     first = yield from search.start(anchor)
     found = yield from search.refine(first, steps, LOOSE)
+    if confirmed is not None and (yield from confirmed(found)):
+        return found
     for _ in range(rounds):
         best = found.energy[0]
         moved = yield from search.moves(found)

@@ -19,7 +19,7 @@ from kcs_torch.methods.detector import detected, detector_deviation
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.batch import Noisy, Sized, serve
-from kcs_torch.methods.pkc.body import Body
+from kcs_torch.methods.pkc.body import Body, Turned
 from kcs_torch.methods.pkc.gate import plausible, without_others
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
@@ -163,26 +163,28 @@ class PKC(Method):
         still = self.contacts and not _turns(cameras) and self.viewpoint != "moving"
         feet = standing_feet(tracks) if still else None
         body = Body(skeleton, image, tracks.fps or 30.0, noise, feet)
+        detections = detected(tracks.weights)  # their errors last, and would be taken for motion
+        polished = enough and body.spanned and not detections
+        compared = polished and self.viewpoint == "auto"
+        turned = self._turned(tracks, image, noise, body.factor)
         if enough and self.viewpoint == "moving":
             moving, _ = yield from self._moving(tracks, image, noise)
             found = yield from self._ranked(body, moving)
         else:
-            found = yield from body.search(self.rounds, self.steps)
-            if enough and not changing and size.range >= TRIED:
+            resizing = enough and not changing and size.range >= TRIED  # what is compared must be searched alike
+            found = yield from body.search(self.rounds, self.steps, turned if compared and not resizing else None)
+            if resizing:
                 other = Body(skeleton, resized, tracks.fps or 30.0, noise, feet)
                 better = yield from self._resized(found, body, other, size)
                 if better is not None:
-                    changing, body, found, image = True, other, better, resized
+                    changing, body, found = True, other, better
+                    turned = self._turned(tracks, resized, noise, body.factor)
             if cameras is None and body.seen_from_around(found):
                 found = body.without_contacts(found)
         if cameras is not None and _turns(cameras):
             found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
-        detections = detected(tracks.weights)  # their errors last, and would be taken for motion
-        if enough and body.spanned and not detections:
-            rival = None
-            if self.viewpoint == "auto" and body.turns(found):
-                rival = yield from self._rival(tracks, image, noise, far=body.is_odd(found))
-                rival = rival * body.factor
+        if polished:
+            rival = (yield from turned(body.is_odd(found))) if compared and body.turns(found) else None
             found = yield from body.polished(found, self.steps, rival)
         made = self._from_hypotheses(found, body, cameras, notes, detections)
         return _with_size(made, size) if changing else made
@@ -252,13 +254,21 @@ class PKC(Method):
         moving = yield from turning(image, tracks.skeleton, *start, lifts=self.lifts, exact=exact, seed=self.seed)
         return moving, first
 
-    def _rival(self, tracks: Tracks, image: Tensor, noise: Tensor, far: bool) -> Search[Any, Any, Tensor]:
-        """Depths (T, N) that the moving viewpoint's turn tells, from many starts if ``far``, else from SfAM's guess."""
-        if far:
-            moving, _ = yield from self._moving(tracks, image, noise)
-            return moving.pose.points[0, ..., 2]
-        (first,) = yield [_complete(tracks, image)]
-        return (yield from settled(image, tracks.skeleton, first.points, complete_rotation(first.cameras)))
+    def _turned(self, tracks: Tracks, image: Tensor, noise: Tensor, factor: Tensor) -> Turned:
+        """What the viewpoint's turn tells, from many starts or from SfAM's guess: each worked out when first wanted."""
+        known: dict[bool, Tensor] = {}
+
+        def turned(far: bool) -> Search[Any, Any, Tensor]:
+            if far and True not in known:
+                moving, _ = yield from self._moving(tracks, image, noise)
+                known[True] = moving.pose.points[0, ..., 2] * factor
+            elif far not in known:
+                (first,) = yield [_complete(tracks, image)]
+                start = first.points, complete_rotation(first.cameras)
+                known[False] = (yield from settled(image, tracks.skeleton, *start)) * factor
+            return known[far]
+
+        return turned
 
     def _ranked(self, body: Body, moving: MovingView) -> Search[Any, Any, Hypotheses]:
         """The moving viewpoint's solution and its mirror image, of a body with a template."""
