@@ -30,7 +30,7 @@ FAR = 34.0
 NEAR = 10.0
 """Distance up to which a camera is near: from there on a wrong focal length does more harm than parallel rays."""
 
-BETTER, SEEN = 5.0, 0.0
+BETTER, SEEN = 5.0, 1.0
 """By how much the energy must be lower than of a far body for a near one to be believed; and in a detector's tracks,
 which come from a real camera."""
 
