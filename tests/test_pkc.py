@@ -288,6 +288,36 @@ def test_polish_takes_no_mirror_image(turning):
         assert_close(polished.depth[1], -sign * depth, rtol=0, atol=0)
 
 
+def test_what_the_turn_confirms_is_not_searched_further():
+    """What it tells otherwise changes nothing; before a camera at rest it is not asked for."""
+    clip = walking_person(60, turn=120.0)
+    points = centred(clip.tracks.points) / centred(clip.tracks.points).square().mean().sqrt()
+    body = Body(clip.skeleton, points, 30.0, torch.zeros_like(clip.tracks.weights))
+    depth = centred(clip.points)[..., 2] / centred(clip.points)[..., :2].square().mean().sqrt() * body.factor
+    asked = []
+
+    def turned(depth):
+        def told(far):
+            assert not far
+            asked.append(1)
+            yield from ()
+            return depth
+
+        return told
+
+    plain = run(body.search(1, 30), serve)
+    for other, share in ((depth, 0.6), (-depth, 0.6), (depth.roll(20, 0), 1.0), (0 * depth, 1.0)):
+        asked.clear()
+        found = run(body.search(1, 30, turned(other)), serve)
+        assert found.steps <= share * plain.steps and len(asked) == 1
+        assert_close(found.depth[0], plain.depth[0], rtol=0, atol=0.06 if share < 1 else 0)
+    still = walking_person(60, turn=0.0, yaw=40.0).tracks
+    image = centred(still.points) / centred(still.points).square().mean().sqrt()
+    asked.clear()
+    run(Body(still.skeleton, image, 30.0, torch.zeros_like(still.weights)).search(0, 5, turned(depth)), serve)
+    assert not asked
+
+
 def test_polish_takes_nothing_that_the_template_rules_out(turning, monkeypatch):
     """Bones whose lengths and changes fit better than the truth's are no rival where the body would be no body."""
     clip, _ = turning

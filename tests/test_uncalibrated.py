@@ -66,6 +66,23 @@ def test_parallel_rays_are_left_as_they_are(turn):
     assert same(kt.PKC()(tracks), kt.reconstruct(tracks))
 
 
+def test_a_hopeless_search_ends_early(monkeypatch):
+    """And one that finds a near camera makes all its steps."""
+    made = []
+
+    def counted(*given, num_steps, **options):
+        made.append(num_steps)
+        return lbfgs(*given, num_steps=num_steps, **options)
+
+    lbfgs = uncalibrated.lbfgs
+    far = quietly(kt.data.walking_person(90, turn=0.0, yaw=10.0).tracks, intrinsics="parallel")
+    near = quietly(filmed()[0], intrinsics="parallel")
+    monkeypatch.setattr(uncalibrated, "lbfgs", counted)
+    assert likely_lens(far) is None and made == [uncalibrated.STEPS[0]]
+    made.clear()
+    assert likely_lens(near) is not None and made == list(uncalibrated.STEPS)
+
+
 def test_who_looks_for_a_near_camera():
     """PKC, unless cameras are known; other methods where they are asked to, by PKC's focal length."""
     tracks, _ = filmed(frames=30)
