@@ -162,6 +162,9 @@ FIXED_VARIANTS = {
             searched(lambda usual: replace(usual, acceleration=10 * usual.acceleration)),
         )
     ),
+    "smoothness counts as much in noise": Variant(
+        changes=(constant(OBJECTIVE, "in_noise", lambda weights, noise: weights),)
+    ),
     "every frame counts alike (no pace)": Variant(
         changes=tuple(constant(owner, "pace_of", lambda image, skeleton, rate: rate / 30) for owner in (BODY, FIXED))
     ),
