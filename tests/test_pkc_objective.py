@@ -73,11 +73,12 @@ def test_terms_by_hand():
 
 def test_smoothness_counts_less_in_noise():
     points = walk(6)
-    noise = 0.006 * (1 + normal(6, 17).abs())
+    noise = 0.002 * (1 + normal(6, 17).abs())
     clear, found = objective(points), Objective(SKELETONS["h36m17"], points[..., :2], Weights(), noise)
     state = points[None, ..., 2] * 0.9, lengths_of(found, points)[None]
     share = 1 + (float(found.noise.median()) / 0.0008) ** 2
     assert_close(found.terms(*state)["smoothness"] * share, clear.terms(*state)["smoothness"])
+    assert in_noise(Weights(), 0.02) == in_noise(Weights(), 0.1) == replace(Weights(), acceleration=8 * 0.08)
     few = noise * (torch.arange(6) < 2)[:, None]  # a gap that was filled
     assert Objective(SKELETONS["h36m17"], points[..., :2], Weights(), few).weights == Weights()
 

@@ -16,9 +16,10 @@ __all__ = ["Weights", "at_pace", "in_noise", "pace_of"]
 WALK = 4.3
 """Frames in which a walking person's bones change in the image by as much as they stray, at 30 frames a second."""
 
-CALM = 0.0008
+CALM, LOOSEST = 0.0008, 8.0
 """Noise of bones' images, for a body of 1.75, at which smoothness counts half: the tracks were smoothed before, and
-where noise lets lengths hold depths only loosely, the smoothest depths are those that move least."""
+where noise lets lengths hold depths only loosely, the smoothest depths are those that move least. And how many times as
+large accelerations may be at most: a detector's errors, which were not smoothed, make depths tremble beyond it."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def at_pace(weights: Weights, rate: float, pace: float = 1.0) -> Weights:
 
 def in_noise(weights: Weights, noise: float) -> Weights:
     """Weights for bones whose images are off by ``noise``: there smoothness would take motion away."""
-    return replace(weights, acceleration=weights.acceleration * math.hypot(1.0, noise / CALM))
+    return replace(weights, acceleration=weights.acceleration * min(math.hypot(1.0, noise / CALM), LOOSEST))
 
 
 def pace_of(image: Tensor, skeleton: Skeleton, rate: float) -> float:
