@@ -16,7 +16,7 @@ from kcs_torch.methods.pkc import batch
 from kcs_torch.methods.pkc import objective as module
 from kcs_torch.methods.pkc.batch import Task, minimise_all
 from kcs_torch.methods.pkc.objective import BLUR, Objective, Unknowns, bone_noise
-from kcs_torch.methods.pkc.weights import WALK, Weights, at_pace, pace_of
+from kcs_torch.methods.pkc.weights import WALK, Weights, at_pace, in_noise, pace_of
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.nn import PostureEnergy
 from kcs_torch.skeleton import SKELETONS
