@@ -78,9 +78,9 @@ def test_a_hopeless_search_ends_early(monkeypatch):
     far = quietly(kt.data.walking_person(90, turn=0.0, yaw=10.0).tracks, intrinsics="parallel")
     near = quietly(filmed()[0], intrinsics="parallel")
     monkeypatch.setattr(uncalibrated, "lbfgs", counted)
-    assert likely_lens(far) is None and made == [uncalibrated.STEPS[0]]
+    assert likely_lens(far) is None and made == [uncalibrated.FEW]
     made.clear()
-    assert likely_lens(near) is not None and made == list(uncalibrated.STEPS)
+    assert likely_lens(near) is not None and made == [uncalibrated.FEW, uncalibrated.STEPS]
 
 
 def test_who_looks_for_a_near_camera():

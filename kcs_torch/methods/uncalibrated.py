@@ -15,7 +15,7 @@ from kcs_torch.methods.detector import detected
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.perspective import WIDE, feet_on_ground, reconstruct_perspective
 from kcs_torch.methods.pinhole import PinholeEnergy
-from kcs_torch.methods.pinhole_coordinates import USUAL
+from kcs_torch.methods.pinhole_coordinates import USUAL, unusual
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.view import View, lens_note
 from kcs_torch.nn.posture import trunk_joints
@@ -34,12 +34,12 @@ BETTER, SEEN = 5.0, 1.0
 """By how much the energy must be lower than of a far body for a near one to be believed; and in a detector's tracks,
 which come from a real camera."""
 
-SECONDS, RATE, STEPS = 5.0, 30.0, (20, 40)
-"""How much of a clip tells whether a camera is near, at how many frames a second at most, and in how many steps: a few,
-and more unless these tell already."""
+SECONDS, RATE, STEPS = 5.0, 30.0, 60
+"""How much of a clip tells whether a camera is near, at how many frames a second at most, and in how many steps; as
+many again where these do not find back to a far body."""
 
-HOPELESS = 10.0
-"""By how much a near body may be dearer after the first steps; one that is there is cheaper by then."""
+FEW, HOPELESS, AWAY = 20, 10.0, 7.5
+"""Steps after which it is hopeless, by how much a near body is dearer then, and how far away it has gone by then."""
 
 
 def may_be_near(tracks: Tracks) -> bool:
@@ -143,16 +143,25 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
         energy = PinholeEnergy(
             tracks.skeleton, view.rays, path, depth, rate, noise[some], standing=standing, focal=lens
         )
+        distance = lambda state: FAR * float(energy.unpack(state).focal[1])  # noqa: E731
+        state, gain = _refined(energy, energy.start, FEW)
+        if gain < -HOPELESS and distance(state) > AWAY:
+            return None
         state = energy.start
-        for steps in STEPS:
-            found = lbfgs(energy, state, num_steps=steps, tolerance=1e-6, slopes=True, part=energy.rows)
-            assert found.energy is not None
-            state, gain = found.value, float(found.energy[0] - found.energy[1])
-            if not gain > -HOPELESS:
-                return None
+        for _ in range(2):
+            state, gain = _refined(energy, state, STEPS)
+            if gain > -unusual(FAR):  # to be as far away costs no more than that
+                break
         better = SEEN if detected(tracks.weights) else BETTER
-        near = gain > better and FAR * float(energy.unpack(state).focal[1]) < NEAR
+        near = gain > better and distance(state) < NEAR
     return Intrinsics(USUAL * unit, USUAL * unit, x, y) if near else None
+
+
+def _refined(energy: PinholeEnergy, state: Tensor, steps: int) -> tuple[Tensor, float]:
+    """Unknowns of a far and of a near body after so many steps, and by how much the near one is cheaper."""
+    found = lbfgs(energy, state, num_steps=steps, tolerance=1e-6, slopes=True, part=energy.rows)
+    assert found.energy is not None
+    return found.value, float(found.energy[0] - found.energy[1])
 
 
 def _liveliest(image: Tensor, count: int) -> Tensor:
