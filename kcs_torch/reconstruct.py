@@ -124,10 +124,16 @@ def reconstruct_all(
     lens = _lens(intrinsics)
     if isinstance(lens, Intrinsics) or lens == "auto":
         return [_before(lens, chosen, one) for one in people]
-    found = chosen.many(people)
-    if lens is None and chosen.turns_over:
-        pairs = zip(people, found, strict=True)
-        found = [reconstruct_uncalibrated(chosen, one, lifted=x) if may_be_near(one) else x for one, x in pairs]
+    if lens == "parallel" or not chosen.turns_over:
+        return chosen.many(people)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
+        found = chosen.many(people)
+    for i, (one, lifted) in enumerate(zip(people, found, strict=True)):
+        if may_be_near(one):
+            found[i] = reconstruct_uncalibrated(chosen, one, lifted=lifted)
+        else:
+            chosen._warn(lifted)
     return found
 
 

@@ -50,7 +50,10 @@ def load_protocol(shared: Path) -> ModuleType:
     """Import protocol.py by its path."""
     path = shared / "protocol" / "protocol.py"
     if not path.is_file():
-        raise SystemExit(f"shared={shared}: expected a folder with protocol/protocol.py and data/, found none")
+        raise SystemExit(
+            f"shared={shared}: expected a folder with protocol/protocol.py and data/, found none: "
+            "the sequences are not part of the project"
+        )
     spec = importlib.util.spec_from_file_location("protocol", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

@@ -20,8 +20,8 @@ FILES = {
     "openpose/pose2sim_multiperson_cam01_json": ("body25b", 40, [16.0, 10.5, 18.8, 98.9]),
     "alphapose/figureskating_alphapose-results_first120.json": ("coco17", 120, [0.0, 94.3, 99.3, 99.6]),
     "coco/mmpose_test_coco.json": ("coco17", 4, [7.4, 55.9, 58.8, 55.9, 79.4, 76.5]),
-    "coco/rewritten_keypoint_results_cam01.json": ("coco17", 60, [7.5, 98.6]),
-    "mmpose/rewritten_results_cam01.json": ("coco17", 60, [7.5, 98.6]),
+    "coco/rewritten_keypoint_results_cam01.json": ("coco17", 60, [8.0, 98.6]),
+    "mmpose/rewritten_results_cam01.json": ("coco17", 60, [8.0, 98.6]),
     "mediapipe/pose_landmarks_cam01.csv": ("mediapipe33", 100, [0.0]),
     "mediapipe/pose_landmarks_cam01.json": ("mediapipe33", 60, [0.0]),
 }

@@ -219,6 +219,12 @@ def test_says_whether_it_settled():
     assert early.iterations <= found.iterations
 
 
+def test_ends_where_it_is_told_to():
+    told = lbfgs(rosenbrock, STARTS, num_steps=1000, enough=lambda made, x, value: int(made.amax()) == 12)
+    assert not told.converged and told.iterations == 12
+    assert_close(rosenbrock(told.value), told.energy)
+
+
 @pytest.mark.parametrize("dtype", FLOATS)
 @pytest.mark.parametrize("grad", [True, False])
 def test_follows_dtype_and_keeps_no_graph(dtype, grad):

@@ -1,12 +1,16 @@
 """PKC's half for viewpoints that turn: from a clip to ranked poses, cameras and uncertainty."""
 
+import dataclasses
 import sys
 
 import pytest
 import torch
 
+import kcs_torch as kt
+from kcs_torch import KcsWarning
 from kcs_torch.data.synthetic import random_motion, walking_person
 from kcs_torch.functional import bone_lengths, complete_rotation, viewpoint_turn
+from kcs_torch.methods.pkc import moving_answer
 from kcs_torch.methods.pkc.descents import Descent, descend_all
 from kcs_torch.methods.pkc.moving_view import moving_view
 from kcs_torch.skeleton import Skeleton
@@ -141,3 +145,20 @@ def test_paths_lead_between_the_frames_that_are_compared(robot):
     points, skeleton = robot
     found = solve(points, skeleton, coarse_frames=40)
     assert depth_error(found.pose.points[0], points) < 0.05
+
+
+def test_a_viewpoint_that_turns_too_little_is_told(monkeypatch):
+    """Along rays as well; depths are less sure then."""
+    tracks = walking_person(40, turn=150.0).tracks
+    free = dataclasses.replace(tracks.skeleton, name="free", template=None)
+    tracks = dataclasses.replace(tracks, skeleton=free)
+    sure = kt.reconstruct(tracks)
+    assert sure.diagnostics.doubt == ""
+    monkeypatch.setattr(moving_answer, "TURN", 170.0)
+    with pytest.warns(KcsWarning, match=r"drawn out.* only 1\d\d degrees"):
+        unsure = kt.reconstruct(tracks)
+    assert unsure.diagnostics.doubt in unsure.diagnostics.notes
+    assert torch.equal(unsure.points, sure.points) and bool((unsure.uncertainty > sure.uncertainty).all())
+    with pytest.warns(KcsWarning, match="drawn out"):
+        along = kt.reconstruct(tracks, intrinsics=(9000.0, 9000.0, *tracks.points.mean((0, 1)).tolist()))
+    assert along.diagnostics.doubt and along.distance is not None

@@ -52,7 +52,8 @@ def people_tracks(
     """Follow the people of T frames and wrap each as :class:`Tracks`.
 
     By the file's track ids where every person has one and no frame has one twice; by their places otherwise. Joints
-    are recognised by their number where neither names nor a skeleton are given.
+    are recognised by their number where neither names nor a skeleton are given. Joints whose x or y is exactly 0 are
+    unseen.
 
     Args:
         frames: the people of each frame.
@@ -70,7 +71,7 @@ def people_tracks(
         SkeletonError: the joints do not fit the skeleton.
     """
     remarks = list(notes)
-    frames = _checked(frames, source, remarks)
+    frames = _measured(_checked(frames, source, remarks), remarks)
     everybody = [s.joints for frame in frames for s in frame]
     if not everybody:
         raise FormatError(f"{source}: expected people in at least one of {len(frames)} frames, got none")
@@ -110,6 +111,21 @@ def people_tracks(
                 notes=remarks,
             )
         )
+    return out
+
+
+def _measured(frames: Sequence[Sequence[Sighting]], remarks: list[str]) -> list[list[Sighting]]:
+    """Without joints at 0, 0, which stand for none; nor is one 0 a measurement: in real files joints jump to x = 0."""
+    out: list[list[Sighting]] = []
+    halves = 0
+    for frame in frames:
+        out.append([])
+        for one in frame:
+            zero = (one.joints[:, :2] == 0).any(-1)
+            halves += int((zero & (one.joints[:, 2] > 0)).sum())
+            out[-1].append(one._replace(joints=np.where(zero[:, None], 0.0, one.joints)) if zero.any() else one)
+    if halves:
+        remarks.append(f"{halves} joints whose x or y is exactly 0 are taken as unseen")
     return out
 
 

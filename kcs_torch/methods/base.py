@@ -102,7 +102,7 @@ class Method(ABC):
             inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
             result = finish(self, tracks, found, size, known, time.perf_counter() - begin)
-        self._warn(result, found.doubt)
+        self._warn(result)
         return result
 
     def many(self, tracks: Sequence[Tracks]) -> list[Reconstruction]:
@@ -127,8 +127,8 @@ class Method(ABC):
             each = (time.perf_counter() - begin) / max(len(tracks), 1)
             rows = zip(tracks, found, parts, strict=True)
             results = [finish(self, one, estimate, size, known, each) for one, estimate, (_, size, known) in rows]
-        for result, estimate in zip(results, found, strict=True):
-            self._warn(result, estimate.doubt)
+        for result in results:
+            self._warn(result)
         return results
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
@@ -148,11 +148,11 @@ class Method(ABC):
         inner = dataclasses.replace(tracks, points=centred / size, weights=tracks.weights.clone())
         return inner, size, tracks.seen.any(-1)
 
-    def _warn(self, result: Reconstruction, doubt: str) -> None:
+    def _warn(self, result: Reconstruction) -> None:
         """Tell what the user should not miss."""
         tracks, found = result.tracks, result.diagnostics
-        if doubt:
-            warnings.warn(f"{tracks.source}: {doubt}", KcsWarning, stacklevel=users_level())
+        if found.doubt:
+            warnings.warn(f"{tracks.source}: {found.doubt}", KcsWarning, stacklevel=users_level())
         elif not (self.learned or found.viewpoint_turn >= WEAK_TURN or self.knows_template(tracks.skeleton)):
             told = tracks.skeleton.template is not None and self.name not in ("pkc", "kcs")
             others = ", while 'pkc' and 'kcs' use the skeleton's template" if told else ""

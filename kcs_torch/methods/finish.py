@@ -219,6 +219,7 @@ def _reconstruction(
         iterations=found.iterations,
         seconds=seconds,
         notes=tuple(notes),
+        doubt=found.doubt,
     )
     return Reconstruction(
         points,

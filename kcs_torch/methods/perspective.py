@@ -15,6 +15,7 @@ from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.detector import detected
+from kcs_torch.methods.finish import WHY_LOOSE, what_is_wrong
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
 from kcs_torch.methods.scene import Bodies, Scene, ahead
@@ -101,7 +102,7 @@ def reconstruct_perspective(
         tracks = method.prepared(tracks)
         result = _reconstruct(method, tracks, intrinsics, cameras, any_focal, rounds, steps)
     result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
-    method._warn(result, "")
+    method._warn(result)
     return result
 
 
@@ -151,7 +152,7 @@ def _reconstruct(
     exact = len(trunk_joints(tracks.skeleton)) >= 3 and not detected(tracks.weights)
     if method.turns_over and exact and not best.flat:
         best = replace(best, bodies=best.scene.polished(best.bodies, steps))
-    return _assemble(tracks, best)
+    return _assemble(method, tracks, best)
 
 
 def feet_on_ground(tracks: Tracks, cameras: Tensor | None) -> Tensor | None:
@@ -224,7 +225,7 @@ def _refine(
     return _Found(bodies, others, scene, view, False, lifted.diagnostics.notes)
 
 
-def _assemble(tracks: Tracks, found: _Found) -> Reconstruction:
+def _assemble(method: Method, tracks: Tracks, found: _Found) -> Reconstruction:
     """The best solution in the camera's frame, with those of the others that differ from it."""
     bodies, unit = found.bodies, found.scene.unit
     keep: list[int] = []
@@ -232,11 +233,11 @@ def _assemble(tracks: Tracks, found: _Found) -> Reconstruction:
         apart = [float((depth - bodies.depth[j]).square().mean().sqrt()) for j in keep]
         if len(keep) <= max(1, len(found.lifted[0].alternatives)) and all(a > APART * unit for a in apart):
             keep.append(k)
-    made = [_in_camera(tracks, found, k) for k in keep]
+    made = [_in_camera(method, tracks, found, k) for k in keep]
     return replace(made[0], alternatives=tuple(made[1:]))
 
 
-def _in_camera(tracks: Tracks, found: _Found, k: int) -> Reconstruction:
+def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconstruction:
     """Solution number ``k`` in the camera's frame."""
     bodies, body = found.bodies, tracks.skeleton
     lifted = found.lifted[int(bodies.origin[k])]
@@ -257,15 +258,22 @@ def _in_camera(tracks: Tracks, found: _Found, k: int) -> Reconstruction:
     ratio = bones[:, list(body.rigid)] / bones.mean(0).clamp_min(torch.finfo(bones.dtype).tiny)[list(body.rigid)]
     spread = (ratio - 1).square().mean(0).sqrt()
     told = () if k else found.notes  # the best solution's; "the mirror image", say, is true of none any more
-    notes = [n for n in told if not n.startswith((ABSENT, FOUND)) and "weak perspective" not in n]
+    stale = (WHY_LOOSE, "weak perspective", "did not settle")  # true of what was lifted, perhaps not of this
+    notes = [n for n in told if not n.startswith((ABSENT, FOUND)) and not any(part in n for part in stale)]
+    before = lifted.diagnostics
+    if not (k or before.converged):
+        notes.append(method.unsettled(before.iterations))
+    if not k:
+        notes.extend(f"{wrong}: {WHY_LOOSE}" for wrong in what_is_wrong(method, points, body))
     notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
     if scene.any_focal:
         notes.append(lens_note(intrinsics, tracks.units))
     facts = replace(
-        lifted.diagnostics,
+        before,
         bone_variation=float(100 * spread.median()) if len(spread) else math.nan,
         reprojection_rms=float(off.square().sum(-1).mean().sqrt()),
         notes=tuple(notes),
+        doubt="" if k else found.lifted[0].diagnostics.doubt,
     )
     return replace(
         lifted,

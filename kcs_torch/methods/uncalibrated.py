@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, users_level
+from kcs_torch.errors import KcsWarning, OptionError
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.detector import detected
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
@@ -38,8 +38,8 @@ SECONDS, RATE, STEPS = 5.0, 30.0, 60
 """How much of a clip tells whether a camera is near, at how many frames a second at most, and in how many steps; as
 many again where these do not find back to a far body."""
 
-FEW, HOPELESS, AWAY = 20, 10.0, 7.5
-"""Steps after which it is hopeless, by how much a near body is dearer then, and how far away it has gone by then."""
+EVERY, HOPELESS, AWAY = 20, 10.0, 7.5
+"""Every so many steps it may be hopeless: if a near body is dearer by so much, and has gone as far away."""
 
 
 def may_be_near(tracks: Tracks) -> bool:
@@ -78,29 +78,26 @@ def reconstruct_uncalibrated(
         )
     begin = time.perf_counter()
     judge = method if isinstance(method, PKC) else PKC()
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        result = judge(tracks, cameras) if lifted is None else lifted
     before = 0.0 if lifted is None else lifted.diagnostics.seconds
-    lens = likely_lens(result, cameras)
-    near: Reconstruction | None = None
-    if lens is not None:
-        with warnings.catch_warnings(record=judge is not method or lifted is not None):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
+        result = judge(tracks, cameras) if lifted is None else lifted
+        lens = likely_lens(result, cameras)
+        near: Reconstruction | None = None
+        if lens is not None:
             near = reconstruct_perspective(judge, tracks, lens, cameras, any_focal=True)
-        if judge is not method:
-            assert near.distance is not None
-            focal = float(near.distance.log().mean().exp())  # the unit is a pixel there
-            lens = replace(lens, fx=focal, fy=focal)
-            near = reconstruct_perspective(method, tracks, lens, cameras)
-            notes = (*near.diagnostics.notes, lens_note(lens, tracks.units))
-            near = replace(near, diagnostics=replace(near.diagnostics, notes=notes))
-    if near is not None and bool(near.points.isfinite().all()):
-        result = near
-    elif judge is not method:
-        result = method(tracks, cameras)
-    else:
-        for one in told:
-            warnings.warn(one.message, one.category, stacklevel=users_level())
+            if judge is not method:
+                assert near.distance is not None
+                focal = float(near.distance.log().mean().exp())  # the unit is a pixel there
+                lens = replace(lens, fx=focal, fy=focal)
+                near = reconstruct_perspective(method, tracks, lens, cameras)
+                notes = (*near.diagnostics.notes, lens_note(lens, tracks.units))
+                near = replace(near, diagnostics=replace(near.diagnostics, notes=notes))
+        if near is not None and bool(near.points.isfinite().all()):
+            result = near
+        elif judge is not method:
+            result = method(tracks, cameras)
+    method._warn(result)
     return replace(result, diagnostics=replace(result.diagnostics, seconds=before + time.perf_counter() - begin))
 
 
@@ -144,24 +141,24 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
             tracks.skeleton, view.rays, path, depth, rate, noise[some], standing=standing, focal=lens
         )
         distance = lambda state: FAR * float(energy.unpack(state).focal[1])  # noqa: E731
-        state, gain = _refined(energy, energy.start, FEW)
-        if gain < -HOPELESS and distance(state) > AWAY:
-            return None
+
+        def hopeless(state: Tensor, cost: Tensor) -> bool:
+            return float(cost[0] - cost[1]) < -HOPELESS and distance(state) > AWAY
+
+        def enough(made: Tensor, state: Tensor, cost: Tensor) -> bool:
+            return len(cost) > 1 and int(made.amin()) % EVERY == 0 and hopeless(state, cost)
+
         state = energy.start
         for _ in range(2):
-            state, gain = _refined(energy, state, STEPS)
-            if gain > -unusual(FAR):  # to be as far away costs no more than that
+            found = lbfgs(energy, state, num_steps=STEPS, tolerance=1e-6, slopes=True, part=energy.rows, enough=enough)
+            state, cost = found.value, found.energy
+            assert cost is not None
+            gain = float(cost[0] - cost[1])
+            if gain > -unusual(FAR) or hopeless(state, cost):  # to be as far away costs no more than that
                 break
         better = SEEN if detected(tracks.weights) else BETTER
         near = gain > better and distance(state) < NEAR
     return Intrinsics(USUAL * unit, USUAL * unit, x, y) if near else None
-
-
-def _refined(energy: PinholeEnergy, state: Tensor, steps: int) -> tuple[Tensor, float]:
-    """Unknowns of a far and of a near body after so many steps, and by how much the near one is cheaper."""
-    found = lbfgs(energy, state, num_steps=steps, tolerance=1e-6, slopes=True, part=energy.rows)
-    assert found.energy is not None
-    return found.value, float(found.energy[0] - found.energy[1])
 
 
 def _liveliest(image: Tensor, count: int) -> Tensor:

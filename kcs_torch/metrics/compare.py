@@ -164,6 +164,11 @@ def _same_frames(pred: Motion, truth: Motion, notes: list[str]) -> tuple[Motion,
             notes.append(f"every {step} frames of {fast.source} are compared with {slow.source}, {count} in all")
             thinned, slow = thinned.frames(0, count), slow.frames(0, count)
             return (thinned, slow) if fast is pred else (slow, thinned)
+    if pred.fps and truth.fps and abs(pred.fps / truth.fps - 1) < 0.01:
+        raise ShapeError(
+            f"expected as many frames in both, which have the same rate, got {pred.num_frames} in {pred.source} and "
+            f"{truth.num_frames} in {truth.source}: cut the longer one, as by its frames(start, stop)"
+        )
     rates = [f"{m.num_frames} frames at {f'{m.fps:g} a second' if m.fps else 'an unknown rate'}" for m in (pred, truth)]
     raise ShapeError(
         f"expected as many frames in both, or rates that are multiples of each other, got {rates[0]} in {pred.source} "

@@ -31,6 +31,7 @@ def lbfgs(
     first_step: float = 1e-2,
     slopes: bool = False,
     part: Callable[[Tensor], Callable[[Tensor], Any]] | None = None,
+    enough: Callable[[Tensor, Tensor, Tensor], bool] | None = None,
 ) -> Solution[Tensor]:
     """Minimise ``energy`` of each row of ``start`` by L-BFGS with a backtracking line search (Nocedal 1980).
 
@@ -48,6 +49,8 @@ def lbfgs(
         first_step: length of the first step, a share of the start's root mean square (of 1 where that is 0).
         slopes: ``energy`` returns its gradient, too: (H,) and (H, D). Else autograd tells it.
         part: makes the energy of some rows, whose indices (K,) it gets: problems that are done are then left out.
+        enough: asked after each trial with the steps made (K,), values (K, D) and energies (K,) of the problems not
+            left out: true ends the search.
 
     Returns:
         The minimisers (H, D); whether all settled within ``num_steps``; where they were ``memory`` steps
@@ -79,7 +82,7 @@ def lbfgs(
         rows.judge(trial, *evaluate(trial), slope, max_trials)
         done = rows.settle(tolerance, num_steps)
         count = int(done.sum())
-        if count == len(done):
+        if count == len(done) or (enough is not None and enough(rows.made, rows.x, rows.value)):
             break
         if part is not None and count >= LEAVE * len(done):
             found.append(rows[done.nonzero().flatten()].found())

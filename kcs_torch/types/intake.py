@@ -32,7 +32,9 @@ def as_floats(value: Any, what: str, ndim: int) -> Tensor:
             array = np.asarray(value)
             value = torch.as_tensor(array if np.iscomplexobj(array) else array.astype(np.float64))
         except (TypeError, ValueError):
-            raise ShapeError(f"{what}: expected an array of numbers, got {type(value).__name__}") from None
+            kind = f"one of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
+            hint = "; kcs_torch.load_tracks reads files" if isinstance(value, (str, Path)) else ""
+            raise ShapeError(f"{what}: expected an array of numbers, got {kind}{hint}") from None
     if value.is_complex():
         raise ShapeError(f"{what}: expected real numbers, got {str(value.dtype).removeprefix('torch.')}")
     if value.ndim != ndim:

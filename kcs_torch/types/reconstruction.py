@@ -30,6 +30,7 @@ class Diagnostics:
         iterations: how many steps were made.
         seconds: wall-clock time of the method.
         notes: sentences for the user.
+        doubt: the one of them that says why depth is hardly to be believed, or nothing.
     """
 
     viewpoint_turn: float
@@ -40,6 +41,7 @@ class Diagnostics:
     iterations: int
     seconds: float = float("nan")
     notes: tuple[str, ...] = ()
+    doubt: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -89,7 +89,7 @@ def _read_files(files: Sequence[Path], notes: list[str]) -> list[list[Person]]:
     """The people of each frame's file."""
     found: list[list[Person]] = []
     first: tuple[int, Path] | None = None
-    others, halves = False, 0
+    others = False
     for file in files:
         found.append([])
         for person in _people(file):
@@ -103,15 +103,10 @@ def _read_files(files: Sequence[Path], notes: list[str]) -> list[list[Person]]:
                     f"{file}: expected {first[0]} numbers a person as in {first[1].name}, got {len(numbers)}"
                 )
             joints = np.array(numbers, float).reshape(-1, 3)
-            # A missing joint is 0, 0, 0. Neither is one 0 a measurement: in real files joints jump to x = 0.
-            unseen = ~np.isfinite(joints).all(-1) | (joints[:, :2] == 0).any(-1)
-            halves += int((unseen & (joints[:, 2] > 0)).sum())
-            joints[unseen] = 0
+            joints[~np.isfinite(joints).all(-1)] = 0
             found[-1].append(joints)
     if others:
         notes.append("face and hand joints are left out: only the body is read")
-    if halves:
-        notes.append(f"{halves} joints whose x or y is exactly 0 are taken as unseen")
     return found
 
 

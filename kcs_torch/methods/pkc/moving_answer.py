@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.methods.finish import Estimate, loose_bones
 from kcs_torch.methods.pkc.body import TOLD
 from kcs_torch.methods.pkc.moving_view import MovingView
@@ -34,7 +35,12 @@ LEAD = 6.0
 of 47 views of robot arms, real and random, 14 had one, and 12 of these had a tenth of a flat guess's error or less."""
 
 BROKEN = 0.5
-"""How sure a solution is at most, 1 being full agreement, that does not keep the lengths of rigid bones."""
+"""How sure a solution is at most, 1 being full agreement, that does not keep the lengths of rigid bones, or whose
+viewpoint turns by less than it should."""
+
+TURN = 60.0
+"""Degrees by which the viewpoint should turn about a body: of a solution that turns by less, depth may be drawn out as
+far as its turn is too small, and other methods follow it there."""
 
 
 def from_moving(
@@ -65,16 +71,19 @@ def from_moving(
     agree = _agreement(points[..., 2], first.points[..., 2])
     size = points[..., 2].square().mean().sqrt()
     sure = witnessed = max(agree / SURE, moving.lead / LEAD)
-    if loose_bones(points, skeleton):  # of which another warning tells
+    shown = math.inf if cameras is not None else float(viewpoint_turn(turned[:, :2]))
+    if loose_bones(points, skeleton) or shown < TURN:  # another warning tells of the former
         sure = min(sure, BROKEN)
     spread = (moving.deviation(turned).square() + (size * max(0.0, 1 - sure)).square()).sqrt()
     doubt = ""
+    needed = f"The viewpoint should turn about the body by {TURN:g} degrees or more, or the skeleton have a template"
     if witnessed < DOUBT / SURE:
         doubt = (
             "depth is little more than a guess: two methods find depths that hardly agree "
-            f"(correlation {agree:.2f}). The viewpoint should turn about the body by 60 degrees or more, or "
-            "the skeleton have a template"
+            f"(correlation {agree:.2f}). {needed}"
         )
+    elif shown < TURN:
+        doubt = f"depth may be drawn out or pressed flat: the viewpoint turned by only {shown:.0f} degrees. {needed}"
     main = Estimate(points, path[:, :2], one, settled, MOVING_STEPS, notes, spread, value, doubt=doubt)
     if told or not mirrored:
         return main
