@@ -476,3 +476,13 @@ def test_nothing_is_said_of_the_root_depth_that_the_distance_replaces():
         for one in (found, *found.alternatives):
             assert not any(note.startswith((ABSENT, FOUND)) for note in one.diagnostics.notes)
             torch.testing.assert_close(one.root_depth, one.distance - one.distance[0])
+
+
+def test_bodies_without_a_template_are_lifted_softly_first(monkeypatch):
+    """Along the rays of wrong depths no bone keeps its length: a method that insists on it goes astray."""
+    tracks, truth = filmed(nearest=2500.0, turn=180.0, frames=80)
+    body = replace(tracks.skeleton, name="free", template=None, proportions=None, spread=None, hinges=())
+    tracks = replace(tracks, skeleton=body)
+    off = error(reconstruct(tracks, intrinsics=LENS).observed, truth)
+    monkeypatch.setattr(perspective, "SOFT", 0)
+    assert off < 20 < error(reconstruct(tracks, intrinsics=LENS).observed, truth) / 2, off

@@ -19,6 +19,7 @@ from kcs_torch.methods.finish import WHY_LOOSE, what_is_wrong
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
 from kcs_torch.methods.scene import Bodies, Scene, ahead
+from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.view import View, lens_note, slow_part, zoomed
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
@@ -36,6 +37,10 @@ APART = 0.04
 
 STILL = 2.0
 """Degrees of the turn of known cameras from which on feet that stand still in the image need not stand still."""
+
+SOFT = 8
+"""Rounds of SfAM, at most, that come first where no template helps: straightened by wrong depths, tracks do not fit
+bones of constant length, which PKC insists on."""
 
 WIDE = 3.0
 """Tangent of the angle off the optical axis from which on the focal length is hardly true."""
@@ -79,7 +84,8 @@ def reconstruct_perspective(
     body's apparent size, each round lifts these tracks by the method, then refines depths, lengths and distances of all
     its solutions and of a mirror image together under perspective (:class:`PinholeEnergy`); bones' constant lengths
     tell mirror images apart, and so do feet that stand still. Where the method looks for runs of wrong signs, and the
-    body has a template, they are turned over (:meth:`Scene.turned_over`).
+    body has a template, they are turned over (:meth:`Scene.turned_over`). Where PKC knows no template, up to
+    eight rounds of SfAM go before its own: it does not insist on lengths while depths are still wrong.
 
     Args:
         method: any.
@@ -132,20 +138,27 @@ def _reconstruct(
         cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
     feet = feet_on_ground(tracks, cameras)
     best: _Found | None = None
-    for _ in range(rounds):
+    soft = SOFT if method.turns_over and len(trunk_joints(tracks.skeleton)) < 3 else 0
+    while rounds > 0:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)
             known = None if cameras is None else (view.look @ complete_rotation(cameras))[:, :2]
-            lifted = method.following()(_straighten(tracks, view.rays, distance, depth), known)
+            lifted = (SfAM() if soft else method.following())(_straighten(tracks, view.rays, distance, depth), known)
         given = lifted, view, distance, depth, rate, feet, steps
         found = _refine(*given, mirror=cameras is None, flips=method.turns_over, any_focal=any_focal)
         bodies = found.bodies
         moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
+        sound = bool(bodies.energy.isfinite().any())
+        if sound:
+            distance, depth = bodies.distance[0], bodies.depth[0]
+        if soft:
+            soft = soft - 1 if sound and moved >= SETTLED else 0
+            continue
+        rounds -= 1
         if best is None or (not bool(bodies.energy[0] >= best.bodies.energy[0]) and bool(bodies.energy[0].isfinite())):
             best = found
-        if moved < SETTLED or not bool(bodies.energy.isfinite().any()):
+        if moved < SETTLED or not sound:
             break
-        distance, depth = bodies.distance[0], bodies.depth[0]
         if any_focal:
             view = View.of(tracks, zoomed(view.lens, float(bodies.focal[0])), rate)
     assert best is not None
