@@ -234,6 +234,19 @@ def test_score_says_what_does_not_fit(scored):
     assert "expected 3D motion under 'points3d'" in done.stderr
 
 
+def test_score_of_a_part_of_a_clip(scored):
+    save(load_motion(scored / "truth.trc").frames(5, 15), scored / "part.trc", units="mm")
+    run("score", scored / "pred.npz", scored / "part.trc", code=2)
+    data = json.loads(run("score", scored / "pred.npz", scored / "part.trc", "--pred-frames", "5:15", "--json").stdout)
+    same = ["--pred-frames", "5:15", "--truth-frames", "5:15", "--json"]
+    assert data["frames"] == 10
+    both = json.loads(run("score", scored / "pred.npz", scored / "truth.trc", *same).stdout)
+    assert data["mpjpe"] == pytest.approx(both["mpjpe"])
+    for frames, message in (("30:", "--truth-frames: expected frames within 0:20"), ("seen", "--truth-frames: expect")):
+        done = run("score", scored / "pred.npz", scored / "truth.trc", "--truth-frames", frames, code=2)
+        assert message in done.stderr
+
+
 def test_score_takes_the_unit_of_files_without_one(scored):
     save(load_motion(scored / "truth.trc"), scored / "truth.npz")
     motion = Motion.of(load_reconstruction(scored / "pred.npz"))

@@ -19,7 +19,16 @@ from torch.testing import assert_close
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import bone_lengths, bone_vectors, kcs_matrix, svt
-from kcs_torch.nn import SVT, BoneLengths, BoneVectors, KCSMatrix
+from kcs_torch.nn import (
+    SVT,
+    BoneLengthEnergy,
+    BoneLengths,
+    BoneVectors,
+    KCSMatrix,
+    LowRankEnergy,
+    SmoothnessEnergy,
+    SymmetryEnergy,
+)
 from kcs_torch.nn.layers import inverse_softplus
 from kcs_torch.skeleton import SKELETONS
 
@@ -201,3 +210,12 @@ def test_the_kcs_matrix_of_millimetres_is_finite_in_half_precision(dtype):
         assert_close(layer(points), exact)
     assert torch.isfinite(layer(points.to(dtype))).all() and exact.max() > torch.finfo(torch.float16).max
     assert_close(level(points.to(dtype)).float(), level(points), rtol=0.05, atol=0.05)
+
+
+def test_confidences_are_no_coordinate():
+    points = torch.rand(2, 5, 17, 4)
+    modules = (KCSMatrix, BoneVectors, BoneLengths, BoneLengthEnergy, SymmetryEnergy)
+    for module in (*(kind("h36m17") for kind in modules), SmoothnessEnergy(), LowRankEnergy()):
+        with pytest.raises(ShapeError, match=r"expected points of 2 or 3 coordinates, got \(2, 5, 17, 4\)"):
+            module(points)
+        assert bool(module(points[..., :3]).isfinite().all())

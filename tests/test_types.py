@@ -363,7 +363,7 @@ def test_scaled_by_height():
         ({"factor": -1.0}, "positive factor"),
         ({"factor": INF}, "positive factor"),
         ({"factor": NAN}, "positive factor"),
-        ({"height": -1.75}, "positive factor"),
+        ({"height": -1.75}, "height: expected a positive number, got -1.75"),
         ({"factor": "2"}, "factor: expected a number, got '2'"),
         ({"height": "1.75"}, "height: expected a number, got '1.75'"),
         ({"factor": torch.ones(2)}, "factor: expected a number"),

@@ -69,20 +69,21 @@ Smooth3D = Annotated[
 ]
 
 
-def frame_range(text: str | None) -> tuple[int, int | None]:
-    """Read ``100:400``, ``100:`` or ``:400``; all frames for ``seen``, which depends on the person.
+def frame_range(text: str | None, option: str = "--frames", *, seen: bool = True) -> tuple[int, int | None]:
+    """Read ``100:400``, ``100:`` or ``:400``; all frames for ``seen``, if it may be, which depends on the person.
 
     Raises:
         OptionError: it is something else.
     """
     from kcs_torch.errors import OptionError
 
-    if text is None or text == SEEN:
+    if text is None or (seen and text == SEEN):
         return 0, None
     first, colon, last = text.strip().partition(":")
     plain = all(part == "" or (part.isascii() and part.isdigit()) for part in (first, last))
     if not colon or not plain or (last and int(last) <= int(first or 0)):
-        raise OptionError(f"--frames: expected A:B, A below B, such as 100:400, 100: or :400, or seen, got {text!r}")
+        forms = "100:400, 100: or :400" + (", or seen" if seen else "")
+        raise OptionError(f"{option}: expected A:B, A below B, such as {forms}, got {text!r}")
     return int(first or 0), int(last) if last else None
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from kcs_torch.cli.cleaning import frame_range
 from kcs_torch.cli.convert import FromUnits
 from kcs_torch.cli.options import AsJson
 from kcs_torch.cli.outputs import Scale, parse_scale, sized
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["score"]
 
 _Up = "The axis that points up in {}, if the file does not say so: y, z, x, -y (the camera's axes) or -z."
+_Frames = "Take frames A to B of {}, counted from 0, without B (A: and :B extend to the ends)."
 
 
 def score(
@@ -55,6 +57,8 @@ def score(
     scale: Scale = None,
     pred_up: Annotated[str | None, typer.Option(metavar="AXIS", help=_Up.format("PRED"))] = None,
     truth_up: Annotated[str | None, typer.Option(metavar="AXIS", help=_Up.format("TRUTH"))] = None,
+    pred_frames: Annotated[str | None, typer.Option(metavar="A:B", help=_Frames.format("PRED"))] = None,
+    truth_frames: Annotated[str | None, typer.Option(metavar="A:B", help=_Frames.format("TRUTH"))] = None,
     pred_fps: Annotated[float | None, typer.Option(metavar="NUMBER", help="PRED's frames a second.")] = None,
     truth_fps: Annotated[float | None, typer.Option(metavar="NUMBER", help="TRUTH's frames a second.")] = None,
     from_units: FromUnits = None,
@@ -66,9 +70,10 @@ def score(
         from kcs_torch.metrics import compare
 
         with progress(f"reading {pred}"):
-            ours = _motion(pred, parse_scale(scale), up=pred_up, fps=pred_fps)
+            ours = _cut(_motion(pred, parse_scale(scale), up=pred_up, fps=pred_fps), pred_frames, "--pred-frames")
         with progress(f"reading {truth}"):
             theirs = load_motion(truth, up=truth_up, fps=truth_fps, units=from_units)
+            theirs = _cut(theirs, truth_frames, "--truth-frames")
         found = compare(ours, theirs, align=align or None, root=root, mirror=mirror, within=within)
         if as_json:
             print_json(dataclasses.asdict(found))
@@ -87,6 +92,17 @@ def _motion(path: str, size: dict[str, Any] | None, **options: Any) -> Motion:
         assert isinstance(data, Reconstruction)
         return Motion.of(sized(data, size))
     return sized(load_motion(path, **options), size)
+
+
+def _cut(motion: Motion, frames: str | None, option: str) -> Motion:
+    """The frames that an option asks for."""
+    from kcs_torch.errors import OptionError
+
+    start, stop = frame_range(frames, option, seen=False)
+    stop = motion.num_frames if stop is None else min(stop, motion.num_frames)
+    if not start < stop:
+        raise OptionError(f"{option}: expected frames within 0:{motion.num_frames} of {motion.source}, got {frames}")
+    return motion.frames(start, stop)
 
 
 def _spoken(found: Comparison, pred: str, truth: str) -> str:

@@ -114,19 +114,17 @@ def people_tracks(
     return out
 
 
-def _measured(frames: Sequence[Sequence[Sighting]], remarks: list[str]) -> list[list[Sighting]]:
+def _measured(frames: Sequence[Sequence[Sighting]], notes: list[str]) -> list[list[Sighting]]:
     """Without joints at 0, 0, which stand for none; nor is one 0 a measurement: in real files joints jump to x = 0."""
-    out: list[list[Sighting]] = []
-    halves = 0
-    for frame in frames:
-        out.append([])
-        for one in frame:
-            zero = (one.joints[:, :2] == 0).any(-1)
-            halves += int((zero & (one.joints[:, 2] > 0)).sum())
-            out[-1].append(one._replace(joints=np.where(zero[:, None], 0.0, one.joints)) if zero.any() else one)
-    if halves:
-        remarks.append(f"{halves} joints whose x or y is exactly 0 are taken as unseen")
-    return out
+    everybody = [s.joints for frame in frames for s in frame]
+    if not everybody:
+        return [list(frame) for frame in frames]
+    joints = np.stack(everybody)
+    zero = (joints[..., :2] == 0).any(-1)
+    if halves := int((zero & (joints[..., 2] > 0)).sum()):
+        notes.append(f"{halves} joints whose x or y is exactly 0 are taken as unseen")
+    kept = iter(np.where(zero[..., None], 0.0, joints))
+    return [[s._replace(joints=next(kept)) for s in frame] for frame in frames]
 
 
 def _checked(frames: Sequence[Sequence[Sighting]], source: str, notes: list[str]) -> list[list[Sighting]]:

@@ -140,7 +140,9 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
         energy = PinholeEnergy(
             tracks.skeleton, view.rays, path, depth, rate, noise[some], standing=standing, focal=lens
         )
-        distance = lambda state: FAR * float(energy.unpack(state).focal[1])  # noqa: E731
+
+        def distance(state: Tensor) -> float:
+            return FAR * float(energy.unpack(state).focal[1])
 
         def hopeless(state: Tensor, cost: Tensor) -> bool:
             return float(cost[0] - cost[1]) < -HOPELESS and distance(state) > AWAY

@@ -167,7 +167,8 @@ def _same_frames(pred: Motion, truth: Motion, notes: list[str]) -> tuple[Motion,
     if pred.fps and truth.fps and abs(pred.fps / truth.fps - 1) < 0.01:
         raise ShapeError(
             f"expected as many frames in both, which have the same rate, got {pred.num_frames} in {pred.source} and "
-            f"{truth.num_frames} in {truth.source}: cut the longer one, as by its frames(start, stop)"
+            f"{truth.num_frames} in {truth.source}: cut the longer one, by its frames(start, stop) or "
+            "by --pred-frames or --truth-frames A:B of kcs-torch score"
         )
     rates = [f"{m.num_frames} frames at {f'{m.fps:g} a second' if m.fps else 'an unknown rate'}" for m in (pred, truth)]
     raise ShapeError(

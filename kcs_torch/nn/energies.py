@@ -19,6 +19,7 @@ from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.spectral import log_det, nuclear_norm, svt
 from kcs_torch.nn.layers import (
     SkeletonModule,
+    check_coordinates,
     check_points,
     check_tensor,
     full_precision,
@@ -293,6 +294,7 @@ def check_clip(points: Tensor, module: nn.Module) -> None:
     check_points(points, module)
     if points.ndim < 3:
         raise ShapeError(f"{type(module).__name__}: expected points (..., T, N, D), got {tuple(points.shape)}")
+    check_coordinates(points, module)
 
 
 def check_weights(weights: Tensor | None, points: Tensor, module: nn.Module) -> None:

@@ -27,10 +27,19 @@ def check_tensor(value: Any, what: str, module: nn.Module) -> None:
 
 
 def check_points(points: Any, module: nn.Module, what: str = "points") -> None:
-    """Raise a ShapeError unless ``points`` are a tensor of floating-point numbers."""
+    """Raise a ShapeError unless ``points`` are a tensor of floating-point numbers with at most three coordinates."""
     check_tensor(points, what, module)
     if not points.is_floating_point():
         raise ShapeError(f"{type(module).__name__}: expected {what} in floating point, got {points.dtype}")
+
+
+def check_coordinates(points: Tensor, module: nn.Module) -> None:
+    """Raise a ShapeError unless ``points`` (..., N, D) have at most three coordinates."""
+    if points.shape[-1] > 3:
+        raise ShapeError(
+            f"{type(module).__name__}: expected points of 2 or 3 coordinates, got {tuple(points.shape)}; confidences "
+            "are no coordinate: pass points[..., :3], and weights where the module takes them"
+        )
 
 
 def check_joints(module: nn.Module, skeleton: Skeleton, points: Tensor, form: str) -> None:
@@ -70,6 +79,7 @@ class SkeletonModule(nn.Module):
         """Raise a ShapeError unless ``points`` are (..., N, D), or a clip (..., T, N, D), with this skeleton's N."""
         check_points(points, self)
         check_joints(self, self.skeleton, points, "points (..., T, {}, 3)" if clip else "points (..., {}, 3)")
+        check_coordinates(points, self)
 
     def extra_repr(self) -> str:
         return f"skeleton='{self.skeleton.name}'"

@@ -57,6 +57,8 @@ def size_factor(
             own = float(lengths[_bone(body, name, what)])
         if not own > 0:
             raise OptionError(f"{what}: {name} is zero or unknown in this motion")
+        if not 0 < size < math.inf:
+            raise OptionError(f"{what}: {name}: expected a positive number, got {size:g}")
         factor = size / own
     factor = _number(factor, f"{what}: factor")
     if not (factor > 0 and math.isfinite(factor)):
