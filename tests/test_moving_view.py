@@ -74,6 +74,39 @@ def test_noise_frees_the_image(film):
     assert 0 < error(found) < 0.9 * error(noisy)
 
 
+def turn(axis, angle):
+    """Rotations (T, 3, 3) about an axis by angles (T,)."""
+    step = torch.zeros(3, 3, dtype=torch.float64)
+    step[axis - 2, axis - 1], step[axis - 1, axis - 2] = -1.0, 1.0
+    return torch.linalg.matrix_exp(angle.double()[:, None, None] * step)
+
+
+def test_a_tail_that_swings_keeps_its_length():
+    """Links of 15 joints follow each other, but for one that swings by itself, whose path has to be tried alone."""
+    time = torch.arange(120, dtype=torch.float64) / 30
+    place = lambda rotations, x, y, z: rotations @ torch.tensor([x, y, z], dtype=torch.float64)  # noqa: E731
+    trunk = turn(0, 0.1 * (3 * time).sin()) @ turn(1, 0.15 * (3 * time).sin())
+    neck = place(trunk, 0, -0.05, -0.7)
+    joints = [0 * neck, neck, neck + place(turn(0, 0.4 * (2 * time).sin()), 0, -0.2, -0.2)]  # hip, neck, head
+    joints.append(place(turn(1, 0.7 * (4 * time).sin()), 0, -0.15, 0.3))
+    bones = [(1, 0), (1, 2), (0, 3)]
+    for side in (1, -1):
+        for parent in (0, 1):
+            wave = 6 * time + torch.pi * (side == 2 * parent - 1)
+            shoulder = joints[parent] + torch.tensor([0.12 * side, 0.05, 0.0])
+            knee = shoulder + place(turn(0, 0.5 * wave.sin()), 0, 0.25, 0)
+            paw = knee + place(turn(0, 0.5 * wave.sin() - 0.4 - 0.4 * wave.cos()), 0, 0.25, 0)
+            count = len(joints)
+            joints += [shoulder, knee, paw]
+            bones += [(parent, count), (count, count + 1), (count + 1, count + 2)]
+    seen = turn(0, 0 * time + 0.15) @ turn(1, 0.4 + torch.pi * time / time[-1])
+    points = torch.stack(joints, 1) @ seen.mT
+    skeleton = Skeleton.from_edges(bones, len(joints))
+    found = kt.reconstruct(points[..., :2], skeleton=skeleton).points
+    lengths = bone_lengths(found, skeleton.bone_index())
+    assert float((lengths.std(0) / lengths.mean(0)).amax()) < 0.01
+
+
 @pytest.mark.parametrize("frames", [1, 2, 4])
 def test_short_clips_stay_finite(film, frames):
     points, clip = film

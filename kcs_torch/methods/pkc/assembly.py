@@ -26,8 +26,12 @@ SPREAD = 5.0
 TOP, KEEP = 12, 4
 """Starts that go on after the first stage and after the second."""
 
-TIMES, TRIED = 4, 8
-"""How often the best changes one bone's path at most, and changes that are settled each time."""
+TIMES = 8
+"""How often the best changes one bone's path at most."""
+
+FEW, MANY = (8, TOP, KEEP), (4, 2, 1)
+"""For bodies of few bones and of many: changes that are settled each time, and how many of them go on after the first
+stage and after the second."""
 
 GAIN = 1.0
 """How much cheaper a solution has to be to count as better."""
@@ -62,23 +66,29 @@ class Assembly:
     seed: int
 
     def near(self, found: Pose) -> Search[Any, Any, Pose]:
-        """Solutions, best first: those that are given, settled, and the paths nearest to them."""
-        return (yield from self._settled(_joined(found, self._nearest(found))))
+        """Solutions, best first: those that are given, settled, the paths nearest to them, and changes of one bone."""
+        return (yield from self._changed(_joined(found, self._nearest(found)), MANY))
 
     def searched(self, found: Pose) -> Search[Any, Any, Pose]:
-        """As :meth:`near`, with all combinations of paths beside it, and changes of single bones; for few bones."""
-        pose = yield from self._settled(_joined(found, self._nearest(found), self._combined()))
+        """As :meth:`near`, with all combinations of paths beside it; for few bones."""
+        return (yield from self._changed(_joined(found, self._nearest(found), self._combined()), FEW))
+
+    def _changed(self, found: Pose, kept: tuple[int, int, int]) -> Search[Any, Any, Pose]:
+        """Solutions, settled, best first; the best takes other paths of single bones while that makes it better."""
+        pose = yield from self._settled(found)
         for _ in range(TIMES):
-            best = self.value(pose)[0]
-            tried = self._placed(self._changes(pose), pose.rotations[:1], 2)
-            tried = yield from self._settled(tried[self.value(tried).argsort()[:TRIED]])
+            best, depth = self.value(pose)[0], self._changes(pose)
+            if not len(depth):
+                break
+            tried = self._placed(depth, pose.rotations[:1], 2)
+            tried = yield from self._settled(tried[self.value(tried).argsort()[: kept[0]]], *kept[1:])
             if not bool(self.value(tried)[0] < best - GAIN):
                 break
             pose = _joined(tried[:1], pose)
         return pose
 
-    def _settled(self, pose: Pose) -> Search[Any, Any, Pose]:
-        for stages, kept in ((self.stages[:1], TOP), (self.stages[1:2], KEEP), (self.stages[2:], KEEP)):
+    def _settled(self, pose: Pose, top: int = TOP, keep: int = KEEP) -> Search[Any, Any, Pose]:
+        for stages, kept in ((self.stages[:1], top), (self.stages[1:2], keep), (self.stages[2:], keep)):
             pose = yield from self.descend(pose, stages)
             pose = pose[self.value(pose).argsort()[:kept]]
         return pose
@@ -118,9 +128,9 @@ class Assembly:
         mirrored = torch.cat([paths, -paths, -own[0, :, None]], 1)  # (B, 2 K + 1, T)
         real = torch.cat([cost.isfinite(), cost.isfinite(), torch.ones_like(cost[:, :1], dtype=torch.bool)], 1)
         real &= (mirrored - own[0, :, None]).square().mean(-1).sqrt() > CHANGED
-        bone, which = real.nonzero().unbind(-1)
+        bone, path = real.nonzero().unbind(-1)
         out = own.repeat(len(bone), 1, 1)
-        out[torch.arange(len(bone), device=out.device), bone] = mirrored[bone, which]
+        out[torch.arange(len(bone), device=out.device), bone] = mirrored[bone, path]
         return out
 
 
