@@ -40,7 +40,7 @@ def solve(points, skeleton, **options):
 def test_finds_depths_and_the_turning_camera_from_a_flat_start(film):
     points, clip = film
     found = solve(points, clip.skeleton, coarse_frames=40, alternatives=2)
-    assert found.pose.points.shape == (2, 70, 17, 3)
+    assert found.pose.points.shape[1:] == (70, 17, 3) and len(found.value) == len(found.pose.points) <= 2
     assert depth_error(found.pose.points[0], points) < 0.05 < depth_error(0 * points, points) / 4
     path, kind = found.cameras()
     assert kind == "constant"
@@ -195,3 +195,42 @@ def test_a_viewpoint_that_turns_too_little_is_told(monkeypatch):
     with pytest.warns(KcsWarning, match="drawn out"):
         along = kt.reconstruct(tracks, intrinsics=(9000.0, 9000.0, *tracks.points.mean((0, 1)).tolist()))
     assert along.diagnostics.doubt and along.distance is not None
+
+
+def chain(links, seed, turn=90):
+    """Tracks (T, N, 2) and depths (T, N) of a short chain, of which nothing but its bones' lengths is known."""
+    skeleton = Skeleton.from_edges([(i, i + 1) for i in range(links)], links + 1)
+    made = random_motion(skeleton, num_frames=150, turn=turn, generator=torch.Generator().manual_seed(seed))
+    points = made.points - made.points.mean(1, keepdim=True)
+    return points[..., :2], points[..., 2], skeleton
+
+
+def relative(result, depth):
+    found = result.points[..., 2] - result.points[..., 2].mean(-1, keepdim=True)
+    return float(min((found - s * depth).norm() for s in (1, -1)) / depth.norm())
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 8])
+def test_bodies_that_fit_nearly_as_well_are_among_the_alternatives(count):
+    tracks, depth, skeleton = chain(6, 4)
+    with pytest.warns(KcsWarning, match="guess"):
+        result = kt.reconstruct(tracks, skeleton=skeleton, fps=30, method="pkc", alternatives=count)
+    mirror, *others = result.alternatives or (None,)
+    assert len(result.alternatives) <= count and (mirror is None) == (count == 0)
+    if mirror is not None:
+        assert mirror.objective == result.objective
+    values = [one.objective for one in (result, *others)]
+    assert values == sorted(values)
+    shown = [one.points[..., 2] for one in (result, *others)]
+    for k, a in enumerate(shown):  # no two are one body, or its mirror image
+        assert all(relative(result, depth) > 0 and min((a - s * b).norm() for s in (1, -1)) > 0.01 for b in shown[:k])
+    if count == 8:
+        assert others and min(relative(one, depth) for one in others) < 0.2 < relative(result, depth)
+        assert all(any("nearly as well" in note for note in one.diagnostics.notes) for one in others)
+
+
+def test_a_solution_that_hardly_leads_is_doubted():
+    tracks, depth, skeleton = chain(6, 102)
+    with pytest.warns(KcsWarning, match=r"fit the tracks nearly as well \(see the alternatives\)"):
+        result = kt.reconstruct(tracks, skeleton=skeleton, fps=30)
+    assert len(result.alternatives) > 1 and relative(result, depth) > 0.3

@@ -84,9 +84,10 @@ class PKC(Method):
             right back where a detector mistakes them (:func:`kcs_torch.clean.unswap`); smooth noisy tracks, fill gaps
             and reject outliers (:func:`kcs_torch.solvers.denoise_tracks`).
         lifts: random starts of the moving viewpoint's solver, for skeletons without a template.
-        rounds: of discrete moves of the fixed viewpoint's solver.
-        steps: L-BFGS steps of each of its refinements.
-        alternatives: further solutions to return.
+        rounds: of discrete moves of the fixed viewpoint's solver; nothing without a template.
+        steps: L-BFGS steps of each of its refinements; nothing without a template.
+        alternatives: further solutions to return at most. Without a template these are the mirror image and bodies that
+            fit the tracks nearly as well, of which there are often none.
         contacts: rank solutions by feet that stand still in the image, and so in space, too, unless the camera goes
             round the body; to be switched off for one that follows it.
         seed: of the random starts.
@@ -152,8 +153,8 @@ class PKC(Method):
             image = resized
         if not has_trunk:
             if enough:
-                moving, first = yield from self._moving(tracks, image, noise)
-                made = from_moving(moving, first, skeleton, cameras, notes, mirrored=self.alternatives > 0)
+                moving, first = yield from self._moving(tracks, image, noise, max(1, self.alternatives))
+                made = from_moving(moving, first, skeleton, cameras, notes, alternatives=self.alternatives)
             else:
                 seen = _complete(tracks, image)
                 (first,) = (yield [seen]) if cameras is None else [SfAM().solve(seen, cameras)]
@@ -247,11 +248,15 @@ class PKC(Method):
             notes.append(f"{counted(count, 'frame')} at the clip's ends {show} nobody: nearest pose held")
         return points - points.mean(-2, keepdim=True), noise, tuple(notes)
 
-    def _moving(self, tracks: Tracks, image: Tensor, noise: Tensor) -> Search[Any, Any, tuple[MovingView, Estimate]]:
-        """Solutions of the moving viewpoint; and the first guess, SfAM's."""
+    def _moving(
+        self, tracks: Tracks, image: Tensor, noise: Tensor, count: int = 1
+    ) -> Search[Any, Any, tuple[MovingView, Estimate]]:
+        """So many solutions of the moving viewpoint at most; and the first guess, SfAM's."""
         (first,) = yield [_complete(tracks, image)]
         start, exact = (first.points, complete_rotation(first.cameras)), float(noise.median()) == 0
-        moving = yield from turning(image, tracks.skeleton, *start, lifts=self.lifts, exact=exact, seed=self.seed)
+        moving = yield from turning(
+            image, tracks.skeleton, *start, lifts=self.lifts, alternatives=count, exact=exact, seed=self.seed
+        )
         return moving, first
 
     def _turned(self, tracks: Tracks, image: Tensor, noise: Tensor, factor: Tensor) -> Turned:

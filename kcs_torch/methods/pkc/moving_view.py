@@ -58,6 +58,10 @@ WORTH = 20.0
 """Weight of how likely the path of each bone is by itself: a bone keeps its direction for about so many frames, which
 the other terms count one by one."""
 
+NEAR = 6.0
+"""How much dearer than the best, for each frame compared, another solution may be to be given beside it: what leads by
+more has so far been right."""
+
 LONG = 2000
 """Frames of a clip up to which paths of bones are put together: of longer ones the frames that are compared are too far
 apart, and paths of all frames would take much memory."""
@@ -71,10 +75,11 @@ ROBOT = 10
 
 @dataclass(frozen=True)
 class MovingView:
-    """Solutions of one clip, best first.
+    """Solutions of one clip, best first, none like another or its mirror image.
 
     Attributes:
         pose: points (H, T, N, 3) in the camera frame, and the rotations that align them.
+        value: (H,) by which they are ranked.
         bones: (B, 2) tree that the poses were aligned in.
         rigid: (P, 2) pairs that keep their distance.
         stiffness: weight of each length.
@@ -83,6 +88,7 @@ class MovingView:
     """
 
     pose: Pose
+    value: Tensor
     bones: Tensor
     rigid: Tensor
     stiffness: float
@@ -135,7 +141,8 @@ def moving_view(
         turns: degrees of further starts with evenly turning cameras.
         lifts: number of further starts from bone lengths with random signs.
         coarse_frames: starts are compared on about as many frames, evenly spread.
-        alternatives: how many of the best (at most the last of KEPT) are refined on all frames.
+        alternatives: how many solutions are refined on all frames and returned at most, the best and those that are
+            hardly dearer (by NEAR).
         exact: the image shows lengths without noise: where all bones of a tree are rigid, those that vary count against
             a solution, and starts are put together from paths that single bones can take.
         seed: of the random starts.
@@ -217,7 +224,7 @@ def searching(
         near = (pose.points[:, None] - mine).square().sum(-1).mean((-2, -1)) < SAME**2
         order = 1 - near.any(-1).long().cpu()  # some are the first guess's still
         lead = _lead(pose, value(pose)) if joints <= ROBOT else 0.0
-    best = value(pose).argsort()[:alternatives]
+    best = _distinct(pose, value(pose), alternatives)
     pose, order = pose[best], order[best.cpu()]
 
     if len(pick) < frames:
@@ -231,12 +238,13 @@ def searching(
         pose = replace(pose, points=points, rotations=turned)
         del first, start, points, turned  # of long clips they are large
         pose = yield from descend(image, pose, tight[0], stages, weights)
-    if len(pick) == frames and is_tree:  # the finest stages have seen all frames
-        return MovingView(pose, bones, rigid, tight[0], lead)
-    if not is_tree:
-        bones = spread(pose.points[0])
-    pose = yield from descend(image, pose, tight[1], fine, weights)
-    return MovingView(pose[value(pose).argsort()], bones, rigid, tight[0], lead)
+    if len(pick) < frames or not is_tree:  # else the finest stages have seen all frames
+        if not is_tree:
+            bones = spread(pose.points[0])
+        pose = yield from descend(image, pose, tight[1], fine, weights)
+    ranks = value(pose)
+    best = _distinct(pose, ranks, alternatives)
+    return MovingView(pose[best], ranks[best], bones, rigid, tight[0], lead)
 
 
 def settled(image: Tensor, skeleton: Skeleton, start: Tensor, rotations: Tensor) -> Search[Descent, Pose, Tensor]:
@@ -254,12 +262,28 @@ def soften(stage: Stage, noise: float) -> Stage:
     return replace(stage, eps=max(stage.eps, 0.1 * noise**2), slack=max(stage.slack, 0.3 * noise))
 
 
+def _distinct(pose: Pose, value: Tensor, count: int) -> Tensor:
+    """Indices of the best solution and those hardly dearer, none like another or its mirror image, best first."""
+    kept: list[int] = []
+    for k in value.argsort().tolist():
+        if len(kept) == count or float(value[k] - value.amin()) > NEAR * pose.points.shape[1]:
+            break
+        if bool((_apart(pose, k)[kept] > OTHER).all()):
+            kept.append(k)
+    return torch.tensor(kept, device=value.device)
+
+
 def _lead(pose: Pose, value: Tensor) -> float:
     """How much dearer than the best, for each frame, the next solution is that is not the same or its mirror image."""
-    depth, best = pose.points[..., 2], value.argmin()
-    off = torch.minimum((depth - depth[best]).square().mean((1, 2)), (depth + depth[best]).square().mean((1, 2)))
-    dearer = (value - value[best])[off.sqrt() > OTHER]
-    return float(dearer.amin()) / depth.shape[1] if len(dearer) else 0.0
+    best = int(value.argmin())
+    dearer = (value - value[best])[_apart(pose, best) > OTHER]
+    return float(dearer.amin()) / pose.points.shape[1] if len(dearer) else 0.0
+
+
+def _apart(pose: Pose, one: int) -> Tensor:
+    """How far the depths of each solution are from those of one or of its mirror image, (H,), root mean square."""
+    depth = pose.points[..., 2]
+    return torch.stack([(depth - s * depth[one]).square().mean((1, 2)) for s in (1, -1)]).amin(0).sqrt()
 
 
 def _starts(
