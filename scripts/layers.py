@@ -122,6 +122,7 @@ def compare_losses(body: kt.Skeleton, repeats: int) -> None:
         "SmoothnessEnergy()": (nn.SmoothnessEnergy(), ()),
         "HingeEnergy(body)": (nn.HingeEnergy(body), (None,)),
         "AdductionEnergy(body)": (nn.AdductionEnergy(body), (None,)),
+        "StanceEnergy(body)": (nn.StanceEnergy(body), (None,)),
         "KCSDistance(body)": (nn.KCSDistance(body), (target,)),
         "JointDistance()": (nn.JointDistance(), (target,)),
         'JointDistance("similarity")': (nn.JointDistance("similarity"), (target,)),

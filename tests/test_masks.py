@@ -24,6 +24,7 @@ from kcs_torch.nn import (
     ProportionEnergy,
     ReprojectionEnergy,
     SmoothnessEnergy,
+    StanceEnergy,
     SymmetryEnergy,
 )
 from kcs_torch.nn.masks import safe_root, weighs_joints
@@ -77,11 +78,13 @@ WEIGHTED = {
     "ProcrusteanEnergy, changes": lambda x, w, t: ProcrusteanEnergy(MAN, order=1)(x, None, w),
     "ReprojectionEnergy": lambda x, w, t: ReprojectionEnergy()(x, TRACKS[t], CAMERAS[t], w),
     "ReprojectionEnergy, huber": lambda x, w, t: ReprojectionEnergy(huber=0.1)(x, TRACKS[t], None, w),
+    "StanceEnergy": lambda x, w, t: StanceEnergy(MAN)(x, None, w),
+    "StanceEnergy, given": lambda x, w, t: StanceEnergy(MAN)(x, 1.1, w),
     "SmoothnessEnergy": lambda x, w, t: SmoothnessEnergy()(x, w),
     "SymmetryEnergy": lambda x, w, t: SymmetryEnergy(MAN)(x, w),
 }
 ALL = slice(0, FRAMES)
-OWN = ("ForeshorteningEnergy, own", "PostureEnergy")
+OWN = ("ForeshorteningEnergy, own", "PostureEnergy", "StanceEnergy")
 each = pytest.mark.parametrize("name", WEIGHTED)
 # A contact's other unknown, the root's velocity, is charged also where no foot is seen.
 each_of_points = pytest.mark.parametrize("name", [name for name in WEIGHTED if name != "ContactEnergy"])

@@ -172,7 +172,7 @@ class Method(ABC):
                 stacklevel=users_level(),
             )
 
-        for wrong in what_is_wrong(self, result.points, tracks.skeleton) if found.converged else ():
+        for wrong in what_is_wrong(self, result.points, tracks.skeleton, found.converged):
             warnings.warn(f"{tracks.source}: {wrong}: {WHY_LOOSE}", KcsWarning, stacklevel=users_level())
 
     def unsettled(self, steps: int) -> str:

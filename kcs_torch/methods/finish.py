@@ -113,9 +113,12 @@ def _rest(method: Method, body: Skeleton) -> str:
     return "constant lengths alone" if body.rigid and method.keeps_lengths else "nothing"
 
 
-def what_is_wrong(method: Method, points: Tensor, body: Skeleton) -> list[str]:
-    """What about points (T, N, 3) tells that they are not the body's, for the user."""
-    told = [loose_bones(points, body) if method.keeps_lengths else ""]
+def what_is_wrong(method: Method, points: Tensor, body: Skeleton, settled: bool = True) -> list[str]:
+    """What about points (T, N, 3) tells that they are not the body's, for the user.
+
+    Lengths that vary are no news of a solution that did not settle; a body unlike any is why it does not.
+    """
+    told = [loose_bones(points, body) if method.keeps_lengths and settled else ""]
     told.append(odd_body(points, body) if method.knows_template(body) else "")
     return [sentence for sentence in told if sentence]
 

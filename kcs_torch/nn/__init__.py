@@ -18,6 +18,7 @@ from kcs_torch.nn.perspective import PerspectiveEnergy
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.nn.procrustean import ProcrusteanEnergy
 from kcs_torch.nn.refined import RefinedLifter
+from kcs_torch.nn.stance import StanceEnergy
 from kcs_torch.nn.unrolled import UnrolledFPC, UnrolledKCS, UnrolledPKC, UnrolledSfAM
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "RefinedLifter",
     "ReprojectionEnergy",
     "SmoothnessEnergy",
+    "StanceEnergy",
     "SymmetryEnergy",
     "TemporalLifter",
     "UnrolledFPC",

@@ -66,6 +66,9 @@ class Descent:
         self.outer = [hinges.joints[:, [0, 1, 3, 4]].tolist().index(limb) for limb in limbs.joints.tolist()]
         self.side = limbs.side.to(like)
         self.lines = torch.cat(lines)  # (2 + 3 hinges, B)
+        stance = obj.stance
+        self.feet = stance.line.to(like)[sides.order] if stance.feet else None
+        self.beneath = stance.usual.to(like)[:, None]  # (2, 1)
         own = bone_vectors(obj.image, obj.bones).movedim((-1, -2), (-3, -2))  # (..., 2, B, T)
         self.image = self.imaged(own if own.ndim == 4 else own[None])
         free = obj.foreshortening
@@ -191,6 +194,7 @@ class Descent:
             own = own * self.time
         y = turn[:, :, 0] * image.seen[0][:, None]
         y.addcmul_(turn[:, :, 1], image.seen[1][:, None]).addcmul_(turn[:, :, 2], own[:, None])
+        stance, strayed = (0.0, None) if self.feet is None else self._stance(y)
         seen = y.view(count, 3 * bones, frames)
         real = wide(obj.count, 2)
         amount = real / wide(self.weights.posture, 2)  # what these frames count
@@ -218,6 +222,8 @@ class Descent:
         out.growth.sub_(grown.index_select(1, sides.back))
         self._lower(pull, (1 - part) * total / real)
         pull = pull.view_as(y)
+        if strayed is not None:
+            pull[:, ::2].addcmul_(strayed[:, :, None], self.feet[:, None])
         out.depth.add_((pull * turn[:, :, 2]).sum(1).index_select(1, sides.back))
         turned = [(pull * v[:, None]).sum(2) for v in (*image.seen, own)]  # (H, 3, T): of k, for each j
         into = self.axes.mT @ torch.stack(turned, 2).flatten(2)  # (H, 3, 3 T)
@@ -234,7 +240,23 @@ class Descent:
             for j in (0, 1):
                 out.image[:, j] += (pull * turn[:, :, j]).sum(1).index_select(1, sides.back)
             out.flat_lines[:, :, 0], out.flat_lines[:, :, 1] = a[:, :2], b[:, :2]
-        return value
+        return value + stance
+
+    def _stance(self, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Value (H,) of bones (H, 3, B, T) seen from the trunk, and slopes (H, 2, T) in where the feet are."""
+        stance, weight = self.objective.stance, wide(self.weights.stance, 2)
+        off = self.feet @ seen[:, ::2] - self.beneath
+        if self.time is not None:
+            off = off * self.time
+        back = off[:, 1].clamp_min(0)
+        square = back.square()
+        far = (off.square().sum(1) - square).mul_(stance.fold**-2).add_(1)
+        total = square.add_(far.log(), alpha=stance.fold**2).sum(-1, keepdim=True)
+        total = total.div_(wide(self.objective.count, 1)).add_(stance.sway**2)[..., None]
+        slope = off / far[:, None]
+        torch.where(back > 0, back, slope[:, 1], out=slope[:, 1])
+        value = weight / 2 * (total / stance.sway**2).log()
+        return value[:, 0, 0], slope.mul_(weight / (total * wide(self.objective.count, 2)))
 
     def _lower(self, values: Tensor, by: Tensor) -> None:
         """Take (H, C, 1) from values (H, C, T), but in frames that pad a clip."""

@@ -20,6 +20,7 @@ from kcs_torch.nn.anatomy import AdductionEnergy, HingeEnergy
 from kcs_torch.nn.contact import ContactEnergy
 from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy, oddity
 from kcs_torch.nn.posture import PostureEnergy
+from kcs_torch.nn.stance import StanceEnergy
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.memory import give_back
@@ -78,7 +79,8 @@ class Objective:
 
     T/2 sum_b log(1 + v_b)        bones keep their length,
     + sum_tb |second difference of dz|^2 / (2 a^2)        move smoothly,
-    + PostureEnergy + HingeEnergy + AdductionEnergy + ForeshorteningEnergy + ProportionEnergy + ContactEnergy.
+    + PostureEnergy + StanceEnergy + HingeEnergy + AdductionEnergy + ForeshorteningEnergy + ProportionEnergy
+    + ContactEnergy.
 
     v_b is the robust mean over time of ((|b|^2 - L^2) / 2L)^2 / s^2: how well a bone keeps its length is for the data
     to say. Perspective and a detector's habits change lengths by much more than s, all clip long.
@@ -115,6 +117,7 @@ class Objective:
         self.proportions = make(ProportionEnergy(skeleton, spread=weights.proportions, twins=weights.twins))
         self.hinges = make(HingeEnergy(skeleton))
         self.adduction = make(AdductionEnergy(skeleton))
+        self.stance = usual_stance(skeleton, image.dtype, image.device)
         self.standing = standing
         shaken = SHAKY * float(noise[:, list(skeleton.contacts)].median()) if skeleton.contacts else 0.0
         slip = math.hypot(weights.slip, shaken)
@@ -127,6 +130,10 @@ class Objective:
         usual = quiet.amin()
         never = quiet > NEVER * usual  # bones of joints that no frame shows
         self.hinges.firm[never[self.hinges.limbs].any(-1)] = 0
+        feet = torch.tensor(self.stance.feet, dtype=torch.long, device=image.device)
+        guessed = not len(feet) or bool(never[torch.isin(self.bones, feet).any(-1)].any())
+        strength = 0.0 if guessed else min(weights.stance, len(image) / weights.posture)
+        self.weights = replace(self.weights, stance=strength)
         least = torch.where(never, usual, quiet).square() + weights.length**2
         self.clear = least / (weights.length**2 + self.noise.square())  # a guessed image is no evidence
         observed = torch.eye(skeleton.num_observed, dtype=image.dtype, device=image.device)
@@ -155,6 +162,7 @@ class Objective:
             "length": self.length_value(self.strayed(dz, lengths, flat).sum(1), lengths),
             "smoothness": bend.sum((1, 2)) / (2 * w.acceleration**2),
             "posture": self.posture(points, lengths, self.share),
+            "stance": w.stance * self.stance(points, 1.0, self.time),
             "hinges": w.hinge / w.sine**2 * self.hinges(points, lengths, self.time).sum(-1),
             "adduction": w.adduction / w.sine**2 * self.adduction(points, lengths, self.time).sum(-1),
             "foreshortening": self.foreshortening(points, lengths, bone_weights=self.clear, bone_noise=self.noise),
@@ -322,6 +330,13 @@ def usual_posture(skeleton: Skeleton, dtype: torch.dtype, device: torch.device) 
     """The skeleton's posture, made once for all clips: not to be changed."""
     with torch.inference_mode(False):
         return PostureEnergy(skeleton).to(device, dtype)
+
+
+@lru_cache(maxsize=16)
+def usual_stance(skeleton: Skeleton, dtype: torch.dtype, device: torch.device) -> StanceEnergy:
+    """The skeleton's stance, made once for all clips: not to be changed."""
+    with torch.inference_mode(False):
+        return StanceEnergy(skeleton).to(device, dtype)
 
 
 def _altered(posture: PostureEnergy, **values: Any) -> PostureEnergy:

@@ -109,6 +109,7 @@ class RunCosts:
             obj.hinges.firm.to(own) * hinges[0].clamp_max(0).square(),
             hinges[1],
             reach[1],
+            obj.stance.strayed(points, 1.0)[..., None],
             obj.foreshortening.each(dz, lengths, obj.clear, obj.noise).sum(-1, keepdim=True),
         )
         posture = obj.posture
@@ -121,12 +122,13 @@ class RunCosts:
         count, w = len(self.own), obj.weights
         total = base.sums.sum(1) + _between(frames.sums - base.sums, runs.part, runs.starts, runs.ends)
         hinges, limbs = len(obj.hinges.joints), len(obj.adduction.joints)
-        strayed, wrong, axes, sides, short = total.split([len(self.lengths), hinges, hinges, limbs, 1], -1)
+        strayed, wrong, axes, sides, feet, short = total.split([len(self.lengths), hinges, hinges, limbs, 1, 1], -1)
         value = self.fixed + obj.length_value(strayed, self.lengths[None]) + short[:, 0]
         value = value + w.hinge / w.sine**2 / 2 * (wrong / _known(axes / count)).sum(-1)
         reach = torch.where(inside(runs, count)[..., None], frames.reach[runs.part], base.reach)
         over = (reach / _known(sides / count).sqrt()[:, None] - obj.adduction.limit).clamp_min(0).square()
         value = value + w.adduction / w.sine**2 / 2 * (over * obj.adduction.firm.to(over)).sum((1, 2))
+        value = value + w.stance / 2 * torch.log1p(feet[:, 0] / (count * obj.stance.sway**2))
         bends = _bends(base.dz, frames.dz, runs.part, runs.starts, runs.ends)
         return value + bends / (2 * w.acceleration**2) + self._posture(frames.poses, runs)
 

@@ -34,6 +34,7 @@ class Weights:
         foreshortening: frames that count as one for the foreshortening.
         hinge: weight of a hinge in a frame.
         adduction: weight of an arm or a leg that reaches across the body, in a frame.
+        stance: strength of the feet's place beneath the trunk, in a clip.
         sine: sine of a wrong bend, or beyond the limit, that costs half its weight.
         proportions: usual deviation of a length, as a share.
         twins: usual difference between left and right, as a share.
@@ -49,6 +50,7 @@ class Weights:
     foreshortening: float = 10.0
     hinge: float = 0.08
     adduction: float = 0.03
+    stance: float = 12.0
     sine: float = 0.05
     proportions: float = 0.08
     twins: float = 0.03
