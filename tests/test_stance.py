@@ -1,4 +1,4 @@
-"""The stance's energy: values by hand, gradients with degenerate inputs, and what it tells of people and of solutions."""
+"""The stance's energy: values by hand, gradients with degenerate inputs, and what it tells of people."""
 
 import math
 from pathlib import Path
@@ -14,9 +14,9 @@ from kcs_torch.data import walking_person
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_vectors
 from kcs_torch.io import load_motion
+from kcs_torch.methods import METHODS
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.weights import Weights
-from kcs_torch.methods import METHODS
 from kcs_torch.nn import StanceEnergy
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.types import Motion
