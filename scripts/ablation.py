@@ -140,7 +140,7 @@ FIXED_VARIANTS = {
     "images as likely as clear ones": Variant(
         changes=tuple(constant(owner, "HIDDEN", 1e-9) for owner in (LENGTHS, DESCENT))
     ),
-    "no posture": without("posture", posture=INF),
+    "no posture": Variant(changes=(*without("posture", posture=INF).changes, *weighted(stance=0.0))),
     "mirror images of a motion not as likely": Variant(
         changes=(
             constant(
@@ -150,6 +150,7 @@ FIXED_VARIANTS = {
             ),
         )
     ),
+    "feet need not be beneath the trunk": Variant(changes=weighted(stance=0.0)),
     "standing feet may slide in depth": Variant({"contacts": False}),
     "no hinges": Variant(changes=(*weighted(hinge=0.0), searched(lambda usual: replace(usual, hinge=0.0)))),
     "limbs may reach across the body": Variant(changes=weighted(adduction=0.0)),

@@ -22,7 +22,7 @@ def test_layers_agree_and_tables_are_printed(monkeypatch, capsys):
         torch.set_num_threads(threads)
     text = capsys.readouterr().out
     rows = [line for line in text.splitlines() if line.startswith("| ") and "---" not in line]
-    assert len(rows) == 1 + 3 + 1 + 17
+    assert len(rows) == 1 + 3 + 1 + 18
     energies = {name for name in kt.nn.__all__ if name.endswith(("Energy", "Distance", "Critic"))}
     assert energies - {name for name in energies if f"`{name}(" in text} == {"ContactEnergy", "ProportionEnergy"}
     body, points = kt.SKELETONS["hand21"], normal(3, 21, 3, dtype=torch.float32)

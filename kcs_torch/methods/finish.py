@@ -37,6 +37,9 @@ ODD, DEEP = 0.4, 1.0
 """Root mean square of the logarithms of lengths over the skeleton's, and depth over the size in the image, beyond which
 a body is another: people in odd postures, seen by detectors, come to .4 and .5."""
 
+POINT = 1e-6
+"""Size in the image, over the depth, up to which a body is a point."""
+
 FAR_STEPS = 2
 """How often joints are weighed anew by their distance, when the body is put in its place."""
 
@@ -154,12 +157,12 @@ def odd_body(points: Tensor, body: Skeleton) -> str:
     own = bone_lengths(points, body.bone_index(device=points.device)).median(0).values
     odd = oddity(own[rigid], usual[rigid])
     middle = points - points.mean(1, keepdim=True)
-    deep = float(middle[..., 2].norm() / middle[..., :2].norm().clamp_min(torch.finfo(points.dtype).tiny))
-    if odd <= ODD or deep <= DEEP:
+    wide, far = float(middle[..., :2].norm()), float(middle[..., 2].norm())
+    if odd <= ODD or far <= DEEP * wide or wide <= POINT * far:  # a point in the image shows no body
         return ""
     return (
         f"this is hardly a body of skeleton '{body.name}': bones are {math.exp(odd):.1f} times as long or as short as "
-        f"usual, and it is {deep:.1f} times as deep as it is large in the image"
+        f"usual, and it is {far / wide:.1f} times as deep as it is large in the image"
     )
 
 

@@ -132,7 +132,7 @@ class Objective:
         self.hinges.firm[never[self.hinges.limbs].any(-1)] = 0
         feet = torch.tensor(self.stance.feet, dtype=torch.long, device=image.device)
         guessed = not len(feet) or bool(never[torch.isin(self.bones, feet).any(-1)].any())
-        strength = 0.0 if guessed else min(weights.stance, len(image) / weights.posture)
+        strength = 0.0 if guessed else min(weights.stance, 2 * len(image) / weights.posture)
         self.weights = replace(self.weights, stance=strength)
         least = torch.where(never, usual, quiet).square() + weights.length**2
         self.clear = least / (weights.length**2 + self.noise.square())  # a guessed image is no evidence
