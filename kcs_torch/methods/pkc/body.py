@@ -47,6 +47,10 @@ FRAMES = 4096
 POLISH = (FINE[0], Stage(1e-5, 100, 0.01, 1.0, 0.003))
 """The moving viewpoint's fine stages without the middle one, and with more steps in the last."""
 
+GAP, SURER = 3.0, 0.2
+"""How many times as noisy as usual a joint is in a frame that does not show it, at least; and the share of that noise
+which is left where the gap is filled in space."""
+
 CLOSE, RIVALS = 10.0, 3
 """By how much solutions may be dearer than the best to be polished as well, and how many of its own kind are."""
 
@@ -214,7 +218,7 @@ class Body:
                 rivals = rivals.joined(replace(ranked, depth=other, energy=found.energy[0] + LEAD + dearer / LESS))
             elif bool(dearer[0] < CLOSE):
                 rivals = rivals.joined(replace(ranked, depth=other))
-        depth, value = yield from self._descended(rivals.depth, (COARSE[-1], *POLISH) if around else POLISH)
+        depth, image, value = yield from self._descended(rivals.depth, (COARSE[-1], *POLISH) if around else POLISH)
         points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
         lengths = bone_lengths(points, bones).median(1).values
         best = (rivals.energy + value / ONE).argsort()[: len(pick)]
@@ -222,10 +226,36 @@ class Body:
             found,
             depth=found.depth.index_copy(0, pick, depth[best]),
             lengths=found.lengths.index_copy(0, pick, lengths[best]),
+            image=None if image is None else image[best[0]],
         )
 
-    def _descended(self, depth: Tensor, stages: tuple[Stage, ...]) -> Search[Any, Any, tuple[Tensor, Tensor]]:
-        """Depths (H, T, N) after stages of the moving viewpoint's descent, in blocks of long clips, and its values."""
+    def unseen(self) -> Tensor:
+        """Which joints (T, N) are seen in other frames only: their places are filled in, and far less sure."""
+        usual = self.noise.median(0).values
+        return (self.noise > GAP * usual) & (usual <= GAP * usual.amin())
+
+    def filled(self, image: Tensor) -> Body:
+        """The body with its gaps filled as polishing has them: in space, by what other joints do.
+
+        Args:
+            image: (T, N, 2) of a polished hypothesis.
+        """
+        gap = self.unseen()
+        rest = (~gap)[..., None].to(image)
+        image = image - (rest * (image - self.image)).sum(1, keepdim=True) / rest.sum(1, keepdim=True).clamp_min(1)
+        image = torch.where(gap[..., None], image, self.image)
+        noise = torch.where(gap, (SURER * self.noise).maximum(self.noise.median(0).values), self.noise)
+        image = image - image.mean(1, keepdim=True)
+        factor = self.factor
+        return Body(self.skeleton, image / factor, self.rate, noise / factor, self.objective.standing)
+
+    def _descended(
+        self, depth: Tensor, stages: tuple[Stage, ...]
+    ) -> Search[Any, Any, tuple[Tensor, Tensor | None, Tensor]]:
+        """Depths (H, T, N) after stages of the moving viewpoint's descent, in blocks of long clips, and its values.
+
+        Where joints are unseen here and there, their images (H, T, N, 2) as well.
+        """
         skeleton, bones, frames = self.skeleton, self.objective.bones, len(self.image)
         size = self.image.square().mean().sqrt()
         level = float(self.noise.median() / size)
@@ -237,7 +267,8 @@ class Body:
         rigid, soft = bones[list(skeleton.rigid)], tuple(soften(stage, level) for stage in stages)
         anchor = float(size / HELD) ** 2
         starts = window_starts(frames, min(LONG, frames), min(OVERLAP, frames - 1))
-        depths, value = [], depth.new_zeros(len(depth))
+        depths, images, value = [], [], depth.new_zeros(len(depth))
+        gaps = bool(self.unseen().any())
         for some in (slice(first, first + LONG) for first in starts):
             weights = None if sure is None else sure[some]
             one = Descent(
@@ -246,10 +277,14 @@ class Body:
             )  # fmt: skip
             (pose,) = yield [one]
             depths.append(pose.points[..., 2].transpose(0, 1) * size)  # (T, H, N)
+            if gaps:
+                images.append(pose.points[..., :2].transpose(0, 1).flatten(2) * size)
             value = value + pose.objective
         depth = blend_windows(torch.stack(depths), starts, frames).transpose(0, 1)
         depth = depth[..., : skeleton.num_observed] @ self.objective.complete
-        return depth - depth.mean(-1, keepdim=True), value
+        image = blend_windows(torch.stack(images), starts, frames).transpose(0, 1) if gaps else None
+        image = None if image is None else image.unflatten(2, (-1, 2))
+        return depth - depth.mean(-1, keepdim=True), image, value
 
     def search(self, rounds: int, steps: int, turned: Turned | None = None) -> Search[Any, Any, Hypotheses]:
         """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best.

@@ -25,6 +25,7 @@ class Hypotheses:
         energy: (H,) of the objective.
         steps: L-BFGS steps made for them.
         moved: (H,) root mean square change of the depths in the last ten steps; None before any.
+        image: (T, N, 2) of the best one as polishing has it, where joints may leave what noisy tracks show; or None.
     """
 
     depth: Tensor
@@ -32,6 +33,7 @@ class Hypotheses:
     energy: Tensor
     steps: int = 0
     moved: Tensor | None = None
+    image: Tensor | None = None
 
     def __getitem__(self, index: slice | Tensor) -> Hypotheses:
         moved = None if self.moved is None else self.moved[index]

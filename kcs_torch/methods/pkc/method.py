@@ -187,6 +187,13 @@ class PKC(Method):
         if polished:
             rival = (yield from turned(body.is_odd(found))) if compared and body.turns(found) else None
             found = yield from body.polished(found, self.steps, rival)
+            if found.image is not None and self.rounds and self.viewpoint != "moving":
+                before, body = body.factor, body.filled(found.image)
+                found = yield from body.search(self.rounds, self.steps)
+                if cameras is not None and _turns(cameras):
+                    found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
+                rival = None if rival is None else rival * (body.factor / before)
+                found = yield from body.polished(found, self.steps, rival)
         made = self._from_hypotheses(found, body, cameras, notes, detections)
         return _with_size(made, size) if changing else made
 
