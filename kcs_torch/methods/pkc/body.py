@@ -47,9 +47,9 @@ FRAMES = 4096
 POLISH = (FINE[0], Stage(1e-5, 100, 0.01, 1.0, 0.003))
 """The moving viewpoint's fine stages without the middle one, and with more steps in the last."""
 
-GAP, SURER = 3.0, 0.2
-"""How many times as noisy as usual a joint is in a frame that does not show it, at least; and the share of that noise
-which is left where the gap is filled in space."""
+GAP, SHOWN, SURER = 3.0, 0.1, 0.2
+"""How many times as noisy a joint is in a frame that does not show it, at least, as in frames that do, of which there
+are as large a share or more; and the share of that noise which is left where the gap is filled in space."""
 
 CLOSE, RIVALS = 10.0, 3
 """By how much solutions may be dearer than the best to be polished as well, and how many of its own kind are."""
@@ -231,8 +231,12 @@ class Body:
 
     def unseen(self) -> Tensor:
         """Which joints (T, N) are seen in other frames only: their places are filled in, and far less sure."""
-        usual = self.noise.median(0).values
+        usual = self._shown()
         return (self.noise > GAP * usual) & (usual <= GAP * usual.amin())
+
+    def _shown(self) -> Tensor:
+        """Noise (N,) of each joint where it is shown."""
+        return self.noise.kthvalue(1 + int(SHOWN * (len(self.noise) - 1)), 0).values
 
     def filled(self, image: Tensor) -> Body:
         """The body with its gaps filled as polishing has them: in space, by what other joints do.
@@ -244,7 +248,7 @@ class Body:
         rest = (~gap)[..., None].to(image)
         image = image - (rest * (image - self.image)).sum(1, keepdim=True) / rest.sum(1, keepdim=True).clamp_min(1)
         image = torch.where(gap[..., None], image, self.image)
-        noise = torch.where(gap, (SURER * self.noise).maximum(self.noise.median(0).values), self.noise)
+        noise = torch.where(gap, (SURER * self.noise).maximum(self._shown()), self.noise)
         image = image - image.mean(1, keepdim=True)
         factor = self.factor
         return Body(self.skeleton, image / factor, self.rate, noise / factor, self.objective.standing)
