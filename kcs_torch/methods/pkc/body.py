@@ -16,6 +16,7 @@ from kcs_torch.functional.temporal import blend_windows, interpolate, window_sta
 from kcs_torch.methods.lockstep import Search, together
 from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.fixed_view import searching
+from kcs_torch.methods.pkc.gaps import fill_gaps, gaps_of
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.moving_view import TIGHT, soften
 from kcs_torch.methods.pkc.objective import Objective, bone_noise, usual_posture
@@ -46,10 +47,6 @@ FRAMES = 4096
 
 POLISH = (FINE[0], Stage(1e-5, 100, 0.01, 1.0, 0.003))
 """The moving viewpoint's fine stages without the middle one, and with more steps in the last."""
-
-GAP, SHOWN, SURER = 3.0, 0.1, 0.2
-"""How many times as noisy a joint is in a frame that does not show it, at least, as in frames that do, of which there
-are as large a share or more; and the share of that noise which is left where the gap is filled in space."""
 
 CLOSE, RIVALS = 10.0, 3
 """By how much solutions may be dearer than the best to be polished as well, and how many of its own kind are."""
@@ -229,29 +226,10 @@ class Body:
             image=None if image is None else image[best[0]],
         )
 
-    def unseen(self) -> Tensor:
-        """Which joints (T, N) are seen in other frames only: their places are filled in, and far less sure."""
-        usual = self._shown()
-        return (self.noise > GAP * usual) & (usual <= GAP * usual.amin())
-
-    def _shown(self) -> Tensor:
-        """Noise (N,) of each joint where it is shown."""
-        return self.noise.kthvalue(1 + int(SHOWN * (len(self.noise) - 1)), 0).values
-
-    def filled(self, image: Tensor) -> Body:
-        """The body with its gaps filled as polishing has them: in space, by what other joints do.
-
-        Args:
-            image: (T, N, 2) of a polished hypothesis.
-        """
-        gap = self.unseen()
-        rest = (~gap)[..., None].to(image)
-        image = image - (rest * (image - self.image)).sum(1, keepdim=True) / rest.sum(1, keepdim=True).clamp_min(1)
-        image = torch.where(gap[..., None], image, self.image)
-        noise = torch.where(gap, (SURER * self.noise).maximum(self._shown()), self.noise)
-        image = image - image.mean(1, keepdim=True)
-        factor = self.factor
-        return Body(self.skeleton, image / factor, self.rate, noise / factor, self.objective.standing)
+    def filled(self, polished: Tensor) -> Body:
+        """The same body with its gaps filled as a polished image (T, N, 2) has them."""
+        image, noise = fill_gaps(self.image, polished, self.noise)
+        return Body(self.skeleton, image / self.factor, self.rate, noise / self.factor, self.objective.standing)
 
     def _descended(
         self, depth: Tensor, stages: tuple[Stage, ...]
@@ -272,7 +250,7 @@ class Body:
         anchor = float(size / HELD) ** 2
         starts = window_starts(frames, min(LONG, frames), min(OVERLAP, frames - 1))
         depths, images, value = [], [], depth.new_zeros(len(depth))
-        gaps = bool(self.unseen().any())
+        gaps = bool(gaps_of(self.noise).any())
         for some in (slice(first, first + LONG) for first in starts):
             weights = None if sure is None else sure[some]
             one = Descent(
@@ -286,8 +264,9 @@ class Body:
             value = value + pose.objective
         depth = blend_windows(torch.stack(depths), starts, frames).transpose(0, 1)
         depth = depth[..., : skeleton.num_observed] @ self.objective.complete
-        image = blend_windows(torch.stack(images), starts, frames).transpose(0, 1) if gaps else None
-        image = None if image is None else image.unflatten(2, (-1, 2))
+        image = None
+        if gaps:
+            image = blend_windows(torch.stack(images), starts, frames).transpose(0, 1).unflatten(2, (-1, 2))
         return depth - depth.mean(-1, keepdim=True), image, value
 
     def search(self, rounds: int, steps: int, turned: Turned | None = None) -> Search[Any, Any, Hypotheses]:

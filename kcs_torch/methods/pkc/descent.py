@@ -67,7 +67,7 @@ class Descent:
         self.side = limbs.side.to(like)
         self.lines = torch.cat(lines)  # (2 + 3 hinges, B)
         stance = obj.stance
-        self.feet = stance.line.to(like)[sides.order] if stance.feet else None
+        self.feet = stance.line.to(like)[sides.order]  # 0 where nothing stands on the ground
         self.beneath = stance.usual.to(like)[:, None]  # (2, 1)
         own = bone_vectors(obj.image, obj.bones).movedim((-1, -2), (-3, -2))  # (..., 2, B, T)
         self.image = self.imaged(own if own.ndim == 4 else own[None])
@@ -194,7 +194,7 @@ class Descent:
             own = own * self.time
         y = turn[:, :, 0] * image.seen[0][:, None]
         y.addcmul_(turn[:, :, 1], image.seen[1][:, None]).addcmul_(turn[:, :, 2], own[:, None])
-        stands = None if self.feet is None else self._stance(y, self.feet)
+        stance, strayed = self._stance(y)
         seen = y.view(count, 3 * bones, frames)
         real = wide(obj.count, 2)
         amount = real / wide(self.weights.posture, 2)  # what these frames count
@@ -222,8 +222,7 @@ class Descent:
         out.growth.sub_(grown.index_select(1, sides.back))
         self._lower(pull, (1 - part) * total / real)
         pull = pull.view_as(y)
-        if self.feet is not None and stands is not None:
-            pull[:, ::2].addcmul_(stands[1][:, :, None], self.feet[:, None])
+        pull[:, ::2].addcmul_(strayed[:, :, None], self.feet[:, None])
         out.depth.add_((pull * turn[:, :, 2]).sum(1).index_select(1, sides.back))
         turned = [(pull * v[:, None]).sum(2) for v in (*image.seen, own)]  # (H, 3, T): of k, for each j
         into = self.axes.mT @ torch.stack(turned, 2).flatten(2)  # (H, 3, 3 T)
@@ -240,12 +239,12 @@ class Descent:
             for j in (0, 1):
                 out.image[:, j] += (pull * turn[:, :, j]).sum(1).index_select(1, sides.back)
             out.flat_lines[:, :, 0], out.flat_lines[:, :, 1] = a[:, :2], b[:, :2]
-        return value if stands is None else value + stands[0]
+        return value + stance
 
-    def _stance(self, seen: Tensor, feet: Tensor) -> tuple[Tensor, Tensor]:
-        """Value (H,) of bones (H, 3, B, T) seen from the trunk, and slopes (H, 2, T) in where the feet (B,) are."""
+    def _stance(self, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Value (H,) of bones (H, 3, B, T) seen from the trunk, and slopes (H, 2, T) in where the feet are."""
         stance, weight = self.objective.stance, wide(self.weights.stance, 2)
-        off = feet @ seen[:, ::2] - self.beneath
+        off = self.feet @ seen[:, ::2] - self.beneath
         if self.time is not None:
             off = off * self.time
         back = off[:, 1].clamp_min(0)

@@ -187,7 +187,7 @@ class PKC(Method):
         if polished:
             rival = (yield from turned(body.is_odd(found))) if compared and body.turns(found) else None
             found = yield from body.polished(found, self.steps, rival)
-            if found.image is not None and self.rounds and self.viewpoint != "moving":
+            if found.image is not None and self.rounds and self.viewpoint != "moving":  # joints unseen here and there
                 before, body = body.factor, body.filled(found.image)
                 found = yield from body.search(self.rounds, self.steps)
                 if cameras is not None and _turns(cameras):

@@ -1,0 +1,42 @@
+"""Joints that some frames do not show: told by their noise, and filled in by a solution in space."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["fill_gaps", "gaps_of"]
+
+GAP, SHOWN = 3.0, 0.1
+"""How many times as noisy a joint is in a frame that does not show it, at least, as in frames that do; and the share of
+the frames that do, at least."""
+
+SURER = 0.2
+"""Share of a gap's noise that is left where it is filled in space."""
+
+
+def gaps_of(noise: Tensor) -> Tensor:
+    """Which joints (T, N) are seen in other frames only, of their noise (T, N) in the image."""
+    usual = _shown(noise)
+    return (noise > GAP * usual) & (usual <= GAP * usual.amin())
+
+
+def fill_gaps(image: Tensor, polished: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """An image (T, N, 2), centred, whose gaps are filled by what other joints and the bones do; and its noise (T, N).
+
+    Args:
+        image: (T, N, 2), centred, whose gaps were filled by each joint's own path.
+        polished: (T, N, 2) of a solution that was free to leave the image where it is noisy.
+        noise: (T, N) standard deviation of the joints in the image.
+    """
+    gap = gaps_of(noise)
+    rest = (~gap)[..., None].to(image)
+    polished = polished - (rest * (polished - image)).sum(1, keepdim=True) / rest.sum(1, keepdim=True).clamp_min(1)
+    image = torch.where(gap[..., None], polished, image)
+    noise = torch.where(gap, (SURER * noise).maximum(_shown(noise)), noise)
+    return image - image.mean(1, keepdim=True), noise
+
+
+def _shown(noise: Tensor) -> Tensor:
+    """Noise (N,) of each joint where it is shown."""
+    return noise.kthvalue(1 + int(SHOWN * (len(noise) - 1)), 0).values
