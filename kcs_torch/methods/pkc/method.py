@@ -84,7 +84,8 @@ class PKC(Method):
             right back where a detector mistakes them (:func:`kcs_torch.clean.unswap`); smooth noisy tracks, fill gaps
             and reject outliers (:func:`kcs_torch.solvers.denoise_tracks`).
         lifts: random starts of the moving viewpoint's solver, for skeletons without a template.
-        rounds: of discrete moves of the fixed viewpoint's solver; nothing without a template.
+        rounds: of discrete moves of the fixed viewpoint's solver; with 0 gaps stay as each joint's own path fills them,
+            too. Nothing without a template.
         steps: L-BFGS steps of each of its refinements; nothing without a template.
         alternatives: further solutions to return at most. Without a template these are the mirror image and bodies that
             fit the tracks nearly as well, of which there are often none.
