@@ -64,6 +64,8 @@ class Estimate:
         objective: value that ranks the solutions of one method on one clip, lower is better; NaN where it has none.
         alternatives: further solutions, best first.
         still: whether the camera may be taken to stand still, so that feet tell the root's depth.
+        standing: (T, C) how surely the skeleton's contact points stand still, where the method knows better than the
+            tracks as they are; None where it does not, or where they hardly ever do.
         doubt: why depth is little more than a guess, a sentence; empty where it is more. The user is warned.
     """
 
@@ -77,6 +79,7 @@ class Estimate:
     objective: float = math.nan
     alternatives: tuple[Estimate, ...] = ()
     still: bool = False
+    standing: Tensor | None = None
     doubt: str = ""
 
 
@@ -98,7 +101,7 @@ def finish(
     still, roots, remark = [i for i, one in enumerate(every) if one.still], None, ""
     pointlike = not bool(_extent(tracks) > 0)
     if still and not pointlike:
-        roots, remark = root_depth(torch.stack([placed[i][0] for i in still]), tracks)
+        roots, remark = root_depth(torch.stack([placed[i][0] for i in still]), tracks, found.standing)
     paths = {} if roots is None else dict(zip(still, roots, strict=True))
     results = [
         _reconstruction(

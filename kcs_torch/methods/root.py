@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.temporal import standing
+from kcs_torch.functional import temporal
 from kcs_torch.solvers.standing import root_velocity
 from kcs_torch.types import Tracks
 
@@ -30,11 +30,11 @@ def standing_feet(tracks: Tracks) -> Tensor | None:
     contacts = list(tracks.skeleton.contacts)
     if not contacts:
         return None
-    sure = standing(tracks.points[:, contacts], tracks.weights[:, contacts])
+    sure = temporal.standing(tracks.points[:, contacts], tracks.weights[:, contacts])
     return sure if float((sure.amax(-1) > 0.5).double().mean()) >= ENOUGH else None
 
 
-def root_depth(points: Tensor, tracks: Tracks) -> tuple[Tensor | None, str]:
+def root_depth(points: Tensor, tracks: Tracks, standing: Tensor | None = None) -> tuple[Tensor | None, str]:
     """The root's depth in each frame, relative to the first.
 
     While a foot stands still in the image it stands still in space, so that the root's depth moves against it: see
@@ -43,6 +43,7 @@ def root_depth(points: Tensor, tracks: Tracks) -> tuple[Tensor | None, str]:
     Args:
         points: (..., T, N, 3) of one or several solutions, depth relative to the body's middle.
         tracks: they were made from, with the skeleton's contact points.
+        standing: (T, C) how surely these stand still; None to tell it from the tracks as they are.
 
     Returns:
         (..., T) in the unit of the points, and a sentence; None where there are too few contacts.
@@ -53,7 +54,7 @@ def root_depth(points: Tensor, tracks: Tracks) -> tuple[Tensor | None, str]:
     if points.shape[-3] < 3:
         return None, f"{ABSENT}too few frames"
     slow = 30.0 / (tracks.fps or 30.0)
-    sure = standing_feet(tracks)
+    sure = standing_feet(tracks) if standing is None else standing
     if sure is None:
         return None, f"{ABSENT}the feet hardly ever stand still in the image"
     body = points - points.mean(-2, keepdim=True)

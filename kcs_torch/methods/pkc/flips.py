@@ -16,6 +16,7 @@ from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.limbs import Limb
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.run_costs import RunCosts, Runs, inside
+from kcs_torch.methods.pkc.strides import strides
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["flipped", "flipped_runs", "parts_of", "promising", "turned", "turned_over"]
@@ -49,6 +50,9 @@ WINDOW = 2
 
 SHARP = 3.0
 """Cost of the bends at a run's ends from which on a flip is hopeless."""
+
+STRIDES = 3
+"""Ways in which legs may stride that are refined."""
 
 SLIGHT = 0.006
 """Root mean square depth that a flip has to change, a standing person being about 1.75 tall."""
@@ -131,7 +135,22 @@ def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypoth
     order = energy.argsort()
     owner = runs.part[order].tolist()
     order = order[[k for k, part in enumerate(owner) if part not in owner[:k]]]
-    return Hypotheses(depths(order), best.lengths.expand(len(order), -1), energy[order], best.steps)
+    found = Hypotheses(depths(order), best.lengths.expand(len(order), -1), energy[order], best.steps)
+    if objective.standing is None or not objective.noisy:  # of exact images the motion tells where bones pass the plane
+        return found
+    return found.joined(_strides(objective, own, member, runs, best))
+
+
+def _strides(objective: Objective, own: Tensor, member: Tensor, runs: Runs, best: Hypotheses) -> Hypotheses:
+    """The best solution with other runs of its legs, by which feet stand; the best few, not refined yet."""
+    bend = _bends(own, member.mT) / (2 * objective.weights.acceleration**2)
+    depth = objective.joints(own * strides(objective, own, member, runs.places, bend))
+    change = (depth - best.depth).square().mean((1, 2)).sqrt()
+    depth = depth[change > SLIGHT]
+    lengths = best.lengths.expand(len(depth), -1)
+    energy = objective(depth, lengths) + objective.contact(depth) if len(depth) else best.energy[:0]
+    order = energy.argsort()[:STRIDES]
+    return Hypotheses(depth[order], lengths[order], energy[order])
 
 
 def turned(depth: Tensor, runs: Runs, member: Tensor) -> Tensor:

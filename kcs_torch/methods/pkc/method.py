@@ -134,12 +134,23 @@ class PKC(Method):
         return run(together([self._steps(one, None) for one in tracks]), serve)
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
-        image, noise, notes = yield from self._clean(tracks)
+        points, noise, notes = yield from self._clean(tracks)
+        standing = standing_feet(replace(tracks, points=points))
+        image = points - points.mean(-2, keepdim=True)
         (size,) = yield [Sized(replace(tracks, points=image))]
-        return (yield from self._solve(tracks, image, noise, cameras, notes, size))
+        found = yield from self._solve(tracks, image, noise, standing, cameras, notes, size)
+        every = [replace(one, standing=standing) for one in (found, *found.alternatives)]
+        return replace(every[0], alternatives=tuple(every[1:]))
 
     def _solve(
-        self, tracks: Tracks, image: Tensor, noise: Tensor, cameras: Tensor | None, notes: tuple[str, ...], size: Size
+        self,
+        tracks: Tracks,
+        image: Tensor,
+        noise: Tensor,
+        standing: Tensor | None,
+        cameras: Tensor | None,
+        notes: tuple[str, ...],
+        size: Size,
     ) -> Search[Any, Any, Estimate]:
         """Solve complete tracks (T, N, 2) of a body that may have a changing size in the image."""
         skeleton = tracks.skeleton
@@ -163,7 +174,7 @@ class PKC(Method):
                 made = replace(first, notes=said)
             return _with_size(made, size) if changing else made
         still = self.contacts and not _turns(cameras) and self.viewpoint != "moving"
-        feet = standing_feet(tracks) if still else None
+        feet = standing if still else None
         body = Body(skeleton, image, tracks.fps or 30.0, noise, feet)
         detections = detected(tracks.weights)  # their errors last, and would be taken for motion
         polished = enough and body.spanned and not detections
@@ -215,7 +226,7 @@ class PKC(Method):
         return new if bool(new.energy[0] < before - BETTER) else None
 
     def _clean(self, tracks: Tracks) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
-        """Complete tracks (T, N, 2), centred per frame, the noise (T, N) left in them, and what was done."""
+        """Complete tracks (T, N, 2), the noise (T, N) left in them, and what was done."""
         level, left, keep = 0.0, 0.0, tracks.seen
         points, notes = tracks.points, []
         if self.denoise:
@@ -254,7 +265,7 @@ class PKC(Method):
             count = int(away.sum())
             show = "shows" if count == 1 else "show"
             notes.append(f"{counted(count, 'frame')} at the clip's ends {show} nobody: nearest pose held")
-        return points - points.mean(-2, keepdim=True), noise, tuple(notes)
+        return points, noise, tuple(notes)
 
     def _moving(
         self, tracks: Tracks, image: Tensor, noise: Tensor, count: int = 1

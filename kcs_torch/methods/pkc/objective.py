@@ -30,7 +30,7 @@ __all__ = ["Objective", "Refined", "bone_noise", "usual_posture"]
 BLUR = 2.0
 """By how much a bone's direction strays, over its noise in the image per length: the trunk's frame is noisy as well."""
 
-SHAKY = 2.0
+SHAKY = 6.0
 """By how much a standing foot strays in depth, over its noise in the image: it hangs on a chain of bones."""
 
 NEVER = 3.5
