@@ -10,7 +10,7 @@ from numerics import BODY, CHAIN, FLOATS, finite, gradcheck, normal, rotations, 
 from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
-from kcs_torch.errors import ShapeError, SkeletonError
+from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths
 from kcs_torch.nn import PostureEnergy
 from kcs_torch.nn.posture import trunk_joints
@@ -218,12 +218,41 @@ def test_frames_of_no_weight_may_be_anything(given):
     """They pad a shorter clip."""
     lengths = bone_lengths(WALK[:6], BONES).mean(0) if given else None
     padded = torch.cat([WALK[:6], torch.full((3, 17, 3), math.nan).double()]).requires_grad_()
-    weights = torch.tensor([1 / 15] * 6 + [0.0] * 3).double()
+    weights = torch.tensor([1.0] * 6 + [0.0] * 3).double()
     value = POSTURE(padded, lengths, weights)
     assert_close(value, POSTURE(WALK[:6], lengths))
+    assert_close(value, POSTURE(padded, lengths, independent=weights / POSTURE.correlation))
     (grad,) = torch.autograd.grad(value, padded)
     assert torch.isfinite(grad).all() and not grad[6:].any() and grad[:6].any()
     assert POSTURE(padded, lengths, 0 * weights).item() == 0
+    with pytest.raises(OptionError, match="expected weights or independent, got both"):
+        POSTURE(padded, lengths, weights, independent=weights)
+
+
+@pytest.mark.parametrize("weights", [torch.ones(6), torch.ones(6, 17)])
+def test_weights_of_one_change_nothing(weights):
+    assert_close(POSTURE(WALK[:6], None, weights.double()), POSTURE(WALK[:6]))
+
+
+@pytest.mark.parametrize("name", ["coco17", "hand21", "ap10k", "mediapipe33"])
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_joints_that_always_coincide_are_drawn_apart_with_no_great_force(name, dtype):
+    """As of a network that begins at zero, and of joints that are never seen: a first step must not be the last."""
+    body = SKELETONS[name]
+    energy, a, b = PostureEnergy(body), *body.bones[-1]
+    points = normal(12, body.num_joints, 3, seed=5).to(dtype)
+    usual = torch.autograd.functional.jacobian(energy, points).abs().max()
+    for far in (0.0, 1e-9, 1e-4):
+        points[:, b] = points[:, a] + far
+        assert torch.autograd.functional.jacobian(energy, points).abs().max() < 100 * usual
+    assert not torch.autograd.functional.jacobian(energy, 0 * points).any()
+
+
+def test_lengths_that_are_nan_are_not_hidden():
+    """A network's that has diverged, say."""
+    lengths = bone_lengths(WALK[:6], BONES).mean(0)
+    lengths[3] = math.nan
+    assert POSTURE(WALK[:6], lengths).isnan()
 
 
 def test_no_frames_cost_nothing():

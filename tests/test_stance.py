@@ -176,3 +176,9 @@ def test_walks_seen_from_the_front_do_not_lean(name):
         way = (points[:, high] - points[:, low]).mean(0)
         leans.append(math.degrees(math.atan2(way[2], -way[1])))
     assert abs(leans[0] - leans[1]) < 4
+
+
+def test_weights_below_zero_count_as_zero():
+    points = standing(0.05, 0.1, 4)
+    weights = torch.tensor([1.0, 0.0, 1.0, 1.0]).double()
+    assert_close(ENERGY(points, None, weights - 1.0 * (weights == 0)), ENERGY(points, None, weights))

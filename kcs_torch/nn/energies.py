@@ -304,7 +304,10 @@ def check_weights(weights: Tensor | None, points: Tensor, module: nn.Module) -> 
     check_tensor(weights, "weights", module)
     if weights.shape[-2:] != points.shape[-3:-1] or not fit_together(weights.shape[:-2], points.shape[:-3]):
         expected = f"(..., {points.shape[-3]}, {points.shape[-2]}) for points {tuple(points.shape)}"
-        raise ShapeError(f"{type(module).__name__}: expected weights {expected}, got {tuple(weights.shape)}")
+        message = f"{type(module).__name__}: expected weights {expected}, got {tuple(weights.shape)}"
+        if weights.shape[-1:] == points.shape[-3:-2]:
+            message += ": those of frames are weights[..., None].expand(..., N)"
+        raise ShapeError(message)
 
 
 def check_lengths(lengths: Tensor | None, points: Tensor, module: SkeletonModule) -> None:

@@ -12,13 +12,16 @@ from kcs_torch.errors import ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.nn.energies import check_lengths, check_weights
 from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
-from kcs_torch.nn.masks import bone_share, some
+from kcs_torch.nn.masks import bone_share, safe_root, some
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["ForeshorteningEnergy", "ProportionEnergy", "foreshortening", "free_bones", "oddity", "usual_size"]
+__all__ = ["LEAST", "ForeshorteningEnergy", "ProportionEnergy", "foreshortening", "free_bones", "oddity", "usual_size"]
 
 LIMB_SPREAD = 26.0
 """Bones that stray from the template by more than this, in degrees, are of the limbs."""
+
+LEAST = 0.01
+"""Length of a bone whose joints coincide, over the root mean square of all bones': what is divided by it has bounds."""
 
 HIDDEN = 2 * math.pi / (math.gamma(1.25) ** 2 * math.sqrt(8))
 """How large squared depths have to be to be told from 0, over noise of the image times length: 2.7. Where a bone of
@@ -85,7 +88,8 @@ class ForeshorteningEnergy(SkeletonModule):
             raise ShapeError(f"ForeshorteningEnergy: expected bone_noise {expected}, got {tuple(bone_noise.shape)}")
         vectors = known(bone_vectors(wide(points), self.bones), bone_weights)
         if lengths is None:
-            lengths = usual_size(vectors.square().sum(-1), bone_weights)
+            lengths = usual_size(vectors.square().sum(-1), bone_weights, LEAST)
+            lengths = lengths.clamp_min(torch.finfo(lengths.dtype).tiny ** 0.5)
         each = self.each(vectors[..., 2], wide(lengths), bone_weights, bone_noise)
         return narrow(each.sum((-2, -1)), points)
 
@@ -168,14 +172,17 @@ def free_bones(skeleton: Skeleton) -> Tensor:
     return torch.tensor([float(s > LIMB_SPREAD) for s in skeleton.spread])
 
 
-def usual_size(square: Tensor, share: Tensor | None) -> Tensor:
-    """Root mean square (..., B) over the frames of squared lengths (..., T, B) that have a share (..., T, B or 1)."""
+def usual_size(square: Tensor, share: Tensor | None, least: float = 0.0) -> Tensor:
+    """Root mean square (..., B) over the frames of squared lengths (..., T, B) that have a share (..., T, B or 1).
+
+    Nothing is shorter than ``least`` times the root mean square over the bones; 0 where all are.
+    """
     if share is None:
         square = square.sum(-2) / max(square.shape[-2], 1)
     else:
         seen = (share > 0).to(square)
         square = (square * seen).sum(-2) / seen.sum(-2).clamp_min(1)
-    return square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
+    return safe_root(square + least**2 * square.detach().mean(-1, keepdim=True))
 
 
 def oddity(lengths: Tensor, usual: Tensor) -> float:

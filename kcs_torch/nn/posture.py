@@ -8,11 +8,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError, SkeletonError
+from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.nn.energies import check_lengths
 from kcs_torch.nn.layers import SkeletonModule, narrow, wide
-from kcs_torch.nn.lengths import usual_size
+from kcs_torch.nn.lengths import LEAST, usual_size
 from kcs_torch.nn.masks import bone_share, known_points, safe_root, some, weighs_joints
 from kcs_torch.skeleton import Skeleton
 
@@ -140,26 +140,40 @@ class PostureEnergy(SkeletonModule):
             share = None
             if weights is not None:
                 share = bone_share(weights, self.bones) if joints else weights[..., None]
-            lengths = usual_size(vectors.square().sum(-1), share)
+            lengths = usual_size(vectors.square().sum(-1), share, LEAST)
         lengths = lengths.to(vectors.dtype)[..., None, :, None]
-        return vectors @ self.frame(points) / torch.where(lengths > 0, lengths, torch.inf)
+        return vectors @ self.frame(points) / torch.where(lengths <= 0, torch.inf, lengths)
 
-    def forward(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
+    def forward(
+        self,
+        points: Tensor,
+        lengths: Tensor | None = None,
+        weights: Tensor | None = None,
+        *,
+        independent: Tensor | None = None,
+    ) -> Tensor:
         """Return the energy of each clip.
 
         Args:
             points: (..., T, N, 3).
             lengths: (..., B); None takes each bone's root mean square over the frames that count.
             weights: (..., T, N) of the joints: a bone weighs as much as the lesser of its ends, and no more than the
-                least joint of the trunk, which it is seen from; or (..., T) how many independent frames each frame
-                counts for, 0 for one that pads a shorter clip. 1, and 1 / correlation, if None.
+                least joint of the trunk, which it is seen from; or (..., T) of the frames: 0 for one that pads a
+                shorter clip; all 1 if None.
+            independent: (..., T) how many independent frames each frame counts for, in place of weights: weights of 1
+                are 1 / correlation.
 
         Returns:
             (...).
 
         Raises:
             ShapeError: the shapes do not fit.
+            OptionError: weights and independent are both given.
         """
+        if independent is not None:
+            if weights is not None:
+                raise OptionError("PostureEnergy: expected weights or independent, got both")
+            weights = independent
         local = self.directions(points, lengths, weights)
         y = ((local - self.mean.to(local)) / self.deviation.to(local)).flatten(-2)
         count: Tensor | float
@@ -169,7 +183,7 @@ class PostureEnergy(SkeletonModule):
             count, mean = y.shape[-2] / self.correlation, y.sum(-2, keepdim=True) / max(y.shape[-2], 1)
             off, each = y - mean, 1 / self.correlation
             pull = count * self.kappa / (count + self.kappa)
-        elif weighs_joints(weights, points, self):
+        elif independent is None and weighs_joints(weights, points, self):
             firm = torch.minimum(bone_share(weights, self.bones), weights[..., self.trunk].amin(-1, keepdim=True))
             share = firm.to(local).repeat_interleave(3, -1) / self.correlation  # (..., T, 3B)
             count, own = share.amax(-1).sum(-1), share.sum(-2, keepdim=True)
@@ -177,7 +191,7 @@ class PostureEnergy(SkeletonModule):
             off = safe_root(share) * (y - mean)
             mean = mean * safe_root(own * self.kappa / (own + self.kappa))
         else:
-            share = weights.to(local)[..., None]
+            share = weights.to(local)[..., None] / (self.correlation if independent is None else 1)
             count = share.sum((-2, -1))
             mean = (share * y).sum(-2, keepdim=True) / torch.where(count > 0, count, 1)[..., None, None]
             off, each = y - mean, share[..., None, :, :]

@@ -87,7 +87,7 @@ class StanceEnergy(SkeletonModule):
         if weights is None:
             mean = each.mean(-1) if each.shape[-1] else each.sum(-1)
         else:
-            share = self._share(points, weights).to(each)
+            share = self._share(points, weights).to(each).clamp_min(0)
             mean = (share * each).sum(-1) / some(share.sum(-1))
         return narrow(torch.log1p(mean / self.sway**2) / 2, points)
 

@@ -161,7 +161,7 @@ class Objective:
         out = {
             "length": self.length_value(self.strayed(dz, lengths, flat).sum(1), lengths),
             "smoothness": bend.sum((1, 2)) / (2 * w.acceleration**2),
-            "posture": self.posture(points, lengths, self.share),
+            "posture": self.posture(points, lengths, independent=self.share),
             "stance": w.stance * self.stance(points, 1.0, self.time),
             "hinges": w.hinge / w.sine**2 * self.hinges(points, lengths, self.time).sum(-1),
             "adduction": w.adduction / w.sine**2 * self.adduction(points, lengths, self.time).sum(-1),
