@@ -493,6 +493,23 @@ def test_joints_that_coincide_are_told(method, place):
     assert "all joints lie at one point in every frame" in told
     assert result.root_depth is None and "root depth" not in told
     assert "one point" not in notes(tracks_of(WALK), method)
+    drift = drift.clone()
+    drift[0] = math.nan
+    assert "all joints lie at one point in every frame" in notes(tracks_of(drift), method)
+
+
+@quiet
+def test_a_body_on_its_head_is_told():
+    """y may point up; a body that lies, or shows its feet now and then, is not meant."""
+    with pytest.warns(KcsWarning, match="feet are above the rest of the body in nearly all frames. If y points up"):
+        reconstruct(tracks_of(WALK * torch.tensor([1.0, -1.0])), method="kcs")
+    turned = WALK.clone()
+    turned[: len(WALK) // 2, :, 1] *= -1
+    for right in (WALK, turned, WALK.flip(-1)):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            reconstruct(tracks_of(right), method="kcs")
+        assert not any("feet are above" in str(one.message) for one in told)
 
 
 @quiet

@@ -86,6 +86,26 @@ def test_confidence_is_a_weight_above_the_threshold():
     assert_close(tracks.points[:, 8:], grid()[:, 8:])
 
 
+def test_joints_at_the_corner_are_unseen():
+    """Detectors write (0, 0) where they see nothing; about a body's own middle it is a place like others."""
+    points = 100 + 50 * torch.rand(6, 17, 2, generator=torch.Generator().manual_seed(2))
+    zeros = points.clone()
+    zeros[:, 9], zeros[2, 4] = 0, 0
+    gone = torch.where((zeros == 0).all(-1, keepdim=True), torch.nan, zeros)
+    told = Tracks.from_arrays(zeros, skeleton="coco17")
+    assert_close(told.points, Tracks.from_arrays(gone, skeleton="coco17").points)
+    assert (
+        not told.seen[:, 9].any()
+        and not told.seen[2, 4]
+        and told.seen.sum() == Tracks.from_arrays(gone, skeleton="coco17").seen.sum()
+    )
+    assert any(note.startswith("7 joints that lie exactly at (0, 0) are taken as unseen") for note in told.notes)
+    centred = points - points[:, :1]
+    confident = Tracks.from_arrays(zeros, torch.ones(6, 17), skeleton="coco17")
+    for kept in (Tracks.from_arrays(centred, skeleton="coco17"), confident):
+        assert kept.seen.all() and not any("(0, 0)" in note for note in kept.notes)
+
+
 def test_confidence_zero_and_nan_are_the_same_as_nan_points():
     hidden = torch.rand(4, 17, generator=torch.Generator().manual_seed(1)) < 0.4
     by_points = Tracks.from_arrays(torch.where(hidden[..., None], NAN, grid()))

@@ -20,6 +20,7 @@ from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.training.seeds import generator_of
 from kcs_torch.types.axes import from_y_up
 from kcs_torch.types.size import unit_ratio
+from kcs_torch.types.upright import upside_down
 
 __all__ = ["SYNTHETIC", "Clip", "file_clips", "find_files", "resampled", "synthetic_clips"]
 
@@ -120,7 +121,7 @@ def file_clips(
                 "file_units=..., one of m, cm, mm"
             )
         clip = _placed(from_y_up(points, "-y") * ratio, known, str(path), body)
-        if up is None and _upside_down(clip):
+        if up is None and upside_down(clip.points[..., 1], clip.known, clip.skeleton):
             warnings.warn(
                 f"{path}: the body stands on its head: say which axis points up in the file, up='y' or 'z'",
                 KcsWarning,
@@ -206,16 +207,6 @@ def resampled(points: Tensor, known: Tensor, old: float, new: float) -> tuple[Te
     out = torch.where((every.all(1) & inside)[..., None], cubic, linear)
     out = torch.where(exact[..., None], b, out)
     return torch.where(both[..., None], out, torch.zeros_like(out)), both
-
-
-def _upside_down(clip: Clip) -> bool:
-    """Whether the joints that touch the ground are above the others in most frames."""
-    below = list(clip.skeleton.contacts)
-    if not below:
-        return False
-    others = [n for n in range(clip.skeleton.num_joints) if n not in below]
-    lower = clip.points[:, below, 1].mean(1) > clip.points[:, others, 1].mean(1)  # y down
-    return bool(lower[clip.known.all(1)].float().mean() < 0.5)
 
 
 def _placed(points: Tensor, known: Tensor, source: str, body: Skeleton) -> Clip:

@@ -156,6 +156,21 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
     )
 
 
+def _at_the_corner(points: Tensor, seen: Tensor, notes: list[str]) -> Tensor:
+    """Which joints (T, N) lie exactly at (0, 0) though all others lie to one side of it: detectors write unseen so.
+
+    About a middle that is 0 the others lie all around.
+    """
+    corner = seen & (points == 0).all(-1)
+    rest = points[seen & ~corner]
+    count = int(corner.sum())
+    if not (count and len(rest) and bool((rest > 0).all())):
+        return torch.zeros_like(corner)
+    are = "joint that lies exactly at (0, 0) is" if count == 1 else "joints that lie exactly at (0, 0) are"
+    notes.append(f"{count} {are} taken as unseen: NaN, or a confidence of 0, says so more clearly")
+    return corner
+
+
 class Intake(NamedTuple):
     """Arrays of one body's motion, checked: observed joints in the skeleton's order, 0 where unseen."""
 
@@ -220,6 +235,8 @@ def take_in(
         where, most = label(*large.nonzero()[0]), float(xy[large].abs().nan_to_num().max())
         raise ShapeError(f"{source}: points: {where}: expected coordinates up to {FARTHEST:g}, got {most:.3g}")
     seen = torch.isfinite(xy).all(-1)
+    if confidence is None and dims == 2:
+        seen = seen & ~_at_the_corner(xy, seen, remarks)
     if confidence is None:
         weights = seen.to(xy.dtype)
     else:

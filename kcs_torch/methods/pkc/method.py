@@ -46,6 +46,9 @@ HELD = 0.1
 """Standard deviation, a share of the body's size, of joints in frames before the body is first seen and after it was
 last seen, and the largest in gaps."""
 
+ROUNDING = 8.0
+"""Size of the body, over where it is and the machine precision, up to which it is a point."""
+
 AGAIN = 3
 """How often depths of the moving viewpoint are refined anew until they settle."""
 
@@ -137,6 +140,9 @@ class PKC(Method):
         points, noise, notes = yield from self._clean(tracks)
         standing = standing_feet(replace(tracks, points=points))
         image = points - points.mean(-2, keepdim=True)
+        rounding = ROUNDING * torch.finfo(points.dtype).eps * float(points.abs().amax())
+        if float(image.abs().amax()) <= rounding:  # all joints lie at one point
+            image = torch.zeros_like(image)
         (size,) = yield [Sized(replace(tracks, points=image))]
         found = yield from self._solve(tracks, image, noise, standing, cameras, notes, size)
         every = [replace(one, standing=standing) for one in (found, *found.alternatives)]
