@@ -212,6 +212,7 @@ class Writer:
         write_people: writes the results of several people of one clip to one file; None: it takes one only.
         unit: of length that files of this kind are usually in; empty: motion keeps its own.
         turns: whether a result is written as motion if the user says which axis shall point up.
+        fits: raises an OutputError unless motion of a skeleton can be written; None: any can.
         ready: raises an OutputError unless the package or the program is there that it needs; None: it needs none.
     """
 
@@ -223,6 +224,7 @@ class Writer:
     write_people: Callable[[Sequence[Reconstruction], Path], None] | None = None
     unit: str = ""
     turns: bool = False
+    fits: Callable[[Skeleton], object] | None = None
     ready: Callable[[], object] | None = None
 
 

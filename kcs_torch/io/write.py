@@ -12,10 +12,11 @@ from kcs_torch.errors import KcsWarning, OptionError, OutputError, unknown, user
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.load import WRITERS
 from kcs_torch.io.registry import Saving, Writer
+from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion, Reconstruction, Tracks
 from kcs_torch.types.size import METRES, unit_ratio
 
-__all__ = ["ready_writer", "save", "save_people", "takes_up", "units_ratio", "writer_for"]
+__all__ = ["check_skeleton", "ready_writer", "save", "save_people", "takes_up", "units_ratio", "writer_for"]
 
 UP = ("y", "z")
 
@@ -76,6 +77,7 @@ def save(
         return Path(path)
     if writer.write_motion is None:
         raise OutputError(f"{path}: expected a result, got motion, which goes to {_suffixes('write_motion')}")
+    check_skeleton(path, data.skeleton)
     motion = Motion.of(data) if isinstance(data, Reconstruction) else data
     motion = replace(motion, points=motion.points.detach())
     if isinstance(data, Reconstruction):
@@ -156,6 +158,20 @@ def ready_writer(path: str | Path) -> Writer:
         except OutputError as error:
             raise OutputError(f"{path}: {error}") from None
     return writer
+
+
+def check_skeleton(path: str | Path, body: Skeleton) -> None:
+    """Make sure that motion of a skeleton can be written to a file.
+
+    Raises:
+        OutputError: it cannot; BVH, say, takes trees only.
+    """
+    fits = writer_for(path).fits
+    if fits is not None:
+        try:
+            fits(body)
+        except OutputError as error:
+            raise OutputError(f"{path}: {error}") from None
 
 
 def units_ratio(old: str, new: str) -> float:
