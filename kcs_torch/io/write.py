@@ -20,6 +20,11 @@ __all__ = ["check_skeleton", "ready_writer", "save", "save_people", "takes_up", 
 
 UP = ("y", "z")
 
+_NO_UNIT = (
+    "got motion in an unknown one: give it where the motion is made, with units=... (kcs-torch convert: --from-units "
+    "cm), or the true size, with scaled(units=..., height=1.75) (--scale height=1.75m)"
+)
+
 
 def save(
     data: Reconstruction | Motion | Tracks,
@@ -90,6 +95,8 @@ def save(
     wanted = units or writer.unit
     if units is not None or (wanted and motion.units in METRES):
         motion = motion.scaled(units=wanted, factor=units_ratio(motion.units, wanted))
+    elif writer.names_unit and not motion.units:
+        raise OptionError(f"{path}: expected motion in a unit of length, which the file names, {_NO_UNIT}")
     elif wanted:
         saving.warnings.append(
             f"the true size is not known: lengths are in {motion.units or 'an unknown unit'}; set it with "
@@ -182,10 +189,12 @@ def units_ratio(old: str, new: str) -> float:
     """
     if new not in METRES and new != old:
         raise unknown("unit of length", new, METRES)
+    if not old:
+        raise OptionError(f"units: expected motion in a unit of length, {_NO_UNIT}")
     ratio = unit_ratio(old, new)
     if ratio is None:
         raise OptionError(
-            f"units: the true size is not known, only lengths in {old or 'an unknown unit'}; set it first with "
+            f"units: the true size is not known, only lengths in {old}; set it first with "
             f"scaled(units={new!r}, height=...) or --scale height=..."
         )
     return ratio

@@ -99,7 +99,7 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
     facts = file["parameters"]["POINT"]
     facts["RATE"]["value"] = [saving.rate(motion)]
     facts["LABELS"]["value"] = names
-    facts["UNITS"]["value"] = [motion.units or "mm"]
+    facts["UNITS"]["value"] = [motion.units]
     right, up = _SCREEN[saving.up]
     file.add_parameter("POINT", "X_SCREEN", [right])
     file.add_parameter("POINT", "Y_SCREEN", [up])
@@ -117,6 +117,7 @@ WRITERS = (
         None,
         write,
         unit="mm",
+        names_unit=True,
         fits=_check_count,
         ready=partial(need, "ezc3d", "C3D", OutputError),
     ),
