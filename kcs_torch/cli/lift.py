@@ -142,6 +142,7 @@ def lift(
         from kcs_torch.io import save_people, writer_for
         from kcs_torch.types.people import shared
         from kcs_torch.types.size import check_size
+        from kcs_torch.types.tracks import unseen_notes
 
         output = check_outputs(output, source=tracks)
         learned = _learned(method, settings) if method.endswith(LEARNED) else None
@@ -212,7 +213,8 @@ def lift(
                 results.append(result)
             reports.append(summary(result, solution))
             reports[-1]["notes"] += written.notes
-            reports[-1]["cleaning"] = [note for note in neat.notes if note not in one.notes]
+            known = {*one.notes, *unseen_notes(neat.weights, neat.skeleton)}
+            reports[-1]["cleaning"] = [note for note in neat.notes if note not in known]
             if not as_json:
                 typer.echo(describe(reports[-1], common))
                 folders = f", in new folders: {', '.join(map(str, made))}" if made else ""
