@@ -2,35 +2,44 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import itertools
+import json
 import os
+import re
+import secrets
 import shutil
 import time
 import traceback
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from kcs_torch.errors import KcsError, KcsWarning, OptionError, unknown
+import torch
+
+from kcs_torch.errors import FormatError, KcsError, KcsWarning, OptionError, OutputError, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.folders import natural_key
 from kcs_torch.io.load import load_people
 from kcs_torch.io.write import ready_writer, save, takes_up
 from kcs_torch.methods.base import Method
-from kcs_torch.reconstruct import reconstruct_all, with_found_bones
-from kcs_torch.types import Reconstruction, Tracks
+from kcs_torch.reconstruct import method_named, reconstruct_all, with_found_bones
+from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.size import parse_size
 
 __all__ = ["Clip", "Outcome", "clips_of", "reconstruct_folder"]
 
 FAILED = ".failed.txt"
 """Suffix of the file that stands in for the results of a clip that failed, and says why."""
+
+MADE_BY = ".made_by.json"
+"""File of the output folder that says by which settings its results were made."""
 
 _READING = [name for name in inspect.signature(load_people).parameters if name != "path"]
 
@@ -145,7 +154,8 @@ def reconstruct_folder(
 
     A clip is done when all its results are there, and each appears whole or not at all: however often the work is
     killed and begun again, nothing is lost or made twice. A clip that fails leaves ``NAME.failed.txt`` with the
-    reason and is not tried again, unless ``retry`` says so.
+    reason and is not tried again, unless ``retry`` says so. A folder holds results of one method and of one kind of
+    reading; which, a hidden file in it tells.
 
     Args:
         source: folder of tracks in any format that is read; a folder in it is a clip of many files.
@@ -157,7 +167,7 @@ def reconstruct_folder(
         shards: how many parts there are.
         batch: clips that are reconstructed together (:func:`kcs_torch.reconstruct_all`).
         everybody: reconstruct all people of a clip, to NAME_0, NAME_1, ..., not the most seen one alone.
-        retry: try clips again that failed.
+        retry: try clips again that failed, perhaps with other options of reading.
         scale: the true size of every body, ``height=1.75m`` or a bone's; else results are in the unit of the tracks.
         up: the axis that points up in those files that hold results so: y or z.
         units: as of :func:`kcs_torch.save`.
@@ -170,8 +180,9 @@ def reconstruct_folder(
         What became of the clips of this part.
 
     Raises:
-        OptionError: an option is out of range, or there is nothing to do.
+        OptionError: an option is out of range, there is nothing to do, or the folder's results were made otherwise.
         OutputError: the results cannot be written.
+        FormatError: the file that says how they were made is damaged.
     """
     if not 0 <= shard < shards:
         raise OptionError(f"shard: expected a number from 0 to {shards - 1} of shards={shards}, got {shard}")
@@ -186,9 +197,13 @@ def reconstruct_folder(
     if up is not None and not any(takes_up(Path(f"x{suffix}")) for suffix in suffixes):
         raise OptionError(f"up: none of {', '.join(suffixes)} holds results with y or z up")
     size = None if scale is None else parse_size(scale)
+    method = method_named(method, {})
     reconstruct_all([], method=method, intrinsics=intrinsics)  # what is wrong with these is so for every clip
     begin = time.monotonic()
     clips = [clip for clip in clips_of(source, output, pattern) if clip.share_of(shards) == shard]
+    lens = intrinsics if intrinsics is None or isinstance(intrinsics, str) else Intrinsics.of(intrinsics)
+    options = {"scale": scale, "up": up, "units": units, "intrinsics": lens}
+    _claim(Path(output), _settings(method, options, reading), retry)
     workplace = Path(output) / f".part_{shard}_of_{shards}"
     _sweep(Path(output), workplace)
     find = reading.get("skeleton") == "auto"
@@ -223,7 +238,7 @@ def reconstruct_folder(
 class _Work:
     """What is done to every clip."""
 
-    method: str | Method
+    method: Method
     suffixes: Sequence[str]
     everybody: bool
     workplace: Path
@@ -302,6 +317,62 @@ def _listing(clip: Clip, failed: list[tuple[Path, str]]) -> Iterator[None]:
         with atomic_path(clip.failure) as temporary:
             temporary.write_text(f"{text}\n", encoding="utf-8", errors="replace")
         failed.append((clip.source, reason.partition("\n")[0]))
+
+
+def _settings(method: Method, options: Mapping[str, object], reading: Mapping[str, object]) -> dict[str, str]:
+    """What results depend on, as text that is the same in every process."""
+    values = {"method": method.name}
+    values |= {f"method.{f.name}": _as_text(getattr(method, f.name)) for f in dataclasses.fields(method)}
+    values |= {name: _as_text(value) for name, value in options.items() if value is not None}
+    return values | {f"reading.{name}": _as_text(value) for name, value in reading.items() if value is not None}
+
+
+def _as_text(value: object) -> str:
+    if isinstance(value, torch.nn.Module):
+        weights = [t.detach().cpu().contiguous().reshape(-1).view(torch.uint8) for t in value.state_dict().values()]
+        return f"{type(value).__name__} {zlib.crc32(b''.join(w.numpy().tobytes() for w in weights)):08x}"
+    return value if isinstance(value, str) else re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+
+
+def _claim(output: Path, settings: dict[str, str], retry: bool) -> None:
+    """Write down how an output folder's results are made, once; all parts of the work have to agree.
+
+    Raises:
+        OptionError: others were made otherwise; what failed may be read otherwise than the rest.
+        OutputError: the folder cannot be written to.
+        FormatError: what is written there is damaged.
+    """
+    record = output / MADE_BY
+    temporary = output / f".{secrets.token_hex(4)}.json"
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        temporary.write_text(json.dumps(settings, indent=1), encoding="utf-8")
+        try:
+            os.link(temporary, record)  # of several processes that begin, one is the first
+        except FileExistsError:
+            pass
+        except OSError:  # a file system without links
+            if not record.exists():
+                os.replace(temporary, record)
+        own = dict(json.loads(record.read_bytes()))
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be written: {error.strerror or error}") from None
+    except (ValueError, TypeError) as error:
+        raise FormatError(f"{record}: damaged: {error}: remove it, if the folder's results may stay") from None
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+    other = [name for name in {**own, **settings} if own.get(name) != settings.get(name)]
+    if own.get("method") != settings["method"]:
+        other = ["method"]
+    elif retry:
+        other = [name for name in other if not name.startswith("reading.")]
+    if other:
+        was, now = (", ".join(f"{n}={str(s.get(n))[:60]}" for n in other[:4]) for s in (own, settings))
+        again = ", or retry, which tries those clips alone that failed" if other[0].startswith("reading.") else ""
+        raise OptionError(
+            f"{output}: holds results of {was}, got {now}: give another output folder, or remove this one{again}"
+        )
 
 
 def _numbered(path: Path, number: int) -> Path:

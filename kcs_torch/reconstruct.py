@@ -18,7 +18,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.intake import no_bones
 
-__all__ = ["reconstruct", "reconstruct_all", "with_found_bones"]
+__all__ = ["method_named", "reconstruct", "reconstruct_all", "with_found_bones"]
 
 DEFAULT = "pkc"
 """What "auto" stands for."""
@@ -86,7 +86,7 @@ def reconstruct(
         tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units)
     if find:
         tracks = with_found_bones(tracks)
-    chosen = _method(method, fields)
+    chosen = method_named(method, fields)
     lacking = no_bones(tracks.skeleton.num_joints)
     if chosen.knows_bones and lacking in tracks.notes:
         warnings.warn(f"{tracks.source}: {lacking}", KcsWarning, stacklevel=users_level())
@@ -120,7 +120,7 @@ def reconstruct_all(
     for i, one in enumerate(people):
         if not isinstance(one, Tracks):
             raise OptionError(f"reconstruct_all: item {i}: expected Tracks (see Tracks.from_arrays), got {type(one)}")
-    chosen = _method(method, fields)
+    chosen = method_named(method, fields)
     lens = _lens(intrinsics)
     if isinstance(lens, Intrinsics) or lens == "auto":
         return [_before(lens, chosen, one) for one in people]
@@ -165,8 +165,12 @@ def _before(lens: Intrinsics | str | None, method: Method, tracks: Tracks, camer
     return method(tracks, cameras) if lens == "parallel" else reconstruct_uncalibrated(method, tracks, cameras)
 
 
-def _method(method: str | Method, fields: dict[str, Any]) -> Method:
-    """The method that a name and its fields, or a :class:`Method`, stand for."""
+def method_named(method: str | Method, fields: dict[str, Any]) -> Method:
+    """The method that a name and its fields, or a :class:`Method`, stand for.
+
+    Raises:
+        OptionError: the name or a field is unknown, a field is out of range, or fields come with a :class:`Method`.
+    """
     if isinstance(method, Method):
         if fields:
             raise OptionError(

@@ -6,11 +6,12 @@ r"""Reconstruct a folder of thousands of track files; stop it whenever you like,
     python scripts/reconstruct_many.py -m input=tracks output=motion shards=8 'shard=range(0,8)' hydra/launcher=joblib
     python scripts/reconstruct_many.py -m input=tracks output=motion shards=200 'shard=range(0,200)' \
         hydra/launcher=submitit_slurm hydra.launcher.cpus_per_task=1 hydra.launcher.timeout_min=240
+    python scripts/reconstruct_many.py -m input=tracks 'output=motion/${hydra:runtime.choices.method}' method=kcs,sfam
 
-Finished results are skipped, failures are listed and leave NAME.failed.txt beside the results, and no file is ever half
-written. The shards of a multirun share nothing but the two folders, so that they may run on any machines that see
-these: hydra/launcher is joblib (processes), submitit_slurm or submitit_local, or ray: pip install
-".[launchers]".
+A folder holds results of one method; another one is refused there. Finished results are skipped, failures are listed
+and leave NAME.failed.txt beside the results, and no file is ever half written. The shards of a multirun share nothing
+but the two folders, so that they may run on any machines that see these: hydra/launcher is joblib (processes),
+submitit_slurm or submitit_local, or ray: pip install ".[launchers]".
 Exit code 1 where a clip failed.
 """
 

@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -261,6 +261,67 @@ def test_what_cannot_be_written_is_told_before_the_lift(openpose_folder, tmp_pat
     assert told in done.stderr and not list(tmp_path.iterdir())
     run("lift", openpose_folder, "-o", tmp_path / "out.npz", "--units", "parsec", code=2)
     run("lift", openpose_folder, "-o", tmp_path / "out.npz", "--scale", "height=2m", "--units", "parsec", code=2)
+
+
+def test_a_skeleton_that_a_file_does_not_take_is_told_before_the_lift(tmp_path, monkeypatch):
+    monkeypatch.setattr(kt, "reconstruct_all", lambda *a, **k: pytest.fail("lifted before it was told"))
+    tracks = kt.Tracks.from_arrays(np.random.default_rng(0).normal(size=(10, 300, 2)))
+    kt.save(tracks, tmp_path / "t.npz")
+    for suffix, told in (
+        (".bvh", "expected a skeleton whose bones are one tree"),
+        (".c3d", "expected up to 255 joints"),
+    ):
+        done = run("lift", tmp_path / "t.npz", "-o", tmp_path / f"a{suffix}", "-o", tmp_path / "a.npz", code=2)
+        assert done.stderr.startswith(f"error: {tmp_path / 'a'}{suffix}: {told}")
+    assert [path.name for path in tmp_path.iterdir()] == ["t.npz"]
+
+
+@pytest.fixture()
+def broken(monkeypatch):
+    """Writers of BVH and of pages that fail, as no check foresaw."""
+    import kcs_torch.io.write as write
+
+    def fails(*args):
+        raise OSError("the disk is full")
+
+    both = {".bvh": {"write_motion": fails}, ".html": {"write": fails, "write_people": fails}}
+    changed = {suffix: replace(write.WRITERS[suffix], **fields) for suffix, fields in both.items()}
+    monkeypatch.setattr(write, "WRITERS", {**write.WRITERS, **changed})
+
+
+@pytest.mark.parametrize("words", [[], ["--person", "all"]])
+def test_a_writer_that_fails_costs_no_other_file(openpose_folder, tmp_path, broken, words):
+    outputs = [tmp_path / name for name in ("new/a.bvh", "a.npz", "a.html", "a.csv")]
+    flags = [word for path in outputs for word in ("-o", path)]
+    done = run("lift", openpose_folder, *flags, "-m", "kcs", *words, "--json", code=2)
+    answer = json.loads(done.stdout)
+    written = [Path(name) for person in answer["people"] for name in person["files"]]
+    assert sorted(path for path in tmp_path.iterdir()) == sorted(written)
+    assert {path.suffix for path in written} == {".npz", ".csv"} and len(written) == (4 if words else 2)
+    for name in ["new/a_0.bvh", "new/a_1.bvh", "a_0.html", "a.html"] if words else ["new/a.bvh", "a.html"]:
+        assert f"{tmp_path / name}: cannot be written: the disk is full" in answer["error"] and name in done.stderr
+    spoken = run("lift", openpose_folder, *flags, "-m", "kcs", *words, code=2)
+    assert f"a{'_1' if words else ''}.csv" in spoken.stdout and "bvh" not in spoken.stdout
+
+
+def test_a_bug_in_a_writer_costs_no_other_file_and_shows_where_it_is(lifted, tmp_path, monkeypatch):
+    import kcs_torch.io.write as write
+
+    def fails(*args):
+        raise ZeroDivisionError("planted")
+
+    monkeypatch.setattr(write, "WRITERS", {**write.WRITERS, ".bvh": replace(write.WRITERS[".bvh"], write_motion=fails)})
+    with pytest.raises(ZeroDivisionError):
+        run("convert", lifted[0] / "walk.npz", tmp_path / "a.bvh", tmp_path / "a.csv")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
+
+
+def test_view_writes_what_it_can(lifted, tmp_path, broken):
+    result = lifted[0] / "walk.npz"
+    for results in ([result], [result, result]):
+        out = tmp_path / f"{len(results)}"
+        done = run("view", *results, "-o", out / "a.html", "-o", out / "a.gif", code=2)
+        assert done.stdout == f"wrote {out / 'a.gif'}\n" and [path.name for path in out.iterdir()] == ["a.gif"]
 
 
 def test_an_output_that_is_named_twice_is_written_once(lifted, tmp_path):

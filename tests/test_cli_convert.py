@@ -76,6 +76,25 @@ def test_motion_goes_from_one_tool_to_another(tmp_path):
     assert np.allclose(table[:, 2:].reshape(10, -1, 3), motion.points, atol=1e-5)
 
 
+@pytest.mark.parametrize("suffix", [".trc", ".c3d"])
+def test_files_that_name_their_unit_take_no_motion_without_one(tmp_path, suffix):
+    """Our own BVH, whose centimetres it does not tell, never becomes markers in millimetres."""
+    save(walking_motion(10), tmp_path / "a.bvh", notes=[])
+    out = tmp_path / f"b{suffix}"
+    for words in ([], ["--units", "m"]):
+        done = run("convert", tmp_path / "a.bvh", out, *words, code=2)
+        assert "got motion in an unknown one" in done.stderr and "--from-units cm" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["a.bvh"]
+    run("convert", tmp_path / "a.bvh", out, "--from-units", "cm")
+    assert torch.allclose(
+        load_motion(out).scaled(units="m", factor=1 if suffix == ".trc" else 1e-3).points,
+        walking_motion(10).points,
+        atol=1e-5,
+    )
+    run("convert", tmp_path / "a.bvh", out, "--scale", "factor=2mm")
+    assert load_motion(out).units == ("m" if suffix == ".trc" else "mm")
+
+
 def test_real_capture_to_animation(shared, tmp_path):
     amc = shared / "data" / "raw_formats" / "asf_amc" / "35_01.amc"
     done = run("convert", amc, tmp_path / "w.bvh", tmp_path / "w.npz", "--fps", 120)

@@ -1,11 +1,15 @@
 """Skeletons found from motion."""
 
+import warnings
+
 import pytest
 import torch
 from test_procrustean import BONES, swinging_body
 
+from kcs_torch.data import walking_person
 from kcs_torch.errors import KcsWarning, OptionError, ShapeError
 from kcs_torch.methods.found import find_skeleton
+from kcs_torch.reconstruct import reconstruct
 from kcs_torch.types import Tracks
 
 
@@ -35,6 +39,18 @@ def test_takes_tracks_and_results():
     tracks = Tracks.from_arrays(points[..., :2], joint_names=list("abcdef"))
     body = find_skeleton(tracks)
     assert body.joints == tuple("abcdef") and body.num_bones == 5
+
+
+def test_the_depths_that_it_looks_at_are_not_doubted_aloud():
+    """A camera that stands still spoils depths, and SfAM says so; who asks for bones sees neither."""
+    points = walking_person(40, turn=0.0).tracks.points.clone()
+    points[:, 4] = torch.nan
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        reconstruct(points, skeleton="auto")
+    said = [str(warning.message) for warning in caught]
+    assert len(said) == len(set(said)) and not any("sfam" in one for one in said)
+    assert sum("never seen" in one for one in said) == 1
 
 
 def test_joints_that_nothing_holds_together_are_warned_of():

@@ -42,6 +42,7 @@ def test_every_clip_once(clips, tmp_path):
     assert (outcome.clips, outcome.done, outcome.skipped, outcome.failed) == (6, 6, 0, ())
     assert outcome.frames == sum(8 + i % 3 for i in range(6))
     made = sorted(p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out").rglob("*") if p.is_file())
+    made.remove(many.MADE_BY)
     assert made == sorted(f"{'more/' if i == 3 else ''}clip{i}.{s}" for i in range(6) for s in ("csv", "npz"))
     alone = kt.reconstruct(kt.load_tracks(clips / "clip4.npz"), method="kcs")
     torch.testing.assert_close(
@@ -166,6 +167,88 @@ def test_everybody(tmp_path):
     assert run(tmp_path / "in", tmp_path / "out", pattern="*", everybody=True).skipped == 1
 
 
+@pytest.mark.parametrize(
+    ("first", "then", "told"),
+    [
+        ({}, {"method": "sfam"}, "out: holds results of method=kcs, got method=sfam: give another output folder"),
+        (
+            {},
+            {"method": kt.KCS(steps_per_weight=7)},
+            "holds results of method.steps_per_weight=.*, got method.steps_per_weight=7",
+        ),
+        ({}, {"scale": "height=1.75m"}, "holds results of scale=None, got scale=height=1.75m"),
+        ({}, {"skeleton": "auto"}, "reading.skeleton=None, got reading.skeleton=auto.* or retry"),
+        ({"intrinsics": (900, 900, 0, 0)}, {}, r"intrinsics=Intrinsics\(fx=900.0.*, got intrinsics=None"),
+    ],
+)
+def test_a_folder_holds_results_of_one_kind(clips, tmp_path, first, then, told):
+    """What is there already is never taken for what another method would make."""
+    source, out = make_clips(tmp_path / "in", 1), tmp_path / "out"
+    assert run(source, out, **first).done == 1
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    with pytest.raises(kt.OptionError, match=told):
+        run(source, out, **{"method": "kcs", **then})
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+    assert run(source, out, **first, suffixes=[".npz", ".csv"], batch=3).done == 1
+
+
+def test_what_failed_may_be_read_otherwise(tmp_path):
+    """The rest stays; a retry that is stopped goes on as a retry."""
+    source, out = make_clips(tmp_path / "in", 1), tmp_path / "out"
+    np.savez(source / "odd.npz", points2d=np.random.default_rng(0).normal(size=(9, 17, 2)), fps=-1.0)
+    assert len(run(source, out, pattern="*.npz").failed) == 1
+    assert run(source, out, pattern="*.npz", retry=True, fps=25).done == 1
+    assert run(source, out, pattern="*.npz", retry=True, fps=25).skipped == 2
+    with pytest.raises(kt.OptionError, match=r"reading.fps=None, got reading.fps=25"):
+        run(source, out, pattern="*.npz", fps=25)
+
+
+def test_how_results_were_made_is_checked_without_links_and_where_it_is_damaged(tmp_path, monkeypatch):
+    source, out = make_clips(tmp_path / "in", 1), tmp_path / "out"
+
+    def refused(*args):
+        raise PermissionError("no links here")
+
+    monkeypatch.setattr(os, "link", refused)
+    assert run(source, out).done == 1 and run(source, out, method=kt.KCS()).skipped == 1
+    with pytest.raises(kt.OptionError, match="method=sfam"):
+        run(source, out, method="sfam")
+    (out / many.MADE_BY).write_text("[1")
+    with pytest.raises(kt.FormatError, match=r"made_by.json: damaged: .* remove it"):
+        run(source, out)
+    assert sorted(path.name for path in out.iterdir()) == [many.MADE_BY, "clip0.npz"]
+
+
+def test_networks_differ_by_their_weights():
+    """Two trainings of one network are two methods; reading one twice is not."""
+    torch.manual_seed(0)
+    one, other = torch.nn.Linear(2, 2), torch.nn.Linear(2, 2)
+    again = torch.nn.Linear(2, 2)
+    again.load_state_dict(one.state_dict())
+    assert many._as_text(one) == many._as_text(again) != many._as_text(other)
+
+
+def test_a_sweep_writes_a_folder_for_each_method(tmp_path, root):
+    pytest.importorskip("hydra")
+    source = make_clips(tmp_path / "in", 1)
+    command = [
+        sys.executable, str(root / "scripts" / "reconstruct_many.py"), "-m", f"input={source}",
+        f"hydra.sweep.dir={tmp_path / 'sweep'}", "method=kcs,sfam", "pattern='*.npz'",
+    ]  # fmt: skip
+    words = [f"output={tmp_path}/motion/${{hydra:runtime.choices.method}}"]
+    done = subprocess.run([*command, *words], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    for method in ("kcs", "sfam"):
+        assert load_reconstruction(tmp_path / "motion" / method / "clip0.npz").method == method
+    done = subprocess.run(
+        [*command, f"output={tmp_path}/one"], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 1 and "holds results of method=kcs, got method=sfam" in done.stderr
+    told = subprocess.run([*command[:2], "--help"], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert "-m input=tracks 'output=motion/${hydra:runtime.choices.method}' method=kcs,sfam\n" in told.stdout
+    assert "Traceback" not in done.stderr
+
+
 def test_names_that_would_meet_keep_their_suffix(tmp_path):
     for name in ("a.json", "a.csv", "b.npz"):
         (tmp_path / name).touch()
@@ -236,7 +319,7 @@ def test_killed_and_taken_up_again(tmp_path, root):
     assert done.returncode == 0, done.stderr
     assert f"{30 - len(first)} made" in done.stdout and f"{len(first)} were there, 0 failed" in done.stdout
     made = list(output.rglob("*.npz"))
-    assert len(made) == 30 and not list(output.glob(".*"))
+    assert len(made) == 30 and [path.name for path in output.glob(".*")] == [many.MADE_BY]
     assert all((p.stat().st_mtime_ns, p.stat().st_ino) == stamp for p, stamp in first.items())
     for path in made:
         assert torch.isfinite(load_reconstruction(path).points).all()

@@ -112,6 +112,10 @@ def test_tracks(raw, tmp_path, name):
 def test_motion(raw, tmp_path, name):
     motion = load_any(raw / name)
     assert isinstance(motion, Motion)
+    if not motion.units:  # which TRC and C3D have to name
+        with pytest.raises(kt.OptionError, match="unit of length"):
+            kt.save(motion, tmp_path / "x.trc")
+        motion = load_any(raw / name, units="cm")
     motion = motion.frames(0, min(motion.num_frames, 40))
     kt.save(motion, tmp_path / "m.npz")
     same(load_motion(tmp_path / "m.npz"), motion, 1e-9)

@@ -79,6 +79,6 @@ def rebuilt(tracks: Tracks, points: Tensor, weights: Tensor, note: str, *, fps: 
     if not bool((weights > 0).any()):
         raise ShapeError(f"{tracks.source}: {note}: no joint is left seen in any frame")
     points, weights = tracks.skeleton.complete(points, weights)
-    return replace(
-        tracks, points=points, weights=weights, fps=tracks.fps if fps is None else fps, notes=(*tracks.notes, note)
-    )
+    rate = tracks.fps if fps is None else fps
+    made = replace(tracks, points=points, weights=weights, fps=rate).noted_anew(tracks.weights)
+    return replace(made, notes=(*made.notes, note))

@@ -46,7 +46,7 @@ def trim(tracks: Tracks, start: int | None = None, stop: int | None = None) -> T
     if not bool(cut.seen.any()):
         raise ShapeError(f"{tracks.source}: no joint is seen in frames {first} to {end - 1}")
     note = f"trim: frames {first} to {end - 1} of {frames}"
-    return replace(cut, notes=(*tracks.notes, note))
+    return replace(cut, notes=(*cut.notes, note))
 
 
 def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: float | None = None) -> Tracks:

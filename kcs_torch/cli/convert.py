@@ -9,7 +9,7 @@ import typer
 
 from kcs_torch.cli.options import ImageSize, Threshold, Trust, check_outputs, image_size, person_number
 from kcs_torch.cli.outputs import Scale, Units, Up, parse_scale, write_files
-from kcs_torch.cli.report import answer, one_line, progress
+from kcs_torch.cli.report import answer, progress
 
 __all__ = ["FromUnits", "FromUp", "convert"]
 
@@ -97,7 +97,5 @@ def convert(
             if isinstance(data, Tracks):
                 raise OptionError("--scale: 2D tracks have no true size: lift them first")
             data = data.scaled(**true_size)
-        for note in (*known, *write_files(data, output, up, units)):
-            typer.echo(f"note: {one_line(note)}", err=True)
-        for path in output:
-            typer.echo(f"wrote {path}")
+        written = write_files(data, output, up, units)
+        written.tell(known)

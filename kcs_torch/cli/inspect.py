@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +20,7 @@ from kcs_torch.cli.options import (
     check_outputs,
     image_size,
 )
-from kcs_torch.cli.outputs import Scale, Units, Up, check_up, parse_scale, sized, write_files
+from kcs_torch.cli.outputs import Scale, Units, Up, Written, check_up, parse_scale, sized, write_files
 from kcs_torch.cli.pictures import check_picture, write_picture
 from kcs_torch.cli.report import answer, one_line, print_json, progress
 from kcs_torch.errors import counted
@@ -179,11 +180,9 @@ def view(
                 motion = load_reconstruction(result)
             people.append(sized(motion.mirrored() if mirror else motion, size))
         if len(people) == 1:
-            for note in write_files(people[0], outputs, up, units):
-                typer.echo(f"note: {one_line(note)}", err=True)
+            written = write_files(people[0], outputs, up, units)
         else:
+            written = Written()
             for path in outputs:
-                with progress(f"writing {path}"):
-                    save_people(people, path)
-        for path in outputs:
-            typer.echo(f"wrote {path}")
+                written.attempt(path, partial(save_people, people, path))
+        written.tell()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,7 +24,7 @@ from kcs_torch.cli.options import (
     person_number,
     use_one_thread,
 )
-from kcs_torch.cli.outputs import Scale, Units, Up, check_units, check_up, parse_scale, sized, write_files
+from kcs_torch.cli.outputs import Scale, Units, Up, Written, check_units, check_up, parse_scale, sized, write_files
 from kcs_torch.cli.report import answer, describe, one_line, print_json, progress, summary
 
 if TYPE_CHECKING:
@@ -137,10 +138,11 @@ def lift(
     as_json: AsJson = False,
 ) -> None:
     """Turn 2D joint tracks, or a video where a detector is installed, into 3D motion."""
-    with answer(as_json):
+    with answer(as_json) as said:
         from kcs_torch.io import save_people, writer_for
         from kcs_torch.types.people import shared
         from kcs_torch.types.size import check_size
+        from kcs_torch.types.tracks import unseen_notes
 
         output = check_outputs(output, source=tracks)
         learned = _learned(method, settings) if method.endswith(LEARNED) else None
@@ -180,14 +182,16 @@ def lift(
                     trust=trust,
                 )
         use_one_thread()
-        reports, results = [], []
+        reports: list[dict[str, Any]] = []
+        results, every = [], Written()
         together = [path for path in output if person == "all" and writer_for(path).write_people is not None]
         if together and frames == "seen":  # each has a first frame of their own then
             say = "with --frames seen people begin at different frames"
             typer.echo(f"note: {', '.join(map(str, together))} not written: {say}", err=True)
             together = []
         for number, one in people:
-            check_outputs([numbered(path, number) for path in output] if person == "all" else [], source=tracks)
+            names = [numbered(path, number) if person == "all" else path for path in output]
+            check_outputs(names, source=tracks, skeleton=None if find else one.skeleton)
             check_units(units, one.units, size_of)
             if size_of is not None and not find:
                 check_size(one.skeleton, next(name for name in size_of if name != "units"), "--scale")
@@ -202,26 +206,32 @@ def lift(
         for (number, one), neat, result in zip(people, cleaned, found, strict=True):
             names = [numbered(path, number) if person == "all" else path for path in output]
             made = new_folders(names)
-            told = write_files(result, names, up, units)
+            written = write_files(result, names, up, units)
+            made = [folder for folder in made if folder.exists()]
+            every.errors.extend(written.errors)
             if together:
                 results.append(result)
             reports.append(summary(result, solution))
-            reports[-1]["notes"] += told
-            reports[-1]["cleaning"] = [note for note in neat.notes if note not in one.notes]
+            reports[-1]["notes"] += written.notes
+            known = {*one.notes, *unseen_notes(neat.weights, neat.skeleton)}
+            reports[-1]["cleaning"] = [note for note in neat.notes if note not in known]
             if not as_json:
                 typer.echo(describe(reports[-1], common))
                 folders = f", in new folders: {', '.join(map(str, made))}" if made else ""
-                typer.echo(f"  wrote {', '.join(map(str, names))}{folders}")
-            reports[-1] |= {"person": number, "files": names, "new_folders": made}
+                if written.files:
+                    typer.echo(f"  wrote {', '.join(map(str, written.files))}{folders}")
+            reports[-1] |= {"person": number, "files": written.files, "new_folders": made}
         if common and not as_json:
             typer.echo("\n".join(["everybody:", *(f"  note: {one_line(note)}" for note in common)]))
         for path in together:
-            with progress(f"writing {path}"):
-                save_people(results, path)
-            if not as_json:
+            every.attempt(path, partial(save_people, results, path))
+        if not as_json:
+            for path in every.files:
                 typer.echo(f"wrote {path}: everybody")
+        said |= {"people": reports, **({"together": every.files} if together else {})}
+        every.check()
         if as_json:
-            print_json({"people": reports, **({"together": together} if together else {})})
+            print_json(said)
 
 
 def method_fields(method: str, settings: list[str]) -> dict[str, Any]:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from kcs_torch.skeleton import Skeleton
 
 __all__ = [
     "AsJson",
@@ -65,23 +68,25 @@ class _NothingWritten(Exception):
     pass
 
 
-def check_outputs(outputs: Sequence[Path], source: str | None = None) -> list[Path]:
-    """Make sure that results can be written, before time is spent on them.
+def check_outputs(outputs: Sequence[Path], source: str | None = None, skeleton: Skeleton | None = None) -> list[Path]:
+    """Make sure that results can be written, of a skeleton where it is known, before time is spent on them.
 
     Returns:
         the outputs, each once.
 
     Raises:
-        OutputError: a suffix is unknown, a package is missing that it needs, a place cannot be written to, or an
-            output would replace the input.
+        OutputError: a suffix is unknown, a package is missing that it needs, a file does not take the skeleton, a place
+            cannot be written to, or an output would replace the input.
     """
     from kcs_torch.errors import OutputError
     from kcs_torch.io.atomic import atomic_path
-    from kcs_torch.io.write import ready_writer
+    from kcs_torch.io.write import check_skeleton, ready_writer
 
     once: dict[Path, Path] = {}
     for path in outputs:
         ready_writer(path)
+        if skeleton is not None:
+            check_skeleton(path, skeleton)
         once.setdefault(path.resolve(), path)
         if source is not None and path.exists() and path.resolve() == Path(source).resolve():
             raise OutputError(f"{path}: expected another file than the tracks, which it would replace")

@@ -1,21 +1,23 @@
-"""How commands write: which way is up, in which unit, and of which size."""
+"""How commands write: which way is up, in which unit, of which size; and each file whatever becomes of the others."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from kcs_torch.cli.report import progress
+from kcs_torch.cli.report import one_line, progress
 
 if TYPE_CHECKING:
     from kcs_torch.types import Motion, Reconstruction, Tracks
 
 _Sized = TypeVar("_Sized", "Motion", "Reconstruction")
 
-__all__ = ["Scale", "Units", "Up", "check_units", "check_up", "parse_scale", "sized", "write_files"]
+__all__ = ["Scale", "Units", "Up", "Written", "check_units", "check_up", "parse_scale", "sized", "write_files"]
 
 Up = Annotated[
     str | None,
@@ -100,10 +102,63 @@ def check_units(units: str | None, own: str, scale: dict[str, Any] | None) -> No
         units_ratio(own if scale is None else scale["units"], units)
 
 
+@dataclass(frozen=True)
+class Written:
+    """What became of files that do not depend on each other.
+
+    Attributes:
+        files: that were written.
+        notes: what is to be said of them.
+        errors: why others were not.
+    """
+
+    files: list[Path] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    errors: list[Exception] = field(default_factory=list)
+
+    def attempt(self, path: Path, write: Callable[[], object]) -> None:
+        """Write one file, and keep the error if it cannot be."""
+        with progress(f"writing {path}"):
+            try:
+                write()
+                self.files.append(path)
+            except Exception as error:
+                self.errors.append(error)
+
+    def tell(self, known: Sequence[str] = ()) -> None:
+        """Say what was written, after notes that are known; raise what went wrong, alone where nothing was written.
+
+        Raises:
+            OutputError: as of :meth:`check`.
+        """
+        if not self.files:
+            self.check()
+        for note in (*known, *self.notes):
+            typer.echo(f"note: {one_line(note)}", err=True)
+        for path in self.files:
+            typer.echo(f"wrote {path}")
+        self.check()
+
+    def check(self) -> None:
+        """Raise what went wrong, once all that can be written is.
+
+        Raises:
+            OutputError: several files could not be written; the error itself where it was one.
+        """
+        from kcs_torch.errors import KcsError, OutputError
+
+        told = {str(error): error for error in self.errors}
+        grave = [error for error in self.errors if not isinstance(error, KcsError)]
+        if grave or len(told) == 1:
+            raise [*grave, *told.values()][0]
+        if told:
+            raise OutputError("; ".join(told))
+
+
 def write_files(
     data: Reconstruction | Motion | Tracks, paths: Sequence[Path], up: str | None = None, units: str | None = None
-) -> list[str]:
-    """Write all files; return what is to be said of each.
+) -> Written:
+    """Write all files that can be written.
 
     Raises:
         OptionError: an axis is asked for, but no file is of a kind that takes it.
@@ -114,11 +169,10 @@ def write_files(
 
     if isinstance(data, Reconstruction):
         check_up(up, paths)
-    told = []
+    written = Written()
     for path in paths:
         notes: list[str] = []
-        fits = not isinstance(data, Reconstruction) or takes_up(path)
-        with progress(f"writing {path}"):
-            save(data, path, up=up if fits else None, units=units, notes=notes)
-        told += [f"{path}: {note}" for note in notes]
-    return told
+        turned = up if not isinstance(data, Reconstruction) or takes_up(path) else None
+        written.attempt(path, partial(save, data, path, up=turned, units=units, notes=notes))
+        written.notes.extend(f"{path}: {note}" for note in notes)
+    return written

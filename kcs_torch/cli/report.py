@@ -26,8 +26,12 @@ def one_line(text: object) -> str:
 
 
 @contextmanager
-def answer(as_json: bool = False) -> Iterator[None]:
-    """Run a command's body: an error of bad input becomes one line and exit code 2, a warning one line."""
+def answer(as_json: bool = False) -> Iterator[dict[str, Any]]:
+    """Run a command's body: an error of bad input becomes one line and exit code 2, a warning one line.
+
+    What the body puts into the dictionary that it gets is printed as JSON together with the error.
+    """
+    found: dict[str, Any] = {}
     usual = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
@@ -40,11 +44,11 @@ def answer(as_json: bool = False) -> Iterator[None]:
         warnings.simplefilter("always", KcsWarning)
         warnings.showwarning = show  # type: ignore[assignment]
         try:
-            yield
+            yield found
         except KcsError as error:
             typer.echo(f"error: {one_line(error)}", err=True)
             if as_json:
-                print_json({"error": one_line(error), "type": type(error).__name__})
+                print_json({**found, "error": one_line(error), "type": type(error).__name__})
             raise typer.Exit(2) from None
 
 

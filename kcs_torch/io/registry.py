@@ -211,7 +211,9 @@ class Writer:
         write_tracks: writes tracks; None: they cannot be written.
         write_people: writes the results of several people of one clip to one file; None: it takes one only.
         unit: of length that files of this kind are usually in; empty: motion keeps its own.
+        names_unit: whether a file says in which unit it is, so that motion has to have one.
         turns: whether a result is written as motion if the user says which axis shall point up.
+        fits: raises an OutputError unless motion of a skeleton can be written; None: any can.
         ready: raises an OutputError unless the package or the program is there that it needs; None: it needs none.
     """
 
@@ -222,7 +224,9 @@ class Writer:
     write_tracks: Callable[[Tracks, Path], None] | None = None
     write_people: Callable[[Sequence[Reconstruction], Path], None] | None = None
     unit: str = ""
+    names_unit: bool = False
     turns: bool = False
+    fits: Callable[[Skeleton], object] | None = None
     ready: Callable[[], object] | None = None
 
 

@@ -13,7 +13,7 @@ from kcs_torch.functional import bone_lengths, minimal_turn, nearest_rotation
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.axes import from_y_up, to_y_up
 
-__all__ = ["Rig", "fit_rig"]
+__all__ = ["Rig", "check_tree", "fit_rig"]
 
 _RIGID = 1e-4  # of the sum of all lengths: half a millimetre of a person
 
@@ -47,6 +47,26 @@ class Rig:
         return torch.stack([points[node] for node in self.joints], 1)
 
 
+def check_tree(body: Skeleton) -> None:
+    """Make sure that a skeleton can be written as a chain.
+
+    Raises:
+        OutputError: it is no tree.
+    """
+    if body.is_tree:
+        return
+    if not body.bones:
+        reason = "has no bones"
+    elif len(pieces := body.pieces()) > 1:
+        reason = f"falls into {len(pieces)} pieces, one of them {body.joints[pieces[-1][0]]}"
+    else:
+        reason = "closes a chain"
+    raise OutputError(
+        f"expected a skeleton whose bones are one tree, got '{body.name}', which {reason}: "
+        "give one with skeleton=... (kcs-torch: --skeleton)"
+    )
+
+
 def fit_rig(points: Tensor, body: Skeleton, *, up: str = "y") -> Rig:
     """Find offsets and rotations whose forward kinematics is nearest to the joints, bone by bone.
 
@@ -63,17 +83,7 @@ def fit_rig(points: Tensor, body: Skeleton, *, up: str = "y") -> Rig:
     Raises:
         OutputError: the skeleton is no tree.
     """
-    if not body.is_tree:
-        if not body.bones:
-            reason = "has no bones"
-        elif len(pieces := body.pieces()) > 1:
-            reason = f"falls into {len(pieces)} pieces, one of them {body.joints[pieces[-1][0]]}"
-        else:
-            reason = "closes a chain"
-        raise OutputError(
-            f"expected a skeleton whose bones are one tree, got '{body.name}', which {reason}: "
-            "give one with skeleton=... (kcs-torch: --skeleton)"
-        )
+    check_tree(body)
     rest = points[0]
     if body.template is not None:
         rest = from_y_up(to_y_up(body.template_points(dtype=points.dtype, device=points.device), "-y"), up)

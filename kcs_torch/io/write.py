@@ -12,12 +12,18 @@ from kcs_torch.errors import KcsWarning, OptionError, OutputError, unknown, user
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.load import WRITERS
 from kcs_torch.io.registry import Saving, Writer
+from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion, Reconstruction, Tracks
 from kcs_torch.types.size import METRES, unit_ratio
 
-__all__ = ["ready_writer", "save", "save_people", "takes_up", "units_ratio", "writer_for"]
+__all__ = ["check_skeleton", "ready_writer", "save", "save_people", "takes_up", "units_ratio", "writer_for"]
 
 UP = ("y", "z")
+
+_NO_UNIT = (
+    "got motion in an unknown one: give it where the motion is made, with units=... (kcs-torch convert: --from-units "
+    "cm), or the true size, with scaled(units=..., height=1.75) (--scale height=1.75m)"
+)
 
 
 def save(
@@ -76,6 +82,7 @@ def save(
         return Path(path)
     if writer.write_motion is None:
         raise OutputError(f"{path}: expected a result, got motion, which goes to {_suffixes('write_motion')}")
+    check_skeleton(path, data.skeleton)
     motion = Motion.of(data) if isinstance(data, Reconstruction) else data
     motion = replace(motion, points=motion.points.detach())
     if isinstance(data, Reconstruction):
@@ -88,6 +95,8 @@ def save(
     wanted = units or writer.unit
     if units is not None or (wanted and motion.units in METRES):
         motion = motion.scaled(units=wanted, factor=units_ratio(motion.units, wanted))
+    elif writer.names_unit and not motion.units:
+        raise OptionError(f"{path}: expected motion in a unit of length, which the file names, {_NO_UNIT}")
     elif wanted:
         saving.warnings.append(
             f"the true size is not known: lengths are in {motion.units or 'an unknown unit'}; set it with "
@@ -158,6 +167,20 @@ def ready_writer(path: str | Path) -> Writer:
     return writer
 
 
+def check_skeleton(path: str | Path, body: Skeleton) -> None:
+    """Make sure that motion of a skeleton can be written to a file.
+
+    Raises:
+        OutputError: it cannot; BVH, say, takes trees only.
+    """
+    fits = writer_for(path).fits
+    if fits is not None:
+        try:
+            fits(body)
+        except OutputError as error:
+            raise OutputError(f"{path}: {error}") from None
+
+
 def units_ratio(old: str, new: str) -> float:
     """How many new units of length an old one has.
 
@@ -166,10 +189,12 @@ def units_ratio(old: str, new: str) -> float:
     """
     if new not in METRES and new != old:
         raise unknown("unit of length", new, METRES)
+    if not old:
+        raise OptionError(f"units: expected motion in a unit of length, {_NO_UNIT}")
     ratio = unit_ratio(old, new)
     if ratio is None:
         raise OptionError(
-            f"units: the true size is not known, only lengths in {old or 'an unknown unit'}; set it first with "
+            f"units: the true size is not known, only lengths in {old}; set it first with "
             f"scaled(units={new!r}, height=...) or --scale height=..."
         )
     return ratio

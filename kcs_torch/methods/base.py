@@ -29,6 +29,7 @@ from kcs_torch.methods.finish import WEAK_TURN, WHY_LOOSE, Estimate, finish, rms
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
 from kcs_torch.types.hints import is_a, spoken
+from kcs_torch.types.tracks import never_seen
 from kcs_torch.types.upright import upside_down
 
 __all__ = ["WEAK_TURN", "Estimate", "Method", "apart"]
@@ -168,13 +169,8 @@ class Method(ABC):
         if not found.converged:
             message = f"{tracks.source}: {self.unsettled(found.iterations)}"
             warnings.warn(message, ConvergenceWarning, stacklevel=users_level())
-        never = [tracks.skeleton.joints[n] for n in (tracks.weights == 0).all(0).nonzero().flatten().tolist()]
-        if never:
-            warnings.warn(
-                f"{tracks.source}: never seen, so placed by the skeleton alone: {', '.join(never)}",
-                KcsWarning,
-                stacklevel=users_level(),
-            )
+        for gone in never_seen(tracks.weights, tracks.skeleton):
+            warnings.warn(f"{tracks.source}: {gone}", KcsWarning, stacklevel=users_level())
         if upside_down(tracks.points[..., 1], tracks.seen, tracks.skeleton, HEADSTAND):
             message = (
                 f"{tracks.source}: the feet are above the rest of the body in nearly all frames. If y points up "

@@ -208,6 +208,8 @@ def _reconstruction(
     if not found.converged:
         notes.append(method.unsettled(found.iterations))
     percent = float(100 * variation[rigid].median()) if rigid else math.nan
+    if percent > LOOSE and not method.keeps_lengths:
+        notes.append(f"bone lengths vary by {percent:.1f} %: '{method.name}' does not hold them constant")
     for wrong in what_is_wrong(method, points, body):
         notes.append(f"{wrong}: {WHY_LOOSE}")
     if not rigid:

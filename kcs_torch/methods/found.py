@@ -54,7 +54,9 @@ def find_skeleton(
     if not rigid_below >= 0:
         raise OptionError(f"find_skeleton: rigid_below: expected a share >= 0, got {rigid_below}")
     if isinstance(source, Tracks):
-        source = SfAM()(source)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", KcsWarning)  # of depths that nobody sees
+            source = SfAM()(source)
     if isinstance(source, Reconstruction):
         weights = source.tracks.weights if weights is None else weights
         joints = source.tracks.skeleton.joints if joints is None else joints

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
+
+from torch import Tensor
 
 from kcs_torch.errors import counted
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.intake import no_bones, take_in
 from kcs_torch.types.trajectories import Trajectories
 
-__all__ = ["Tracks"]
+__all__ = ["Tracks", "never_seen", "unseen_notes"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -85,13 +87,33 @@ class Tracks(Trajectories):
         if skeleton is None and not body.bones:
             remarks.append(no_bones(body.num_joints))
         xy, weights = body.complete(taken.points, taken.weights)
-        never = [body.joints[n] for n in (weights == 0).all(0).nonzero().flatten().tolist()]
-        if never:
-            remarks.append(f"never seen, so placed by the skeleton alone: {', '.join(never)}")
-        blank = (weights == 0).all(1).nonzero().flatten().tolist()
-        if blank:
-            shown = ", ".join(map(str, blank[:8])) + (", ..." if len(blank) > 8 else "")
-            frames = counted(len(blank), "frame")
-            whose = "its" if len(blank) == 1 else "their"
-            remarks.append(f"{frames} without any seen joint (frame {shown}): filled from {whose} neighbours")
+        remarks += unseen_notes(weights, body)
         return cls(xy, weights, body, taken.fps, units, source, tuple(remarks))
+
+    def frames(self, start: int, stop: int, step: int = 1) -> Self:
+        """A run of frames, with notes on what they do not show; with a step, every so many, at the slower rate."""
+        return super().frames(start, stop, step).noted_anew(self.weights)
+
+    def noted_anew(self, old: Tensor) -> Self:
+        """The same tracks, whose notes tell of their weights what they told of the ``old`` ones (T, N)."""
+        stale = unseen_notes(old, self.skeleton)
+        kept = [note for note in self.notes if note not in stale]
+        return replace(self, notes=(*kept, *unseen_notes(self.weights, self.skeleton)))
+
+
+def never_seen(weights: Tensor, body: Skeleton) -> list[str]:
+    """What to say of joints that no frame of weights (T, N) shows; nothing where there is none."""
+    never = [body.joints[n] for n in (weights == 0).all(0).nonzero().flatten().tolist()] if len(weights) else []
+    return [f"never seen, so placed by the skeleton alone: {', '.join(never)}"] if never else []
+
+
+def unseen_notes(weights: Tensor, body: Skeleton) -> list[str]:
+    """What to say of joints and frames of weights (T, N) that show nothing."""
+    notes = never_seen(weights, body)
+    blank = (weights == 0).all(1).nonzero().flatten().tolist()
+    if blank:
+        shown = ", ".join(map(str, blank[:8])) + (", ..." if len(blank) > 8 else "")
+        frames = counted(len(blank), "frame")
+        whose = "its" if len(blank) == 1 else "their"
+        notes.append(f"{frames} without any seen joint (frame {shown}): filled from {whose} neighbours")
+    return notes

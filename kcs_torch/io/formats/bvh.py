@@ -20,12 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import FormatError, OutputError
+from kcs_torch.errors import FormatError
 from kcs_torch.functional import euler_angles, euler_rotation, interpolate
 from kcs_torch.io.build_motion import build_motion, distinct, numbers, read_lines
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer
-from kcs_torch.io.rig import Rig, fit_rig
+from kcs_torch.io.rig import Rig, check_tree, fit_rig
 from kcs_torch.types import Motion
 from kcs_torch.types.axes import from_y_up
 from kcs_torch.types.size import METRES
@@ -207,10 +207,7 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
         saving.warnings.append(
             f"BVH has no gaps: {100 * motion.unseen_share:.1f} % of the joints are filled in between frames"
         )
-    try:
-        rig = fit_rig(points, motion.skeleton, up=saving.up)
-    except OutputError as error:
-        raise OutputError(f"{saving.name}: {error}") from None
+    rig = fit_rig(points, motion.skeleton, up=saving.up)
     off = (rig.positions() - points).norm(dim=-1)
     extra = [name for node, name in enumerate(rig.names) if node not in set(rig.joints)]
     if extra:
@@ -263,6 +260,11 @@ def _write_rig(rig: Rig, path: Path, rate: float) -> None:
 MOTION_READERS = (MotionReader("bvh", "BVH: joints by forward kinematics; y up unless told", recognises, read),)
 WRITERS = (
     Writer(
-        ".bvh", "BVH: a chain of joints in centimetres, y up, for Blender and other animation", None, write, unit="cm"
+        ".bvh",
+        "BVH: a chain of joints in centimetres, y up, for Blender and other animation",
+        None,
+        write,
+        unit="cm",
+        fits=check_tree,
     ),
 )

@@ -18,6 +18,7 @@ from kcs_torch.io.build_motion import build_motion, distinct
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer, need
 from kcs_torch.io.worker import ask_worker
+from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion
 from kcs_torch.types.axes import from_y_up
 
@@ -76,13 +77,21 @@ def _ask(path: Path) -> tuple[dict[str, Any], np.ndarray[Any, np.dtype[np.float6
         raise FormatError(f"{path}: damaged: ezc3d failed on it: {error}") from None
 
 
+def _check_count(body: Skeleton) -> None:
+    """Make sure that there are no more joints than a byte counts.
+
+    Raises:
+        OutputError: there are.
+    """
+    if body.num_joints > 255:
+        raise OutputError(f"expected up to 255 joints, got {body.num_joints}: C3D holds no more")
+
+
 def write(motion: Motion, path: Path, saving: Saving) -> None:
     """Write the joints as markers; the file holds single precision."""
     ezc3d = need("ezc3d", str(path), OutputError)
     points, seen = plain(from_y_up(motion.points, saving.up)), plain(motion.seen) > 0
     frames, count = seen.shape
-    if count > 255:
-        raise OutputError(f"{path}: expected up to 255 joints, got {count}: C3D holds no more")
     file = ezc3d.c3d()
     whole = np.ones((4, count, frames))
     whole[:3] = np.where(seen[..., None], points, np.nan).transpose(2, 1, 0)
@@ -90,7 +99,7 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
     facts = file["parameters"]["POINT"]
     facts["RATE"]["value"] = [saving.rate(motion)]
     facts["LABELS"]["value"] = names
-    facts["UNITS"]["value"] = [motion.units or "mm"]
+    facts["UNITS"]["value"] = [motion.units]
     right, up = _SCREEN[saving.up]
     file.add_parameter("POINT", "X_SCREEN", [right])
     file.add_parameter("POINT", "Y_SCREEN", [up])
@@ -108,6 +117,8 @@ WRITERS = (
         None,
         write,
         unit="mm",
+        names_unit=True,
+        fits=_check_count,
         ready=partial(need, "ezc3d", "C3D", OutputError),
     ),
 )

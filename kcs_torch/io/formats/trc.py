@@ -88,7 +88,7 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
     points, seen = plain(from_y_up(motion.points, saving.up)), plain(motion.seen) > 0
     rate, count = saving.rate(motion), motion.num_frames
     names = [re.sub(r"\s+", "_", joint) for joint in motion.skeleton.joints]
-    facts = (f"{rate:.9g}", f"{rate:.9g}", count, len(names), motion.units or "mm", f"{rate:.9g}", 1, count)
+    facts = (f"{rate:.9g}", f"{rate:.9g}", count, len(names), motion.units, f"{rate:.9g}", 1, count)
     keys = [
         "DataRate",
         "CameraRate",
@@ -114,4 +114,6 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
 
 
 MOTION_READERS = (MotionReader("trc", "TRC of motion capture: markers; y up unless told", recognises, read),)
-WRITERS = (Writer(".trc", "TRC: markers in metres, y up, for OpenSim and others", None, write, unit="m"),)
+WRITERS = (
+    Writer(".trc", "TRC: markers in metres, y up, for OpenSim and others", None, write, unit="m", names_unit=True),
+)
