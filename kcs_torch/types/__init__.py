@@ -8,5 +8,6 @@ from kcs_torch.types.intrinsics import Intrinsics
 from kcs_torch.types.motion import Motion
 from kcs_torch.types.reconstruction import Diagnostics, Reconstruction
 from kcs_torch.types.tracks import Tracks
+from kcs_torch.types.variation import BoneVariation
 
-__all__ = ["Diagnostics", "Intrinsics", "Motion", "Reconstruction", "Tracks", "as_floats"]
+__all__ = ["BoneVariation", "Diagnostics", "Intrinsics", "Motion", "Reconstruction", "Tracks", "as_floats"]

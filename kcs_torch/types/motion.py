@@ -21,6 +21,7 @@ from kcs_torch.types.reconstruction import Reconstruction
 from kcs_torch.types.size import size_factor
 from kcs_torch.types.tracks import Tracks
 from kcs_torch.types.trajectories import Trajectories
+from kcs_torch.types.variation import BoneVariation, bone_variation
 
 __all__ = ["Motion"]
 
@@ -149,10 +150,19 @@ class Motion(Trajectories):
     @property
     def lengths(self) -> Tensor:
         """(B,) mean bone lengths over the frames in which both ends are seen; NaN where there is none."""
+        return self._lengths().nanmean(0)
+
+    @property
+    def variation(self) -> BoneVariation:
+        """How much rigid bones change their length, per cent: that of the median bone, the largest, and whose it is."""
+        return bone_variation(self._lengths(), self.skeleton)
+
+    def _lengths(self) -> Tensor:
+        """(T, B) bone lengths; NaN where an end is unseen."""
         a, b = self.skeleton.bone_index(device=self.points.device).unbind(-1)
         both = self.seen[:, a] & self.seen[:, b]
         length = (self.points[:, b] - self.points[:, a]).norm(dim=-1)
-        return torch.where(both, length, torch.full_like(length, math.nan)).nanmean(0)
+        return torch.where(both, length, torch.full_like(length, math.nan))
 
     def scaled(self, *, units: str, factor: float | None = None, **sizes: float) -> Motion:
         """The same motion in another unit; arguments and errors as of :meth:`Reconstruction.scaled`."""

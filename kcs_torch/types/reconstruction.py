@@ -12,6 +12,7 @@ from kcs_torch.errors import OptionError
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.size import size_factor
 from kcs_torch.types.tracks import Tracks
+from kcs_torch.types.variation import BoneVariation
 
 __all__ = ["Diagnostics", "Reconstruction"]
 
@@ -31,6 +32,8 @@ class Diagnostics:
         seconds: wall-clock time of the method.
         notes: sentences for the user.
         doubt: the one of them that says why depth is hardly to be believed, or nothing.
+        largest_bone_variation: that of the rigid bone whose length varies most, per cent; NaN where it is not known.
+        loosest_bone: the name of this bone; empty where it is not known.
     """
 
     viewpoint_turn: float
@@ -42,6 +45,13 @@ class Diagnostics:
     seconds: float = float("nan")
     notes: tuple[str, ...] = ()
     doubt: str = ""
+    largest_bone_variation: float = float("nan")
+    loosest_bone: str = ""
+
+    @property
+    def variation(self) -> BoneVariation:
+        """What the three fields say of bones' lengths; ``str`` makes words of it."""
+        return BoneVariation(self.bone_variation, self.largest_bone_variation, self.loosest_bone)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +100,7 @@ class Reconstruction:
         found = self.diagnostics
         return (
             f"Reconstruction({self.method} of {self.tracks.source!r}: points {tuple(self.points.shape)}, {self.units}, "
-            f"viewpoint turn {found.viewpoint_turn:.0f} degrees, bone variation {found.bone_variation:.2f} %, "
+            f"viewpoint turn {found.viewpoint_turn:.0f} degrees, bone variation {found.variation}, "
             f"{'converged' if found.converged else 'not converged'})"
         )
 
