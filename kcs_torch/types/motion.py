@@ -14,6 +14,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError
 from kcs_torch.functional import orbit
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
+from kcs_torch.types.angles import JointAngles, Joints, angles_of
 from kcs_torch.types.axes import from_y_up, to_y_up
 from kcs_torch.types.intake import as_floats, take_in
 from kcs_torch.types.intrinsics import Intrinsics
@@ -168,6 +169,17 @@ class Motion(Trajectories):
         """The same motion in another unit; arguments and errors as of :meth:`Reconstruction.scaled`."""
         factor = size_factor(self.skeleton, self.lengths, factor, sizes)
         return replace(self, points=self.points * factor, units=units)
+
+    def angles(self, joints: Joints | None = None) -> JointAngles:
+        """How joints bend over time; arguments and errors as of :meth:`Reconstruction.angles`, without deviations.
+
+        An angle is NaN where one of its joints is unseen. Where an end of a hinge's axis is, it has no sign.
+
+        >>> walk = Motion.from_arrays(torch.rand(10, 17, 3), skeleton="h36m17", units="m")
+        >>> walk.angles(["left_knee", ("thorax", "neck", "head")])
+        JointAngles('motion': 10 frames of left_knee, thorax-neck-head)
+        """
+        return angles_of(self.points, self.seen, self.skeleton, joints, fps=self.fps, source=self.source)
 
     def in_camera(self, *, yaw: float = 0.0, pitch: float = 0.0, turn: float = 0.0) -> Tensor:
         """See the motion from a camera that looks at the middle of it all.
