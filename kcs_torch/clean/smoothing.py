@@ -14,6 +14,7 @@ from kcs_torch.clean.filters import FILTERS, Filter
 from kcs_torch.errors import unknown
 from kcs_torch.functional import bone_lengths
 from kcs_torch.types import Reconstruction, Tracks
+from kcs_torch.types.variation import bone_variation
 
 __all__ = ["SMOOTHERS", "smooth"]
 
@@ -102,13 +103,14 @@ def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: flo
     change = math.sqrt(float(np.square(moved - points).sum(-1).mean()))
     new = torch.from_numpy(moved).to(result.points)
     bones = bone_lengths(new, result.skeleton.bone_index(device=new.device))
-    ratio = bones / bones.mean(0).clamp_min(torch.finfo(bones.dtype).tiny)
-    spread = ratio.std(0, correction=0)[list(result.skeleton.rigid)]
+    variation = bone_variation(bones, result.skeleton)
     told = f"joints moved by {change:.2g} {result.units} (root mean square); the reprojection is that before"
     note = f"smooth 3D ({words}): {told}"
     facts = replace(
         result.diagnostics,
-        bone_variation=float(100 * spread.median()) if spread.numel() else math.nan,
+        bone_variation=variation.median,
+        largest_bone_variation=variation.largest,
+        loosest_bone=variation.bone,
         notes=(*result.diagnostics.notes, note),
     )
 

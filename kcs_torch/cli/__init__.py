@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from kcs_torch.cli import convert, demo, detect, doctor, inspect, lift, score, skeletons, train
+from kcs_torch.cli import angles, convert, demo, detect, doctor, inspect, lift, score, skeletons, train
 
 __all__ = ["app", "main"]
 
@@ -25,6 +25,7 @@ app.command()(inspect.info)
 app.command()(doctor.doctor)
 app.command()(inspect.view)
 app.command()(convert.convert)
+app.command()(angles.angles)
 app.command()(score.score)
 app.command(context_settings=train.CONTEXT)(train.train)
 app.add_typer(skeletons.app, name="skeletons")

@@ -116,6 +116,8 @@ def summary(result: Reconstruction, solution: int = 1) -> dict[str, Any]:
         "unseen_share": facts.unseen_share,
         "viewpoint_turn": facts.viewpoint_turn,
         "bone_variation": facts.bone_variation,
+        "largest_bone_variation": facts.largest_bone_variation,
+        "loosest_bone": facts.loosest_bone,
         "reprojection_rms": facts.reprojection_rms,
         "track_units": tracks.units,
         "converged": facts.converged,
@@ -130,8 +132,10 @@ def summary(result: Reconstruction, solution: int = 1) -> dict[str, Any]:
 
 def describe(facts: dict[str, Any], leave_out: Container[str] = ()) -> str:
     """The same for a reader: a heading and a line a fact; without those notes that are told elsewhere."""
+    from kcs_torch.types.variation import BoneVariation
+
     rate = f", {facts['fps']:g} frames a second" if facts["fps"] else ""
-    variation = facts["bone_variation"]
+    variation = BoneVariation(facts["bone_variation"], facts["largest_bone_variation"], facts["loosest_bone"])
     ended = "converged" if facts["converged"] else "did not converge"
     pace = 1000 * facts["seconds"] / facts["frames"]
     took = "" if math.isnan(pace) else f", {facts['seconds']:.2f} s ({pace:.1f} ms a frame)"
@@ -139,7 +143,7 @@ def describe(facts: dict[str, Any], leave_out: Container[str] = ()) -> str:
         "unseen joints": f"{100 * facts['unseen_share']:.1f} %",
         "method": f"{facts['method']}: {ended}, {facts['iterations']} iterations{took}",
         "viewpoint turn": counted(round(facts["viewpoint_turn"]), "degree"),
-        "bone variation": "unknown: no bones" if math.isnan(variation) else f"{variation:.2f} %",
+        "bone variation": "unknown: no bones" if math.isnan(variation.median) else str(variation),
         "reprojection": f"{facts['reprojection_rms']:.3g} {facts['track_units']} (root mean square)",
     }
     frames = counted(facts["frames"], "frame")

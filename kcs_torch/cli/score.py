@@ -107,6 +107,7 @@ def _cut(motion: Motion, frames: str | None, option: str) -> Motion:
 
 def _spoken(found: Comparison, pred: str, truth: str) -> str:
     from kcs_torch.metrics import ALIGNMENTS
+    from kcs_torch.types.variation import BoneVariation
 
     unit = f" {found.units}" if found.units else ""
     names = [ours if ours == theirs else f"{ours} = {theirs}" for ours, theirs in found.joints]
@@ -121,8 +122,9 @@ def _spoken(found: Comparison, pred: str, truth: str) -> str:
         lines.append(f"{how:<12}{error:>14.4g}{share}  {what}")
     rows: dict[str, Any] = {"e3d": f"{found.e3d:.4f} (one orthogonal matrix for the clip)"}
     true = found.bone_deviation_truth
-    rows["bone deviation"] = f"{100 * found.bone_deviation:.2f} %"
-    rows["bone deviation"] += " (no bones in the truth)" if math.isnan(true) else f" (truth: {100 * true:.2f} %)"
+    variation = BoneVariation(100 * found.bone_deviation, 100 * found.largest_deviation, found.loosest_bone)
+    theirs = "no bones in the truth" if math.isnan(true) else f"truth: {100 * true:.2f} %"
+    rows["bone deviation"] = f"{variation}; {theirs}"
     if math.isnan(found.e3d):
         del rows["e3d"]
     if math.isnan(found.bone_deviation):

@@ -9,6 +9,7 @@ from kcs_torch.functional.align import (
     similarity,
     superpose,
 )
+from kcs_torch.functional.angles import angle_between, flexion, joint_angles
 from kcs_torch.functional.camera import (
     back_project,
     camera_disagreement,
@@ -53,6 +54,7 @@ from kcs_torch.functional.temporal import best_path, blend_windows, interpolate,
 
 __all__ = [
     "ALIGNMENTS",
+    "angle_between",
     "back_project",
     "best_path",
     "blend_windows",
@@ -67,9 +69,11 @@ __all__ = [
     "euler_angles",
     "euler_rotation",
     "factorize",
+    "flexion",
     "incidence",
     "interpolate",
     "jitter",
+    "joint_angles",
     "kcs_matrix",
     "log_det",
     "minimal_turn",

@@ -1,5 +1,6 @@
 """Files in and out: :func:`load_tracks`, :func:`load_people`, :func:`load_motion`, :func:`save`, lists of formats."""
 
+from kcs_torch.io.angles import save_angles
 from kcs_torch.io.anything import load_any
 from kcs_torch.io.formats.npz import load_reconstruction
 from kcs_torch.io.link import link_people
@@ -25,6 +26,7 @@ __all__ = [
     "load_reconstruction",
     "load_tracks",
     "save",
+    "save_angles",
     "save_people",
     "writer_for",
 ]

@@ -18,6 +18,7 @@ from kcs_torch.methods.root import root_depth
 from kcs_torch.nn.lengths import oddity
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Reconstruction, Tracks
+from kcs_torch.types.variation import bone_shares, bone_variation
 
 if TYPE_CHECKING:
     from kcs_torch.methods.base import Method
@@ -135,8 +136,7 @@ def loose_bones(points: Tensor, body: Skeleton) -> str:
     if not rigid or not len(points):
         return ""
     bones = bone_lengths(points, body.bone_index(device=points.device))[:, rigid]
-    mean, spread = bones.mean(0), bones.std(0, correction=0)
-    share = 100 * torch.where(mean > 0, spread / torch.where(mean > 0, mean, 1), 0)
+    spread, share = bones.std(0, correction=0), 100 * bone_shares(bones)
     if float(share.median()) > LOOSE:
         return f"bone lengths vary by {float(share.median()):.1f} %"
     if not body.is_tree:  # links between markers, say, of which some bend
@@ -192,11 +192,7 @@ def _reconstruction(
     """One solution, whose place is known."""
     body = tracks.skeleton
     bones = bone_lengths(points, body.bone_index(device=points.device))
-    rigid = list(body.rigid)
-    mean = bones.mean(0)
-    one = torch.ones_like(bones)
-    ratio = torch.where(mean > 0, bones / torch.where(mean > 0, mean, one), one)
-    variation = (ratio - 1).square().mean(0).sqrt()
+    variation = bone_variation(bones, body)
     turn = float(viewpoint_turn(found.cameras))
     notes = list(found.notes)
     if turn < WEAK_TURN and not method.learned:
@@ -207,12 +203,11 @@ def _reconstruction(
         notes.append(found.doubt)
     if not found.converged:
         notes.append(method.unsettled(found.iterations))
-    percent = float(100 * variation[rigid].median()) if rigid else math.nan
-    if percent > LOOSE and not method.keeps_lengths:
-        notes.append(f"bone lengths vary by {percent:.1f} %: '{method.name}' does not hold them constant")
+    if variation.median > LOOSE and not method.keeps_lengths:
+        notes.append(f"bone lengths vary by {variation.median:.1f} %: '{method.name}' does not hold them constant")
     for wrong in what_is_wrong(method, points, body):
         notes.append(f"{wrong}: {WHY_LOOSE}")
-    if not rigid:
+    if not body.rigid:
         kind = "no bones" if not body.num_bones else "no rigid bones"
         notes.append(f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown")
     if tracks.fps is None and method.reckons_in_seconds:
@@ -224,13 +219,15 @@ def _reconstruction(
     diagnostics = Diagnostics(
         viewpoint_turn=turn,
         unseen_share=tracks.unseen_share,
-        bone_variation=percent,
+        bone_variation=variation.median,
         reprojection_rms=float(rms(seen - tracks.points, tracks.seen.to(points.dtype))),
         converged=found.converged,
         iterations=found.iterations,
         seconds=seconds,
         notes=tuple(notes),
         doubt=found.doubt,
+        largest_bone_variation=variation.largest,
+        loosest_bone=variation.bone,
     )
     return Reconstruction(
         points,

@@ -23,6 +23,7 @@ from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.view import View, lens_note, slow_part, zoomed
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
+from kcs_torch.types.variation import bone_variation
 
 __all__ = ["WIDE", "feet_on_ground", "reconstruct_perspective"]
 
@@ -268,8 +269,7 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
     off = (intrinsics.project(points) - tracks.points)[:, :n][tracks.seen[:, :n]]
     points = torch.cat([points[..., :2], points[..., 2:] - root[:, None, None]], -1)
     bones = bone_lengths(points, body.bone_index(device=points.device))
-    ratio = bones[:, list(body.rigid)] / bones.mean(0).clamp_min(torch.finfo(bones.dtype).tiny)[list(body.rigid)]
-    spread = (ratio - 1).square().mean(0).sqrt()
+    variation = bone_variation(bones, body)
     told = () if k else found.notes  # the best solution's; "the mirror image", say, is true of none any more
     stale = (WHY_LOOSE, "weak perspective", "did not settle")  # true of what was lifted, perhaps not of this
     notes = [n for n in told if not n.startswith((ABSENT, FOUND)) and not any(part in n for part in stale)]
@@ -283,7 +283,9 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
         notes.append(lens_note(intrinsics, tracks.units))
     facts = replace(
         before,
-        bone_variation=float(100 * spread.median()) if len(spread) else math.nan,
+        bone_variation=variation.median,
+        largest_bone_variation=variation.largest,
+        loosest_bone=variation.bone,
         reprojection_rms=float(off.square().sum(-1).mean().sqrt()),
         notes=tuple(notes),
         doubt="" if k else found.lifted[0].diagnostics.doubt,

@@ -38,6 +38,8 @@ class Comparison:
         e3d: normalised error of non-rigid structure from motion, one orthogonal matrix for the clip.
         bone_deviation: of the prediction's bones: the median of standard deviation over mean; NaN without bones.
         bone_deviation_truth: of the truth's.
+        largest_deviation: of the prediction's bone that strays most from one length; NaN without bones.
+        loosest_bone: the name of this bone; empty without bones.
         notes: sentences for the user.
     """
 
@@ -52,6 +54,8 @@ class Comparison:
     e3d: float
     bone_deviation: float
     bone_deviation_truth: float
+    largest_deviation: float
+    loosest_bone: str
     notes: tuple[str, ...] = field(default=())
 
 
@@ -104,6 +108,7 @@ def compare(
         points, flip = flip, points
     figure = lambda p, how: float(mpjpe(p, target, align=how, weights=weights, root=at))  # noqa: E731
     limit = within if within is not None else _USUAL_PCK / METRES[truth.units] if truth.units in METRES else math.nan
+    variation = pred.variation
     return Comparison(
         joints=tuple(names),
         frames=len(target),
@@ -119,6 +124,8 @@ def compare(
         e3d=float(e3d(points, target, weights=weights)) if ratio is not None else math.nan,
         bone_deviation=_deviation(pred),
         bone_deviation_truth=_deviation(truth),
+        largest_deviation=variation.largest / 100,
+        loosest_bone=variation.bone,
         notes=tuple(notes),
     )
 

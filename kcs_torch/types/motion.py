@@ -14,6 +14,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError
 from kcs_torch.functional import orbit
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
+from kcs_torch.types.angles import JointAngles, Joints, angles_of
 from kcs_torch.types.axes import from_y_up, to_y_up
 from kcs_torch.types.intake import as_floats, take_in
 from kcs_torch.types.intrinsics import Intrinsics
@@ -21,6 +22,7 @@ from kcs_torch.types.reconstruction import Reconstruction
 from kcs_torch.types.size import size_factor
 from kcs_torch.types.tracks import Tracks
 from kcs_torch.types.trajectories import Trajectories
+from kcs_torch.types.variation import BoneVariation, bone_variation
 
 __all__ = ["Motion"]
 
@@ -149,15 +151,35 @@ class Motion(Trajectories):
     @property
     def lengths(self) -> Tensor:
         """(B,) mean bone lengths over the frames in which both ends are seen; NaN where there is none."""
+        return self._lengths().nanmean(0)
+
+    @property
+    def variation(self) -> BoneVariation:
+        """How much rigid bones change their length, per cent: that of the median bone, the largest, and whose it is."""
+        return bone_variation(self._lengths(), self.skeleton)
+
+    def _lengths(self) -> Tensor:
+        """(T, B) bone lengths; NaN where an end is unseen."""
         a, b = self.skeleton.bone_index(device=self.points.device).unbind(-1)
         both = self.seen[:, a] & self.seen[:, b]
         length = (self.points[:, b] - self.points[:, a]).norm(dim=-1)
-        return torch.where(both, length, torch.full_like(length, math.nan)).nanmean(0)
+        return torch.where(both, length, torch.full_like(length, math.nan))
 
     def scaled(self, *, units: str, factor: float | None = None, **sizes: float) -> Motion:
         """The same motion in another unit; arguments and errors as of :meth:`Reconstruction.scaled`."""
         factor = size_factor(self.skeleton, self.lengths, factor, sizes)
         return replace(self, points=self.points * factor, units=units)
+
+    def angles(self, joints: Joints | None = None) -> JointAngles:
+        """How joints bend over time; arguments and errors as of :meth:`Reconstruction.angles`, without deviations.
+
+        An angle is NaN where one of its joints is unseen. Where an end of a hinge's axis is, it has no sign.
+
+        >>> walk = Motion.from_arrays(torch.rand(10, 17, 3), skeleton="h36m17", units="m")
+        >>> walk.angles(["left_knee", ("thorax", "neck", "head")])
+        JointAngles('motion': 10 frames of left_knee, thorax-neck-head)
+        """
+        return angles_of(self.points, self.seen, self.skeleton, joints, fps=self.fps, source=self.source)
 
     def in_camera(self, *, yaw: float = 0.0, pitch: float = 0.0, turn: float = 0.0) -> Tensor:
         """See the motion from a camera that looks at the middle of it all.

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.types.angles import JointAngles, Joints, angles_of
 from kcs_torch.types.size import size_factor
 from kcs_torch.types.tracks import Tracks
+from kcs_torch.types.variation import BoneVariation
 
 __all__ = ["Diagnostics", "Reconstruction"]
 
@@ -31,6 +33,8 @@ class Diagnostics:
         seconds: wall-clock time of the method.
         notes: sentences for the user.
         doubt: the one of them that says why depth is hardly to be believed, or nothing.
+        largest_bone_variation: that of the rigid bone whose length varies most, per cent; NaN where it is not known.
+        loosest_bone: the name of this bone; empty where it is not known.
     """
 
     viewpoint_turn: float
@@ -42,6 +46,13 @@ class Diagnostics:
     seconds: float = float("nan")
     notes: tuple[str, ...] = ()
     doubt: str = ""
+    largest_bone_variation: float = float("nan")
+    loosest_bone: str = ""
+
+    @property
+    def variation(self) -> BoneVariation:
+        """What the three fields say of bones' lengths; ``str`` makes words of it."""
+        return BoneVariation(self.bone_variation, self.largest_bone_variation, self.loosest_bone)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +101,7 @@ class Reconstruction:
         found = self.diagnostics
         return (
             f"Reconstruction({self.method} of {self.tracks.source!r}: points {tuple(self.points.shape)}, {self.units}, "
-            f"viewpoint turn {found.viewpoint_turn:.0f} degrees, bone variation {found.bone_variation:.2f} %, "
+            f"viewpoint turn {found.viewpoint_turn:.0f} degrees, bone variation {found.variation}, "
             f"{'converged' if found.converged else 'not converged'})"
         )
 
@@ -153,6 +164,41 @@ class Reconstruction:
                 "skeleton with contact points and feet that stand still now and then; see diagnostics.notes"
             )
         return self.points + torch.nn.functional.pad(path[:, None, None], (2, 0))
+
+    def angles(self, joints: Joints | None = None) -> JointAngles:
+        """How joints bend over time: the flexion of hinges (knees, elbows, ankles, fingers), or of other joints.
+
+        0 is a straight limb: the child lies in line with parent and joint. A hinge's angle grows as it bends its way,
+        and hyperextension is negative, but not at the elbows of people: the upper arm turns about itself, so that
+        nothing tells which way they bend. An ankle bends from the shank to the toes: about 60 in upright standing, more
+        in dorsiflexion.
+
+        Deviations follow from ``uncertainty`` alone: depths of joints are taken as independent of each other, and x and
+        y as exact. Errors that neighbouring joints share make them too large, errors of the tracks too small. Beyond
+        the first order, curvature counts: a leg that bends within the image, as in a gait seen from the side, is less
+        certain than its slope in depth tells. They are None where the method has no uncertainty.
+
+        Args:
+            joints: names of hinges, and triples of names (parent, joint, child) for other joints, whose angles are 0 to
+                180 without a sign; all hinges of the skeleton if None. Names may be spelt in any usual way.
+
+        Returns:
+            Degrees by name: that of the joint for a hinge, ``parent-joint-child`` for a triple.
+
+        Raises:
+            SkeletonError: there is no such joint.
+            OptionError: the skeleton has no hinges, or not this one; a triple is none.
+        """
+        seen = torch.ones_like(self.points[..., 0], dtype=torch.bool)
+        return angles_of(
+            self.points,
+            seen,
+            self.skeleton,
+            joints,
+            uncertainty=self.uncertainty,
+            fps=self.fps,
+            source=self.tracks.source,
+        )
 
     def scaled(self, *, units: str, factor: float | None = None, **sizes: float) -> Reconstruction:
         """The same motion in another unit.

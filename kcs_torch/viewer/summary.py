@@ -19,7 +19,7 @@ def summarise(result: Reconstruction) -> str:
         f"skeleton {result.skeleton.name}",
         _fact("viewpoint turn {:.0f}°", d.viewpoint_turn),
         _fact("unseen {:.1f} %", 100 * d.unseen_share),
-        _fact("bone variation {:.2g} %", d.bone_variation),
+        f"bone variation {d.variation}" if math.isfinite(d.bone_variation) else "",
         _fact(f"reprojection {{:.3g}} {result.tracks.units}", d.reprojection_rms),
         "converged" if d.converged else f"not converged after {d.iterations} iterations",
     ]

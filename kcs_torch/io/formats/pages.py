@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 
 import torch
 
-from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.io.registry import Saving, Writer
 from kcs_torch.types import Diagnostics, Motion, Reconstruction
 
@@ -76,10 +74,8 @@ def as_result(motion: Motion) -> Reconstruction:
     """Motion as a camera sees it that stands a little to the side and above: what pages and films show."""
     points = motion.in_camera(yaw=20.0, pitch=8.0)
     frames = len(points)
-    size = bone_lengths(points, motion.skeleton.bone_index(device=points.device))
     mean = motion.lengths
-    rigid = list(motion.skeleton.rigid)
-    spread = (size / mean - 1).square().nanmean(0).sqrt()[rigid]
+    variation = motion.variation
     return Reconstruction(
         points,
         torch.eye(3).to(points)[:2].expand(frames, 2, 3),
@@ -90,11 +86,13 @@ def as_result(motion: Motion) -> Reconstruction:
         Diagnostics(
             viewpoint_turn=0.0,
             unseen_share=float((~motion.seen).double().mean()),
-            bone_variation=float(100 * spread.nanmedian()) if len(spread) else math.nan,
+            bone_variation=variation.median,
             reprojection_rms=0.0,
             converged=True,
             iterations=0,
             notes=("3D motion of a file, filmed from the side: no method made it",),
+            largest_bone_variation=variation.largest,
+            loosest_bone=variation.bone,
         ),
         units=motion.units or "units",
     )

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from kcs_torch.io.registry import Saving, Writer
 from kcs_torch.types import Motion, Reconstruction
 from kcs_torch.types.axes import from_y_up
 
-__all__ = ["WRITERS"]
+__all__ = ["WRITERS", "cell", "write_table"]
 
 
 def write_csv(result: Reconstruction, path: Path) -> None:
@@ -41,15 +42,19 @@ def _write_rows(
     points: NDArray[Any], moved: Reconstruction | Motion, more: dict[str, NDArray[Any]], path: Path
 ) -> None:
     unit = f" [{moved.units}]" if moved.units else ""
-    header = ["frame", "time [s]"]
-    header += [f"{_cell(joint)}_{axis}{unit}" for joint in moved.skeleton.joints for axis in "xyz"]
+    header = [f"{cell(joint)}_{axis}{unit}" for joint in moved.skeleton.joints for axis in "xyz"]
     header += [f"{name}{unit}" for name in more]
     rows = np.concatenate([points.reshape(len(points), -1), *(v[:, None] for v in more.values())], 1)
+    write_table(header, rows, moved.fps, path)
+
+
+def write_table(header: Iterable[str], rows: NDArray[Any], fps: float | None, path: Path) -> None:
+    """Write rows (T, K) of numbers after the columns ``frame`` and ``time [s]``; cells of NaN are empty."""
     with path.open("w", newline="", encoding="utf-8", errors="replace") as file:
         writer = csv.writer(file)
-        writer.writerow(header)
+        writer.writerow(["frame", "time [s]", *header])
         for frame, row in enumerate(rows.tolist()):
-            time = f"{frame / moved.fps:.6g}" if moved.fps else ""
+            time = f"{frame / fps:.6g}" if fps else ""
             writer.writerow([frame, time, *("" if math.isnan(v) else f"{v:.9g}" for v in row)])
 
 
@@ -81,7 +86,7 @@ def write_json(result: Reconstruction, path: Path) -> None:
     path.write_text(json.dumps(data, allow_nan=False), encoding="utf-8")
 
 
-def _cell(name: str) -> str:
+def cell(name: str) -> str:
     """A name that no spreadsheet takes for a formula: names come from files that others wrote."""
     return f"'{name}" if name.startswith(("=", "+", "-", "@", "\t", "\r")) else name
 

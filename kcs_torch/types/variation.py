@@ -1,0 +1,56 @@
+"""How far rigid bones are from keeping their length."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcs_torch.skeleton import Skeleton
+
+__all__ = ["BoneVariation", "bone_shares", "bone_variation"]
+
+
+class BoneVariation(NamedTuple):
+    """Standard deviations of rigid bones' lengths over their means, per cent; NaN and "" where there are none.
+
+    >>> str(BoneVariation(0.05, 3.95, "Neck-UpperNeck"))
+    '0.05 % (median), at most 3.95 % (Neck-UpperNeck)'
+    """
+
+    median: float = math.nan
+    largest: float = math.nan
+    bone: str = ""
+
+    def __str__(self) -> str:
+        most = f", at most {self.largest:.2f} % ({self.bone})" if self.bone else ""  # older files lack it
+        return f"{self.median:.2f} % (median){most}"
+
+
+def bone_variation(lengths: Tensor, body: Skeleton) -> BoneVariation:
+    """Say how much the rigid bones of a body change their length: the median bone, and the one that does most.
+
+    Args:
+        lengths: (T, B) of all its bones, NaN where unseen.
+        body: the skeleton.
+
+    >>> arm = Skeleton.from_names(list("abc"), [("a", "b"), ("b", "c")])
+    >>> str(bone_variation(torch.tensor([[1.0, 9.0], [1.0, 11.0]]), arm))
+    '0.00 % (median), at most 10.00 % (b-c)'
+    """
+    rigid = list(body.rigid)
+    shares = 100 * bone_shares(lengths)[rigid]
+    known = shares.nan_to_num(-1.0)
+    if not rigid or float(known.max()) < 0:
+        return BoneVariation()
+    worst = int(known.argmax())
+    return BoneVariation(float(shares.nanmedian()), float(shares[worst]), body.bone_names[rigid[worst]])
+
+
+def bone_shares(lengths: Tensor) -> Tensor:
+    """The standard deviation of lengths (T, B) over their mean, (B,): 0 of bones of length 0, NaN of those unseen."""
+    mean = lengths.nanmean(0)
+    ratio = torch.where(mean != 0, lengths / torch.where(mean != 0, mean, 1), 1)
+    return (ratio - 1).square().nanmean(0).sqrt()
