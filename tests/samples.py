@@ -288,6 +288,16 @@ def write_mediapipe_csv(path: Path, size=1.0, num_frames=4) -> Path:
     return path
 
 
+def write_table(path: Path, names=("LHip", "LKnee", "tail"), what=("x", "y", "score"), num_frames=4) -> Path:
+    """A plain table, of joints of any names."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["frame", "time", *(f"{n}_{c}" for n in names for c in what)])
+        for t, pose in enumerate(person(num_frames, len(names))):
+            writer.writerow([t, t / 25, *pose[:, : len(what)].ravel().tolist()])
+    return path
+
+
 def write_npy(path: Path, array) -> Path:
     np.save(path, array)
     return path
@@ -332,6 +342,7 @@ SAMPLES: dict[str, tuple[Callable[[Path], Path], ...]] = {
         lambda folder: write_npy(folder / "landmarks.npy", person(4, 33)[:, :, [0, 1, 2, 2]] / 1000),
         lambda folder: write_npy(folder / "hand.npy", person(4, 21)[:, :, :2]),
     ),
+    "csv": (lambda folder: write_table(folder / "table.csv"),),
     "videopose3d": (lambda folder: write_videopose3d(folder / "data_2d_h36m_gt.npz"),),
     "deeplabcut": (
         _deeplabcut(write_deeplabcut_csv, "mouse.csv"),
@@ -428,6 +439,7 @@ MOTION_SAMPLES: dict[str, tuple[Callable[[Path], Path], ...]] = {
     "bvh": (_saved("a.bvh"),),
     "c3d": (_saved("a.c3d"),),
     "amc": (write_amc,),
+    "csv": (_saved("walk.csv"), lambda folder: write_table(folder / "rig.csv", what=("x", "y", "z"))),
     "deeplabcut": (
         lambda folder: write_deeplabcut_csv(folder / "rat.csv", *_animal_3d()),
         lambda folder: write_deeplabcut_table(folder / "rat.h5", *_animal_3d()),

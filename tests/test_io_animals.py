@@ -274,6 +274,13 @@ def test_short_lines_are_unseen_there(tmp_path):
     assert tracks.notes == ("1 line ends before the last column: what is missing is unseen", NO_BONES)
 
 
+def test_frames_that_occur_twice_are_told(tmp_path):
+    columns, values = _animal()
+    tracks = load_tracks(write_deeplabcut_csv(tmp_path / "a.csv", columns, values, [(0,), (1,), (2,), (1,)]))
+    assert np.array_equal(tracks.points[:, 0, 0].numpy(), values[[0, 1, 3, 2], 0])
+    assert "number 1 stands for several of the rows: each of these is taken as a frame of its own" in tracks.notes
+
+
 def test_animals_that_say_nothing_are_left_out(tmp_path):
     columns = deeplabcut_columns(["m1", "m2"]) + deeplabcut_columns(["single"], ["food"])
     values = deeplabcut_values(columns)

@@ -51,12 +51,21 @@ def test_too_many_joints_are_refused(tmp_path):
 
 def test_what_only_begins_like_one(tmp_path):
     path = tmp_path / "x.c3d"
-    path.write_bytes(b"\x02\x50" + bytes(510))
+    path.write_bytes(b"\x02\x50" + bytes(14) + b"\x09" + bytes(495))
     with pytest.raises(FormatError, match=r"x.c3d: damaged"):
         load_motion(path)
     path.write_bytes(b"\x02\x50" + bytes(2000))  # the parameters' own header is not one
     with pytest.raises(FormatError, match="got something else"):
         detect_motion_format(path)
+
+
+def test_a_picture_is_none(tmp_path):
+    path = tmp_path / "x.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\x00\x03\xe8\x00\x00\x02X\x08\x06" + bytes(2000))
+    with pytest.raises(FormatError, match="got something else"):
+        detect_motion_format(path)
+    with pytest.raises(FormatError, match="got a file that begins with .*PNG"):
+        kt.load_tracks(path)
 
 
 def test_damaged_files_end_in_our_errors(tmp_path):

@@ -33,6 +33,8 @@ def test_any_names_can_be_sorted(names):
         ([0, 5, 15], [0, 1, 3], "1 of 4 frames has no file (number 10): unseen"),
         ([None, 1, 2], [0, 1, 2], "no frame numbers"),
         ([3, 2, 4], [0, 1, 2], "no frame numbers"),
+        ([7, 8, 8, 9], [0, 1, 2, 3], "number 8 stands for several of the file names: each of these is taken"),
+        ([7, 7, 7, 9, 9], [0, 1, 2, 3, 4], "numbers 7, 9 stand for several"),
         ([1, 1700000000000, 1700000000001], [0, 1, 2], "too far apart"),
     ],
 )

@@ -66,7 +66,7 @@ def test_a_new_format_is_one_new_file(tmp_path, monkeypatch):
         ("a.json", b"{", "got text that is not JSON"),
         ("a.json", b"{}", "got JSON with other content"),
         ("a.json", b"[" * 100_000, "nested too deeply"),
-        ("a.csv", b"x,y\n1,2\n", "a file that begins with 'x,y"),
+        ("a.csv", b"x,y\n1,2\n", "a table that begins with 'x,y'"),
         ("a.h5", b"\x89HDF\r\n\x1a\n" + bytes(50), r"an HDF5 file that cannot be read \(damaged"),
         ("a.zip", b"PK\x03\x04" + bytes(50), "a binary file with other content"),
         ("a.txt", b"", "an empty file"),

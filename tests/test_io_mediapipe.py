@@ -89,6 +89,20 @@ def test_no_visibility_is_full_confidence(tmp_path, visibility):
     assert not any("visibility" in n for n in tracks.notes)
 
 
+@pytest.mark.parametrize("key", ["confidence", "score", "likelihood", "prob"])
+def test_confidences_are_weights_as_they_are(tmp_path, key):
+    frames = [[{"x": m["x"], "y": m["y"], key: m["visibility"]} for m in marks(p)] for p in POSE]
+    frames[0][5][key] = 0.1
+    (tracks,) = read(tmp_path, frames)
+    assert tracks.weights[0, 4:7].tolist() == pytest.approx([0.8, 0, 0.8])
+    assert not any("visibility" in n for n in tracks.notes)
+    text = write_mediapipe_csv(tmp_path / "a.csv").read_text().replace("_visibility", f"_{key}")
+    (tmp_path / "a.csv").write_text(text)
+    assert load_tracks(tmp_path / "a.csv", image_size=SIZE, threshold=0.8).weights.numpy() == pytest.approx(0.8)
+    with pytest.raises(KcsError, match="no joint has a confidence of 0.9"):
+        load_tracks(tmp_path / "a.csv", image_size=SIZE, threshold=0.9)
+
+
 # ---------------------------------------------------------------------- JSON
 
 LAYOUTS = {
@@ -218,6 +232,19 @@ def test_csv_of_some_landmarks(tmp_path):
     assert tracks.skeleton.name == "mediapipe33"
     assert tracks.seen[0].sum() == 19  # with pelvis and neck
     assert np.allclose(tracks.points[:, 9], person(4, 17)[:, 0, :2])
+
+
+def test_a_missing_column_is_told(tmp_path):
+    header, *rows = [line.split(",") for line in write_mediapipe_csv(tmp_path / "a.csv").read_text().splitlines()]
+    at = header.index("left_knee_y")
+    (tmp_path / "b.csv").write_text(table(header[:at] + header[at + 1 :], [r[:at] + r[at + 1 :] for r in rows]))
+    tracks = load_tracks(tmp_path / "b.csv", image_size=SIZE)
+    assert "a column is missing, so its joint is left out: left_knee_y" in tracks.notes
+    assert tracks.skeleton.name == "mediapipe33" and not tracks.seen[:, tracks.skeleton.index("left_knee")].any()
+    a, b = at - 1, at + 2
+    (tmp_path / "b.csv").write_text(table(header[:a] + header[b:], [r[:a] + r[b:] for r in rows]))
+    lacking = "these landmarks of the pose have no columns x and y, so they are unseen: left_knee"
+    assert lacking in load_tracks(tmp_path / "b.csv", image_size=SIZE).notes
 
 
 def test_csv_of_several_people(tmp_path):

@@ -158,7 +158,19 @@ def test_skeleton_by_name_object_and_file(tmp_path):
 def test_names_of_a_built_in_skeleton_select_it():
     names = SKELETONS["coco17"].joints[:17]
     assert Tracks.from_arrays(grid(), joint_names=names).skeleton is SKELETONS["coco17"]
-    assert Tracks.from_arrays(grid(), joint_names=names[::-1]).skeleton.name == "points"
+
+
+def test_names_in_another_order_are_put_into_the_skeletons():
+    names = SKELETONS["coco17"].joints[:17]
+    points, confidence = grid(), torch.linspace(0.5, 1, 68, dtype=torch.float64).reshape(4, 17)
+    tracks = Tracks.from_arrays(points, confidence, joint_names=names[::-1])
+    assert tracks.skeleton is SKELETONS["coco17"]
+    assert torch.equal(tracks.points[:, :17], points.flip(1))
+    assert torch.equal(tracks.weights[:, :17], confidence.flip(1))
+    assert "joints matched by name with skeleton 'coco17'" in tracks.notes
+    chain = [[i, i + 1] for i in range(16)]  # bones are given by the arrays' own order
+    assert Tracks.from_arrays(points, joint_names=names[::-1], edges=chain).skeleton.joints == names[::-1]
+    assert Tracks.from_arrays(points, joint_names=["head", *names[1:]]).skeleton.name == "points"
 
 
 def test_points_without_any_skeleton():

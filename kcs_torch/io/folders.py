@@ -64,8 +64,16 @@ def frame_numbers(
     if len(numbers) < 2:
         return list(range(len(numbers)))
     steps = [b - a for a, b in itertools.pairwise(known)]
-    if len(known) < len(numbers) or min(steps) < 1:
+    if len(known) < len(numbers) or min(steps) < 0:
         notes.append(f"the {names} hold no frame numbers: frames are taken in the order of the {names}")
+        return list(range(len(numbers)))
+    if 0 in steps:
+        again = sorted({n for n, step in zip(known, steps, strict=False) if not step})
+        shown = ", ".join(map(str, again[:5])) + (", ..." if len(again) > 5 else "")
+        verb, plural = ("stands", "") if len(again) == 1 else ("stand", "s")
+        notes.append(
+            f"number{plural} {shown} {verb} for several of the {names}: each of these is taken as a frame of its own"
+        )
         return list(range(len(numbers)))
     step = math.gcd(*steps)
     frames = [(n - known[0]) // step for n in known]

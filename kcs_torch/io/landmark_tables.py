@@ -2,137 +2,81 @@
 
 from __future__ import annotations
 
-import csv
 import math
-import re
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.frames import as_track_id
-from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_text
-from kcs_torch.io.landmarks import BODIES, FRAME_KEYS, Landmarks
+from kcs_torch.io.jsonfile import FARTHEST
+from kcs_torch.io.landmarks import BODIES, VISIBILITIES, Landmarks
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import read_error
-from kcs_torch.skeleton import SKELETONS
+from kcs_torch.io.wide import Columns, Header, read_wide
+from kcs_torch.skeleton import SKELETONS, guess_skeleton
 
-__all__ = ["csv_columns", "frame_shape", "npy_shape", "read_csv", "read_npy"]
+__all__ = ["frame_shape", "npy_shape", "read_csv", "read_npy", "table_kind"]
 
 _LIMIT = 2**30  # bytes of a file
-_WHO = ("person", "person_id", "pose", "track_id", "hand", "handedness", "id")
-_NAMED = re.compile(r"(?:pose_)?(?P<name>.+?)[_. ](?P<what>x|y|z|visibility|presence|score|confidence|v|c)\Z")
-_NUMBERED = re.compile(r"(?P<what>x|y|z|visibility|v)_?(?P<name>[0-9]{1,4})\Z")
-_SEEN = ("visibility", "v", "score", "confidence", "c")
 
 
-def csv_columns(header: str) -> tuple[dict[str, dict[str, int]], list[str]]:
-    """The columns of each landmark by what they hold, and all columns' names, of a CSV's first line.
+@cache
+def _named() -> frozenset[str]:
+    """Names of all landmarks; loading skeletons is left until they are needed."""
+    return frozenset(j for b in BODIES.values() for j in SKELETONS[b].joints[: SKELETONS[b].num_observed])
 
-    >>> csv_columns("frame,nose_x,nose_y,nose_visibility")[0]
-    {'nose': {'x': 1, 'y': 2, 'visibility': 3}}
+
+def table_kind(head: bytes) -> str:
+    """Tell what a table with columns for each joint holds, by the beginning of its text.
+
+    Returns:
+        "landmarks" of MediaPipe, by their names or numbers; "motion", where every joint has z; other "tracks"; empty
+        where it is no such table.
+
+    >>> table_kind(b"frame,a_x,a_y,b_x,b_y"), table_kind(b"a_x,a_y,a_z,b_x,b_y,b_z"), table_kind(b"track,frame,a_x,a_y")
+    ('tracks', 'motion', '')
     """
-    try:
-        cells = next(csv.reader([header.lstrip("\ufeff")], delimiter=_delimiter(header)), [])
-    except csv.Error:
-        return {}, []
-    cells = [c.strip().lower() for c in cells]
-    marks: dict[str, dict[str, int]] = {}
-    for i, cell in enumerate(cells):
-        match = _NUMBERED.match(cell) or _NAMED.match(cell)
-        if match:
-            marks.setdefault(match["name"].replace(" ", "_"), {}).setdefault(match["what"], i)
-    return {name: what for name, what in marks.items() if {"x", "y"} <= set(what)}, cells
+    header = Header.of(head.split(b"\n", 1)[0].decode("utf-8", "replace"))
+    lower = [cell.lower() for cell in header.cells[:2]]
+    if len(header.joints) < 2 or lower == ["track", "frame_idx"]:  # SLEAP's
+        return ""
+    deep = all("z" in columns for columns in header.joints.values())
+    if deep and lower == ["frame", "time [s]"] and not any(set(c) & set(VISIBILITIES) for c in header.joints.values()):
+        return "motion"  # as results are written, of whatever joints
+    names = {_plain(name) for name in header.joints}
+    if len(_named() & names) >= 10 or (len(names) >= 21 and all(name.isdecimal() for name in names)):
+        return "landmarks"
+    return "motion" if deep else "tracks"
 
 
-def _delimiter(header: str) -> str:
-    return max(",;\t", key=header.count)
+def _plain(name: str) -> str:
+    return name.lower().replace(" ", "_").removeprefix("pose_")
 
 
 def read_csv(path: Path) -> Landmarks:
     """Read a CSV with a row a frame, or a row a person where a column says who it is."""
-    out = Landmarks()
-    try:
-        if path.stat().st_size > _LIMIT:
-            raise FormatError(f"{path}: expected 1 GiB of CSV at most: split the file")
-        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            header = file.readline(2**20)
-            marks, cells = csv_columns(header.rstrip("\r\n"))
-            if not marks:
-                raise FormatError(f"{path}: expected columns such as nose_x, nose_y, got '{as_text(header.strip())}'")
-            out.names, columns = _layout(marks, out.notes)
-            rows = csv.reader(file, delimiter=_delimiter(header))
-            for i, row in enumerate(rows):
-                _add_row(out, row, i, cells, columns, path)
-    except OSError as error:
-        raise read_error(path, error) from None
-    except csv.Error as error:
-        raise FormatError(f"{path}: expected a CSV table, got text that does not parse: {error}") from None
-    return out
+    return read_wide(path, _layout)
 
 
-def _add_row(
-    out: Landmarks,
-    row: Sequence[str],
-    i: int,
-    cells: Sequence[str],
-    columns: Sequence[tuple[int, int, int]],
-    path: Path,
-) -> None:
-    if not any(row):
-        return
-    where = f"{path}: row {i + 2}"
-    if len(row) != len(cells):
-        raise FormatError(f"{where}: expected {len(cells)} values as in the first row, got {len(row)}")
-    column = next((cells.index(n) for n in FRAME_KEYS if n in cells), None)
-    number = i if column is None else as_frame_number(_value(row[column], where, cells[column]))
-    if number is None:
-        raise FormatError(f"{where}: '{cells[column or 0]}': expected a whole number, got {as_text(row[column or 0])}")
-    who = next((as_track_id(row[cells.index(n)]) for n in _WHO if n in cells), None)
-    joints = np.array([[math.nan if c < 0 else _value(row[c], where, cells[c]) for c in triple] for triple in columns])
-    people = out.frames.setdefault(number, [])
-    if people and (who is None or any(s.track == who for s in people)):
-        raise FormatError(f"{where}: expected every frame once, or a column 'person', got frame {number} again")
-    people.append(Sighting(joints, who))
-
-
-def _value(cell: str, where: str, name: str) -> float:
-    try:
-        value = float(cell) if cell.strip() else math.nan
-    except ValueError:
-        raise FormatError(f"{where}: '{name}': expected a number, got '{as_text(cell)}'") from None
-    if not (math.isnan(value) or abs(value) <= FARTHEST):
-        raise FormatError(f"{where}: '{name}': expected a coordinate or a visibility, got {value:.3g}")
-    return value
-
-
-def _layout(
-    marks: dict[str, dict[str, int]], notes: list[str]
-) -> tuple[tuple[str, ...] | None, list[tuple[int, int, int]]]:
-    """The joints' names, and the columns of x, y and visibility of each; -1 where there is none."""
-    names: tuple[str, ...] | None = tuple(marks)
+def _layout(joints: Columns, notes: list[str]) -> tuple[tuple[str, ...] | None, list[dict[str, int]]]:
+    """The joints' names, and the columns of each; None where they are the usual ones, by number."""
+    marks = {_plain(name): columns for name, columns in joints.items()}
     if all(n.isdecimal() for n in marks):
         marks = dict(sorted(marks.items(), key=lambda item: int(item[0])))
         for count in BODIES:
             if len(marks) > count and len(marks) not in BODIES:
                 notes.append(f"of {len(marks)} numbered landmarks the first {count} are read, as the pose")
                 marks = dict(list(marks.items())[:count])
-        names = None
-    else:
-        for body in (SKELETONS["coco17"], *(SKELETONS[b] for b in BODIES.values())):
-            joints = body.joints[: body.num_observed]
-            if set(marks) == set(joints) or (body.name == "mediapipe33" and set(marks) < set(joints)):
-                names = joints
-                break
-    keys = list(marks) if names is None else list(names)
-    blank: dict[str, int] = {}
-    columns = []
-    for key in keys:
-        what = marks.get(key, blank)
-        seen = next((what[k] for k in _SEEN if k in what), -1)
-        columns.append((what.get("x", -1), what.get("y", -1), seen))
-    return names, columns
+        return None, list(marks.values())
+    pose = SKELETONS[BODIES[33]]
+    names = pose.joints[: pose.num_observed]
+    if set(marks) < set(names) and guess_skeleton(list(marks), ordered=False) is None:
+        lacking = ", ".join(name for name in names if name not in marks)
+        notes.append(f"these landmarks of the pose have no columns x and y, so they are unseen: {lacking}")
+        return names, [marks.get(name, {}) for name in names]
+    return tuple(marks), list(marks.values())
 
 
 # ---------------------------------------------------------------------- NPY
@@ -194,6 +138,7 @@ def read_npy(path: Path) -> Landmarks:
         out.notes.append(f"of {array.shape[1]} numbers a frame the first {count * width} are read, as the pose")
     rows = array.reshape(len(array), -1)[:, : count * width].reshape(-1, count, width)
     seen = np.full(rows.shape[:2], math.nan)
+    out.seen.add("visibility")
     if width > 3:
         seen = rows[..., 3]
     elif width == 3:

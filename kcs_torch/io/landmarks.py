@@ -14,9 +14,19 @@ from numpy.typing import NDArray
 from kcs_torch.errors import FormatError
 from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_joints, as_text, entries, read_json
 from kcs_torch.io.people import Sighting
+from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import SKELETONS
 
-__all__ = ["BODIES", "FRAME_KEYS", "KEYS", "Landmarks", "read_landmarks_json"]
+__all__ = [
+    "BODIES",
+    "CONFIDENCES",
+    "FRAME_KEYS",
+    "KEYS",
+    "VISIBILITIES",
+    "Landmarks",
+    "read_landmarks_json",
+    "settle",
+]
 
 BODIES = {33: "mediapipe33", 21: "hand21"}
 _POSE = ("pose_landmarks", "poseLandmarks", "landmarks", "landmark", "keypoints")
@@ -31,6 +41,15 @@ KEYS = frozenset([*_POSE[:2], *_HANDS, *_ONE_HAND])
 """Keys that only MediaPipe's results have."""
 _LISTS = ("frames", "results", "data", "detections")
 FRAME_KEYS = ("frame", "frame_id", "frame_number", "frame_idx", "frame_index", "index")
+CONFIDENCES = ("confidence", "conf", "score", "likelihood", "probability", "prob", "c")
+"""What a detector's own confidence in a joint is called."""
+VISIBILITIES = ("visibility", "v", "presence")
+"""What MediaPipe's guess at whether a joint is hidden is called."""
+_HIDDEN = 0.3
+"""Weight of a joint of visibility 0 within the image, beside 1 of one that is seen for certain. Against other
+detections of the same video, joints of visibility below 0.5 are off by 2.5 times as much as the others, not by more:
+a guess that is worth something."""
+_SHARES = 2.0  # coordinates whose median is above this are no shares of the image
 
 
 @dataclass
@@ -38,7 +57,9 @@ class Landmarks:
     """What a file holds: people by the number of the frame, and what it says of the video."""
 
     frames: dict[int, list[Sighting]] = field(default_factory=dict)
+    times: dict[int, float] = field(default_factory=dict)  # of frames; NaN where unknown
     names: tuple[str, ...] | None = None  # None: the usual 33 or 21
+    seen: set[str] = field(default_factory=set)  # what the joints' third number is called
     size: tuple[float, float] | None = None
     fps: float | None = None
     notes: list[str] = field(default_factory=list)
@@ -60,7 +81,7 @@ def read_landmarks_json(path: Path) -> Landmarks:
     for number, frame, where in _frames(data, path):
         if number in poses:
             raise FormatError(f"{where}: expected every frame once, got frame {number} again")
-        poses[number], hands[number] = _people(frame, where)
+        poses[number], hands[number] = _people(frame, where, out.seen)
     out.frames = poses
     if not any(poses.values()) and any(hands.values()):
         out.frames = hands
@@ -95,7 +116,7 @@ def _frames(data: Any, path: Path) -> Iterator[tuple[int, Any, str]]:
         yield number or 0, frame, f"{path}: frame {number}"
 
 
-def _people(frame: Any, where: str) -> tuple[list[Sighting], list[Sighting]]:
+def _people(frame: Any, where: str, seen: set[str]) -> tuple[list[Sighting], list[Sighting]]:
     """Poses and hands of a frame."""
     found: list[tuple[Any, Any]] = []  # landmarks and who it is
     if isinstance(frame, dict):
@@ -116,7 +137,7 @@ def _people(frame: Any, where: str) -> tuple[list[Sighting], list[Sighting]]:
     poses: list[Sighting] = []
     hands: list[Sighting] = []
     for landmarks, who in found:
-        joints = _joints(landmarks, where)
+        joints = _joints(landmarks, where, seen)
         if len(joints) not in BODIES:
             raise FormatError(f"{where}: expected 33 landmarks of a pose or 21 of a hand, got {len(joints)}")
         (poses if len(joints) == 33 else hands).append(Sighting(joints, who))
@@ -148,8 +169,8 @@ def _inside(value: Any) -> Any:
     return value
 
 
-def _joints(landmarks: Any, where: str) -> NDArray[np.float64]:
-    """x, y, visibility of each landmark; visibility NaN where it is not given."""
+def _joints(landmarks: Any, where: str, seen: set[str]) -> NDArray[np.float64]:
+    """x, y, confidence or visibility of each landmark; NaN where it is not given. ``seen`` gets what it is called."""
     if isinstance(landmarks, dict):  # by name
         by_name = {str(k).lower().replace(" ", "_"): v for k, v in landmarks.items()}
         body = next((b for b in map(SKELETONS.get, BODIES.values()) if b and set(by_name) & set(b.joints)), None)
@@ -163,16 +184,65 @@ def _joints(landmarks: Any, where: str) -> NDArray[np.float64]:
         for here, mark in entries(landmarks, where):
             if "x" not in mark or "y" not in mark:
                 raise FormatError(f"{here}: expected a landmark with 'x' and 'y', got {_keys(mark)}")
-            seen = next((mark[k] for k in ("visibility", "score", "confidence") if mark.get(k) is not None), None)
-            rows.append([mark["x"], mark["y"], seen])
+            key = next((k for k in (*CONFIDENCES, *VISIBILITIES) if mark.get(k) is not None), "")
+            seen |= {key} - {""}
+            rows.append([mark["x"], mark["y"], mark.get(key)])
         return as_joints(rows, where)
     joints = as_joints(landmarks, where)
     width = len(landmarks[0]) if isinstance(landmarks[0], list) else 3
+    seen.add("visibility")
     if width > 3:  # x, y, z, visibility
         joints[:, 2] = as_joints([row[2:4] for row in landmarks], where)[:, 1]
     elif width == 2:
         joints[:, 2] = math.nan
     return joints
+
+
+def settle(found: Landmarks, path: Path, options: Options, *, shares: bool) -> None:
+    """Turn shares of the image into pixels, and visibilities into weights; confidences are weights as they are.
+
+    A joint that is hidden is guessed less well, but is not unseen, unless it is out of the image. Where a file has
+    confidences, a joint without one is unseen.
+
+    Args:
+        found: changed in place.
+        path: for messages.
+        options: of the caller.
+        shares: whether such files hold shares of the image as a rule, so that its size has to be known.
+
+    Raises:
+        FormatError: there are no landmarks, or the image's size is needed.
+    """
+    people = [s.joints for frame in found.frames.values() for s in frame]
+    everything = np.concatenate(people or [np.zeros((0, 3))])
+    places = np.abs(everything[:, :2][np.isfinite(everything[:, :2])])
+    if not len(places):
+        raise FormatError(f"{path}: expected landmarks in at least one of {len(found.frames)} frames, got none")
+    small = bool(np.median(places) <= _SHARES)
+    size = options.image_size or found.size
+    hint = "image_size=(width, height) (kcs-torch: --image-size 1920x1080)"
+    if shares and not small:
+        found.notes.append("the coordinates are pixels already")
+    elif shares and size is None:
+        raise FormatError(f"{path}: its coordinates are shares of the image, which needs the video's size: give {hint}")
+    elif small and size is None:
+        found.notes.append(f"coordinates are taken as they are: if they are shares of the image, give {hint}")
+    small = small and size is not None
+    visible = not found.seen & set(CONFIDENCES)
+    seen = everything[:, 2]
+    known = visible and bool((seen[np.isfinite(seen)] > 0).any())  # hands have 0 everywhere
+    if known:
+        found.notes.append(
+            f"visibility v tells what is hidden, not how well it is placed: it counts as confidence {_HIDDEN:g} + "
+            f"{1 - _HIDDEN:g} v, and outside the image as v"
+        )
+    for joints in people:
+        if visible:
+            outside = small & ((joints[:, :2] < 0) | (joints[:, :2] > 1)).any(-1)
+            weight = np.where(np.isnan(joints[:, 2]), 1.0, joints[:, 2].clip(0, 1)) if known else np.ones(len(joints))
+            joints[:, 2] = np.where(outside, weight, _HIDDEN + (1 - _HIDDEN) * weight)
+        if small and size is not None:
+            joints[:, :2] *= size
 
 
 def _side(value: Any) -> Any:

@@ -9,7 +9,7 @@ from pathlib import Path
 from kcs_torch.errors import FormatError, OptionError, unknown
 from kcs_torch.io.hdf5 import read_tree
 from kcs_torch.io.motion import MOTION_READERS
-from kcs_torch.io.registry import Options, Probe, Reader, discover
+from kcs_torch.io.registry import Options, Probe, Reader, brief, discover
 from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
@@ -195,5 +195,9 @@ def _describe(probe: Probe) -> str:
         return "a binary file with other content"
     if probe.head.startswith(b"\x93NUMPY"):
         return "a single array: write it with numpy.savez(path, points2d=array), (frames, joints, 2), NaN where unseen"
+    if probe.suffix in (".csv", ".tsv"):
+        line = probe.head.split(b"\n", 1)[0].decode("utf-8", "replace").strip("\ufeff\r")
+        wanted = "csv has a row a frame and columns name_x, name_y of each joint"
+        return f"a table that begins with {brief(line)!r}: {wanted}"
     start = probe.head[:16]
     return f"a file that begins with {start.decode()!r}" if start.isascii() else f"a file that begins with {start!r}"

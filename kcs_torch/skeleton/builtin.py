@@ -59,10 +59,16 @@ def get_skeleton(skeleton: str | Path | Skeleton) -> Skeleton:
     return SKELETONS[skeleton]
 
 
-def guess_skeleton(joint_names: Sequence[str]) -> Skeleton | None:
-    """Return the built-in skeleton whose observed joints carry exactly these names in this order, if any."""
-    names = tuple(str(j) for j in joint_names)
+def guess_skeleton(joint_names: Sequence[str], *, ordered: bool = True) -> Skeleton | None:
+    """Return the built-in skeleton whose observed joints carry exactly these names, if any.
+
+    Args:
+        joint_names: names of a body's joints.
+        ordered: whether they have to stand in the skeleton's order.
+    """
+    names = [str(j) for j in joint_names]
     for skeleton in SKELETONS.values():
-        if skeleton.joints[: skeleton.num_observed] == names:
+        own = list(skeleton.joints[: skeleton.num_observed])
+        if own == names or (not ordered and sorted(own) == sorted(names)):
             return skeleton
     return None

@@ -218,6 +218,8 @@ def take_in(
     names = None if joint_names is None else [str(n) for n in joint_names]
     if names is not None and len(names) != num_joints:
         raise ShapeError(f"{source}: joint_names: expected {num_joints} names, got {len(names)}")
+    if skeleton is None and names is not None and edges is None:
+        skeleton = guess_skeleton(names, ordered=False)
     if skeleton is not None and names is not None:
         order = joint_order(names, get_skeleton(skeleton), source, remarks)
         if order is not None:  # -1 is the column of a joint that is not there

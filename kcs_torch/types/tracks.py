@@ -56,7 +56,8 @@ class Tracks(Trajectories):
             confidence: (T, N), non-negative; 1 where None. Used as a soft weight.
             skeleton: a :class:`Skeleton`, a built-in name or a YAML/JSON file. If None it is built from
                 ``edges`` and ``joint_names``; names that are exactly a built-in skeleton's select it where
-                the edges are absent or not a tree. Without any of these the joints have no bones.
+                the edges are absent (then in any order: the joints are put into the skeleton's) or not a
+                tree. Without any of these the joints have no bones.
             joint_names: N names. With a skeleton they say which joint is which: joints are matched by name, whatever
                 their order, and those that the skeleton has not are left out.
             edges: (B, 2) (parent, child) indices. Edges that are not a tree become a graph of rigid links.

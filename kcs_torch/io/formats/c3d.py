@@ -28,12 +28,14 @@ _SCREEN = {"y": ("+X", "+Y"), "z": ("+X", "+Z")}  # which axes point right and u
 
 
 def recognises(probe: Probe) -> bool:
-    """Tell by the second byte, and by the parameters' own header, to which the first one points."""
+    """Tell by the second byte and the parameters' own header, to which the first one points."""
     head = probe.head
     if len(head) < 512 or head[1] != 0x50 or not head[0]:
         return False
     at = 512 * (head[0] - 1)
-    return at + 4 > len(head) or head[at + 3] in (83, 84, 85, 86)  # the processor's type
+    if at + 4 > len(head):  # cut short, or no C3D: its data begin in some block
+        return head[16:18] != b"\0\0"
+    return head[at + 3] in (83, 84, 85, 86)  # the processor's type
 
 
 def read(path: Path, options: MotionOptions) -> Motion:

@@ -1,0 +1,117 @@
+"""Plain tables: CSV with a row a frame and columns ``name_x, name_y`` for each joint, whatever it is called.
+
+A third column of a joint may hold its confidence (``_confidence``, ``_conf``, ``_score``, ``_likelihood``,
+``_probability``, ``_prob``, ``_c``), which is its weight, or MediaPipe's visibility. With ``name_z`` of every joint the
+table is 3D motion: so the results that we write as CSV are read back.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kcs_torch.anatomy import places_of_known
+from kcs_torch.errors import FormatError
+from kcs_torch.io.build_motion import build_motion
+from kcs_torch.io.frames import by_number
+from kcs_torch.io.landmark_tables import table_kind
+from kcs_torch.io.landmarks import settle
+from kcs_torch.io.people import people_tracks
+from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader
+from kcs_torch.io.wide import Header, read_wide
+from kcs_torch.types import Motion, Tracks
+
+__all__ = ["MOTION_READERS", "READERS"]
+
+_UPPER = ("headtop", "head", "nose", "eye", "ear", "upperneck", "neck", "thorax", "shoulder")
+_LOWER = ("ankle", "heel", "bigtoe", "smalltoe", "knee")
+_MOST = 5e7  # coordinates of all frames, those between the file's included
+
+
+def recognises(probe: Probe) -> bool:
+    """Tell by the columns' names, where no other format has them."""
+    return table_kind(probe.head) == "tracks"
+
+
+def recognises_motion(probe: Probe) -> bool:
+    """Tell by a column z of every joint."""
+    return table_kind(probe.head) == "motion"
+
+
+def read(path: Path, options: Options) -> list[Tracks]:
+    """Read everybody: a row is a person where a column ``person`` or ``id`` says who."""
+    probe = _file(path)
+    if recognises_motion(probe):
+        raise FormatError(
+            f"{path}: expected 2D tracks, got 3D motion (x, y, z): kcs_torch.load_motion reads it; "
+            "leave the columns z out if these are tracks with depths"
+        )
+    found = read_wide(path)
+    settle(found, path, options, shares=False)
+    frames = by_number(found.frames, found.notes)
+    return people_tracks(frames, options, source=str(path), names=found.names, fps=found.fps, notes=found.notes)
+
+
+def read_motion(path: Path, options: MotionOptions) -> Motion:
+    """Read the motion of the one body in the table."""
+    probe = _file(path)
+    found = read_wide(path, depth=True)
+    if len({s.track for frame in found.frames.values() for s in frame}) > 1:
+        raise FormatError(f"{path}: expected the motion of one body, got several: write a table for each")
+    names = found.names or ()
+    frames = by_number(found.frames, found.notes)
+    if len(frames) * len(names) * 3 > _MOST:
+        raise FormatError(f"{path}: {len(frames)} frames of {len(names)} joints are more than fits: split the file")
+    if not frames:
+        raise FormatError(f"{path}: expected a row a frame below the columns' names, got none")
+    points = np.full((len(frames), len(names), 3), np.nan)
+    for t, people in enumerate(frames):
+        for one in people:
+            points[t] = one.joints
+    up = None if options.up else _up(names, points)
+    if up is not None:
+        found.notes.append(
+            f"{up} is taken to point up, as the head is above the feet there: give up=... if it does not"
+        )
+    header = Header.of(probe.head.split(b"\n", 1)[0].decode("utf-8", "replace"))
+    return build_motion(
+        torch.from_numpy(points),
+        options,
+        source=str(path),
+        names=names,
+        fps=found.fps,
+        units=header.unit,
+        up=up,
+        notes=found.notes,
+    )
+
+
+def _file(path: Path) -> Probe:
+    probe = Probe(path)
+    if not probe.is_file:
+        raise FormatError(f"{path}: expected a table, got a folder")
+    return probe
+
+
+def _up(names: tuple[str, ...], points: NDArray[np.float64]) -> str | None:
+    """The axis along which heads are furthest above feet; None where the names tell neither."""
+    parts = [None if place is None else place[1] for place in places_of_known(names)]
+    upper, lower = (points[:, [part in wanted for part in parts]].reshape(-1, 3) for wanted in (_UPPER, _LOWER))
+    if not (np.isfinite(upper).any(0).all() and np.isfinite(lower).any(0).all()):
+        return None
+    x, y, z = np.nanmean(upper, 0) - np.nanmean(lower, 0)
+    height = {"y": y, "z": z, "-y": -y, "x": x, "-z": -z}
+    return max(height, key=lambda axis: height[axis])
+
+
+READERS = (
+    Reader("csv", "plain CSV: a row a frame, columns name_x, name_y, name_confidence of each joint", recognises, read),
+)
+MOTION_READERS = (
+    MotionReader(
+        "csv", "plain CSV: columns name_x, name_y, name_z, as results are written", recognises_motion, read_motion
+    ),
+)

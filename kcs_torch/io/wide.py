@@ -1,0 +1,266 @@
+"""Tables of text with a row a frame and columns for each joint: ``nose_x, nose_y, nose_confidence, ...``."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+import re
+import statistics
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcs_torch.errors import FormatError
+from kcs_torch.io.folders import frame_numbers
+from kcs_torch.io.frames import as_track_id
+from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_text
+from kcs_torch.io.landmarks import CONFIDENCES, FRAME_KEYS, VISIBILITIES, Landmarks
+from kcs_torch.io.people import Sighting
+from kcs_torch.io.registry import brief, read_error
+
+__all__ = ["Columns", "Header", "read_wide"]
+
+_LIMIT = 2**30  # bytes of a file
+_WHO = ("person", "person_id", "pose", "track_id", "hand", "handedness", "id")
+_WHAT = "|".join(("x", "y", "z", *CONFIDENCES, *VISIBILITIES))
+_NAMED = re.compile(rf"(?P<name>.+)[_. ](?P<what>{_WHAT})(?: \[(?P<unit>[^\]]*)\])?\Z", re.IGNORECASE)
+_NUMBERED = re.compile(rf"(?P<what>{_WHAT})_?(?P<name>[0-9]{{1,4}})\Z", re.IGNORECASE)
+_TIME = re.compile(r"(?:time|timestamp|t)[ _]?[\[(]?(?P<unit>|s|sec|seconds|ms|msec|milliseconds)[\])]?\Z")
+_UNEVEN = 0.3  # of a frame, by which times may be off
+
+Columns = dict[str, dict[str, int]]
+"""Of each joint the columns by what they hold: x, y, z, confidence, ..."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """The first line of a table.
+
+    Attributes:
+        cells: the columns' names.
+        joints: the columns of the joints that have x and y.
+        halves: columns that are missing, of joints that have x or y only.
+        twice: a column that is there twice; empty where none is.
+        unit: of the coordinates, where the first one tells.
+    """
+
+    cells: list[str]
+    joints: Columns
+    halves: list[str] = field(default_factory=list)
+    twice: str = ""
+    unit: str = ""
+
+    @classmethod
+    def of(cls, line: str) -> Header:
+        """Take a line apart.
+
+        >>> Header.of("frame,nose_x,nose_y,nose_visibility").joints
+        {'nose': {'x': 1, 'y': 2, 'visibility': 3}}
+        """
+        try:
+            line = line.strip("\ufeff\r\n")
+            cells = [] if "\0" in line else next(csv.reader([line], delimiter=_delimiter(line)), [])
+        except csv.Error:
+            return cls([], {})
+        cells = [re.sub(r"\A'(?=[=+\-@\t\r])", "", cell.strip()) for cell in cells]  # as formulas are kept off
+        joints: Columns = {}
+        unit = twice = ""
+        for i, cell in enumerate(cells):
+            match = _NUMBERED.match(cell) or _NAMED.match(cell)
+            if match:
+                columns, what = joints.setdefault(match["name"], {}), match["what"].lower()
+                twice = twice or (cell if what in columns else "")
+                columns.setdefault(what, i)
+                unit = unit or match.groupdict().get("unit") or ""
+        whole = {name: columns for name, columns in joints.items() if {"x", "y"} <= set(columns)}
+        halves = [
+            f"{n}_{'y' if 'x' in c else 'x'}" for n, c in joints.items() if n not in whole and {"x", "y"} & set(c)
+        ]
+        return cls(cells, whole, halves, twice, unit)
+
+    @cached_property
+    def number(self) -> int | None:
+        """The column of frame numbers."""
+        return self._column(FRAME_KEYS)
+
+    @cached_property
+    def who(self) -> int | None:
+        """The column that tells people apart."""
+        return self._column(_WHO)
+
+    @cached_property
+    def time(self) -> tuple[int, str] | None:
+        """The column of times, and their unit where its name tells."""
+        matches = ((i, _TIME.match(cell.lower())) for i, cell in enumerate(self.cells))
+        return next(((i, match["unit"]) for i, match in matches if match), None)
+
+    def _column(self, names: Sequence[str]) -> int | None:
+        lower = [cell.lower() for cell in self.cells]
+        return next((lower.index(name) for name in names if name in lower), None)
+
+    def left_out(self, read: Iterable[int]) -> list[str]:
+        """What the columns of joints that are not among those that are read hold."""
+        used = set(read)
+        out: dict[str, None] = {}
+        for i, cell in enumerate(self.cells):
+            for separator in () if i in used else re.finditer(r"[_. ]", cell):
+                if cell[: separator.start()] in self.joints:
+                    out[re.sub(r" \[[^\]]*\]\Z", "", cell[separator.end() :])] = None
+        return list(out)
+
+
+class _Row(NamedTuple):
+    where: str
+    number: int | None
+    time: float
+    who: Hashable
+    joints: NDArray[np.float64]
+
+
+def _delimiter(line: str) -> str:
+    return max(",;\t", key=line.count)
+
+
+def read_wide(
+    path: Path,
+    arrange: Callable[[Columns, list[str]], tuple[tuple[str, ...] | None, list[dict[str, int]]]] | None = None,
+    *,
+    depth: bool = False,
+) -> Landmarks:
+    """Read a table with a row a frame, or a row a person where a column says who it is.
+
+    Frames are placed by a column of numbers, else by one of times; the rate follows from times.
+
+    Args:
+        path: the table.
+        arrange: gives the joints' names and columns in their order, and adds to the notes; as in the table if None.
+        depth: whether to read z of each joint rather than its confidence or visibility.
+
+    Raises:
+        FormatError: it cannot be read, or is no such table; the message names row and column.
+    """
+    out = Landmarks()
+    rows: list[_Row] = []
+    try:
+        if path.stat().st_size > _LIMIT:
+            raise FormatError(f"{path}: expected 1 GiB of CSV at most: split the file")
+        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+            line = file.readline(2**20)
+            header = Header.of(line)
+            if not header.joints:
+                raise FormatError(f"{path}: expected columns such as nose_x, nose_y, got '{as_text(line.strip())}'")
+            if header.twice:
+                raise FormatError(f"{path}: expected every column once, got '{as_text(header.twice)}' again")
+            joints = header.joints
+            out.names, marks = arrange(joints, out.notes) if arrange else (tuple(joints), list(joints.values()))
+            columns = _triples(marks, out, depth)
+            blank = (math.nan, math.nan, 1.0 if out.seen & set(CONFIDENCES) else math.nan)  # where there is no column
+            if header.halves:
+                one = len(header.halves) == 1
+                said = "a column is missing, so its joint is" if one else "columns are missing, so their joints are"
+                out.notes.append(f"{said} left out: {brief(', '.join(header.halves))}")
+            if left := header.left_out(i for triple in columns for i in triple):
+                out.notes.append(f"columns of joints that are left out: {brief(', '.join(left))}")
+            for i, cells in enumerate(csv.reader(file, delimiter=_delimiter(line)), 2):
+                if any(cells):
+                    rows.append(_row(cells, header, columns, blank, f"{path}: row {i}"))
+    except OSError as error:
+        raise read_error(path, error) from None
+    except csv.Error as error:
+        raise FormatError(f"{path}: expected a CSV table, got text that does not parse: {error}") from None
+    numbers = _numbers(rows, out.notes)
+    if len(rows) > 1 and len({row.who for row in rows}) == len(set(numbers)) == len(rows):  # of rows, not of people
+        rows = [row._replace(who=0) for row in rows]
+    for row, number in zip(rows, numbers, strict=True):
+        people = out.frames.setdefault(number, [])
+        if any(s.track in (None, row.who) for s in people):
+            again = f"frame {number}" if row.number is not None else f"time {row.time:g}"
+            raise FormatError(f"{row.where}: expected every frame once, or a column 'person', got {again} again")
+        people.append(Sighting(row.joints, row.who))
+        out.times.setdefault(number, row.time)
+    out.fps = _rate(out.times, header.time[1] if header.time else "", out.notes)
+    return out
+
+
+def _triples(marks: Sequence[dict[str, int]], out: Landmarks, depth: bool) -> list[tuple[int, int, int]]:
+    """The columns of x, y and a third number of each joint; -1 where there is none."""
+    third: Sequence[str] = ("z",)
+    if not depth:
+        third = next((kind for kind in (CONFIDENCES, VISIBILITIES) if any(set(kind) & set(m) for m in marks)), ())
+    keys = [next((key for key in third if key in mark), "") for mark in marks]
+    out.seen |= set(keys) - {"", "z"}
+    return [(m.get("x", -1), m.get("y", -1), m.get(key, -1)) for m, key in zip(marks, keys, strict=True)]
+
+
+def _row(
+    cells: Sequence[str],
+    header: Header,
+    columns: Sequence[tuple[int, int, int]],
+    blank: tuple[float, float, float],
+    where: str,
+) -> _Row:
+    if len(cells) != len(header.cells):
+        raise FormatError(f"{where}: expected {len(header.cells)} values as in the first row, got {len(cells)}")
+    value = lambda i, most=FARTHEST: _value(cells[i], where, header.cells[i], most)  # noqa: E731
+    number, time = None, math.nan
+    if header.number is not None:
+        number = as_frame_number(value(header.number))
+        if number is None:
+            name, got = header.cells[header.number], as_text(cells[header.number])
+            raise FormatError(f"{where}: '{name}': expected a whole number, got {got}")
+    if header.time is not None:
+        time = value(header.time[0], 1e30)
+    who = 0 if header.who is None else as_track_id(cells[header.who])  # one row a frame is one body
+    joints = [[value(c) if c >= 0 else none for c, none in zip(three, blank, strict=True)] for three in columns]
+    return _Row(where, number, time, who, np.array(joints))
+
+
+def _value(cell: str, where: str, name: str, most: float) -> float:
+    try:
+        value = float(cell) if cell.strip() else math.nan
+    except ValueError:
+        hint = " (write decimals with a point)" if re.fullmatch(r"-?[0-9]+,[0-9]+", cell) else ""
+        raise FormatError(f"{where}: '{name}': expected a number, got '{as_text(cell)}'{hint}") from None
+    if not (math.isnan(value) or abs(value) <= most):
+        raise FormatError(f"{where}: '{name}': expected a coordinate or a visibility, got {value:.3g}")
+    return value
+
+
+def _numbers(rows: Sequence[_Row], notes: list[str]) -> list[int]:
+    """The frame of each row: as it says, else by its time, else in their order."""
+    if rows and rows[0].number is not None:
+        return [row.number or 0 for row in rows]
+    if any(math.isnan(row.time) for row in rows):
+        return list(range(len(rows)))
+    times = sorted({row.time for row in rows})
+    step = statistics.median_low([b - a for a, b in itertools.pairwise(times)] or [1.0])
+    exact = [min((time - times[0]) / step, 1e300) for time in times]
+    frames = [round(number) for number in exact]
+    if len(set(frames)) < len(frames) or any(abs(a - b) > _UNEVEN for a, b in zip(exact, frames, strict=True)):
+        notes.append("the times are uneven: frames are taken in their order, at the mean rate")
+        frames = list(range(len(times)))
+    frame = dict(zip(times, frames, strict=True))
+    return [frame[row.time] for row in rows]
+
+
+def _rate(times: dict[int, float], unit: str, notes: list[str]) -> float | None:
+    """Frames per second by the times of numbered frames."""
+    numbers = sorted(times)
+    known = [(f, times[n]) for f, n in zip(frame_numbers(numbers, []), numbers, strict=True) if times[n] == times[n]]
+    if len(known) < 2 or not known[-1][1] > known[0][1]:
+        return None
+    rate = (known[-1][0] - known[0][0]) / (known[-1][1] - known[0][1])
+    if unit.startswith("m"):
+        rate *= 1e3
+    elif not unit:
+        scale = next((s for s in (1.0, 1e3, 1e6, 1e9) if s * rate >= 1), 1.0)
+        if scale > 1:
+            notes.append(f"times are taken to count {scale:.0f} a second")
+        rate *= scale
+    return round(rate, 3) or None

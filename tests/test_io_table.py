@@ -1,0 +1,262 @@
+"""Plain tables: columns for each joint of any names, times, people, confidences by all their names, and 3D motion."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from samples import person, write_mediapipe_csv, write_table
+from typer.testing import CliRunner
+
+import kcs_torch as kt
+from kcs_torch.cli import app
+from kcs_torch.errors import FormatError, KcsError
+from kcs_torch.io import READERS, detect_format, detect_motion_format, load_motion, load_people, load_tracks
+from kcs_torch.io.registry import Probe
+from kcs_torch.skeleton import SKELETONS
+
+LEG = ("hip", "left knee", "Foot")
+
+
+def lines(path, *rows):
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return path
+
+
+def notes_of(path, **options):
+    return " | ".join(load_tracks(path, **options).notes)
+
+
+# ---------------------------------------------------------------------- tracks
+
+
+@pytest.mark.parametrize("what", ["confidence", "conf", "score", "likelihood", "probability", "prob", "c", "Score"])
+def test_confidences_are_weights_whatever_they_are_called(tmp_path, what):
+    path = write_table(tmp_path / "a.csv", LEG, ("x", "y", what))
+    text = path.read_text().splitlines()
+    text[1] = text[1].removesuffix("0.8") + "0.1"
+    text[2] = text[2].removesuffix("0.8")
+    tracks = load_tracks(lines(path, *text))
+    assert detect_format(path) == "csv"
+    assert tracks.skeleton.joints == LEG
+    assert tracks.weights.tolist() == [[0.8, 0.8, 0], [0.8, 0.8, 0], [0.8] * 3, [0.8] * 3]
+    assert np.allclose(tracks.points[2:], person(4, 3)[2:, :, :2])
+    assert tracks.fps == 25
+    assert load_tracks(path, threshold=0.05).weights[0, 2] == pytest.approx(0.1)
+
+
+def test_visibility_is_no_confidence(tmp_path):
+    path = write_table(tmp_path / "a.csv", LEG, ("x", "y", "visibility"))
+    assert load_tracks(path).weights.numpy() == pytest.approx(0.3 + 0.7 * 0.8)
+    assert "visibility v tells what is hidden" in notes_of(path)
+
+
+def test_a_joint_without_a_confidence_is_seen_and_other_columns_are_told(tmp_path):
+    header = "a_x,a_y,a_score,a_visibility,b_x,b_y,b_std_dev,c_x,d_y,remark"
+    path = lines(tmp_path / "a.csv", header, "1,2,.5,.1,3,4,9,5,6,good", "1,3,.5,.1,3,5,9,5,6,bad")
+    tracks = load_tracks(path)
+    assert (tracks.skeleton.joints, tracks.weights[0].tolist()) == (("a", "b"), [0.5, 1.0])
+    assert "columns are missing, so their joints are left out: c_y, d_x" in tracks.notes
+    assert "columns of joints that are left out: visibility, std_dev" in tracks.notes
+
+
+@pytest.mark.parametrize("name", ["body25", "h36m17", "coco17", "ap10k", "cmu17"])
+def test_names_of_a_built_in_skeleton_select_it_in_any_order(tmp_path, name):
+    body = SKELETONS[name]
+    names = body.joints[: body.num_observed]
+    path = write_table(tmp_path / "a.csv", names[::-1])
+    tracks = load_tracks(path)
+    assert tracks.skeleton is body
+    assert np.allclose(tracks.points[:, : len(names)], person(4, len(names))[:, ::-1, :2])
+    assert (tracks.weights[:, : len(names)] == 0.8).all()
+
+
+def test_other_spellings_of_the_table(tmp_path):
+    text = write_table(tmp_path / "a.csv", LEG).read_text()
+    expected = load_tracks(tmp_path / "a.csv").points
+    for change in (
+        text.replace("_", "."),
+        text.replace(",", ";"),
+        text.replace(",", "\t"),
+        text.replace("_x", "_X [px]").replace("_y", "_Y [px]"),
+        "\ufeff" + text,
+    ):
+        (tmp_path / "b.csv").write_text(change, encoding="utf-8", newline="")
+        assert detect_format(tmp_path / "b.csv") == "csv"
+        assert torch.equal(load_tracks(tmp_path / "b.csv").points, expected)
+
+
+def test_a_row_a_frame_is_one_body_however_it_jumps(tmp_path):
+    rows = [",".join(map(str, row)) for row in np.random.default_rng(0).uniform(1, 500, (30, 6)).tolist()]
+    (tracks,) = load_people(lines(tmp_path / "a.csv", "a_x,a_y,b_x,b_y,c_x,c_y", *rows))
+    assert tracks.seen.all() and tracks.num_frames == 30
+
+
+def test_numbers_of_rows_are_no_people(tmp_path):
+    (tracks,) = load_people(lines(tmp_path / "a.csv", "id,a_x,a_y,b_x,b_y", *(f"{t},{t + 1},2,3,4" for t in range(5))))
+    assert tracks.seen.all() and tracks.num_frames == 5
+
+
+def test_people_by_a_column(tmp_path):
+    rows = [f"{t},{who},{100 * at + t},5,{100 * at + t},50" for t in range(4) for at, who in ((1, "b"), (7, "a"))]
+    a, b = load_people(lines(tmp_path / "a.csv", "frame,person,hip_x,hip_y,foot_x,foot_y", *rows))
+    assert {a.points[0, 0, 0].item(), b.points[0, 0, 0].item()} == {100, 700}
+    assert a.points[:, 0, 0].diff().tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("column", "times", "fps", "seen"),
+    [
+        ("time", [0, 0.04, 0.08, 0.12], 25, [0, 1, 2, 3]),
+        ("time [s]", [7, 7.04, 7.12, 7.16], 25, [0, 1, 3, 4]),
+        ("time", [0, 40, 80, 120], 25, [0, 1, 2, 3]),
+        ("time_ms", [0, 2000, 4000, 6000], 0.5, [0, 1, 2, 3]),
+        ("t", [0.12, 0.08, 0.04, 0], 25, [0, 1, 2, 3]),
+        ("timestamp", [0, 0.04, 0.1, 0.12], 25, [0, 1, 2, 3]),
+        ("time", ["", "", "", ""], None, [0, 1, 2, 3]),
+        ("time", [1, 1e30, 2, 3], None, [0, 1, 2, 3]),
+        ("timestamp", [0, 5e-324, 0.1, 0.12], 25, [0, 1, 2, 3]),
+    ],
+    ids=["seconds", "gap", "milliseconds", "unit", "backwards", "uneven", "none", "far", "near"],
+)
+def test_times_place_frames_and_tell_the_rate(tmp_path, column, times, fps, seen):
+    path = lines(tmp_path / "a.csv", f"{column},a_x,a_y,b_x,b_y", *(f"{t},{9 - i},2,3,4" for i, t in enumerate(times)))
+    tracks = load_tracks(path)
+    assert tracks.seen.all(1).nonzero().flatten().tolist() == seen
+    assert tracks.fps is None if fps is None else tracks.fps == pytest.approx(fps, rel=1e-3)
+    assert ("uneven" in notes_of(path)) == (column == "timestamp")
+    if column == "t":
+        assert tracks.points[:, 0, 0].tolist() == [6, 7, 8, 9]
+    assert load_tracks(path, fps=50).fps == 50
+
+
+def test_frames_go_before_times_and_their_steps_are_frames(tmp_path):
+    path = lines(tmp_path / "a.csv", "frame,time,a_x,a_y,b_x,b_y", *(f"{5 * i},{i / 6},1,2,3,4" for i in (0, 1, 3)))
+    tracks = load_tracks(path)
+    assert tracks.seen.all(1).tolist() == [True, True, False, True]
+    assert tracks.fps == pytest.approx(6, abs=1e-3)
+
+
+def test_shares_of_the_image_are_told_and_scaled_by_its_size(tmp_path):
+    path = lines(tmp_path / "a.csv", "a_x,a_y,b_x,b_y", ".1,.2,.3,.4", ".1,.2,.3,.5")
+    assert "if they are shares of the image, give image_size" in notes_of(path)
+    assert load_tracks(path).points[0].tolist() == [[0.1, 0.2], [0.3, 0.4]]
+    assert load_tracks(path, image_size=(100, 50)).points[0].numpy() == pytest.approx(np.array([[10, 10], [30, 20]]))
+
+
+HEAD = "frame,a_x,a_y,b_x,b_y"
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ((HEAD,), "in at least one of 0 frames"),
+        (("frame,joint,x,y", "0,a,1,2"), "expected columns such as nose_x, nose_y, got 'frame,joint,x,y'"),
+        ((f"{HEAD},a_x", "0,1,2,3,4,5"), "expected every column once, got 'a_x' again"),
+        ((HEAD, "0,1,2,3,4", "1,2,3"), "row 3: expected 5 values as in the first row, got 3"),
+        ((HEAD, "0,1,x,3,4"), "row 2: 'a_y': expected a number, got 'x'"),
+        ((HEAD, "0,1,2,3,4", "0,1,2,3,4"), "row 3: expected every frame once, or a column 'person', got frame 0 again"),
+        (("time" + HEAD[5:], ".5,1,2,3,4", ".5,1,2,3,4"), "row 3: .* got time 0.5 again"),
+        ((HEAD.replace(",", ";"), "0;1,5;2;3;4"), r"row 2: 'a_x': expected a number, got '1,5' \(write decimals with"),
+        ((HEAD, "0,1,inf,3,4"), "row 2: 'a_y': expected a coordinate"),
+        (("a_x,a_y,a_z,b_x,b_y,b_z", "1,2,3,4,5,6"), "expected 2D tracks, got 3D motion .* leave the columns z out"),
+    ],
+)
+def test_tables_that_are_none_are_told(tmp_path, rows, message):
+    path = lines(tmp_path / "broken.csv", *rows)
+    with pytest.raises(KcsError, match=message) as caught:
+        load_people(path, format="csv")
+    assert str(path) in str(caught.value)
+
+
+def test_what_no_reader_takes_says_what_a_table_needs(tmp_path):
+    path = lines(tmp_path / "long.csv", "frame,joint,x,y", "0,a,1,2")
+    with pytest.raises(FormatError, match="got a table that begins with 'frame,joint,x,y': csv has .*name_x, name_y"):
+        load_tracks(path)
+
+
+def test_mediapipes_tables_stay_mediapipes(tmp_path):
+    path = write_mediapipe_csv(tmp_path / "a.csv")
+    deep = lines(tmp_path / "b.csv", *path.read_text().replace("_visibility", "_z").splitlines())
+    for table in (path, deep):
+        assert [name for name, reader in READERS.items() if reader.recognises(Probe(table))] == ["mediapipe"]
+        with pytest.raises(FormatError, match="got something else"):
+            detect_motion_format(table)
+    assert load_motion(deep, format="csv").skeleton.name == "mediapipe33"
+
+
+# ---------------------------------------------------------------------- motion
+
+
+@pytest.fixture(scope="module")
+def result():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", kt.KcsWarning)
+        return kt.reconstruct(kt.data.walking_person(12, skeleton="coco17", fps=30).tracks, method="kcs")
+
+
+@pytest.mark.parametrize("height", [None, 1.7], ids=["pixels", "metres"])
+def test_a_result_is_read_back_as_motion(tmp_path, result, height):
+    moved = result if height is None else result.scaled(height=height, units="m")
+    path = kt.save(moved, tmp_path / "walk.csv")
+    assert detect_motion_format(path) == "csv"
+    motion = load_motion(path)
+    assert motion.skeleton is SKELETONS["coco17"]  # with the virtual joints
+    assert (motion.fps, motion.units) == (30, moved.units)
+    assert torch.allclose(motion.points, moved.points * torch.tensor([1.0, -1, -1]), rtol=1e-6, atol=1e-6)
+    assert any(note.startswith("-y is taken to point up") for note in motion.notes)
+    with pytest.raises(FormatError, match=r"got 3D motion \(csv\)"):
+        load_tracks(path)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_motion_with_gaps_is_read_back(tmp_path, result, up):
+    motion = kt.Motion.of(result)
+    motion.weights[3, 9] = 0
+    motion.points[3, 9] = 0
+    back = load_motion(kt.save(motion, tmp_path / "walk.csv", up=up))
+    assert torch.equal(back.weights, motion.weights)
+    assert torch.allclose(back.points, motion.points, rtol=1e-6, atol=1e-6)
+    assert back.fps == 30
+
+
+def test_the_command_line_scores_and_converts_it(tmp_path, result):
+    motion = kt.Motion.of(result.scaled(height=1.7, units="m"))
+    table, truth = kt.save(motion, tmp_path / "walk.csv"), kt.save(motion, tmp_path / "walk.trc")
+    for words in (["score", table, truth], ["score", truth, table], ["convert", table, tmp_path / "b.bvh"]):
+        done = CliRunner().invoke(app, [str(word) for word in words])
+        assert done.exit_code == 0, done.output
+        assert words[0] != "score" or "100.0 %" in done.output
+
+
+def test_markers_of_any_names(tmp_path):
+    path = lines(
+        tmp_path / "rig.csv",
+        "time,m1_x [mm],m1_y [mm],m1_z [mm],'=m2_x [mm],'=m2_y [mm],'=m2_z [mm]",
+        "0,1,2,3,4,5,6",
+        "0.01,1,2,3,,,",
+        "0.03,1,2,3,4,5,6",
+    )
+    motion = load_motion(path)
+    assert (motion.skeleton.joints, motion.fps, motion.units) == (("m1", "=m2"), 100, "mm")
+    assert motion.seen.tolist() == [[True, True], [True, False], [False, False], [True, True]]
+    assert load_motion(path, up="z").points[0].tolist() == [[1, 3, -2], [4, 6, -5]]
+    assert any("3D" in note or "frame" in note for note in motion.notes)
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (("a_x,a_y,a_z,b_x,b_y,b_z",), "expected a row a frame"),
+        (
+            ("t,id,a_x,a_y,a_z,b_x,b_y,b_z", "0,1,1,2,3,4,5,6", "0,2,1,2,3,4,5,6"),
+            "the motion of one body, got several",
+        ),
+        (("a_x,a_y,a_z,b_x,b_y,b_z", "1,2,3,4,5,?"), r"row 2: 'b_z': expected a number, got '\?'"),
+    ],
+)
+def test_motion_that_is_none_is_told(tmp_path, rows, message):
+    path = lines(tmp_path / "broken.csv", *rows)
+    with pytest.raises(KcsError, match=message) as caught:
+        load_motion(path)
+    assert str(path) in str(caught.value)
