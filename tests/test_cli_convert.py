@@ -61,6 +61,20 @@ def test_results_go_to_all_formats(tmp_path):
     assert torch.equal(load_reconstruction(outputs[0]).points, walk_result().points)
 
 
+def test_inputs_that_a_star_lists_are_not_replaced(tmp_path):
+    files = [tmp_path / f"{name}.trc" for name in "abc"]
+    for k, path in enumerate(files):
+        save(walking_motion(5 + k), path, units="m")
+    before = [path.read_bytes() for path in files]
+    told = run("convert", *files, tmp_path / "new.npz", code=2).stderr
+    assert "b.trc: is there, and a .trc file as" in " ".join(told.split()) and "--overwrite" in told
+    assert [path.read_bytes() for path in files] == before and not (tmp_path / "new.npz").exists()
+    for _ in range(2):  # another kind of file is ours to replace
+        run("convert", files[0], tmp_path / "new.npz")
+    run("convert", files[0], files[1], "--overwrite")
+    assert len(load_motion(files[1]).points) == 5
+
+
 def test_motion_goes_from_one_tool_to_another(tmp_path):
     motion = walking_motion(10)
     save(motion, tmp_path / "a.bvh", notes=[])

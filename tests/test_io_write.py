@@ -167,6 +167,20 @@ def test_paths_that_cannot_be_written(tmp_path, result):
     assert (tmp_path / "file").read_text() == "kept"
 
 
+def test_a_read_only_file_is_not_replaced(tmp_path, result):
+    """The rename that puts a file in its place asks for the folder's permission only."""
+    save(result, tmp_path / "w.npz")
+    before = (tmp_path / "w.npz").read_bytes()
+    (tmp_path / "w.npz").chmod(0o444)
+    (tmp_path / "link.npz").symlink_to(tmp_path / "w.npz")
+    for name in ("w.npz", "link.npz"):
+        with pytest.raises(OutputError, match=rf"{name}: is there and read-only: give another name"):
+            save(result, tmp_path / name)
+    assert (tmp_path / "w.npz").read_bytes() == before
+    (tmp_path / "w.npz").chmod(0o644)
+    save(result, tmp_path / "w.npz")
+
+
 def test_a_device_is_not_replaced(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
     with pytest.raises(OutputError, match="device or pipe"), atomic_path(tmp_path / "pipe.csv"):

@@ -70,14 +70,23 @@ def convert(
     threshold: Threshold = 0.3,
     size: ImageSize = None,
     trust: Trust = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace files of IN's kind, which may be inputs that a * has listed.")
+    ] = False,
 ) -> None:
     """Convert tracks, results and motion from one kind of file to another."""
     with answer():
-        from kcs_torch.errors import OptionError
+        from kcs_torch.errors import OptionError, OutputError
         from kcs_torch.io import load_any
         from kcs_torch.types import Reconstruction, Tracks
 
         output = check_outputs(output, source=source)
+        for path in output:
+            if not overwrite and path.exists() and path.suffix == Path(source).suffix:
+                raise OutputError(
+                    f"{path}: is there, and a {path.suffix} file as {source} is. One file is converted at a time, into "
+                    "all that follow it: give another name, or --overwrite to replace it"
+                )
         true_size = parse_scale(scale)
         with progress(f"reading {source}"):
             data = load_any(

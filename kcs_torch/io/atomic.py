@@ -5,12 +5,15 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
 from kcs_torch.errors import KcsError, OutputError
 
 __all__ = ["atomic_path"]
+
+WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
 
 @contextlib.contextmanager
@@ -22,7 +25,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     OutputError of the block that names the temporary path names ``path`` instead.
 
     Raises:
-        OutputError: ``path`` is a folder or a device, or cannot be written to.
+        OutputError: ``path`` is a folder, a device or a read-only file, or cannot be written to.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -63,6 +66,8 @@ def _target(path: str | Path) -> Path:
             raise OutputError(f"{path}: expected the name of a file, got a folder: add a file name")
         if target.exists() and not target.is_file():
             raise OutputError(f"{path}: expected the name of a file, got a device or pipe, which is not replaced")
+        if target.exists() and not target.stat().st_mode & WRITABLE:  # a rename would not ask
+            raise OutputError(f"{path}: is there and read-only: give another name, or make it writable first")
     except KcsError:
         raise
     except (OSError, ValueError) as error:  # ValueError: a null character in the path

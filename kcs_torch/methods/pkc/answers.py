@@ -45,7 +45,7 @@ NEAREST = 0.02
 
 NOISE, LASTING = 0.6, 1.0
 """What a bone's depth takes on of its image's noise in a frame, which its neighbours make good in part, and of the
-noise of usual frames, which its length takes on."""
+noise of all frames, which its length takes on."""
 
 POSTURE, STRANGE = 0.167, 1.5
 """Energy of usual postures, for each bone and frame that counts, and the power of a larger one that deviations go with:
@@ -130,7 +130,7 @@ def depth_deviation(
     if image is not None:
         noise = noise.square().add(NEAR**2).sqrt()
     blur = bone_noise(noise, bones).square()
-    wrong = length.square() * told + NOISE**2 * blur + LASTING**2 * blur.median(0).values
+    wrong = length.square() * told + NOISE**2 * blur + LASTING**2 * blur.mean(0)
     tree = chain_inverse(incidence(bones, skeleton.num_joints, dtype=noise.dtype))  # (N, B)
     variance = (wrong / (steep.square() + FLAT**2)) @ tree.square().mT
     if image is not None:
