@@ -57,7 +57,7 @@ HELD = 0.08
 ONE = 20.0
 """Frames that count as one in what rivals are chosen by: errors of the changes last."""
 
-LEVEL = 0.001
+LEVEL = 0.0003
 """Least noise, a share of the body's size, of tracks that are not exact throughout."""
 
 LONG = 2000
