@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
 import itertools
@@ -203,7 +204,7 @@ def reconstruct_folder(
     clips = [clip for clip in clips_of(source, output, pattern) if clip.share_of(shards) == shard]
     lens = intrinsics if intrinsics is None or isinstance(intrinsics, str) else Intrinsics.of(intrinsics)
     options = {"scale": scale, "up": up, "units": units, "intrinsics": lens}
-    _claim(Path(output), _settings(method, options, reading), retry)
+    _claim(Path(output), _settings(method, options, reading) | {"everybody": str(everybody)}, retry)
     workplace = Path(output) / f".part_{shard}_of_{shards}"
     _sweep(Path(output), workplace)
     find = reading.get("skeleton") == "auto"
@@ -251,9 +252,13 @@ class _Work:
 
     def is_done(self, clip: Clip) -> bool:
         """Whether all results are there; of everybody's the last written says so."""
-        if self.everybody:
-            return _people_list(clip).exists()
-        return all(path.exists() for path in clip.outputs(self.suffixes))
+        if not self.everybody:
+            return all(path.exists() for path in clip.outputs(self.suffixes))
+        with contextlib.suppress(OSError, ValueError):
+            count = int(_people_list(clip).read_text("utf-8"))
+            paths = (path for i in range(count) for path in _person(clip, i).outputs(self.suffixes))
+            return all(path.exists() for path in paths)
+        return False
 
     def reconstruct(self, clips: Sequence[Clip]) -> tuple[int, int, list[tuple[Path, str]]]:
         """Reconstruct a batch: clips and frames that were made, and what failed."""
@@ -287,7 +292,7 @@ class _Work:
     def _write(self, clip: Clip, results: list[Reconstruction]) -> None:
         """Write all results of a clip, and that they are all."""
         for number, result in enumerate(results):
-            target = clip if not self.everybody else replace(clip, target=_numbered(clip.target, number))
+            target = _person(clip, number) if self.everybody else clip
             self._save(result if self.size is None else result.scaled(**self.size), target)
         if self.everybody:
             with atomic_path(_people_list(clip)) as temporary:
@@ -375,8 +380,8 @@ def _claim(output: Path, settings: dict[str, str], retry: bool) -> None:
         )
 
 
-def _numbered(path: Path, number: int) -> Path:
-    return path.with_name(f"{path.name}_{number}")
+def _person(clip: Clip, number: int) -> Clip:
+    return replace(clip, target=clip.target.with_name(f"{clip.target.name}_{number}"))
 
 
 def _people_list(clip: Clip) -> Path:

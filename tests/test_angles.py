@@ -195,7 +195,7 @@ def test_size_does_not_matter():
         assert_close(scaled.deviation[name], found.deviation[name])
 
 
-def test_unseen_joints_have_no_angle_and_unseen_axes_no_sign():
+def test_unseen_joints_have_no_angle_and_axes_never_seen_no_sign():
     motion = walking_motion(6)
     mirrored = replace(motion, points=motion.points * motion.points.new_tensor([1.0, 1.0, -1.0]))
     weights = motion.weights.clone()
@@ -203,7 +203,10 @@ def test_unseen_joints_have_no_angle_and_unseen_axes_no_sign():
     weights[2, motion.skeleton.index("right_hip")] = 0
     found = replace(mirrored, weights=weights).angles("left_knee").degrees["left_knee"]
     assert found.isnan().tolist() == [False, True, False, False, False, False]
-    assert (found > 0).tolist() == [False, False, True, False, False, False]
+    assert (found > 0).tolist() == [False] * 6  # the hips in the frames beside tell the sign
+    weights[:, motion.skeleton.index("right_hip")] = 0
+    found = replace(mirrored, weights=weights).angles("left_knee").degrees["left_knee"]
+    assert (found > 0).tolist() == [True, False, True, True, True, True]
 
 
 def test_one_frame():
@@ -260,7 +263,8 @@ def test_wrong_joints_are_told(joints, error, match):
 def test_a_skeleton_without_hinges_needs_names():
     body = kt.Skeleton.from_names(list("abc"), [("a", "b"), ("b", "c")], name="chain")
     motion = kt.Motion.from_arrays(normal(4, 3, 3), skeleton=body)
-    with pytest.raises(OptionError, match=r"skeleton 'chain' has no hinges: name the joints, such as .*--joint a,b,c"):
+    told = r"skeleton 'chain' has no hinges: give one that has .* or name three joints, such as .*--joint a,b,c"
+    with pytest.raises(OptionError, match=told):
         motion.angles()
     assert list(motion.angles([("a", "b", "c")]).degrees) == ["a-b-c"]
 
@@ -421,3 +425,27 @@ def test_command_does_not_replace_what_it_reads(saved, monkeypatch):
     monkeypatch.chdir(saved)
     (saved / "m.csv").write_bytes((saved / "m.trc").read_bytes())
     assert "which it would replace" in run("m.csv", "-o", "m.csv", code=2).stderr
+
+
+def test_a_knee_keeps_its_sign_where_the_other_hip_is_unseen():
+    clip = walking_motion(20)
+    points, body = clip.points.clone(), clip.skeleton
+    hip, knee, ankle = (points[:, body.index(f"left_{name}")] for name in ("hip", "knee", "ankle"))
+    thigh = torch.nn.functional.normalize(knee - hip, dim=-1)
+    shank = ankle - knee
+    points[:, body.index("left_ankle")] = knee + 2 * (shank * thigh).sum(-1, keepdim=True) * thigh - shank
+    seen = torch.ones(20, body.num_joints, dtype=torch.bool)
+    whole = angles_of(points, seen, body, ["left_knee"]).degrees["left_knee"]
+    assert whole[5:8].abs().min() > 2
+    seen[5:8, body.index("right_hip")] = False
+    torn = torch.where(seen[..., None], points, math.nan)
+    assert_close(angles_of(torn, seen, body, ["left_knee"]).degrees["left_knee"], whole)
+    seen[:, body.index("right_hip")] = False
+    told = angles_of(torn, seen, body, ["left_knee"])
+    assert not told.signed
+    assert_close(told.degrees["left_knee"], whole.abs())
+
+
+def test_what_are_no_joints_is_told():
+    with pytest.raises(OptionError, match="expected names of hinges or triples of names, got 3"):
+        walk_result().angles(3)

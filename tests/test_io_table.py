@@ -260,3 +260,15 @@ def test_motion_that_is_none_is_told(tmp_path, rows, message):
     with pytest.raises(KcsError, match=message) as caught:
         load_motion(path)
     assert str(path) in str(caught.value)
+
+
+def test_a_zero_is_a_place_unless_it_is_the_corner(tmp_path):
+    """These tables may be anything, also about the body's middle; detectors' own files know no place at 0."""
+    rows = ("frame,a_x,a_y,b_x,b_y", "0,412,0,300.5,44", "1,410,0,333.5,44", "2,405,10,303.5,44")
+    assert load_tracks(lines(tmp_path / "a.csv", *rows)).seen.all()
+    rows = ("frame,a_x,a_y,b_x,b_y", "0,0,0,-30,44", "1,0,0,33,44", "2,5,60,30,44")
+    assert load_tracks(lines(tmp_path / "b.csv", *rows)).seen.all()
+    rows = ("frame,a_x,a_y,b_x,b_y", "0,0,0,3,4", "1,1,2,3,4")
+    tracks = load_tracks(lines(tmp_path / "c.csv", *rows))
+    assert tracks.seen.tolist() == [[False, True], [True, True]]
+    assert any(note.startswith("1 joint that lies exactly at (0, 0) is taken as unseen") for note in tracks.notes)

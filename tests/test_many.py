@@ -165,6 +165,10 @@ def test_everybody(tmp_path):
     outcome = run(tmp_path / "in", tmp_path / "out", pattern="*", everybody=True)
     assert outcome.done == 1 and {p.name for p in (tmp_path / "out").glob("*.npz")} == {"two_0.npz", "two_1.npz"}
     assert run(tmp_path / "in", tmp_path / "out", pattern="*", everybody=True).skipped == 1
+    more = run(tmp_path / "in", tmp_path / "out", pattern="*", everybody=True, suffixes=[".npz", ".csv"])
+    assert more.done == 1 and {p.name for p in (tmp_path / "out").glob("*.csv")} == {"two_0.csv", "two_1.csv"}
+    with pytest.raises(kt.OptionError, match="everybody=True, got everybody=False"):  # two_0 may be a clip's own name
+        run(tmp_path / "in", tmp_path / "out", pattern="*")
 
 
 @pytest.mark.parametrize(

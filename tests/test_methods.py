@@ -502,7 +502,8 @@ def test_joints_that_coincide_are_told(method, place):
 def test_a_body_on_its_head_is_told():
     """y may point up; a body that lies, or shows its feet now and then, is not meant."""
     with pytest.warns(KcsWarning, match="feet are above the rest of the body in nearly all frames. If y points up"):
-        reconstruct(tracks_of(WALK * torch.tensor([1.0, -1.0])), method="kcs")
+        result = reconstruct(tracks_of(WALK * torch.tensor([1.0, -1.0])), method="kcs")
+    assert any("feet are above" in note for note in result.diagnostics.notes)
     turned = WALK.clone()
     turned[: len(WALK) // 2, :, 1] *= -1
     for right in (WALK, turned, WALK.flip(-1)):

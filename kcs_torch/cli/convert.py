@@ -71,7 +71,7 @@ def convert(
     size: ImageSize = None,
     trust: Trust = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace files of IN's kind, which may be inputs that a * has listed.")
+        bool, typer.Option("--overwrite", help="Replace files that are there, which may be inputs that a * has listed.")
     ] = False,
 ) -> None:
     """Convert tracks, results and motion from one kind of file to another."""
@@ -82,10 +82,10 @@ def convert(
 
         output = check_outputs(output, source=source)
         for path in output:
-            if not overwrite and path.exists() and path.suffix == Path(source).suffix:
+            if path.exists() and not overwrite:
                 raise OutputError(
-                    f"{path}: is there, and a {path.suffix} file as {source} is. One file is converted at a time, into "
-                    "all that follow it: give another name, or --overwrite to replace it"
+                    f"{path}: is there. One file is converted at a time, into all that follow it (a * may list more): "
+                    "give another name, or --overwrite to replace it"
                 )
         true_size = parse_scale(scale)
         with progress(f"reading {source}"):

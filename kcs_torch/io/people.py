@@ -16,6 +16,7 @@ from kcs_torch.io.link import follow_people
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
+from kcs_torch.types.intake import at_the_corner
 
 __all__ = ["Sighting", "people_tracks"]
 
@@ -48,6 +49,7 @@ def people_tracks(
     skeleton: str | Skeleton | None = None,
     fps: float | None = None,
     notes: Sequence[str] = (),
+    measured: bool = False,
 ) -> list[Tracks]:
     """Follow the people of T frames and wrap each as :class:`Tracks`.
 
@@ -64,6 +66,7 @@ def people_tracks(
         skeleton: the file's own skeleton.
         fps: the file's frames per second.
         notes: sentences for the user.
+        measured: no detector made them: only joints at (0, 0) with all others to the right and below are unseen.
 
     Raises:
         FormatError: nobody is in any frame, or people have different numbers of joints.
@@ -71,7 +74,7 @@ def people_tracks(
         SkeletonError: the joints do not fit the skeleton.
     """
     remarks = list(notes)
-    frames = _measured(_checked(frames, source, remarks), remarks)
+    frames = _without_zeros(_checked(frames, source, measured, remarks), measured, remarks)
     everybody = [s.joints for frame in frames for s in frame]
     if not everybody:
         raise FormatError(f"{source}: expected people in at least one of {len(frames)} frames, got none")
@@ -114,20 +117,27 @@ def people_tracks(
     return out
 
 
-def _measured(frames: Sequence[Sequence[Sighting]], notes: list[str]) -> list[list[Sighting]]:
-    """Without joints at 0, 0, which stand for none; nor is one 0 a measurement: in real files joints jump to x = 0."""
+def _without_zeros(frames: Sequence[Sequence[Sighting]], measured: bool, notes: list[str]) -> list[list[Sighting]]:
+    """Without joints at 0, 0, which stand for none; nor is one 0 a detector's: in real files joints jump to x = 0."""
     everybody = [s.joints for frame in frames for s in frame]
     if not everybody:
         return [list(frame) for frame in frames]
     joints = np.stack(everybody)
-    zero = (joints[..., :2] == 0).any(-1)
-    if halves := int((zero & (joints[..., 2] > 0)).sum()):
-        notes.append(f"{halves} joints whose x or y is exactly 0 are taken as unseen")
+    seen = joints[..., 2] > 0
+    if measured:
+        zero = at_the_corner(joints[..., :2], seen, notes) | ~seen
+    else:
+        zero = (joints[..., :2] == 0).any(-1)
+        if halves := int((zero & seen).sum()):
+            are = "joint whose x or y is exactly 0 is" if halves == 1 else "joints whose x or y is exactly 0 are"
+            notes.append(f"{halves} {are} taken as unseen")
     kept = iter(np.where(zero[..., None], 0.0, joints))
     return [[s._replace(joints=next(kept)) for s in frame] for frame in frames]
 
 
-def _checked(frames: Sequence[Sequence[Sighting]], source: str, notes: list[str]) -> list[list[Sighting]]:
+def _checked(
+    frames: Sequence[Sequence[Sighting]], source: str, measured: bool, notes: list[str]
+) -> list[list[Sighting]]:
     """The same people with confidences within 0..1, 0 where unseen; those without any joint are left out."""
     counts = Counter(len(s.joints) for frame in frames for s in frame)
     if len(counts) > 1:
@@ -148,7 +158,9 @@ def _checked(frames: Sequence[Sequence[Sighting]], source: str, notes: list[str]
         for sighting in frame:
             joints = sighting.joints.copy()
             negative += int((joints[:, 2] < 0).sum())
-            unseen = ~np.isfinite(joints).all(-1) | (joints[:, :2] == 0).all(-1) | (joints[:, 2] <= 0)
+            unseen = ~np.isfinite(joints).all(-1) | (joints[:, 2] <= 0)
+            if not measured:
+                unseen |= (joints[:, :2] == 0).all(-1)
             joints[:, 2] = (joints[:, 2] / scale).clip(max=1)
             joints[unseen] = 0
             if not unseen.all():

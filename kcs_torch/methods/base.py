@@ -25,17 +25,13 @@ from kcs_torch.errors import (
     users_level,
 )
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.finish import WEAK_TURN, WHY_LOOSE, Estimate, finish, rms, what_is_wrong
+from kcs_torch.methods.finish import HEADSTAND, WEAK_TURN, WHY_LOOSE, Estimate, finish, rms, what_is_wrong
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
 from kcs_torch.types.hints import is_a, spoken
 from kcs_torch.types.tracks import never_seen
-from kcs_torch.types.upright import upside_down
 
 __all__ = ["WEAK_TURN", "Estimate", "Method", "apart"]
-
-HEADSTAND = 0.9
-"""Share of the frames in which feet are above the rest of the body where y may well point up."""
 
 
 @dataclass(frozen=True)
@@ -171,13 +167,8 @@ class Method(ABC):
             warnings.warn(message, ConvergenceWarning, stacklevel=users_level())
         for gone in never_seen(tracks.weights, tracks.skeleton):
             warnings.warn(f"{tracks.source}: {gone}", KcsWarning, stacklevel=users_level())
-        if upside_down(tracks.points[..., 1], tracks.seen, tracks.skeleton, HEADSTAND):
-            message = (
-                f"{tracks.source}: the feet are above the rest of the body in nearly all frames. If y points up "
-                "in these tracks, give -y instead: it has to point down, as in images, or the body is upside "
-                "down and mirrored"
-            )
-            warnings.warn(message, KcsWarning, stacklevel=users_level())
+        if HEADSTAND in found.notes:
+            warnings.warn(f"{tracks.source}: {HEADSTAND}", KcsWarning, stacklevel=users_level())
         for wrong in what_is_wrong(self, result.points, tracks.skeleton, found.converged):
             warnings.warn(f"{tracks.source}: {wrong}: {WHY_LOOSE}", KcsWarning, stacklevel=users_level())
 

@@ -18,12 +18,13 @@ from kcs_torch.methods.root import root_depth
 from kcs_torch.nn.lengths import oddity
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Reconstruction, Tracks
+from kcs_torch.types.upright import upside_down
 from kcs_torch.types.variation import bone_shares, bone_variation
 
 if TYPE_CHECKING:
     from kcs_torch.methods.base import Method
 
-__all__ = ["WEAK_TURN", "WHY_LOOSE", "Estimate", "finish", "loose_bones", "rms", "what_is_wrong"]
+__all__ = ["HEADSTAND", "WEAK_TURN", "WHY_LOOSE", "Estimate", "finish", "loose_bones", "rms", "what_is_wrong"]
 
 WEAK_TURN = 30.0
 """Degrees of viewpoint turn below which depth is weakly determined."""
@@ -43,6 +44,14 @@ POINT = 1e-6
 
 FAR_STEPS = 2
 """How often joints are weighed anew by their distance, when the body is put in its place."""
+
+NEARLY_ALL = 0.9
+"""Share of the frames in which feet are above the rest of the body where y may well point up."""
+
+HEADSTAND = (
+    "the feet are above the rest of the body in nearly all frames. If y points up in these tracks, give -y instead: it "
+    "has to point down, as in images, or the body is upside down and mirrored"
+)
 
 WHY_LOOSE = (
     "joints may be wrong, swapped or in another order, the skeleton may be another, parts of the body may bend, or the "
@@ -205,6 +214,8 @@ def _reconstruction(
         notes.append(method.unsettled(found.iterations))
     if variation.median > LOOSE and not method.keeps_lengths:
         notes.append(f"bone lengths vary by {variation.median:.1f} %: '{method.name}' does not hold them constant")
+    if upside_down(tracks.points[..., 1], tracks.seen, body, NEARLY_ALL):
+        notes.append(HEADSTAND)
     for wrong in what_is_wrong(method, points, body):
         notes.append(f"{wrong}: {WHY_LOOSE}")
     if not body.rigid:

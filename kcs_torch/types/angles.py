@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, SkeletonError, counted
 from kcs_torch.functional import flexion
+from kcs_torch.functional.temporal import interpolate
 from kcs_torch.skeleton import Hinge, Skeleton, map_joints
 
 __all__ = ["JointAngles", "Joints", "angles_of"]
@@ -84,12 +85,11 @@ def angles_of(
     index = torch.tensor([chain for chain, _ in chosen.values()], device=points.device)
     above, here, below = (points[:, i] for i in index.unbind(-1))
     axis, known = torch.zeros_like(here), seen[:, index].all(-1)
+    filled, ever = interpolate(torch.where(seen[..., None], points, 0), seen), seen.any(0)
     signed = []
     for k, (name, (_, hinge)) in enumerate(chosen.items()):
-        if hinge is not None and hinge.firm >= FIRM:
-            ends = (seen[:, hinge.left] & seen[:, hinge.right])[:, None]
-            across = hinge.sign * (points[:, hinge.left] - points[:, hinge.right])
-            axis[:, k] = torch.where(ends, across, torch.zeros_like(across))
+        if hinge is not None and hinge.firm >= FIRM and bool(ever[hinge.left] & ever[hinge.right]):
+            axis[:, k] = hinge.sign * (filled[:, hinge.left] - filled[:, hinge.right])
             signed.append(name)
     upper, lower = here - above, below - here
     angle = flexion(upper, lower, axis)
@@ -122,10 +122,13 @@ def _chosen(body: Skeleton, joints: Joints | None) -> dict[str, tuple[Triple, Hi
     if joints is None:
         if not hinges:
             raise OptionError(
-                f"angles: skeleton '{body.name}' has no hinges: name the joints, such as {_example(body)}"
+                f"angles: skeleton '{body.name}' has no hinges: give one that has (kcs-torch angles: --skeleton "
+                f"body25) or name three joints, such as {_example(body)}"
             )
         return {name: ((h.parent, h.joint, h.child), h) for name, h in hinges.items()}
     found: dict[str, tuple[Triple, Hinge | None]] = {}
+    if not isinstance(joints, (str, Sequence)):
+        raise OptionError(f"angles: expected names of hinges or triples of names, got {joints!r}")
     for one in [joints] if isinstance(joints, str) else joints:
         if isinstance(one, str):
             at = _index(body, one)

@@ -16,7 +16,17 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton, map_joints
 
-__all__ = ["FARTHEST", "Intake", "as_floats", "as_number", "choose_skeleton", "joint_order", "no_bones", "take_in"]
+__all__ = [
+    "FARTHEST",
+    "Intake",
+    "as_floats",
+    "as_number",
+    "at_the_corner",
+    "choose_skeleton",
+    "joint_order",
+    "no_bones",
+    "take_in",
+]
 
 FARTHEST = 1e30  # of coordinates: their sums are finite in single precision, in which pages are written
 
@@ -156,16 +166,16 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
     )
 
 
-def _at_the_corner(points: Tensor, seen: Tensor, notes: list[str]) -> Tensor:
-    """Which joints (T, N) lie exactly at (0, 0) though all others lie to one side of it: detectors write unseen so.
+def at_the_corner(points: np.ndarray, seen: np.ndarray, notes: list[str]) -> np.ndarray:
+    """Which joints (..., N) of points (..., N, 2) lie exactly at (0, 0), and all others to the right of and below it.
 
-    About a middle that is 0 the others lie all around.
+    Detectors write unseen joints so. About a middle that is 0 the others lie all around.
     """
     corner = seen & (points == 0).all(-1)
     rest = points[seen & ~corner]
     count = int(corner.sum())
-    if not (count and len(rest) and bool((rest > 0).all())):
-        return torch.zeros_like(corner)
+    if not (count and len(rest) and (rest > 0).all()):
+        return np.zeros_like(corner)
     are = "joint that lies exactly at (0, 0) is" if count == 1 else "joints that lie exactly at (0, 0) are"
     notes.append(f"{count} {are} taken as unseen: NaN, or a confidence of 0, says so more clearly")
     return corner
@@ -238,7 +248,8 @@ def take_in(
         raise ShapeError(f"{source}: points: {where}: expected coordinates up to {FARTHEST:g}, got {most:.3g}")
     seen = torch.isfinite(xy).all(-1)
     if confidence is None and dims == 2:
-        seen = seen & ~_at_the_corner(xy, seen, remarks)
+        corner = at_the_corner(xy.numpy(force=True), seen.numpy(force=True), remarks)
+        seen = seen & ~torch.as_tensor(corner, device=seen.device)
     if confidence is None:
         weights = seen.to(xy.dtype)
     else:

@@ -52,7 +52,9 @@ def read(path: Path, options: Options) -> list[Tracks]:
     found = read_wide(path)
     settle(found, path, options, shares=False)
     frames = by_number(found.frames, found.notes)
-    return people_tracks(frames, options, source=str(path), names=found.names, fps=found.fps, notes=found.notes)
+    return people_tracks(
+        frames, options, source=str(path), names=found.names, fps=found.fps, notes=found.notes, measured=True
+    )
 
 
 def read_motion(path: Path, options: MotionOptions) -> Motion:
