@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import inspect
 import itertools
@@ -254,7 +253,7 @@ class _Work:
         """Whether all results are there; of everybody's the last written says so."""
         if not self.everybody:
             return all(path.exists() for path in clip.outputs(self.suffixes))
-        with contextlib.suppress(OSError, ValueError):
+        with suppress(OSError, ValueError):
             count = int(_people_list(clip).read_text("utf-8"))
             paths = (path for i in range(count) for path in _person(clip, i).outputs(self.suffixes))
             return all(path.exists() for path in paths)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kcs_torch.cli.options import AsJson
+from kcs_torch.cli.options import AsJson, Rate
 from kcs_torch.cli.report import answer, print_json, progress
 from kcs_torch.errors import counted
 
@@ -53,9 +53,7 @@ def angles(
             help="For 3D motion: a built-in skeleton or a YAML or JSON file; joints are matched by name.",
         ),
     ] = None,
-    fps: Annotated[
-        float | None, typer.Option(metavar="NUMBER", help="Frames a second; those of IN if not given.")
-    ] = None,
+    fps: Rate = None,
     mirror: Annotated[bool, typer.Option("--mirror", help="Take the mirror image in depth of a result.")] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from kcs_torch.cli.options import ImageSize, Threshold, Trust, check_outputs, image_size, person_number
+from kcs_torch.cli.options import ImageSize, Rate, Threshold, Trust, check_outputs, image_size, person_number
 from kcs_torch.cli.outputs import Scale, Units, Up, parse_scale, write_files
 from kcs_torch.cli.report import answer, progress
 
@@ -60,9 +60,7 @@ def convert(
             help="A built-in skeleton or a YAML or JSON file; joints are matched by name. For .amc: its .asf file.",
         ),
     ] = None,
-    fps: Annotated[
-        float | None, typer.Option(metavar="NUMBER", help="Frames a second; those of IN if not given.")
-    ] = None,
+    fps: Rate = None,
     person: Annotated[
         str | None,
         typer.Option(metavar="NUMBER", help="Which person's 2D tracks, counted from 0; the most visible if not given."),

@@ -15,6 +15,7 @@ __all__ = [
     "AsJson",
     "FormatName",
     "ImageSize",
+    "Rate",
     "Threshold",
     "TracksPath",
     "Trust",
@@ -34,6 +35,7 @@ TracksPath = Annotated[
         show_default=False,
     ),
 ]
+Rate = Annotated[float | None, typer.Option(metavar="NUMBER", help="Frames a second; those of IN if not given.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 FormatName = Annotated[
     str | None,

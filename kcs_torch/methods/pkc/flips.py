@@ -145,12 +145,12 @@ def _strides(objective: Objective, own: Tensor, member: Tensor, runs: Runs, best
     """The best solution with other runs of its legs, by which feet stand; the best few, not refined yet."""
     bend = _bends(own, member.mT) / (2 * objective.weights.acceleration**2)
     depth = objective.joints(own * strides(objective, own, member, runs.places, bend))
-    change = (depth - best.depth).square().mean((1, 2)).sqrt()
-    depth = depth[change > SLIGHT]
-    lengths = best.lengths.expand(len(depth), -1)
-    energy = objective(depth, lengths) + objective.contact(depth) if len(depth) else best.energy[:0]
-    order = energy.argsort()[:STRIDES]
-    return Hypotheses(depth[order], lengths[order], energy[order])
+    made = Hypotheses(depth, best.lengths.expand(len(depth), -1), best.energy.expand(len(depth)))
+    made = made[_change(made, best) > SLIGHT]
+    if not len(made.depth):
+        return made
+    energy = objective(made.depth, made.lengths) + objective.contact(made.depth)
+    return replace(made, energy=energy)[energy.argsort()[:STRIDES]]
 
 
 def turned(depth: Tensor, runs: Runs, member: Tensor) -> Tensor:
