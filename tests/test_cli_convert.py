@@ -280,6 +280,12 @@ def test_score_of_a_part_of_a_clip(scored):
         assert message in done.stderr
 
 
+def test_score_of_a_result_takes_its_format(scored):
+    words = ["score", scored / "pred.npz", scored / "truth.trc", "--align", "root", "--scale", "height=1.6m"]
+    assert run(*words, "--pred-format", "npz", "--truth-format", "trc").output == run(*words).output
+    assert "expected" in run(*words, "--truth-format", "bvh", code=2).stderr
+
+
 def test_score_takes_the_unit_of_files_without_one(scored):
     save(load_motion(scored / "truth.trc"), scored / "truth.npz")
     motion = Motion.of(load_reconstruction(scored / "pred.npz"))

@@ -11,7 +11,15 @@ from typer.testing import CliRunner
 import kcs_torch as kt
 from kcs_torch.cli import app
 from kcs_torch.errors import FormatError, KcsError
-from kcs_torch.io import READERS, detect_format, detect_motion_format, load_motion, load_people, load_tracks
+from kcs_torch.io import (
+    READERS,
+    detect_format,
+    detect_motion_format,
+    load_any,
+    load_motion,
+    load_people,
+    load_tracks,
+)
 from kcs_torch.io.registry import Probe
 from kcs_torch.skeleton import SKELETONS
 
@@ -183,6 +191,8 @@ def test_mediapipes_tables_stay_mediapipes(tmp_path):
         with pytest.raises(FormatError, match="got something else"):
             detect_motion_format(table)
     assert load_motion(deep, format="csv").skeleton.name == "mediapipe33"
+    assert isinstance(load_any(deep, format="csv"), kt.Motion)
+    assert isinstance(load_any(path, format="csv"), kt.Tracks)
 
 
 # ---------------------------------------------------------------------- motion
@@ -227,6 +237,26 @@ def test_the_command_line_scores_and_converts_it(tmp_path, result):
         done = CliRunner().invoke(app, [str(word) for word in words])
         assert done.exit_code == 0, done.output
         assert words[0] != "score" or "100.0 %" in done.output
+
+
+def test_commands_take_the_format_of_motion_that_looks_like_mediapipes(tmp_path):
+    names = SKELETONS["mediapipe33"].joints[:33]
+    path = write_table(tmp_path / "walk.csv", names, ("x", "y", "z"))
+
+    def told(*words, code=0):
+        done = CliRunner().invoke(app, [str(word) for word in words])
+        assert done.exit_code == code, done.output
+        return done.output
+
+    assert "got 2D tracks: lift them first (kcs-torch lift), or say with --format" in told("angles", path, code=2)
+    assert "left_knee" in told("angles", path, "--format", "csv")
+    assert "expected 3D motion" in told("score", path, path, "--pred-format", "csv", code=2)
+    assert "MPJPE" in told("score", path, path, "--pred-format", "csv", "--truth-format", "csv")
+    told("convert", path, tmp_path / "walk.npz", "--format", "csv")
+    assert load_motion(tmp_path / "walk.npz").skeleton.name == "mediapipe33"
+    for words in (["angles", path, "--format"], ["score", path, path, "--pred-format"]):
+        assert "unknown format 'cvs'" in told(*words, "cvs", code=2)
+    assert "got 2D tracks" in told("angles", write_table(tmp_path / "a.csv", names), "--format", "csv", code=2)
 
 
 def test_markers_of_any_names(tmp_path):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kcs_torch.cli.options import AsJson, Rate
+from kcs_torch.cli.options import AsJson, InFormat, Rate
 from kcs_torch.cli.report import answer, print_json, progress
 from kcs_torch.errors import counted
 
@@ -45,6 +45,7 @@ def angles(
             show_default=False,
         ),
     ] = [],  # noqa: B006 (typer reads it and never changes it)
+    format: InFormat = None,
     skeleton: Annotated[
         str | None,
         typer.Option(
@@ -66,10 +67,11 @@ def angles(
         if output is not None:
             _check(output, source)
         with progress(f"reading {source}"):
-            data = load_any(source, skeleton=skeleton, fps=fps)
+            data = load_any(source, format=format, skeleton=skeleton, fps=fps)
         if isinstance(data, Tracks):
             raise FormatError(
-                f"{source}: expected a result or 3D motion, got 2D tracks: lift them first (kcs-torch lift)"
+                f"{source}: expected a result or 3D motion, got 2D tracks: lift them first (kcs-torch lift), "
+                "or say with --format as which 3D motion to read it"
             )
         if mirror:
             if not isinstance(data, Reconstruction):

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from kcs_torch.cli.options import ImageSize, Rate, Threshold, Trust, check_outputs, image_size, person_number
+from kcs_torch.cli.options import ImageSize, InFormat, Rate, Threshold, Trust, check_outputs, image_size, person_number
 from kcs_torch.cli.outputs import Scale, Units, Up, parse_scale, write_files
 from kcs_torch.cli.report import answer, progress
 
@@ -48,10 +48,7 @@ def convert(
     units: Units = None,
     from_up: FromUp = None,
     from_units: FromUnits = None,
-    format: Annotated[
-        str | None,
-        typer.Option("--format", metavar="NAME", help="Format of IN; recognised by its content if not given."),
-    ] = None,
+    format: InFormat = None,
     skeleton: Annotated[
         str | None,
         typer.Option(

@@ -15,6 +15,7 @@ __all__ = [
     "AsJson",
     "FormatName",
     "ImageSize",
+    "InFormat",
     "Rate",
     "Threshold",
     "TracksPath",
@@ -40,6 +41,9 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to standard out
 FormatName = Annotated[
     str | None,
     typer.Option("--format", metavar="NAME", help="Format of TRACKS; recognised by its content if not given."),
+]
+InFormat = Annotated[
+    str | None, typer.Option("--format", metavar="NAME", help="Format of IN; recognised by its content if not given.")
 ]
 UseSkeleton = Annotated[
     str | None,

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["score"]
 
 _Up = "The axis that points up in {}, if the file does not say so: y, z, x, -y (the camera's axes) or -z."
+_Format = "Format of {}; recognised by its content if not given."
 _Frames = "Take frames A to B of {}, counted from 0, without B (A: and :B extend to the ends)."
 
 
@@ -55,6 +56,12 @@ def score(
         float | None, typer.Option(metavar="NUMBER", help="Distance for PCK, in TRUTH's unit; 150 mm if not given.")
     ] = None,
     scale: Scale = None,
+    pred_format: Annotated[
+        str | None, typer.Option("--pred-format", metavar="NAME", help=_Format.format("PRED"))
+    ] = None,
+    truth_format: Annotated[
+        str | None, typer.Option("--truth-format", metavar="NAME", help=_Format.format("TRUTH"))
+    ] = None,
     pred_up: Annotated[str | None, typer.Option(metavar="AXIS", help=_Up.format("PRED"))] = None,
     truth_up: Annotated[str | None, typer.Option(metavar="AXIS", help=_Up.format("TRUTH"))] = None,
     pred_frames: Annotated[str | None, typer.Option(metavar="A:B", help=_Frames.format("PRED"))] = None,
@@ -70,9 +77,10 @@ def score(
         from kcs_torch.metrics import compare
 
         with progress(f"reading {pred}"):
-            ours = _cut(_motion(pred, parse_scale(scale), up=pred_up, fps=pred_fps), pred_frames, "--pred-frames")
+            ours = _motion(pred, parse_scale(scale), format=pred_format, up=pred_up, fps=pred_fps)
+            ours = _cut(ours, pred_frames, "--pred-frames")
         with progress(f"reading {truth}"):
-            theirs = load_motion(truth, up=truth_up, fps=truth_fps, units=from_units)
+            theirs = load_motion(truth, format=truth_format, up=truth_up, fps=truth_fps, units=from_units)
             theirs = _cut(theirs, truth_frames, "--truth-frames")
         found = compare(ours, theirs, align=align or None, root=root, mirror=mirror, within=within)
         if as_json:
@@ -81,17 +89,17 @@ def score(
             typer.echo(_spoken(found, pred, truth))
 
 
-def _motion(path: str, size: dict[str, Any] | None, **options: Any) -> Motion:
+def _motion(path: str, size: dict[str, Any] | None, *, format: str | None, **options: Any) -> Motion:
     """A result, which knows its own bones' lengths, or any other motion; in its true size."""
     from kcs_torch.io import load_any, load_motion
     from kcs_torch.io.anything import kind_of
     from kcs_torch.types import Motion, Reconstruction
 
-    if kind_of(path) == "result":
-        data = load_any(path, **options)
+    if kind_of(path, format) == "result":
+        data = load_any(path, format=format, **options)
         assert isinstance(data, Reconstruction)
         return Motion.of(sized(data, size))
-    return sized(load_motion(path, **options), size)
+    return sized(load_motion(path, format=format, **options), size)
 
 
 def _cut(motion: Motion, frames: str | None, option: str) -> Motion:

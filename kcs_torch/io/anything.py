@@ -85,7 +85,9 @@ def kind_of(path: str | Path, format: str | None = None) -> str:
             return "result"
         return "motion" if "points3d" in keys and "points2d" not in keys else "tracks"
     if format is not None:
-        return "tracks" if format in READERS else "motion"
+        motion = MOTION_READERS.get(format)
+        holds = motion and (motion.holds or motion.recognises)
+        return "motion" if holds and (format not in READERS or holds(probe)) else "tracks"
     if any(reader.recognises(probe) for reader in MOTION_READERS.values()):
         return "motion"
     try:

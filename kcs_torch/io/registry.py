@@ -167,12 +167,15 @@ class MotionReader:
         summary: one line for lists of formats.
         recognises: tells from a :class:`Probe`, by content and cheaply, whether the path is of this format.
         read: reads the motion of one body.
+        holds: tells whether a path that is said to be of this format holds motion, where its name is also one of 2D
+            tracks; as it recognises if None.
     """
 
     name: str
     summary: str
     recognises: Callable[[Probe], bool]
     read: Callable[[Path, MotionOptions], Motion]
+    holds: Callable[[Probe], bool] | None = None
 
 
 @dataclass(frozen=True)

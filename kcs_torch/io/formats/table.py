@@ -41,6 +41,12 @@ def recognises_motion(probe: Probe) -> bool:
     return table_kind(probe.head) == "motion"
 
 
+def holds_motion(probe: Probe) -> bool:
+    """Tell by a column z of every joint, where the joints may have MediaPipe's names."""
+    joints = _header(probe).joints
+    return bool(joints) and all("z" in columns for columns in joints.values())
+
+
 def read(path: Path, options: Options) -> list[Tracks]:
     """Read everybody: a row is a person where a column ``person`` or ``id`` says who."""
     probe = _file(path)
@@ -78,17 +84,20 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         found.notes.append(
             f"{up} is taken to point up, as the head is above the feet there: give up=... if it does not"
         )
-    header = Header.of(probe.head.split(b"\n", 1)[0].decode("utf-8", "replace"))
     return build_motion(
         torch.from_numpy(points),
         options,
         source=str(path),
         names=names,
         fps=found.fps,
-        units=header.unit,
+        units=_header(probe).unit,
         up=up,
         notes=found.notes,
     )
+
+
+def _header(probe: Probe) -> Header:
+    return Header.of(probe.head.split(b"\n", 1)[0].decode("utf-8", "replace"))
 
 
 def _file(path: Path) -> Probe:
@@ -114,6 +123,10 @@ READERS = (
 )
 MOTION_READERS = (
     MotionReader(
-        "csv", "plain CSV: columns name_x, name_y, name_z, as results are written", recognises_motion, read_motion
+        "csv",
+        "plain CSV: columns name_x, name_y, name_z, as results are written",
+        recognises_motion,
+        read_motion,
+        holds_motion,
     ),
 )
