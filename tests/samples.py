@@ -298,6 +298,16 @@ def write_table(path: Path, names=("LHip", "LKnee", "tail"), what=("x", "y", "sc
     return path
 
 
+def write_long(path: Path, names=("LHip", "LKnee", "tail"), what=("x", "y", "score"), num_frames=4) -> Path:
+    """The same with a row a frame and joint."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["frame", "time", "joint", *what])
+        for t, pose in enumerate(person(num_frames, len(names))):
+            writer.writerows([t, t / 25, name, *at[: len(what)]] for name, at in zip(names, pose.tolist(), strict=True))
+    return path
+
+
 def write_npy(path: Path, array) -> Path:
     np.save(path, array)
     return path
@@ -342,7 +352,7 @@ SAMPLES: dict[str, tuple[Callable[[Path], Path], ...]] = {
         lambda folder: write_npy(folder / "landmarks.npy", person(4, 33)[:, :, [0, 1, 2, 2]] / 1000),
         lambda folder: write_npy(folder / "hand.npy", person(4, 21)[:, :, :2]),
     ),
-    "csv": (lambda folder: write_table(folder / "table.csv"),),
+    "csv": (lambda folder: write_table(folder / "table.csv"), lambda folder: write_long(folder / "long.csv")),
     "videopose3d": (lambda folder: write_videopose3d(folder / "data_2d_h36m_gt.npz"),),
     "deeplabcut": (
         _deeplabcut(write_deeplabcut_csv, "mouse.csv"),
@@ -439,7 +449,11 @@ MOTION_SAMPLES: dict[str, tuple[Callable[[Path], Path], ...]] = {
     "bvh": (_saved("a.bvh"),),
     "c3d": (_saved("a.c3d"),),
     "amc": (write_amc,),
-    "csv": (_saved("walk.csv"), lambda folder: write_table(folder / "rig.csv", what=("x", "y", "z"))),
+    "csv": (
+        _saved("walk.csv"),
+        lambda folder: write_table(folder / "rig.csv", what=("x", "y", "z")),
+        lambda folder: write_long(folder / "long.csv", what=("x", "y", "z")),
+    ),
     "deeplabcut": (
         lambda folder: write_deeplabcut_csv(folder / "rat.csv", *_animal_3d()),
         lambda folder: write_deeplabcut_table(folder / "rat.h5", *_animal_3d()),

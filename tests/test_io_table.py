@@ -159,7 +159,7 @@ HEAD = "frame,a_x,a_y,b_x,b_y"
     ("rows", "message"),
     [
         ((HEAD,), "in at least one of 0 frames"),
-        (("frame,joint,x,y", "0,a,1,2"), "expected columns such as nose_x, nose_y, got 'frame,joint,x,y'"),
+        (("frame,joint,px,py", "0,a,1,2"), "expected columns such as nose_x, nose_y, got 'frame,joint,px,py'"),
         ((f"{HEAD},a_x", "0,1,2,3,4,5"), "expected every column once, got 'a_x' again"),
         ((HEAD, "0,1,2,3,4", "1,2,3"), "row 3: expected 5 values as in the first row, got 3"),
         ((HEAD, "0,1,x,3,4"), "row 2: 'a_y': expected a number, got 'x'"),
@@ -178,8 +178,9 @@ def test_tables_that_are_none_are_told(tmp_path, rows, message):
 
 
 def test_what_no_reader_takes_says_what_a_table_needs(tmp_path):
-    path = lines(tmp_path / "long.csv", "frame,joint,x,y", "0,a,1,2")
-    with pytest.raises(FormatError, match="got a table that begins with 'frame,joint,x,y': csv has .*name_x, name_y"):
+    path = lines(tmp_path / "long.csv", "frame,joint,px,py", "0,a,1,2")
+    expected = "got a table that begins with 'frame,joint,px,py': csv has .*name_x, name_y.* frame, joint, x, y"
+    with pytest.raises(FormatError, match=expected):
         load_tracks(path)
 
 

@@ -12,12 +12,13 @@ import numpy as np
 from kcs_torch.errors import FormatError
 from kcs_torch.io.jsonfile import FARTHEST
 from kcs_torch.io.landmarks import BODIES, VISIBILITIES, Landmarks
+from kcs_torch.io.long import LongHeader
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import read_error
 from kcs_torch.io.wide import Columns, Header, read_wide
 from kcs_torch.skeleton import SKELETONS, guess_skeleton
 
-__all__ = ["frame_shape", "npy_shape", "read_csv", "read_npy", "table_kind"]
+__all__ = ["first_line", "frame_shape", "npy_shape", "read_csv", "read_npy", "table_kind"]
 
 _LIMIT = 2**30  # bytes of a file
 
@@ -29,7 +30,7 @@ def _named() -> frozenset[str]:
 
 
 def table_kind(head: bytes) -> str:
-    """Tell what a table with columns for each joint holds, by the beginning of its text.
+    """Tell what a table with columns or rows for each joint holds, by the beginning of its text.
 
     Returns:
         "landmarks" of MediaPipe, by their names or numbers; "motion", where every joint has z; other "tracks"; empty
@@ -37,11 +38,15 @@ def table_kind(head: bytes) -> str:
 
     >>> table_kind(b"frame,a_x,a_y,b_x,b_y"), table_kind(b"a_x,a_y,a_z,b_x,b_y,b_z"), table_kind(b"track,frame,a_x,a_y")
     ('tracks', 'motion', '')
+    >>> table_kind(b"frame,joint,x,y"), table_kind(b"frame,joint,x,y,z")
+    ('tracks', 'motion')
     """
-    header = Header.of(head.split(b"\n", 1)[0].decode("utf-8", "replace"))
+    line = first_line(head)
+    header = Header.of(line)
     lower = [cell.lower() for cell in header.cells[:2]]
     if len(header.joints) < 2 or lower == ["track", "frame_idx"]:  # SLEAP's
-        return ""
+        long = LongHeader.of(line)
+        return "" if long is None else "motion" if long.deep else "tracks"
     deep = all("z" in columns for columns in header.joints.values())
     if deep and lower == ["frame", "time [s]"] and not any(set(c) & set(VISIBILITIES) for c in header.joints.values()):
         return "motion"  # as results are written, of whatever joints
@@ -49,6 +54,11 @@ def table_kind(head: bytes) -> str:
     if len(_named() & names) >= 10 or (len(names) >= 21 and all(name.isdecimal() for name in names)):
         return "landmarks"
     return "motion" if deep else "tracks"
+
+
+def first_line(head: bytes) -> str:
+    """The first line of a text, by its first bytes."""
+    return head.split(b"\n", 1)[0].decode("utf-8", "replace")
 
 
 def _plain(name: str) -> str:

@@ -62,6 +62,8 @@ class Landmarks:
     seen: set[str] = field(default_factory=set)  # what the joints' third number is called
     size: tuple[float, float] | None = None
     fps: float | None = None
+    unit: str = ""  # of the coordinates, where the file tells
+    who: str = ""  # the column of a table that tells people apart
     notes: list[str] = field(default_factory=list)
 
 

@@ -197,7 +197,7 @@ def _describe(probe: Probe) -> str:
         return "a single array: write it with numpy.savez(path, points2d=array), (frames, joints, 2), NaN where unseen"
     if probe.suffix in (".csv", ".tsv"):
         line = probe.head.split(b"\n", 1)[0].decode("utf-8", "replace").strip("\ufeff\r")
-        wanted = "csv has a row a frame and columns name_x, name_y of each joint"
+        wanted = "csv has a row a frame and columns name_x, name_y of each joint, or columns frame, joint, x, y"
         return f"a table that begins with {brief(line)!r}: {wanted}"
     start = probe.head[:16]
     return f"a file that begins with {start.decode()!r}" if start.isascii() else f"a file that begins with {start!r}"

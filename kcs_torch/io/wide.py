@@ -24,10 +24,11 @@ from kcs_torch.io.landmarks import CONFIDENCES, FRAME_KEYS, VISIBILITIES, Landma
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import brief, read_error
 
-__all__ = ["Columns", "Header", "read_wide"]
+__all__ = ["WHO", "Columns", "Header", "Row", "as_value", "delimiter", "place_rows", "plain_name", "read_wide"]
 
 _LIMIT = 2**30  # bytes of a file
-_WHO = ("person", "person_id", "pose", "track_id", "hand", "handedness", "id")
+WHO = ("person", "person_id", "pose", "track_id", "hand", "handedness", "id")
+"""What a column is called that tells people apart."""
 _WHAT = "|".join(("x", "y", "z", *CONFIDENCES, *VISIBILITIES))
 _NAMED = re.compile(rf"(?P<name>.+)[_. ](?P<what>{_WHAT})(?: \[(?P<unit>[^\]]*)\])?\Z", re.IGNORECASE)
 _NUMBERED = re.compile(rf"(?P<what>{_WHAT})_?(?P<name>[0-9]{{1,4}})\Z", re.IGNORECASE)
@@ -65,10 +66,10 @@ class Header:
         """
         try:
             line = line.strip("\ufeff\r\n")
-            cells = [] if "\0" in line else next(csv.reader([line], delimiter=_delimiter(line)), [])
+            cells = [] if "\0" in line else next(csv.reader([line], delimiter=delimiter(line)), [])
         except csv.Error:
             return cls([], {})
-        cells = [re.sub(r"\A'(?=[=+\-@\t\r])", "", cell.strip()) for cell in cells]  # as formulas are kept off
+        cells = [plain_name(cell) for cell in cells]
         joints: Columns = {}
         unit = twice = ""
         for i, cell in enumerate(cells):
@@ -87,12 +88,12 @@ class Header:
     @cached_property
     def number(self) -> int | None:
         """The column of frame numbers."""
-        return self._column(FRAME_KEYS)
+        return self.column(FRAME_KEYS)
 
     @cached_property
     def who(self) -> int | None:
         """The column that tells people apart."""
-        return self._column(_WHO)
+        return self.column(WHO)
 
     @cached_property
     def time(self) -> tuple[int, str] | None:
@@ -100,7 +101,8 @@ class Header:
         matches = ((i, _TIME.match(cell.lower())) for i, cell in enumerate(self.cells))
         return next(((i, match["unit"]) for i, match in matches if match), None)
 
-    def _column(self, names: Sequence[str]) -> int | None:
+    def column(self, names: Sequence[str]) -> int | None:
+        """The column that has the first of these names that is there."""
         lower = [cell.lower() for cell in self.cells]
         return next((lower.index(name) for name in names if name in lower), None)
 
@@ -115,7 +117,17 @@ class Header:
         return list(out)
 
 
-class _Row(NamedTuple):
+class Row(NamedTuple):
+    """One person in one frame, as a table has it.
+
+    Attributes:
+        where: file and row, for messages.
+        number: of the frame; None where the table has none.
+        time: of the frame; NaN where the table has none.
+        who: it is.
+        joints: (N, 3).
+    """
+
     where: str
     number: int | None
     time: float
@@ -123,7 +135,13 @@ class _Row(NamedTuple):
     joints: NDArray[np.float64]
 
 
-def _delimiter(line: str) -> str:
+def plain_name(cell: str) -> str:
+    """A name without what keeps spreadsheets from taking it for a formula."""
+    return re.sub(r"\A'(?=[=+\-@\t\r])", "", cell.strip())
+
+
+def delimiter(line: str) -> str:
+    """What stands between the cells of a line."""
     return max(",;\t", key=line.count)
 
 
@@ -146,7 +164,7 @@ def read_wide(
         FormatError: it cannot be read, or is no such table; the message names row and column.
     """
     out = Landmarks()
-    rows: list[_Row] = []
+    rows: list[Row] = []
     try:
         if path.stat().st_size > _LIMIT:
             raise FormatError(f"{path}: expected 1 GiB of CSV at most: split the file")
@@ -167,13 +185,30 @@ def read_wide(
                 out.notes.append(f"{said} left out: {brief(', '.join(header.halves))}")
             if left := header.left_out(i for triple in columns for i in triple):
                 out.notes.append(f"columns of joints that are left out: {brief(', '.join(left))}")
-            for i, cells in enumerate(csv.reader(file, delimiter=_delimiter(line)), 2):
+            for i, cells in enumerate(csv.reader(file, delimiter=delimiter(line)), 2):
                 if any(cells):
                     rows.append(_row(cells, header, columns, blank, f"{path}: row {i}"))
     except OSError as error:
         raise read_error(path, error) from None
     except csv.Error as error:
         raise FormatError(f"{path}: expected a CSV table, got text that does not parse: {error}") from None
+    out.unit = header.unit
+    out.who = "" if header.who is None else header.cells[header.who]
+    place_rows(rows, header.time[1] if header.time else "", out)
+    return out
+
+
+def place_rows(rows: Sequence[Row], unit: str, out: Landmarks) -> None:
+    """Put the people of a table into their frames, and find the rate.
+
+    Args:
+        rows: each person in each frame.
+        unit: of times, where the table tells.
+        out: gets frames, times and rate, and what was assumed.
+
+    Raises:
+        FormatError: a person is in a frame twice.
+    """
     numbers = _numbers(rows, out.notes)
     if len(rows) > 1 and len({row.who for row in rows}) == len(set(numbers)) == len(rows):  # of rows, not of people
         rows = [row._replace(who=0) for row in rows]
@@ -184,8 +219,7 @@ def read_wide(
             raise FormatError(f"{row.where}: expected every frame once, or a column 'person', got {again} again")
         people.append(Sighting(row.joints, row.who))
         out.times.setdefault(number, row.time)
-    out.fps = _rate(out.times, header.time[1] if header.time else "", out.notes)
-    return out
+    out.fps = _rate(out.times, unit, out.notes)
 
 
 def _triples(marks: Sequence[dict[str, int]], out: Landmarks, depth: bool) -> list[tuple[int, int, int]]:
@@ -204,10 +238,10 @@ def _row(
     columns: Sequence[tuple[int, int, int]],
     blank: tuple[float, float, float],
     where: str,
-) -> _Row:
+) -> Row:
     if len(cells) != len(header.cells):
         raise FormatError(f"{where}: expected {len(header.cells)} values as in the first row, got {len(cells)}")
-    value = lambda i, most=FARTHEST: _value(cells[i], where, header.cells[i], most)  # noqa: E731
+    value = lambda i, most=FARTHEST: as_value(cells[i], where, header.cells[i], most)  # noqa: E731
     number, time = None, math.nan
     if header.number is not None:
         number = as_frame_number(value(header.number))
@@ -218,10 +252,11 @@ def _row(
         time = value(header.time[0], 1e30)
     who = 0 if header.who is None else as_track_id(cells[header.who])  # one row a frame is one body
     joints = [[value(c) if c >= 0 else none for c, none in zip(three, blank, strict=True)] for three in columns]
-    return _Row(where, number, time, who, np.array(joints))
+    return Row(where, number, time, who, np.array(joints))
 
 
-def _value(cell: str, where: str, name: str, most: float) -> float:
+def as_value(cell: str, where: str, name: str, most: float) -> float:
+    """The number in a cell, NaN if it is empty; an error with file, row and column if it is none, or too large."""
     try:
         value = float(cell) if cell.strip() else math.nan
     except ValueError:
@@ -232,7 +267,7 @@ def _value(cell: str, where: str, name: str, most: float) -> float:
     return value
 
 
-def _numbers(rows: Sequence[_Row], notes: list[str]) -> list[int]:
+def _numbers(rows: Sequence[Row], notes: list[str]) -> list[int]:
     """The frame of each row: as it says, else by its time, else in their order."""
     if rows and rows[0].number is not None:
         return [row.number or 0 for row in rows]

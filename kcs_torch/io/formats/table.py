@@ -2,7 +2,8 @@
 
 A third column of a joint may hold its confidence (``_confidence``, ``_conf``, ``_score``, ``_likelihood``,
 ``_probability``, ``_prob``, ``_c``), which is its weight, or MediaPipe's visibility. With ``name_z`` of every joint the
-table is 3D motion: so the results that we write as CSV are read back.
+table is 3D motion: so the results that we write as CSV are read back. Long tables have a row a frame and joint, and
+columns ``frame, joint, x, y``.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from kcs_torch.anatomy import places_of_known
 from kcs_torch.errors import FormatError
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.frames import by_number
-from kcs_torch.io.landmark_tables import table_kind
+from kcs_torch.io.landmark_tables import first_line, table_kind
 from kcs_torch.io.landmarks import settle
+from kcs_torch.io.long import LongHeader, read_long
 from kcs_torch.io.people import people_tracks
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader
 from kcs_torch.io.wide import Header, read_wide
@@ -43,7 +45,9 @@ def recognises_motion(probe: Probe) -> bool:
 
 def holds_motion(probe: Probe) -> bool:
     """Tell by a column z of every joint, where the joints may have MediaPipe's names."""
-    joints = _header(probe).joints
+    if _is_long(probe):
+        return recognises_motion(probe)
+    joints = Header.of(first_line(probe.head)).joints
     return bool(joints) and all("z" in columns for columns in joints.values())
 
 
@@ -55,7 +59,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
             f"{path}: expected 2D tracks, got 3D motion (x, y, z): kcs_torch.load_motion reads it; "
             "leave the columns z out if these are tracks with depths"
         )
-    found = read_wide(path)
+    found = read_long(path) if _is_long(probe) else read_wide(path)
     settle(found, path, options, shares=False)
     frames = by_number(found.frames, found.notes)
     return people_tracks(
@@ -66,9 +70,13 @@ def read(path: Path, options: Options) -> list[Tracks]:
 def read_motion(path: Path, options: MotionOptions) -> Motion:
     """Read the motion of the one body in the table."""
     probe = _file(path)
-    found = read_wide(path, depth=True)
-    if len({s.track for frame in found.frames.values() for s in frame}) > 1:
-        raise FormatError(f"{path}: expected the motion of one body, got several: write a table for each")
+    found = (read_long if _is_long(probe) else read_wide)(path, depth=True)
+    several = len({s.track for frame in found.frames.values() for s in frame})
+    if several > 1:
+        raise FormatError(
+            f"{path}: expected the motion of one body, got several: column '{found.who}' has {several}: "
+            "write a table for each"
+        )
     names = found.names or ()
     frames = by_number(found.frames, found.notes)
     if len(frames) * len(names) * 3 > _MOST:
@@ -90,14 +98,16 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         source=str(path),
         names=names,
         fps=found.fps,
-        units=_header(probe).unit,
+        units=found.unit,
         up=up,
         notes=found.notes,
     )
 
 
-def _header(probe: Probe) -> Header:
-    return Header.of(probe.head.split(b"\n", 1)[0].decode("utf-8", "replace"))
+def _is_long(probe: Probe) -> bool:
+    """Whether a row is a joint: a table that may be read as both has a row a frame."""
+    line = first_line(probe.head)
+    return LongHeader.of(line) is not None and len(Header.of(line).joints) < 2
 
 
 def _file(path: Path) -> Probe:
@@ -119,12 +129,18 @@ def _up(names: tuple[str, ...], points: NDArray[np.float64]) -> str | None:
 
 
 READERS = (
-    Reader("csv", "plain CSV: a row a frame, columns name_x, name_y, name_confidence of each joint", recognises, read),
+    Reader(
+        "csv",
+        "plain CSV: a row a frame, columns name_x, name_y, name_confidence of each joint; or a row a frame and joint, "
+        "columns frame, joint, x, y, confidence",
+        recognises,
+        read,
+    ),
 )
 MOTION_READERS = (
     MotionReader(
         "csv",
-        "plain CSV: columns name_x, name_y, name_z, as results are written",
+        "plain CSV: columns name_x, name_y, name_z, as results are written; or frame, joint, x, y, z",
         recognises_motion,
         read_motion,
         holds_motion,
