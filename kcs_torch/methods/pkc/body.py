@@ -178,8 +178,14 @@ class Body:
 
     def turns(self, found: Hypotheses) -> bool:
         """Whether the trunk of the best hypothesis turns far enough to tell depth better than the template does."""
-        least = LITTLE if self.is_odd(found) else TURNING
-        return float(viewpoint_turn(self.frames(found.depth[0])[:, :2])) >= least
+        return self._turn(found) >= (LITTLE if self.is_odd(found) else TURNING)
+
+    def sways(self, found: Hypotheses) -> bool:
+        """Whether it turns far enough for aligned bones to tell depth as well as the template does, not better."""
+        return LITTLE <= self._turn(found) < TURNING
+
+    def _turn(self, found: Hypotheses) -> float:
+        return float(viewpoint_turn(self.frames(found.depth[0])[:, :2]))
 
     def is_odd(self, found: Hypotheses) -> bool:
         """Whether the best hypothesis is a body of other proportions than the template's."""

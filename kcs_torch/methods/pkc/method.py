@@ -52,6 +52,10 @@ ROUNDING = 8.0
 AGAIN = 3
 """How often depths of the moving viewpoint are refined anew until they settle."""
 
+FILLS = 3
+"""How often gaps are filled in space: the first time the search is made once more; then, where the viewpoint sways,
+what was found is polished further."""
+
 TELLING = 2.0
 """Degrees of the turn of known cameras from which on they tell the sign of depth."""
 
@@ -205,12 +209,19 @@ class PKC(Method):
         if polished:
             rival = (yield from turned(body.is_odd(found))) if compared and body.turns(found) else None
             found = yield from body.polished(found, self.steps, rival)
-            if found.image is not None and self.rounds and self.viewpoint != "moving":  # joints unseen here and there
+            fills = FILLS if self.rounds and self.viewpoint != "moving" else 0
+            for again in range(fills):  # joints unseen here and there
+                if found.image is None or (again and not body.sways(found)):
+                    break
                 before, body = body.factor, body.filled(found.image)
-                found = yield from body.search(self.rounds, self.steps)
-                if cameras is not None and _turns(cameras):
-                    found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
-                rival = None if rival is None else rival * (body.factor / before)
+                ratio = body.factor / before
+                rival = None if rival is None or again else rival * ratio
+                if again:
+                    found = replace(found, depth=found.depth * ratio, lengths=found.lengths * ratio)
+                else:
+                    found = yield from body.search(self.rounds, self.steps)
+                    if cameras is not None and _turns(cameras):
+                        found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
                 found = yield from body.polished(found, self.steps, rival)
         made = self._from_hypotheses(found, body, cameras, notes, detections)
         return _with_size(made, size) if changing else made
