@@ -298,6 +298,12 @@ def write_table(path: Path, names=("LHip", "LKnee", "tail"), what=("x", "y", "sc
     return path
 
 
+def lines(path: Path, *rows: str) -> Path:
+    """A file of these lines."""
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return path
+
+
 def write_long(path: Path, names=("LHip", "LKnee", "tail"), what=("x", "y", "score"), num_frames=4) -> Path:
     """The same with a row a frame and joint."""
     with path.open("w", newline="", encoding="utf-8") as file:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from samples import SAMPLES, person, write_long, write_table
+from samples import SAMPLES, lines, person, write_long, write_table
 from typer.testing import CliRunner
 
 import kcs_torch as kt
@@ -24,11 +24,6 @@ from kcs_torch.io.registry import Probe
 from kcs_torch.skeleton import SKELETONS
 
 LEG = ("hip", "left knee", "Foot")
-
-
-def lines(path, *rows):
-    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
-    return path
 
 
 def same(a, b):

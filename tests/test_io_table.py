@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from samples import person, write_mediapipe_csv, write_table
+from samples import lines, person, write_mediapipe_csv, write_table
 from typer.testing import CliRunner
 
 import kcs_torch as kt
@@ -24,11 +24,6 @@ from kcs_torch.io.registry import Probe
 from kcs_torch.skeleton import SKELETONS
 
 LEG = ("hip", "left knee", "Foot")
-
-
-def lines(path, *rows):
-    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
-    return path
 
 
 def notes_of(path, **options):

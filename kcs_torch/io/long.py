@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from array import array
 from collections.abc import Iterable
@@ -16,12 +15,10 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_text
 from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
-from kcs_torch.io.registry import read_error
-from kcs_torch.io.wide import WHO, Header, Row, as_value, delimiter, place_rows, plain_name
+from kcs_torch.io.wide import WHO, Header, Row, as_value, opened, place_rows, plain_name
 
 __all__ = ["LongHeader", "read_long"]
 
-_LIMIT = 2**30  # bytes of a file
 _MOST = 5e7  # coordinates of all frames, those between the file's included
 _MOST_JOINTS = 2000
 _FARTHEST_TIME = 1e30
@@ -99,22 +96,14 @@ def read_long(path: Path, *, depth: bool = False) -> Landmarks:
     Raises:
         FormatError: it cannot be read, or is no such table; the message names row and column.
     """
-    try:
-        if path.stat().st_size > _LIMIT:
-            raise FormatError(f"{path}: expected 1 GiB of CSV at most: split the file")
-        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            line = file.readline(2**20)
-            header = LongHeader.of(line)
-            if header is None:
-                raise FormatError(f"{path}: expected columns such as frame, joint, x, y, got '{as_text(line.strip())}'")
-            if header.twice:
-                raise FormatError(f"{path}: expected every column once, got '{header.twice}' again")
-            table = _Table(path, header, depth)
-            table.take(csv.reader(file, delimiter=delimiter(line)))
-    except OSError as error:
-        raise read_error(path, error) from None
-    except csv.Error as error:
-        raise FormatError(f"{path}: expected a CSV table, got text that does not parse: {error}") from None
+    with opened(path) as (line, cells_of):
+        header = LongHeader.of(line)
+        if header is None:
+            raise FormatError(f"{path}: expected columns such as frame, joint, x, y, got '{as_text(line.strip())}'")
+        if header.twice:
+            raise FormatError(f"{path}: expected every column once, got '{header.twice}' again")
+        table = _Table(path, header, depth)
+        table.take(cells_of)
     return table.landmarks()
 
 

@@ -7,7 +7,8 @@ import itertools
 import math
 import re
 import statistics
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +25,7 @@ from kcs_torch.io.landmarks import CONFIDENCES, FRAME_KEYS, VISIBILITIES, Landma
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import brief, read_error
 
-__all__ = ["WHO", "Columns", "Header", "Row", "as_value", "delimiter", "place_rows", "plain_name", "read_wide"]
+__all__ = ["WHO", "Columns", "Header", "Row", "as_value", "opened", "place_rows", "plain_name", "read_wide"]
 
 _LIMIT = 2**30  # bytes of a file
 WHO = ("person", "person_id", "pose", "track_id", "hand", "handedness", "id")
@@ -66,7 +67,7 @@ class Header:
         """
         try:
             line = line.strip("\ufeff\r\n")
-            cells = [] if "\0" in line else next(csv.reader([line], delimiter=delimiter(line)), [])
+            cells = [] if "\0" in line else next(csv.reader([line], delimiter=_delimiter(line)), [])
         except csv.Error:
             return cls([], {})
         cells = [plain_name(cell) for cell in cells]
@@ -140,9 +141,28 @@ def plain_name(cell: str) -> str:
     return re.sub(r"\A'(?=[=+\-@\t\r])", "", cell.strip())
 
 
-def delimiter(line: str) -> str:
+def _delimiter(line: str) -> str:
     """What stands between the cells of a line."""
     return max(",;\t", key=line.count)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[tuple[str, Iterator[list[str]]]]:
+    """Open a table: its first line, and the cells of each row that follows.
+
+    Raises:
+        FormatError: it is too large, or cannot be read.
+    """
+    try:
+        if path.stat().st_size > _LIMIT:
+            raise FormatError(f"{path}: expected 1 GiB of CSV at most: split the file")
+        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+            line = file.readline(2**20)
+            yield line, csv.reader(file, delimiter=_delimiter(line))
+    except OSError as error:
+        raise read_error(path, error) from None
+    except csv.Error as error:
+        raise FormatError(f"{path}: expected a CSV table, got text that does not parse: {error}") from None
 
 
 def read_wide(
@@ -165,33 +185,25 @@ def read_wide(
     """
     out = Landmarks()
     rows: list[Row] = []
-    try:
-        if path.stat().st_size > _LIMIT:
-            raise FormatError(f"{path}: expected 1 GiB of CSV at most: split the file")
-        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            line = file.readline(2**20)
-            header = Header.of(line)
-            if not header.joints:
-                raise FormatError(f"{path}: expected columns such as nose_x, nose_y, got '{as_text(line.strip())}'")
-            if header.twice:
-                raise FormatError(f"{path}: expected every column once, got '{as_text(header.twice)}' again")
-            joints = header.joints
-            out.names, marks = arrange(joints, out.notes) if arrange else (tuple(joints), list(joints.values()))
-            columns = _triples(marks, out, depth)
-            blank = (math.nan, math.nan, 1.0 if out.seen & set(CONFIDENCES) else math.nan)  # where there is no column
-            if header.halves:
-                one = len(header.halves) == 1
-                said = "a column is missing, so its joint is" if one else "columns are missing, so their joints are"
-                out.notes.append(f"{said} left out: {brief(', '.join(header.halves))}")
-            if left := header.left_out(i for triple in columns for i in triple):
-                out.notes.append(f"columns of joints that are left out: {brief(', '.join(left))}")
-            for i, cells in enumerate(csv.reader(file, delimiter=delimiter(line)), 2):
-                if any(cells):
-                    rows.append(_row(cells, header, columns, blank, f"{path}: row {i}"))
-    except OSError as error:
-        raise read_error(path, error) from None
-    except csv.Error as error:
-        raise FormatError(f"{path}: expected a CSV table, got text that does not parse: {error}") from None
+    with opened(path) as (line, cells_of):
+        header = Header.of(line)
+        if not header.joints:
+            raise FormatError(f"{path}: expected columns such as nose_x, nose_y, got '{as_text(line.strip())}'")
+        if header.twice:
+            raise FormatError(f"{path}: expected every column once, got '{as_text(header.twice)}' again")
+        joints = header.joints
+        out.names, marks = arrange(joints, out.notes) if arrange else (tuple(joints), list(joints.values()))
+        columns = _triples(marks, out, depth)
+        blank = (math.nan, math.nan, 1.0 if out.seen & set(CONFIDENCES) else math.nan)  # where there is no column
+        if header.halves:
+            one = len(header.halves) == 1
+            said = "a column is missing, so its joint is" if one else "columns are missing, so their joints are"
+            out.notes.append(f"{said} left out: {brief(', '.join(header.halves))}")
+        if left := header.left_out(i for triple in columns for i in triple):
+            out.notes.append(f"columns of joints that are left out: {brief(', '.join(left))}")
+        for i, cells in enumerate(cells_of, 2):
+            if any(cells):
+                rows.append(_row(cells, header, columns, blank, f"{path}: row {i}"))
     out.unit = header.unit
     out.who = "" if header.who is None else header.cells[header.who]
     place_rows(rows, header.time[1] if header.time else "", out)
