@@ -209,22 +209,29 @@ class PKC(Method):
         if polished:
             rival = (yield from turned(body.is_odd(found))) if compared and body.turns(found) else None
             found = yield from body.polished(found, self.steps, rival)
-            fills = FILLS if self.rounds and self.viewpoint != "moving" else 0
-            for again in range(fills):  # joints unseen here and there
-                if found.image is None or (again and not body.sways(found)):
-                    break
-                before, body = body.factor, body.filled(found.image)
-                ratio = body.factor / before
-                rival = None if rival is None or again else rival * ratio
-                if again:
-                    found = replace(found, depth=found.depth * ratio, lengths=found.lengths * ratio)
-                else:
-                    found = yield from body.search(self.rounds, self.steps)
-                    if cameras is not None and _turns(cameras):
-                        found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
-                found = yield from body.polished(found, self.steps, rival)
+            if self.rounds and self.viewpoint != "moving":
+                found, body = yield from self._filled(found, body, cameras, rival)
         made = self._from_hypotheses(found, body, cameras, notes, detections)
         return _with_size(made, size) if changing else made
+
+    def _filled(
+        self, found: Hypotheses, body: Body, cameras: Tensor | None, rival: Tensor | None
+    ) -> Search[Any, Any, tuple[Hypotheses, Body]]:
+        """Hypotheses anew where joints are unseen here and there, and the body with its gaps filled in space."""
+        for again in range(FILLS):
+            if found.image is None or (again and not body.sways(found)):
+                break
+            before, body = body.factor, body.filled(found.image)
+            ratio = body.factor / before
+            if again:
+                found, rival = replace(found, depth=found.depth * ratio, lengths=found.lengths * ratio), None
+            else:
+                rival = None if rival is None else rival * ratio
+                found = yield from body.search(self.rounds, self.steps)
+                if cameras is not None and _turns(cameras):
+                    found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
+            found = yield from body.polished(found, self.steps, rival)
+        return found, body
 
     def _resized(self, found: Hypotheses, body: Body, other: Body, size: Size) -> Search[Any, Any, Hypotheses | None]:
         """Hypotheses of a body whose size in the image changes, if they explain the tracks better; else None.
