@@ -141,6 +141,8 @@ def test_scale_is_read():
         (["r.npz", "o.trc", "--scale", "tail=1m"], "unknown size 'tail'"),
         (["r.npz", "o.trc", "--units", "ell"], "unknown unit of length 'ell'"),
         (["r.npz", "o.trc", "--skeleton", "coco17"], "a result has its own skeleton"),
+        (["r.npz", "o.trc", "--fps", "0"], r"fps \(--fps\): expected a positive number, got 0"),
+        (["r.npz", "o.npz", "--fps", "nan"], r"fps \(--fps\): expected a positive number, got nan"),
         (["r.npz", "r.npz"], "expected another file"),
         (["r.npz", "o.xyz"], "one of the suffixes"),
         (["r.npz", "missing/../o.trc", "--format", "nothing"], "unknown format 'nothing'"),

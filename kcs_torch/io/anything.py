@@ -10,7 +10,7 @@ from kcs_torch.io.archive import Archive
 from kcs_torch.io.formats.npz import load_reconstruction
 from kcs_torch.io.load import READERS, detect_format, load_tracks
 from kcs_torch.io.motion import MOTION_READERS, load_motion
-from kcs_torch.io.registry import Probe
+from kcs_torch.io.registry import Probe, check_fps
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion, Reconstruction, Tracks
 
@@ -50,6 +50,7 @@ def load_any(
     """
     if format is not None and format not in READERS and format not in MOTION_READERS:
         raise unknown("format", format, {*READERS, *MOTION_READERS})
+    check_fps(fps)
     kind = kind_of(path, format)
     if kind == "result":
         if skeleton is not None or up is not None or units is not None or person is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from kcs_torch.errors import FormatError, OptionError, unknown
 from kcs_torch.io.hdf5 import read_tree
 from kcs_torch.io.motion import MOTION_READERS
-from kcs_torch.io.registry import Options, Probe, Reader, brief, discover
+from kcs_torch.io.registry import Options, Probe, Reader, brief, check_fps, discover
 from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
@@ -72,8 +72,7 @@ def load_people(
         raise unknown("format", format, READERS)
     if not 0 <= threshold <= 1:
         raise OptionError(f"threshold: expected a number from 0 to 1, got {threshold}")
-    if fps is not None and not 0 < fps < float("inf"):
-        raise OptionError(f"fps (--fps): expected a positive number, got {fps}; leave it out where it is not known")
+    check_fps(fps)
     if image_size is not None:
         image_size = _size(image_size)
     probe = Probe(path)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from kcs_torch.errors import FormatError, OptionError, unknown
-from kcs_torch.io.registry import MotionOptions, Probe, discover_motion
+from kcs_torch.errors import FormatError, unknown
+from kcs_torch.io.registry import MotionOptions, Probe, check_fps, discover_motion
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion
 from kcs_torch.types.axes import AXES
@@ -67,8 +67,7 @@ def load_motion(
         raise unknown("format", format, MOTION_READERS)
     if up is not None and up not in AXES:
         raise unknown("axis for up", up, AXES)
-    if fps is not None and not 0 < fps < float("inf"):
-        raise OptionError(f"fps (--fps): expected a positive number, got {fps}; leave it out where it is not known")
+    check_fps(fps)
     probe = Probe(path)
     reader = MOTION_READERS[detect_motion_format(path) if format is None else format]
     return reader.read(probe.path, MotionOptions(skeleton, fps, up, units))

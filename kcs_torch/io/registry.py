@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from kcs_torch.errors import FormatError, KcsError
+from kcs_torch.errors import FormatError, KcsError, OptionError
 from kcs_torch.io.folders import natural_key, sibling_files
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
@@ -34,6 +34,7 @@ __all__ = [
     "Saving",
     "Writer",
     "brief",
+    "check_fps",
     "discover",
     "discover_motion",
     "need",
@@ -278,6 +279,16 @@ def brief(value: Any, most: int = 100) -> str:
     """A text from a file as a message shows it, cut where it is long."""
     text = str(value)
     return text if len(text) <= most else f"{text[: most - 4]} ..."
+
+
+def check_fps(fps: float | None) -> None:
+    """Make sure that the rate that a caller gives is one.
+
+    Raises:
+        OptionError: it is not positive and finite.
+    """
+    if fps is not None and not 0 < fps < float("inf"):
+        raise OptionError(f"fps (--fps): expected a positive number, got {fps}; leave it out where it is not known")
 
 
 def read_error(path: Any, error: BaseException) -> FormatError:
