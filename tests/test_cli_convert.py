@@ -245,6 +245,9 @@ def test_score_tells_of_a_mirror(scored):
     save(load_reconstruction(scored / "pred.npz").mirrored(), scored / "flip.npz")
     told = run("score", scored / "flip.npz", scored / "truth.trc", "--align", "rigid").output
     assert "note: the mirror image in depth is closer (rigid" in told
+    assert told.endswith("score it with --mirror\n")
+    wrong = run("score", scored / "pred.npz", scored / "truth.trc", "--align", "rigid", "--mirror").output
+    assert wrong.endswith("score it without --mirror\n")
     plain = run("score", scored / "pred.npz", scored / "truth.trc", "--align", "rigid").output
     mirrored = run("score", scored / "flip.npz", scored / "truth.trc", "--align", "rigid", "--mirror").output
     pick = lambda text: next(line for line in text.splitlines() if line.startswith("rigid"))  # noqa: E731

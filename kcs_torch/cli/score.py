@@ -86,7 +86,7 @@ def score(
         if as_json:
             print_json(dataclasses.asdict(found))
         else:
-            typer.echo(_spoken(found, pred, truth))
+            typer.echo(_spoken(found, pred, truth, mirror))
 
 
 def _motion(path: str, size: dict[str, Any] | None, *, format: str | None, **options: Any) -> Motion:
@@ -113,7 +113,7 @@ def _cut(motion: Motion, frames: str | None, option: str) -> Motion:
     return motion.frames(start, stop)
 
 
-def _spoken(found: Comparison, pred: str, truth: str) -> str:
+def _spoken(found: Comparison, pred: str, truth: str, mirror: bool) -> str:
     from kcs_torch.metrics import ALIGNMENTS
     from kcs_torch.types.variation import BoneVariation
 
@@ -141,5 +141,6 @@ def _spoken(found: Comparison, pred: str, truth: str) -> str:
     better = [how for how in found.mpjpe if found.mirrored[how] < 0.98 * found.mpjpe[how]]
     if better:
         shown = ", ".join(f"{how} {found.mirrored[how]:.4g}{unit}" for how in better)
-        lines.append(f"note: the mirror image in depth is closer ({shown}): score it with --mirror")
+        how = "without" if mirror else "with"
+        lines.append(f"note: the mirror image in depth is closer ({shown}): score it {how} --mirror")
     return "\n".join([*lines, *(f"note: {one_line(note)}" for note in found.notes)])
