@@ -256,6 +256,9 @@ def test_score_tells_of_a_mirror(scored):
 
 def test_score_says_what_does_not_fit(scored):
     save(walking_motion(15), scored / "short.trc")
+    save(walk_result(20), scored / "other.npz")
+    done = run("score", scored / "other.npz", scored / "truth.trc", "--pred-frames", "30:", code=2)
+    assert f"expected frames within 0:20 of {scored / 'other.npz'}, got 30:" in done.stderr  # not of its tracks
     for words, message in [
         (["short.trc"], "expected as many frames in both"),
         (["truth.trc", "--align", "best"], "unknown alignment 'best'"),

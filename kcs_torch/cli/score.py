@@ -98,7 +98,7 @@ def _motion(path: str, size: dict[str, Any] | None, *, format: str | None, **opt
     if kind_of(path, format) == "result":
         data = load_any(path, format=format, **options)
         assert isinstance(data, Reconstruction)
-        return Motion.of(sized(data, size))
+        return dataclasses.replace(Motion.of(sized(data, size)), source=path)
     return sized(load_motion(path, format=format, **options), size)
 
 
