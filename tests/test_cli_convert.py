@@ -263,6 +263,8 @@ def test_score_says_what_does_not_fit(scored):
         (["short.trc"], "expected as many frames in both"),
         (["truth.trc", "--align", "best"], "unknown alignment 'best'"),
         (["truth.trc", "--root", "Tail"], "unknown root"),
+        (["truth.trc", "--within", "-150"], "within (--within): expected a positive distance, got -150"),
+        (["truth.trc", "--within", "nan"], "within (--within): expected a positive distance, got nan"),
         (["absent.trc"], "no such file"),
         (["truth.trc", "--truth-up", "w"], "axis for up"),
     ]:

@@ -84,8 +84,10 @@ def compare(
     Raises:
         SkeletonError: fewer than 3 joints have counterparts, or there is no such root.
         ShapeError: the frames do not fit each other.
-        OptionError: an alignment is unknown or needs a size that is not known.
+        OptionError: an alignment is unknown or needs a size that is not known, or ``within`` is not positive.
     """
+    if within is not None and not 0 < within < math.inf:
+        raise OptionError(f"within (--within): expected a positive distance, got {within}")
     notes: list[str] = []
     names = _joints(pred, truth, notes)
     pred, truth = _same_frames(pred, truth, notes)
