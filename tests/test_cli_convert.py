@@ -151,6 +151,7 @@ def test_scale_is_read():
         (["t.npz", "o.npz", "--from-up", "z"], "are for 3D motion, got 2D tracks"),
         (["t.npz", "o.npz", "--up", "z"], "are for 3D motion|--up"),
         (["m.trc", "o.json"], "got motion, which goes to"),
+        (["m.trc", "o.csv", "--person", "1"], "a person is chosen of 2D tracks, got 3D motion"),
         (["text", "o.npz"], "expected tracks or motion in one of"),
         (["absent", "o.npz"], "no such file"),
     ],

@@ -58,6 +58,8 @@ def load_any(
         result = load_reconstruction(path)
         return result if fps is None else replace(result, tracks=replace(result.tracks, fps=fps))
     if kind == "motion":
+        if person is not None:
+            raise OptionError(f"{path}: a person is chosen of 2D tracks, got 3D motion of one body")
         return load_motion(path, format=format, skeleton=skeleton, fps=fps, up=up, units=units)
     if up is not None or units is not None:
         raise OptionError(f"{path}: an axis that points up and units of length are for 3D motion, got 2D tracks")
