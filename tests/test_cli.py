@@ -170,6 +170,16 @@ def test_lift_everybody_says_whom_a_warning_is_about(openpose_folder, tmp_path):
     assert all(note.removeprefix("  note: ") in one["notes"] for note in notes[:1] for one in told)
 
 
+def test_lift_everybody_who_is_in_these_frames(openpose_folder, tmp_path):
+    words = ("lift", openpose_folder, "-o", tmp_path / "a.npz", "--person", "all", "-m", "sfam", "--frames")
+    done = run(*words, "0:1")  # the second person comes in frame 1
+    assert f"note: {openpose_folder}, person 1: not seen in frames 0:1: left out\n" in done.stderr
+    assert {p.name for p in tmp_path.iterdir()} == {"a_0.npz"}
+    assert "left out" not in run(*words, "0:2").stderr
+    assert {p.name for p in tmp_path.iterdir()} == {"a_0.npz", "a_1.npz"}
+    assert "expected frames within 0:40" in run(*words, "90:", code=2).stderr
+
+
 def test_lift_one_of_several(openpose_folder, tmp_path):
     done = run("lift", openpose_folder, "-o", tmp_path / "a.npz", "--person", 1, "-m", "sfam", "--json")
     (person,) = json.loads(done.stdout)["people"]

@@ -4,12 +4,25 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kcs_torch.cli.cleaning import SEEN, Fill, Frames, Gate, Resample, Smooth, Smooth3D, Unswap, cleaner, finisher
+from kcs_torch.cli.cleaning import (
+    SEEN,
+    Fill,
+    Frames,
+    Gate,
+    Resample,
+    Smooth,
+    Smooth3D,
+    Unswap,
+    cleaner,
+    finisher,
+    frame_range,
+)
 from kcs_torch.cli.detect import DetectorName, Models, What, numbered, people_of
 from kcs_torch.cli.options import (
     AsJson,
@@ -181,6 +194,8 @@ def lift(
                     image_size=image_size(size),
                     trust=trust,
                 )
+            if person == "all" and frames is not None:
+                people = _in_sight(people, frames)
         use_one_thread()
         reports: list[dict[str, Any]] = []
         results, every = [], Written()
@@ -289,6 +304,18 @@ def _people(tracks: str, person: str | None, **options: Any) -> list[tuple[int, 
         return list(enumerate(load_people(tracks, **options)))
     number = person_number(person)
     return [(number or 0, load_tracks(tracks, person=number, **options))]
+
+
+def _in_sight(people: list[tuple[int, Tracks]], frames: str) -> list[tuple[int, Tracks]]:
+    """Those who are seen in a part of the clip, and a word on the others; all where nobody is, as that is an error."""
+    start, stop = frame_range(frames)
+    there = [bool(one.seen[start:stop].any()) for _, one in people]
+    if not any(there):
+        return people
+    for (_, one), seen in zip(people, there, strict=True):
+        if not seen:
+            typer.echo(f"note: {one_line(one.source)}: not seen in frames {frames}: left out", err=True)
+    return list(compress(people, there))
 
 
 def _is_video(path: str) -> bool:
