@@ -89,6 +89,16 @@ def test_other_spellings_of_the_table(tmp_path):
         assert torch.equal(load_tracks(tmp_path / "b.csv").points, expected)
 
 
+@pytest.mark.parametrize("missing", ["", "nan", "NaN", "NA", "N/A", "null", "None"])
+def test_missing_numbers_are_unseen_joints_however_they_are_written(tmp_path, missing):
+    wide = lines(tmp_path / "w.csv", "frame,a_x,a_y,b_x,b_y", "0,1,2,3,4", f"1,{missing},{missing},5,6")
+    long = lines(tmp_path / "l.csv", "frame,joint,x,y", "0,a,1,2", "0,b,3,4", f"1,a,{missing},{missing}", "1,b,5,6")
+    for path in (wide, long):
+        tracks = load_tracks(path)
+        assert tracks.seen.tolist() == [[True, True], [False, True]]
+        assert tracks.points[tracks.seen].tolist() == [[1, 2], [3, 4], [5, 6]]
+
+
 def test_a_row_a_frame_is_one_body_however_it_jumps(tmp_path):
     rows = [",".join(map(str, row)) for row in np.random.default_rng(0).uniform(1, 500, (30, 6)).tolist()]
     (tracks,) = load_people(lines(tmp_path / "a.csv", "a_x,a_y,b_x,b_y,c_x,c_y", *rows))

@@ -25,7 +25,7 @@ from kcs_torch.io.landmarks import CONFIDENCES, FRAME_KEYS, VISIBILITIES, Landma
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import brief, read_error
 
-__all__ = ["WHO", "Columns", "Header", "Row", "as_value", "opened", "place_rows", "plain_name", "read_wide"]
+__all__ = ["EMPTY", "WHO", "Columns", "Header", "Row", "as_value", "opened", "place_rows", "plain_name", "read_wide"]
 
 _LIMIT = 2**30  # bytes of a file
 WHO = ("person", "person_id", "pose", "track_id", "hand", "handedness", "id")
@@ -35,6 +35,9 @@ _NAMED = re.compile(rf"(?P<name>.+)[_. ](?P<what>{_WHAT})(?: \[(?P<unit>[^\]]*)\
 _NUMBERED = re.compile(rf"(?P<what>{_WHAT})_?(?P<name>[0-9]{{1,4}})\Z", re.IGNORECASE)
 _TIME = re.compile(r"(?:time|timestamp|t)[ _]?[\[(]?(?P<unit>|s|sec|seconds|ms|msec|milliseconds)[\])]?\Z")
 _UNEVEN = 0.3  # of a frame, by which times may be off
+
+EMPTY = ("", "NA", "N/A", "null", "None")
+"""What cells hold where a number is missing, beside NaN: R writes NA."""
 
 Columns = dict[str, dict[str, int]]
 """Of each joint the columns by what they hold: x, y, z, confidence, ..."""
@@ -268,9 +271,9 @@ def _row(
 
 
 def as_value(cell: str, where: str, name: str, most: float) -> float:
-    """The number in a cell, NaN if it is empty; an error with file, row and column if it is none, or too large."""
+    """The number in a cell, NaN if it is missing; an error with file, row and column if it is none, or too large."""
     try:
-        value = float(cell) if cell.strip() else math.nan
+        value = math.nan if cell.strip() in EMPTY else float(cell)
     except ValueError:
         hint = " (write decimals with a point)" if re.fullmatch(r"-?[0-9]+,[0-9]+", cell) else ""
         raise FormatError(f"{where}: '{name}': expected a number, got '{as_text(cell)}'{hint}") from None
