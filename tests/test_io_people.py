@@ -74,6 +74,18 @@ def scored(confidence):
     return [[Sighting(f)] for f in frames]
 
 
+@pytest.mark.parametrize("ids", [None, [[1] * 6, [2] * 6]], ids=["places", "ids"])
+def test_shares_of_the_image_are_told_and_scaled_by_its_size(ids):
+    shares = [[s._replace(joints=s.joints / [1920, 1080, 1]) for s in frame] for frame in two(ids=ids)]
+    told = "coordinates are taken as they are: if they are shares of the image, give image_size=(width, height)"
+    assert any(note.startswith(told) for note in read(shares)[0].notes)
+    a, b = read(shares, Options(image_size=(1920, 1080)))
+    assert np.allclose(numbers(a), A) and np.allclose(numbers(b), B)
+    for pixels in (read(two()), read(two(), Options(image_size=(1920, 1080)))):
+        assert np.allclose(numbers(pixels[0]), A)
+        assert not any("shares" in n for n in pixels[0].notes)
+
+
 def test_confidences_a_little_above_one_are_one():
     (tracks,) = read(scored(1.02))
     assert (tracks.weights == 1).all()

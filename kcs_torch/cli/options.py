@@ -61,7 +61,7 @@ ImageSize = Annotated[
     typer.Option(
         "--image-size",
         metavar="WIDTHxHEIGHT",
-        help="Size of the video in pixels, for formats with coordinates relative to it (MediaPipe).",
+        help="Size of the video in pixels, where coordinates are relative to it (as MediaPipe's are).",
     ),
 ]
 Trust = Annotated[

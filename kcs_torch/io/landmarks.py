@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_joints, as_text, entries, read_json
-from kcs_torch.io.people import Sighting
+from kcs_torch.io.people import SHARES, SIZE_HINT, Sighting
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import SKELETONS
 
@@ -49,7 +49,6 @@ _HIDDEN = 0.3
 """Weight of a joint of visibility 0 within the image, beside 1 of one that is seen for certain. Against other
 detections of the same video, joints of visibility below 0.5 are off by 2.5 times as much as the others, not by more:
 a guess that is worth something."""
-_SHARES = 2.0  # coordinates whose median is above this are no shares of the image
 
 
 @dataclass
@@ -220,15 +219,16 @@ def settle(found: Landmarks, path: Path, options: Options, *, shares: bool) -> N
     places = np.abs(everything[:, :2][np.isfinite(everything[:, :2])])
     if not len(places):
         raise FormatError(f"{path}: expected landmarks in at least one of {len(found.frames)} frames, got none")
-    small = bool(np.median(places) <= _SHARES)
+    small = bool(np.median(places) <= SHARES)
     size = options.image_size or found.size
-    hint = "image_size=(width, height) (kcs-torch: --image-size 1920x1080)"
     if shares and not small:
         found.notes.append("the coordinates are pixels already")
     elif shares and size is None:
-        raise FormatError(f"{path}: its coordinates are shares of the image, which needs the video's size: give {hint}")
+        raise FormatError(
+            f"{path}: its coordinates are shares of the image, which needs the video's size: give {SIZE_HINT}"
+        )
     elif small and size is None:
-        found.notes.append(f"coordinates are taken as they are: if they are shares of the image, give {hint}")
+        found.notes.append(f"coordinates are taken as they are: if they are shares of the image, give {SIZE_HINT}")
     small = small and size is not None
     visible = not found.seen & set(CONFIDENCES)
     seen = everything[:, 2]

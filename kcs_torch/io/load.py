@@ -55,7 +55,7 @@ def load_people(
             matched by name where the file names them, by their order otherwise.
         fps: frames per second; as the file says if None.
         threshold: a joint with less confidence counts as unseen, 0..1.
-        image_size: width and height of the video in pixels, for formats whose coordinates are shares of it (MediaPipe).
+        image_size: width and height of the video in pixels, where coordinates are shares of it (as MediaPipe's are).
         trust: read a file although it is a pickle (VideoPose3D's .npz): arrays and numbers are taken from it, no code.
 
     Returns:
@@ -101,7 +101,7 @@ def load_tracks(
         skeleton: a :class:`Skeleton`, a built-in name or a YAML/JSON file; as the file says if None.
         fps: frames per second; as the file says if None.
         threshold: a joint with less confidence counts as unseen, 0..1.
-        image_size: width and height of the video in pixels, for formats whose coordinates are shares of it (MediaPipe).
+        image_size: width and height of the video in pixels, where coordinates are shares of it (as MediaPipe's are).
         trust: read a file although it is a pickle (VideoPose3D's .npz): arrays and numbers are taken from it, no code.
 
     Returns:

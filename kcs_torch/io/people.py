@@ -18,7 +18,11 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 from kcs_torch.types.intake import at_the_corner
 
-__all__ = ["Sighting", "people_tracks"]
+__all__ = ["SHARES", "SIZE_HINT", "Sighting", "people_tracks"]
+
+SHARES = 2.0
+"""Coordinates whose median is above this are no shares of the image."""
+SIZE_HINT = "image_size=(width, height) (kcs-torch: --image-size 1920x1080)"
 
 _OVERSHOOT = 1.5  # some networks' confidences pass 1 a little; above this they are on another scale
 _WELL_SEEN = 0.95  # quantile of the confidences that counts as certain where they are on another scale
@@ -75,6 +79,8 @@ def people_tracks(
     """
     remarks = list(notes)
     frames = _without_zeros(_checked(frames, source, measured, remarks), measured, remarks)
+    if not measured:
+        frames = _in_pixels(frames, options.image_size, remarks)
     everybody = [s.joints for frame in frames for s in frame]
     if not everybody:
         raise FormatError(f"{source}: expected people in at least one of {len(frames)} frames, got none")
@@ -133,6 +139,19 @@ def _without_zeros(frames: Sequence[Sequence[Sighting]], measured: bool, notes: 
             notes.append(f"{halves} {are} taken as unseen")
     kept = iter(np.where(zero[..., None], 0.0, joints))
     return [[s._replace(joints=next(kept)) for s in frame] for frame in frames]
+
+
+def _in_pixels(
+    frames: Sequence[Sequence[Sighting]], size: tuple[int, int] | None, notes: list[str]
+) -> Sequence[Sequence[Sighting]]:
+    """With shares of an image of this size as pixels: some detectors write shares if they are told to."""
+    seen = [s.joints[s.joints[:, 2] > 0, :2] for frame in frames for s in frame]
+    if not seen or np.median(np.abs(np.concatenate(seen))) > SHARES:
+        return frames
+    if size is None:
+        notes.append(f"coordinates are taken as they are: if they are shares of the image, give {SIZE_HINT}")
+        return frames
+    return [[s._replace(joints=s.joints * [*size, 1]) for s in frame] for frame in frames]
 
 
 def _checked(

@@ -53,7 +53,7 @@ class Options:
         skeleton: a :class:`Skeleton`, a built-in name, or a YAML/JSON file; None: as the file says.
         fps: frames per second; None: as the file says.
         threshold: a joint with less confidence counts as unseen.
-        image_size: width and height of the video in pixels, for formats whose coordinates are shares of it.
+        image_size: width and height of the video in pixels, where coordinates are shares of it.
         trust: whether a pickle (VideoPose3D's .npz) may be read; arrays, lists and numbers are taken from it, no code.
     """
 
