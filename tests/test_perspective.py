@@ -16,7 +16,7 @@ from kcs_torch.cli import app
 from kcs_torch.io import load_reconstruction
 from kcs_torch.methods import perspective, scene
 from kcs_torch.methods.root import ABSENT, FOUND
-from kcs_torch.types import Intrinsics
+from kcs_torch.types import Intrinsics, Motion
 
 LENS = (1500.0, 1480.0, 960.0, 540.0)
 
@@ -211,6 +211,11 @@ def test_the_mirror_image_has_the_same_image():
     torch.testing.assert_close(project(other.in_space()), project(result.in_space()))
     torch.testing.assert_close(other.points[..., 2], -result.points[..., 2])
     torch.testing.assert_close(other.mirrored().points, result.points)
+    measured = Motion.of(other).variation
+    assert other.diagnostics.variation.bone == measured.bone
+    assert other.diagnostics.variation[:2] == pytest.approx(measured[:2])
+    bones = kt.functional.bone_lengths(other.points, other.skeleton.bone_index())
+    torch.testing.assert_close(other.lengths, bones.median(0).values)
 
 
 def test_any_skeleton():

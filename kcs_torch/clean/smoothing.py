@@ -12,9 +12,7 @@ import torch
 from kcs_torch.clean.common import Array, frame_rate, number, rebuilt, runs, share
 from kcs_torch.clean.filters import FILTERS, Filter
 from kcs_torch.errors import unknown
-from kcs_torch.functional import bone_lengths
 from kcs_torch.types import Reconstruction, Tracks
-from kcs_torch.types.variation import bone_variation
 
 __all__ = ["SMOOTHERS", "smooth"]
 
@@ -101,18 +99,8 @@ def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: flo
         return replace(result, diagnostics=replace(result.diagnostics, notes=(*result.diagnostics.notes, note)))
     moved = _smooth_runs(points, np.ones(points.shape[:2]), chosen)[0]
     change = math.sqrt(float(np.square(moved - points).sum(-1).mean()))
-    new = torch.from_numpy(moved).to(result.points)
-    bones = bone_lengths(new, result.skeleton.bone_index(device=new.device))
-    variation = bone_variation(bones, result.skeleton)
     told = f"joints moved by {change:.2g} {result.units} (root mean square); the reprojection is that before"
     note = f"smooth 3D ({words}): {told}"
-    facts = replace(
-        result.diagnostics,
-        bone_variation=variation.median,
-        largest_bone_variation=variation.largest,
-        loosest_bone=variation.bone,
-        notes=(*result.diagnostics.notes, note),
-    )
 
     def path(values: torch.Tensor | None) -> torch.Tensor | None:
         if values is None:
@@ -122,13 +110,12 @@ def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: flo
 
     return replace(
         result,
-        points=new,
-        lengths=bones.median(0).values,
-        diagnostics=facts,
+        points=torch.from_numpy(moved).to(result.points),
+        diagnostics=replace(result.diagnostics, notes=(*result.diagnostics.notes, note)),
         root_depth=path(result.root_depth),
         distance=path(result.distance),
         alternatives=tuple(_smooth_result(other, method, cutoff, rate) for other in result.alternatives),
-    )
+    ).remeasured()
 
 
 def _size(points: Array) -> float:

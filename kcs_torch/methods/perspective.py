@@ -12,7 +12,6 @@ from torch import Tensor
 
 from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
-from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.detector import detected
 from kcs_torch.methods.finish import WHY_LOOSE, what_is_wrong
@@ -23,7 +22,6 @@ from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.view import View, lens_note, slow_part, zoomed
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
-from kcs_torch.types.variation import bone_variation
 
 __all__ = ["WIDE", "feet_on_ground", "reconstruct_perspective"]
 
@@ -268,8 +266,6 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
     n = body.num_observed  # virtual joints are means of others in the image, too, which no projection is
     off = (intrinsics.project(points) - tracks.points)[:, :n][tracks.seen[:, :n]]
     points = torch.cat([points[..., :2], points[..., 2:] - root[:, None, None]], -1)
-    bones = bone_lengths(points, body.bone_index(device=points.device))
-    variation = bone_variation(bones, body)
     told = () if k else found.notes  # the best solution's; "the mirror image", say, is true of none any more
     stale = (WHY_LOOSE, "weak perspective", "did not settle")  # true of what was lifted, perhaps not of this
     notes = [n for n in told if not n.startswith((ABSENT, FOUND)) and not any(part in n for part in stale)]
@@ -283,9 +279,6 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
         notes.append(lens_note(intrinsics, tracks.units))
     facts = replace(
         before,
-        bone_variation=variation.median,
-        largest_bone_variation=variation.largest,
-        loosest_bone=variation.bone,
         reprojection_rms=float(off.square().sum(-1).mean().sqrt()),
         notes=tuple(notes),
         doubt="" if k else found.lifted[0].diagnostics.doubt,
@@ -295,7 +288,6 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
         points=points,
         cameras=(found.view.look.mT @ complete_rotation(lifted.cameras))[:, :2],
         scales=intrinsics.focal / root,
-        lengths=bones.median(0).values,
         tracks=tracks,
         diagnostics=facts,
         uncertainty=None if lifted.uncertainty is None else lifted.uncertainty * factor,
@@ -303,4 +295,4 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
         root_depth=root - root[0],
         distance=root,
         alternatives=(),
-    )
+    ).remeasured()

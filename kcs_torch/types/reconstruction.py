@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
+from kcs_torch.functional import bone_lengths
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.angles import JointAngles, Joints, angles_of
 from kcs_torch.types.size import size_factor
 from kcs_torch.types.tracks import Tracks
-from kcs_torch.types.variation import BoneVariation
+from kcs_torch.types.variation import BoneVariation, bone_variation
 
 __all__ = ["Diagnostics", "Reconstruction"]
 
@@ -130,9 +131,21 @@ class Reconstruction:
             near = torch.maximum(far - depth, 0.01 * far)
             points = self.points * (near / (far + depth))[..., None]
             points = torch.cat([points[..., :2], (near - far)[..., None]], -1)
-            return replace(self, points=points, cameras=self.cameras * flip)
+            return replace(self, points=points, cameras=self.cameras * flip).remeasured()
         root = None if self.root_depth is None else -self.root_depth
         return replace(self, points=self.points * flip, cameras=self.cameras * flip, root_depth=root)
+
+    def remeasured(self) -> Reconstruction:
+        """The same with the lengths that the bones of its points have, and with how much these vary."""
+        bones = bone_lengths(self.points, self.skeleton.bone_index(device=self.points.device))
+        variation = bone_variation(bones, self.skeleton)
+        facts = replace(
+            self.diagnostics,
+            bone_variation=variation.median,
+            largest_bone_variation=variation.largest,
+            loosest_bone=variation.bone,
+        )
+        return replace(self, lengths=bones.median(0).values, diagnostics=facts)
 
     def solution(self, number: int) -> Reconstruction:
         """The solution of this number, with all the others as its alternatives: 1 is this one, 2 the first alternative.
