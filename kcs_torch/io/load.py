@@ -192,6 +192,10 @@ def _describe(probe: Probe) -> str:
         return f"an HDF5 file with other content ({', '.join(held[:8]) or 'nothing'}{', ...' if len(held) > 8 else ''})"
     if probe.head.startswith((b"PK\x03\x04", b"\x80")):
         return "a binary file with other content"
+    if probe.head.startswith(b"\x1f\x8b"):
+        return "a compressed file: unpack it first, with gunzip"
+    if probe.head.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "text in UTF-16, which some spreadsheets write: save it in UTF-8"
     if probe.head.startswith(b"\x93NUMPY"):
         return "a single array: write it with numpy.savez(path, points2d=array), (frames, joints, 2), NaN where unseen"
     if probe.suffix in (".csv", ".tsv"):
