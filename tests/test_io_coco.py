@@ -7,7 +7,7 @@ from samples import coco_annotations, person, write_json
 
 from kcs_torch.errors import KcsError
 from kcs_torch.io import detect_format, load_people, load_tracks
-from kcs_torch.skeleton import SKELETONS
+from kcs_torch.skeleton import SKELETONS, Skeleton
 
 A, B = person(6, 17), person(6, 17, at=(900.0, 300.0), confidence=0.6)
 
@@ -57,6 +57,17 @@ def test_annotations_bring_their_own_skeleton(tmp_path):
     assert tracks.skeleton.bones == ((0, 1), (1, 2))  # counted from 1 in the file
     assert np.allclose(tracks.points, person(4, 3)[..., :2])
     assert (tracks.weights == 1).all()
+
+
+def test_the_users_skeleton_goes_before_the_files_own(tmp_path):
+    """Some programs count the joints of a category's links from 0."""
+    path = write_json(tmp_path / "a.json", coco_annotations(skeleton=((0, 1), (1, 2))))
+    with pytest.raises(KcsError, match=r"counted 1..3, got \[0, 1\]: mend it, or give a skeleton \(--skeleton\)"):
+        load_tracks(path)
+    leg = Skeleton.from_names(["foot", "knee", "hip"], [("hip", "knee"), ("knee", "foot")])
+    tracks = load_tracks(path, skeleton=leg)
+    assert tracks.skeleton is leg
+    assert np.allclose(tracks.points, person(4, 3)[:, ::-1, :2])
 
 
 def test_names_of_a_known_skeleton_bring_its_tree(tmp_path):

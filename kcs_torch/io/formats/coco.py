@@ -71,7 +71,7 @@ def _annotations(data: dict[str, Any], path: Path, options: Options) -> list[Tra
         options,
         source=str(path),
         names=names,
-        edges=_bones(category, names, path) if names is not None else None,
+        edges=None if names is None or options.skeleton is not None else _bones(category, names, path),
         notes=notes,
     )
 
@@ -118,7 +118,10 @@ def _bones(category: dict[str, Any], names: Sequence[str], path: Path) -> list[t
     for pair in links:
         ends = tuple(as_frame_number(v) for v in pair)
         if any(e is None or not 1 <= e <= len(names) for e in ends) or ends[0] == ends[1]:
-            raise FormatError(f"{where}: expected two different joints, counted 1..{len(names)}, got {as_text(pair)}")
+            raise FormatError(
+                f"{where}: expected two different joints, counted 1..{len(names)}, got {as_text(pair)}: mend it, or "
+                "give a skeleton (--skeleton)"
+            )
         bones.setdefault(frozenset(e - 1 for e in ends if e), (int(ends[0] or 0) - 1, int(ends[1] or 0) - 1))
     return list(bones.values())
 
