@@ -229,6 +229,15 @@ def test_csv_as_a_spreadsheet_saves_it(tmp_path):
     assert np.array_equal(load_tracks(tmp_path / "b.csv").points.numpy(), values.reshape(4, 3, 3)[..., :2])
 
 
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_csv_with_every_cell_in_quotes(tmp_path, delimiter):
+    columns, values = _animal()
+    rows = write_deeplabcut_csv(tmp_path / "a.csv", columns, values).read_text().splitlines()
+    quoted = (delimiter.join(f'"{cell}"' for cell in row.split(",")) for row in rows)
+    (tmp_path / "b.csv").write_text("\n".join(quoted))
+    assert torch.equal(load_tracks(tmp_path / "b.csv").points, load_tracks(tmp_path / "a.csv").points)
+
+
 def test_a_line_with_the_name_of_the_index_is_no_frame(tmp_path):
     columns, values = _animal()
     path = write_deeplabcut_csv(tmp_path / "a.csv", columns, values)

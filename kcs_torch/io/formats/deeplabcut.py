@@ -54,7 +54,7 @@ def recognises_motion(probe: Probe) -> bool:
 
 
 def _first_lines(probe: Probe) -> list[bytes]:
-    return probe.head.removeprefix(_BOM).split(b"\n", 4)[:4]
+    return [line.replace(b'"', b"") for line in probe.head.removeprefix(_BOM).split(b"\n", 4)[:4]]
 
 
 def read(path: Path, options: Options) -> list[Tracks]:
@@ -141,7 +141,7 @@ def _read_csv(path: Path, coords: Sequence[str], notes: list[str]) -> Table:
     rows: list[tuple[str, ...]] = []
     try:
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            delimiter = file.read(7)[6:]
+            delimiter = file.read(9).replace('"', "")[6:7]
             file.seek(0)
             lines = csv.reader(bounded_lines(file, path), delimiter=delimiter if delimiter in (",", ";", "\t") else ",")
             header = _header(lines, path)
