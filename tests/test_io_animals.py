@@ -510,6 +510,17 @@ def test_sleap_csv(tmp_path):
     assert people[0].weights[0].tolist() == [0.9, 0.8, 0.7]
 
 
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_sleap_csv_as_a_spreadsheet_saves_it(tmp_path, delimiter, quote):
+    path = write_sleap_csv(tmp_path / "a.csv", [["a", 3, 0.9, *CELLS], ["a", 4, 0.9, *CELLS]])
+    expected = load_tracks(path).points
+    rows = (delimiter.join(f"{quote}{cell}{quote}" for cell in row.split(",")) for row in path.read_text().split())
+    path.write_text("\ufeff" + "\r\n".join(rows), encoding="utf-8", newline="")
+    assert detect_format(path) == "sleap"
+    assert torch.equal(load_tracks(path).points, expected)
+
+
 def test_sleap_csv_without_tracks_is_followed(tmp_path):
     def cells(x):
         return [x, 0, 0.9, x, 10, 0.9, x, 20, 0.9]

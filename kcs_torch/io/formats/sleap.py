@@ -15,14 +15,15 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.animals import LIMIT, Animal, bounded_lines, build_animals, frames_of, refuse_3d
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5 import Tree, read_tree
+from kcs_torch.io.landmark_tables import first_line
 from kcs_torch.io.link import link_people
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief, read_error
+from kcs_torch.io.wide import Header
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]
 
-_FIRST = b"track,frame_idx,instance.score"
-_BOM = b"\xef\xbb\xbf"
+_FIRST = ["track", "frame_idx", "instance.score"]
 _FPS = 30.0  # assumed for how long somebody may be out of sight, where nothing is known
 _ORDERS = (("track", "xy", "node", "frame"), ("frame", "track", "node", "xy"))
 """Of the dimensions of ``tracks``: SLEAP's own, which MATLAB sees reversed, and that of sleap-io's "standard" files."""
@@ -36,7 +37,7 @@ def recognises(probe: Probe) -> bool:
         if len(shapes.get("tracks", ())) == 4:
             return "node_names" in shapes or "track_occupancy" in shapes or len(shapes) == 1
         return _is_project(probe.hdf5)
-    return probe.head.removeprefix(_BOM).startswith(_FIRST)
+    return Header.of(first_line(probe.head)).cells[:3] == _FIRST
 
 
 def read(path: Path, options: Options) -> list[Tracks]:
@@ -173,7 +174,9 @@ def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
     instances: dict[str, dict[int, list[NDArray[np.float64]]]] = {}
     try:
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            lines = csv.reader(bounded_lines(file, path))
+            delimiter = file.read(8).replace('"', "")[5:6]  # after "track"
+            file.seek(0)
+            lines = csv.reader(bounded_lines(file, path), delimiter=delimiter if delimiter in (";", "\t") else ",")
             header = next(lines, [])
             names = list(dict.fromkeys(c.rpartition(".")[0] for c in header[3:]))
             places = [[_place(header, f"{n}.{c}") for c in ("x", "y", "score")] for n in names]
