@@ -116,6 +116,8 @@ def reconstruct_all(
     >>> [len(one.points) for one in both]
     [40, 30]
     """
+    if isinstance(people, Tracks):
+        raise OptionError("reconstruct_all: expected a list of Tracks, got one: reconstruct takes it")
     people = list(people)
     for i, one in enumerate(people):
         if not isinstance(one, Tracks):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from samples import walking_motion
+from samples import walk_result, walking_motion
 
 import kcs_torch as kt
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
@@ -50,6 +50,15 @@ def test_joints_are_matched_by_name_and_not_by_order():
     assert found.mpjpe["none"] == pytest.approx(0, abs=1e-9)
     assert any("only in motion: " in note and "tail" in note for note in found.notes)
     assert found.root is None  # no pelvis is among them
+
+
+def test_a_result_is_no_motion():
+    result = walk_result(12)
+    told = r"compare: {}: expected Motion, got Reconstruction; Motion.of\(result\) makes it of a result"
+    with pytest.raises(OptionError, match=told.format("pred")):
+        compare(result, Motion.of(result))
+    with pytest.raises(OptionError, match=told.format("truth")):
+        compare(Motion.of(result), result)
 
 
 def test_fewer_than_three_joints_are_no_comparison():

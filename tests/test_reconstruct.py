@@ -214,3 +214,11 @@ def test_warnings_point_to_the_caller(method):
         with pytest.warns(kt.KcsWarning, match="never seen") as told:
             call()
         assert {w.filename for w in told} == {__file__}
+
+
+def test_all_of_one_is_told():
+    tracks = kt.data.walking_person(12).tracks
+    with pytest.raises(OptionError, match="reconstruct_all: expected a list of Tracks, got one: reconstruct takes it"):
+        kt.reconstruct_all(tracks)
+    with pytest.raises(OptionError, match="reconstruct_all: item 1: expected Tracks"):
+        kt.reconstruct_all([tracks, tracks.points])

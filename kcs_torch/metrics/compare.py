@@ -84,8 +84,14 @@ def compare(
     Raises:
         SkeletonError: fewer than 3 joints have counterparts, or there is no such root.
         ShapeError: the frames do not fit each other.
-        OptionError: an alignment is unknown or needs a size that is not known, or ``within`` is not positive.
+        OptionError: something is not Motion, an alignment is unknown or needs a size that is not known, or ``within``
+            is not positive.
     """
+    given: dict[str, object] = {"pred": pred, "truth": truth}
+    for name, one in given.items():
+        if not isinstance(one, Motion):
+            hint = "Motion.of(result) makes it of a result"
+            raise OptionError(f"compare: {name}: expected Motion, got {type(one).__name__}; {hint}")
     if within is not None and not 0 < within < math.inf:
         raise OptionError(f"within (--within): expected a positive distance, got {within}")
     notes: list[str] = []
