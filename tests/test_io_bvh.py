@@ -250,6 +250,17 @@ def test_gaps_are_filled_and_told(tmp_path):
     assert torch.allclose(back.points[8] / 100, motion.points[8], atol=0.01)
 
 
+def test_a_joint_that_is_never_seen_stretches_no_bone(tmp_path):
+    motion = walking_motion()
+    weights, ankle = motion.weights.clone(), motion.skeleton.index("left_ankle")
+    weights[:, ankle] = 0
+    gappy = replace(motion, weights=weights, points=motion.points * weights[..., None])
+    notes: list[str] = []
+    back = load_motion(save(gappy, tmp_path / "w.bvh", notes=notes))
+    assert "never seen, so laid on the joints beside them: left_ankle" in notes
+    assert any("left out because they lie on their parent: left_ankle" in note for note in back.notes)
+
+
 def test_odd_names_are_written(tmp_path):
     body = kt.Skeleton.from_names(["a b", "a_b", "{x}", "naïve"], [("a b", "a_b"), ("a_b", "{x}"), ("{x}", "naïve")])
     clip = kt.data.random_motion(body, 5, generator=torch.Generator().manual_seed(0))

@@ -308,6 +308,21 @@ def test_motion_can_be_looked_at(tmp_path):
         assert motion.save(tmp_path / f"m{suffix}").stat().st_size > 5000
 
 
+def test_pages_fill_gaps_and_lay_what_is_never_seen_on_its_neighbour():
+    motion = walk()
+    body, weights = motion.skeleton, motion.weights.clone()
+    hip, knee, ankle, wrist = map(body.index, ("left_hip", "left_knee", "left_ankle", "right_wrist"))
+    weights[:, [knee, ankle]] = 0
+    weights[3, wrist] = 0
+    gappy = replace(motion, weights=weights, points=motion.points * weights[..., None])
+    filled = gappy.filled()
+    assert torch.equal(filled[:, knee], motion.points[:, hip]) and torch.equal(filled[:, ankle], motion.points[:, hip])
+    assert torch.allclose(filled[3, wrist], motion.points[[2, 4], wrist].mean(0))
+    assert torch.equal(filled[gappy.seen], motion.points[gappy.seen])
+    assert torch.equal(motion.filled(), motion.points)
+    assert torch.allclose(as_result(gappy).points, replace(motion, points=filled).in_camera(yaw=20.0, pitch=8.0))
+
+
 def test_csv_holds_results_as_they_are_or_with_an_axis_up(tmp_path):
     result = walk_result()
 

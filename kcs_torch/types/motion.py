@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
-from kcs_torch.functional import orbit
+from kcs_torch.functional import interpolate, orbit
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
 from kcs_torch.types.angles import JointAngles, Joints, angles_of
 from kcs_torch.types.axes import from_y_up, to_y_up
@@ -157,6 +157,18 @@ class Motion(Trajectories):
     def variation(self) -> BoneVariation:
         """How much rigid bones change their length, per cent: that of the median bone, the largest, and whose it is."""
         return bone_variation(self._lengths(), self.skeleton)
+
+    def filled(self) -> Tensor:
+        """(T, N, 3): gaps are filled linearly in time; a joint that is never seen lies on its neighbour by a bone."""
+        points, there = interpolate(self.points, self.seen), self.seen.any(0).tolist()
+        reach = [i for i, seen in enumerate(there) if seen]
+        for here in reach:  # grows
+            for bone in self.skeleton.bones:
+                other = sum(bone) - here
+                if here in bone and not there[other]:
+                    points[:, other], there[other] = points[:, here], True
+                    reach.append(other)
+        return points
 
     def _lengths(self) -> Tensor:
         """(T, B) bone lengths; NaN where an end is unseen."""

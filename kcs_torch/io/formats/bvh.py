@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import FormatError
-from kcs_torch.functional import euler_angles, euler_rotation, interpolate
+from kcs_torch.functional import euler_angles, euler_rotation
 from kcs_torch.io.build_motion import build_motion, distinct, numbers, read_lines
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer
@@ -201,12 +201,14 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
     Raises:
         OutputError: the skeleton is no tree.
     """
-    points = from_y_up(motion.points, saving.up).double()
+    points = from_y_up(motion.filled(), saving.up).double()
     if not bool(motion.seen.all()):
-        points = interpolate(points, motion.seen)
         saving.warnings.append(
             f"BVH has no gaps: {100 * motion.unseen_share:.1f} % of the joints are filled in between frames"
         )
+        never = [n for n, seen in zip(motion.skeleton.joints, motion.seen.any(0).tolist(), strict=True) if not seen]
+        if never:
+            saving.warnings.append(f"never seen, so laid on the joints beside them: {', '.join(never)}")
     rig = fit_rig(points, motion.skeleton, up=saving.up)
     off = (rig.positions() - points).norm(dim=-1)
     extra = [name for node, name in enumerate(rig.names) if node not in set(rig.joints)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,8 @@ def _rrd_ready() -> None:
 
 def as_result(motion: Motion) -> Reconstruction:
     """Motion as a camera sees it that stands a little to the side and above: what pages and films show."""
-    points = motion.in_camera(yaw=20.0, pitch=8.0)
+    whole = replace(motion, points=motion.filled(), weights=torch.ones_like(motion.weights))
+    points = whole.in_camera(yaw=20.0, pitch=8.0)
     frames = len(points)
     mean = motion.lengths
     variation = motion.variation
