@@ -175,3 +175,11 @@ def test_figures_have_gradients():
         (grad,) = torch.autograd.grad(mpjpe(pred, clip(), align=how), pred)
         assert torch.isfinite(grad).all()
         assert grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize("kinds", [(torch.float64, torch.float32), (torch.bfloat16, torch.float32), (torch.float16,) * 2])
+def test_e3d_of_any_precision(kinds):
+    pred, truth = clip().to(kinds[0]), clip(seed=1).to(kinds[1])
+    exact = e3d(pred.double(), truth.double())
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.allclose(e3d(pred, truth).double(), exact, rtol=1e-5)

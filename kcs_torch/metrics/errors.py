@@ -88,12 +88,14 @@ def e3d(pred: Tensor, truth: Tensor, *, weights: Tensor | None = None) -> Tensor
     Raises:
         ShapeError: the shapes differ.
     """
-    aligned(pred, truth, "none", weights=weights)  # checks the shapes
+    pred = aligned(pred, truth, "none", weights=weights)  # checks the shapes; at least in single precision
+    truth = truth.to(pred)
     mass = torch.ones_like(truth[..., 0]) if weights is None else weights.to(truth)
     source, target = centre(pred, mass)[0], centre(truth, mass)[0]
-    left = (source * mass[..., None]).flatten(-3, -2)
-    turn = nearest_rotation(left.mT @ target.flatten(-3, -2), reflect=True)
-    distance = (source @ turn[..., None, :, :] - target).norm(dim=-1)
+    with torch.autocast(pred.device.type, enabled=False):
+        left = (source * mass[..., None]).flatten(-3, -2)
+        turn = nearest_rotation(left.mT @ target.flatten(-3, -2), reflect=True)
+        distance = (source @ turn[..., None, :, :] - target).norm(dim=-1)
     count = mass.sum(-1, keepdim=True).clamp_min(1)
     spread = ((target.square() * mass[..., None]).sum(-2) / count).sqrt()  # (..., T, 3)
     known = (mass.sum(-1) > 0).to(mass)
