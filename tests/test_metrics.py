@@ -183,3 +183,10 @@ def test_e3d_of_any_precision(kinds):
     exact = e3d(pred.double(), truth.double())
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.allclose(e3d(pred, truth).double(), exact, rtol=1e-5)
+
+
+def test_weights_of_e3d_are_shares():
+    truth, pred = clip(), clip(seed=1)
+    weights = torch.rand(12, 6, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    assert torch.allclose(e3d(pred, truth, weights=0.01 * weights), e3d(pred, truth, weights=weights))
+    assert torch.allclose(e3d(pred, truth, weights=torch.full_like(weights, 0.01)), e3d(pred, truth))
