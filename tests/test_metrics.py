@@ -190,3 +190,11 @@ def test_weights_of_e3d_are_shares():
     weights = torch.rand(12, 6, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     assert torch.allclose(e3d(pred, truth, weights=0.01 * weights), e3d(pred, truth, weights=weights))
     assert torch.allclose(e3d(pred, truth, weights=torch.full_like(weights, 0.01)), e3d(pred, truth))
+
+
+def test_bones_of_joints_that_are_nan_count_where_they_are_seen():
+    points, weights = clip(), torch.ones(12, 6, dtype=torch.float64)
+    weights[3, 1] = weights[5, 4] = 0
+    gone = torch.where(weights[..., None] > 0, points, torch.nan)
+    for bones in (BONES, BONES[:1]):
+        assert torch.equal(bone_deviation(gone, bones, weights=weights), bone_deviation(points, bones, weights=weights))

@@ -111,7 +111,7 @@ def bone_deviation(
     Args:
         points: (..., T, N, 3).
         bones: (B, 2) joint indices.
-        weights: (..., T, N), 0 where a joint is unknown; all 1 if None.
+        weights: (..., T, N), 0 where a joint is unknown, whatever stands there; all 1 if None.
 
     Returns:
         (...), a share: 0.01 is 1 per cent.
@@ -130,6 +130,7 @@ def bone_deviation(
     mass = torch.ones_like(lengths)
     if weights is not None:
         mass = (weights[..., index[:, 0]] > 0).to(points) * (weights[..., index[:, 1]] > 0).to(points)
+        lengths = torch.where(mass > 0, lengths, torch.zeros_like(lengths))
     count = mass.sum(-2)
     mean = (lengths * mass).sum(-2) / count
     spread = ((lengths - mean[..., None, :]).square() * mass).sum(-2).div(count).sqrt()
