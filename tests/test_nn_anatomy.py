@@ -189,6 +189,21 @@ def test_dtypes(dtype):
     assert_close(energy.double(), torch.tensor([0.125]).double(), rtol=0.02, atol=0)
 
 
+@pytest.mark.parametrize("make", [HingeEnergy, lambda body: AdductionEnergy(body, limit=0)])
+@pytest.mark.parametrize("dtype", HALVES)
+def test_unseen_joints_beside_millimetres_in_half_precision(make, dtype):
+    """A bone to an unseen joint, whose place is 0, is a hundred times too long."""
+    energy, points = make(LEGS), (5000 + 30 * normal(9, 6, 3)).to(dtype)
+    weights = torch.ones(9, 6, dtype=dtype)
+    weights[::2, 2] = weights[1, 3:] = 0
+    leaf = points.clone().requires_grad_()
+    value = energy(leaf, None, weights)
+    (grad,) = torch.autograd.grad(value.sum(), leaf)
+    assert value.dtype == energy(points, None, weights.double()).dtype == dtype and value.any()
+    assert_close(value.double(), energy(points.double(), None, weights.double()), rtol=0.02, atol=1e-3)
+    assert torch.isfinite(grad).all() and not grad[weights == 0].any()
+
+
 def test_a_body_without_hinges():
     points = normal(2, 5, 4, 3).requires_grad_()
     energy = HingeEnergy(CHAIN)(points)

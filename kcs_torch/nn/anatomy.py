@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.nn.energies import check_lengths
-from kcs_torch.nn.layers import SkeletonModule, wide
+from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
 from kcs_torch.nn.masks import known_points, some, weighs_joints
 from kcs_torch.skeleton import Skeleton
 
@@ -60,10 +60,13 @@ class _JointEnergy(SkeletonModule):
         each = 0.5 * self.firm.to(wrong.dtype) * wrong.square()
         if weights is not None:
             each = each * self._share(points, weights)
-        return each.sum(-1)
+        return narrow(each.sum(-1), points)
 
     def _vectors(self, points: Tensor, lengths: Tensor | None, weights: Tensor | None) -> tuple[Tensor, ...]:
-        """Bones of the chains and then the axes, each (..., T, H, 3) over its length; arguments as in forward."""
+        """Bones of the chains and then the axes, each (..., T, H, 3) over its length; arguments as in forward.
+
+        They are 0 where nothing counts: a bone to a joint that is not known may be of any length.
+        """
         self.check(points, clip=True)
         if points.shape[-1] != 3:
             raise ShapeError(f"{type(self).__name__}: expected points (..., T, N, 3), got {tuple(points.shape)}")
@@ -78,7 +81,7 @@ class _JointEnergy(SkeletonModule):
         else:
             sizes = lengths.to(full.dtype)[..., None, self.limbs].unbind(-1)  # each (..., 1, H)
             edges = [_divide(edge, size[..., None]) for edge, size in zip(edges, sizes, strict=True)]
-        return *edges, _to_size(left - right, share)
+        return tuple(known(vectors, share) for vectors in (*edges, _to_size(left - right, share)))
 
     def _share(self, points: Tensor, weights: Tensor) -> Tensor:
         """Weights of the joints' terms, (..., T, H), or of all alike, (..., T, 1)."""
@@ -112,12 +115,15 @@ class HingeEnergy(_JointEnergy):
         self.register_buffer("sign", torch.tensor([h.sign for h in hinges]), persistent=False)
 
     def _wrong(self, points: Tensor, lengths: Tensor | None, weights: Tensor | None) -> Tensor:
-        return (-self.bend(points, lengths, weights)).clamp_min(0)
+        return (-self._sines(points, lengths, weights)).clamp_min(0)
 
     def bend(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """The sine s of each hinge, (..., T, H), positive where it bends its way; arguments as in :meth:`forward`."""
+        return narrow(self._sines(points, lengths, weights), points)
+
+    def _sines(self, points: Tensor, lengths: Tensor | None, weights: Tensor | None) -> Tensor:
         upper, lower, axis = self._vectors(points, lengths, weights)
-        return (self.sign.to(axis.dtype) * _triple(upper, lower, axis)).to(points.dtype)
+        return self.sign.to(axis.dtype) * _triple(upper, lower, axis)
 
 
 class AdductionEnergy(_JointEnergy):
@@ -159,12 +165,15 @@ class AdductionEnergy(_JointEnergy):
         self.register_buffer("side", torch.tensor(side), persistent=False)
 
     def _wrong(self, points: Tensor, lengths: Tensor | None, weights: Tensor | None) -> Tensor:
-        return (-self.limit - self.abduction(points, lengths, weights)).clamp_min(0)
+        return (-self.limit - self._sines(points, lengths, weights)).clamp_min(0)
 
     def abduction(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """The sine s of each limb, (..., T, L), positive to its own side; arguments as in :meth:`forward`."""
+        return narrow(self._sines(points, lengths, weights), points)
+
+    def _sines(self, points: Tensor, lengths: Tensor | None, weights: Tensor | None) -> Tensor:
         upper, axis = self._vectors(points, lengths, weights)
-        return (self.side.to(axis.dtype) * (upper * axis).sum(-1)).to(points.dtype)
+        return self.side.to(axis.dtype) * (upper * axis).sum(-1)
 
 
 def _bone_places(skeleton: Skeleton) -> dict[frozenset[int], int]:
