@@ -492,6 +492,20 @@ def test_half_precision_in_millimetres(name, dtype):
     )
 
 
+@pytest.mark.parametrize("dtype", HALVES)
+@pytest.mark.parametrize("huber", [None, 30.0])
+def test_tracks_far_from_the_origin_in_half_precision(huber, dtype):
+    """The sum that makes the mean of 25 joints at x = 4000 is more than half precision can hold."""
+    points = (300 * normal(2, 25, 3)).to(dtype).requires_grad_()
+    tracks = (4000 + points.detach()[..., :2] + 40 * normal(2, 25, 2, seed=1)).to(dtype)
+    energy = ReprojectionEnergy(huber=huber)
+    value, exact = energy(points, tracks), energy(points.double(), tracks.double())
+    assert value.dtype == energy.residual(points, tracks).dtype == dtype
+    assert_close(value.double(), exact, rtol=0.01, atol=0)
+    (grad,) = torch.autograd.grad(value.sum() / 1000, points)
+    assert torch.isfinite(grad).all()
+
+
 @given(st.integers(0, 10**6), st.floats(-6, 6), st.sampled_from(FLOATS), st.sampled_from(KINDS))
 @settings(max_examples=60, deadline=None)
 def test_nothing_is_nan_at_any_scale(seed, power, dtype, kind):

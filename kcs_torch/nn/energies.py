@@ -135,14 +135,17 @@ class ReprojectionEnergy(nn.Module):
         Raises:
             ShapeError: the shapes do not fit.
         """
-        residual = self.residual(points, tracks, cameras, weights)
-        square = huber_square(wide(residual).square().sum(-1), self.huber)
-        return narrow(0.5 * (square * seen_weights(tracks, weights)).sum(-1), residual)
+        square = huber_square(self._residual(points, tracks, cameras, weights).square().sum(-1), self.huber)
+        return narrow(0.5 * (square * seen_weights(tracks, weights)).sum(-1), finer(points, tracks))
 
     def residual(
         self, points: Tensor, tracks: Tensor, cameras: Tensor | None = None, weights: Tensor | None = None
     ) -> Tensor:
         """R x + t - y, (..., T, N, 2); of no meaning where the weight is 0 or a track NaN."""
+        return narrow(self._residual(points, tracks, cameras, weights), finer(points, tracks))
+
+    def _residual(self, points: Tensor, tracks: Tensor, cameras: Tensor | None, weights: Tensor | None) -> Tensor:
+        """The same, at least in single precision: a sum of pixels over joints leaves the range of half precision."""
         check_clip(points, self)
         check_tensor(tracks, "tracks", self)
         if tracks.shape[-3:] != (*points.shape[-3:-1], 2) or not fit_together(tracks.shape[:-3], points.shape[:-3]):
@@ -154,7 +157,7 @@ class ReprojectionEnergy(nn.Module):
             raise ShapeError(f"ReprojectionEnergy: expected {expected}, got {got}")
         check_weights(weights, points, self)
         weights = seen_weights(tracks, weights)
-        points, tracks = known(points, weights), known(tracks, weights)
+        points, tracks = known(wide(points), weights), known(wide(tracks), weights)
         with full_precision(points):
             dtype = torch.promote_types(points.dtype, tracks.dtype)
             seen = points[..., :2] if cameras is None else project(points.to(dtype), cameras.to(dtype))
@@ -319,6 +322,11 @@ def check_lengths(lengths: Tensor | None, points: Tensor, module: SkeletonModule
     if lengths.shape[-1:] != (count,) or not fit_together(lengths.shape[:-1], points.shape[:-3]):
         expected = f"(..., {count}), the same in all frames, for points {tuple(points.shape)}"
         raise ShapeError(f"{type(module).__name__}: expected lengths {expected}, got {tuple(lengths.shape)}")
+
+
+def finer(points: Tensor, tracks: Tensor) -> Tensor:
+    """That of the two which has more digits."""
+    return tracks if torch.finfo(tracks.dtype).bits > torch.finfo(points.dtype).bits else points
 
 
 def huber_square(square: Tensor, huber: float | None) -> Tensor:
