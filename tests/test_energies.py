@@ -486,6 +486,13 @@ def test_half_precision_in_millimetres(name, dtype):
         energy(points).double(), energy(points.double()).clamp_max(torch.finfo(dtype).max), rtol=0.02, atol=1.0
     )
     finite(lambda x: ReprojectionEnergy()(x, points[..., :2] + 40, None), points)
+    far = 20 * points  # singular values add up to some 130 000
+    assert_close(
+        LowRankEnergy()(far).double(),
+        LowRankEnergy()(far.double()).clamp_max(torch.finfo(dtype).max),
+        rtol=0.02,
+        atol=0,
+    )
     huge = ReprojectionEnergy(translation=False)(points, points[..., :2] + 400)  # 7 joints times 160 000
     assert_close(
         huge.double(), torch.full_like(huge, 1).double() * min(1.12e6, torch.finfo(dtype).max), rtol=0.02, atol=0

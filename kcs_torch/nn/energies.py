@@ -207,10 +207,11 @@ class LowRankEnergy(nn.Module):
         check_weights(weights, points, self)
         matrix = known(points, weights).flatten(-2)
         share = None if weights is None else weights.repeat_interleave(points.shape[-1], -1)  # (..., T, N D)
-        if self.kind == "nuclear":
-            return nuclear_norm(matrix if share is None else matrix * safe_root(share).to(matrix.dtype))
         with full_precision(points):
-            return narrow(self._log_det(wide(matrix), share), points)
+            matrix = wide(matrix)
+            if self.kind == "log_det":
+                return narrow(self._log_det(matrix, share), points)
+            return narrow(nuclear_norm(matrix if share is None else matrix * safe_root(share).to(matrix.dtype)), points)
 
     def _log_det(self, matrix: Tensor, share: Tensor | None) -> Tensor:
         """T/2 log det(Sigma + eps I) of rows (..., T, D); what has no share in any frame adds nothing."""
