@@ -191,6 +191,18 @@ def test_degenerate_frames_are_finite(kind, dtype):
         assert PerspectiveEnergy()(points, tracks, LENS, weights).max() < 1e-3
 
 
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_joints_that_coincide_have_a_bounded_slope(dtype):
+    """The best place for them is the camera's own: what is left of their distance there is rounding."""
+    tracks = scene(dtype=dtype)[2]
+    for place in ((1.0, 1.0, 1.0), (0.3, -2.0, 7.0), (100.0, -20.0, 3000.0)):
+        for weight in (1.0, 0.37, 0.01, 1e-5, 1e-7):
+            points = torch.tensor(place, dtype=dtype).expand(5, 7, 3).clone().requires_grad_()
+            value = PerspectiveEnergy()(points, tracks, LENS, torch.full((5, 7), weight, dtype=dtype))
+            (grad,) = torch.autograd.grad(value.sum(), points)
+            assert torch.isfinite(value).all() and grad.abs().max() < weight * 1e8, (place, weight)
+
+
 def test_tracks_that_are_nan_are_unseen():
     points, _, tracks = scene(noise=2.0)
     weights = torch.ones(5, 7).double()

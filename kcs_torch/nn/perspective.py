@@ -20,6 +20,9 @@ __all__ = ["PerspectiveEnergy"]
 BEHIND = 0.01
 """What a distance behind the camera counts for, beside the body's size: one joint has none."""
 
+LOST = 16.0
+"""Distances and sizes below this, in rounding errors of the points, are none."""
+
 
 class PerspectiveEnergy(nn.Module):
     """1/2 sum_n w_n |pi(x_n + t) - y_n|^2 of each frame, pi(X) = (fx X/Z + cx, fy Y/Z + cy).
@@ -85,9 +88,10 @@ class PerspectiveEnergy(nn.Module):
             weights = seen_weights(tracks, weights)
             at, seen = wide(known(points, weights)), known(wide(tracks), weights)
             share = weights.to(at.dtype).expand(at.shape[:-1])
+            rounding = torch.finfo(at.dtype).eps * at.detach().abs().amax((-2, -1))
             if self.translation:
                 at = at + pinhole_translation(at, (seen - lens[..., 2:]) / lens[..., :2], share)[..., None, :]
-            near = self.nearest * _reach(at, share)[..., None]
+            near = self.nearest * _reach(at, share, rounding)[..., None]
             behind = (near - at[..., 2]).clamp_min(0) / near
             ahead = torch.cat([at[..., :2], torch.maximum(at[..., 2], near)[..., None]], -1)
             square = huber_square((perspective(ahead, lens) - seen).square().sum(-1), self.huber)
@@ -105,8 +109,10 @@ def lens_tensor(intrinsics: Any, like: Tensor) -> Tensor:
     return Intrinsics.of(intrinsics).tensor(like)
 
 
-def _reach(points: Tensor, share: Tensor) -> Tensor:
+def _reach(points: Tensor, share: Tensor, rounding: Tensor) -> Tensor:
     """Distance of a body (..., N, 3) before the camera along z, or its size, where that is more, (...).
+
+    1 where neither is more than rounding: what is divided by it has bounds.
 
     Were the distance behind the camera to count like that before it, what lies behind would cost the same however far:
     nothing would push it ahead.
@@ -115,4 +121,5 @@ def _reach(points: Tensor, share: Tensor) -> Tensor:
     middle = (share[..., None] * points).sum(-2, keepdim=True) / total
     size = safe_root((share[..., None] * (points - middle).square() / total).sum((-2, -1)))
     far = middle[..., 0, 2]
-    return some(torch.maximum(torch.maximum(far, -BEHIND * far), size))
+    reach = torch.maximum(torch.maximum(far, -BEHIND * far), size)
+    return torch.where(reach > LOST * rounding, reach, torch.ones_like(reach))
