@@ -368,6 +368,13 @@ class TestSweeps:
         assert code == 2 and "lr: expected a positive number" in err and "Traceback" not in err
         assert [row["run"] for row in rows(tmp_path / "sweep" / "results.csv")] == ["0", "2"]
 
+    @pytest.mark.filterwarnings("ignore:Experiment logs directory")
+    def test_figures_of_an_earlier_sweep_are_not_those_of_a_run_that_fails(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.chdir(tmp_path)
+        assert called(capsys, *SWEEP, "+module.lr=1e-3,1e-4")[0] == 0
+        assert called(capsys, *SWEEP, "+module.lr=-1,2e-4")[0] == 2
+        assert [row["module.lr"] for row in rows(tmp_path / "sweep" / "results.csv")] == ["0.0002"]
+
     def test_the_table_is_that_of_all_who_have_ended(self, tmp_path):
         for number in (10, 2):
             run = tmp_path / str(number)

@@ -213,6 +213,7 @@ def job(config: DictConfig) -> float:
     """Train in the folder that Hydra gives a run, tell what it came to, and return what a sweep optimises."""
     settings = HydraConfig.get()
     folder = Path(settings.runtime.output_dir)
+    (folder / RESULT).unlink(missing_ok=True)  # of an earlier run, whose settings Hydra has replaced
     with in_one_line(MisconfigurationException), _said():
         outcome = train(config, folder)
     figures = {config.optimise: outcome.value} | dict(outcome.metrics)
