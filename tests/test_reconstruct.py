@@ -95,6 +95,19 @@ def test_results_follow_the_tracks_dtype():
     assert read.points.dtype == torch.float64  # as readers give it
 
 
+@pytest.mark.parametrize("method", QUICK)
+def test_the_callers_default_precision_does_not_matter(method):
+    tracks = TRACKS.to(torch.float32)
+    expected = reconstruct(tracks, method=method, **QUICK[method])
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = reconstruct(tracks, method=method, **QUICK[method])
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert found.points.dtype == torch.float32
+    assert (found.points - expected.points).norm() < 1e-2 * expected.points.norm()
+
+
 def test_the_package_exports_it():
     import kcs_torch.reconstruct  # noqa: F401  # the submodule must not hide the function
 

@@ -190,7 +190,7 @@ class PinholeEnergy:
         change = (path / self.path).log()
         distance = path / wide
         value, along = self._steady(distance)
-        firm = 0.0 if self.free is None else FIRM * self.free
+        firm = 0.0 if self.free is None else FIRM * self.free.to(value)
         usual = (wide * USUAL / self.path.mean(-1, keepdim=True)).log()  # (H, 1)
         value = value + firm * usual[:, 0].square() / 2
         value = value + change.square().mean(-1) / (2 * STRAY**2)
