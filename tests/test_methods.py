@@ -228,6 +228,16 @@ def test_gradients_are_neither_needed_nor_kept():
         assert not result.points.is_inference()
 
 
+@quiet
+@pytest.mark.parametrize("method", METHODS)
+def test_autocast_is_for_networks(method):
+    tracks = CLIP.tracks.to(torch.float32)
+    expected = reconstruct(tracks, method=method)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = reconstruct(tracks, method=method)
+    assert torch.equal(found.points, expected.points)
+
+
 # ---------------------------------------------------------------------- invariances
 
 

@@ -197,9 +197,11 @@ class Method(ABC):
 
 @contextlib.contextmanager
 def apart(tracks: Sequence[Tracks]) -> Iterator[None]:
-    """Leave the caller's autograd and inference mode alone, and make on the tracks' device what is made anew."""
+    """Leave the caller's autograd, inference mode and autocast alone; make on the tracks' device what is made anew."""
     devices = {one.points.device for one in tracks}
-    with torch.inference_mode(False), torch.no_grad():
+    with torch.inference_mode(False), torch.no_grad(), contextlib.ExitStack() as precision:
+        for kind in {device.type for device in devices}:
+            precision.enter_context(torch.autocast(kind, enabled=False))
         if len(devices) != 1 or devices == {torch.get_default_device()}:
             yield  # a device's context costs each operation, so there is none without need
         else:
