@@ -34,7 +34,7 @@ def reconstruct(
     skeleton: str | Path | Skeleton | None = None,
     confidence: Any = None,
     fps: float | None = None,
-    units: str = "px",
+    units: str | None = None,
     cameras: Any = None,
     intrinsics: Any = None,
     **fields: Any,
@@ -48,7 +48,7 @@ def reconstruct(
             too, finds the bones from how the joints move (:func:`kcs_torch.find_skeleton`).
         confidence: for arrays: (T, N) in 0..1.
         fps: for arrays: frames per second.
-        units: for arrays.
+        units: for arrays; px if None.
         cameras: (T, 2, 3) camera rows, world to camera, where they are known.
         intrinsics: (fx, fy, cx, cy) or a matrix K (3, 3) in the unit of the tracks, where it is known. Perspective is
             then taken into account, and ``result.in_space()`` lies before the camera and projects onto the tracks.
@@ -78,12 +78,12 @@ def reconstruct(
     if find:
         skeleton = None
     if isinstance(tracks, Tracks):
-        if skeleton is not None or confidence is not None or fps is not None:
+        if any(option is not None for option in (skeleton, confidence, fps, units)):
             raise OptionError(
-                "reconstruct: skeleton, confidence and fps belong to arrays; these tracks already have them"
+                "reconstruct: skeleton, confidence, fps and units belong to arrays; these tracks already have them"
             )
     else:
-        tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units)
+        tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units or "px")
     if find:
         tracks = with_found_bones(tracks)
     chosen = method_named(method, fields)

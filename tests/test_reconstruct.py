@@ -152,7 +152,7 @@ def test_values_out_of_range(method, field, value, words):
 
 
 def test_options_of_arrays_with_tracks():
-    for option in ({"skeleton": "coco17"}, {"confidence": np.ones((20, 17))}, {"fps": 25}):
+    for option in ({"skeleton": "coco17"}, {"confidence": np.ones((20, 17))}, {"fps": 25}, {"units": "mm"}):
         refused(OptionError, "belong to arrays; these tracks already have them", **option)
 
 
