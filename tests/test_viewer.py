@@ -94,6 +94,12 @@ def test_page_holds_the_motion(result):
     assert np.allclose(spread, result.uncertainty, atol=1e-4 * float(result.uncertainty.max()))
 
 
+def test_tensors_that_need_gradients_are_shown_as_they_are(result):
+    grown = {name: getattr(result, name).clone().requires_grad_() for name in ("points", "uncertainty")}
+    tracks = replace(result.tracks, points=result.tracks.points.clone().requires_grad_())
+    assert scene(player(replace(result, tracks=tracks, **grown))) == scene(player(result))
+
+
 def test_page_needs_no_network_and_is_small(result):
     text = player(result)
     assert len(text) < 70_000

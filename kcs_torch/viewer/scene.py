@@ -55,7 +55,7 @@ def scene_of(results: Sequence[Reconstruction], names: Sequence[str] | None = No
         if (most := float(np.abs(known).max())) > FARTHEST:
             raise OutputError(f"{name}: an HTML page needs coordinates up to {FARTHEST:g}, got {most:.3g}: scale them")
     middle = np.median(np.concatenate(finite), axis=0)
-    seen = [r.tracks.points.double().cpu().numpy()[r.tracks.seen.cpu().numpy()] for r in results]
+    seen = [r.tracks.points.double().numpy(force=True)[r.tracks.seen.cpu().numpy()] for r in results]
     together = np.concatenate(seen)
     middle2d = np.median(together, axis=0) if len(together) else np.zeros(2)
     return {
@@ -106,7 +106,7 @@ def _person(result: Reconstruction, name: str, frames: slice, middle: Array, mid
         "fit": None if result.distance is not None else _floats(_fit(result, middle, middle2d)[frames]),
         "tracks": _whole(np.where(weights[..., None] > 0, places, np.nan)),
         "weights": _encode((255 * np.clip(weights, 0, 1)).round().astype("u1"), "u1"),
-        "spread": None if result.uncertainty is None else _whole(result.uncertainty[frames].cpu().double().numpy()),
+        "spread": None if result.uncertainty is None else _whole(result.uncertainty[frames].double().numpy(force=True)),
     }
 
 
