@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -43,6 +44,13 @@ def test_arrays_of_any_kind(kind):
     assert (tracks.num_frames, tracks.num_joints, tracks.unseen_share) == (4, 17, 0.0)
     assert tracks.seen.all() and torch.equal(tracks.weights, torch.ones(4, 17, dtype=torch.float64))
     assert (tracks.fps, tracks.units, tracks.source, tracks.notes) == (25, "mm", "walk.csv", ("hello",))
+
+
+def test_what_a_masked_array_masks_is_unseen():
+    points, sure = np.ma.masked_array(grid().numpy()), np.ma.masked_array(np.ones((4, 17)))
+    points[1, 2] = sure[2, 3] = np.ma.masked
+    tracks = Tracks.from_arrays(points, sure, skeleton="h36m17")
+    assert (~tracks.seen).nonzero().tolist() == [[1, 2], [2, 3]]
 
 
 @pytest.mark.parametrize(

@@ -34,13 +34,15 @@ FARTHEST = 1e30  # of coordinates: their sums are finite in single precision, in
 def as_floats(value: Any, what: str, ndim: int) -> Tensor:
     """An array-like as a floating tensor of ``ndim`` dimensions; tensors keep their device and single precision.
 
+    What a masked array masks is NaN.
+
     Raises:
         ShapeError: it is no array of real numbers, or has another number of dimensions.
     """
     if not isinstance(value, Tensor):
         try:
-            array = np.asarray(value)
-            value = torch.as_tensor(array if np.iscomplexobj(array) else array.astype(np.float64))
+            array = np.asanyarray(value)
+            value = torch.as_tensor(array if np.iscomplexobj(array) else np.ma.filled(array.astype(np.float64), np.nan))
         except (TypeError, ValueError):
             kind = f"one of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
             hint = "; kcs_torch.load_tracks reads files" if isinstance(value, (str, Path)) else ""
