@@ -174,6 +174,13 @@ def test_batches_equal_loops():
     same_as_loop(lambda w, r, s: module(w, r, start=s), (5, 7, 2), (5, 2, 3), (5, 7, 3), make=camera)
 
 
+def test_lengths_of_several_bodies_make_several_shapes():
+    module, (tracks, cameras, weights) = UnrolledPKC(BODY, 3, eps=0.3, final=0.1, noise=0.1), scene(BODY)
+    lengths = 1 + 0.2 * normal(3, 6).abs()
+    found = module(tracks, cameras, weights=weights, lengths=lengths)
+    assert_close(found, torch.stack([module(tracks, cameras, weights=weights, lengths=one) for one in lengths]))
+
+
 def test_a_network_in_single_precision_may_start_it():
     tracks, cameras, _ = scene(BODY, dtype=torch.float32)
     start = normal(6, 7, 3, dtype=torch.bfloat16).requires_grad_()

@@ -160,7 +160,8 @@ class UnrolledPKC(Unrolled):
                 for name, least in (("eps", 1e-7), ("slack", 1e-3), ("noise", 1e-3))
             )
             graded = not self.skeleton.tree
-            begin = begin.expand(*broadcast_shapes(begin.shape[:-3], rows.shape[:-3]), *begin.shape[-3:])
+            given = () if lengths is None else lengths.shape[:-1]
+            begin = begin.expand(*broadcast_shapes(begin.shape[:-3], rows.shape[:-3], given), *begin.shape[-3:])
             world = complete_rotation(rows).expand(*begin.shape[:-2], 3, 3)
 
             # The state: points, and below them the rotations of frames that are turned.
