@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from numerics import DEVICES, FLOATS, leaves_arguments_alone, normal, rotations, same_as_loop
+from numerics import DEVICES, FLOATS, HALVES, leaves_arguments_alone, normal, rotations, same_as_loop
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
@@ -149,6 +149,17 @@ def test_results_follow_dtype_and_device(dtype, device):
         leaves_arguments_alone(similarity, a, b),
     ]
     assert {(v.dtype, v.device.type) for v in values} == {(dtype, device)}
+
+
+@pytest.mark.parametrize("dtype", HALVES)
+def test_half_precision(dtype):
+    source, turn = centred(8, 3), rotations(seed=1)
+    found, scale = procrustes(source.to(dtype), (2 * source @ turn).to(dtype))
+    assert found.dtype == scale.dtype == dtype
+    assert_close(found.double(), turn, rtol=0, atol=0.02)
+    assert_close(
+        similarity(source[None].to(dtype), 3 * source[None].to(dtype)).double(), 3 * source[None], rtol=0, atol=0.1
+    )
 
 
 def test_random_rotations_are_rotations():

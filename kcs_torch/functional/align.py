@@ -94,8 +94,9 @@ def nearest_rotation(matrix: Tensor, *, reflect: bool = False) -> Tensor:
     Raises:
         ShapeError: it holds NaN.
     """
-    out: Tensor = applied(_Polar, matrix, reflect)[0]
-    return out
+    wide = matrix.to(torch.promote_types(matrix.dtype, torch.float32))  # no LAPACK takes half precision
+    out: Tensor = applied(_Polar, wide, reflect)[0]
+    return out.to(matrix.dtype)
 
 
 def procrustes(
