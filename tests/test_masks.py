@@ -149,6 +149,15 @@ def test_empty_frames_at_the_end_are_no_frames(name):
 
 
 @each_of_points
+@pytest.mark.parametrize("weights", [None, torch.ones(0, 17).double()])
+def test_a_clip_without_frames_has_no_energy(name, weights):
+    leaf = WALK[:0].clone().requires_grad_()
+    value = WEIGHTED[name](leaf, weights, slice(0, 0))
+    (grad,) = torch.autograd.grad(value.sum(), leaf)
+    assert not value.any() and grad.shape == leaf.shape
+
+
+@each_of_points
 @pytest.mark.parametrize("dtype", FLOATS)
 def test_nothing_seen_is_no_energy(name, dtype):
     none = torch.zeros(FRAMES, 17, dtype=dtype)

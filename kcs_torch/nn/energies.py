@@ -216,9 +216,9 @@ class LowRankEnergy(nn.Module):
     def _log_det(self, matrix: Tensor, share: Tensor | None) -> Tensor:
         """T/2 log det(Sigma + eps I) of rows (..., T, D); what has no share in any frame adds nothing."""
         if share is None:
-            frames: Tensor | float = float(matrix.shape[-2])
-            centred = matrix - matrix.mean(-2, keepdim=True)
-            covariance = centred.mT @ centred / frames
+            frames: Tensor | int = matrix.shape[-2]
+            centred = matrix - matrix.sum(-2, keepdim=True) / max(frames, 1)
+            covariance = centred.mT @ centred / max(frames, 1)
             gone = torch.zeros_like(covariance[..., 0])
             variance = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
         else:

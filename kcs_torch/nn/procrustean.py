@@ -111,6 +111,8 @@ def _align(vectors: Tensor, num_steps: int, share: Tensor | None = None) -> Tens
     It is the first frame of those that show most; bones count their share (..., T, B, 1).
     """
     rotations = torch.eye(3, dtype=vectors.dtype, device=vectors.device).expand(*vectors.shape[:-2], 3, 3)
+    if not vectors.shape[-3]:
+        return rotations
     if share is None:
         mean, heavy, count = vectors[..., :1, :, :], vectors, None
     else:
