@@ -613,6 +613,7 @@ def test_other_shapes_that_do_not_fit():
 
 TRUNK = SKELETONS["h36m17"]
 SEEN = 1000 * normal(4, 5, 17, 3)[..., :2] / (10 + normal(4, 5, 17, 3)[..., 2:])
+POSTURE = PostureEnergy(TRUNK)
 CALLS = {
     "bone length": lambda p, w: BoneLengthEnergy(TRUNK)(p, None, w),
     "symmetry": lambda p, w: SymmetryEnergy(TRUNK)(p, w),
@@ -624,6 +625,8 @@ CALLS = {
     "kcs": lambda p, w: KCSDistance(TRUNK)(p, torch.zeros(4, 5, 17, 3), w),
     "foreshortening": lambda p, w: ForeshorteningEnergy(TRUNK)(p, None, w),
     "procrustean": lambda p, w: ProcrusteanEnergy(TRUNK)(p, None, w),
+    "hinge": lambda p, w: HingeEnergy(TRUNK)(p, None, w),
+    "posture": lambda p, w: POSTURE(p, None, w),
 }
 
 

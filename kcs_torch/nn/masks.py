@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.nn.layers import known, known_frames
+from kcs_torch.functional.shapes import fit_together
+from kcs_torch.nn.layers import check_tensor, known, known_frames
 
 __all__ = ["bone_share", "known_points", "safe_root", "some", "weighs_joints"]
 
@@ -19,14 +20,16 @@ def weighs_joints(weights: Tensor, points: Tensor, module: nn.Module) -> bool:
     Raises:
         ShapeError: they are neither.
     """
+    check_tensor(weights, "weights", module)
     frames, joints = points.shape[-3:-1]
     if weights.shape[-2:] == (frames, joints) and (frames != joints or weights.ndim >= points.ndim - 1):
-        return True
-    if weights.shape[-1:] == (frames,):
+        if fit_together(weights.shape[:-2], points.shape[:-3]):
+            return True
+    elif weights.shape[-1:] == (frames,) and fit_together(weights.shape[:-1], points.shape[:-3]):
         return False
     raise ShapeError(
-        f"{type(module).__name__}: expected weights (..., {frames}, {joints}) of joints or (..., {frames}) of frames, "
-        f"got {tuple(weights.shape)}"
+        f"{type(module).__name__}: expected weights (..., {frames}, {joints}) of joints or (..., {frames}) of frames "
+        f"for points {tuple(points.shape)}, got {tuple(weights.shape)}"
     )
 
 
