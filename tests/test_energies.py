@@ -37,6 +37,7 @@ from kcs_torch.nn import (
     ProcrusteanEnergy,
     ReprojectionEnergy,
     SmoothnessEnergy,
+    StanceEnergy,
     SymmetryEnergy,
 )
 from kcs_torch.skeleton import SKELETONS
@@ -613,7 +614,7 @@ def test_other_shapes_that_do_not_fit():
 
 TRUNK = SKELETONS["h36m17"]
 SEEN = 1000 * normal(4, 5, 17, 3)[..., :2] / (10 + normal(4, 5, 17, 3)[..., 2:])
-POSTURE = PostureEnergy(TRUNK)
+STANCE, POSTURE = StanceEnergy(TRUNK), PostureEnergy(TRUNK)
 CALLS = {
     "bone length": lambda p, w: BoneLengthEnergy(TRUNK)(p, None, w),
     "symmetry": lambda p, w: SymmetryEnergy(TRUNK)(p, w),
@@ -626,6 +627,7 @@ CALLS = {
     "foreshortening": lambda p, w: ForeshorteningEnergy(TRUNK)(p, None, w),
     "procrustean": lambda p, w: ProcrusteanEnergy(TRUNK)(p, None, w),
     "hinge": lambda p, w: HingeEnergy(TRUNK)(p, None, w),
+    "stance": lambda p, w: STANCE(p, None, w),
     "posture": lambda p, w: POSTURE(p, None, w),
 }
 

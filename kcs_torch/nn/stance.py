@@ -46,6 +46,7 @@ class StanceEnergy(SkeletonModule):
 
     line: Tensor  # (B,) that makes of bones the way from the trunk's middle to that of the feet, 1 in the template
     usual: Tensor  # (2,) where the template has them, to the side and to the back
+    joints: Tensor  # of the trunk and the feet
 
     def __init__(self, skeleton: str | Path | Skeleton, *, sway: float = 0.06, fold: float = 0.15) -> None:
         super().__init__(skeleton)
@@ -63,6 +64,7 @@ class StanceEnergy(SkeletonModule):
             if not float(usual.norm()) > 0:
                 feet, line = [], torch.zeros_like(line)
         self.feet = feet
+        self.register_buffer("joints", torch.cat([self.posture.trunk, torch.tensor(feet).long()]), persistent=False)
         far = usual.norm() if feet else 1.0
         self.register_buffer("line", line / far, persistent=False)
         self.register_buffer("usual", usual[::2] / far, persistent=False)
@@ -120,5 +122,5 @@ class StanceEnergy(SkeletonModule):
     def _share(self, points: Tensor, weights: Tensor) -> Tensor:
         """What each frame counts, (..., T)."""
         if weighs_joints(weights, points, self):
-            return weights[..., [*self.posture.trunk.tolist(), *self.feet]].amin(-1)
+            return weights[..., self.joints].amin(-1)
         return weights
