@@ -48,7 +48,8 @@ class ContactEnergy(SkeletonModule):
         Args:
             points: (..., T, N, 3), depth relative to the root or the body's middle.
             velocity: v (..., T), the first frame's does not count; None takes the best one
-                (:func:`kcs_torch.solvers.standing.root_velocity`), at which the energy has hardly any slope in v.
+                (:func:`kcs_torch.solvers.standing.root_velocity`), at which the energy has hardly any slope in v. It is
+                a constant for autograd: second derivatives lack what it would change.
             standing: c (..., T, C).
             weights: (..., T, N) of the joints: a foot stands no more than it is seen; or (..., T) of the frames, 0 for
                 one that pads a shorter clip.
