@@ -199,3 +199,9 @@ def test_bones_of_joints_that_are_nan_count_where_they_are_seen():
     gone = torch.where(weights[..., None] > 0, points, torch.nan)
     for bones in (BONES, BONES[:1]):
         assert torch.equal(bone_deviation(gone, bones, weights=weights), bone_deviation(points, bones, weights=weights))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_bone_deviation_of_half_precision_in_millimetres(dtype):
+    points = (300 * clip(frames=1) + 10 * clip(frames=300, seed=1)).to(dtype)
+    assert torch.allclose(bone_deviation(points, BONES).double(), bone_deviation(points.double(), BONES), rtol=1e-4)

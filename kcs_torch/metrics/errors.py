@@ -126,6 +126,7 @@ def bone_deviation(
     index = torch.as_tensor(bones, device=points.device)
     if index.ndim != 2 or not len(index):
         raise ShapeError(f"bones: expected pairs of joints, got shape {tuple(index.shape)}")
+    points = points.to(torch.promote_types(points.dtype, torch.float32))
     lengths = bone_lengths(points, index)  # (..., T, B)
     mass = torch.ones_like(lengths)
     if weights is not None:
