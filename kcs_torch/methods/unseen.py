@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.align import centre, procrustes
-from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["gap_deviation", "place_unseen"]
+__all__ = ["gap_deviation", "place_unseen", "within_reach"]
 
 LEAST = 0.001
 """Least standard deviation of a place that was filled in, a share of the body's size, and that of others at rest."""
@@ -19,6 +19,63 @@ LONGEST = 0.8
 
 BEND = 0.3
 """Share of its usual acceleration, over a second, by which a joint strays from the path that fills a gap."""
+
+ROUNDS = 20
+"""How often all bones of unseen joints are shortened: enough for a limb of which only the root is seen."""
+
+
+def within_reach(points: Tensor, seen: Tensor, skeleton: Skeleton) -> Tensor:
+    """Pull joints that were filled in back to where their bones reach.
+
+    A path through a gap knows nothing of bones, and at the end of a clip it may run anywhere. No bone looks longer than
+    it is: what it is comes from its longest image in frames that show both ends, and from the skeleton's usual lengths
+    at the scale that the others have. Joints move along their bones, both ends where both are unseen.
+
+    Args:
+        points: (T, N, 2), complete.
+        seen: (T, N) bool; what is seen stays where it is.
+        skeleton: of the N joints; virtual ones follow their sources.
+
+    Returns:
+        (T, N, 2).
+
+    >>> from kcs_torch import Skeleton
+    >>> arm = Skeleton(["shoulder", "elbow"], [(0, 1)])
+    >>> points = torch.tensor([[[0.0, 0], [0, 3]], [[0.0, 0], [4, 0]], [[0.0, 0], [0, 9]]])
+    >>> within_reach(points, torch.tensor([[True, True], [True, True], [True, False]]), arm)[:, 1]
+    tensor([[0., 3.],
+            [4., 0.],
+            [0., 4.]])
+    """
+    count = skeleton.num_observed
+    rigid = skeleton.bone_index(device=points.device)[list(skeleton.rigid)]
+    some = (rigid < count).all(-1)
+    bones = rigid[some]
+    if bool(seen.all()) or not len(bones):
+        return points
+    own, there = points[:, :count], seen[:, :count]
+    both = there[:, bones].all(-1)  # (T, B)
+    longest = torch.where(both, bone_vectors(own, bones).norm(dim=-1), 0).amax(0)
+    usual = skeleton.relative_lengths(dtype=points.dtype, device=points.device)
+    if usual is not None:
+        usual = usual[list(skeleton.rigid)][some]
+        told = (longest > 0) & (usual > 0)
+        if bool(told.any()):
+            longest = torch.maximum(longest, usual * (longest / usual)[told].median())
+    reach = torch.where(longest > 0, longest, torch.inf)
+    free = (~there).to(points)
+    shares = [free[:, bones[:, end]] / free[:, bones].sum(-1).clamp_min(1) for end in (0, 1)]
+    for _ in range(ROUNDS):
+        vectors = bone_vectors(own, bones)
+        over = (1 - reach / vectors.norm(dim=-1).clamp_min(torch.finfo(points.dtype).tiny)).clamp_min(0)
+        if not bool((over * (shares[0] + shares[1]) > 0).any()):
+            break
+        pull, parts = torch.zeros_like(own), torch.zeros_like(free)
+        for end, share, sign in zip((0, 1), shares, (1, -1), strict=True):
+            pull = pull.index_add(1, bones[:, end], sign * (share * over)[..., None] * vectors)
+            parts = parts.index_add(1, bones[:, end], ((share * over) > 0).to(points))
+        own = own + pull / parts.clamp_min(1)[..., None]
+    return skeleton.complete(own)[0]
 
 
 def gap_deviation(points: Tensor, seen: Tensor, rate: float, most: float = 0.1) -> Tensor:

@@ -28,7 +28,7 @@ from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import Size
-from kcs_torch.methods.unseen import gap_deviation, place_unseen
+from kcs_torch.methods.unseen import gap_deviation, place_unseen, within_reach
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
@@ -278,6 +278,7 @@ class PKC(Method):
         if not bool(known.all()):
             flat = torch.nn.functional.pad(points, (0, 1))
             points = place_unseen(flat, known, tracks.skeleton)[..., :2]
+        points = within_reach(points, keep, tracks.skeleton)
         noise = (gap_deviation(points, keep, tracks.fps or 30.0, HELD).square() + left**2).sqrt()
         if detected(tracks.weights):
             noise = noise.maximum(detector_deviation(tracks.weights))
