@@ -7,7 +7,8 @@ import torch
 from numerics import leaves_arguments_alone, normal, turning
 from torch.testing import assert_close
 
-from kcs_torch.methods.unseen import BEND, LEAST, gap_deviation, place_unseen
+from kcs_torch.functional import bone_lengths
+from kcs_torch.methods.unseen import BEND, LEAST, gap_deviation, place_unseen, within_reach
 from kcs_torch.skeleton import SKELETONS, Skeleton
 
 BODY = SKELETONS["h36m17"]
@@ -143,3 +144,42 @@ def test_only_the_second_about_a_gap_counts():
     seen[[50, 250]] = False
     found = gap_deviation(points, seen, 30.0)
     assert found[50, 0] > 2 * LEAST and found[250, 0] == LEAST
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_was_filled_comes_back_to_where_bones_reach(dtype):
+    """An arm that ran off while only its shoulder was seen; what is seen stays, and so does what is near enough."""
+    points = turned_template(frames=20)[..., :2].to(dtype)
+    seen = torch.ones(20, 17, dtype=torch.bool)
+    shoulder, elbow, wrist = (BODY.index(f"left_{part}") for part in ("shoulder", "elbow", "wrist"))
+    seen[15:, [elbow, wrist]] = seen[3, KNEE] = False
+    spoilt = points.clone()
+    spoilt[15:, wrist] += torch.linspace(0, 3000, 5).to(dtype)[:, None]
+    found = leaves_arguments_alone(lambda p, s: within_reach(p, s, BODY), spoilt, seen)
+    assert torch.equal(found[seen], points[seen]) and torch.equal(found[3], points[3])
+    arm = torch.tensor([[shoulder, elbow], [elbow, wrist]])
+    longest, images = bone_lengths(turned_template(frames=20).to(dtype), arm)[0], bone_lengths(found, arm)
+    assert found.dtype == dtype and (images <= 1.01 * longest).all(), images / longest
+    assert (bone_lengths(spoilt, arm)[-1] > 5 * longest).any()
+
+
+def test_nothing_is_said_of_bones_that_nobody_knows():
+    """Without usual lengths a bone that no frame shows, and one of no length, may be of any."""
+    dots = Skeleton(["a", "b", "c"], [(0, 1), (1, 2)])
+    points = normal(6, 3, 2)
+    seen = torch.tensor([True, True, False]).expand(6, 3)
+    assert torch.equal(within_reach(points, seen, dots), points)
+    points[:, 1] = points[:, 0]
+    assert torch.equal(within_reach(points, torch.tensor([True, False, False]).expand(6, 3), dots), points)
+
+
+def test_virtual_joints_follow_what_was_pulled_back():
+    body = SKELETONS["coco17"]
+    points = body.complete(normal(5, body.num_observed, 2))[0]
+    seen = torch.ones(5, body.num_joints, dtype=torch.bool)
+    hip = body.index("left_hip")
+    seen[4, hip] = False
+    points[4, hip] += 1e3
+    found = within_reach(points, seen, body)
+    assert (found[4, hip] - points[4, hip]).norm() > 100
+    assert_close(found, body.complete(found[:, : body.num_observed])[0])

@@ -20,7 +20,7 @@ LONGEST = 0.8
 BEND = 0.3
 """Share of its usual acceleration, over a second, by which a joint strays from the path that fills a gap."""
 
-ROUNDS = 20
+ROUNDS = 50
 """How often all bones of unseen joints are shortened: enough for a limb of which only the root is seen."""
 
 
@@ -53,9 +53,10 @@ def within_reach(points: Tensor, seen: Tensor, skeleton: Skeleton) -> Tensor:
     bones = rigid[some]
     if bool(seen.all()) or not len(bones):
         return points
-    own, there = points[:, :count], seen[:, :count]
+    there = seen[:, :count]
     both = there[:, bones].all(-1)  # (T, B)
-    longest = torch.where(both, bone_vectors(own, bones).norm(dim=-1), 0).amax(0)
+    images = bone_lengths(points, bones)
+    longest = torch.where(both, images, 0).amax(0)
     usual = skeleton.relative_lengths(dtype=points.dtype, device=points.device)
     if usual is not None:
         usual = usual[list(skeleton.rigid)][some]
@@ -63,19 +64,22 @@ def within_reach(points: Tensor, seen: Tensor, skeleton: Skeleton) -> Tensor:
         if bool(told.any()):
             longest = torch.maximum(longest, usual * (longest / usual)[told].median())
     reach = torch.where(longest > 0, longest, torch.inf)
-    free = (~there).to(points)
+    wrong = ((images > reach) & ~both).any(-1)  # (T,) frames
+    if not bool(wrong.any()):
+        return points
+    own, free = points[wrong, :count], (~there[wrong]).to(points)
     shares = [free[:, bones[:, end]] / free[:, bones].sum(-1).clamp_min(1) for end in (0, 1)]
     for _ in range(ROUNDS):
         vectors = bone_vectors(own, bones)
         over = (1 - reach / vectors.norm(dim=-1).clamp_min(torch.finfo(points.dtype).tiny)).clamp_min(0)
-        if not bool((over * (shares[0] + shares[1]) > 0).any()):
-            break
         pull, parts = torch.zeros_like(own), torch.zeros_like(free)
         for end, share, sign in zip((0, 1), shares, (1, -1), strict=True):
             pull = pull.index_add(1, bones[:, end], sign * (share * over)[..., None] * vectors)
             parts = parts.index_add(1, bones[:, end], ((share * over) > 0).to(points))
         own = own + pull / parts.clamp_min(1)[..., None]
-    return skeleton.complete(own)[0]
+    out = points.clone()
+    out[wrong] = skeleton.complete(own)[0]
+    return out
 
 
 def gap_deviation(points: Tensor, seen: Tensor, rate: float, most: float = 0.1) -> Tensor:
