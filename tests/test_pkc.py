@@ -293,6 +293,17 @@ def test_gaps_of_a_swaying_viewpoint_are_filled_again(monkeypatch):
     assert torch.equal(again[2], once[2]) and torch.equal(again[3], once[3])
 
 
+def test_a_gap_at_the_end_of_a_clip_does_not_spoil_it(protocol, shared):
+    """A neck that only ever shows now and then: nobody's neck is half a metre long."""
+    case = {"src": "cmu_cs2s/train_directing_traffic_1", "sway": 20, "missing": 0.3, "yaw": 45, "pitch": 10}
+    given, truth = protocol.build(shared / "data", case | {"max_frames": 150})
+    tracks = Tracks.from_arrays(
+        given["points2d"], edges=given["edges"], joint_names=given["joint_names"], fps=given["fps"], units="mm"
+    )
+    found = PKC()(tracks)
+    assert protocol.score(found.observed.numpy(), truth["points3d"], truth["edges"])["rigid"] < 40  # flat is at 107
+
+
 def test_what_counts_as_a_gap():
     """Joints that are seen elsewhere and not where they are; those never seen are not filled by what they never did."""
     clip = walking_person(40, turn=0.0)
