@@ -167,6 +167,16 @@ def test_gradient_penalty_trains_the_critic():
     assert one.gradient_penalty(real, fake, generator=draw).mean() < 0.2 * first
 
 
+@pytest.mark.parametrize("context", [torch.no_grad, torch.inference_mode])
+def test_gradient_penalty_in_a_validation_step(context):
+    one, real, fake = critic(), normal(3, 7, 3), normal(3, 7, 3, seed=1)
+    draw = lambda: torch.Generator().manual_seed(5)  # noqa: E731
+    expected = one.gradient_penalty(real, fake, generator=draw())
+    with context():
+        value = one.gradient_penalty(real + 0, fake + 0, generator=draw())
+    assert torch.equal(value, expected.detach()) and not value.requires_grad
+
+
 def test_gradient_penalty_beside_gaps():
     one, real = critic(), normal(3, 7, 3)
     weights = torch.ones(3, 7).double()

@@ -147,11 +147,14 @@ class KCSCritic(SkeletonModule):
             ours, others = self.features(real, weights), self.features(fake, weights)
             mix = torch.rand(ours.shape[:-1], generator=generator, dtype=ours.dtype, device=ours.device)
             between = others + mix[..., None] * (ours - others)
-        between.requires_grad_()
-        each = [
-            n(b) for n, b in zip(self.networks, between.to(next(self.parameters())).split(self.sizes, -1), strict=True)
-        ]
-        (slope,) = torch.autograd.grad(torch.cat(each, -1).sum(), between, create_graph=True)
+        wanted = (
+            torch.is_grad_enabled()
+        )  # a validation step wants the value alone, which is made of slopes all the same
+        with torch.inference_mode(False), torch.enable_grad():
+            between = between.clone().requires_grad_()
+            parts = between.to(next(self.parameters())).split(self.sizes, -1)
+            each = [n(b) for n, b in zip(self.networks, parts, strict=True)]
+            (slope,) = torch.autograd.grad(torch.cat(each, -1).sum(), between, create_graph=wanted)
         excess = torch.stack([(safe_norm(block) - 1).square() for block in slope.split(self.sizes, -1)], -1)
         if weights is None:
             return excess.mean(-1)
