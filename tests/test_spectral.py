@@ -446,7 +446,10 @@ def test_vectors_are_refused(function):
         function(normal(5))
 
 
-@pytest.mark.parametrize("function", [lambda x: svt(x, 1.0), lambda x: psd_shrink(x, 1.0), nuclear_norm, spectral_norm])
+@pytest.mark.parametrize(
+    "function",
+    [lambda x: svt(x, 1.0), lambda x: psd_shrink(x, 1.0), nuclear_norm, spectral_norm, singular_values],
+)
 @pytest.mark.parametrize("recorded", [True, False])
 def test_nan_is_refused_in_our_words(function, recorded):
     matrix = normal(2, 5, 5)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kcs_torch.errors import NotFiniteError, ShapeError
 
-__all__ = ["LargestSum", "PSDShrink", "ShrinkSingularValues", "applied", "batch_first"]
+__all__ = ["LargestSum", "PSDShrink", "ShrinkSingularValues", "applied", "batch_first", "why_failed"]
 
 
 def applied(function: type[torch.autograd.Function], *inputs: Any) -> Any:
@@ -29,12 +29,17 @@ def applied(function: type[torch.autograd.Function], *inputs: Any) -> Any:
     try:
         return call(*inputs)
     except torch.linalg.LinAlgError as error:
-        if bool(inputs[0].isfinite().all()):
-            raise ShapeError(f"singular values: {error}") from None
-        raise NotFiniteError(
-            f"singular values: expected finite numbers, got NaN or infinite ones in a {tuple(inputs[0].shape)} array: "
-            "give unseen joints weights of 0; where a network made them, its training diverged"
-        ) from None
+        raise why_failed(inputs[0], error) from None
+
+
+def why_failed(matrix: Tensor, error: Exception) -> NotFiniteError | ShapeError:
+    """What a matrix whose factorisation failed is refused with."""
+    if bool(matrix.isfinite().all()):
+        return ShapeError(f"singular values: {error}")
+    return NotFiniteError(
+        f"singular values: expected finite numbers, got NaN or infinite ones in a {tuple(matrix.shape)} array: "
+        "give unseen joints weights of 0; where a network made them, its training diverged"
+    )
 
 
 def batch_first(info: Any, in_dims: tuple[int | None, ...], tensors: tuple[Tensor, ...], cores: tuple[int, ...]) -> Any:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.functional.derivatives import LargestSum, PSDShrink, ShrinkSingularValues, applied
+from kcs_torch.functional.derivatives import LargestSum, PSDShrink, ShrinkSingularValues, applied, why_failed
 
 __all__ = ["dct_basis", "log_det", "nuclear_norm", "psd_shrink", "singular_values", "spectral_norm", "svt"]
 
@@ -166,11 +166,18 @@ def singular_values(matrix: Tensor) -> Tensor:
 
     Returns:
         (..., min(M, N)), accurate to about 1e-8 times the largest.
+
+    Raises:
+        NotFiniteError: the matrix holds NaN.
     """
     with torch.no_grad():
         work = _double(matrix)
         gram = work.mT @ work if work.shape[-2] >= work.shape[-1] else work @ work.mT
-        return torch.linalg.eigvalsh(gram).clamp_min(0).sqrt().flip(-1).to(matrix.dtype)
+        try:
+            values = torch.linalg.eigvalsh(gram)
+        except torch.linalg.LinAlgError as error:
+            raise why_failed(matrix, error) from None
+        return values.clamp_min(0).sqrt().flip(-1).to(matrix.dtype)
 
 
 def dct_basis(
