@@ -1,4 +1,4 @@
-"""Joints that are not seen: how far they may be from where gaps are filled, and where to put those never seen."""
+"""Joints that are not seen: how far off filled gaps may be, how far bones reach, and where to put those never seen."""
 
 from __future__ import annotations
 
