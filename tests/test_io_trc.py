@@ -27,6 +27,13 @@ def write(folder, text):
     return path
 
 
+@pytest.mark.parametrize(
+    "name, unit", [("meters", "m"), ("Millimetre", "mm"), ("CM", "cm"), ("feet", "ft"), ("au", "au")]
+)
+def test_units_may_be_written_out(tmp_path, name, unit):
+    assert load_motion(write(tmp_path, HEAD.replace("mm", name) + ROWS)).units == unit
+
+
 def test_cells_by_hand(tmp_path):
     motion = load_motion(write(tmp_path, HEAD + "\n" + ROWS))
     assert motion.points.tolist() == [[[1, 2, 3], [4, 5, 6]], [[1, 2, 3], [0, 0, 0]]]

@@ -14,10 +14,25 @@ from kcs_torch.errors import OptionError
 from kcs_torch.skeleton import Skeleton, map_joints, stature_weights
 from kcs_torch.types.intake import as_number
 
-__all__ = ["METRES", "check_size", "parse_size", "size_factor", "unit_ratio"]
+__all__ = ["METRES", "check_size", "parse_size", "short_unit", "size_factor", "unit_ratio"]
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Units of length in metres."""
+
+PREFIXES = {"": "m", "centi": "cm", "milli": "mm"}
+SPELT = {f"{size}{word}": unit for size, unit in PREFIXES.items() for word in ("meter", "meters", "metre", "metres")}
+SPELT |= {"inch": "in", "inches": "in", "foot": "ft", "feet": "ft"}
+"""Their names as words."""
+
+
+def short_unit(name: str) -> str:
+    """A unit of length as it is written here, whatever a file calls it; other units in small letters.
+
+    >>> short_unit("Millimeters"), short_unit("px")
+    ('mm', 'px')
+    """
+    name = name.strip().lower()
+    return SPELT.get(name, name)
 
 
 def unit_ratio(old: str, new: str) -> float | None:

@@ -21,6 +21,7 @@ from kcs_torch.io.worker import ask_worker
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion
 from kcs_torch.types.axes import from_y_up
+from kcs_torch.types.size import short_unit
 
 __all__ = ["MOTION_READERS", "WRITERS"]
 
@@ -60,7 +61,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
         source=str(path),
         names=[name for name, seen in zip(names, there, strict=True) if seen],
         fps=rate if 0 < rate < 1e6 else None,
-        units=str(answer["units"]).strip().lower(),
+        units=short_unit(str(answer["units"])),
         up=next((axis for axis in ("y", "z") if answer["y_screen"].strip() == f"+{axis.upper()}"), None),
         notes=notes,
     )

@@ -21,6 +21,7 @@ from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer
 from kcs_torch.types import Motion
 from kcs_torch.types.axes import from_y_up
+from kcs_torch.types.size import short_unit
 
 __all__ = ["MOTION_READERS", "WRITERS"]
 
@@ -73,7 +74,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
         source=str(path),
         names=distinct(names),
         fps=_rate(rate, path) if rate else None,
-        units=header.get("Units", "").lower(),
+        units=short_unit(header.get("Units", "")),
         notes=notes,
     )
 
