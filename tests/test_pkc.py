@@ -18,6 +18,7 @@ from kcs_torch.methods.pkc import body as body_module
 from kcs_torch.methods.pkc import method as module
 from kcs_torch.methods.pkc.batch import Noisy, clean_all, serve
 from kcs_torch.methods.pkc.body import Body
+from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.gaps import gaps_of
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
@@ -639,7 +640,7 @@ def test_confidences_that_vary_are_a_detector_s():
     method = PKC(rounds=0)
     weights = torch.rand(clip.tracks.weights.shape, generator=torch.Generator().manual_seed(0)).double() * 0.8 + 0.2
     unsure = replace(clip.tracks, weights=weights)
-    _, noise, notes = run(method._clean(unsure), serve)
+    _, noise, notes = run(cleaned(unsure, denoise=True), serve)
     assert_close(noise, detector.DETECTED / weights.sqrt())
     assert any("detector" in note for note in notes)
     chosen = torch.where(weights > 0.6, 1.0, 0.3)

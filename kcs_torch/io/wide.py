@@ -25,7 +25,10 @@ from kcs_torch.io.landmarks import CONFIDENCES, FRAME_KEYS, VISIBILITIES, Landma
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import brief, read_error
 
-__all__ = ["EMPTY", "WHO", "Columns", "Header", "Row", "as_value", "opened", "place_rows", "plain_name", "read_wide"]
+__all__ = [
+    *("EMPTY", "WHO", "Columns", "Header", "Row"),
+    *("as_value", "delimiter", "opened", "place_rows", "plain_name", "read_wide"),
+]
 
 _LIMIT = 2**30  # bytes of a file
 WHO = ("person", "person_id", "pose", "track_id", "hand", "handedness", "id")
@@ -70,7 +73,7 @@ class Header:
         """
         try:
             line = line.strip("\ufeff\r\n")
-            cells = [] if "\0" in line else next(csv.reader([line], delimiter=_delimiter(line)), [])
+            cells = [] if "\0" in line else next(csv.reader([line], delimiter=delimiter(line)), [])
         except csv.Error:
             return cls([], {})
         cells = [plain_name(cell) for cell in cells]
@@ -144,7 +147,7 @@ def plain_name(cell: str) -> str:
     return re.sub(r"\A'(?=[=+\-@\t\r])", "", cell.strip())
 
 
-def _delimiter(line: str) -> str:
+def delimiter(line: str) -> str:
     """What stands between the cells of a line."""
     return max(",;\t", key=line.count)
 
@@ -161,7 +164,7 @@ def opened(path: Path) -> Iterator[tuple[str, Iterator[list[str]]]]:
             raise FormatError(f"{path}: expected 1 GiB of CSV at most: split the file")
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
             line = file.readline(2**20)
-            yield line, csv.reader(file, delimiter=_delimiter(line))
+            yield line, csv.reader(file, delimiter=delimiter(line))
     except OSError as error:
         raise read_error(path, error) from None
     except csv.Error as error:

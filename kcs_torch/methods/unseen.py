@@ -37,7 +37,7 @@ def within_reach(points: Tensor, seen: Tensor, skeleton: Skeleton) -> Tensor:
         skeleton: of the N joints; virtual ones follow their sources.
 
     Returns:
-        (T, N, 2).
+        (T, N, 2), in the unit of the points.
 
     >>> from kcs_torch import Skeleton
     >>> arm = Skeleton(["shoulder", "elbow"], [(0, 1)])

@@ -151,7 +151,7 @@ class KCSCritic(SkeletonModule):
             torch.is_grad_enabled()
         )  # a validation step wants the value alone, which is made of slopes all the same
         with torch.inference_mode(False), torch.enable_grad():
-            between = between.clone().requires_grad_()
+            between = between.clone().requires_grad_()  # what inference mode made cannot need gradients, a copy can
             parts = between.to(next(self.parameters())).split(self.sizes, -1)
             each = [n(b) for n, b in zip(self.networks, parts, strict=True)]
             (slope,) = torch.autograd.grad(torch.cat(each, -1).sum(), between, create_graph=wanted)

@@ -18,11 +18,11 @@ import torch
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.animals import LIMIT, Animal, bounded_lines, build_animals, frames_of, refuse_3d
+from kcs_torch.io.animals import LIMIT, LINE, Animal, bounded_lines, build_animals, frames_of, refuse_3d
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5_pandas import Table, has_column, pandas_group, read_pandas
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief, read_error
-from kcs_torch.io.wide import EMPTY
+from kcs_torch.io.wide import EMPTY, delimiter
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]
@@ -141,9 +141,9 @@ def _read_csv(path: Path, coords: Sequence[str], notes: list[str]) -> Table:
     rows: list[tuple[str, ...]] = []
     try:
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            delimiter = file.read(9).replace('"', "")[6:7]
+            between = delimiter(file.readline(LINE))
             file.seek(0)
-            lines = csv.reader(bounded_lines(file, path), delimiter=delimiter if delimiter in (",", ";", "\t") else ",")
+            lines = csv.reader(bounded_lines(file, path), delimiter=between)
             header = _header(lines, path)
             width, first = len(header[0]), _first_column(header)
             columns = list(zip(*header, strict=True))

@@ -12,13 +12,13 @@ import torch
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.animals import LIMIT, Animal, bounded_lines, build_animals, frames_of, refuse_3d
+from kcs_torch.io.animals import LIMIT, LINE, Animal, bounded_lines, build_animals, frames_of, refuse_3d
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5 import Tree, read_tree
 from kcs_torch.io.landmark_tables import first_line
 from kcs_torch.io.link import link_people
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief, read_error
-from kcs_torch.io.wide import Header
+from kcs_torch.io.wide import Header, delimiter
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]
@@ -174,9 +174,9 @@ def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
     instances: dict[str, dict[int, list[NDArray[np.float64]]]] = {}
     try:
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            delimiter = file.read(8).replace('"', "")[5:6]  # after "track"
+            between = delimiter(file.readline(LINE))
             file.seek(0)
-            lines = csv.reader(bounded_lines(file, path), delimiter=delimiter if delimiter in (";", "\t") else ",")
+            lines = csv.reader(bounded_lines(file, path), delimiter=between)
             header = next(lines, [])
             names = list(dict.fromkeys(c.rpartition(".")[0] for c in header[3:]))
             places = [[_place(header, f"{n}.{c}") for c in ("x", "y", "score")] for n in names]

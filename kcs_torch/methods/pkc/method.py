@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -11,16 +10,16 @@ import torch
 from torch import Tensor
 
 from kcs_torch.clean.sides import unswap
-from kcs_torch.errors import OptionError, counted
+from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
-from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.base import Estimate, Method
-from kcs_torch.methods.detector import detected, detector_deviation
+from kcs_torch.methods.detector import detected
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
-from kcs_torch.methods.pkc.batch import Noisy, Sized, serve
+from kcs_torch.methods.pkc.batch import Sized, serve
 from kcs_torch.methods.pkc.body import Body, Turned
-from kcs_torch.methods.pkc.gate import plausible, without_others
+from kcs_torch.methods.pkc.cleaning import cleaned
+from kcs_torch.methods.pkc.gate import without_others
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
 from kcs_torch.methods.pkc.moving_view import MovingView, settled
@@ -28,23 +27,11 @@ from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import Size
-from kcs_torch.methods.unseen import gap_deviation, place_unseen, within_reach
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
 __all__ = ["PKC"]
-
-CLEAN = 0.003
-"""Noise below this share of the body's size is left in the tracks."""
-
-WINDOW, QUICK = 64, 2.2
-"""Frames in which motion and noise are told apart, at 30 a second: two seconds, and up to 120 frames a second about as
-many. And the frequency in Hz from which on what joints do not share is noise rather than motion."""
-
-HELD = 0.1
-"""Standard deviation, a share of the body's size, of joints in frames before the body is first seen and after it was
-last seen, and the largest in gaps."""
 
 ROUNDING = 8.0
 """Size of the body, over where it is and the machine precision, up to which it is a point."""
@@ -141,7 +128,7 @@ class PKC(Method):
         return run(together([self._steps(one, None) for one in tracks]), serve)
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
-        points, noise, notes = yield from self._clean(tracks)
+        points, noise, notes = yield from cleaned(tracks, self.denoise)
         standing = standing_feet(replace(tracks, points=points))
         image = points - points.mean(-2, keepdim=True)
         rounding = ROUNDING * torch.finfo(points.dtype).eps * float(points.abs().amax())
@@ -249,49 +236,6 @@ class PKC(Method):
         new = yield from other.search(self.rounds, self.steps)
         return new if bool(new.energy[0] < before - BETTER) else None
 
-    def _clean(self, tracks: Tracks) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
-        """Complete tracks (T, N, 2), the noise (T, N) left in them, and what was done."""
-        level, left, keep = 0.0, 0.0, tracks.seen
-        points, notes = tracks.points, []
-        if self.denoise:
-            keep = plausible(points, keep, tracks.skeleton)
-            rate = tracks.fps or 30.0
-            window = WINDOW * round(min(max(rate / 30, 1), 4))
-            quick = math.ceil(2 * QUICK * window / rate)
-            (clean,) = yield [Noisy(points, torch.where(keep, tracks.weights, 0), window, quick)]
-            level, left = float(clean.noise.median()), float(clean.left.median())
-            wrong = int((clean.outliers & keep).sum()) + int((tracks.seen & ~keep).sum())
-            if wrong:
-                share = wrong / int(tracks.seen.sum())
-                notes.append(f"{counted(wrong, 'detection')} ({100 * share:.1f} %) rejected as outliers")
-            keep = keep & ~clean.outliers
-            exact = keep
-            if level <= CLEAN:
-                left = 0.0
-            else:
-                exact = torch.zeros_like(keep)
-                notes.append(f"tracks smoothed: noise of {100 * level:.1f} % of the body's size")
-            points = torch.where(exact[..., None], points, clean.points)
-        else:
-            points = interpolate(points, tracks.seen)
-        known = keep.any(0)
-        if not bool(known.all()):
-            flat = torch.nn.functional.pad(points, (0, 1))
-            points = place_unseen(flat, known, tracks.skeleton)[..., :2]
-        points = within_reach(points, keep, tracks.skeleton)
-        noise = (gap_deviation(points, keep, tracks.fps or 30.0, HELD).square() + left**2).sqrt()
-        if detected(tracks.weights):
-            noise = noise.maximum(detector_deviation(tracks.weights))
-            notes.append("confidences vary as a detector's do: joints may be off by a centimetre or more")
-        held = _nearest_shown(keep)
-        away = held != torch.arange(len(held), device=held.device)
-        if bool(away.any()):  # nothing tells what goes on there, and a model of motion would run off
-            points, noise = points[held], torch.where(away[:, None], points.new_full((), HELD), noise)
-            count = int(away.sum())
-            show = "shows" if count == 1 else "show"
-            notes.append(f"{counted(count, 'frame')} at the clip's ends {show} nobody: nearest pose held")
-        return points, noise, tuple(notes)
-
     def _moving(
         self, tracks: Tracks, image: Tensor, noise: Tensor, count: int = 1
     ) -> Search[Any, Any, tuple[MovingView, Estimate]]:
@@ -364,13 +308,6 @@ def _complete(tracks: Tracks, image: Tensor) -> Tracks:
 def _turns(cameras: Tensor | None) -> bool:
     """Whether known cameras turn far enough to tell the sign of depth."""
     return cameras is not None and float(viewpoint_turn(cameras)) >= TELLING
-
-
-def _nearest_shown(seen: Tensor) -> Tensor:
-    """Each frame's own index (T,), but that of the nearest frame that shows something at the clip's ends."""
-    shown = (seen.sum(-1) > 1).nonzero().flatten()
-    index = torch.arange(len(seen), device=seen.device)
-    return index if not len(shown) else index.clamp(int(shown[0]), int(shown[-1]))
 
 
 def _with_size(found: Estimate, size: Size) -> Estimate:

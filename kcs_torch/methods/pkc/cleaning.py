@@ -1,0 +1,90 @@
+"""The tracks that PKC solves: smoothed where they are noisy, complete, and how far off each joint may be."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcs_torch.errors import counted
+from kcs_torch.functional.temporal import interpolate
+from kcs_torch.methods.detector import detected, detector_deviation
+from kcs_torch.methods.lockstep import Search
+from kcs_torch.methods.pkc.batch import Noisy
+from kcs_torch.methods.pkc.gate import plausible
+from kcs_torch.methods.unseen import gap_deviation, place_unseen, within_reach
+from kcs_torch.types import Tracks
+
+__all__ = ["cleaned"]
+
+CLEAN = 0.003
+"""Noise below this share of the body's size is left in the tracks."""
+
+WINDOW, QUICK = 64, 2.2
+"""Frames in which motion and noise are told apart, at 30 a second: two seconds, and up to 120 frames a second about as
+many. And the frequency in Hz from which on what joints do not share is noise rather than motion."""
+
+HELD = 0.1
+"""Standard deviation, a share of the body's size, of joints in frames before the body is first seen and after it was
+last seen, and the largest in gaps."""
+
+
+def cleaned(tracks: Tracks, denoise: bool) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
+    """Smooth noisy tracks, reject outliers and fill gaps.
+
+    Args:
+        tracks: of root mean square 1.
+        denoise: whether to smooth and reject; else gaps are filled linearly.
+
+    Returns:
+        Complete tracks (T, N, 2), the standard deviation (T, N) of the noise that is left in them, and what was done.
+    """
+    level, left, keep = 0.0, 0.0, tracks.seen
+    points, notes = tracks.points, []
+    if denoise:
+        keep = plausible(points, keep, tracks.skeleton)
+        rate = tracks.fps or 30.0
+        window = WINDOW * round(min(max(rate / 30, 1), 4))
+        quick = math.ceil(2 * QUICK * window / rate)
+        (clean,) = yield [Noisy(points, torch.where(keep, tracks.weights, 0), window, quick)]
+        level, left = float(clean.noise.median()), float(clean.left.median())
+        wrong = int((clean.outliers & keep).sum()) + int((tracks.seen & ~keep).sum())
+        if wrong:
+            share = wrong / int(tracks.seen.sum())
+            notes.append(f"{counted(wrong, 'detection')} ({100 * share:.1f} %) rejected as outliers")
+        keep = keep & ~clean.outliers
+        exact = keep
+        if level <= CLEAN:
+            left = 0.0
+        else:
+            exact = torch.zeros_like(keep)
+            notes.append(f"tracks smoothed: noise of {100 * level:.1f} % of the body's size")
+        points = torch.where(exact[..., None], points, clean.points)
+    else:
+        points = interpolate(points, tracks.seen)
+    known = keep.any(0)
+    if not bool(known.all()):
+        flat = torch.nn.functional.pad(points, (0, 1))
+        points = place_unseen(flat, known, tracks.skeleton)[..., :2]
+    points = within_reach(points, keep, tracks.skeleton)
+    noise = (gap_deviation(points, keep, tracks.fps or 30.0, HELD).square() + left**2).sqrt()
+    if detected(tracks.weights):
+        noise = noise.maximum(detector_deviation(tracks.weights))
+        notes.append("confidences vary as a detector's do: joints may be off by a centimetre or more")
+    held = _nearest_shown(keep)
+    away = held != torch.arange(len(held), device=held.device)
+    if bool(away.any()):  # nothing tells what goes on there, and a model of motion would run off
+        points, noise = points[held], torch.where(away[:, None], points.new_full((), HELD), noise)
+        count = int(away.sum())
+        show = "shows" if count == 1 else "show"
+        notes.append(f"{counted(count, 'frame')} at the clip's ends {show} nobody: nearest pose held")
+    return points, noise, tuple(notes)
+
+
+def _nearest_shown(seen: Tensor) -> Tensor:
+    """Each frame's own index (T,), but that of the nearest frame that shows something at the clip's ends."""
+    shown = (seen.sum(-1) > 1).nonzero().flatten()
+    index = torch.arange(len(seen), device=seen.device)
+    return index if not len(shown) else index.clamp(int(shown[0]), int(shown[-1]))
