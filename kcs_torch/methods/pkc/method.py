@@ -241,10 +241,12 @@ class PKC(Method):
     ) -> Search[Any, Any, tuple[MovingView, Estimate]]:
         """So many solutions of the moving viewpoint at most; and the first guess, SfAM's."""
         (first,) = yield [_complete(tracks, image)]
-        start, exact = (first.points, complete_rotation(first.cameras)), float(noise.median()) == 0
+        start, usual = (first.points, complete_rotation(first.cameras)), float(noise.median())
+        weights = (usual / noise.clamp_min(usual)).square() if usual > 0 else None
         moving = yield from turning(
-            image, tracks.skeleton, *start, lifts=self.lifts, alternatives=count, exact=exact, seed=self.seed
-        )
+            image, tracks.skeleton, *start, weights=weights, noise=usual, lifts=self.lifts, alternatives=count,
+            exact=usual == 0, seed=self.seed,
+        )  # fmt: skip
         return moving, first
 
     def _turned(self, tracks: Tracks, image: Tensor, noise: Tensor, factor: Tensor) -> Turned:

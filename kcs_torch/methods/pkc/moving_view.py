@@ -29,6 +29,7 @@ from kcs_torch.solvers.procrustean import (
     depth_deviation,
     length_energy,
     motion_energy,
+    track_energy,
 )
 
 __all__ = ["TIGHT", "MovingView", "moving_view", "searching", "settled", "soften"]
@@ -65,6 +66,10 @@ more has so far been right."""
 LONG = 2000
 """Frames of a clip up to which paths of bones are put together: of longer ones the frames that are compared are too far
 apart, and paths of all frames would take much memory."""
+
+FREE = 30_000_000
+"""Numbers of the matrices that whiten all frames up to which x and y are unknowns in noise: 10,000 frames of 17 joints.
+With all that goes with them they take 70 KB a frame there; the image of longer clips is taken as it is."""
 
 GIVEN = 3
 """Solutions whose bones are then led along paths of constant length."""
@@ -137,7 +142,7 @@ def moving_view(
         start: (T, N, 3) a first guess, from :class:`kcs_torch.methods.SfAM`.
         rotations: (T, 3, 3) world to camera, of that guess.
         weights: (T, N) confidences, for ``noise``.
-        noise: of the image; 0 holds x and y.
+        noise: standard deviation of the image, a share of its size; 0 holds x and y.
         turns: degrees of further starts with evenly turning cameras.
         lifts: number of further starts from bone lengths with random signs.
         coarse_frames: starts are compared on about as many frames, evenly spread.
@@ -176,6 +181,8 @@ def searching(
     frames, joints, _ = image.shape
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
+    if frames * (3 * joints + 3) ** 2 > FREE:
+        noise, weights = 0.0, None
     held = is_tree and exact and noise == 0 and len(rigid) == joints - 1
     first = torch.cat([image, start[..., 2:] - start[..., 2:].mean(1, keepdim=True)], -1)[None]
     spread = lambda points: rigid_tree(distance_spread(points)[1])  # noqa: E731
@@ -195,6 +202,10 @@ def searching(
         pull = image.new_full((len(rigid),), TIGHT if held else tight[0])
         total = motion_energy(pose.points, pose.rotations, bones, stage)
         total = total + length_energy(pose.points, rigid, pull, stage.slack)
+        if noise > 0:  # who leaves the tracks moves as simply as he likes
+            tracks, sure = (image, weights) if pose.points.shape[1] == frames else (few, few_weights)
+            sure = torch.ones_like(tracks[..., 0]) if sure is None else sure
+            total = total + track_energy(pose.points, tracks, sure, noise)
         if held:
             own = bone_vectors(pose.points, rigid).transpose(-3, -2)  # (H, P, T, 3)
             total = total + WORTH * path_energy(own[..., 2], own[..., :2]).sum(-1)
