@@ -239,6 +239,21 @@ def test_metres_for_blender(tmp_path):
     assert np.abs(found - motion.points.numpy()).max() < 1e-4
 
 
+@pytest.mark.parametrize(("units", "factor"), [("m", 1e-3), ("m", 1e-6), ("", 1e-9)])
+def test_small_animals_are_written_as_exactly(tmp_path, units, factor):
+    """A fly is two millimetres long: six decimals of a metre resolve its feet to a few hundredths of its leg."""
+    motion = walking_motion()
+    small = replace(motion, points=factor * motion.points, units=units)
+    found = theirs(save(small, tmp_path / "w.bvh", units=units or None, notes=[]), motion.skeleton.joints) / factor
+    assert np.abs(found - motion.points.numpy()).max() < 1e-5
+
+
+@pytest.mark.parametrize("fps", [29.97, 3000.0, 7000.0])
+def test_rates_of_fast_cameras_come_back(tmp_path, fps):
+    motion = replace(walking_motion(3), fps=fps)
+    assert load_motion(save(motion, tmp_path / "w.bvh", notes=[])).fps == fps
+
+
 def test_gaps_are_filled_and_told(tmp_path):
     motion = walking_motion()
     weights = motion.weights.clone()

@@ -10,6 +10,7 @@ from ours is told.
 
 from __future__ import annotations
 
+import math
 import re
 from array import array
 from collections.abc import Iterator, Sequence
@@ -232,6 +233,8 @@ def _write_rig(rig: Rig, path: Path, rate: float) -> None:
     for node, parent in enumerate(rig.parents):
         children[parent].append(node)
     lines, order = ["HIERARCHY"], []
+    size = float(rig.offsets.norm(dim=-1).sum())
+    places = max(6, 8 - math.floor(math.log10(size))) if size > 0 else 6  # decimals: small bodies need more
     stack: list[tuple[int, int]] = [(0, 0)]  # node (~node closes it) and depth
     while stack:
         node, depth = stack.pop()
@@ -243,7 +246,7 @@ def _write_rig(rig: Rig, path: Path, rate: float) -> None:
         x, y, z = rig.offsets[node].tolist()
         place = "" if depth else "Xposition Yposition Zposition "
         lines += [f"{tab}{'JOINT' if depth else 'ROOT'} {names[node]}", f"{tab}{{"]
-        lines += [f"{tab}\tOFFSET {x:.6f} {y:.6f} {z:.6f}"]
+        lines += [f"{tab}\tOFFSET {x:.{places}f} {y:.{places}f} {z:.{places}f}"]
         lines += [f"{tab}\tCHANNELS {3 if depth else 6} {place}Zrotation Xrotation Yrotation"]
         if not children[node]:
             lines += [f"{tab}\tEnd Site", f"{tab}\t{{", f"{tab}\t\tOFFSET 0.000000 0.000000 0.000000", f"{tab}\t}}"]
@@ -251,12 +254,11 @@ def _write_rig(rig: Rig, path: Path, rate: float) -> None:
         stack += [(child, depth + 1) for child in reversed(children[node])]
     angles = plain(euler_angles("ZXY", rig.turns[:, order]).rad2deg())
     angles = np.unwrap(angles, axis=0, period=360).reshape(len(angles), -1)
-    rows = np.concatenate([plain(rig.root), angles], 1)
-    lines += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1 / rate:.8f}"]
+    lines += ["MOTION", f"Frames: {len(angles)}", f"Frame Time: {1 / rate:.12f}"]
     with path.open("w", encoding="utf-8", errors="replace", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
-        for row in rows.tolist():
-            file.write(" ".join(f"{v:.6f}" for v in row) + "\n")
+        for root, row in zip(plain(rig.root).tolist(), angles.tolist(), strict=True):
+            file.write(" ".join([*(f"{v:.{places}f}" for v in root), *(f"{v:.6f}" for v in row)]) + "\n")
 
 
 MOTION_READERS = (MotionReader("bvh", "BVH: joints by forward kinematics; y up unless told", recognises, read),)
