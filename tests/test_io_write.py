@@ -17,6 +17,7 @@ import kcs_torch as kt
 from kcs_torch.errors import OutputError
 from kcs_torch.io import WRITERS, load_reconstruction, registry, save, write
 from kcs_torch.io.atomic import atomic_path
+from kcs_torch.io.formats.text import write_table
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +57,14 @@ def test_csv_without_a_rate_has_no_times(tmp_path, result):
     still = replace(result, tracks=replace(result.tracks, fps=None))
     with save(still, tmp_path / "w.csv").open(newline="") as file:
         assert {row["time [s]"] for row in csv.DictReader(file)} == {""}
+
+
+def test_csv_times_of_long_clips_differ(tmp_path):
+    """After a quarter of an hour at 120 frames a second, six digits tell two frames at the same time."""
+    write_table(["a"], np.zeros((130_000, 1)), 120.0, tmp_path / "w.csv")
+    with (tmp_path / "w.csv").open(newline="") as file:
+        times = [float(row["time [s]"]) for row in csv.DictReader(file)]
+    assert np.allclose(np.diff(times), 1 / 120, rtol=1e-3, atol=0)
 
 
 def test_csv_names_are_no_formulas(tmp_path, result):

@@ -54,7 +54,7 @@ def write_table(header: Iterable[str], rows: NDArray[Any], fps: float | None, pa
         writer = csv.writer(file)
         writer.writerow(["frame", "time [s]", *header])
         for frame, row in enumerate(rows.tolist()):
-            time = f"{frame / fps:.6g}" if fps else ""
+            time = f"{frame / fps:.9g}" if fps else ""
             writer.writerow([frame, time, *("" if math.isnan(v) else f"{v:.9g}" for v in row)])
 
 
