@@ -42,6 +42,11 @@ def test_what_is_written_is_read_back(tmp_path, up):
     assert np.nanmax(raw[..., "xyz".index(up)]) == pytest.approx(1000 * float(motion.points[..., 1].max()), rel=1e-5)
 
 
+@pytest.mark.parametrize("fps", [23.976, 29.97, 59.94, 1000.0])
+def test_rates_that_single_precision_rounds_come_back(tmp_path, fps):
+    assert load_motion(save(replace(walk(3), fps=fps), tmp_path / "w.c3d")).fps == fps
+
+
 def test_too_many_joints_are_refused(tmp_path):
     motion = kt.Motion.from_arrays(torch.zeros(2, 300, 3), fps=30, units="m")
     with pytest.raises(OutputError, match="up to 255 joints"):

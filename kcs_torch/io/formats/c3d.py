@@ -51,7 +51,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
     if not there.all():
         gone = [name for name, seen in zip(names, there, strict=True) if not seen]
         notes.append(f"never seen, left out: {', '.join(gone[:8])}{', ...' if len(gone) > 8 else ''}")
-    rate = float(answer["rate"])
+    rate = float(f"{float(answer['rate']):.7g}")  # of single precision
     first, last = (int.from_bytes(Probe(path).head[at : at + 2], "little") for at in (6, 8))
     if len(points) < last - first + 1 < 0xFFFF:
         notes.append(f"the header tells {last - first + 1} frames, the file has {len(points)}: it is cut short")
