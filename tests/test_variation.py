@@ -50,6 +50,18 @@ def test_unseen_bones_and_bones_of_no_length_are_no_news():
     assert bone_variation(torch.ones(1, 4), BODY) == (0, 0, "a-b")
 
 
+@pytest.mark.parametrize("method", ["pkc", "sfam"])
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+def test_a_joint_that_nobody_saw_has_no_bone_that_varies(method):
+    """It lies on its neighbour, and rounding is all that the bone's length is."""
+    motion = kt.data.random_motion(BODY, 40, turn=120, generator=torch.Generator().manual_seed(0))
+    points = motion.tracks.points.clone()
+    points[:, 0] = math.nan
+    found = kt.reconstruct(points, skeleton=BODY, method=method)
+    assert float(found.lengths[0]) < 1e-6 * float(found.lengths.max())
+    assert found.diagnostics.loosest_bone != "a-b" and found.diagnostics.largest_bone_variation < 20
+
+
 def test_a_skeleton_without_rigid_bones_has_none():
     loose = kt.Skeleton.from_names(["a", "b"], [("a", "b")], flexible=[("a", "b")])
     assert bone_variation(torch.ones(3, 1), loose).bone == ""

@@ -12,6 +12,9 @@ from kcs_torch.skeleton import Skeleton
 
 __all__ = ["BoneVariation", "bone_shares", "bone_variation"]
 
+POINT = 1e-6
+"""Length of a bone, over that of the longest, up to which its ends are one point."""
+
 
 class BoneVariation(NamedTuple):
     """Standard deviations of rigid bones' lengths over their means, per cent; NaN and "" where there are none.
@@ -50,7 +53,11 @@ def bone_variation(lengths: Tensor, body: Skeleton) -> BoneVariation:
 
 
 def bone_shares(lengths: Tensor) -> Tensor:
-    """The standard deviation of lengths (T, B) over their mean, (B,): 0 of bones of length 0, NaN of those unseen."""
+    """The standard deviation of lengths (T, B) over their mean, (B,): 0 of bones of length 0, NaN of those unseen.
+
+    A joint that nobody saw may lie on its neighbour: the length of the bone between them is then 0 but for rounding.
+    """
     mean = lengths.nanmean(0)
-    ratio = torch.where(mean != 0, lengths / torch.where(mean != 0, mean, 1), 1)
+    some = ~(mean <= POINT * max(mean.nan_to_num(0.0).tolist(), default=0.0))
+    ratio = torch.where(some, lengths / torch.where(some, mean, 1), 1)
     return (ratio - 1).square().nanmean(0).sqrt()
