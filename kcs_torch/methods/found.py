@@ -34,7 +34,8 @@ def find_skeleton(
         source: tracks (which are lifted first, by :class:`SfAM`), a reconstruction, or points (T, N, 3).
         weights: (T, N), 0 where unseen; those of the tracks if None.
         joints: their names, for points; those of the tracks' skeleton otherwise.
-        rigid_below: a bone whose length varies by more than this share (standard deviation over mean) is flexible.
+        rigid_below: a bone whose length varies by more than this share (standard deviation over mean) is flexible, and
+            so is one whose ends are never seen together.
 
     Returns:
         A skeleton named "found" with ``proportions``, the median lengths; its bones run away from the first joint.
@@ -70,14 +71,16 @@ def find_skeleton(
     mean, spread = distance_spread(source, weights)
     # Between equally rigid pairs, those of a body at rest say, the shorter is the likelier bone.
     cost = spread + 1e-3 * mean
-    if weights is not None:  # what was never seen together is joined last
-        together = torch.minimum(weights[:, :, None], weights[:, None, :]).sum(0)
-        cost = torch.where(together > 0, cost, 1e3 * (1 + cost.amax()) + mean)
+    apart = torch.zeros_like(cost, dtype=torch.bool)
+    if weights is not None:  # what was never seen together is joined last, and nobody knows how far apart it is
+        apart = torch.minimum(weights[:, :, None], weights[:, None, :]).sum(0) == 0
+        cost = torch.where(apart, 1e3 * (1 + cost.amax()) + mean, cost)
     bones = rigid_tree(cost)
     size = bone_lengths(source, bones)
     ratio = spread[bones[:, 0], bones[:, 1]] / mean[bones[:, 0], bones[:, 1]].clamp_min(torch.finfo(mean.dtype).tiny)
     lengths = size.median(0).values
-    flexible = tuple((ratio > rigid_below).nonzero().flatten().tolist())
+    loose = (ratio > rigid_below) | apart[bones[:, 0], bones[:, 1]]
+    flexible = tuple(loose.nonzero().flatten().tolist())
     if len(flexible) == len(bones):
         warnings.warn(
             f"find_skeleton: no two joints keep their distance within {100 * rigid_below:g} %, so that no lengths hold "
