@@ -106,6 +106,17 @@ def test_single_precision():
     assert_close(path.double(), root_depth(points, tracks)[0], rtol=1e-3, atol=1.0)
 
 
+@pytest.mark.parametrize("fps", [2000.0, 1e5, 1e7, 1e9])
+def test_fast_cameras(fps):
+    tracks, points, _ = walk()
+    tracks = replace(tracks, fps=fps)
+    path, _ = root_depth(points, tracks)
+    small = replace(tracks, points=tracks.points.float(), weights=tracks.weights.float())
+    short, _ = root_depth(points.float(), small)
+    assert torch.isfinite(path).all()
+    assert_close(short.double(), path, rtol=1e-3, atol=0.01 * float(path.abs().max()))
+
+
 def test_says_why_there_is_none():
     tracks, points, _ = walk(20)
     cut = lambda n: replace(tracks, points=tracks.points[:n], weights=tracks.weights[:n])  # noqa: E731

@@ -21,6 +21,9 @@ SLIP, CHANGE = 0.012, 0.008
 """Standard deviations of a standing foot's speed, and of the root's acceleration: shares of the body's radius per
 frame at 30 frames a second."""
 
+FASTEST = 3e5
+"""Frames a second beyond which neighbouring frames are tied no closer: the equations would be singular."""
+
 ENOUGH = 0.5
 """Share of frames in which some contact point must stand."""
 
@@ -53,7 +56,7 @@ def root_depth(points: Tensor, tracks: Tracks, standing: Tensor | None = None) -
         return None, f"{ABSENT}skeleton '{tracks.skeleton.name}' has no contact points"
     if points.shape[-3] < 3:
         return None, f"{ABSENT}too few frames"
-    slow = 30.0 / (tracks.fps or 30.0)
+    slow = 30.0 / min(tracks.fps or 30.0, FASTEST)
     sure = standing_feet(tracks) if standing is None else standing
     if sure is None:
         return None, f"{ABSENT}the feet hardly ever stand still in the image"
@@ -62,6 +65,7 @@ def root_depth(points: Tensor, tracks: Tracks, standing: Tensor | None = None) -
     radius = ((body / top).square().sum(-1).mean((-2, -1)).sqrt().clamp_min(1e-3) * top)[..., None]
     move = points[..., contacts, 2].diff(dim=-2) / radius[..., None]  # (..., T - 1, C), while the root stays
     weight = torch.minimum(sure[1:], sure[:-1])
-    speed = root_velocity(move, weight, SLIP * slow, CHANGE * slow**2)
-    path = torch.nn.functional.pad(speed.cumsum(-1), (1, 0)) * radius
+    # In double precision: fast cameras tie neighbouring frames so closely that single precision knows nothing else.
+    speed = root_velocity(move.double(), weight.double(), SLIP * slow, CHANGE * slow**2)
+    path = torch.nn.functional.pad(speed.cumsum(-1), (1, 0)).to(radius) * radius
     return path, FOUND
