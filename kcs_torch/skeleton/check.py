@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from kcs_torch.errors import SkeletonError
+from kcs_torch.skeleton.parse import index_pairs
 
 if TYPE_CHECKING:
     from kcs_torch.skeleton.core import Skeleton
@@ -17,8 +18,8 @@ def as_tuples(body: Skeleton) -> dict[str, Any]:
     """The fields of a skeleton that may come as lists, as tuples of plain numbers: so it can be hashed."""
     return {
         "joints": tuple(body.joints),
-        "bones": tuple((int(a), int(b)) for a, b in body.bones),
-        "mirror": tuple((int(a), int(b)) for a, b in body.mirror),
+        "bones": tuple(index_pairs(body.bones, body.name, "bones")),
+        "mirror": tuple(index_pairs(body.mirror, body.name, "mirror")),
         "virtual": tuple((int(v), tuple(sources)) for v, sources in body.virtual),
         "flexible": tuple(body.flexible),
         "hinges": tuple(body.hinges),

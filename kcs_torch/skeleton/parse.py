@@ -28,7 +28,7 @@ Pair = tuple[int, int]
 Point = tuple[float, float, float]
 
 
-def index_pairs(edges: Iterable[Sequence[int]], name: str) -> list[Pair]:
+def index_pairs(edges: Iterable[Sequence[int]], name: str, what: str = "edges") -> list[Pair]:
     """Pairs of joint indices as plain integers.
 
     Raises:
@@ -36,9 +36,16 @@ def index_pairs(edges: Iterable[Sequence[int]], name: str) -> list[Pair]:
     """
     pairs = []
     for edge in edges:
-        if len(edge) != 2 or not all(float(e).is_integer() for e in edge):
-            raise SkeletonError(f"edges of skeleton '{name}': expected pairs of joint indices, got {edge!r}")
-        pairs.append((int(edge[0]), int(edge[1])))
+        try:
+            ends = tuple(map(float, edge))
+        except (TypeError, ValueError):
+            ends = ()
+        if len(ends) != 2 or not all(e.is_integer() for e in ends):
+            raise SkeletonError(
+                f"{what} of skeleton '{name}': expected pairs of joint indices, got {edge!r}; "
+                "Skeleton.from_names takes pairs of names"
+            )
+        pairs.append((int(ends[0]), int(ends[1])))
     return pairs
 
 
@@ -214,6 +221,11 @@ def _read_template(
     if isinstance(template, str):
         real = [n for n in names if n not in virtual]
         given = dict(zip(real, template_by_names(template, real), strict=True))
+    elif not isinstance(template, Mapping):
+        raise SkeletonError(
+            f"template of skeleton '{name}': expected {{joint: (x, y, z)}} or one of {', '.join(KINDS)}, "
+            f"got {type(template).__name__}"
+        )
     else:
         given = {str(n): tuple(float(c) for c in p) for n, p in template.items()}
         _check_keys(f"template of skeleton '{name}'", given, names, [n for n in names if n not in virtual])
