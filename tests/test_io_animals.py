@@ -534,6 +534,13 @@ def test_sleap_csv_without_tracks_is_followed(tmp_path):
     assert "animals without a track are followed over the frames by where they are" in people[0].notes
 
 
+def test_sleap_csv_whose_frames_are_floats(tmp_path):
+    """As pandas writes whole numbers where some were missing."""
+    lines = [["a", f"{t}.0", 0.9, *CELLS] for t in (2, 4, 3)]
+    tracks = load_tracks(write_sleap_csv(tmp_path / "a.csv", lines))
+    assert tracks.num_frames == 3
+
+
 def test_sleap_csv_with_a_frame_twice(tmp_path):
     lines = [["a", 0, 0.9, *CELLS], ["a", 0, 0.9, *["1"] * 9], ["a", 1, 0.9, *CELLS]]
     tracks = load_tracks(write_sleap_csv(tmp_path / "a.csv", lines))
@@ -549,6 +556,7 @@ def test_sleap_csv_with_a_frame_twice(tmp_path):
         ([["a", "x", 0.9, *CELLS]], "line 2: expected numbers"),
         ([["a", -1, 0.9, *CELLS]], "line 2: expected a frame number, got -1"),
         ([["a", 10**30, 0.9, *CELLS]], "line 2: expected a frame number"),
+        ([["a", 1.5, 0.9, *CELLS]], "line 2: expected a frame number, got 1.5"),
         ([["a", 0, 0.9, "left", *CELLS[1:]]], "line 2: expected numbers"),
     ],
 )

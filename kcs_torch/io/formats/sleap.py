@@ -15,6 +15,7 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.animals import LIMIT, LINE, Animal, bounded_lines, build_animals, frames_of, refuse_3d
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5 import Tree, read_tree
+from kcs_torch.io.jsonfile import as_frame_number
 from kcs_torch.io.landmark_tables import first_line
 from kcs_torch.io.link import link_people
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief, read_error
@@ -188,11 +189,11 @@ def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
                 if len(line) != len(header):
                     raise FormatError(f"{path}: line {lines.line_num}: expected {len(header)} cells, got {len(line)}")
                 try:
-                    frame = int(line[1])
+                    frame = as_frame_number(float(line[1]))  # tables that pandas wrote again may say 7.0
                     values = [[_number(line[i]) if i is not None else math.nan for i in p] for p in places]
                 except ValueError as error:
                     raise FormatError(f"{path}: line {lines.line_num}: expected numbers: {brief(error)}") from None
-                if not 0 <= frame < 10**15:
+                if frame is None or not 0 <= frame < 10**15:
                     raise FormatError(f"{path}: line {lines.line_num}: expected a frame number, got {brief(line[1])}")
                 instances.setdefault(line[0], {}).setdefault(frame, []).append(np.array(values))
     except OSError as error:
