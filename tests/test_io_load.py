@@ -93,6 +93,13 @@ def test_nothing_there(tmp_path):
         load_tracks("/dev/null")
 
 
+@pytest.mark.parametrize("path", [None, 3, b"w.npz", ["w.npz"]])
+def test_what_is_no_path_is_told(path):
+    for read in (load_people, load_tracks, kt.load_motion, kt.io.load_reconstruction):
+        with pytest.raises(FormatError, match="^path: expected the name of a file or folder, got"):
+            read(path)
+
+
 def test_a_file_that_the_system_refuses(tmp_path, monkeypatch):
     from pathlib import Path
 
@@ -133,13 +140,13 @@ def test_a_person_too_many_is_told(samples):
         load_tracks(samples["npz"], person=1)
 
 
-@pytest.mark.parametrize("options", [{"threshold": -0.1}, {"threshold": 1.5}, {"threshold": float("nan")}])
-def test_a_wrong_threshold_is_told(samples, options):
+@pytest.mark.parametrize("threshold", [-0.1, 1.5, float("nan"), "high"])
+def test_a_wrong_threshold_is_told(samples, threshold):
     with pytest.raises(OptionError, match="threshold: expected a number from 0 to 1"):
-        load_people(samples["npz"], **options)
+        load_people(samples["npz"], threshold=threshold)
 
 
-@pytest.mark.parametrize("fps", [0, -25, float("inf"), float("nan")])
+@pytest.mark.parametrize("fps", [0, -25, float("inf"), float("nan"), "30"])
 def test_a_wrong_rate_is_told(samples, fps):
     with pytest.raises(OptionError, match=r"^fps \(--fps\): expected a positive number, got .*; leave it out where"):
         load_people(samples["npz"], fps=fps)

@@ -13,6 +13,7 @@ from kcs_torch.io.registry import Options, Probe, Reader, brief, check_fps, disc
 from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
+from kcs_torch.types.intake import as_number
 from kcs_torch.types.people import tell_apart
 
 __all__ = ["READERS", "WRITERS", "check_person", "detect_format", "load_people", "load_tracks"]
@@ -70,8 +71,9 @@ def load_people(
     """
     if format is not None and format not in READERS:
         raise unknown("format", format, READERS)
-    if not 0 <= threshold <= 1:
-        raise OptionError(f"threshold: expected a number from 0 to 1, got {threshold}")
+    least = as_number(threshold)
+    if least is None or not 0 <= least <= 1:
+        raise OptionError(f"threshold: expected a number from 0 to 1, got {threshold!r}")
     check_fps(fps)
     if image_size is not None:
         image_size = _size(image_size)

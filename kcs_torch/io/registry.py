@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import pkgutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,6 +21,7 @@ from kcs_torch.errors import FormatError, KcsError, OptionError
 from kcs_torch.io.folders import natural_key, sibling_files
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
+from kcs_torch.types.intake import as_number
 
 if TYPE_CHECKING:
     from kcs_torch.io.hdf5 import Tree
@@ -90,6 +92,8 @@ class Probe:
     """
 
     def __init__(self, path: str | Path) -> None:
+        if not isinstance(path, (str, os.PathLike)):
+            raise FormatError(f"path: expected the name of a file or folder, got {brief(repr(path))}")
         self.path = Path(path)
         try:
             self.is_file = self.path.is_file()
@@ -287,8 +291,8 @@ def check_fps(fps: float | None) -> None:
     Raises:
         OptionError: it is not positive and finite.
     """
-    if fps is not None and not 0 < fps < float("inf"):
-        raise OptionError(f"fps (--fps): expected a positive number, got {fps}; leave it out where it is not known")
+    if fps is not None and not 0 < (as_number(fps) or 0) < float("inf"):
+        raise OptionError(f"fps (--fps): expected a positive number, got {fps!r}; leave it out where it is not known")
 
 
 def read_error(path: Any, error: BaseException) -> FormatError:
