@@ -41,6 +41,22 @@ def test_a_result_stands_on_its_feet():
     assert torch.allclose(back - back[:1, :1], result.points - result.points[:1, :1])
 
 
+def test_joints_of_a_result_that_are_nan_are_unseen_and_spoil_no_others(tmp_path):
+    result = walk_result().scaled(units="m", factor=1e-3)
+    points = result.points.clone()
+    points[0] = torch.nan
+    points[3, 4] = torch.nan
+    motion = Motion.of(replace(result, points=points))
+    assert bool(torch.isfinite(motion.points).all()) and torch.equal(motion.seen, torch.isfinite(points).all(-1))
+    apart = motion.points - Motion.of(result).points
+    assert torch.allclose(apart[motion.seen], apart[5, 5].expand_as(apart[motion.seen]))
+    for suffix in (".trc", ".csv"):
+        back = load_motion(kt.save(motion, tmp_path / f"w{suffix}"))
+        assert torch.equal(back.seen, motion.seen)
+    nothing = Motion.of(replace(result, points=torch.full_like(points, torch.nan)))
+    assert not bool(nothing.seen.any()) and bool((nothing.points == 0).all())
+
+
 def test_a_result_walks_through_space_where_its_path_is_known():
     result = walk_result()
     path = torch.linspace(0, 2000, 12, dtype=torch.float64)

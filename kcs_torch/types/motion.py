@@ -127,20 +127,20 @@ class Motion(Trajectories):
         point of the clip, below the middle of the first frame.
 
         Args:
-            result: of a method; ``scaled()`` before if sizes matter.
+            result: of a method; ``scaled()`` before if sizes matter. Joints that are NaN are unseen.
         """
         notes = [*result.tracks.notes, *result.diagnostics.notes]
         known = result.distance is not None or result.root_depth is not None
         points = to_y_up(result.in_space() if known else result.points, "-y")
         if not known:
             notes.append("how far the body walks towards or away from the camera is not known: it stays at one depth")
-        if result.distance is None:
-            low, middle = points[..., 1].amin(), points[0].mean(0)
+        there = torch.isfinite(points).all(-1)
+        if result.distance is None and bool(there.any()):
+            low, middle = points[there][:, 1].amin(), points[0, there[0]].mean(0).nan_to_num(0.0)
             points = points - torch.stack([middle[0], low, middle[2]])
-        weights = torch.ones_like(points[..., 0])
         return cls(
-            points,
-            weights,
+            torch.where(there[..., None], points, 0.0),
+            there.to(points),
             result.skeleton,
             result.fps,
             result.units,
