@@ -145,6 +145,11 @@ def test_odd_motions_are_filmed(result, tmp_path):
         animation(replace(result, points=result.points * torch.nan))
     with pytest.raises(OptionError, match="at least one result"):
         animation([])
+    other = replace(result, tracks=replace(result.tracks, fps=50.0))
+    for suffix in (".gif", ".rrd"):
+        with pytest.raises(OptionError, match="people of one clip, got frame rates"):
+            save_people([result, other], tmp_path / f"w{suffix}")
+    assert not list(tmp_path.iterdir())
 
 
 def test_recording_is_read_by_rerun(result, tmp_path):

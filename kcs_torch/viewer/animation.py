@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.types import Reconstruction
 from kcs_torch.viewer.film import Film
+from kcs_torch.viewer.names import clip_rate
 
 __all__ = ["GIF", "MP4", "Pace", "animation", "pace", "save_gif", "save_mp4"]
 
@@ -72,14 +73,14 @@ def animation(
         The pictures, (H, W, 3) bytes, one after another; how many there are; and how many a second.
 
     Raises:
-        OptionError: there is no result.
+        OptionError: there is no result, or the frame rates differ.
         OutputError: matplotlib is not installed, or no joint is at a finite place.
     """
     people = [results] if isinstance(results, Reconstruction) else list(results)
     if not people:
         raise OptionError("animation: expected at least one result, got none")
     total = max(len(r.points) for r in people)
-    step, rate, faster = pace(total, next((r.fps for r in people if r.fps), None), limits)
+    step, rate, faster = pace(total, clip_rate(people, "animation"), limits)
     film = Film(people, faster)
     turns = (math.sin(2 * math.pi * k / rate / TURN_SECONDS) for k in itertools.count())
     frames = range(0, total, step)

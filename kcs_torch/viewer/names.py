@@ -5,10 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from kcs_torch.errors import OptionError
 from kcs_torch.types import Reconstruction
 from kcs_torch.types.people import file_and_person
 
-__all__ = ["person_names", "printable"]
+__all__ = ["clip_rate", "person_names", "printable"]
+
+
+def clip_rate(results: Sequence[Reconstruction], what: str) -> float | None:
+    """Frames per second of people of one clip, or None where nobody's are known.
+
+    Args:
+        results: the people.
+        what: is made of them, for messages.
+
+    Raises:
+        OptionError: the frame rates differ.
+    """
+    rates = {r.fps for r in results} - {None}
+    if len(rates) > 1:
+        raise OptionError(f"{what}: expected people of one clip, got frame rates {', '.join(f'{r:g}' for r in rates)}")
+    return next(iter(rates), None)
 
 
 def printable(text: str) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.types import Reconstruction
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
-from kcs_torch.viewer.names import person_names, printable
+from kcs_torch.viewer.names import clip_rate, person_names, printable
 
 __all__ = ["need_rerun", "save_recording"]
 
@@ -23,12 +23,13 @@ def save_recording(results: Reconstruction | Sequence[Reconstruction], path: str
     is known. Unseen joints are left out of the tracks.
 
     Raises:
-        OptionError: there is no result.
+        OptionError: there is no result, or the frame rates differ.
         OutputError: rerun is not installed, or it cannot write the file.
     """
     people = [results] if isinstance(results, Reconstruction) else list(results)
     if not people:
         raise OptionError("save_recording: expected at least one result, got none")
+    clip_rate(people, "save_recording")
     rr, rrb = need_rerun()
     layout = rrb.Horizontal(
         rrb.Spatial3DView(origin="/space", name="3D"),

@@ -14,7 +14,7 @@ from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.types import Reconstruction
 from kcs_torch.types.intake import FARTHEST
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
-from kcs_torch.viewer.names import person_names
+from kcs_torch.viewer.names import clip_rate, person_names
 from kcs_torch.viewer.summary import summarise
 
 __all__ = ["MOST_NUMBERS", "scene_of"]
@@ -40,9 +40,7 @@ def scene_of(results: Sequence[Reconstruction], names: Sequence[str] | None = No
     """
     if not results:
         raise OptionError("player: expected at least one result, got none")
-    rates = {r.fps for r in results} - {None}
-    if len(rates) > 1:
-        raise OptionError(f"player: expected people of one clip, got frame rates {', '.join(f'{r:g}' for r in rates)}")
+    rate = clip_rate(results, "player")
     names = person_names(results) if names is None else list(names)
     if len(names) != len(results):
         raise OptionError(f"player: expected {len(results)} names, got {len(names)}")
@@ -61,7 +59,7 @@ def scene_of(results: Sequence[Reconstruction], names: Sequence[str] | None = No
     return {
         "total": total,
         "step": step,
-        "fps": next(iter(rates), None),
+        "fps": rate,
         "units": results[0].units,
         "middle": middle.tolist(),
         "colours": COLOURS,
