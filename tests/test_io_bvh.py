@@ -56,6 +56,11 @@ def theirs(path, joints):
 # ---------------------------------------------------------------------- reading
 
 
+def test_units_that_the_user_says_may_be_written_out(tmp_path):
+    motion = load_motion(write(tmp_path, TEXT), units="centimeters")
+    assert motion.units == "cm"
+
+
 def test_by_hand(tmp_path):
     motion = load_motion(write(tmp_path, TEXT), units="cm")
     assert motion.skeleton.joints == ("Hips", "Leg", "Leg_end")

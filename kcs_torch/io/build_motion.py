@@ -14,6 +14,7 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.registry import MotionOptions, read_error
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion
+from kcs_torch.types.size import short_unit
 
 __all__ = ["build_motion", "distinct", "numbers", "read_lines"]
 
@@ -65,7 +66,7 @@ def build_motion(
         joint_names=names,
         edges=None if options.skeleton else edges,
         fps=options.fps if options.fps is not None else fps,
-        units=options.units or units,
+        units=short_unit(options.units) if options.units else units,
         source=source,
         notes=remarks,
     )
