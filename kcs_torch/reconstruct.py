@@ -61,7 +61,8 @@ def reconstruct(
         A :class:`Reconstruction`: points (T, N, 3) in the camera frame, cameras, lengths, diagnostics.
 
     Raises:
-        OptionError: the method or a field is unknown, or its value is out of range; or array options come with Tracks.
+        OptionError: the method or a field is unknown, or its value is out of range; or array options come with Tracks;
+            or a camera of these intrinsics would see nothing like the tracks.
         ShapeError: an array, or the intrinsics, has the wrong shape or values.
         SkeletonError: the skeleton is unknown or does not fit.
 
@@ -163,7 +164,16 @@ def _before(lens: Intrinsics | str | None, method: Method, tracks: Tracks, camer
     if lens is None:
         lens = "auto" if method.turns_over and cameras is None and may_be_near(tracks) else "parallel"
     if isinstance(lens, Intrinsics):
-        return reconstruct_perspective(method, tracks, lens, cameras)
+        found = reconstruct_perspective(method, tracks, lens, cameras)
+        if not bool(found.points.isfinite().all()):
+            off = (lens.rays(tracks.points)[..., :2].norm(dim=-1) * tracks.seen).amax(1)
+            frame = int(off.argmax())
+            raise OptionError(
+                f"{tracks.source}: intrinsics: expected tracks that such a camera sees, found no finite motion: in "
+                f"frame {frame} a joint lies {float(off[frame]):.3g} focal lengths off the optical axis. Leave out "
+                "what is wrong there, or correct the intrinsics"
+            )
+        return found
     return method(tracks, cameras) if lens == "parallel" else reconstruct_uncalibrated(method, tracks, cameras)
 
 

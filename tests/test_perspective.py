@@ -388,6 +388,17 @@ def test_an_absurd_focal_length_gives_no_nan(focal):
     check_sound(reconstruct(tracks, method="kcs", intrinsics=(focal, focal, 0.0, 0.0)))
 
 
+@pytest.mark.parametrize(("method", "factor"), [("sfam", 1e10), ("kcs", 1e14)])
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+def test_a_frame_far_beside_the_camera_is_told(method, factor):
+    """Its numbers are those of no image, and nothing that a method finds in them is finite."""
+    tracks, _ = filmed(frames=12)
+    points = tracks.points.clone()
+    points[5] *= factor
+    with pytest.raises(kt.OptionError, match="in frame 5 a joint lies .* focal lengths off the optical axis"):
+        reconstruct(replace(tracks, points=points), method=method, intrinsics=(500.0, 500.0, 0.0, 0.0))
+
+
 def test_a_focal_length_in_another_unit_is_told():
     with pytest.warns(kt.KcsWarning, match=r"focal length 120 in the tracks' unit \(px\)"):
         kt.reconstruct(filmed(frames=5)[0], method="kcs", intrinsics=(120, 120, 0, 0))
