@@ -237,6 +237,22 @@ def test_targets_that_do_not_fit_the_poses():
             loss(points, target.numpy())
 
 
+@each_alignment
+def test_points_and_target_of_different_precision(how):
+    points, target = pair()
+    root = 2 if how in ("root", "scale") else None
+    expected = JointDistance(how, root=root)(points, target)
+    for one, other in ((points.float(), target), (points, target.float())):
+        value = JointDistance(how, root=root)(one, other)
+        assert value.dtype == one.dtype
+        assert_close(value, expected.to(one), rtol=1e-5, atol=1e-5)
+
+
+def test_a_target_without_coordinates_is_refused():
+    with pytest.raises(ShapeError, match=r"a target like it, got \(5, 7, 3\) and \(\)"):
+        KCSDistance(BODY)(pair()[0], torch.tensor(1.0))
+
+
 def test_what_half_precision_cannot_hold_is_its_largest_number():
     """Of values a million times larger it used to be 0: the difference of both was lost to rounding."""
     points, target = (300 * x for x in pair(3, dtype=torch.float32))

@@ -27,6 +27,7 @@ from kcs_torch.functional import bone_lengths, project
 from kcs_torch.nn import (
     AdductionEnergy,
     BoneLengthEnergy,
+    ContactEnergy,
     ForeshorteningEnergy,
     HingeEnergy,
     JointDistance,
@@ -35,6 +36,7 @@ from kcs_torch.nn import (
     PerspectiveEnergy,
     PostureEnergy,
     ProcrusteanEnergy,
+    ProportionEnergy,
     ReprojectionEnergy,
     SmoothnessEnergy,
     StanceEnergy,
@@ -709,6 +711,56 @@ def test_other_arguments_that_do_not_fit():
         ForeshorteningEnergy(TRUNK)(points, bone_weights=torch.ones(4, 5, 17))
     with pytest.raises(ShapeError, match=r"expected tracks .*for points \(4, 5, 17, 3\), got \(3, 5, 17, 2\)"):
         ReprojectionEnergy()(points, torch.zeros(3, 5, 17, 2))
+    with pytest.raises(ShapeError, match=r"got \(4, 5, 17, 3\) and \(3, 5, 17, 2\)"):
+        PerspectiveEnergy()(points, torch.zeros(3, 5, 17, 2), (1000, 1000, 0, 0))
+
+
+BESIDE = {
+    "cameras": (lambda x, given: ReprojectionEnergy()(x, x[..., :2], given), (5, 2, 3)),
+    "rotations": (lambda x, given: ProcrusteanEnergy(TRUNK)(x, given), (5, 3, 3)),
+    "bone_weights": (lambda x, given: ForeshorteningEnergy(TRUNK)(x, bone_weights=given), (5, 16)),
+    "bone_noise": (lambda x, given: ForeshorteningEnergy(TRUNK)(x, bone_noise=given), (5, 16)),
+    "independent": (lambda x, given: PostureEnergy(TRUNK)(x, independent=given), (5,)),
+    "velocity": (lambda x, given: ContactEnergy(TRUNK)(x, given, torch.ones(5, len(TRUNK.contacts))), (5,)),
+    "standing": (lambda x, given: ContactEnergy(TRUNK)(x, None, given), (5, len(TRUNK.contacts))),
+    "size": (lambda x, given: StanceEnergy(TRUNK)(x, given), ()),
+}
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_what_stands_beside_points_is_of_their_batch(name):
+    """These ended in errors of torch about sizes at some dimension, or lists without shapes."""
+    energy, shape = BESIDE[name]
+    points = normal(4, 5, 17, 3)
+    assert energy(points, torch.ones(4, *shape, dtype=torch.float64)).isfinite().all()
+    assert energy(points, torch.ones(shape)).isfinite().all()  # of all clips, in single precision
+    with pytest.raises(ShapeError, match=rf"{name}:? .*\(\.\.\..*got .*\(3,"):
+        energy(points, torch.ones(3, *shape))
+    if shape:
+        with pytest.raises(ShapeError, match=rf"expected a tensor of {name}, got list"):
+            energy(points, torch.ones(4, *shape).tolist())
+    with pytest.raises(ShapeError, match=r"expected points|expected a tensor of points"):
+        energy(points[0, 0], torch.ones(4, *shape))
+
+
+def test_lengths_and_weights_of_proportions_fit():
+    energy = ProportionEnergy(TRUNK)
+    for wrong in (torch.tensor(1.0), torch.ones(15)):
+        with pytest.raises(ShapeError, match=r"expected lengths \(\.\.\., 16\), got"):
+            energy(wrong)
+    for wrong in (torch.ones(15), torch.ones(3, 16), torch.ones(1)):
+        with pytest.raises(ShapeError, match=r"expected weights \(\.\.\., 16\), got .* for lengths \(2, 16\)"):
+            energy(torch.ones(2, 16), wrong)
+    with pytest.raises(ShapeError, match="expected lengths in floating point, got torch.int64"):
+        energy(torch.ones(16).long())
+    with pytest.raises(ShapeError, match="expected a tensor of lengths, got list"):
+        energy([1.0] * 16)
+
+
+def test_tracks_may_be_whole_pixels():
+    points, tracks = normal(4, 5, 17, 3), (100 * normal(4, 5, 17, 2)).long()
+    assert_close(ReprojectionEnergy()(points, tracks), ReprojectionEnergy()(points, tracks.double()))
+    assert ReprojectionEnergy()(points.half(), tracks).dtype == torch.float16
 
 
 def test_unknown_skeletons_are_named():

@@ -172,6 +172,13 @@ def test_svt_layer_state():
     assert not SVT(0.3).state_dict()
 
 
+@pytest.mark.parametrize("matrix", [torch.ones(3, 4).long(), torch.ones(3, 4).numpy(), None])
+def test_svt_takes_numbers_in_floating_point_alone(matrix):
+    """Whole numbers came back cut off to whole numbers; an array ended in an AttributeError."""
+    with pytest.raises(ShapeError, match="SVT: expected (a tensor of matrices|matrices in floating point), got"):
+        SVT(0.3)(matrix)
+
+
 @pytest.mark.parametrize("threshold", [-0.1, float("nan"), float("inf")])
 @pytest.mark.parametrize("learnable", [False, True])
 def test_svt_layer_thresholds_out_of_range(threshold, learnable):
@@ -219,3 +226,9 @@ def test_confidences_are_no_coordinate():
         with pytest.raises(ShapeError, match=r"expected points of 2 or 3 coordinates, got \(2, 5, 17, 4\)"):
             module(points)
         assert bool(module(points[..., :3]).isfinite().all())
+
+
+@pytest.mark.parametrize("module", [BoneLengths("h36m17"), BoneLengthEnergy("h36m17"), LowRankEnergy("log_det")])
+def test_points_without_coordinates_are_refused(module):
+    with pytest.raises(ShapeError, match=r"points of 2 or 3 coordinates, got \(5, 17, 0\)"):
+        module(torch.ones(5, 17, 0))

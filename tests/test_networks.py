@@ -42,6 +42,13 @@ def test_any_batch_and_any_length(lifter, shape):
     torch.testing.assert_close(out[one], lifter(tracks[one], weights[one]))
 
 
+def test_a_scale_of_other_clips_is_refused(lifter):
+    tracks, weights = clip(2, 9)
+    for wrong in (torch.ones(3, 1, 1, 1), torch.ones(2, 1, 1), torch.ones(2), torch.ones(2, 1, 1, 0)):
+        with pytest.raises(ShapeError, match=r"scale \(\.\.\., 1, 1, 1\), got .* for tracks \(2, 9, 17, 2\)"):
+            lifter(tracks, weights, scale=wrong)
+
+
 @pytest.mark.parametrize("name", ["coco17", "hand21", "ap10k"])
 @pytest.mark.parametrize("kind", sorted(LIFTERS))
 def test_any_skeleton_with_its_virtual_joints(kind, name):

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
+from kcs_torch.functional.shapes import fit_together
+from kcs_torch.nn.layers import SkeletonModule, check_tensor, known, narrow, wide
 from kcs_torch.nn.masks import weighs_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.standing import RIDGE, root_velocity
@@ -72,16 +73,20 @@ class ContactEnergy(SkeletonModule):
 
     def _check(self, points: Tensor, velocity: Tensor | None, standing: Tensor) -> None:
         self.check(points, clip=True)
-        frames = points.shape[-3]
+        if points.shape[-1] != 3:
+            raise ShapeError(f"ContactEnergy: points: expected (..., N, 3), got {tuple(points.shape)}")
+        frames, batch = points.shape[-3], points.shape[:-3]
         wanted = (
-            ("points", points, (points.shape[-2], 3), 2, "N, 3"),
-            ("velocity", velocity, (frames,), 1, "T"),
-            ("standing", standing, (frames, len(self.contacts)), 2, "T, C"),
+            ("velocity", points[..., 0, 0] if velocity is None else velocity, (frames,), "T"),
+            ("standing", standing, (frames, len(self.contacts)), "T, C"),
         )
-        for name, value, shape, dims, letters in wanted:
-            if value is not None and value.shape[-dims:] != shape:
+        for name, value, shape, letters in wanted:
+            check_tensor(value, name, self)
+            dims = len(shape)
+            if value.shape[-dims:] != shape or not fit_together(value.shape[:-dims], batch):
                 expected = f"(..., {letters}) = (..., {', '.join(map(str, shape))})"
-                raise ShapeError(f"ContactEnergy: {name}: expected {expected}, got {tuple(value.shape)}")
+                got = f"{tuple(value.shape)} for points {tuple(points.shape)}"
+                raise ShapeError(f"ContactEnergy: {name}: expected {expected}, got {got}")
 
     @torch.no_grad()
     def _best(self, step: Tensor, standing: Tensor) -> Tensor:

@@ -68,7 +68,8 @@ class JointDistance(nn.Module):
         with full_precision(points):
             weights = seen_weights(target, weights)
             source, goal = wide(known(points, weights)), known(wide(target), weights)
-            source, goal = torch.broadcast_tensors(source, goal)
+            finer = torch.promote_types(source.dtype, goal.dtype)
+            source, goal = torch.broadcast_tensors(source.to(finer), goal.to(finer))
             share = weights.to(goal).expand(goal.shape[:-1])
             distance = safe_norm(superpose(source, goal, self.align, share, root=self.root) - goal)
             if self.root is not None and self.align in ("root", "scale"):
@@ -113,7 +114,7 @@ class KCSDistance(SkeletonModule):
         """
         self.check(points)
         check_tensor(target, "target", self)
-        if target.shape[-1] != points.shape[-1] or not fit_together(target.shape[:-2], points.shape[:-2]):
+        if target.shape[-1:] != points.shape[-1:] or not fit_together(target.shape[:-2], points.shape[:-2]):
             message = f"KCSDistance: expected points (..., N, 3) and a target like it, got {tuple(points.shape)}"
             raise ShapeError(f"{message} and {tuple(target.shape)}")
         self.check(target)

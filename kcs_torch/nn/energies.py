@@ -151,10 +151,13 @@ class ReprojectionEnergy(nn.Module):
         if tracks.shape[-3:] != (*points.shape[-3:-1], 2) or not fit_together(tracks.shape[:-3], points.shape[:-3]):
             expected = f"(..., {points.shape[-3]}, {points.shape[-2]}, 2) for points {tuple(points.shape)}"
             raise ShapeError(f"ReprojectionEnergy: expected tracks {expected}, got {tuple(tracks.shape)}")
-        if cameras is not None and (cameras.shape[-3:] != (points.shape[-3], 2, 3) or points.shape[-1] != 3):
-            expected = f"points (..., T, N, 3) and cameras (..., {points.shape[-3]}, 2, 3)"
-            got = f"{tuple(points.shape)} and {tuple(cameras.shape)}"
-            raise ShapeError(f"ReprojectionEnergy: expected {expected}, got {got}")
+        if cameras is not None:
+            check_tensor(cameras, "cameras", self)
+            fits = fit_together(cameras.shape[:-3], points.shape[:-3])
+            if cameras.shape[-3:] != (points.shape[-3], 2, 3) or not fits or points.shape[-1] != 3:
+                expected = f"points (..., T, N, 3) and cameras (..., {points.shape[-3]}, 2, 3)"
+                got = f"{tuple(points.shape)} and {tuple(cameras.shape)}"
+                raise ShapeError(f"ReprojectionEnergy: expected {expected}, got {got}")
         check_weights(weights, points, self)
         weights = seen_weights(tracks, weights)
         points, tracks = known(wide(points), weights), known(wide(tracks), weights)
@@ -327,7 +330,7 @@ def check_lengths(lengths: Tensor | None, points: Tensor, module: SkeletonModule
 
 def finer(points: Tensor, tracks: Tensor) -> Tensor:
     """That of the two which has more digits."""
-    return tracks if torch.finfo(tracks.dtype).bits > torch.finfo(points.dtype).bits else points
+    return tracks if torch.promote_types(points.dtype, tracks.dtype) == tracks.dtype else points
 
 
 def huber_square(square: Tensor, huber: float | None) -> Tensor:

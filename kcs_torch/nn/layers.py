@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_lengths, bone_vectors, pose_matrix
+from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.spectral import svt
 from kcs_torch.skeleton import Skeleton, get_skeleton
 
@@ -33,9 +35,22 @@ def check_points(points: Any, module: nn.Module, what: str = "points") -> None:
         raise ShapeError(f"{type(module).__name__}: expected {what} in floating point, got {points.dtype}")
 
 
+def check_beside(
+    value: Any, what: str, shape: Sequence[int], clip: Tensor, module: nn.Module, of: str = "points"
+) -> None:
+    """Raise a ShapeError unless ``value`` is None or a tensor (..., *shape) whose batch fits (..., T, N, D)."""
+    if value is None:
+        return
+    check_tensor(value, what, module)
+    given, own = tuple(value.shape), value.ndim - len(shape)
+    if own < 0 or given[own:] != tuple(shape) or not fit_together(given[:own], clip.shape[:-3]):
+        expected = f"{what} (..., {', '.join(map(str, shape))})"
+        raise ShapeError(f"{type(module).__name__}: expected {expected}, got {given} for {of} {tuple(clip.shape)}")
+
+
 def check_coordinates(points: Tensor, module: nn.Module) -> None:
     """Raise a ShapeError unless ``points`` (..., N, D) have at most three coordinates."""
-    if points.shape[-1] > 3:
+    if not 0 < points.shape[-1] <= 3:
         raise ShapeError(
             f"{type(module).__name__}: expected points of 2 or 3 coordinates, got {tuple(points.shape)}; confidences "
             "are no coordinate: pass points[..., :3], and weights where the module takes them"
@@ -155,6 +170,7 @@ class SVT(nn.Module):
         return self.fixed if self.raw is None else nn.functional.softplus(self.raw)
 
     def forward(self, matrix: Tensor) -> Tensor:
+        check_points(matrix, self, "matrices")
         level = self.threshold
         if self.relative:
             level = level * torch.linalg.matrix_norm(matrix)

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_lengths, check_weights
-from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
+from kcs_torch.nn.layers import SkeletonModule, check_beside, check_points, check_tensor, known, narrow, wide
 from kcs_torch.nn.masks import bone_share, safe_root, some
 from kcs_torch.skeleton import Skeleton
 
@@ -78,14 +79,11 @@ class ForeshorteningEnergy(SkeletonModule):
             raise ShapeError(f"ForeshorteningEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
         check_weights(weights, points, self)
         check_lengths(lengths, points, self)
+        bones = (points.shape[-3], len(self.bones))
+        check_beside(bone_weights, "bone_weights", bones, points, self)
+        check_beside(bone_noise, "bone_noise", bones, points, self)
         if weights is not None:
             bone_weights = bone_share(weights, self.bones)
-        elif bone_weights is not None and bone_weights.shape[-1] not in (1, len(self.bones)):
-            expected = f"(..., {points.shape[-3]}, {len(self.bones)})"
-            raise ShapeError(f"ForeshorteningEnergy: expected bone_weights {expected}, got {tuple(bone_weights.shape)}")
-        if bone_noise is not None and bone_noise.shape[-2:] != (points.shape[-3], len(self.bones)):
-            expected = f"(..., {points.shape[-3]}, {len(self.bones)})"
-            raise ShapeError(f"ForeshorteningEnergy: expected bone_noise {expected}, got {tuple(bone_noise.shape)}")
         vectors = known(bone_vectors(wide(points), self.bones), bone_weights)
         if lengths is None:
             lengths = usual_size(vectors.square().sum(-1), bone_weights, LEAST)
@@ -135,8 +133,15 @@ class ProportionEnergy(SkeletonModule):
 
     def forward(self, lengths: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return (...) of lengths (..., B), positive, in any unit; weights (..., B), 0 for bones that are not known."""
-        if lengths.shape[-1] != len(self.usual):
-            raise ShapeError(f"ProportionEnergy: expected lengths (..., {len(self.usual)}), got {tuple(lengths.shape)}")
+        count = len(self.usual)
+        check_points(lengths, self, "lengths")
+        if lengths.shape[-1:] != (count,):
+            raise ShapeError(f"ProportionEnergy: expected lengths (..., {count}), got {tuple(lengths.shape)}")
+        if weights is not None:
+            check_tensor(weights, "weights", self)
+            if weights.shape[-1:] != (count,) or not fit_together(weights.shape, lengths.shape):
+                got = f"got {tuple(weights.shape)} for lengths {tuple(lengths.shape)}"
+                raise ShapeError(f"ProportionEnergy: expected weights (..., {count}), {got}")
         tiny = torch.finfo(lengths.dtype).tiny
         if weights is not None:
             lengths = torch.where(weights > 0, lengths, self.usual.to(lengths))

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.nn.layers import SkeletonModule, check_joints, check_points, check_tensor
+from kcs_torch.nn.layers import SkeletonModule, check_beside, check_joints, check_points, check_tensor
 from kcs_torch.nn.normalise import NormalisedTracks, neighbours, normalise_tracks
 from kcs_torch.skeleton import Skeleton
 
@@ -106,6 +106,7 @@ class _Network(SkeletonModule):
             raise ShapeError(
                 f"{type(self).__name__}: weights: expected {tuple(tracks.shape[:-1])}, got {tuple(weights.shape)}"
             )
+        check_beside(scale, "scale", (1, 1, 1), tracks, self, "tracks")
         if tracks.shape[-3] == 0:
             raise ShapeError(f"{type(self).__name__}: expected at least 1 frame, got none")
         known = normalise_tracks(tracks, weights, scale)

@@ -75,7 +75,8 @@ class PerspectiveEnergy(nn.Module):
         check_clip(points, self)
         check_weights(weights, points, self)
         check_tensor(tracks, "tracks", self)
-        if tracks.shape[-3:] != (*points.shape[-3:-1], 2) or points.shape[-1] != 3:
+        fits = tracks.shape[-3:] == (*points.shape[-3:-1], 2) and fit_together(tracks.shape[:-3], points.shape[:-3])
+        if not fits or points.shape[-1] != 3:
             expected = f"points (..., T, N, 3) and tracks (..., {points.shape[-3]}, {points.shape[-2]}, 2)"
             got = f"{tuple(points.shape)} and {tuple(tracks.shape)}"
             raise ShapeError(f"PerspectiveEnergy: expected {expected}, got {got}")

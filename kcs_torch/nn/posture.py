@@ -11,7 +11,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.nn.energies import check_lengths
-from kcs_torch.nn.layers import SkeletonModule, check_tensor, narrow, wide
+from kcs_torch.nn.layers import SkeletonModule, check_beside, narrow, wide
 from kcs_torch.nn.lengths import LEAST, usual_size
 from kcs_torch.nn.masks import bone_share, known_points, safe_root, some, weighs_joints
 from kcs_torch.skeleton import Skeleton
@@ -170,13 +170,11 @@ class PostureEnergy(SkeletonModule):
             ShapeError: the shapes do not fit.
             OptionError: weights and independent are both given.
         """
+        self.check(points, clip=True)
         if independent is not None:
             if weights is not None:
                 raise OptionError("PostureEnergy: expected weights or independent, got both")
-            check_tensor(independent, "independent", self)
-            if independent.shape[-1:] != points.shape[-3:-2]:
-                expected = f"(..., {points.shape[-3]}) for points {tuple(points.shape)}"
-                raise ShapeError(f"PostureEnergy: expected independent {expected}, got {tuple(independent.shape)}")
+            check_beside(independent, "independent", points.shape[-3:-2], points, self)
             weights = independent
         local = self.directions(points, lengths, weights)
         y = ((local - self.mean.to(local)) / self.deviation.to(local)).flatten(-2)

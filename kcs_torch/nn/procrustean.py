@@ -12,7 +12,7 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.nn.energies import check_weights
-from kcs_torch.nn.layers import SkeletonModule, full_precision, known
+from kcs_torch.nn.layers import SkeletonModule, check_beside, full_precision, known
 from kcs_torch.nn.masks import bone_share, safe_root, some
 from kcs_torch.skeleton import Skeleton
 
@@ -67,20 +67,17 @@ class ProcrusteanEnergy(SkeletonModule):
         """
         self.check(points, clip=True)
         check_weights(weights, points, self)
-        turns = (points.shape[-3], 3, 3)
-        if points.shape[-1] != 3 or (rotations is not None and rotations.shape[-3:] != turns):
-            expected = (
-                f"points (..., T, {points.shape[-2]}, 3) and rotations (..., {', '.join(map(str, turns))}) or None"
-            )
-            got = f"{tuple(points.shape)} and {None if rotations is None else tuple(rotations.shape)}"
-            raise ShapeError(f"ProcrusteanEnergy: expected {expected}, got {got}")
+        check_beside(rotations, "rotations", (points.shape[-3], 3, 3), points, self)
+        if points.shape[-1] != 3:
+            expected = f"points (..., T, {points.shape[-2]}, 3) and rotations (..., T, 3, 3) or None"
+            raise ShapeError(f"ProcrusteanEnergy: expected {expected}, got points {tuple(points.shape)}")
         with full_precision(points):
             wide = known(points, weights).to(torch.promote_types(points.dtype, torch.float32))
             vectors = bone_vectors(wide, self.bones)
             share = None if weights is None else bone_share(weights, self.bones).to(vectors.dtype)[..., None]
             if rotations is None:
                 rotations = _align(vectors, self.num_steps, share)
-            aligned = (vectors @ rotations).flatten(-2)
+            aligned = (vectors @ rotations.to(vectors.dtype)).flatten(-2)
             rows, seen = self._rows(aligned, share)
             floor = rows.new_zeros(rows.shape[:-2]) + self.eps
             least = rows.shape[-2] * rows.shape[-1] / 2 * floor.log()  # what a clip at rest is charged

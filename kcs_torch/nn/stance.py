@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
-from kcs_torch.nn.layers import SkeletonModule, narrow, wide
+from kcs_torch.nn.layers import SkeletonModule, check_beside, narrow, wide
 from kcs_torch.nn.lengths import usual_size
 from kcs_torch.nn.masks import bone_share, known_points, some, weighs_joints
 from kcs_torch.nn.posture import PostureEnergy
@@ -101,6 +101,7 @@ class StanceEnergy(SkeletonModule):
         self.check(points, clip=True)
         if points.shape[-1] != 3:
             raise ShapeError(f"StanceEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
+        check_beside(size if isinstance(size, Tensor) else None, "size", (), points, self)
         joints = weights is not None and weighs_joints(weights, points, self)
         points = wide(known_points(points, weights, self))
         vectors = bone_vectors(points, self.bones)
