@@ -29,7 +29,7 @@ from torch.testing import assert_close
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths, rows_to_cameras
 from kcs_torch.methods import SfAM
-from kcs_torch.nn import UnrolledFPC, UnrolledSfAM
+from kcs_torch.nn import UnrolledFPC, UnrolledPKC, UnrolledSfAM
 from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape
 
 BODIES = {"body": BODY, "chain": CHAIN, "ring": RING}
@@ -619,6 +619,25 @@ def test_wrong_joint_count_names_the_skeleton(joints):
     tracks, cameras, _ = scene(BODY)
     with pytest.raises(ShapeError, match=r"lengths \(\.\.\., 6\), got \(5,\)"):
         UnrolledSfAM(BODY, 2)(tracks, cameras, lengths=torch.ones(5))
+
+
+@pytest.mark.parametrize("layer", [UnrolledSfAM, UnrolledPKC])
+def test_lengths_that_are_not_of_the_batch(layer):
+    """Lengths of other clips ended in an error of torch, or in one about the batch of something."""
+    tracks, cameras, _ = (x.expand(2, *x.shape) for x in scene(BODY))
+    with pytest.raises(ShapeError, match=r"lengths \(\.\.\., 6\), got \(3, 6\) for tracks \(2, 6, 7, 2\)"):
+        layer(BODY, 2)(tracks, cameras, lengths=torch.ones(3, 6))
+    with pytest.raises(ShapeError, match="expected a tensor of lengths, got list"):
+        layer(BODY, 2)(tracks, cameras, lengths=[1.0] * 6)
+
+
+@pytest.mark.parametrize("layer", [UnrolledFPC(2), UnrolledSfAM(BODY, 2), UnrolledPKC(BODY, 2)])
+def test_weights_and_lengths_may_have_another_precision(layer):
+    tracks, cameras, weights = scene(BODY, "gaps", dtype=torch.float32)
+    given = {} if isinstance(layer, UnrolledFPC) else {"lengths": torch.linspace(0.8, 1.2, 6)}
+    value = layer(tracks, cameras, weights=weights, **given)
+    given = {name: x.double() for name, x in given.items()}
+    assert_close(layer(tracks, cameras, weights=weights.double(), **given), value)
 
 
 @pytest.mark.parametrize(

@@ -197,6 +197,14 @@ def test_state_round_trip():
     assert torch.equal(one(tracks, cameras), two(tracks, cameras))
 
 
+def test_weights_and_scales_may_have_another_precision():
+    module, given = UnrolledKCS(BODY, 2, template=REST), scene(BODY, "gaps", dtype=torch.float32)
+    tracks, cameras, weights = given
+    value = module(tracks, cameras, weights=weights, scales=torch.linspace(0.5, 0.6, 6))
+    scales = torch.linspace(0.5, 0.6, 6, dtype=torch.float32).double()
+    assert_close(module(tracks, cameras, weights=weights.double(), scales=scales), value)
+
+
 def test_what_does_not_fit():
     with pytest.raises(SkeletonError, match="no template"):
         UnrolledKCS(BODY)
@@ -214,5 +222,11 @@ def test_what_does_not_fit():
         module(tracks[:, :6], cameras)
     with pytest.raises(ShapeError, match=r"scales \(\.\.\., 6\)"):
         module(tracks, cameras, scales=torch.ones(5))
+    with pytest.raises(ShapeError, match=r"scales \(\.\.\., 6\), got \(3, 6\) for tracks \(2, 6, 7, 2\)"):
+        module(tracks.expand(2, -1, -1, -1), cameras, scales=torch.ones(3, 6))
+    with pytest.raises(ShapeError, match="expected a tensor of scales, got list"):
+        module(tracks, cameras, scales=[1.0] * 6)
+    with pytest.raises(ShapeError, match="expected a tensor of tracks, got list"):
+        module(tracks.tolist(), cameras)
     with pytest.raises(ShapeError, match=r"cameras \(\.\.\., T, 2, 3\)"):
         module(tracks, cameras[:3])

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_weights
-from kcs_torch.nn.layers import check_joints, check_points, check_tensor, inverse_softplus, seen_weights
+from kcs_torch.nn.layers import check_beside, check_joints, check_points, check_tensor, inverse_softplus, seen_weights
 from kcs_torch.nn.steps import corner_of
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.implicit import Implicit, fixed_point
@@ -196,12 +196,14 @@ class Unrolled(nn.Module):
         weights: Tensor | None,
         start: Tensor | None,
         skeleton: Skeleton | None = None,
-        **others: Any,
+        *,
+        lengths: Tensor | None = None,
+        scales: Tensor | None = None,
     ) -> Tensor:
-        """Return the weights (..., T, N), 0 where tracks are not finite.
+        """Return the weights (..., T, N) in the dtype of the tracks, 0 where these are not finite.
 
         Raises:
-            ShapeError: the arguments do not fit; ``others`` are (tensor or None, expected trailing shape).
+            ShapeError: the arguments do not fit.
         """
         name = type(self).__name__
         check_points(tracks, self, "tracks")
@@ -225,6 +227,8 @@ class Unrolled(nn.Module):
             )
         if skeleton is not None:
             check_joints(self, skeleton, tracks, "tracks (..., T, {}, 2)")
+            check_beside(lengths, "lengths", (skeleton.num_bones,), tracks, self, "tracks")
+        check_beside(scales, "scales", tracks.shape[-3:-2], tracks, self, "tracks")
         check_weights(weights, tracks, self)
         if start is not None and start.shape[-3:] != (*tracks.shape[-3:-1], 3):
             expected = f"(..., {tracks.shape[-3]}, {tracks.shape[-2]}, 3)"
@@ -233,9 +237,4 @@ class Unrolled(nn.Module):
             if value is not None and not fit_together(value.shape[:-3], tracks.shape[:-3]):
                 expected = f"a batch of {what} like that of tracks {tuple(tracks.shape)}"
                 raise ShapeError(f"{name}: expected {expected}, got {tuple(value.shape)}")
-        for other, (value, shape) in others.items():
-            if value is not None and tuple(value.shape[value.ndim - len(shape) :]) != tuple(shape):
-                raise ShapeError(
-                    f"{name}: expected {other} (..., {', '.join(map(str, shape))}), got {tuple(value.shape)}"
-                )
-        return seen_weights(tracks, weights)
+        return seen_weights(tracks, weights).to(tracks.dtype)

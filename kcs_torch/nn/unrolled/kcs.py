@@ -213,7 +213,7 @@ class UnrolledKCS(Unrolled):
 
         With ``measure`` it tells whether the last step stood still, which waits for the device.
         """
-        weights = self._check(tracks, cameras, weights, start, self.skeleton, scales=(scales, tracks.shape[-3:-2]))
+        weights = self._check(tracks, cameras, weights, start, self.skeleton, scales=scales)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         with full_precision(tracks):
             points, share = self._centred(tracks, weights)
@@ -223,6 +223,7 @@ class UnrolledKCS(Unrolled):
                 with torch.no_grad():
                     low, high = self._bounds(points, share, rest)
                 scales = frame_scales(rest, points, cameras, share, low, high)
+            scales = scales.to(tracks.dtype)
             size = scales.mean(-1)[..., None, None, None]
             given = (deviation_goal(rest, points / scales[..., None, None], cameras, share), cameras, share)
             top = deviation_scale(*given, matrix=matrix, arrangement=self.arrangement)

@@ -138,8 +138,8 @@ class UnrolledPKC(Unrolled):
 
         With ``measure`` it tells whether the last step stood still, which waits for the device.
         """
-        joints, count = self.skeleton.num_joints, self.skeleton.num_bones
-        weights = self._check(tracks, cameras, weights, start, self.skeleton, lengths=(lengths, (count,)))
+        joints = self.skeleton.num_joints
+        weights = self._check(tracks, cameras, weights, start, self.skeleton, lengths=lengths)
         depends_on = (tracks, cameras, weights, start, lengths)
         with full_precision(tracks):
             # Factorisations of covariances: in double precision, as for singular values.

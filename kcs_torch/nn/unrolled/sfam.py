@@ -145,13 +145,14 @@ class UnrolledSfAM(Unrolled):
         Returns:
             The solution; ``change`` is that of the last step, (...).
         """
-        expected = (self.skeleton.num_bones,)
-        weights = self._check(tracks, cameras, weights, start, self.skeleton, lengths=(lengths, expected))
+        weights = self._check(tracks, cameras, weights, start, self.skeleton, lengths=None if one_body else lengths)
         tracks = known(tracks, weights)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         stiffness = self._values("stiffness", tracks)
         relative = one_body or lengths is None
-        if lengths is None and self.has_lengths:
+        if lengths is not None:
+            lengths = lengths.to(tracks.dtype)
+        elif self.has_lengths:
             lengths = self._values("length", tracks)
         fixed = None if lengths is None else lengths[..., self.rigid]
         graded = not self.skeleton.tree
