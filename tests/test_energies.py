@@ -565,6 +565,15 @@ def test_autocast_does_not_coarsen(device):
         energy.to("cpu")
 
 
+@pytest.mark.parametrize("energy", [PostureEnergy, StanceEnergy, HingeEnergy, AdductionEnergy, ProcrusteanEnergy])
+def test_autocast_does_not_coarsen_what_a_skeleton_knows(energy):
+    """Under autocast the posture's scatter had three digits, and the energy was off by a third."""
+    points, module = normal(2, 6, 17, 3, dtype=torch.float32), energy(TRUNK)
+    expected = module(points)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(module(points), expected)
+
+
 @pytest.mark.parametrize("dtype", HALVES)
 @each_energy
 def test_half_precision(energy, dtype):

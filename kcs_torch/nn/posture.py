@@ -11,7 +11,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.nn.energies import check_lengths
-from kcs_torch.nn.layers import SkeletonModule, check_beside, narrow, wide
+from kcs_torch.nn.layers import SkeletonModule, check_beside, full_precision, narrow, wide
 from kcs_torch.nn.lengths import LEAST, usual_size
 from kcs_torch.nn.masks import bone_share, known_points, safe_root, some, weighs_joints
 from kcs_torch.skeleton import Skeleton
@@ -134,15 +134,16 @@ class PostureEnergy(SkeletonModule):
             raise ShapeError(f"PostureEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
         check_lengths(lengths, points, self)
         joints = weights is not None and weighs_joints(weights, points, self)
-        points = wide(known_points(points, weights, self))
-        vectors = bone_vectors(points, self.bones)
-        if lengths is None:
-            share = None
-            if weights is not None:
-                share = bone_share(weights, self.bones) if joints else weights[..., None]
-            lengths = usual_size(vectors.square().sum(-1), share, LEAST)
-        lengths = lengths.to(vectors.dtype)[..., None, :, None]
-        return vectors @ self.frame(points) / torch.where(lengths <= 0, torch.inf, lengths)
+        with full_precision(points):
+            points = wide(known_points(points, weights, self))
+            vectors = bone_vectors(points, self.bones)
+            if lengths is None:
+                share = None
+                if weights is not None:
+                    share = bone_share(weights, self.bones) if joints else weights[..., None]
+                lengths = usual_size(vectors.square().sum(-1), share, LEAST)
+            lengths = lengths.to(vectors.dtype)[..., None, :, None]
+            return vectors @ self.frame(points) / torch.where(lengths <= 0, torch.inf, lengths)
 
     def forward(
         self,
@@ -176,32 +177,33 @@ class PostureEnergy(SkeletonModule):
                 raise OptionError("PostureEnergy: expected weights or independent, got both")
             check_beside(independent, "independent", points.shape[-3:-2], points, self)
             weights = independent
-        local = self.directions(points, lengths, weights)
-        y = ((local - self.mean.to(local)) / self.deviation.to(local)).flatten(-2)
-        count: Tensor | float
-        each: Tensor | float = 1.0
-        pull: Tensor | float = 1.0
-        if weights is None:
-            count, mean = y.shape[-2] / self.correlation, y.sum(-2, keepdim=True) / max(y.shape[-2], 1)
-            off, each = y - mean, 1 / self.correlation
-            pull = count * self.kappa / (count + self.kappa)
-        elif independent is None and weighs_joints(weights, points, self):
-            firm = torch.minimum(bone_share(weights, self.bones), weights[..., self.trunk].amin(-1, keepdim=True))
-            share = firm.to(local).repeat_interleave(3, -1) / self.correlation  # (..., T, 3B)
-            count, own = share.amax(-1).sum(-1), share.sum(-2, keepdim=True)
-            mean = (share * y).sum(-2, keepdim=True) / some(own)
-            off = safe_root(share) * (y - mean)
-            mean = mean * safe_root(own * self.kappa / (own + self.kappa))
-        else:
-            share = weights.to(local)[..., None] / (self.correlation if independent is None else 1)
-            count = share.sum((-2, -1))
-            mean = (share * y).sum(-2, keepdim=True) / torch.where(count > 0, count, 1)[..., None, None]
-            off, each = y - mean, share[..., None, :, :]
-            pull = (count * self.kappa / (count + self.kappa))[..., None, None, None]
-        off, mean = (self.taken_apart(rows) for rows in (off, mean))  # (..., S, T or 1, K)
-        scatter = (off * each).mT @ off + pull * (mean.mT @ mean)
-        each = count[..., None] if isinstance(count, Tensor) else count
-        return narrow(self.of_scatter(scatter, each).sum(-1), points)
+        with full_precision(points):
+            local = self.directions(points, lengths, weights)
+            y = ((local - self.mean.to(local)) / self.deviation.to(local)).flatten(-2)
+            count: Tensor | float
+            each: Tensor | float = 1.0
+            pull: Tensor | float = 1.0
+            if weights is None:
+                count, mean = y.shape[-2] / self.correlation, y.sum(-2, keepdim=True) / max(y.shape[-2], 1)
+                off, each = y - mean, 1 / self.correlation
+                pull = count * self.kappa / (count + self.kappa)
+            elif independent is None and weighs_joints(weights, points, self):
+                firm = torch.minimum(bone_share(weights, self.bones), weights[..., self.trunk].amin(-1, keepdim=True))
+                share = firm.to(local).repeat_interleave(3, -1) / self.correlation  # (..., T, 3B)
+                count, own = share.amax(-1).sum(-1), share.sum(-2, keepdim=True)
+                mean = (share * y).sum(-2, keepdim=True) / some(own)
+                off = safe_root(share) * (y - mean)
+                mean = mean * safe_root(own * self.kappa / (own + self.kappa))
+            else:
+                share = weights.to(local)[..., None] / (self.correlation if independent is None else 1)
+                count = share.sum((-2, -1))
+                mean = (share * y).sum(-2, keepdim=True) / torch.where(count > 0, count, 1)[..., None, None]
+                off, each = y - mean, share[..., None, :, :]
+                pull = (count * self.kappa / (count + self.kappa))[..., None, None, None]
+            off, mean = (self.taken_apart(rows) for rows in (off, mean))  # (..., S, T or 1, K)
+            scatter = (off * each).mT @ off + pull * (mean.mT @ mean)
+            each = count[..., None] if isinstance(count, Tensor) else count
+            return narrow(self.of_scatter(scatter, each).sum(-1), points)
 
     def taken_apart(self, rows: Tensor) -> Tensor:
         """Bones' coordinates (..., T, 3B) in each of the halves, (..., S, T, K)."""

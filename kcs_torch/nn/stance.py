@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
-from kcs_torch.nn.layers import SkeletonModule, check_beside, narrow, wide
+from kcs_torch.nn.layers import SkeletonModule, check_beside, full_precision, narrow, wide
 from kcs_torch.nn.lengths import usual_size
 from kcs_torch.nn.masks import bone_share, known_points, some, weighs_joints
 from kcs_torch.nn.posture import PostureEnergy
@@ -103,22 +103,23 @@ class StanceEnergy(SkeletonModule):
             raise ShapeError(f"StanceEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
         check_beside(size if isinstance(size, Tensor) else None, "size", (), points, self)
         joints = weights is not None and weighs_joints(weights, points, self)
-        points = wide(known_points(points, weights, self))
-        vectors = bone_vectors(points, self.bones)
-        if size is None:
-            share = None
-            if weights is not None:
-                share = bone_share(weights, self.bones) if joints else weights[..., None]
-            square = vectors.square().sum(-1)
-            known = square.new_ones(square.shape[-1]) if share is None else (share > 0).any(-2).to(square)
-            size = (known * usual_size(square, share)).sum(-1)
-            size = size / some((known * self.posture.rest_lengths.to(square)).sum(-1))
-        if isinstance(size, Tensor):
-            size = torch.where(size > 0, size, torch.inf).to(vectors)[..., None, None]
-        way = (self.line.to(vectors) @ vectors)[..., None, :] @ self.posture.frame(points)  # (..., T, 1, 3)
-        off = way[..., 0, ::2] / size - self.usual.to(vectors)
-        back = off[..., 1].clamp_min(0).square()
-        return back + self.fold**2 * torch.log1p((off.square().sum(-1) - back) / self.fold**2)
+        with full_precision(points):
+            points = wide(known_points(points, weights, self))
+            vectors = bone_vectors(points, self.bones)
+            if size is None:
+                share = None
+                if weights is not None:
+                    share = bone_share(weights, self.bones) if joints else weights[..., None]
+                square = vectors.square().sum(-1)
+                known = square.new_ones(square.shape[-1]) if share is None else (share > 0).any(-2).to(square)
+                size = (known * usual_size(square, share)).sum(-1)
+                size = size / some((known * self.posture.rest_lengths.to(square)).sum(-1))
+            if isinstance(size, Tensor):
+                size = torch.where(size > 0, size, torch.inf).to(vectors)[..., None, None]
+            way = (self.line.to(vectors) @ vectors)[..., None, :] @ self.posture.frame(points)  # (..., T, 1, 3)
+            off = way[..., 0, ::2] / size - self.usual.to(vectors)
+            back = off[..., 1].clamp_min(0).square()
+            return back + self.fold**2 * torch.log1p((off.square().sum(-1) - back) / self.fold**2)
 
     def _share(self, points: Tensor, weights: Tensor) -> Tensor:
         """What each frame counts, (..., T)."""
