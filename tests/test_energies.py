@@ -1,6 +1,7 @@
 """Energies: values by hand, gradients with degenerate inputs, and the prox and gradient that solvers use."""
 
 import warnings
+from copy import deepcopy
 
 import pytest
 import torch
@@ -572,6 +573,13 @@ def test_autocast_does_not_coarsen_what_a_skeleton_knows(energy):
     expected = module(points)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.equal(module(points), expected)
+
+
+@each_energy
+def test_shapes_are_known_without_data(energy):
+    """The meta device has no autocast to suspend."""
+    points = clip(dtype=torch.float32)
+    assert deepcopy(energy).to("meta")(points.to("meta")).shape == energy(points).shape
 
 
 @pytest.mark.parametrize("dtype", HALVES)

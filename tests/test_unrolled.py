@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from copy import deepcopy
 
 import pytest
 import torch
@@ -629,6 +630,12 @@ def test_lengths_that_are_not_of_the_batch(layer):
         layer(BODY, 2)(tracks, cameras, lengths=torch.ones(3, 6))
     with pytest.raises(ShapeError, match="expected a tensor of lengths, got list"):
         layer(BODY, 2)(tracks, cameras, lengths=[1.0] * 6)
+
+
+@pytest.mark.parametrize("layer", [UnrolledFPC(2), UnrolledSfAM(BODY, 2), UnrolledPKC(BODY, 2)])
+def test_shapes_are_known_without_data(layer):
+    tracks, cameras, weights = (x.to("meta") for x in scene(BODY, "gaps"))
+    assert deepcopy(layer).to("meta")(tracks, cameras, weights=weights).shape == (6, 7, 3)
 
 
 @pytest.mark.parametrize("layer", [UnrolledFPC(2), UnrolledSfAM(BODY, 2), UnrolledPKC(BODY, 2)])

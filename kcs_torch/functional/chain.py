@@ -38,8 +38,8 @@ def incidence(bones: Tensor | Sequence[Sequence[int]], num_joints: int, *, dtype
     [[-1.0, 0.0], [1.0, -1.0], [0.0, 1.0]]
     """
     index = _pairs(bones)
-    # A compiled graph cannot look at numbers: there the indices are those that were checked before.
-    look = index.numel() > 0 and not torch.compiler.is_compiling()
+    # A compiled graph cannot look at numbers, nor are there any on the meta device: the indices were checked before.
+    look = index.numel() > 0 and not index.is_meta and not torch.compiler.is_compiling()
     low, high = (int(index.min()), int(index.max())) if look else (0, -1)
     if low < 0 or high >= num_joints:
         raise ShapeError(f"bones: expected joint indices 0..{num_joints - 1}, got {low}..{high}")

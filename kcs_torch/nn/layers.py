@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -177,9 +178,10 @@ class SVT(nn.Module):
         return svt(matrix, level)
 
 
-def full_precision(tensor: Tensor) -> torch.autocast:
-    """Suspend autocast on the tensor's device: pixels and factorisations need more than three digits."""
-    return torch.autocast(tensor.device.type, enabled=False)
+def full_precision(tensor: Tensor) -> AbstractContextManager[Any]:
+    """Suspend autocast on the tensor's device, if it has any: pixels and factorisations need more than three digits."""
+    kind = tensor.device.type
+    return torch.autocast(kind, enabled=False) if torch.amp.is_autocast_available(kind) else nullcontext()
 
 
 def wide(tensor: Tensor) -> Tensor:
