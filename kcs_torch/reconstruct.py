@@ -10,7 +10,7 @@ from typing import Any
 
 from kcs_torch.errors import KcsWarning, OptionError, ShapeError, unknown, users_level
 from kcs_torch.methods import METHODS
-from kcs_torch.methods.base import Method
+from kcs_torch.methods.base import Method, check_tracks
 from kcs_torch.methods.found import find_skeleton
 from kcs_torch.methods.perspective import reconstruct_perspective
 from kcs_torch.methods.uncalibrated import may_be_near, reconstruct_uncalibrated
@@ -121,8 +121,7 @@ def reconstruct_all(
         raise OptionError("reconstruct_all: expected a list of Tracks, got one: reconstruct takes it")
     people = list(people)
     for i, one in enumerate(people):
-        if not isinstance(one, Tracks):
-            raise OptionError(f"reconstruct_all: item {i}: expected Tracks (see Tracks.from_arrays), got {type(one)}")
+        check_tracks(one, f"reconstruct_all: item {i}")
     chosen = method_named(method, fields)
     lens = _lens(intrinsics)
     if isinstance(lens, Intrinsics) or lens == "auto":
@@ -161,6 +160,7 @@ def _lens(value: Any) -> Intrinsics | str | None:
 
 def _before(lens: Intrinsics | str | None, method: Method, tracks: Tracks, cameras: Any = None) -> Reconstruction:
     """Reconstruct one body before a camera."""
+    check_tracks(tracks, "reconstruct")
     if lens is None:
         lens = "auto" if method.turns_over and cameras is None and may_be_near(tracks) else "parallel"
     if isinstance(lens, Intrinsics):

@@ -235,3 +235,33 @@ def test_all_of_one_is_told():
         kt.reconstruct_all(tracks)
     with pytest.raises(OptionError, match="reconstruct_all: item 1: expected Tracks"):
         kt.reconstruct_all([tracks, tracks.points])
+
+
+@pytest.mark.parametrize(
+    "call", [kt.reconstruct, lambda one: kt.reconstruct_all([one]), kt.KCS(), lambda one: kt.SfAM().many([one])]
+)
+def test_tracks_that_nothing_can_be_made_of_are_refused(call):
+    """No frames, and half precision by ``Tracks.to``, ended in errors of torch about amax, pinv and quantile."""
+    tracks = kt.data.walking_person(12).tracks
+    with pytest.raises(ShapeError, match="expected at least 1 frame, got none in walking_person"):
+        call(tracks.frames(5, 5))
+    for dtype, name in ((torch.float16, "float16"), (torch.bfloat16, "bfloat16")):
+        with pytest.raises(ShapeError, match=rf"single or double precision, got {name} in walking_person: use tracks"):
+            call(tracks.to(dtype))
+
+
+def test_methods_take_tracks_and_no_arrays():
+    tracks = kt.data.walking_person(12).tracks
+    with pytest.raises(OptionError, match=r"^kcs: expected Tracks \(see Tracks.from_arrays\), got"):
+        kt.KCS()(tracks.points)
+    with pytest.raises(OptionError, match="^sfam: item 1: expected Tracks"):
+        kt.SfAM().many([tracks, tracks.points])
+
+
+@pytest.mark.parametrize("step", [0, -1, 2.0, True])
+def test_frames_go_forward_by_whole_steps(step):
+    clip = kt.data.walking_person(12)
+    motion = kt.Motion.from_arrays(clip.points, skeleton="h36m17", units="mm", up="-y")
+    for one in (clip.tracks, motion):
+        with pytest.raises(OptionError, match="frames: step: expected a whole number from 1, got"):
+            one.frames(0, 10, step)

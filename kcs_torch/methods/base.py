@@ -10,7 +10,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -88,13 +88,15 @@ class Method(ABC):
             The reconstruction, on the device and in the dtype of the tracks.
 
         Raises:
-            ShapeError: the cameras do not fit the tracks.
+            OptionError: something else than tracks is given.
+            ShapeError: the cameras do not fit the tracks; these have no frames, or half precision.
 
         Warns:
             KcsWarning: depth is weakly determined, or joints were never seen.
             ConvergenceWarning: the iteration stopped at its limit.
         """
         begin = time.perf_counter()
+        check_tracks(tracks, self.name)
         if cameras is not None:
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         # Solvers differentiate, which inference mode forbids.
@@ -121,6 +123,8 @@ class Method(ABC):
             ConvergenceWarning: as a call does.
         """
         begin = time.perf_counter()
+        for i, one in enumerate(tracks):
+            check_tracks(one, f"{self.name}: item {i}")
         with apart(tracks):
             tracks = [self.prepared(one) for one in tracks]
             parts = [self._normalised(one) for one in tracks]
@@ -207,6 +211,20 @@ def apart(tracks: Sequence[Tracks]) -> Iterator[None]:
         else:
             with devices.pop():
                 yield
+
+
+def check_tracks(tracks: Any, what: str) -> None:
+    """Raise unless these are tracks of at least one frame, in a precision that has factorisations."""
+    if not isinstance(tracks, Tracks):
+        raise OptionError(f"{what}: expected Tracks (see Tracks.from_arrays), got {type(tracks)}")
+    if not tracks.num_frames:
+        raise ShapeError(f"{what}: expected at least 1 frame, got none in {tracks.source}")
+    if tracks.points.dtype not in (torch.float32, torch.float64):
+        kind = str(tracks.points.dtype).removeprefix("torch.")
+        raise ShapeError(
+            f"{what}: expected tracks in single or double precision, got {kind} in {tracks.source}: use "
+            "tracks.to(torch.float32)"
+        )
 
 
 def check_cameras(cameras: Tensor, frames: int) -> Tensor:

@@ -7,6 +7,7 @@ from typing import Any, Self
 
 from torch import Tensor
 
+from kcs_torch.errors import OptionError
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["Trajectories"]
@@ -66,6 +67,12 @@ class Trajectories:
         return replace(self, points=self.points.to(*args, **kwargs), weights=self.weights.to(*args, **kwargs))
 
     def frames(self, start: int, stop: int, step: int = 1) -> Self:
-        """A run of frames; with a step, every so many, at the slower rate."""
+        """A run of frames, as a slice takes them; with a step, every so many, at the slower rate.
+
+        Raises:
+            OptionError: the step is below 1, or no whole number.
+        """
+        if isinstance(step, bool) or not isinstance(step, int) or step < 1:
+            raise OptionError(f"{self.source}: frames: step: expected a whole number from 1, got {step!r}")
         rate = None if self.fps is None else self.fps / step
         return replace(self, points=self.points[start:stop:step], weights=self.weights[start:stop:step], fps=rate)
