@@ -8,7 +8,7 @@ from scipy.spatial import procrustes as scipy_procrustes
 from scipy.spatial.transform import Rotation
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.functional import similarity
+from kcs_torch.functional import similarity, superpose
 from kcs_torch.metrics import ALIGNMENTS, align, bone_deviation, e3d, mpjpe, pck
 
 BONES = [(0, 1), (1, 2), (2, 3), (0, 4)]
@@ -205,3 +205,38 @@ def test_bones_of_joints_that_are_nan_count_where_they_are_seen():
 def test_bone_deviation_of_half_precision_in_millimetres(dtype):
     points = (300 * clip(frames=1) + 10 * clip(frames=300, seed=1)).to(dtype)
     assert torch.allclose(bone_deviation(points, BONES).double(), bone_deviation(points.double(), BONES), rtol=1e-4)
+
+
+def test_arrays_and_lists_are_told_what_to_become():
+    points, ones = torch.rand(5, 7, 3), torch.ones(5, 7)
+    for figure in (mpjpe, e3d, lambda *a, **k: pck(*a, 0.1, **k)):
+        with pytest.raises(ShapeError, match=r"pred: expected a tensor, got ndarray: use torch.as_tensor\(pred\)"):
+            figure(points.numpy(), points)
+        with pytest.raises(ShapeError, match="weights: expected a tensor, got list"):
+            figure(points, points, weights=ones.tolist())
+    with pytest.raises(ShapeError, match="points: expected a tensor, got ndarray"):
+        bone_deviation(points.numpy(), [(0, 1)])
+
+
+@pytest.mark.parametrize("threshold", [-1.0, float("nan")])
+def test_no_joint_is_within_less_than_nothing(threshold):
+    with pytest.raises(OptionError, match="pck: expected a threshold of at least 0, got"):
+        pck(torch.rand(5, 7, 3), torch.rand(5, 7, 3), threshold)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int64])
+def test_figures_of_many_joints_are_not_rounded(dtype):
+    """The sum of many weights in half precision was rounded, or infinite; so was the share of joints that are near."""
+    truth = torch.zeros(5000, 17, 3, dtype=dtype)
+    pred = truth.clone()
+    pred[:3000, :, 0] = 1
+    half = torch.ones(5000, 17, dtype=dtype)
+    for weights in (None, half):
+        assert mpjpe(pred, truth, align="none", weights=weights).item() == pytest.approx(0.6, abs=1e-6)
+        assert pck(pred, truth, 0.5, align="none", weights=weights).item() == pytest.approx(0.4, abs=1e-6)
+
+
+def test_superpose_knows_its_alignments():
+    """Any other name was taken for "similarity"."""
+    with pytest.raises(OptionError, match="did you mean 'similarity'"):
+        superpose(torch.rand(5, 7, 3), torch.rand(5, 7, 3), "similarty")

@@ -170,7 +170,11 @@ def superpose(
 
     Returns:
         (..., T, N, 3), where the target is. Differentiable in both.
+
+    Raises:
+        OptionError: there is no such alignment.
     """
+    check_alignment(how, root)
     if how == "none":
         return source
     mass = torch.ones_like(target[..., 0]) if weights is None else weights.to(target)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -9,7 +11,7 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import ALIGNMENTS, superpose
 from kcs_torch.functional.align import check_alignment
 
-__all__ = ["ALIGNMENTS", "align"]
+__all__ = ["ALIGNMENTS", "align", "check_tensors"]
 
 
 def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = None, root: int | None = None) -> Tensor:
@@ -34,6 +36,7 @@ def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = Non
     True
     """
     check_alignment(how, root)
+    check_tensors(pred=pred, truth=truth, weights=weights)
     if pred.shape != truth.shape or pred.ndim < 3 or pred.shape[-1] != 3:
         raise ShapeError(
             f"align: expected two of shape (..., T, N, 3), got {tuple(pred.shape)} and {tuple(truth.shape)}"
@@ -47,3 +50,10 @@ def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = Non
     wide = torch.promote_types(torch.promote_types(pred.dtype, truth.dtype), torch.float32)
     with torch.autocast(pred.device.type, enabled=False):  # rotations need more than three digits
         return superpose(pred.to(wide), truth.to(wide), how, None if weights is None else weights.to(wide), root=root)
+
+
+def check_tensors(**given: Any) -> None:
+    """Raise a ShapeError unless all that is given, by its names, are tensors or None."""
+    for name, value in given.items():
+        if value is not None and not isinstance(value, Tensor):
+            raise ShapeError(f"{name}: expected a tensor, got {type(value).__name__}: use torch.as_tensor({name})")

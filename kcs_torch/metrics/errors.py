@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import bone_lengths, centre, nearest_rotation
 from kcs_torch.metrics.align import align as aligned
+from kcs_torch.metrics.align import check_tensors
 
 __all__ = ["bone_deviation", "distances", "e3d", "mpjpe", "pck"]
 
@@ -65,10 +66,12 @@ def pck(
 
     Raises:
         ShapeError: the shapes differ.
-        OptionError: there is no such alignment.
+        OptionError: there is no such alignment, or the threshold is negative.
     """
+    if not threshold >= 0:
+        raise OptionError(f"pck: expected a threshold of at least 0, got {threshold}")
     distance, mass = distances(pred, truth, align, weights, root)
-    return _mean((distance <= threshold).to(truth), mass)
+    return _mean((distance <= threshold).to(distance), mass)
 
 
 def e3d(pred: Tensor, truth: Tensor, *, weights: Tensor | None = None) -> Tensor:
@@ -123,6 +126,7 @@ def bone_deviation(
     >>> round(bone_deviation(points, [(0, 1)]).item(), 4)
     0.1
     """
+    check_tensors(points=points, weights=weights)
     index = torch.as_tensor(bones, device=points.device)
     if index.ndim != 2 or not len(index):
         raise ShapeError(f"bones: expected pairs of joints, got shape {tuple(index.shape)}")
@@ -150,4 +154,7 @@ def distances(
 
 def _mean(values: Tensor, weights: Tensor | None) -> Tensor:
     """Weighted mean over frames and joints: (..., T, N) -> (...)."""
-    return values.mean((-2, -1)) if weights is None else (values * weights).sum((-2, -1)) / weights.sum((-2, -1))
+    if weights is None:
+        return values.mean((-2, -1))
+    weights = weights.to(values)  # sums of half precision would be rounded, or infinite
+    return (values * weights).sum((-2, -1)) / weights.sum((-2, -1))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.align import check_alignment
+from kcs_torch.metrics.align import check_tensors
 from kcs_torch.metrics.errors import bone_deviation, distances, e3d
 from kcs_torch.skeleton import Skeleton, get_skeleton
 
@@ -170,6 +171,7 @@ class BoneDeviation(_Mean):
 
 def _known(points: Tensor, weights: Tensor | None) -> Tensor:
     """Points, 0 where they do not count."""
+    check_tensors(points=points, weights=weights)
     if weights is None:
         return points
     if weights.shape != points.shape[:-1]:
