@@ -429,6 +429,23 @@ def test_notes_on_what_is_unseen_are_those_of_the_tracks_that_are_left():
     assert not any("without any seen" in note for note in (*late.notes, *kt.clean.fill(tracks, 3).notes))
 
 
+def test_what_is_no_tracks_is_told():
+    """Motion and arrays ended in AttributeErrors about attributes that they have not."""
+    motion = kt.Motion.from_arrays(torch.rand(9, 17, 3), skeleton="h36m17", fps=30)
+    calls = {
+        "fill": lambda one: kt.clean.fill(one, 3),
+        "gate": kt.clean.gate,
+        "unswap": kt.clean.unswap,
+        "trim": kt.clean.trim,
+        "resample": lambda one: kt.clean.resample(one, 60),
+    }
+    for name, call in calls.items():
+        with pytest.raises(kt.OptionError, match=f"^{name}: expected Tracks, got Motion"):
+            call(motion)
+    with pytest.raises(kt.OptionError, match="^smooth: expected Tracks or Reconstruction, got Tensor"):
+        kt.clean.smooth(motion.points)
+
+
 def test_trim_to_nothing_seen_is_an_error():
     points = sine(1.0)
     points[:20] = np.nan

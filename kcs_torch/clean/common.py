@@ -14,9 +14,16 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.types import Tracks
 
-__all__ = ["Array", "body_size", "frame_rate", "number", "rebuilt", "runs", "share"]
+__all__ = ["Array", "body_size", "check_tracks", "frame_rate", "number", "rebuilt", "runs", "share"]
 
 Array = NDArray[np.float64]
+
+
+def check_tracks(given: Any, what: str, kinds: tuple[type, ...] = (Tracks,)) -> None:
+    """Raise an OptionError unless tracks, or one of the kinds named, are given."""
+    if not isinstance(given, kinds):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise OptionError(f"{what}: expected {wanted}, got {type(given).__name__}")
 
 
 def number(value: Any, what: str, expected: str, *, above: float = 0.0, below: float = math.inf) -> float:

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcs_torch.clean.common import body_size, frame_rate, number, rebuilt, share
+from kcs_torch.clean.common import body_size, check_tracks, frame_rate, number, rebuilt, share
 from kcs_torch.types import Tracks
 
 __all__ = ["gate"]
@@ -58,6 +58,7 @@ def gate(tracks: Tracks, *, threshold: float = 6.0, floor: float = 0.2, reach: f
     >>> cleaned.seen[30, 9].item(), cleaned.notes[-1]
     (False, 'gate: 1 of 1020 (0.098 %) detections dropped as outliers: neck 1')
     """
+    check_tracks(tracks, "gate")
     number(threshold, "gate: threshold", "a positive number of usual errors")
     number(floor, "gate: floor", "a positive share of the body's size")
     number(reach, "gate: reach", "a positive number of seconds")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from kcs_torch.clean.common import body_size, rebuilt, share
+from kcs_torch.clean.common import body_size, check_tracks, rebuilt, share
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.graph import find_pieces
@@ -41,6 +41,7 @@ def unswap(tracks: Tracks) -> Tracks:
     >>> unswap(tracks).notes[-1]
     'unswap: left and right swapped back in 5 of 60 (8.3 %) frames'
     """
+    check_tracks(tracks, "unswap")
     body, count = tracks.skeleton, tracks.skeleton.num_observed
     pairs = [pair for pair in body.mirror if max(pair) < count]
     if len(pairs) < _FEWEST:

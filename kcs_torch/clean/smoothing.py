@@ -9,7 +9,7 @@ from typing import overload
 import numpy as np
 import torch
 
-from kcs_torch.clean.common import Array, frame_rate, number, rebuilt, runs, share
+from kcs_torch.clean.common import Array, check_tracks, frame_rate, number, rebuilt, runs, share
 from kcs_torch.clean.filters import FILTERS, Filter
 from kcs_torch.errors import unknown
 from kcs_torch.types import Reconstruction, Tracks
@@ -56,6 +56,7 @@ def smooth(
     """
     if method not in FILTERS:
         raise unknown("method of smooth", method, FILTERS)
+    check_tracks(motion, "smooth", (Tracks, Reconstruction))
     tracks = motion if isinstance(motion, Tracks) else motion.tracks
     rate = frame_rate(motion.fps, fps, "smooth", tracks.source)
     expected = f"above 0 and below half of the {rate:g} frames a second, {rate / 2:g} Hz"

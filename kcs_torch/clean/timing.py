@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from kcs_torch.clean.common import frame_rate, number, rebuilt, runs
+from kcs_torch.clean.common import check_tracks, frame_rate, number, rebuilt, runs
 from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.types import Tracks
 
@@ -34,6 +34,7 @@ def trim(tracks: Tracks, start: int | None = None, stop: int | None = None) -> T
     >>> trim(walking_person(60).tracks, 10, 30).notes[-1]
     'trim: frames 10 to 29 of 60'
     """
+    check_tracks(tracks, "trim")
     frames = tracks.num_frames
     for name, value in (("start", start), ("stop", stop)):
         if value is not None and (isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0):
@@ -72,6 +73,7 @@ def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: flo
     >>> resample(walking_person(61, fps=30).tracks, 60).num_frames
     121
     """
+    check_tracks(tracks, "resample")
     if kind not in _KINDS:
         raise unknown("kind of resample", kind, _KINDS)
     number(fps, "resample: fps", "a positive number of frames a second")
