@@ -80,6 +80,13 @@ def test_joints_are_triples(joints):
         joint_angles(normal(5, 3), joints)
 
 
+def test_joints_of_a_list_are_those_of_the_points():
+    with pytest.raises(ShapeError, match=r"joints: expected joint indices 0..4, got \(0, 1, 5\)"):
+        joint_angles(torch.rand(4, 5, 3), [(0, 1, 5)])
+    with pytest.raises(ShapeError, match=r"of indices \(parent, joint, child\), got a row \('a', 'b', 'c'\)"):
+        joint_angles(torch.rand(4, 5, 3), [("a", "b", "c")])
+
+
 @pytest.mark.parametrize("degrees", [5.0, 60.0, 150.0])
 def test_sign_tells_the_way(degrees):
     assert float(flexion(DOWN, bent(degrees), LEFT)) > 0

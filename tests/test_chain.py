@@ -194,3 +194,18 @@ def test_results_follow_dtype_and_device(dtype, device):
         incidence(BONES.to(device), 7, dtype=dtype),
     ]
     assert {(v.dtype, v.device.type) for v in values} == {(dtype, device)}
+
+
+@pytest.mark.parametrize("call", [bone_vectors, bone_lengths, pose_matrix])
+def test_bones_of_a_list_are_pairs_of_the_points_joints(call):
+    """Fractions were cut off to whole numbers; other joints ended in "index out of range in self"."""
+    points = torch.rand(4, 5, 3)
+    for wrong in ([(0, 5)], [(-1, 2)]):
+        with pytest.raises(ShapeError, match=r"bones: expected joint indices 0..4, got \("):
+            call(points, wrong)
+    for wrong in ([(0.5, 1)], [("a", "b")], [(0, 1, 2)]):
+        with pytest.raises(
+            ShapeError, match=r"bones: expected shape \(B, 2\) of indices \(parent, child\), got a row \("
+        ):
+            call(points, wrong)
+    assert torch.equal(call(points, np.array([[0, 4]])), call(points, [(0, 4)]))

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError
-from kcs_torch.functional.chain import safe_norm, unit_size
+from kcs_torch.functional.chain import index_rows, safe_norm, unit_size
 
 __all__ = ["angle_between", "flexion", "joint_angles"]
 
@@ -72,17 +71,13 @@ def joint_angles(points: Tensor, joints: Tensor | Sequence[Sequence[int]]) -> Te
         (..., J) in radians: 0 straight, pi folded; 0 with the derivative 0 where two joints coincide.
 
     Raises:
-        ShapeError: ``joints`` is not (J, 3).
+        ShapeError: ``joints`` is not (J, 3), or lists joints that the points have not.
 
     >>> arm = torch.tensor([[0.0, 0, 0], [0, 3, 0], [2, 3, 0]])
     >>> joint_angles(arm, [(0, 1, 2)]).rad2deg().tolist()
     [90.0]
     """
-    index = joints if isinstance(joints, Tensor) else torch.tensor([list(j) for j in joints], dtype=torch.long)
-    if index.numel() == 0:
-        index = index.reshape(-1, 3)
-    if index.ndim != 2 or index.shape[-1] != 3:
-        raise ShapeError(f"joints: expected shape (J, 3) of (parent, joint, child), got {tuple(index.shape)}")
+    index = index_rows(joints, points.shape[-2], what="joints", form=("parent", "joint", "child"))
     above, here, below = (points.index_select(-2, i) for i in index.to(points.device).unbind(-1))
     return angle_between(here - above, below - here)
 

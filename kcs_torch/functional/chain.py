@@ -37,7 +37,7 @@ def incidence(bones: Tensor | Sequence[Sequence[int]], num_joints: int, *, dtype
     >>> incidence([(0, 1), (1, 2)], 3).tolist()
     [[-1.0, 0.0], [1.0, -1.0], [0.0, 1.0]]
     """
-    index = _pairs(bones)
+    index = index_rows(bones)
     # A compiled graph cannot look at numbers, nor are there any on the meta device: the indices were checked before.
     look = index.numel() > 0 and not index.is_meta and not torch.compiler.is_compiling()
     low, high = (int(index.min()), int(index.max())) if look else (0, -1)
@@ -98,7 +98,7 @@ def bone_vectors(points: Tensor, bones: Tensor | Sequence[Sequence[int]]) -> Ten
     >>> bone_vectors(torch.tensor([[0.0, 0], [1, 2]]), [(0, 1)]).tolist()
     [[1.0, 2.0]]
     """
-    index = _pairs(bones).to(points.device)
+    index = index_rows(bones, points.shape[-2]).to(points.device)
     return points.index_select(-2, index[:, 1]) - points.index_select(-2, index[:, 0])
 
 
@@ -161,7 +161,7 @@ def pose_matrix(
     >>> pose_matrix(torch.tensor([[0.0, 0], [3, 0], [4, 2]]), [(0, 1), (1, 2)]).tolist()
     [[9.0, 3.0], [3.0, 5.0]]
     """
-    parents, children = _pairs(bones).to(points.device).unbind(-1)
+    parents, children = index_rows(bones, points.shape[-2]).to(points.device).unbind(-1)
     rows = points.mT
     across = rows.index_select(-1, children) - rows.index_select(-1, parents)  # (..., D, B)
     if normalise:
@@ -210,12 +210,27 @@ def safe_norm(vectors: Tensor) -> Tensor:
     return torch.where(zero, torch.zeros_like(square), root * scale.squeeze(-1))
 
 
-def _pairs(bones: Tensor | Sequence[Sequence[int]]) -> Tensor:
-    if not isinstance(bones, Tensor):
-        pairs = [tuple(b) for b in bones]
-        if any(len(p) != 2 for p in pairs):
-            raise ShapeError(f"bones: expected (parent, child) pairs, got {next(p for p in pairs if len(p) != 2)}")
-        return torch.tensor(pairs, dtype=torch.long).reshape(-1, 2)
-    if bones.ndim != 2 or bones.shape[-1] != 2:
-        raise ShapeError(f"bones: expected shape (B, 2) of (parent, child), got {tuple(bones.shape)}")
-    return bones
+def index_rows(
+    rows: Tensor | Sequence[Sequence[int]],
+    joints: int | None = None,
+    *,
+    what: str = "bones",
+    form: tuple[str, ...] = ("parent", "child"),
+) -> Tensor:
+    """Rows of joint indices, (B, 2) for bones; those of a list are among so many joints, or any if None.
+
+    Raises:
+        ShapeError: the rows are not of this form, or a list has other indices.
+    """
+    shape = f"shape ({what[0].upper()}, {len(form)}) of indices ({', '.join(form)})"
+    if not isinstance(rows, Tensor):
+        listed = [tuple(row) for row in rows]
+        for row in listed:
+            if len(row) != len(form) or not all(hasattr(i, "__index__") for i in row):
+                raise ShapeError(f"{what}: expected {shape}, got a row {row}")
+            if joints is not None and not all(0 <= i < joints for i in row):
+                raise ShapeError(f"{what}: expected joint indices 0..{joints - 1}, got {row}")
+        return torch.tensor(listed, dtype=torch.long).reshape(-1, len(form))
+    if rows.ndim != 2 or rows.shape[-1] != len(form):
+        raise ShapeError(f"{what}: expected {shape}, got {tuple(rows.shape)}")
+    return rows
