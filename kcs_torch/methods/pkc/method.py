@@ -19,10 +19,11 @@ from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, t
 from kcs_torch.methods.pkc.batch import Sized, serve
 from kcs_torch.methods.pkc.body import Body, Turned
 from kcs_torch.methods.pkc.cleaning import cleaned
+from kcs_torch.methods.pkc.gaps import fill_gaps, gaps_of
 from kcs_torch.methods.pkc.gate import without_others
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
-from kcs_torch.methods.pkc.moving_view import MovingView, settled
+from kcs_torch.methods.pkc.moving_view import ROBOT, MovingView, freed, settled
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
@@ -162,7 +163,7 @@ class PKC(Method):
             image = resized
         if not has_trunk:
             if enough:
-                moving, first = yield from self._moving(tracks, image, noise, max(1, self.alternatives))
+                moving, first = yield from self._in_space(tracks, image, noise)
                 made = from_moving(moving, first, skeleton, cameras, notes, alternatives=self.alternatives)
             else:
                 seen = _complete(tracks, image)
@@ -247,6 +248,17 @@ class PKC(Method):
             image, tracks.skeleton, *start, weights=weights, noise=usual, lifts=self.lifts, alternatives=count,
             exact=usual == 0, seed=self.seed,
         )  # fmt: skip
+        return moving, first
+
+    def _in_space(self, tracks: Tracks, image: Tensor, noise: Tensor) -> Search[Any, Any, tuple[MovingView, Estimate]]:
+        """As :meth:`_moving`; where joints are unseen here and there, once more with gaps that the first one fills."""
+        count = max(1, self.alternatives)
+        moving, first = yield from self._moving(tracks, image, noise, count)
+        if self.rounds and image.shape[1] > ROBOT and bool(gaps_of(noise).any()):
+            moving = yield from freed(moving, image, noise)
+            image, noise = fill_gaps(image, moving.pose.points[0, ..., :2], noise)
+            moving, first = yield from self._moving(tracks, image, noise, count)
+            moving = yield from freed(moving, image, noise)
         return moving, first
 
     def _turned(self, tracks: Tracks, image: Tensor, noise: Tensor, factor: Tensor) -> Turned:

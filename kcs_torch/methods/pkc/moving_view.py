@@ -32,7 +32,7 @@ from kcs_torch.solvers.procrustean import (
     track_energy,
 )
 
-__all__ = ["TIGHT", "MovingView", "moving_view", "searching", "settled", "soften"]
+__all__ = ["ROBOT", "TIGHT", "MovingView", "freed", "moving_view", "searching", "settled", "soften"]
 
 TURNS = (30.0, 60.0, 90.0, 120.0, 180.0, 360.0)
 """Degrees that the cameras of the starts turn, evenly, about the image's vertical."""
@@ -71,11 +71,15 @@ FREE = 30_000_000
 """Numbers of the matrices that whiten all frames up to which x and y are unknowns in noise: 10,000 frames of 17 joints.
 With all that goes with them they take 70 KB a frame there; the image of longer clips is taken as it is."""
 
+LEAST = 0.003
+"""Noise, a share of the body's size, that joints are taken to have where only gaps are not exact."""
+
 GIVEN = 3
 """Solutions whose bones are then led along paths of constant length."""
 
 ROBOT = 10
-"""Up to as many joints, twenty times the random starts are tried: they are cheap, and little else decides."""
+"""Up to as many joints, twenty times the random starts are tried: they are cheap, and little else decides. Nor does one
+solution fill gaps for another: where it is wrong, so are they."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +185,7 @@ def searching(
     frames, joints, _ = image.shape
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
-    if frames * (3 * joints + 3) ** 2 > FREE:
+    if _large(image):
         noise, weights = 0.0, None
     held = is_tree and exact and noise == 0 and len(rigid) == joints - 1
     first = torch.cat([image, start[..., 2:] - start[..., 2:].mean(1, keepdim=True)], -1)[None]
@@ -258,6 +262,19 @@ def searching(
     return MovingView(pose[best], ranks[best], bones, rigid, tight[0], lead)
 
 
+def freed(moving: MovingView, image: Tensor, noise: Tensor) -> Search[Descent, Pose, MovingView]:
+    """Solutions whose x and y may leave an image (T, N, 2) by its noise (T, N), where they were held before."""
+    least = max(LEAST, float(noise.median()))
+    if _large(image):
+        return moving
+    pose, stages = moving.pose, tuple(soften(stage, least) for stage in FINE)
+    weights, pull = (least / noise.clamp_min(least)).square(), TIGHT if moving.stiffness == 1 else LOOSER
+    (pose,) = yield [
+        Descent(image, pose.points, pose.rotations, moving.bones, weights, moving.rigid, pull, least, stages)
+    ]
+    return replace(moving, pose=pose)
+
+
 def settled(image: Tensor, skeleton: Skeleton, start: Tensor, rotations: Tensor) -> Search[Descent, Pose, Tensor]:
     """Depths (T, N) that the coarse stages make of a first guess of a tree; arguments as of :func:`moving_view`."""
     bones = skeleton.bone_index(device=image.device)
@@ -271,6 +288,11 @@ def settled(image: Tensor, skeleton: Skeleton, start: Tensor, rotations: Tensor)
 def soften(stage: Stage, noise: float) -> Stage:
     """The stage, with no scale far below the noise."""
     return replace(stage, eps=max(stage.eps, 0.1 * noise**2), slack=max(stage.slack, 0.3 * noise))
+
+
+def _large(image: Tensor) -> bool:
+    """Whether a clip is too long for x and y to be unknowns."""
+    return image.shape[0] * (3 * image.shape[1] + 3) ** 2 > FREE
 
 
 def _distinct(pose: Pose, value: Tensor, count: int) -> Tensor:
