@@ -251,10 +251,10 @@ class PKC(Method):
         return moving, first
 
     def _in_space(self, tracks: Tracks, image: Tensor, noise: Tensor) -> Search[Any, Any, tuple[MovingView, Estimate]]:
-        """As :meth:`_moving`; where joints are unseen here and there, once more with gaps that the first one fills."""
-        count = max(1, self.alternatives)
+        """As :meth:`_moving`; where exact tracks have gaps, once more with these filled by the first one."""
+        count, exact = max(1, self.alternatives), float(noise.median()) == 0
         moving, first = yield from self._moving(tracks, image, noise, count)
-        if self.rounds and image.shape[1] > ROBOT and bool(gaps_of(noise).any()):
+        if self.rounds and exact and image.shape[1] > ROBOT and bool(gaps_of(noise).any()):
             moving = yield from freed(moving, image, noise)
             image, noise = fill_gaps(image, moving.pose.points[0, ..., :2], noise)
             moving, first = yield from self._moving(tracks, image, noise, count)

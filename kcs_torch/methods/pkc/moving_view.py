@@ -71,6 +71,9 @@ FREE = 30_000_000
 """Numbers of the matrices that whiten all frames up to which x and y are unknowns in noise: 10,000 frames of 17 joints.
 With all that goes with them they take 70 KB a frame there; the image of longer clips is taken as it is."""
 
+FREEING = 2e-4
+"""The eps of stages from which on x and y are unknowns in noise; in coarser ones they would only take time."""
+
 LEAST = 0.003
 """Noise, a share of the body's size, that joints are taken to have where only gaps are not exact."""
 
@@ -197,7 +200,8 @@ def searching(
     def descend(
         tracks: Tensor, pose: Pose, pull: float, stages: tuple[Stage, ...], weights: Tensor | None
     ) -> Search[Descent, Pose, Pose]:
-        (found,) = yield [Descent(tracks, pose.points, pose.rotations, bones, weights, rigid, pull, noise, stages)]
+        sigma, sure = (noise, weights) if stages[0].eps <= max(FREEING, 0.1 * noise**2) else (0.0, None)
+        (found,) = yield [Descent(tracks, pose.points, pose.rotations, bones, sure, rigid, pull, sigma, stages)]
         return found
 
     def value(pose: Pose) -> Tensor:
@@ -263,14 +267,13 @@ def searching(
 
 
 def freed(moving: MovingView, image: Tensor, noise: Tensor) -> Search[Descent, Pose, MovingView]:
-    """Solutions whose x and y may leave an image (T, N, 2) by its noise (T, N), where they were held before."""
-    least = max(LEAST, float(noise.median()))
+    """Solutions whose x and y, held so far, may leave the image (T, N, 2) in gaps, by their noise (T, N)."""
     if _large(image):
         return moving
-    pose, stages = moving.pose, tuple(soften(stage, least) for stage in FINE)
-    weights, pull = (least / noise.clamp_min(least)).square(), TIGHT if moving.stiffness == 1 else LOOSER
+    pose, stages = moving.pose, tuple(soften(stage, LEAST) for stage in FINE)
+    weights, pull = (LEAST / noise.clamp_min(LEAST)).square(), TIGHT if moving.stiffness == 1 else LOOSER
     (pose,) = yield [
-        Descent(image, pose.points, pose.rotations, moving.bones, weights, moving.rigid, pull, least, stages)
+        Descent(image, pose.points, pose.rotations, moving.bones, weights, moving.rigid, pull, LEAST, stages)
     ]
     return replace(moving, pose=pose)
 
