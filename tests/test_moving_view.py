@@ -242,10 +242,13 @@ def test_noise_of_a_body_without_template_is_told_from_its_motion():
     size = (clip.tracks.points - clip.tracks.points.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()
     shift = torch.randn(60, 17, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     tracks = dataclasses.replace(clip.tracks, points=clip.tracks.points + 0.02 * size * shift, skeleton=body)
-    found = kt.PKC(alternatives=0)(tracks).points
-    mirror = found.new_tensor([1.0, 1.0, -1.0])
+    result = kt.PKC(alternatives=0)(tracks)
+    found, mirror = result.points, result.points.new_tensor([1.0, 1.0, -1.0])
     error = min(kt.metrics.mpjpe(one, clip.points, align="rigid") for one in (found, found * mirror))
     assert float(error / size) < 0.03  # .064 where smoothed tracks are taken as exact
+    depth, true = (x[..., 2] - x[..., 2].mean(1, keepdim=True) for x in (found, clip.points))
+    off = min(((depth - s * true).abs() for s in (1, -1)), key=torch.mean)
+    assert 0.5 < float((off <= result.uncertainty).double().mean()) < 0.9
 
 
 def test_gaps_of_a_body_without_template_are_filled_in_space():

@@ -259,7 +259,8 @@ class PKC(Method):
             image, noise = fill_gaps(image, moving.pose.points[0, ..., :2], noise)
             moving, first = yield from self._moving(tracks, image, noise, count)
             moving = yield from freed(moving, image, noise)
-        return moving, first
+        frame = noise[:, tracks.seen.any(0)].square().mean(1, keepdim=True)  # whose pose they turn
+        return replace(moving, noise=(noise.square() + frame).sqrt()), first
 
     def _turned(self, tracks: Tracks, image: Tensor, noise: Tensor, factor: Tensor) -> Turned:
         """What the viewpoint's turn tells, from many starts or from SfAM's guess: each worked out when first wanted."""
