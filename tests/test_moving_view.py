@@ -246,9 +246,19 @@ def test_noise_of_a_body_without_template_is_told_from_its_motion():
     found, mirror = result.points, result.points.new_tensor([1.0, 1.0, -1.0])
     error = min(kt.metrics.mpjpe(one, clip.points, align="rigid") for one in (found, found * mirror))
     assert float(error / size) < 0.03  # .064 where smoothed tracks are taken as exact
-    depth, true = (x[..., 2] - x[..., 2].mean(1, keepdim=True) for x in (found, clip.points))
+
+
+def test_deviations_of_depth_know_of_noise(protocol, shared):
+    """A dog, in noise of 2 % of its size: .2 of its depths were off by no more than they should be."""
+    case = {"src": "dog/dog_walk01", "orbit": 180, "yaw": 250, "pitch": 10, "max_frames": 120}
+    given, truth = protocol.build(shared / "data", case)
+    points, true = torch.from_numpy(given["points2d"]), torch.from_numpy(truth["points3d"])
+    size = (true - true.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()
+    points = points + 0.02 * size * torch.randn(points.shape, generator=torch.Generator().manual_seed(0)).double()
+    found = kt.PKC(alternatives=0)(kt.Tracks.from_arrays(points, edges=given["edges"], fps=given["fps"]))
+    depth, true = (x[..., 2] - x[..., 2].mean(1, keepdim=True) for x in (found.points, true))
     off = min(((depth - s * true).abs() for s in (1, -1)), key=torch.mean)
-    assert 0.5 < float((off <= result.uncertainty).double().mean()) < 0.9
+    assert 0.5 < float((off <= found.uncertainty).double().mean()) < 0.85
 
 
 def test_gaps_of_a_body_without_template_are_filled_in_space():
