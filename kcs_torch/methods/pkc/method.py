@@ -23,7 +23,7 @@ from kcs_torch.methods.pkc.gaps import fill_gaps, gaps_of
 from kcs_torch.methods.pkc.gate import without_others
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
-from kcs_torch.methods.pkc.moving_view import ROBOT, MovingView, freed, settled
+from kcs_torch.methods.pkc.moving_view import MovingView, fillable, freed, settled
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
@@ -254,7 +254,7 @@ class PKC(Method):
         """As :meth:`_moving`; where exact tracks have gaps, once more with these filled by the first one."""
         count, exact = max(1, self.alternatives), float(noise.median()) == 0
         moving, first = yield from self._moving(tracks, image, noise, count)
-        if self.rounds and exact and image.shape[1] > ROBOT and bool(gaps_of(noise).any()):
+        if self.rounds and exact and fillable(image) and bool(gaps_of(noise).any()):
             moving = yield from freed(moving, image, noise)
             image, noise = fill_gaps(image, moving.pose.points[0, ..., :2], noise)
             moving, first = yield from self._moving(tracks, image, noise, count)

@@ -32,7 +32,7 @@ from kcs_torch.solvers.procrustean import (
     track_energy,
 )
 
-__all__ = ["ROBOT", "TIGHT", "MovingView", "freed", "moving_view", "searching", "settled", "soften"]
+__all__ = ["TIGHT", "MovingView", "fillable", "freed", "moving_view", "searching", "settled", "soften"]
 
 TURNS = (30.0, 60.0, 90.0, 120.0, 180.0, 360.0)
 """Degrees that the cameras of the starts turn, evenly, about the image's vertical."""
@@ -195,9 +195,9 @@ def searching(
     frames, joints, _ = image.shape
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
+    held = is_tree and exact and noise == 0 and len(rigid) == joints - 1
     if _large(image):
         noise, weights = 0.0, None
-    held = is_tree and exact and noise == 0 and len(rigid) == joints - 1
     first = torch.cat([image, start[..., 2:] - start[..., 2:].mean(1, keepdim=True)], -1)[None]
     spread = lambda points: rigid_tree(distance_spread(points)[1])  # noqa: E731
     bones = skeleton.bone_index(device=image.device) if is_tree else spread(first[0])
@@ -275,8 +275,6 @@ def searching(
 
 def freed(moving: MovingView, image: Tensor, noise: Tensor) -> Search[Descent, Pose, MovingView]:
     """Solutions whose x and y, held so far, may leave the image (T, N, 2) in gaps, by their noise (T, N)."""
-    if _large(image):
-        return moving
     pose, stages = moving.pose, tuple(soften(stage, LEAST) for stage in FINE)
     weights, pull = (LEAST / noise.clamp_min(LEAST)).square(), TIGHT if moving.stiffness == 1 else LOOSER
     (pose,) = yield [
@@ -298,6 +296,11 @@ def settled(image: Tensor, skeleton: Skeleton, start: Tensor, rotations: Tensor)
 def soften(stage: Stage, noise: float) -> Stage:
     """The stage, with no scale far below the noise."""
     return replace(stage, eps=max(stage.eps, 0.1 * noise**2), slack=max(stage.slack, 0.3 * noise))
+
+
+def fillable(image: Tensor) -> bool:
+    """Whether one solution may fill an image's gaps for the next."""
+    return image.shape[1] > ROBOT and not _large(image)
 
 
 def _large(image: Tensor) -> bool:
