@@ -249,7 +249,7 @@ def test_noise_of_a_body_without_template_is_told_from_its_motion():
 
 
 def test_deviations_of_depth_know_of_noise(protocol, shared):
-    """A dog, in noise of 2 % of its size: .2 of its depths were off by no more than they should be."""
+    """A dog, in noise of 2 % of its size: fewer than half of its depths were as near as they were said to be."""
     case = {"src": "dog/dog_walk01", "orbit": 180, "yaw": 250, "pitch": 10, "max_frames": 120}
     given, truth = protocol.build(shared / "data", case)
     points, true = torch.from_numpy(given["points2d"]), torch.from_numpy(truth["points3d"])

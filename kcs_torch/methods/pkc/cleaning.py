@@ -17,10 +17,10 @@ from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.unseen import gap_deviation, place_unseen, within_reach
 from kcs_torch.types import Tracks
 
-__all__ = ["cleaned"]
+__all__ = ["CLEAN", "cleaned"]
 
 CLEAN = 0.003
-"""Noise below this share of the body's size is left in the tracks."""
+"""Noise below this share of the body's size is left in the tracks: they count as exact."""
 
 WINDOW, QUICK = 64, 2.2
 """Frames in which motion and noise are told apart, at 30 a second: two seconds, and up to 120 frames a second about as

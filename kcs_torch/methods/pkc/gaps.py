@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-__all__ = ["fill_gaps", "gaps_of"]
+from kcs_torch.methods.lockstep import Search
+from kcs_torch.methods.pkc.cleaning import CLEAN
+from kcs_torch.methods.pkc.descents import Descent
+from kcs_torch.methods.pkc.moving_view import FINER, ROBOT, MovingView, relative_weights, soften, too_long
+from kcs_torch.solvers.procrustean import FINE, Pose
+
+__all__ = ["fill_gaps", "fillable", "freed", "gaps_of"]
 
 GAP, SHOWN = 3.0, 0.1
 """How many times as noisy a joint is in a frame that does not show it, at least, as in frames that do; and the share of
@@ -35,6 +43,21 @@ def fill_gaps(image: Tensor, polished: Tensor, noise: Tensor) -> tuple[Tensor, T
     image = torch.where(gap[..., None], polished, image)
     noise = torch.where(gap, (SURER * noise).maximum(_shown(noise)), noise)
     return image - image.mean(1, keepdim=True), noise
+
+
+def fillable(image: Tensor) -> bool:
+    """Whether one solution of the moving viewpoint may fill the gaps of an image (T, N, 2) for the next."""
+    return image.shape[1] > ROBOT and not too_long(image)
+
+
+def freed(moving: MovingView, image: Tensor, noise: Tensor) -> Search[Descent, Pose, MovingView]:
+    """Solutions whose x and y, held so far, may leave the image (T, N, 2) in gaps, by their noise (T, N)."""
+    pose, stages = moving.pose, tuple(soften(stage, CLEAN) for stage in FINE)
+    weights, pull = relative_weights(noise, CLEAN), FINER[moving.stiffness]
+    (pose,) = yield [
+        Descent(image, pose.points, pose.rotations, moving.bones, weights, moving.rigid, pull, CLEAN, stages)
+    ]
+    return replace(moving, pose=pose)
 
 
 def _shown(noise: Tensor) -> Tensor:

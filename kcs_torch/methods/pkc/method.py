@@ -19,11 +19,11 @@ from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, t
 from kcs_torch.methods.pkc.batch import Sized, serve
 from kcs_torch.methods.pkc.body import Body, Turned
 from kcs_torch.methods.pkc.cleaning import cleaned
-from kcs_torch.methods.pkc.gaps import fill_gaps, gaps_of
+from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of
 from kcs_torch.methods.pkc.gate import without_others
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
-from kcs_torch.methods.pkc.moving_view import MovingView, fillable, freed, settled
+from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights, settled
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
@@ -243,7 +243,7 @@ class PKC(Method):
         """So many solutions of the moving viewpoint at most; and the first guess, SfAM's."""
         (first,) = yield [_complete(tracks, image)]
         start, usual = (first.points, complete_rotation(first.cameras)), float(noise.median())
-        weights = (usual / noise.clamp_min(usual)).square() if usual > 0 else None
+        weights = relative_weights(noise, usual) if usual > 0 else None
         moving = yield from turning(
             image, tracks.skeleton, *start, weights=weights, noise=usual, lifts=self.lifts, alternatives=count,
             exact=usual == 0, seed=self.seed,

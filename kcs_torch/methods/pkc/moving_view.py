@@ -32,7 +32,18 @@ from kcs_torch.solvers.procrustean import (
     track_energy,
 )
 
-__all__ = ["TIGHT", "MovingView", "fillable", "freed", "moving_view", "searching", "settled", "soften"]
+__all__ = [
+    "FINER",
+    "ROBOT",
+    "TIGHT",
+    "MovingView",
+    "moving_view",
+    "relative_weights",
+    "searching",
+    "settled",
+    "soften",
+    "too_long",
+]
 
 TURNS = (30.0, 60.0, 90.0, 120.0, 180.0, 360.0)
 """Degrees that the cameras of the starts turn, evenly, about the image's vertical."""
@@ -48,6 +59,9 @@ TIGHT = 10.0
 
 LOOSE, LOOSER = 0.3, 0.1
 """Weight of each length where the links are no tree (markers, say), in the coarse stages and in the fine ones."""
+
+FINER = {1.0: TIGHT, LOOSE: LOOSER}
+"""Weight of each length in the fine stages by that in the coarse ones: of a tree, and of other links."""
 
 SAME = 0.05
 """Root mean square distance of solutions that are one, of tracks of root mean square 1."""
@@ -74,15 +88,12 @@ With all that goes with them they take 70 KB a frame there; the image of longer 
 FREEING = 2e-4
 """The eps of stages from which on x and y are unknowns in noise; in coarser ones they would only take time."""
 
-LEAST = 0.003
-"""Noise, a share of the body's size, that joints are taken to have where only gaps are not exact."""
-
 GIVEN = 3
 """Solutions whose bones are then led along paths of constant length."""
 
 FARTHER = 1.8
-"""How far depths are off for each deviation that the image is off by: fitted to dogs, hands and people in noise of 1 to
-4 % of their size, and with 30 % missing, before a camera that goes round by 180 degrees."""
+"""How far depths are off, in deviations of the image, beyond what exact tracks leave open: fitted to dogs, hands and
+people in noise of 1 to 4 % of their size, and with 30 % missing, before a camera that goes round by 180 degrees."""
 
 ROBOT = 10
 """Up to as many joints, twenty times the random starts are tried: they are cheap, and little else decides. Nor does one
@@ -196,13 +207,13 @@ def searching(
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
     held = is_tree and exact and noise == 0 and len(rigid) == joints - 1
-    if _large(image):
+    if too_long(image):
         noise, weights = 0.0, None
     first = torch.cat([image, start[..., 2:] - start[..., 2:].mean(1, keepdim=True)], -1)[None]
     spread = lambda points: rigid_tree(distance_spread(points)[1])  # noqa: E731
     bones = skeleton.bone_index(device=image.device) if is_tree else spread(first[0])
     coarse, fine = (tuple(soften(s, noise) for s in stages) for stages in (COARSE, FINE))
-    tight = (1.0, TIGHT) if is_tree else (LOOSE, LOOSER)
+    loose = 1.0 if is_tree else LOOSE
 
     def descend(
         tracks: Tensor, pose: Pose, pull: float, stages: tuple[Stage, ...], weights: Tensor | None
@@ -214,7 +225,7 @@ def searching(
     def value(pose: Pose) -> Tensor:
         """How solutions are ranked, (H,)."""
         stage = soften(RANKING, noise)
-        pull = image.new_full((len(rigid),), TIGHT if held else tight[0])
+        pull = image.new_full((len(rigid),), TIGHT if held else loose)
         total = motion_energy(pose.points, pose.rotations, bones, stage)
         total = total + length_energy(pose.points, rigid, pull, stage.slack)
         if noise > 0:  # who leaves the tracks moves as simply as he likes
@@ -235,10 +246,10 @@ def searching(
     pose = Pose(points, turned, zero, zero)
     order = torch.arange(len(points))
     for stage, kept in zip(coarse, KEPT, strict=True):
-        pose = yield from descend(few, pose, tight[0], (stage,), few_weights)
+        pose = yield from descend(few, pose, loose, (stage,), few_weights)
         best = pose.objective.argsort()[: kept if joints > ROBOT else 3 * kept]
         pose, order = pose[best], order[best.cpu()]
-    pose = yield from descend(few, pose, tight[1], fine, few_weights)
+    pose = yield from descend(few, pose, FINER[loose], fine, few_weights)
     lead, paths = 0.0, bone_paths(image, bones) if held and lifts > 0 and frames <= LONG else None
     if paths is not None:
         mine, pose = pose.points[(order == 0).to(image.device)], pose[value(pose).argsort()[:GIVEN]]
@@ -263,24 +274,19 @@ def searching(
         stages = coarse if bool(own.any()) else coarse[-1:]
         pose = replace(pose, points=points, rotations=turned)
         del first, start, points, turned  # of long clips they are large
-        pose = yield from descend(image, pose, tight[0], stages, weights)
+        pose = yield from descend(image, pose, loose, stages, weights)
     if len(pick) < frames or not is_tree:  # else the finest stages have seen all frames
         if not is_tree:
             bones = spread(pose.points[0])
-        pose = yield from descend(image, pose, tight[1], fine, weights)
+        pose = yield from descend(image, pose, FINER[loose], fine, weights)
     ranks = value(pose)
     best = _distinct(pose, ranks, alternatives)
-    return MovingView(pose[best], ranks[best], bones, rigid, tight[0], lead)
+    return MovingView(pose[best], ranks[best], bones, rigid, loose, lead)
 
 
-def freed(moving: MovingView, image: Tensor, noise: Tensor) -> Search[Descent, Pose, MovingView]:
-    """Solutions whose x and y, held so far, may leave the image (T, N, 2) in gaps, by their noise (T, N)."""
-    pose, stages = moving.pose, tuple(soften(stage, LEAST) for stage in FINE)
-    weights, pull = (LEAST / noise.clamp_min(LEAST)).square(), TIGHT if moving.stiffness == 1 else LOOSER
-    (pose,) = yield [
-        Descent(image, pose.points, pose.rotations, moving.bones, weights, moving.rigid, pull, LEAST, stages)
-    ]
-    return replace(moving, pose=pose)
+def relative_weights(noise: Tensor, least: float) -> Tensor:
+    """Weights (T, N) by which joints of noise ``least`` count as those of their own noise do, and no more than 1."""
+    return (least / noise.clamp_min(least)).square()
 
 
 def settled(image: Tensor, skeleton: Skeleton, start: Tensor, rotations: Tensor) -> Search[Descent, Pose, Tensor]:
@@ -298,12 +304,7 @@ def soften(stage: Stage, noise: float) -> Stage:
     return replace(stage, eps=max(stage.eps, 0.1 * noise**2), slack=max(stage.slack, 0.3 * noise))
 
 
-def fillable(image: Tensor) -> bool:
-    """Whether one solution may fill an image's gaps for the next."""
-    return image.shape[1] > ROBOT and not _large(image)
-
-
-def _large(image: Tensor) -> bool:
+def too_long(image: Tensor) -> bool:
     """Whether a clip is too long for x and y to be unknowns."""
     return image.shape[0] * (3 * image.shape[1] + 3) ** 2 > FREE
 
