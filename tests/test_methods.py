@@ -129,7 +129,7 @@ def check(result, tracks):
     assert told.unseen_share == tracks.unseen_share
     if tracks.skeleton.rigid:
         mean = size.mean(0)  # a bone of no length has one of rounding, which does not count
-        share = torch.where(mean > 1e-6 * mean.max(), size.std(0, unbiased=False) / mean, 0)
+        share = torch.where(mean > 1e-6 * mean.max(), (size / mean).std(0, unbiased=False), 0)
         share = 100 * float(share[list(tracks.skeleton.rigid)].median())
         assert told.bone_variation == pytest.approx(share, rel=1e-3, abs=1e-3 if fine > 1e-6 else 1e-9)
     else:
