@@ -18,6 +18,13 @@ torch.set_num_threads(1)
 ROOT = Path(__file__).resolve().parents[1]
 
 
+@pytest.fixture(autouse=True)
+def deterministic_operations_end_with_the_test():
+    """A trainer that is asked for deterministic operations asks torch for them, and leaves it so."""
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
 @pytest.fixture(scope="session")
 def root() -> Path:
     """The repository."""

@@ -575,9 +575,11 @@ def test_autocast_does_not_coarsen_what_a_skeleton_knows(energy):
         assert torch.equal(module(points), expected)
 
 
+@pytest.mark.parametrize("deterministic", [False, True])
 @each_energy
-def test_shapes_are_known_without_data(energy):
-    """The meta device has no autocast to suspend."""
+def test_shapes_are_known_without_data(energy, deterministic):
+    """The meta device has no autocast to suspend, and as few deterministic operations as a GPU."""
+    torch.use_deterministic_algorithms(deterministic)
     points = clip(dtype=torch.float32)
     assert deepcopy(energy).to("meta")(points.to("meta")).shape == energy(points).shape
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.clean.common import body_size, check_tracks, frame_rate, number, rebuilt, share
+from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.types import Tracks
 
 __all__ = ["gate"]
@@ -96,8 +97,8 @@ def _line(points: Tensor, seen: Tensor, offsets: list[int]) -> Tensor:
     time = torch.tensor(shifts, dtype=points.dtype, device=points.device)
     apart = time[:, None] - time
     apart.fill_diagonal_(math.nan)
-    slope = ((near[..., :, None] - near[..., None, :]) / apart).nanmedian(-1).values.nanmedian(-1, keepdim=True).values
-    place = (near - slope * time).nanmedian(-1).values
+    slope = nanmedian(nanmedian((near[..., :, None] - near[..., None, :]) / apart, -1), -1, keepdim=True)
+    place = nanmedian(near - slope * time, -1)
     enough = near.isfinite().sum(-1) >= _LEAST
     return torch.where(enough, place, math.nan)
 
@@ -105,7 +106,7 @@ def _line(points: Tensor, seen: Tensor, offsets: list[int]) -> Tensor:
 def _usual(error: Tensor, seen: Tensor) -> Tensor:
     """(T, N) median error of each joint: about each frame, but within one to four times that of the clip."""
     known = torch.where(seen, error, math.nan)
-    clip = known.nanmedian(0, keepdim=True).values
+    clip = nanmedian(known, 0, keepdim=True)
     around = torch.nn.functional.pad(known.mT, (_AROUND, _AROUND), value=math.nan).unfold(-1, 2 * _AROUND + 1, 1)
-    near = around.nanmedian(-1).values.mT.nan_to_num(0.0)
+    near = nanmedian(around, -1).mT.nan_to_num(0.0)
     return torch.maximum(clip, torch.minimum(near, 4 * clip)).nan_to_num(0.0)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import nearest_rotation
+from kcs_torch.functional.ranks import median
 
 __all__ = [
     "back_project",
@@ -191,7 +192,7 @@ def camera_disagreement(first: Tensor, second: Tensor) -> Tensor:
         source = complete_rotation(first * mirror)
         gauge = nearest_rotation((source.mT @ target).sum(-3))
         trace = ((source @ gauge[..., None, :, :]) * target).sum((-2, -1))
-        angles.append(torch.rad2deg(torch.arccos(((trace - 1) / 2).clamp(-1, 1))).median(-1).values)
+        angles.append(median(torch.rad2deg(torch.arccos(((trace - 1) / 2).clamp(-1, 1))), -1))
     return torch.minimum(*angles)
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import KcsError
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.ranks import median
 from kcs_torch.live.filter import Shape, Told
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.nn.posture import PostureEnergy, trunk_joints
@@ -62,7 +63,7 @@ def solve_window(method: PKC, skeleton: Skeleton, image: Tensor, weights: Tensor
         return None
     points = found.points - found.points.mean(1, keepdim=True)
     bones = skeleton.bone_index()
-    length = bone_lengths(points, bones).median(0).values
+    length = median(bone_lengths(points, bones), 0)
     if posture is None:
         factor, rotations, trunk = 0.5, torch.eye(3).to(points).expand(len(points), 3, 3), points.new_zeros(0, 3)
     else:

@@ -13,6 +13,7 @@ from kcs_torch.errors import counted
 from kcs_torch.functional.align import centre
 from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.ranks import median
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.root import root_depth
 from kcs_torch.nn.lengths import oddity
@@ -166,7 +167,7 @@ def odd_body(points: Tensor, body: Skeleton) -> str:
     rigid = list(body.rigid)
     if usual is None or not rigid or not len(points):
         return ""
-    own = bone_lengths(points, body.bone_index(device=points.device)).median(0).values
+    own = median(bone_lengths(points, body.bone_index(device=points.device)), 0)
     odd = oddity(own[rigid], usual[rigid])
     middle = points - points.mean(1, keepdim=True)
     wide, far = float(middle[..., :2].norm()), float(middle[..., 2].norm())
@@ -244,7 +245,7 @@ def _reconstruction(
         points,
         found.cameras,
         found.scales,
-        bones.median(0).values,
+        median(bones, 0),
         tracks,
         method.name,
         diagnostics,

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import KcsWarning, OptionError, ShapeError, users_level
 from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.skeleton import Skeleton
@@ -78,7 +79,7 @@ def find_skeleton(
     bones = rigid_tree(cost)
     size = bone_lengths(source, bones)
     ratio = spread[bones[:, 0], bones[:, 1]] / mean[bones[:, 0], bones[:, 1]].clamp_min(torch.finfo(mean.dtype).tiny)
-    lengths = size.median(0).values
+    lengths = median(size, 0)
     loose = (ratio > rigid_below) | apart[bones[:, 0], bones[:, 1]]
     flexible = tuple(loose.nonzero().flatten().tolist())
     if len(flexible) == len(bones):

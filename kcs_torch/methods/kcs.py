@@ -15,6 +15,7 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import centre, nearest_rotation
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.chain import bone_lengths, chain_inverse, incidence
+from kcs_torch.functional.ranks import median
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.clips import Clips, in_batches, padded
 from kcs_torch.methods.template import clip_scale, rigid_shape
@@ -197,7 +198,7 @@ class KCS(Method):
     def _constant_bones(self, points: Tensor, body: Skeleton, seen: Tensor) -> Tensor:
         """Alternate the bone-length step with the image positions of seen joints."""
         bones = body.bone_index(device=points.device)[list(body.rigid)]
-        lengths = bone_lengths(points, bones).median(0).values
+        lengths = median(bone_lengths(points, bones), 0)
         image = points[..., :2]
         for _ in range(self.bone_steps):
             points = fit_bones(points, lengths, bones, num_steps=1)

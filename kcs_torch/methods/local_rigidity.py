@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import back_project, complete_rotation, factorize, project, rows_to_cameras
+from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rigidity import distance_spread
 from kcs_torch.methods.factorised import Factorised
 from kcs_torch.solvers.ist import ist, metric_upgrade
@@ -194,7 +195,7 @@ def rigid_pairs(points: Tensor, most: int, below: float) -> tuple[Tensor, Tensor
     order = ratio.argsort(stable=True)[:most]
     order = order[ratio[order] < below]
     bones = torch.stack([row, column], -1)[order]
-    return bones, (points[:, bones[:, 0]] - points[:, bones[:, 1]]).norm(dim=-1).median(0).values
+    return bones, median((points[:, bones[:, 0]] - points[:, bones[:, 1]]).norm(dim=-1), 0)
 
 
 def _solve(normal: Tensor, goal: Tensor) -> Tensor:

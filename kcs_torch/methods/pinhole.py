@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.ranks import median
 from kcs_torch.functional.spectral import dct_basis
 from kcs_torch.methods.pinhole_coordinates import FIRM, STRAY, USUAL, coordinates
 from kcs_torch.methods.pkc.descent import Descent
@@ -140,9 +141,9 @@ class PinholeEnergy:
         self.path, self.wide, self.depth = path, wide[:, None], depth.mT.contiguous()
         self.own = bone_vectors(depth[..., None], self.bones)[..., 0].mT.contiguous()
         image = self._imaged(self._far(self.depth, path, self.wide)[0])
-        own = (self.own.square() + image.square().sum(1)).sqrt().median(-1).values.clamp_min(1e-6)
+        own = median((self.own.square() + image.square().sum(1)).sqrt(), -1).clamp_min(1e-6)
         if lengths is not None:  # the distance that they tell
-            ratio = (lengths / own).median(-1, keepdim=True).values
+            ratio = median(lengths / own, -1, keepdim=True)
             self.path = path * ratio
             self.depth, self.own = self.depth * ratio[..., None], self.own * ratio[..., None]
         self.lengths = own if lengths is None else lengths

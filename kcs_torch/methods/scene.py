@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.ranks import median
 from kcs_torch.functional.temporal import blend_windows, window_starts
 from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
@@ -107,7 +108,7 @@ class Scene:
         z = depth.new_empty(len(begins), size, *depth[:, 0].shape)
         far = depth.new_empty(len(begins), size, len(depth))
         energy, lengths = depth.new_zeros(len(depth)), None
-        for i in lively.median(-1).values.argsort(descending=True).tolist() if len(begins) > 1 else [0]:
+        for i in median(lively, -1).argsort(descending=True).tolist() if len(begins) > 1 else [0]:
             some = slice(begins[i], begins[i] + size)
             feet = None if self.standing is None else self.standing[some]
             lens = focal, torch.full_like(focal, self.any_focal and lengths is None, dtype=torch.bool)
@@ -166,7 +167,7 @@ class Scene:
             return found
         depth = best.depth / self.unit * body.factor
         points = torch.cat([body.image[None], depth[..., None]], -1)
-        lengths = bone_lengths(points, body.objective.bones).median(1).values
+        lengths = median(bone_lengths(points, body.objective.bones), 1)
         now = Hypotheses(depth, lengths, body.objective(depth, lengths))
         better = run(body.polished(now, steps), serve).depth / body.factor * self.unit
         return replace(found, depth=torch.cat([better, found.depth[1:]]))
@@ -186,7 +187,7 @@ class Scene:
         stiffness = (bone_noise(self.noise, bones) / Weights().length).square()
         middle = points.mean(-2, keepdim=True)
         body = (points - middle) / self.unit
-        lengths = bone_lengths(body, bones).median(0).values
+        lengths = median(bone_lengths(body, bones), 0)
         held = []
         for some, stiff in zip(body.split(BLOCK), stiffness.split(BLOCK), strict=True):  # each frame by itself
             goal = lengths.expand(len(some), -1)
@@ -205,7 +206,7 @@ class Scene:
         weights = at_pace(Weights(), self.rate, pace_of(image, self.skeleton, self.rate))
         objective = Objective(self.skeleton, image, weights, self.noise, standing=self.standing)
         points = torch.cat([image[None], depth[..., None]], -1)
-        lengths = bone_lengths(points, objective.bones).median(1).values
+        lengths = median(bone_lengths(points, objective.bones), 1)
         now = Hypotheses(depth, lengths, objective(depth, lengths) + objective.contact(depth))
         parts = parts_of(self.skeleton, limbs_of(self.skeleton, objective.posture.trunk.tolist()))
         tried = flipped(objective, parts, now)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
+from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.spectral import dct_basis
 from kcs_torch.functional.temporal import interpolate, window_starts
 from kcs_torch.methods.base import Estimate, Method
@@ -262,7 +263,7 @@ class SfAM(Method):
         first = path[:, 1] @ path[:, 0].mT
         trace = first.diagonal(dim1=-2, dim2=-1).sum(-1)
         turn = torch.arccos(((trace - 1) / 2).clamp(-1, 1)) * (counts - 1)
-        off = angle.nanmedian(-1).values
+        off = nanmedian(angle, -1)
         even = off < EVEN * turn if self.camera_path == "auto" else torch.ones_like(off, dtype=torch.bool)
         for k in even.nonzero().flatten().tolist():
             degrees = float(torch.rad2deg(off[k]))

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from kcs_torch.functional.align import centre, procrustes
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.ranks import kth_smallest
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["gap_deviation", "place_unseen", "within_reach"]
@@ -167,6 +168,6 @@ def _size(points: Tensor, known: Tensor, rest: Tensor, skeleton: Skeleton) -> Te
     bones = skeleton.bone_index(device=points.device)
     bones = bones[known[bones].all(-1)]
     usual, longest = bone_lengths(rest, bones), bone_lengths(points, bones)
-    longest = longest.kthvalue(round(LONGEST * (len(points) - 1)) + 1, 0).values if len(bones) else usual
+    longest = kth_smallest(longest, round(LONGEST * (len(points) - 1)) + 1, 0) if len(bones) else usual
     use = (usual > 0) & (longest > 0)
     return (longest[use] / usual[use]).median() if bool(use.any()) else None

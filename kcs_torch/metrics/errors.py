@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import bone_lengths, centre, nearest_rotation
+from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.metrics.align import align as aligned
 from kcs_torch.metrics.align import check_tensors
 
@@ -139,7 +140,7 @@ def bone_deviation(
     count = mass.sum(-2)
     mean = (lengths * mass).sum(-2) / count
     spread = ((lengths - mean[..., None, :]).square() * mass).sum(-2).div(count).sqrt()
-    return (spread / mean).nanmedian(-1).values
+    return nanmedian(spread / mean, -1)
 
 
 def distances(

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kcs_torch.functional.camera import project
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.spectral import spectral_norm, svt
 from kcs_torch.nn.masks import some
 
@@ -129,7 +130,7 @@ def template_scale(
     count = max(1, round(frames / span))
     edges = [round(i * frames / count) for i in range(count + 1)]
     spans = list(itertools.pairwise(edges))
-    vote = lambda part: _quantile_of_known(part, quantile).nanmedian(-1).values  # noqa: E731
+    vote = lambda part: nanmedian(_quantile_of_known(part, quantile), -1)  # noqa: E731
     overall = vote(ratio)
     overall = torch.where(torch.isfinite(overall) & (overall > 0), overall, fallback)[..., None]
     votes = torch.stack([vote(ratio[..., a:b, :]) for a, b in spans], -1)

@@ -10,6 +10,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.ranks import median, nanmedian
 from kcs_torch.functional.spectral import spectral_norm, svt
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.nn.energies import centred_residual
@@ -80,9 +81,9 @@ def estimate_lengths(
         seen = seen | ~seen.any(-2, keepdim=True)
         if inside is not None:
             seen = seen & inside[..., None]
-        lengths = torch.where(seen, size, torch.nan).nanmedian(-2).values
+        lengths = nanmedian(torch.where(seen, size, torch.nan), -2)
     else:
-        lengths = size.median(-2).values
+        lengths = median(size, -2)
     if not graded or size.shape[-1] == 0:
         return lengths, torch.ones_like(lengths)
     with torch.no_grad():
@@ -102,7 +103,7 @@ def to_scale(proportions: Tensor, lengths: Tensor) -> Tensor:
     """Relative lengths (..., B), brought to the scale of measured ones (..., B): the median bone of both agrees."""
     there = proportions > 0
     ratio = lengths / torch.where(there, proportions, torch.ones_like(proportions))
-    return proportions * ratio.median(-1, keepdim=True).values
+    return proportions * median(ratio, -1, keepdim=True)
 
 
 def shape_step(

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import nearest_rotation
+from kcs_torch.functional.ranks import median, nanmedian
 from kcs_torch.functional.rotation import rotation_angle, rotation_matrix, rotation_vector
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.functional.spectral import dct_basis
@@ -62,7 +63,7 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | No
     nowhere = torch.where(inside, 0.0, torch.nan).to(time)  # medians pass over NaN
     time = time - last / 2
     step = rotation_vector(rotations[:, 1:] @ rotations[:, :-1].mT)
-    turn = (step + nowhere[:, 1:, None]).nanmedian(1).values  # (K, 3)
+    turn = nanmedian(step + nowhere[:, 1:, None], 1)  # (K, 3)
     factors = torch.linspace(0.8, 1.2, 161, dtype=turn.dtype, device=turn.device)
     means = _sum_unturned(rotations * inside[..., None, None], factors, time, turn)  # (K, 161, 3, 3)
     starts = nearest_rotation(means)
@@ -75,7 +76,7 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | No
         spin = rotation_matrix(turned)
         error = rotation_vector(rotations @ (spin @ start[:, None]).mT)
         angle = error.norm(dim=-1)
-        spread = (angle + nowhere).nanmedian(-1, keepdim=True).values.clamp_min(1e-9)
+        spread = nanmedian(angle + nowhere, -1, keepdim=True).clamp_min(1e-9)
         weight = inside / (1 + (angle / spread).square())
         jacobian = torch.cat([_left_jacobian(turned) * time[..., None, None], spin], -1)
         normal = (jacobian.mT * weight[..., None, None] @ jacobian).sum(1)
@@ -171,7 +172,7 @@ def settle_path(
     if frames < 3:
         return path
     time = torch.arange(frames, dtype=path.dtype, device=path.device) - (frames - 1) / 2
-    turn = rotation_vector(path[1:] @ path[:-1].mT).median(0).values
+    turn = median(rotation_vector(path[1:] @ path[:-1].mT), 0)
     spin = rotation_matrix(time[:, None] * turn)
     rest = spin.mT @ path  # one rotation, if the path is of constant angular velocity
     # a radian of tilt moves the axis, a radian of speed the path's ends

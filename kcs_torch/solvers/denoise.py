@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcs_torch.functional.ranks import median, nanmedian
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.spectrum import spectrum_floor, temporal_modes, unshared
@@ -166,7 +167,7 @@ class _Model:
         windows, length, size = y.shape[1:]
         self.share = w.mean((1, 2, 3)).clamp_min(1e-3)[:, None, None, None]
         z = self.basis.mT @ (x + w * (y - x))
-        typical = z.square().movedim(2, 1).flatten(2).median(-1).values / 0.4549  # of chi-square: blind to impacts
+        typical = median(z.square().movedim(2, 1).flatten(2), -1) / 0.4549  # of chi-square: blind to impacts
         floor = spectrum_floor(typical)
         alone, _ = unshared(z[:, :, length // 2 :].flatten(1, 2))
         alone = torch.where(alone.isfinite(), alone, floor)
@@ -314,7 +315,7 @@ def _stray_from_neighbours(values: Tensor, seen: Tensor, threshold: float, floor
         (start, first), (stop, last) = near[a], near[b]
         gap = torch.where(stop == start, torch.ones_like(stop), stop - start)
         lines.append(first + ((time - start) / gap)[..., None] * (last - first))
-    error = (values - torch.stack(lines).nanmedian(0).values).norm(dim=-1)
+    error = (values - nanmedian(torch.stack(lines), 0)).norm(dim=-1)
     return _far(error, seen & error.isfinite(), threshold, floor)
 
 
@@ -323,10 +324,10 @@ def _far(error: Tensor, seen: Tensor, threshold: float, floor: float, spread: in
     known = torch.where(seen, error, torch.full_like(error, math.nan))
     # Of a Gaussian's distances the quantile is at the median. It is above it where a joint is still most of the time
     # and then swings: no quick stride is an outlier, no outliers are as common.
-    clip = torch.maximum(known.nanmedian(1, keepdim=True).values, known.nanquantile(_COMMON, 1, keepdim=True) / _RATIO)
+    clip = torch.maximum(nanmedian(known, 1, keepdim=True), known.nanquantile(_COMMON, 1, keepdim=True) / _RATIO)
     around = torch.nn.functional.pad(known.mT, (spread, spread), value=math.nan).unfold(-1, 2 * spread + 1, 1)
     # Bounded, as near the ends of a clip one outlier may spoil the prediction of all that is around.
-    usual = torch.maximum(clip, torch.minimum(around.nanmedian(-1).values.mT, 4 * clip)).nan_to_num(0.0)
+    usual = torch.maximum(clip, torch.minimum(nanmedian(around, -1).mT, 4 * clip)).nan_to_num(0.0)
     return seen & (error > threshold * usual + floor)
 
 
@@ -336,4 +337,4 @@ def _body_size(values: Tensor, seen: Tensor) -> Tensor:
     centre = (values * kept).sum(2, keepdim=True) / kept.sum(2, keepdim=True).clamp_min(1)
     distance = (values - centre).norm(dim=-1)
     distance = torch.where(seen, distance, torch.full_like(distance, math.nan))
-    return distance.flatten(1).nanmedian(1).values.nan_to_num(0.0)
+    return nanmedian(distance.flatten(1), 1).nan_to_num(0.0)

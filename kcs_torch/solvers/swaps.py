@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kcs_torch.functional.ranks import nanmedian
+
 __all__ = ["swapped_frames"]
 
 MEMORY = 5
@@ -90,7 +92,7 @@ def _costs(apart: Tensor, seen: Tensor, time: Tensor, size: float, memory: int) 
         errors = [
             (apart[middle] - x * old - y * new).norm(dim=-1) / longer for y in (1, -1) for x in (1, -1)
         ]  # by whether the last frame, then whether the first, has another sign than the middle one
-        usual = torch.where(known, errors[0], math.nan).nanmedian(0).values.nan_to_num(0.0)
+        usual = nanmedian(torch.where(known, errors[0], math.nan), 0).nan_to_num(0.0)
         usual = (USUAL * usual).clamp_min(LEAST * size)
         each = [((e / usual).clamp_max(MOST).square().log1p() * known).sum(-1) for e in errors]
         cost[last] += share * torch.stack(each, -1)[:, 2 * (bit[0] ^ bit[a]) + (bit[b] ^ bit[a])]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.ranks import kth_smallest
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.objective import Objective, bone_noise
 from kcs_torch.skeleton import Skeleton
@@ -124,7 +125,7 @@ def depth_deviation(
     dz = bone_vectors(found.depth[0][..., None], bones)[..., 0]  # (T, B)
     length = found.lengths[0].clamp_min(1e-9)
     steep = (dz.abs() / length).clamp_max(STEEP)
-    nearest = steep.kthvalue(1 + int(NEAREST * (len(steep) - 1)), 0).values.square()
+    nearest = kth_smallest(steep, 1 + int(NEAREST * (len(steep) - 1)), 0).square()
     told = (nearest / (1 - nearest)) * (doubt * ANGLE) ** 2  # tan(a)^2 da^2
     told = told * USUAL**2 / (told + USUAL**2) + (doubt * LEAST) ** 2
     if image is not None:

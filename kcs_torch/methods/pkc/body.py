@@ -12,6 +12,7 @@ from torch import Tensor
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.ranks import median
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.lockstep import Search, together
 from kcs_torch.methods.pkc.descents import Descent
@@ -140,7 +141,7 @@ class Body:
     def rank(self, depth: Tensor, steps: int) -> Search[Any, Any, Hypotheses]:
         """Depths (H, T, N) from elsewhere, refined on the objective, best first."""
         points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
-        lengths = bone_lengths(points, self.objective.bones).median(1).values
+        lengths = median(bone_lengths(points, self.objective.bones), 1)
         usual = self.objective.posture.rest_lengths
         lengths = torch.where(lengths > 1e-3 * usual, lengths, usual)
         return (yield from refined(self.objective, Hypotheses(depth, lengths, depth.new_zeros(len(depth))), steps))
@@ -223,7 +224,7 @@ class Body:
                 rivals = rivals.joined(replace(ranked, depth=other))
         depth, image, value = yield from self._descended(rivals.depth, (COARSE[-1], *POLISH) if around else POLISH)
         points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
-        lengths = bone_lengths(points, bones).median(1).values
+        lengths = median(bone_lengths(points, bones), 1)
         best = (rivals.energy + value / ONE).argsort()[: len(pick)]
         return replace(
             found,

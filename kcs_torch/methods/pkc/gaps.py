@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from kcs_torch.functional.ranks import kth_smallest
 from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.cleaning import CLEAN
 from kcs_torch.methods.pkc.descents import Descent
@@ -62,4 +63,4 @@ def freed(moving: MovingView, image: Tensor, noise: Tensor) -> Search[Descent, P
 
 def _shown(noise: Tensor) -> Tensor:
     """Noise (N,) of each joint where it is shown."""
-    return noise.kthvalue(1 + int(SHOWN * (len(noise) - 1)), 0).values
+    return kth_smallest(noise, 1 + int(SHOWN * (len(noise) - 1)), 0)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from kcs_torch.clean.common import rebuilt, share
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
@@ -43,15 +44,15 @@ def elsewhere(points: Tensor, seen: Tensor) -> Tensor:
     if len(shown) < 4:
         return away
     known = torch.where(seen[..., None], points, torch.nan)[shown]  # (K, N, 2)
-    size = (known - known.nanmedian(1, keepdim=True).values).norm(dim=-1).nanmedian()
-    step = (known[1:] - known[:-1]).nanmedian(1).values.norm(dim=-1).nan_to_num()
+    size = (known - nanmedian(known, 1, keepdim=True)).norm(dim=-1).nanmedian()
+    step = nanmedian(known[1:] - known[:-1], 1).norm(dim=-1).nan_to_num()
     leaps = (step > LEAP * size).nonzero().flatten().tolist()
     if not size > 0 or len(leaps) > PART * len(shown):  # a camera that shakes, or tracks of no one
         return away
     k = 0
     while k + 1 < len(leaps):
         first, last = leaps[k], leaps[k + 1]
-        gap, least = (known[last + 1] - known[first]).nanmedian(0).values.norm(), torch.minimum(step[first], step[last])
+        gap, least = nanmedian(known[last + 1] - known[first], 0).norm(), torch.minimum(step[first], step[last])
         beside = [step[i] for i in (first - 1, first + 1, last - 1, last + 1) if i not in (first, last, -1, len(step))]
         sudden = all(bool(least > SUDDEN * one) for one in beside)
         if last - first <= PART * len(shown) and sudden and bool(gap < BACK * least):

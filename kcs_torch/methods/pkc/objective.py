@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.ranks import median
 from kcs_torch.methods.pkc.descent import ANCHOR, CORNER, HEAVY, NOISE, Descent, wide
 from kcs_torch.methods.pkc.unknowns import Unknowns
 from kcs_torch.methods.pkc.weights import Weights, in_noise
@@ -110,7 +111,7 @@ class Objective:
         self.weights = in_noise(weights, float(self.noise.median())) if self.noisy else weights
         make = lambda module: module.to(image)  # noqa: E731
         plain = usual_posture(skeleton, image.dtype, image.device)
-        blur = BLUR * self.noise.median(0).values / plain.rest_lengths.clamp_min(SHORT)
+        blur = BLUR * median(self.noise, 0) / plain.rest_lengths.clamp_min(SHORT)
         spread = (plain.deviation.square() + blur.square()[:, None]).sqrt()
         self.posture = _altered(plain, kappa=weights.kappa, correlation=weights.posture, deviation=spread)
         self.foreshortening = make(ForeshorteningEnergy(skeleton, correlation=weights.foreshortening))
