@@ -25,19 +25,17 @@ def test_everything_is_made_where_the_tracks_are(name, turn):
     method = kt.METHODS[name]()
     expected = method(clip)
     with torch.device("meta"):  # a tensor that is made without a device would have no numbers
-        found = method(clip)
-        (together,) = method.many([clip])
-    for result in (found, together):
-        assert result.points.device == result.cameras.device == clip.points.device
-        assert_close(result.points, expected.points)
+        (found,) = method.many([clip]) if turn else (method(clip),)
+    assert found.points.device == found.cameras.device == clip.points.device
+    assert_close(found.points, expected.points)
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["free", "known cameras"])
 @pytest.mark.parametrize("name", ["kcs", "pkc"])
 @pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
 def test_full_perspective_too(name, known):
-    clip = walk(0.0, 20)
-    cameras = torch.eye(3, dtype=clip.points.dtype)[:2].expand(20, -1, -1) if known else None
+    clip = walk(0.0, 12)
+    cameras = torch.eye(3, dtype=clip.points.dtype)[:2].expand(12, -1, -1) if known else None
     lens = (1500.0, 1500.0, 0.0, 0.0)
     expected = kt.reconstruct(clip, method=name, intrinsics=lens, cameras=cameras)
     with torch.device("meta"):

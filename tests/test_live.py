@@ -201,13 +201,12 @@ def test_never_waits_if_so_told(clip):
 
 
 def test_bodies_that_show_nothing(clip):
-    still = observed(clip)[:1].expand(60, -1, -1)
-    nothing = torch.full((60, 17, 2), 7.0)
-    line = torch.stack([torch.zeros(17), torch.arange(17.0)], -1).expand(60, -1, -1)
-    for frames in (still, nothing, line):
+    still = observed(clip)[:1].expand(45, -1, -1)
+    nothing = torch.full((45, 17, 2), 7.0)
+    line = torch.stack([torch.zeros(17), torch.arange(17.0)], -1).expand(45, -1, -1)
+    for frames in (nothing, line, still):
         found = follow(kt.Tracker("coco17", fps=30, window=24), frames)
         assert all(bool(torch.isfinite(p.points).all()) for p in found)
-    found = follow(kt.Tracker("coco17", fps=30, window=24), still)
     assert float((found[-1].points - found[-2].points).abs().max()) < 1e-6
 
 

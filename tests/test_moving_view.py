@@ -182,7 +182,7 @@ def test_paths_lead_between_the_frames_that_are_compared(robot):
 
 def test_a_viewpoint_that_turns_too_little_is_told(monkeypatch):
     """Along rays as well; depths are less sure then."""
-    tracks = walking_person(40, turn=150.0).tracks
+    tracks = walking_person(32, turn=150.0).tracks
     free = dataclasses.replace(tracks.skeleton, name="free", template=None)
     tracks = dataclasses.replace(tracks, skeleton=free)
     sure = kt.reconstruct(tracks)

@@ -150,7 +150,7 @@ def test_in_metres_the_person_is_where_they_are():
 @pytest.mark.parametrize("method", ["kcs", "pkc"])
 def test_body_off_the_optical_axis(method):
     """Seen 30 degrees from the axis the same scene gives the same body, and a better one than parallel rays."""
-    tracks, truth = filmed(yaw=60, frames=60)
+    tracks, truth = filmed(yaw=60, frames=40)
     turn = torch.tensor(math.radians(30), dtype=torch.float64)
     c, s, o = turn.cos(), turn.sin(), torch.zeros_like(turn)
     aside = truth @ torch.stack([torch.stack([c, o, s]), torch.stack([o, o + 1, o]), torch.stack([-s, o, c])]).mT
@@ -221,7 +221,7 @@ def test_the_mirror_image_has_the_same_image():
 def test_any_skeleton():
     """A body without a template, three metres from the camera."""
     arm = kt.Skeleton.from_names(list("abcd"), [("a", "b"), ("b", "c"), ("c", "d")])
-    clip = kt.data.random_motion(arm, 60, turn=180, generator=torch.Generator().manual_seed(1))
+    clip = kt.data.random_motion(arm, 40, turn=180, generator=torch.Generator().manual_seed(1))
     truth = clip.points + torch.tensor([0, 0, 3000.0], dtype=torch.float64)
     tracks = kt.Tracks.from_arrays(Intrinsics.of(LENS).project(truth), skeleton=arm, fps=30.0)
     for method in (kt.SfAM(), kt.PKC(lifts=1)):
@@ -317,7 +317,7 @@ def test_a_clip_of_one_block_is_one_problem(monkeypatch):
 def test_blocks_in_which_nobody_is_seen_or_nothing_moves(monkeypatch):
     monkeypatch.setattr(scene, "BLOCK", 20)
     monkeypatch.setattr(scene, "OVERLAP", 5)
-    tracks, _ = filmed(frames=50)
+    tracks, _ = filmed(frames=45)
     hidden, still = tracks.points.clone(), tracks.points.clone()
     hidden[15:40] = math.nan
     still[20:] = still[20]
@@ -496,7 +496,7 @@ def test_nothing_is_said_of_the_root_depth_that_the_distance_replaces():
 
 def test_bodies_without_a_template_are_lifted_softly_first(monkeypatch):
     """Along the rays of wrong depths no bone keeps its length: a method that insists on it goes astray."""
-    tracks, truth = filmed(nearest=2500.0, turn=180.0, frames=80)
+    tracks, truth = filmed(nearest=2500.0, turn=180.0, frames=60)
     body = replace(tracks.skeleton, name="free", template=None, proportions=None, spread=None, hinges=())
     tracks = replace(tracks, skeleton=body)
     off = error(reconstruct(tracks, intrinsics=LENS).observed, truth)

@@ -258,9 +258,9 @@ def test_known_cameras_are_those_of_every_solution(turning):
 @pytest.mark.parametrize("turn", [0.0, 120.0])
 def test_polish(turn, monkeypatch):
     """Bones that would move in depth each by itself move together, in blocks of long clips, too."""
-    clip = walking_person(90, turn=turn, yaw=40.0)
+    clip = walking_person(72, turn=turn, yaw=40.0)
     polished = PKC()(clip.tracks)
-    monkeypatch.setattr(body_module, "LONG", 60)
+    monkeypatch.setattr(body_module, "LONG", 48)
     blocks = PKC()(clip.tracks)
     monkeypatch.setattr(Body, "polished", lambda self, found, steps, other=None: left(found))
     plain = PKC()(clip.tracks)
@@ -284,14 +284,15 @@ def test_gaps_are_filled_in_space(monkeypatch):
 def test_gaps_of_a_swaying_viewpoint_are_filled_again(monkeypatch):
     """What is polished with better places is better; before a viewpoint at rest nothing is done again."""
     draw = torch.Generator().manual_seed(5)
-    clips = [walking_person(60, turn=t, yaw=y, missing=0.2, generator=draw) for t in (50.0, 5.0) for y in (30.0, 60.0)]
+    views = ((50.0, 30.0), (50.0, 60.0), (5.0, 30.0))
+    clips = [walking_person(60, turn=turn, yaw=yaw, missing=0.2, generator=draw) for turn, yaw in views]
     again, once = [], []
     for fills, answers in ((module.FILLS, again), (1, once)):
         monkeypatch.setattr(module, "FILLS", fills)
         answers += [PKC()(clip.tracks).points for clip in clips]
     errors = [sum(error(some[k], clips[k].points) for k in (0, 1)) for some in (again, once)]
     assert errors[0] < 0.95 * errors[1], errors
-    assert torch.equal(again[2], once[2]) and torch.equal(again[3], once[3])
+    assert torch.equal(again[2], once[2])
 
 
 def test_a_gap_at_the_end_of_a_clip_does_not_spoil_it(protocol, shared):
@@ -746,10 +747,10 @@ def test_too_little_for_the_moving_viewpoint_is_told():
 
 
 def test_many_clips_take_few_more_operations_than_one():
-    """Counts, which no busy machine changes: eight clips of eight lengths, padded to few batches."""
-    clips = [walking_person(24 + i, turn=20.0 * (i % 3), yaw=40.0 * i).tracks for i in range(8)]
+    """Counts, which no busy machine changes: six clips of six lengths, padded to few batches."""
+    clips = [walking_person(24 + i, turn=20.0 * (i % 3), yaw=40.0 * i).tracks for i in range(6)]
     one, many = (count_operations(lambda c=some: PKC().many(c)).total for some in (clips[3:4], clips))
-    assert many < 3.3 * one
+    assert many < 2.3 * one
 
 
 def test_several_clips_at_once():

@@ -1,5 +1,6 @@
 """A camera of which nothing is known: near ones are noticed and their focal length found, far ones change nothing."""
 
+import functools
 import warnings
 from dataclasses import replace
 
@@ -32,6 +33,12 @@ def quietly(tracks, **options):
         return kt.reconstruct(tracks, **options)
 
 
+@functools.cache
+def lifted_near():
+    """A near walk of a second, reconstructed once for several tests."""
+    return quietly(filmed(frames=30)[0])
+
+
 def error(result, truth):
     a, b = (x - x.mean(1, keepdim=True) for x in (result.points, truth))
     a = a @ kt.functional.nearest_rotation((a.mT @ b).mT).mT
@@ -58,12 +65,12 @@ def test_a_near_camera_is_noticed():
 
 @pytest.mark.parametrize("turn", [0.0, 90.0])
 def test_parallel_rays_are_left_as_they_are(turn):
-    tracks = kt.data.walking_person(40, turn=turn, yaw=60.0).tracks
-    for method in ("pkc", "kcs"):
-        far = kt.reconstruct(tracks, method=method, intrinsics="parallel")
-        assert same(kt.reconstruct(tracks, method=method), far)
-        assert same(kt.reconstruct(tracks, method=method, intrinsics="auto"), far)
-    assert same(kt.PKC()(tracks), kt.reconstruct(tracks))
+    tracks = kt.data.walking_person(30, turn=turn, yaw=60.0).tracks
+    plain = kt.PKC()(tracks)
+    assert same(kt.reconstruct(tracks), plain) and same(kt.reconstruct(tracks, intrinsics="parallel"), plain)
+    far = kt.KCS()(tracks)
+    assert same(kt.reconstruct(tracks, method="kcs"), far)
+    assert same(kt.reconstruct(tracks, method="kcs", intrinsics="auto"), far)
 
 
 def test_a_hopeless_search_ends_early(monkeypatch):
@@ -90,7 +97,7 @@ def test_who_looks_for_a_near_camera():
     turned = torch.eye(3, dtype=torch.float64)[:2].expand(30, -1, -1)
     assert quietly(tracks, cameras=turned).distance is None
     found = quietly(tracks, method="kcs", intrinsics="auto")
-    own = quietly(tracks)
+    own = lifted_near()
     assert found.method == "kcs" and found.diagnostics.notes[-1] == own.diagnostics.notes[-1]
     assert_close(found.distance.log().mean(), own.distance.log().mean())
     dog = kt.data.random_motion(
@@ -120,7 +127,7 @@ def test_a_person_on_a_treadmill():
 def test_units_that_are_no_pixels():
     tracks, _ = filmed(frames=30)
     small = quietly(replace(tracks, points=tracks.points / 1920, units="widths"))
-    focal, plain = small.distance.log().mean().exp(), quietly(tracks).distance.log().mean().exp()
+    focal, plain = small.distance.log().mean().exp(), lifted_near().distance.log().mean().exp()
     assert_close(1920 * focal, plain, rtol=0.05, atol=0)
     assert any(f"focal length of {focal:.4g} widths" in note for note in small.diagnostics.notes)
 
@@ -139,8 +146,7 @@ def test_several_bodies_as_each_by_itself():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", kt.KcsWarning)
         both = kt.reconstruct_all([near, far])
-    for one, tracks in zip(both, (near, far), strict=True):
-        alone = quietly(tracks)
+    for one, alone in zip(both, (lifted_near(), quietly(far)), strict=True):
         assert (one.distance is None) == (alone.distance is None)
         assert_close(one.points, alone.points, rtol=0, atol=0.02 * float(alone.points.abs().max()))
     assert both[0].distance is not None and both[1].distance is None
@@ -186,7 +192,7 @@ def test_clips_that_tell_nothing(what):
         tracks = replace(tracks, points=tracks.points[:1].expand_as(tracks.points))
     if what == "lying flat":
         tracks = replace(tracks, points=tracks.points * torch.tensor([1.0, 0.0]))
-    for method in ("pkc", "kcs"):
+    for method in ("pkc",) if what == "lying flat" else ("pkc", "kcs"):  # pkc looks for the lens of any
         found = kt.reconstruct(tracks, method=method, intrinsics="auto")
         assert found.points.isfinite().all() and found.lengths.isfinite().all()
 
@@ -202,7 +208,7 @@ def test_what_it_needs_is_told():
 
 
 def test_gradients_and_inference_mode_do_not_matter():
-    tracks, _ = filmed(frames=20)
+    tracks, _ = filmed(frames=12)
     with torch.inference_mode():
         inside = quietly(tracks)
     assert same(inside, quietly(replace(tracks, points=tracks.points.clone().requires_grad_())))
@@ -216,6 +222,8 @@ def test_command_line(tmp_path, word):
     words = ["lift", str(source), "-o", str(output), "--method", "kcs", "--skeleton", "h36m17", "--intrinsics", word]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
-    wanted = quietly(tracks, method="kcs", intrinsics=word)
-    assert_close(load_reconstruction(output).points, wanted.points)
-    assert (wanted.distance is None) == (word == "parallel")
+    found = load_reconstruction(output)
+    assert (found.distance is None) == (word == "parallel")
+    assert any("found from the tracks" in note for note in found.diagnostics.notes) == (word == "auto")
+    if word == "parallel":
+        assert_close(found.points, quietly(tracks, method="kcs", intrinsics=word).points)
