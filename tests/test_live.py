@@ -99,6 +99,13 @@ def test_memory_is_bounded_by_the_window(clip):
     assert tracker.tracks().num_frames == 20
 
 
+def test_lengths_of_windows_are_whole_numbers_of_any_kind():
+    assert kt.Tracker("coco17", window=np.int64(24)).window == 24
+    for wrong in (24.0, True, 5):
+        with pytest.raises(kt.OptionError, match=f"window: expected at least 12 frames, a whole number, got {wrong}"):
+            kt.Tracker("coco17", window=wrong)
+
+
 @pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")
 def test_result_is_the_window(clip):
     tracker = kt.Tracker("coco17", fps=30, window=20, units="mm", method=kt.METHODS["pkc"](viewpoint="fixed", steps=3))

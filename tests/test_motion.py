@@ -175,6 +175,9 @@ def test_noise_and_gaps_of_tracks():
     assert float(off.std()) == pytest.approx(0.01, rel=0.2)
     with pytest.raises(OptionError, match="noise"):
         motion.tracks(noise=-1)
+    for angle in (float("nan"), float("inf"), "45", None):
+        with pytest.raises(OptionError, match="yaw: expected a finite number of degrees, got"):
+            motion.tracks(yaw=angle)
 
 
 def test_what_is_filmed_can_be_lifted():

@@ -20,6 +20,7 @@ from kcs_torch.methods.pkc import PKC
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Reconstruction, Tracks
+from kcs_torch.types.hints import is_a
 from kcs_torch.types.intake import as_number
 
 __all__ = ["Tracker"]
@@ -114,9 +115,9 @@ class Tracker:
         window = max(2 * LEAST, round(LENGTH * rate)) if window is None else window
         period = max(window, round(AGAIN * rate)) if period is None else period
         for name, value in (("window", window), ("period", period)):
-            if not isinstance(value, int) or isinstance(value, bool) or value < LEAST:
-                raise OptionError(f"Tracker: {name}: expected at least {LEAST} frames, got {value!r}")
-        self.skeleton, self.fps, self.window, self.period = body, rate, window, period
+            if not is_a(value, int) or value < LEAST:
+                raise OptionError(f"Tracker: {name}: expected at least {LEAST} frames, a whole number, got {value!r}")
+        self.skeleton, self.fps, self.window, self.period = body, rate, int(window), int(period)
         self.units, self.threshold, self.wait = units, least, bool(wait)
         self.method = PKC() if method is None else method
         self._filter: BodyFilter | ChainFilter

@@ -65,7 +65,16 @@ def arguments(
     spread: Mapping[str, float] | None,
 ) -> dict[str, Any]:
     """Return the arguments of ``Skeleton`` from those of ``Skeleton.from_names``."""
-    virtual = {str(v): tuple(sources) for v, sources in (virtual or {}).items()}
+    for what, mapping in (("virtual", virtual), ("proportions", proportions), ("spread", spread)):
+        if not isinstance(mapping, (Mapping, type(None))):
+            raise SkeletonError(f"{what} of skeleton '{name}': expected a mapping from names, got {mapping!r}")
+    virtual = {str(v): _listed(s, f"virtual joint '{v}'", name) for v, s in (virtual or {}).items()}
+    joints = _listed(list(joints) if isinstance(joints, str) else joints, "joints", name)
+    if any(isinstance(joint, bool) for joint in joints):
+        raise SkeletonError(
+            f"joints of skeleton '{name}': expected names, got True or False: YAML reads on, off, yes and no as such, "
+            "so put them in quotes"
+        )
     names = (*(str(j) for j in joints), *virtual)
     position = {n: i for i, n in enumerate(names)}
 
@@ -76,7 +85,7 @@ def arguments(
 
     def pairs(items: Iterable[tuple[str, str]], what: str) -> tuple[Pair, ...]:
         out = []
-        for item in items:
+        for item in _listed(items, what, name):
             if not isinstance(item, (list, tuple)) or len(item) != 2:
                 raise SkeletonError(f"{what} of skeleton '{name}': expected pairs of joint names, got {item!r}")
             out.append((at(item[0], what), at(item[1], what)))
@@ -92,7 +101,7 @@ def arguments(
         if given is None:
             return None
         _check_keys(f"{what} of skeleton '{name}'", given, bone_names, bone_names)
-        return tuple(float(given[b]) for b in bone_names)
+        return tuple(_numbers((given[b],), f"{what} of skeleton '{name}': '{b}'")[0] for b in bone_names)
 
     spreads = None if spread is None or len(spread) == 0 else per_bone(spread, "spread")
     if spread is None and template is not None:
@@ -101,9 +110,9 @@ def arguments(
     if hinges is None:
         bends = hinges_by_names(names, bone_pairs)
     else:
-        bends = tuple(_read_hinge(h, names, bone_pairs, twins, f"hinges of skeleton '{name}'") for h in hinges)
-    if isinstance(contacts, str):
-        raise SkeletonError(f"contacts of skeleton '{name}': expected a list of joint names, got {contacts!r}")
+        given = _listed(hinges, "hinges", name)
+        bends = tuple(_read_hinge(h, names, bone_pairs, twins, f"hinges of skeleton '{name}'") for h in given)
+    stand = None if contacts is None else _listed(contacts, "contacts", name)
     return {
         "joints": names,
         "bones": bone_pairs,
@@ -115,7 +124,7 @@ def arguments(
         "flexible": tuple(i for i, b in enumerate(bone_pairs) if frozenset(b) in soft),
         "tree": tree,
         "hinges": bends,
-        "contacts": contacts_by_names(names) if contacts is None else tuple(at(c, "contacts") for c in contacts),
+        "contacts": contacts_by_names(names) if stand is None else tuple(at(c, "contacts") for c in stand),
         "spread": spreads,
     }
 
@@ -206,7 +215,7 @@ def _read_hinge(
     else:
         raise SkeletonError(f"{what}: '{names[joint]}': axis: expected two joint names, left and right, got {axis!r}")
     weight = data.get("weight")
-    firm = 1.0 if weight is None else float(weight)
+    (firm,) = (1.0,) if weight is None else _numbers((weight,), f"{what}: '{names[joint]}': weight")
     return Hinge(ends["parent"], joint, ends["child"], *pair, sign=BENDS[data["bends"]], firm=firm)
 
 
@@ -227,13 +236,39 @@ def _read_template(
             f"got {type(template).__name__}"
         )
     else:
-        given = {str(n): tuple(float(c) for c in p) for n, p in template.items()}
+        given = {str(n): _numbers(p, f"template of skeleton '{name}': '{n}'", 3) for n, p in template.items()}
         _check_keys(f"template of skeleton '{name}'", given, names, [n for n in names if n not in virtual])
     for joint, sources in virtual.items():
         if joint not in given and all(s in given for s in sources):
             columns = zip(*(given[s] for s in sources), strict=True)
             given[joint] = tuple(sum(column) / len(sources) for column in columns)
     return tuple(tuple(given[n]) for n in names if n in given)  # type: ignore[misc]
+
+
+def _listed(items: Iterable[Any], what: str, name: str) -> tuple[Any, ...]:
+    """The items of a list, which a word is none of.
+
+    Raises:
+        SkeletonError: they are none.
+    """
+    if isinstance(items, (str, Mapping)) or not isinstance(items, Iterable):
+        raise SkeletonError(f"{what} of skeleton '{name}': expected a list, got {items!r}")
+    return tuple(items)
+
+
+def _numbers(values: Iterable[float], what: str, count: int = 1) -> tuple[float, ...]:
+    """So many numbers.
+
+    Raises:
+        SkeletonError: they are none, or not so many.
+    """
+    try:
+        numbers = tuple(float(value) for value in values)
+    except (TypeError, ValueError):
+        numbers = ()
+    if len(numbers) != count:
+        raise SkeletonError(f"{what}: expected {'a number' if count == 1 else f'{count} numbers'}, got {values!r}")
+    return numbers
 
 
 def _check_keys(what: str, given: Iterable[str], known: Sequence[str], needed: Sequence[str]) -> None:

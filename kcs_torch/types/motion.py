@@ -16,7 +16,7 @@ from kcs_torch.functional import interpolate, orbit
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
 from kcs_torch.types.angles import JointAngles, Joints, angles_of
 from kcs_torch.types.axes import from_y_up, to_y_up
-from kcs_torch.types.intake import as_floats, take_in
+from kcs_torch.types.intake import as_floats, as_number, take_in
 from kcs_torch.types.intrinsics import Intrinsics
 from kcs_torch.types.reconstruction import Reconstruction
 from kcs_torch.types.size import size_factor
@@ -203,7 +203,13 @@ class Motion(Trajectories):
 
         Returns:
             (T, N, 3): x right, y down, z away from the camera, from the middle of the seen joints' bounding box.
+
+        Raises:
+            OptionError: an angle is no finite number.
         """
+        for name, angle in (("yaw", yaw), ("pitch", pitch), ("turn", turn)):
+            if (degrees := as_number(angle)) is None or not math.isfinite(degrees):
+                raise OptionError(f"{name}: expected a finite number of degrees, got {angle!r}")
         steps = torch.linspace(0, 1, self.num_frames, dtype=self.points.dtype, device=self.points.device)
         cameras = orbit(yaw + turn * steps, pitch)
         far = torch.full_like(self.points, math.inf)
