@@ -25,9 +25,11 @@ def test_everything_is_made_where_the_tracks_are(name, turn):
     method = kt.METHODS[name]()
     expected = method(clip)
     with torch.device("meta"):  # a tensor that is made without a device would have no numbers
-        (found,) = method.many([clip]) if turn else (method(clip),)
-    assert found.points.device == found.cameras.device == clip.points.device
-    assert_close(found.points, expected.points)
+        found = method(clip)
+        (together,) = method.many([clip]) if turn else (found,)
+    for result in (found, together):
+        assert result.points.device == result.cameras.device == clip.points.device
+        assert_close(result.points, expected.points)
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["free", "known cameras"])

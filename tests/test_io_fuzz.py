@@ -32,7 +32,7 @@ import kcs_torch as kt
 from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io import MOTION_READERS, READERS, detect_format, load_motion, load_people, load_tracks
 
-INPUTS = int(os.environ.get("KCS_FUZZ_INPUTS", "4000"))
+INPUTS = int(os.environ.get("KCS_FUZZ_INPUTS", "10000"))
 HERE = Path(__file__).parent
 
 
@@ -55,7 +55,7 @@ def test_every_reader_has_samples():
     assert set(MOTION_SAMPLES) == set(MOTION_READERS)
 
 
-def test_damaged_files(tmp_path):
+def test_ten_thousand_damaged_files(tmp_path):
     """The campaign, in a process of its own whose memory is bounded."""
     pytest.importorskip("h5py")
     pytest.importorskip("ezc3d")
