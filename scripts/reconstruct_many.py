@@ -61,6 +61,8 @@ def main(config: DictConfig) -> None:
         )
     for path, reason in outcome.failed:
         print(f"failed: {path}: {reason}")
+    for path in outcome.outdated:
+        print(f"outdated: {path} was changed after its results were made: remove these to have them made anew")
     if outcome.failed:
         print("options of reading, such as skeleton=..., go in as +reading.skeleton=...; retry=true tries them again")
     rate = outcome.done / outcome.seconds if outcome.seconds else 0.0
@@ -73,5 +75,9 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        print("stopped: run it again to go on", file=sys.stderr)
+        sys.exit(130)
     sys.exit(1 if failed else 0)

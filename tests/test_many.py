@@ -12,10 +12,10 @@ import pytest
 import torch
 
 import kcs_torch as kt
-from kcs_torch import many
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.io import load_reconstruction
-from kcs_torch.many import clips_of, reconstruct_folder
+from kcs_torch.many import clips_of, folder, reconstruct_folder
+from kcs_torch.many.record import MADE_BY, as_text
 
 
 def make_clips(folder, count, frames=8):
@@ -42,7 +42,7 @@ def test_every_clip_once(clips, tmp_path):
     assert (outcome.clips, outcome.done, outcome.skipped, outcome.failed) == (6, 6, 0, ())
     assert outcome.frames == sum(8 + i % 3 for i in range(6))
     made = sorted(p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out").rglob("*") if p.is_file())
-    made.remove(many.MADE_BY)
+    made.remove(MADE_BY)
     assert made == sorted(f"{'more/' if i == 3 else ''}clip{i}.{s}" for i in range(6) for s in ("csv", "npz"))
     alone = kt.reconstruct(kt.load_tracks(clips / "clip4.npz"), method="kcs")
     torch.testing.assert_close(
@@ -97,7 +97,7 @@ def test_a_clip_that_breaks_the_batch_is_found(clips, tmp_path, monkeypatch):
 def test_the_camera_is_kept_where_a_clip_breaks_the_batch(tmp_path, monkeypatch):
     """Each for itself is still each with its intrinsics."""
     source = make_clips(tmp_path / "in", 3)
-    real, asked = many.reconstruct_all, []
+    real, asked = folder.reconstruct_all, []
 
     def spied(tracks, **options):
         asked.append((len(tracks), options["intrinsics"]))
@@ -105,7 +105,7 @@ def test_the_camera_is_kept_where_a_clip_breaks_the_batch(tmp_path, monkeypatch)
             raise ZeroDivisionError("planted")
         return real(tracks, **options)
 
-    monkeypatch.setattr(many, "reconstruct_all", spied)
+    monkeypatch.setattr(folder, "reconstruct_all", spied)
     camera = (1500.0, 1500.0, 960.0, 540.0)
     outcome = run(source, tmp_path / "out", intrinsics=camera)
     assert outcome.done == 3 and asked == [(0, camera), (3, camera)] + 3 * [(1, camera)]
@@ -165,6 +165,8 @@ def test_everybody(tmp_path):
     outcome = run(tmp_path / "in", tmp_path / "out", pattern="*", everybody=True)
     assert outcome.done == 1 and {p.name for p in (tmp_path / "out").glob("*.npz")} == {"two_0.npz", "two_1.npz"}
     assert run(tmp_path / "in", tmp_path / "out", pattern="*", everybody=True).skipped == 1
+    assert run(tmp_path / "in", tmp_path / "most", pattern="*").done == 1
+    assert any("2 people found" in n for n in load_reconstruction(tmp_path / "most" / "two.npz").tracks.notes)
     more = run(tmp_path / "in", tmp_path / "out", pattern="*", everybody=True, suffixes=[".npz", ".csv"])
     assert more.done == 1 and {p.name for p in (tmp_path / "out").glob("*.csv")} == {"two_0.csv", "two_1.csv"}
     with pytest.raises(kt.OptionError, match="everybody=True, got everybody=False"):  # two_0 may be a clip's own name
@@ -217,10 +219,10 @@ def test_how_results_were_made_is_checked_without_links_and_where_it_is_damaged(
     assert run(source, out).done == 1 and run(source, out, method=kt.KCS()).skipped == 1
     with pytest.raises(kt.OptionError, match="method=sfam"):
         run(source, out, method="sfam")
-    (out / many.MADE_BY).write_text("[1")
+    (out / MADE_BY).write_text("[1")
     with pytest.raises(kt.FormatError, match=r"made_by.json: damaged: .* remove it"):
         run(source, out)
-    assert sorted(path.name for path in out.iterdir()) == [many.MADE_BY, "clip0.npz"]
+    assert sorted(path.name for path in out.iterdir()) == [MADE_BY, "clip0.npz"]
 
 
 def test_networks_differ_by_their_weights():
@@ -229,7 +231,7 @@ def test_networks_differ_by_their_weights():
     one, other = torch.nn.Linear(2, 2), torch.nn.Linear(2, 2)
     again = torch.nn.Linear(2, 2)
     again.load_state_dict(one.state_dict())
-    assert many._as_text(one) == many._as_text(again) != many._as_text(other)
+    assert as_text(one) == as_text(again) != as_text(other)
 
 
 def test_a_sweep_writes_a_folder_for_each_method(tmp_path, root):
@@ -323,7 +325,7 @@ def test_killed_and_taken_up_again(tmp_path, root):
     assert done.returncode == 0, done.stderr
     assert f"{30 - len(first)} made" in done.stdout and f"{len(first)} were there, 0 failed" in done.stdout
     made = list(output.rglob("*.npz"))
-    assert len(made) == 30 and [path.name for path in output.glob(".*")] == [many.MADE_BY]
+    assert len(made) == 30 and [path.name for path in output.glob(".*")] == [MADE_BY]
     assert all((p.stat().st_mtime_ns, p.stat().st_ino) == stamp for p, stamp in first.items())
     for path in made:
         assert torch.isfinite(load_reconstruction(path).points).all()
@@ -375,3 +377,58 @@ def test_a_wrong_call_of_the_script_is_a_line(tmp_path, root, words, told):
     command = [sys.executable, str(root / "scripts" / "reconstruct_many.py"), *words]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 1 and told in done.stderr and "Traceback" not in done.stderr
+
+
+def test_names_of_results_are_distinct_whatever_clips_are_called(tmp_path):
+    """A name without its suffix may be another's whole name, and what follows a folder's last dot is no suffix."""
+    for name in ("m.csv", "m.json", "m.csv.bak", "m.json.csv", "solo.csv"):
+        (tmp_path / name).touch()
+    (tmp_path / "shot.cam01").mkdir()
+    targets = {clip.name: clip.target.name for clip in clips_of(tmp_path, tmp_path / "out")}
+    assert len(set(targets.values())) == 6
+    assert (targets["solo.csv"], targets["shot.cam01"], targets["m.csv"]) == ("solo", "shot.cam01", "m.csv")
+
+
+def test_results_within_the_input_are_no_clips(clips, tmp_path):
+    source = make_clips(tmp_path / "in", 2)
+    run(source, source / "motion", pattern="*")
+    names = [clip.name for clip in clips_of(source, source / "again", "**/*.npz")]
+    assert names == ["clip0.npz", "clip1.npz"]
+    for output in (source, tmp_path):
+        with pytest.raises(kt.OptionError, match="lies in the output folder"):
+            clips_of(source, output)
+
+
+def test_what_cannot_be_read_so_leaves_no_trace(clips, tmp_path):
+    """A wrong option of reading is told at once: no clip fails for it, and the right one is welcome after it."""
+    for reading, told in (
+        ({"skeleton": "cocco17"}, "did you mean 'coco17'"),
+        ({"skeleton": str(tmp_path / "none.yaml")}, "none.yaml: cannot be read"),
+        ({"fps": -1}, "fps"),
+        ({"threshold": 3}, "threshold"),
+        ({"fsp": 30}, "reading option"),
+    ):
+        with pytest.raises(kt.KcsError, match=told):
+            run(clips, tmp_path / "out", **reading)
+    assert not (tmp_path / "out").exists()
+    assert run(clips, tmp_path / "out", skeleton="coco17", suffixes=".npz").done == 6
+
+
+def test_a_skeleton_file_counts_by_what_is_in_it(tmp_path):
+    source, body = make_clips(tmp_path / "in", 1), tmp_path / "body.yaml"
+    text = kt.SKELETONS["coco17"].to_dict()
+    body.write_text(json.dumps(text))
+    assert run(source, tmp_path / "out", skeleton=str(body)).done == 1
+    assert run(source, tmp_path / "out", skeleton=str(body)).skipped == 1
+    body.write_text(json.dumps({**text, "name": "other"}))
+    with pytest.raises(kt.OptionError, match="reading.skeleton"):
+        run(source, tmp_path / "out", skeleton=str(body))
+
+
+def test_what_was_changed_since_is_told(tmp_path):
+    source = make_clips(tmp_path / "in", 2)
+    assert run(source, tmp_path / "out").outdated == ()
+    later = time.time() + 60
+    os.utime(source / "clip1.npz", (later, later))
+    again = run(source, tmp_path / "out")
+    assert (again.skipped, again.outdated) == (2, (source / "clip1.npz",))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 
 from kcs_torch.errors import FormatError, OptionError, unknown
@@ -11,12 +12,15 @@ from kcs_torch.io.hdf5 import read_tree
 from kcs_torch.io.motion import MOTION_READERS
 from kcs_torch.io.registry import Options, Probe, Reader, brief, check_fps, discover
 from kcs_torch.io.video import looks_like_video
-from kcs_torch.skeleton import Skeleton
+from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
 from kcs_torch.types.intake import as_number
 from kcs_torch.types.people import tell_apart
 
-__all__ = ["READERS", "WRITERS", "check_person", "detect_format", "load_people", "load_tracks"]
+__all__ = [
+    *("READERS", "WRITERS"),
+    *("check_person", "check_reading", "detect_format", "load_people", "load_tracks", "most_seen"),
+]
 
 READERS, WRITERS = discover()
 """The formats that tracks come in, by name, and those that can be written, by suffix."""
@@ -69,17 +73,10 @@ def load_people(
         SkeletonError: the joints do not fit the skeleton.
         OptionError: an option is unknown or out of range.
     """
-    if format is not None and format not in READERS:
-        raise unknown("format", format, READERS)
-    least = as_number(threshold)
-    if least is None or not 0 <= least <= 1:
-        raise OptionError(f"threshold: expected a number from 0 to 1, got {threshold!r}")
-    check_fps(fps)
-    if image_size is not None:
-        image_size = _size(image_size)
+    options = check_reading(format, skeleton, fps, threshold, image_size, trust)
     probe = Probe(path)
     reader: Reader = READERS[detect_format(path) if format is None else format]
-    people = reader.read(probe.path, Options(skeleton, fps, threshold, image_size, trust))
+    people = reader.read(probe.path, options)
     return tell_apart(sorted(people, key=_amount_seen, reverse=True))
 
 
@@ -128,10 +125,43 @@ def load_tracks(
     )
     if person is not None:
         return people[check_person(path, person, len(people))]
+    return most_seen(people)
+
+
+def most_seen(people: Sequence[Tracks]) -> Tracks:
+    """The first of :func:`load_people`'s, with a note where there are others."""
     if len(people) == 1:
         return people[0]
     note = f"{len(people)} people found: this is the most seen one, number 0"
     return replace(people[0], notes=(*people[0].notes, note))
+
+
+def check_reading(
+    format: str | None = None,
+    skeleton: str | Path | Skeleton | None = None,
+    fps: float | None = None,
+    threshold: float = 0.3,
+    image_size: tuple[int, int] | None = None,
+    trust: bool = False,
+    **unknown_options: object,
+) -> Options:
+    """Options of :func:`load_people` as readers take them.
+
+    Raises:
+        OptionError: an option is unknown or out of range.
+        SkeletonError: there is no such skeleton.
+        FormatError: the skeleton's file cannot be read.
+    """
+    for name in unknown_options:
+        raise unknown("reading option", name, ["format", *(field.name for field in fields(Options))])
+    if format is not None and format not in READERS:
+        raise unknown("format", format, READERS)
+    least = as_number(threshold)
+    if least is None or not 0 <= least <= 1:
+        raise OptionError(f"threshold: expected a number from 0 to 1, got {threshold!r}")
+    check_fps(fps)
+    size = None if image_size is None else _size(image_size)
+    return Options(None if skeleton is None else get_skeleton(skeleton), fps, threshold, size, trust)
 
 
 def check_person(path: str | Path, person: int, count: int) -> int:

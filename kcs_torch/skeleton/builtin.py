@@ -43,6 +43,10 @@ SKELETONS: Mapping[str, Skeleton] = _BuiltIn()
 """The built-in skeletons by name."""
 
 
+SUFFIXES = (".yaml", ".yml", ".json")
+"""By which a name is told to be that of a skeleton's file."""
+
+
 def get_skeleton(skeleton: str | Path | Skeleton) -> Skeleton:
     """Return a skeleton from itself, a built-in name, or a YAML/JSON file.
 
@@ -52,7 +56,7 @@ def get_skeleton(skeleton: str | Path | Skeleton) -> Skeleton:
     """
     if isinstance(skeleton, Skeleton):
         return skeleton
-    if isinstance(skeleton, Path) or str(skeleton).lower().endswith((".yaml", ".yml", ".json")):
+    if isinstance(skeleton, Path) or str(skeleton).lower().endswith(SUFFIXES):
         return Skeleton.load(skeleton)
     if skeleton not in SKELETONS:
         raise unknown("skeleton", skeleton, SKELETONS, SkeletonError)

@@ -1,78 +1,34 @@
-"""Thousands of clips: a folder of tracks to a folder of motion, in parts that can be stopped and taken up again."""
+"""A folder of tracks to a folder of motion: :func:`reconstruct_folder`."""
 
 from __future__ import annotations
 
-import dataclasses
-import inspect
 import itertools
-import json
 import os
-import re
-import secrets
 import shutil
 import time
 import traceback
 import warnings
-import zlib
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from kcs_torch.errors import FormatError, KcsError, KcsWarning, OptionError, OutputError, unknown
+from kcs_torch.errors import KcsError, KcsWarning, OptionError
 from kcs_torch.io.atomic import atomic_path
-from kcs_torch.io.folders import natural_key
-from kcs_torch.io.load import load_people
+from kcs_torch.io.load import check_reading, load_people, most_seen
 from kcs_torch.io.write import ready_writer, save, takes_up
+from kcs_torch.many.clips import Clip, clips_of
+from kcs_torch.many.record import claim, settings_of
 from kcs_torch.methods.base import Method
 from kcs_torch.reconstruct import method_named, reconstruct_all, with_found_bones
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.size import parse_size
 
-__all__ = ["Clip", "Outcome", "clips_of", "reconstruct_folder"]
-
-FAILED = ".failed.txt"
-"""Suffix of the file that stands in for the results of a clip that failed, and says why."""
-
-MADE_BY = ".made_by.json"
-"""File of the output folder that says by which settings its results were made."""
-
-_READING = [name for name in inspect.signature(load_people).parameters if name != "path"]
+__all__ = ["Outcome", "reconstruct_folder"]
 
 STALE = 3600.0
 """Seconds after which another part's folder was left by a process that was killed."""
-
-
-@dataclass(frozen=True)
-class Clip:
-    """One clip's tracks, and where its results go.
-
-    Attributes:
-        source: a file, or a folder of files that make one clip.
-        target: of the results, without their suffixes.
-        name: of the source within the folder of all clips.
-    """
-
-    source: Path
-    target: Path
-    name: str
-
-    def outputs(self, suffixes: Sequence[str]) -> list[Path]:
-        """The files of its results."""
-        return [self.target.with_name(self.target.name + suffix) for suffix in suffixes]
-
-    @property
-    def failure(self) -> Path:
-        """The file that says why it failed."""
-        return self.target.with_name(self.target.name + FAILED)
-
-    def share_of(self, shards: int) -> int:
-        """Which of so many parts of the work it belongs to: told by its name alone, the same on every machine."""
-        return zlib.crc32(self.name.encode("utf-8", "surrogateescape")) % shards
 
 
 @dataclass(frozen=True)
@@ -83,6 +39,7 @@ class Outcome:
         clips: how many there are.
         done: made now.
         skipped: made before.
+        outdated: of these, clips whose file was changed since: remove their results to have them made anew.
         failed: each clip that failed, now or before, and why.
         frames: of the clips made now.
         seconds: that it took.
@@ -91,44 +48,10 @@ class Outcome:
     clips: int
     done: int
     skipped: int
+    outdated: tuple[Path, ...]
     failed: tuple[tuple[Path, str], ...]
     frames: int
     seconds: float
-
-
-def clips_of(source: str | Path, output: str | Path, pattern: str = "*") -> list[Clip]:
-    """List the clips of a folder in natural order.
-
-    Args:
-        source: the folder.
-        output: of the results: a clip ``a/b.json`` becomes ``OUTPUT/a/b.json.npz``, or ``OUTPUT/a/b.npz`` where that is
-            no other clip's.
-        pattern: of clips within the folder; ``**/*.json`` looks into folders, ``*`` takes files, and folders as clips.
-
-    Raises:
-        OptionError: the folder is none, lies in the output, or holds nothing of the pattern.
-    """
-    folder, output = Path(source), Path(output)
-    if not folder.is_dir():
-        raise OptionError(f"{folder}: expected a folder of tracks, got {'a file' if folder.exists() else 'nothing'}")
-    inside = output.resolve()
-    try:
-        found = [
-            p for p in folder.glob(pattern) if not any(part.startswith(".") for part in p.relative_to(folder).parts)
-        ]
-    except (ValueError, NotImplementedError) as error:
-        raise OptionError(f"pattern: expected one such as *.json or **/*.npz, got {pattern!r} ({error})") from None
-    found = [p for p in found if p.resolve() != inside and inside not in p.resolve().parents]
-    if not found:
-        raise OptionError(f"{folder}: expected tracks that match {pattern!r}, found none")
-    found.sort(key=lambda p: natural_key(str(p)))
-    names = [p.relative_to(folder) for p in found]
-    short = [n.with_suffix("") for n in names]
-    counts = Counter(short)
-    pairs = zip(found, names, short, strict=True)
-    return [
-        Clip(path, output / (brief if counts[brief] == 1 else name), name.as_posix()) for path, name, brief in pairs
-    ]
 
 
 def reconstruct_folder(
@@ -136,7 +59,7 @@ def reconstruct_folder(
     output: str | Path,
     *,
     method: str | Method = "auto",
-    suffixes: Sequence[str] = (".npz",),
+    suffixes: str | Sequence[str] = (".npz",),
     pattern: str = "*",
     shard: int = 0,
     shards: int = 1,
@@ -188,32 +111,35 @@ def reconstruct_folder(
         raise OptionError(f"shard: expected a number from 0 to {shards - 1} of shards={shards}, got {shard}")
     if batch < 1:
         raise OptionError(f"batch: expected at least 1 clip, got {batch}")
+    suffixes = [suffixes] if isinstance(suffixes, str) else suffixes
     suffixes = [s if s.startswith(".") else f".{s}" for s in suffixes]
     for suffix in suffixes:
         ready_writer(Path(f"NAME{suffix}"))
-    for name in reading:
-        if name not in _READING:
-            raise unknown("reading option", name, _READING)
     if up is not None and not any(takes_up(Path(f"x{suffix}")) for suffix in suffixes):
         raise OptionError(f"up: none of {', '.join(suffixes)} holds results with y or z up")
     size = None if scale is None else parse_size(scale)
     method = method_named(method, {})
+    find = reading.get("skeleton") == "auto"
+    how = {name: value for name, value in reading.items() if not (find and name == "skeleton")}
+    check_reading(**how)  # type: ignore[arg-type]
     reconstruct_all([], method=method, intrinsics=intrinsics)  # what is wrong with these is so for every clip
     begin = time.monotonic()
     clips = [clip for clip in clips_of(source, output, pattern) if clip.share_of(shards) == shard]
     lens = intrinsics if intrinsics is None or isinstance(intrinsics, str) else Intrinsics.of(intrinsics)
     options = {"scale": scale, "up": up, "units": units, "intrinsics": lens}
-    _claim(Path(output), _settings(method, options, reading) | {"everybody": str(everybody)}, retry)
+    claim(Path(output), settings_of(method, options, reading) | {"everybody": str(everybody)}, retry)
     workplace = Path(output) / f".part_{shard}_of_{shards}"
     _sweep(Path(output), workplace)
-    find = reading.get("skeleton") == "auto"
-    if find:
-        del reading["skeleton"]
-    work = _Work(method, suffixes, everybody, workplace, size, up, units, intrinsics, find, reading)
-    todo, skipped, failed = [], 0, []
+    work = _Work(method, suffixes, everybody, workplace, size, up, units, intrinsics, find, how)
+    todo: list[Clip] = []
+    outdated: list[Path] = []
+    failed: list[tuple[Path, str]] = []
+    skipped = 0
     for clip in clips:
-        if work.is_done(clip):  # perhaps but those of another call's suffixes, which failed
+        results = work.results(clip)
+        if results:  # perhaps but those of another call's suffixes, which failed
             skipped += 1
+            outdated += [clip.source] if clip.is_newer_than(results) else []
         elif clip.failure.exists() and not retry:
             failed.append((clip.source, clip.failure.read_text("utf-8", "replace").partition("\n")[0]))
         else:
@@ -231,7 +157,7 @@ def reconstruct_folder(
                 f"{rate:.1f} clips a second, {(len(todo) - tried) / rate / 60:.1f} minutes left"
             )
     _sweep(Path(output), workplace)
-    return Outcome(len(clips), done, skipped, tuple(failed), frames, time.monotonic() - begin)
+    return Outcome(len(clips), done, skipped, tuple(outdated), tuple(failed), frames, time.monotonic() - begin)
 
 
 @dataclass(frozen=True)
@@ -249,15 +175,16 @@ class _Work:
     find: bool
     reading: dict[str, object]
 
-    def is_done(self, clip: Clip) -> bool:
-        """Whether all results are there; of everybody's the last written says so."""
+    def results(self, clip: Clip) -> list[Path]:
+        """The clip's results if all are there, else none; of everybody's the last written says so."""
+        paths: list[Path] = []
         if not self.everybody:
-            return all(path.exists() for path in clip.outputs(self.suffixes))
-        with suppress(OSError, ValueError):
-            count = int(_people_list(clip).read_text("utf-8"))
-            paths = (path for i in range(count) for path in _person(clip, i).outputs(self.suffixes))
-            return all(path.exists() for path in paths)
-        return False
+            paths = clip.outputs(self.suffixes)
+        else:
+            with suppress(OSError, ValueError):
+                count = int(clip.people_list.read_text("utf-8"))
+                paths = [path for i in range(count) for path in clip.person(i).outputs(self.suffixes)]
+        return paths if all(path.exists() for path in paths) else []
 
     def reconstruct(self, clips: Sequence[Clip]) -> tuple[int, int, list[tuple[Path, str]]]:
         """Reconstruct a batch: clips and frames that were made, and what failed."""
@@ -282,7 +209,7 @@ class _Work:
 
     def _people(self, clip: Clip) -> list[Tracks]:
         people = load_people(clip.source, **self.reading)  # type: ignore[arg-type]
-        people = people if self.everybody else people[:1]
+        people = people if self.everybody else [most_seen(people)]
         return [with_found_bones(one) for one in people] if self.find else people
 
     def _lift(self, people: list[Tracks]) -> list[Reconstruction]:
@@ -291,10 +218,10 @@ class _Work:
     def _write(self, clip: Clip, results: list[Reconstruction]) -> None:
         """Write all results of a clip, and that they are all."""
         for number, result in enumerate(results):
-            target = _person(clip, number) if self.everybody else clip
+            target = clip.person(number) if self.everybody else clip
             self._save(result if self.size is None else result.scaled(**self.size), target)
         if self.everybody:
-            with atomic_path(_people_list(clip)) as temporary:
+            with atomic_path(clip.people_list) as temporary:
                 temporary.write_text(f"{len(results)}\n", encoding="utf-8")
         clip.failure.unlink(missing_ok=True)
 
@@ -321,71 +248,6 @@ def _listing(clip: Clip, failed: list[tuple[Path, str]]) -> Iterator[None]:
         with atomic_path(clip.failure) as temporary:
             temporary.write_text(f"{text}\n", encoding="utf-8", errors="replace")
         failed.append((clip.source, reason.partition("\n")[0]))
-
-
-def _settings(method: Method, options: Mapping[str, object], reading: Mapping[str, object]) -> dict[str, str]:
-    """What results depend on, as text that is the same in every process."""
-    values = {"method": method.name}
-    values |= {f"method.{f.name}": _as_text(getattr(method, f.name)) for f in dataclasses.fields(method)}
-    values |= {name: _as_text(value) for name, value in options.items() if value is not None}
-    return values | {f"reading.{name}": _as_text(value) for name, value in reading.items() if value is not None}
-
-
-def _as_text(value: object) -> str:
-    if isinstance(value, torch.nn.Module):
-        weights = [t.detach().cpu().contiguous().reshape(-1).view(torch.uint8) for t in value.state_dict().values()]
-        return f"{type(value).__name__} {zlib.crc32(b''.join(w.numpy().tobytes() for w in weights)):08x}"
-    return value if isinstance(value, str) else re.sub(r" at 0x[0-9a-f]+", "", repr(value))
-
-
-def _claim(output: Path, settings: dict[str, str], retry: bool) -> None:
-    """Write down how an output folder's results are made, once; all parts of the work have to agree.
-
-    Raises:
-        OptionError: others were made otherwise; what failed may be read otherwise than the rest.
-        OutputError: the folder cannot be written to.
-        FormatError: what is written there is damaged.
-    """
-    record = output / MADE_BY
-    temporary = output / f".{secrets.token_hex(4)}.json"
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(json.dumps(settings, indent=1), encoding="utf-8")
-        try:
-            os.link(temporary, record)  # of several processes that begin, one is the first
-        except FileExistsError:
-            pass
-        except OSError:  # a file system without links
-            if not record.exists():
-                os.replace(temporary, record)
-        own = dict(json.loads(record.read_bytes()))
-    except OSError as error:
-        raise OutputError(f"{output}: cannot be written: {error.strerror or error}") from None
-    except (ValueError, TypeError) as error:
-        raise FormatError(f"{record}: damaged: {error}: remove it, if the folder's results may stay") from None
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-    other = [name for name in {**own, **settings} if own.get(name) != settings.get(name)]
-    if own.get("method") != settings["method"]:
-        other = ["method"]
-    elif retry:
-        other = [name for name in other if not name.startswith("reading.")]
-    if other:
-        was, now = (", ".join(f"{n}={str(s.get(n))[:60]}" for n in other[:4]) for s in (own, settings))
-        again = ", or retry, which tries those clips alone that failed" if other[0].startswith("reading.") else ""
-        raise OptionError(
-            f"{output}: holds results of {was}, got {now}: give another output folder, or remove this one{again}"
-        )
-
-
-def _person(clip: Clip, number: int) -> Clip:
-    return replace(clip, target=clip.target.with_name(f"{clip.target.name}_{number}"))
-
-
-def _people_list(clip: Clip) -> Path:
-    """Written last of all people's results; holds how many there are."""
-    return clip.target.with_name(f"{clip.target.name}.people.txt")
 
 
 def _sweep(output: Path, workplace: Path) -> None:
