@@ -81,7 +81,8 @@ def reconstruct(
     if isinstance(tracks, Tracks):
         if any(option is not None for option in (skeleton, confidence, fps, units)):
             raise OptionError(
-                "reconstruct: skeleton, confidence, fps and units belong to arrays; these tracks already have them"
+                "reconstruct: skeleton, confidence, fps and units belong to arrays; these tracks already have them: "
+                "give them where tracks are made (load_tracks, Tracks.from_arrays)"
             )
     else:
         tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units or "px")

@@ -414,7 +414,7 @@ def test_notes_on_what_is_unseen_are_those_of_the_tracks_that_are_left():
     points[[20, 390]] = np.nan
     tracks = tracks_of(points)
     joints = tracks.skeleton.joints
-    told = "never seen, so placed by the skeleton alone: "
+    told = "never seen, so placed beside their neighbours, as there is no template: "
     assert tracks.notes[-2:] == (
         f"{told}{joints[1]}",
         "2 frames without any seen joint (frame 20, 390): filled from their neighbours",

@@ -243,7 +243,7 @@ def test_a_missing_column_is_told(tmp_path):
     assert tracks.skeleton.name == "mediapipe33" and not tracks.seen[:, tracks.skeleton.index("left_knee")].any()
     a, b = at - 1, at + 2
     (tmp_path / "b.csv").write_text(table(header[:a] + header[b:], [r[:a] + r[b:] for r in rows]))
-    lacking = "these landmarks of the pose have no columns x and y, so they are unseen: left_knee"
+    lacking = "these joints of mediapipe33 have no columns x and y, so they are unseen: left_knee"
     assert lacking in load_tracks(tmp_path / "b.csv", image_size=SIZE).notes
 
 

@@ -308,3 +308,62 @@ def test_a_zero_is_a_place_unless_it_is_the_corner(tmp_path):
     tracks = load_tracks(lines(tmp_path / "c.csv", *rows))
     assert tracks.seen.tolist() == [[False, True], [True, True]]
     assert any(note.startswith("1 joint that lies exactly at (0, 0) is taken as unseen") for note in tracks.notes)
+
+
+# ---------------------------------------------------------------------- tables of pandas and others
+
+
+@pytest.mark.parametrize("name", ["Frame #", "frame_no", "Frame Number", "FRAME ID", "frame", "frameindex", "index"])
+def test_frame_numbers_by_any_usual_name(tmp_path, name):
+    path = lines(tmp_path / "a.csv", f"{name},a_x,a_y,b_x,b_y", "4,1,2,3,4", "5,1,2,3,4", "7,1,2,3,4")
+    tracks = load_tracks(path)
+    assert tracks.num_frames == 4 and tracks.weights[2].sum() == 0
+
+
+def test_a_column_without_a_name_is_told_unless_it_counts_rows(tmp_path):
+    """pandas writes its index so: of a table cut out of another it numbers frames, or rows of several people."""
+    rows = ("1,2,3,4", "5,6,7,8", "1,3,3,5")
+    for index, told in (("0", "1", "2"), False), (("1", "2", "3"), False), (("7", "9", "11"), True):
+        for name in ("", "Unnamed: 0"):
+            path = lines(tmp_path / "a.csv", f"{name},a_x,a_y,b_x,b_y", *map(",".join, zip(index, rows, strict=True)))
+            assert ("one without a name (call it 'frame'" in notes_of(path)) is told
+    path = lines(
+        tmp_path / "a.csv", "image,a_x,a_y,b_x,b_y,_x,_y", *(f"{k}.png,{row},0,0" for k, row in enumerate(rows))
+    )
+    assert "other columns are left out: image, _x, _y" in notes_of(path)
+
+
+@pytest.mark.parametrize("missing", ["NULL", "n/a", "#N/A", "<NA>", "none", "NaN", " "])
+def test_missing_numbers_in_any_usual_spelling(tmp_path, missing):
+    tracks = load_tracks(lines(tmp_path / "a.csv", "a_x,a_y,b_x,b_y", f"{missing},2,3,4", "1,2,3,4"))
+    assert tracks.weights.tolist() == [[0, 1], [1, 1]]
+
+
+def test_line_breaks_in_the_names_of_columns(tmp_path):
+    """Quoted, they are legal CSV, which spreadsheets write; our own tables are read back."""
+    body = kt.Skeleton.from_names(["nose\ntip", 'the "big", toe', "hip"], [], tree=False)
+    result = kt.Motion.from_arrays(torch.randn(5, 3, 3, dtype=torch.float64), up="y", skeleton=body, units="m")
+    kt.save(result, tmp_path / "a.csv")
+    again = load_motion(tmp_path / "a.csv", up="y")
+    assert again.skeleton.joints == body.joints
+    torch.testing.assert_close(again.points, result.points)
+    path = lines(tmp_path / "b.csv", 'frame,"nose\ntip_x","nose\ntip_y",b_x,b_y', "0,1,2,3,4")
+    assert detect_format(path) == "csv" and load_tracks(path).skeleton.joints == ("nose\ntip", "b")
+    with pytest.raises(FormatError, match="columns such as"):
+        load_tracks(lines(tmp_path / "c.csv", 'frame,"a_x,a_y', "1,2,3"), format="csv")
+
+
+def test_some_joints_of_coco_are_no_landmarks(tmp_path):
+    """Limbs of a person, without the face: MediaPipe's 33 landmarks would be unseen for the most part."""
+    limbs = SKELETONS["coco17"].joints[5:17]
+    tracks = load_tracks(write_table(tmp_path / "a.csv", limbs, ("x", "y", "score")))
+    assert tracks.skeleton.name == "coco17" and "these joints of coco17 have no columns" in " ".join(tracks.notes)
+    assert tracks.seen[:, 5:17].all() and not tracks.seen[:, :5].any()
+    visible = load_tracks(write_table(tmp_path / "b.csv", limbs, ("x", "y", "visibility")), image_size=(100, 100))
+    assert visible.skeleton.name == "mediapipe33"
+
+
+def test_which_way_is_up_is_told_where_it_is_assumed(tmp_path):
+    path = write_table(tmp_path / "a.csv", ("snout", "tail"), ("x", "y", "z"))
+    assert any("point up" in note for note in load_motion(path).notes)
+    assert not any("point up" in note for note in load_motion(path, up="-y").notes)

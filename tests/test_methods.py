@@ -356,6 +356,18 @@ def test_a_joint_never_seen_is_placed_and_told_of(method):
     assert (result.points[:, 6, 1] > result.points[:, 5, 1]).all()
 
 
+def test_where_nothing_tells_a_joints_place_its_depth_is_as_unsure_as_the_body_is_large():
+    """Without a template a joint that no frame shows takes its neighbour's place."""
+    body = Skeleton.from_edges([((i - 1) // 2, i) for i in range(1, 13)], 13, name="twig")
+    points = random_motion(body, 40, turn=180.0).tracks.points.clone()
+    points[:, 12] = torch.nan
+    with pytest.warns(KcsWarning, match="never seen, so placed beside their neighbours, as there is no template"):
+        result = reconstruct(points, skeleton=body)
+    size = (result.points - result.points.mean(1, keepdim=True))[..., :2].square().sum(-1).mean().sqrt()
+    assert result.uncertainty[:, 12].min() > 0.8 * size
+    assert result.uncertainty[:, :12].median() < 0.5 * size
+
+
 # A walk is quicker than the camera: cosines and rigid windows cannot tell its depth with all joints seen either.
 @pytest.mark.parametrize("method", [name for name in METHODS if name not in ("pta", "local_rigidity")])
 def test_half_of_the_joints_suffice(method):

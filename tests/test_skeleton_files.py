@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from test_skeleton import BUILT_IN, trees
 
 from kcs_torch.errors import FormatError, KcsError, SkeletonError
-from kcs_torch.skeleton import SKELETONS, Skeleton
+from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
@@ -102,3 +102,23 @@ def test_unreadable_files(tmp_path):
 def test_name_of_a_file_without_a_name(tmp_path):
     (tmp_path / "horse.yaml").write_text("joints: [a, b]\nbones: [[a, b]]\n")
     assert Skeleton.load(tmp_path / "horse.yaml").name == "horse"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.yaml", "joints: [a, b]\nbones: [[a, b]]\nbones: [[b, a]]"),
+        ("a.json", '{"joints": ["a", "b"], "bones": [["a", "b"]], "bones": [["b", "a"]]}'),
+    ],
+)
+def test_a_key_that_is_there_twice_is_an_error(tmp_path, name, text):
+    """Of the two the last would count, without a word."""
+    (tmp_path / name).write_text(text)
+    with pytest.raises(FormatError, match="'bones' is there twice"):
+        Skeleton.load(tmp_path / name)
+
+
+def test_a_file_of_another_name_is_told_what_it_should_be_called(tmp_path):
+    (tmp_path / "body.txt").write_text("joints: [a, b]\nbones: [[a, b]]")
+    with pytest.raises(SkeletonError, match=r"body.txt: expected a skeleton's file to be called .yaml or .json"):
+        get_skeleton(str(tmp_path / "body.txt"))

@@ -57,7 +57,11 @@ def build_motion(
     if axis is None:
         axis = "y"
         longest = _longest(points)
-        if longest is not None and longest != "y":
+        if longest in (None, "y"):
+            remarks.append(
+                "y is taken to point up: give up=... if it does not (results written as CSV have y down: -y)"
+            )
+        else:
             remarks.append(f"y is taken to point up, but the body is longest along {longest}: give up=... if it stands")
     return Motion.from_arrays(
         points,

@@ -15,10 +15,10 @@ from kcs_torch.io.landmarks import BODIES, VISIBILITIES, Landmarks
 from kcs_torch.io.long import LongHeader
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import read_error
-from kcs_torch.io.wide import Columns, Header, read_wide
+from kcs_torch.io.wide import Columns, Header, first_line, read_wide
 from kcs_torch.skeleton import SKELETONS, guess_skeleton
 
-__all__ = ["first_line", "frame_shape", "npy_shape", "read_csv", "read_npy", "table_kind"]
+__all__ = ["frame_shape", "npy_shape", "read_csv", "read_npy", "table_kind"]
 
 _LIMIT = 2**30  # bytes of a file
 
@@ -29,19 +29,19 @@ def _named() -> frozenset[str]:
     return frozenset(j for b in BODIES.values() for j in SKELETONS[b].joints[: SKELETONS[b].num_observed])
 
 
-def table_kind(head: bytes) -> str:
+def table_kind(text: str) -> str:
     """Tell what a table with columns or rows for each joint holds, by the beginning of its text.
 
     Returns:
         "landmarks" of MediaPipe, by their names or numbers; "motion", where every joint has z; other "tracks"; empty
         where it is no such table.
 
-    >>> table_kind(b"frame,a_x,a_y,b_x,b_y"), table_kind(b"a_x,a_y,a_z,b_x,b_y,b_z"), table_kind(b"track,frame,a_x,a_y")
+    >>> table_kind("frame,a_x,a_y,b_x,b_y"), table_kind("a_x,a_y,a_z,b_x,b_y,b_z"), table_kind("track,frame,a_x,a_y")
     ('tracks', 'motion', '')
-    >>> table_kind(b"frame,joint,x,y"), table_kind(b"frame,joint,x,y,z")
+    >>> table_kind("frame,joint,x,y"), table_kind("frame,joint,x,y,z")
     ('tracks', 'motion')
     """
-    line = first_line(head)
+    line = first_line(text)
     header = Header.of(line)
     lower = [cell.lower() for cell in header.cells[:2]]
     if len(header.joints) < 2 or lower == ["track", "frame_idx"]:  # SLEAP's
@@ -54,11 +54,6 @@ def table_kind(head: bytes) -> str:
     if len(_named() & names) >= 10 or (len(names) >= 21 and all(name.isdecimal() for name in names)):
         return "landmarks"
     return "motion" if deep else "tracks"
-
-
-def first_line(head: bytes) -> str:
-    """The first line of a text, by its first bytes."""
-    return head.split(b"\n", 1)[0].decode("utf-8", "replace")
 
 
 def _plain(name: str) -> str:
@@ -80,11 +75,13 @@ def _layout(joints: Columns, notes: list[str]) -> tuple[tuple[str, ...] | None, 
                 notes.append(f"of {len(marks)} numbered landmarks the first {count} are read, as the pose")
                 marks = dict(list(marks.items())[:count])
         return None, list(marks.values())
-    pose = SKELETONS[BODIES[33]]
-    names = pose.joints[: pose.num_observed]
-    if set(marks) < set(names) and guess_skeleton(list(marks), ordered=False) is None:
+    visible = any(set(columns) & set(VISIBILITIES) for columns in marks.values())
+    for body in () if guess_skeleton(list(marks), ordered=False) else (SKELETONS["coco17"], SKELETONS[BODIES[33]]):
+        names = body.joints[: body.num_observed]
+        if not set(marks) < set(names) or (visible and len(names) != 33):  # only MediaPipe writes visibilities
+            continue
         lacking = ", ".join(name for name in names if name not in marks)
-        notes.append(f"these landmarks of the pose have no columns x and y, so they are unseen: {lacking}")
+        notes.append(f"these joints of {body.name} have no columns x and y, so they are unseen: {lacking}")
         return names, [marks.get(name, {}) for name in names]
     return tuple(marks), list(marks.values())
 

@@ -125,6 +125,11 @@ class Probe:
             return file.read(HEAD)
 
     @cached_property
+    def text(self) -> str:
+        """The head as text; what is none shows as such."""
+        return self.head.decode("utf-8", "replace")
+
+    @cached_property
     def files(self) -> tuple[Path, ...]:
         """The files of a folder in natural order, or those whose names begin like, or match, a path that is none."""
         return () if self.is_file else tuple(sibling_files(self.path))

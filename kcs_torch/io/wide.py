@@ -21,26 +21,29 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.frames import as_track_id
 from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_text
-from kcs_torch.io.landmarks import CONFIDENCES, FRAME_KEYS, VISIBILITIES, Landmarks
+from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import brief, read_error
 
 __all__ = [
-    *("EMPTY", "WHO", "Columns", "Header", "Row"),
-    *("as_value", "delimiter", "opened", "place_rows", "plain_name", "read_wide"),
+    *("WHO", "Columns", "Header", "Row"),
+    *("as_value", "delimiter", "first_line", "is_missing", "opened", "place_rows", "plain_name", "read_wide"),
 ]
 
 _LIMIT = 2**30  # bytes of a file
 WHO = ("person", "person_id", "pose", "track_id", "hand", "handedness", "id")
 """What a column is called that tells people apart."""
 _WHAT = "|".join(("x", "y", "z", *CONFIDENCES, *VISIBILITIES))
-_NAMED = re.compile(rf"(?P<name>.+)[_. ](?P<what>{_WHAT})(?: \[(?P<unit>[^\]]*)\])?\Z", re.IGNORECASE)
+_NAMED = re.compile(rf"(?P<name>.+)[_. ](?P<what>{_WHAT})(?: \[(?P<unit>[^\]]*)\])?\Z", re.IGNORECASE | re.DOTALL)
 _NUMBERED = re.compile(rf"(?P<what>{_WHAT})_?(?P<name>[0-9]{{1,4}})\Z", re.IGNORECASE)
 _TIME = re.compile(r"(?:time|timestamp|t)[ _]?[\[(]?(?P<unit>|s|sec|seconds|ms|msec|milliseconds)[\])]?\Z")
+_NAMELESS = re.compile(r"(?:Unnamed: [0-9]+)?\Z")
+_LINE = re.compile(r'(?:[^"\n]+|"[^"]*")*')
+_HEAD = 2**20  # characters of the first line, at most
 _UNEVEN = 0.3  # of a frame, by which times may be off
 
-EMPTY = ("", "NA", "N/A", "null", "None")
-"""What cells hold where a number is missing, beside NaN: R writes NA."""
+_MISSING = ("", "na", "n/a", "#n/a", "<na>", "null", "none")
+_FRAME = re.compile(r"frame(?:[ _]?(?:#|no|nr|num|number|id|idx|index))?\.?|index\Z", re.IGNORECASE)
 
 Columns = dict[str, dict[str, int]]
 """Of each joint the columns by what they hold: x, y, z, confidence, ..."""
@@ -95,7 +98,7 @@ class Header:
     @cached_property
     def number(self) -> int | None:
         """The column of frame numbers."""
-        return self.column(FRAME_KEYS)
+        return next((i for i, cell in enumerate(self.cells) if _FRAME.fullmatch(cell)), None)
 
     @cached_property
     def who(self) -> int | None:
@@ -123,6 +126,13 @@ class Header:
                     out[re.sub(r" \[[^\]]*\]\Z", "", cell[separator.end() :])] = None
         return list(out)
 
+    @cached_property
+    def others(self) -> list[int]:
+        """Columns that are of no joint, no frame, no time and nobody."""
+        known = {self.number, self.who, self.time and self.time[0]}
+        of_joints = (_NUMBERED.match(cell) or _NAMED.match(cell) for cell in self.cells)
+        return [i for i, is_joint in enumerate(of_joints) if not is_joint and i not in known]
+
 
 class Row(NamedTuple):
     """One person in one frame, as a table has it.
@@ -147,6 +157,26 @@ def plain_name(cell: str) -> str:
     return re.sub(r"\A'(?=[=+\-@\t\r])", "", cell.strip())
 
 
+def is_missing(cell: str) -> bool:
+    """Whether a cell says that a number is missing, otherwise than by NaN: R writes NA, SQL NULL.
+
+    >>> is_missing(" N/A "), is_missing("nan"), is_missing("0")
+    (True, False, False)
+    """
+    return cell.strip().lower() in _MISSING
+
+
+def first_line(text: str) -> str:
+    r"""The first line of a table, which goes on where a line break stands within quotes.
+
+    >>> first_line('frame,"nose\ntip_x"\n1,2')
+    'frame,"nose\ntip_x"'
+    """
+    whole = _LINE.match(text)
+    end = whole.end() if whole else 0
+    return text[:end] if text[end : end + 1] in ("", "\n") else text.partition("\n")[0]
+
+
 def delimiter(line: str) -> str:
     """What stands between the cells of a line."""
     return max(",;\t", key=line.count)
@@ -163,7 +193,10 @@ def opened(path: Path) -> Iterator[tuple[str, Iterator[list[str]]]]:
         if path.stat().st_size > _LIMIT:
             raise FormatError(f"{path}: expected 1 GiB of CSV at most: split the file")
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            line = file.readline(2**20)
+            line = first_line(file.read(_HEAD))
+            file.seek(0)
+            for _ in range(line.count("\n") + 1):
+                file.readline(_HEAD)
             yield line, csv.reader(file, delimiter=delimiter(line))
     except OSError as error:
         raise read_error(path, error) from None
@@ -207,9 +240,15 @@ def read_wide(
             out.notes.append(f"{said} left out: {brief(', '.join(header.halves))}")
         if left := header.left_out(i for triple in columns for i in triple):
             out.notes.append(f"columns of joints that are left out: {brief(', '.join(left))}")
+        others = {i: header.cells[i] for i in header.others if not _NAMELESS.match(header.cells[i])}
         for i, cells in enumerate(cells_of, 2):
             if any(cells):
                 rows.append(_row(cells, header, columns, blank, f"{path}: row {i}"))
+                for k in header.others:  # one without a name most often counts rows, as pandas writes it
+                    if k not in others and cells[k].strip() not in ("", str(len(rows) - 1), str(len(rows))):
+                        others[k] = "one without a name (call it 'frame' if it numbers the frames)"
+        if others:
+            out.notes.append(f"other columns are left out: {brief(', '.join(others.values()))}")
     out.unit = header.unit
     out.who = "" if header.who is None else header.cells[header.who]
     place_rows(rows, header.time[1] if header.time else "", out)
@@ -276,7 +315,7 @@ def _row(
 def as_value(cell: str, where: str, name: str, most: float) -> float:
     """The number in a cell, NaN if it is missing; an error with file, row and column if it is none, or too large."""
     try:
-        value = math.nan if cell.strip() in EMPTY else float(cell)
+        value = math.nan if is_missing(cell) else float(cell)
     except ValueError:
         hint = " (write decimals with a point)" if re.fullmatch(r"-?[0-9]+,[0-9]+", cell) else ""
         raise FormatError(f"{where}: '{name}': expected a number, got '{as_text(cell)}'{hint}") from None

@@ -25,7 +25,10 @@ from kcs_torch.types.variation import bone_shares, bone_variation
 if TYPE_CHECKING:
     from kcs_torch.methods.base import Method
 
-__all__ = ["HEADSTAND", "WEAK_TURN", "WHY_LOOSE", "Estimate", "finish", "loose_bones", "rms", "what_is_wrong"]
+__all__ = [
+    *("HARDLY", "HEADSTAND", "WEAK_TURN", "WHY_LOOSE", "Estimate"),
+    *("finish", "little_turn", "loose_bones", "rms", "what_is_wrong"),
+]
 
 WEAK_TURN = 30.0
 """Degrees of viewpoint turn below which depth is weakly determined."""
@@ -123,6 +126,16 @@ def finish(
     return replace(results[0], alternatives=tuple(results[1:]))
 
 
+HARDLY = "the viewpoint turned by only"
+
+
+def little_turn(method: Method, body: Skeleton, turn: float) -> str:
+    """What depth rests on where the viewpoint hardly turns, by so many degrees, for the user; else empty."""
+    if turn >= WEAK_TURN or method.learned:
+        return ""
+    return f"{HARDLY} {counted(round(turn), 'degree')}: depth rests on {_rest(method, body)}"
+
+
 def _rest(method: Method, body: Skeleton) -> str:
     """What depth rests on where the viewpoint does not turn."""
     if method.knows_template(body):
@@ -205,10 +218,8 @@ def _reconstruction(
     variation = bone_variation(bones, body)
     turn = float(viewpoint_turn(found.cameras))
     notes = list(found.notes)
-    if turn < WEAK_TURN and not method.learned:
-        notes.append(
-            f"the viewpoint turned by only {counted(round(turn), 'degree')}: depth rests on {_rest(method, body)}"
-        )
+    if little := little_turn(method, body, turn):
+        notes.append(little)
     if found.doubt:
         notes.append(found.doubt)
     if not found.converged:
@@ -249,10 +260,17 @@ def _reconstruction(
         tracks,
         method.name,
         diagnostics,
-        uncertainty=None if found.deviation is None else found.deviation * size,
+        uncertainty=None if found.deviation is None else _guessed(found.deviation, tracks) * size,
         objective=found.objective,
         root_depth=root,
     )
+
+
+def _guessed(deviation: Tensor, tracks: Tracks) -> Tensor:
+    """Deviations (T, N) of depth, as large as the body where nothing but a neighbour's place tells where a joint is."""
+    if tracks.skeleton.template is not None:
+        return deviation
+    return torch.where(tracks.seen.any(0), deviation, deviation.clamp_min(1.0))
 
 
 def _shift(residuals: Tensor, weights: Tensor) -> Tensor:

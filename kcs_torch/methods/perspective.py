@@ -14,7 +14,7 @@ from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.detector import detected
-from kcs_torch.methods.finish import WHY_LOOSE, what_is_wrong
+from kcs_torch.methods.finish import HARDLY, WHY_LOOSE, little_turn, what_is_wrong
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
 from kcs_torch.methods.scene import Bodies, Scene, ahead
@@ -267,11 +267,14 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
     off = (intrinsics.project(points) - tracks.points)[:, :n][tracks.seen[:, :n]]
     points = torch.cat([points[..., :2], points[..., 2:] - root[:, None, None]], -1)
     told = () if k else found.notes  # the best solution's; "the mirror image", say, is true of none any more
-    stale = (WHY_LOOSE, "weak perspective", "did not settle")  # true of what was lifted, perhaps not of this
+    stale = (WHY_LOOSE, HARDLY, "weak perspective", "did not settle")  # true of what was lifted, perhaps not of this
     notes = [n for n in told if not n.startswith((ABSENT, FOUND)) and not any(part in n for part in stale)]
     before = lifted.diagnostics
     if not (k or before.converged):
         notes.append(method.unsettled(before.iterations))
+    cameras = (found.view.look.mT @ complete_rotation(lifted.cameras))[:, :2]
+    if not k and (little := little_turn(method, body, float(viewpoint_turn(cameras)))):
+        notes.append(little)
     if not k:
         notes.extend(f"{wrong}: {WHY_LOOSE}" for wrong in what_is_wrong(method, points, body))
     notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
@@ -286,7 +289,7 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
     return replace(
         lifted,
         points=points,
-        cameras=(found.view.look.mT @ complete_rotation(lifted.cameras))[:, :2],
+        cameras=cameras,
         scales=intrinsics.focal / root,
         tracks=tracks,
         diagnostics=facts,

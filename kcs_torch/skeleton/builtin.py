@@ -58,6 +58,8 @@ def get_skeleton(skeleton: str | Path | Skeleton) -> Skeleton:
         return skeleton
     if isinstance(skeleton, Path) or str(skeleton).lower().endswith(SUFFIXES):
         return Skeleton.load(skeleton)
+    if isinstance(skeleton, str) and skeleton not in SKELETONS and Path(skeleton).is_file():
+        raise SkeletonError(f"{skeleton}: expected a skeleton's file to be called .yaml or .json")
     if skeleton not in SKELETONS:
         raise unknown("skeleton", skeleton, SKELETONS, SkeletonError)
     return SKELETONS[skeleton]

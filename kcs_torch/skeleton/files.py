@@ -31,8 +31,7 @@ def read_mapping(path: Path) -> Any:
 
     try:
         text = path.read_text(encoding="utf-8")
-        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C is several times faster
-        data = json.loads(text) if path.suffix.lower() == ".json" else yaml.load(text, Loader=loader)
+        data = json.loads(text, object_pairs_hook=_once) if path.suffix.lower() == ".json" else _yaml(text)
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -41,6 +40,32 @@ def read_mapping(path: Path) -> Any:
     if isinstance(data, dict):
         data.setdefault("name", path.stem)
     return data
+
+
+def _yaml(text: str) -> Any:
+    import yaml
+
+    class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # in C it is several times faster
+        """Refuses a key that is there twice, of which YAML would take the last."""
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            _once([(key.value, None) for key, _ in node.value if isinstance(key, yaml.ScalarNode)])
+            return super().construct_mapping(node, deep)
+
+    return yaml.load(text, Loader=Loader)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The mapping of these pairs.
+
+    Raises:
+        ValueError: a key is there twice.
+    """
+    keys = [key for key, _ in pairs]
+    twice = next((key for key in keys if keys.count(key) > 1), None)
+    if twice is not None:
+        raise ValueError(f"'{twice}' is there twice")
+    return dict(pairs)
 
 
 def check_mapping(data: Any, source: str) -> dict[str, Any]:

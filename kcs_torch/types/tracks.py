@@ -105,7 +105,8 @@ class Tracks(Trajectories):
 def never_seen(weights: Tensor, body: Skeleton) -> list[str]:
     """What to say of joints that no frame of weights (T, N) shows; nothing where there is none."""
     never = [body.joints[n] for n in (weights == 0).all(0).nonzero().flatten().tolist()] if len(weights) else []
-    return [f"never seen, so placed by the skeleton alone: {', '.join(never)}"] if never else []
+    where = "beside their neighbours, as there is no template" if body.template is None else "by the skeleton alone"
+    return [f"never seen, so placed {where}: {', '.join(never)}"] if never else []
 
 
 def unseen_notes(weights: Tensor, body: Skeleton) -> list[str]:

@@ -22,7 +22,7 @@ from kcs_torch.io.animals import LIMIT, LINE, Animal, bounded_lines, build_anima
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5_pandas import Table, has_column, pandas_group, read_pandas
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief, read_error
-from kcs_torch.io.wide import EMPTY, delimiter
+from kcs_torch.io.wide import delimiter, is_missing
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]
@@ -162,7 +162,7 @@ def _read_csv(path: Path, coords: Sequence[str], notes: list[str]) -> Table:
                 if not rows and not any(values) and not any(c.isdigit() for c in "".join(line[:first])):
                     continue  # pandas may write the name of the index in a line of its own
                 try:
-                    numbers.extend([float(v) if v not in EMPTY else math.nan for v in values])
+                    numbers.extend([math.nan if is_missing(v) else float(v) for v in values])
                 except ValueError as error:
                     raise FormatError(f"{path}: line {lines.line_num}: expected numbers: {brief(error)}") from None
                 rows.append(tuple(line[:first]))

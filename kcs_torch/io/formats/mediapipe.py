@@ -26,7 +26,7 @@ def recognises(probe: Probe) -> bool:
         if any(route[-2] in KEYS and route[-1] in ("list", "dict", "null") for route in routes if len(route) > 1):
             return True
         return any(route in routes for route in (("[]", "[]", "x", "number"), ("[]", "[]", "[]", "x", "number")))
-    return table_kind(probe.head) == "landmarks"
+    return table_kind(probe.text) == "landmarks"
 
 
 def read(path: Path, options: Options) -> list[Tracks]:

@@ -16,10 +16,9 @@ from kcs_torch.io.animals import LIMIT, LINE, Animal, bounded_lines, build_anima
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5 import Tree, read_tree
 from kcs_torch.io.jsonfile import as_frame_number
-from kcs_torch.io.landmark_tables import first_line
 from kcs_torch.io.link import link_people
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief, read_error
-from kcs_torch.io.wide import Header, delimiter
+from kcs_torch.io.wide import Header, delimiter, first_line
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]
@@ -38,7 +37,7 @@ def recognises(probe: Probe) -> bool:
         if len(shapes.get("tracks", ())) == 4:
             return "node_names" in shapes or "track_occupancy" in shapes or len(shapes) == 1
         return _is_project(probe.hdf5)
-    return Header.of(first_line(probe.head)).cells[:3] == _FIRST
+    return Header.of(first_line(probe.text)).cells[:3] == _FIRST
 
 
 def read(path: Path, options: Options) -> list[Tracks]:

@@ -18,12 +18,12 @@ from kcs_torch.anatomy import places_of_known
 from kcs_torch.errors import FormatError
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.frames import by_number
-from kcs_torch.io.landmark_tables import first_line, table_kind
+from kcs_torch.io.landmark_tables import table_kind
 from kcs_torch.io.landmarks import settle
 from kcs_torch.io.long import LongHeader, read_long
 from kcs_torch.io.people import people_tracks
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader
-from kcs_torch.io.wide import Header, read_wide
+from kcs_torch.io.wide import Header, first_line, read_wide
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]
@@ -35,19 +35,19 @@ _MOST = 5e7  # coordinates of all frames, those between the file's included
 
 def recognises(probe: Probe) -> bool:
     """Tell by the columns' names, where no other format has them."""
-    return table_kind(probe.head) == "tracks"
+    return table_kind(probe.text) == "tracks"
 
 
 def recognises_motion(probe: Probe) -> bool:
     """Tell by a column z of every joint."""
-    return table_kind(probe.head) == "motion"
+    return table_kind(probe.text) == "motion"
 
 
 def holds_motion(probe: Probe) -> bool:
     """Tell by a column z of every joint, where the joints may have MediaPipe's names."""
     if _is_long(probe):
         return recognises_motion(probe)
-    joints = Header.of(first_line(probe.head)).joints
+    joints = Header.of(first_line(probe.text)).joints
     return bool(joints) and all("z" in columns for columns in joints.values())
 
 
@@ -106,7 +106,7 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
 
 def _is_long(probe: Probe) -> bool:
     """Whether a row is a joint: a table that may be read as both has a row a frame."""
-    line = first_line(probe.head)
+    line = first_line(probe.text)
     return LongHeader.of(line) is not None and len(Header.of(line).joints) < 2
 
 
