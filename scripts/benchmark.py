@@ -37,7 +37,7 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.methods import METHODS
-from kcs_torch.training.configured import in_one_line, method_of
+from kcs_torch.training.configured import check_threads, in_one_line, method_of
 
 FACTS = (
     *("suite", "case", "method", "options", "cameras", "intrinsics", "frames", "joints"),
@@ -90,8 +90,6 @@ def true_cameras(protocol: ModuleType, data: Path, case: dict[str, Any]) -> torc
 
 def lens_of(protocol: ModuleType, data: Path, case: dict[str, Any], wanted: bool | str | None) -> Any:
     """What is given as intrinsics: None, a word, or K (3, 3) of the case's camera, where the data has it."""
-    if wanted not in (None, False, True, "auto", "parallel"):
-        raise SystemExit(f"intrinsics={wanted}: expected null, true, auto or parallel")
     if not wanted or isinstance(wanted, str):
         return wanted or None
     source = protocol.load(data, case["src"])
@@ -177,6 +175,8 @@ def make_papers(paper: DictConfig, shared: Path, folder: Path) -> None:
 def main(config: DictConfig) -> None:
     """Run every chosen case and write results.csv."""
     global failed
+    with in_one_line():
+        check_threads(config.threads)
     torch.set_num_threads(config.threads)
     warnings.simplefilter("ignore", kt.KcsWarning)  # the column "converged" says it
     job = HydraConfig.get()
@@ -186,14 +186,17 @@ def main(config: DictConfig) -> None:
         make_papers(config.paper, shared, folder)
         return
     protocol = load_protocol(shared)
+    if config.intrinsics not in (None, False, True, "auto", "parallel"):
+        raise SystemExit(f"intrinsics={config.intrinsics}: expected null, true, auto or parallel")
     with in_one_line():
         method = method_of(config.method)
     options = {k: v for k, v in OmegaConf.to_container(config.method).items() if k != "_target_"}
     name = job.runtime.choices.method
     text = " ".join(f"{k}={v}" for k, v in options.items())
     rows: list[dict[str, Any]] = []
+    stopped = False
     suites = config.suite if isinstance(config.suite, str) else list(config.suite)
-    for suite, case in chosen(protocol, suites, config.case):
+    for suite, case in chosen(protocol, suites, str(config.case)):
         label = protocol.case_name(case)
         row: dict[str, Any] = {"suite": suite, "case": label, "method": name, "options": text}
         try:
@@ -201,12 +204,15 @@ def main(config: DictConfig) -> None:
             row |= run_case(*given, config.cameras, config.intrinsics)
             shown = "  ".join(f"{f} {row[f]:.4f}" for f in protocol.FIGURES if f in row)
             print(f"{suite}/{label}  {shown}  {row['ms_per_frame']:.2f} ms a frame", flush=True)
+        except KeyboardInterrupt:
+            stopped = True
+            break
         except (Exception, SystemExit) as error:  # the protocol leaves by SystemExit where a prediction is no good
             row["error"] = f"{type(error).__name__}: {error}"
             failed += 1
             print(f"{suite}/{label}  {row['error']}", flush=True)
         rows.append(row)
-    if not rows:
+    if not rows and not stopped:
         raise SystemExit(f"case={config.case}: matches no case of suite={config.suite}")
     columns = (*FACTS, *protocol.FIGURES, "error")
     folder.mkdir(parents=True, exist_ok=True)
@@ -214,6 +220,8 @@ def main(config: DictConfig) -> None:
     if job.mode == RunMode.MULTIRUN:
         write_rows(Path(job.sweep.dir) / "results.csv", rows, columns)
     print(f"\n{table(rows, protocol.FIGURES)}\n{folder / 'results.csv'}")
+    if stopped:
+        raise SystemExit("stopped: these are the cases that were done")
 
 
 if __name__ == "__main__":

@@ -5,8 +5,15 @@
     python scripts/label_efficiency.py outputs/train/FIRST outputs/train/SECOND methods=[pkc,kcs,sfam]
 
 Reads results.csv of the sweeps, and prints a Markdown table: mean and standard deviation over the seeds of the test
-error (the figure named by ``metric``), for each share of labels. The methods that need no training lift the same test
-clips, of the same seeds, and are scored on the same windows; so is the flat guess, which is the tracks with depth 0.
+error, for each share of labels, a row for each experiment and whatever else was swept. The methods that need no
+training lift the same test clips, of the same seeds, and are scored on the same windows; so is the flat guess, which is
+the tracks with depth 0.
+
+    metric=pa_mpjpe     the figure
+    methods=[]          training-free methods beside the networks
+    experiment=NAME     whose test data they lift; the first of the sweeps if not given
+    shared=../shared    folder of motion files
+    cache=FOLDER        where reconstructions are kept from run to run
 """
 
 from __future__ import annotations
@@ -28,11 +35,12 @@ from kcs_torch.training.module import ALIGNED
 from kcs_torch.training.pseudo import pseudo_labels
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-OPTIONS = {"metric": "pa_mpjpe", "methods": "[]", "experiment": "labels", "shared": "../shared", "cache": ""}
+SHOWN = ("run", "experiment", "data.labelled", "seed")
+OPTIONS = {"metric": "pa_mpjpe", "methods": "[]", "experiment": "", "shared": "../shared", "cache": ""}
 
 
 def runs_of(folders: list[Path], metric: str) -> dict[str, dict[str, dict[int, float]]]:
-    """Figures by experiment, share of labels and seed."""
+    """Figures by experiment and what else was swept, share of labels and seed."""
     found: dict[str, dict[str, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
     for folder in folders:
         table = folder / "results.csv"
@@ -44,8 +52,13 @@ def runs_of(folders: list[Path], metric: str) -> dict[str, dict[str, dict[int, f
                 if not figure:
                     names = ", ".join(name.removeprefix("test/") for name in row if name.startswith("test/"))
                     raise SystemExit(f"metric={metric}: expected one of {names}")
-                share = row.get("data.labelled") or ("0" if row.get("experiment") == "two_d_only" else "1")
-                found[row.get("experiment") or "-"][share][int(row.get("seed") or 0)] = float(figure)
+                experiment, seed = row.get("experiment") or "-", int(row.get("seed") or 0)
+                share = row.get("data.labelled") or ("0" if experiment == "two_d_only" else "1")
+                swept = [f"{n}={v}" for n, v in row.items() if v and "/" not in n.split(".")[0] and n not in SHOWN]
+                one = found[" ".join([experiment, *swept])][share]
+                if seed in one:
+                    raise SystemExit(f"{table}: expected one run of {experiment} with seed {seed} and these settings")
+                one[seed] = float(figure)
     return found
 
 
@@ -90,8 +103,9 @@ def main(arguments: list[str]) -> None:
             options[name] = value
         else:
             raise SystemExit(f"{name}: expected one of {', '.join(OPTIONS)}, or folders of sweeps")
-    if not folders:
-        raise SystemExit(__doc__)
+    if not folders or {"-h", "--help"} & set(arguments):
+        print(__doc__)
+        raise SystemExit(0 if folders else 2)
     if options["metric"] not in ALIGNED:
         raise SystemExit(f"metric={options['metric']}: expected one of {', '.join(ALIGNED)}")
     methods = [name.strip() for name in options["methods"].strip("[]").split(",") if name.strip()]
@@ -99,6 +113,7 @@ def main(arguments: list[str]) -> None:
         if name not in kt.METHODS:
             raise SystemExit(f"methods: expected some of {', '.join(kt.METHODS)}, got {name}")
     found = runs_of(folders, options["metric"])
+    experiment = options["experiment"] or next(iter(found)).split()[0]
     shares = sorted({share for one in found.values() for share in one}, key=float)
     seeds = sorted({seed for one in found.values() for row in one.values() for seed in row})
     print(f"test/{options['metric']}, mm, mean ± standard deviation over seeds {', '.join(map(str, seeds))}\n")
@@ -110,10 +125,7 @@ def main(arguments: list[str]) -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", kt.KcsWarning)
     for name in ["flat", *methods]:
-        each = [
-            untrained(name, s, options["experiment"], options["shared"], options["cache"], options["metric"])
-            for s in seeds
-        ]
+        each = [untrained(name, s, experiment, options["shared"], options["cache"], options["metric"]) for s in seeds]
         print(f"| {name} | {cell(each)} |", flush=True)
 
 

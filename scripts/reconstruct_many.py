@@ -31,7 +31,7 @@ import torch
 
 from kcs_torch.errors import counted
 from kcs_torch.many import reconstruct_folder
-from kcs_torch.training.configured import in_one_line, method_of
+from kcs_torch.training.configured import check_threads, in_one_line, method_of
 
 
 class ClipsFailed(CompactHydraException):
@@ -45,12 +45,14 @@ failed = 0  # clips of all jobs run in this process; Hydra hands no exit code th
 def main(config: DictConfig) -> None:
     """Do one shard of the work."""
     global failed
-    torch.set_num_threads(config.threads)
     names = (
         "pattern", "suffixes", "everybody", "shard", "shards", "batch", "retry", "scale", "up", "units", "intrinsics",
     )  # fmt: skip
     options = OmegaConf.to_container(config, resolve=True)
+    options["pattern"] = str(options["pattern"])
     with in_one_line():
+        check_threads(config.threads)
+        torch.set_num_threads(config.threads)
         outcome = reconstruct_folder(
             config.input,
             config.output,

@@ -151,11 +151,15 @@ def main() -> None:
     parser.add_argument("--save", type=Path, help="write the trained parameters to this file")
     parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
+    for name in ("steps", "many", "frames", "rounds", "batch", "test"):
+        if getattr(options, name) < 1:
+            parser.error(f"--{name}: expected at least 1, got {getattr(options, name)}")
     torch.set_num_threads(1)
     skeleton, clips = motions(options.data, tested=False)
     film, unseen = Film(clips, options), Film(motions(options.data, tested=True)[1], options)
     generator = torch.Generator().manual_seed(options.seed + 1)
-    held_out = [unseen.batch(options.batch, generator) for _ in range(max(1, options.test // options.batch))]
+    sizes = [min(options.batch, options.test - first) for first in range(0, options.test, options.batch)]
+    held_out = [unseen.batch(size, generator) for size in sizes]
     layer = build(options.solver, skeleton, options.steps, trained=True)
     for name in options.fix:
         if not hasattr(layer, f"raw_{name}"):
@@ -175,9 +179,7 @@ def main() -> None:
     count = sum(p.numel() for p in layer.parameters() if p.requires_grad)
     told = f"{count} parameters ({', '.join(learned(layer))})"
     print(f"\n{options.solver}: trained in {seconds:.0f} s of CPU, {told}; figures are of")
-    print(
-        f"{len(held_out) * options.batch} windows of {options.frames} frames of other people, the same for all rows\n"
-    )
+    print(f"{options.test} windows of {options.frames} frames of other people, the same for all rows\n")
     print("| solver | steps | error mm | worst clip | ms/frame | time |\n|---|---|---|---|---|---|")
     figures = [(name, one.num_steps, *score(one, held_out)) for name, one in rows]
     whole = figures[1][3]

@@ -270,6 +270,8 @@ def test_what_does_not_fit_is_said():
             KCSCritic(BODY, **options)
     with pytest.raises(OptionError, match="expected a skeleton with bones"):
         KCSCritic(Skeleton.from_edges([], 2, tree=False))
+    with pytest.raises(ShapeError, match=r"critic_loss: expected scores of one shape, got \(2, 8\) and \(16,\)"):
+        critic_loss(normal(2, 8), normal(16))
     with pytest.raises(ShapeError, match="skeleton 'body7'"):
         critic()(normal(6, 3))
     with pytest.raises(ShapeError, match=r"expected weights \(2, 7\)"):

@@ -407,6 +407,8 @@ def test_what_cannot_be_read_so_leaves_no_trace(clips, tmp_path):
         ({"fps": -1}, "fps"),
         ({"threshold": 3}, "threshold"),
         ({"fsp": 30}, "reading option"),
+        ({"units": "inch"}, "unit of length 'inch'"),
+        ({"scale": 1.75}, "expected height=1.75m, .* got '1.75'"),
     ):
         with pytest.raises(kt.KcsError, match=told):
             run(clips, tmp_path / "out", **reading)

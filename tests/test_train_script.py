@@ -270,6 +270,7 @@ class TestCommandLine:
         ("argument", "told"),
         [
             ("model=transformer", "mlp\n\ttemporal"),
+            ("--experiment=smoke", "--experiment=smoke: settings have no dashes: experiment=smoke"),
             ("modle=mlp", "unknown setting 'modle': did you mean .*choices: .*experiment, .*model, "),
             ("hydr/launcher=joblib", "unknown setting 'hydr': did you mean 'hydra'"),
             ("model.widht=3", "Could not override 'model.widht'"),

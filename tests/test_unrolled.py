@@ -30,7 +30,7 @@ from torch.testing import assert_close
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths, rows_to_cameras
 from kcs_torch.methods import SfAM
-from kcs_torch.nn import UnrolledFPC, UnrolledPKC, UnrolledSfAM
+from kcs_torch.nn import MLPLifter, RefinedLifter, UnrolledFPC, UnrolledPKC, UnrolledSfAM
 from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape
 
 BODIES = {"body": BODY, "chain": CHAIN, "ring": RING}
@@ -766,3 +766,17 @@ def test_step_without_bones_is_plain():
         bones=bones, lengths=torch.ones(6).double(), stiffness=torch.zeros(6).double(),
     )  # fmt: skip
     assert_close(free, plain)
+
+
+def test_what_is_no_number_of_steps_or_no_camera_is_told():
+    for steps in (2.5, "10", 0, None):
+        with pytest.raises(OptionError, match="whole num_steps"):
+            UnrolledSfAM(BODY, num_steps=steps)
+    with pytest.raises(ShapeError, match="expected a tensor of cameras, got NoneType"):
+        UnrolledSfAM(BODY, num_steps=2)(torch.zeros(3, BODY.num_joints, 2), None)
+
+
+def test_a_lifter_is_refined_by_a_solver_of_its_skeleton():
+    """Bones of another body of as many joints would link other joints, without a word."""
+    with pytest.raises(SkeletonError, match="RefinedLifter: expected a solver of the network's skeleton, 'h36m17'"):
+        RefinedLifter(MLPLifter("h36m17"), UnrolledSfAM("cmu17", num_steps=2))

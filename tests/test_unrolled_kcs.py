@@ -230,3 +230,9 @@ def test_what_does_not_fit():
         module(tracks.tolist(), cameras)
     with pytest.raises(ShapeError, match=r"cameras \(\.\.\., T, 2, 3\)"):
         module(tracks, cameras[:3])
+
+
+def test_an_empty_batch_has_no_cameras():
+    tracks, _, _ = scene(BODY)
+    rows, sizes = UnrolledKCS(BODY, 2, template=REST).find_cameras(tracks[None][:0])
+    assert rows.shape == (0, len(tracks), 2, 3) and sizes.shape == (0, len(tracks))

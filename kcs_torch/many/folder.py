@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kcs_torch.errors import KcsError, KcsWarning, OptionError
+from kcs_torch.errors import KcsError, KcsWarning, OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.load import check_reading, load_people, most_seen
 from kcs_torch.io.write import ready_writer, save, takes_up
@@ -23,7 +23,7 @@ from kcs_torch.many.record import claim, settings_of
 from kcs_torch.methods.base import Method
 from kcs_torch.reconstruct import method_named, reconstruct_all, with_found_bones
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
-from kcs_torch.types.size import parse_size
+from kcs_torch.types.size import METRES, parse_size
 
 __all__ = ["Outcome", "reconstruct_folder"]
 
@@ -117,6 +117,8 @@ def reconstruct_folder(
         ready_writer(Path(f"NAME{suffix}"))
     if up is not None and not any(takes_up(Path(f"x{suffix}")) for suffix in suffixes):
         raise OptionError(f"up: none of {', '.join(suffixes)} holds results with y or z up")
+    if units not in (None, "px", *METRES):
+        raise unknown("unit of length", units, METRES)
     size = None if scale is None else parse_size(scale)
     method = method_named(method, {})
     find = reading.get("skeleton") == "auto"

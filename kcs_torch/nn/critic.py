@@ -40,7 +40,8 @@ class KCSCritic(SkeletonModule):
         width: of the hidden layers.
         num_layers: how many there are.
         combined: one score for each pose, the mean over the whole and the parts; False gives each.
-        spectral: normalise each layer by its largest singular value, which bounds the slope by 1.
+        spectral: normalise each layer by its largest singular value, which bounds the slope by 1. Torch pickles no
+            such layers, but their ``state_dict``.
 
     Raises:
         OptionError: a number is out of range, or a part names no bones.
@@ -209,7 +210,13 @@ def critic_loss(real: Tensor, fake: Tensor, *, game: str = "least_squares") -> T
 
     Raises:
         OptionError: there is no such game.
+        ShapeError: the shapes differ.
     """
+    if real.shape != fake.shape:
+        raise ShapeError(
+            f"critic_loss: expected scores of one shape, got {tuple(real.shape)} and {tuple(fake.shape)}: "
+            "of different numbers of poses take the mean of each first"
+        )
     if game == "least_squares":
         return 0.5 * (real - 1).square() + 0.5 * fake.square()
     if game == "wasserstein":

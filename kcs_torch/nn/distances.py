@@ -80,7 +80,8 @@ class JointDistance(nn.Module):
 class KCSDistance(SkeletonModule):
     """1/2 sum_bc w_bc (Psi_bc - Psi'_bc)^2 of each pose, Psi = B B^T: lengths of bones and angles between them.
 
-    It does not see how a pose is placed, turned or mirrored.
+    It does not see how a pose is placed, turned or mirrored. Of float16 give metres, or ``scale_free``: the gradient of
+    millimetres, which goes with their third power, leaves its range.
 
     Args:
         skeleton: a :class:`Skeleton`, a built-in name or a file.

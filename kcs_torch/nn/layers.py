@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -159,9 +160,10 @@ class SVT(nn.Module):
 
     def __init__(self, threshold: float, *, learnable: bool = False, relative: bool = False) -> None:
         super().__init__()
-        if not (threshold >= 0 and math.isfinite(threshold)) or (learnable and threshold == 0):
+        number = isinstance(threshold, (Real, Tensor))
+        if not number or not 0 <= float(threshold) < math.inf or (learnable and threshold == 0):
             kind = "positive" if learnable else "non-negative"
-            raise OptionError(f"SVT: expected a {kind}, finite threshold, got {threshold}")
+            raise OptionError(f"SVT: expected a {kind}, finite threshold, got {threshold!r}")
         self.relative = relative
         self.raw = nn.Parameter(inverse_softplus(torch.tensor(float(threshold)))) if learnable else None
         self.fixed = float(threshold)

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from kcs_torch.errors import SkeletonError
 from kcs_torch.functional import centre
 from kcs_torch.nn.layers import seen_weights
 from kcs_torch.skeleton import Skeleton
@@ -24,6 +25,9 @@ class RefinedLifter(nn.Module):
         network: (tracks, weights) to points, such as :class:`TemporalLifter`.
         solver: called as ``solver(tracks, cameras, weights=..., start=points)``, such as :class:`UnrolledSfAM`.
 
+    Raises:
+        SkeletonError: the two are of different skeletons.
+
     >>> from kcs_torch.nn import TemporalLifter, UnrolledSfAM
     >>> network = RefinedLifter(TemporalLifter("h36m17"), UnrolledSfAM("h36m17", num_steps=3))
     >>> network(torch.rand(2, 27, 17, 2)).shape
@@ -32,6 +36,10 @@ class RefinedLifter(nn.Module):
 
     def __init__(self, network: nn.Module, solver: nn.Module) -> None:
         super().__init__()
+        bodies = [getattr(module, "skeleton", None) for module in (network, solver)]
+        if None not in bodies and bodies[0] != bodies[1]:
+            one, other = (f"'{body.name}'" for body in bodies if body is not None)
+            raise SkeletonError(f"RefinedLifter: expected a solver of the network's skeleton, {one}, got {other}")
         self.network, self.solver = network, solver
 
     @property

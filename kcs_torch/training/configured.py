@@ -19,7 +19,7 @@ from kcs_torch.errors import KcsError, OptionError
 from kcs_torch.methods import Method
 from kcs_torch.types.hints import is_a, spoken
 
-__all__ = ["WrongConfiguration", "check_values", "in_one_line", "method_of"]
+__all__ = ["WrongConfiguration", "check_threads", "check_values", "check_whole", "in_one_line", "method_of"]
 
 
 class WrongConfiguration(CompactHydraException):
@@ -42,6 +42,25 @@ def in_one_line(*also: type[Exception]) -> Iterator[None]:
         if (text := _told(error, also)) is None or os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
         raise WrongConfiguration(f"error: {text}") from None
+
+
+def check_whole(name: str, value: Any, least: int, most: int) -> None:
+    """Make sure that a setting is a whole number within limits.
+
+    Raises:
+        OptionError: it is not.
+    """
+    if type(value) is not int or not least <= value <= most:
+        raise OptionError(f"{name}: expected a whole number within {least}..{most}, got {value!r}")
+
+
+def check_threads(value: Any) -> None:
+    """Make sure that this is a number of threads.
+
+    Raises:
+        OptionError: it is not.
+    """
+    check_whole("threads", value, 1, 1024)
 
 
 def check_values(config: Mapping[str, Any], place: str = "") -> None:

@@ -30,7 +30,7 @@ from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.training.callbacks import Best, Diverged, Last, Watch
 from kcs_torch.training.checkpoint import describe, save_lifter
-from kcs_torch.training.configured import check_values, in_one_line
+from kcs_torch.training.configured import check_threads, check_values, check_whole, in_one_line
 from kcs_torch.training.sweep import RESULT, tabulate
 
 __all__ = ["Outcome", "configs", "job", "main", "train"]
@@ -111,6 +111,10 @@ def train(config: DictConfig, folder: Path) -> Outcome:
             if resumed is None or not re.search("state.dict", str(error)):
                 raise
             raise OptionError(f"resume={resumed}: does not fit this configuration: {error}") from None
+        except SystemExit:  # so Lightning ends at Ctrl-C
+            if trainer.interrupted and (folder / "checkpoints" / "last.ckpt").is_file():
+                print(f"stopped: resume={folder} goes on", file=sys.stderr)
+            raise
         if best.best_model_score is None:
             raise OptionError("train: expected at least one epoch with validation, got none: see the group trainer")
         tested = trainer.test(module, datamodule=data, ckpt_path=best.best_model_path, verbose=False, weights_only=True)
@@ -135,9 +139,8 @@ def _savable(network: Any) -> bool:
 
 def _check(config: Mapping[str, Any]) -> None:
     """Look at the settings that no constructor looks at."""
-    for name, least, most in (("seed", 0, 2**32 - 1), ("threads", 1, 1024)):
-        if type(config[name]) is not int or not least <= config[name] <= most:
-            raise OptionError(f"{name}: expected a whole number within {least}..{most}, got {config[name]!r}")
+    check_whole("seed", config["seed"], 0, 2**32 - 1)
+    check_threads(config["threads"])
     if config["mode"] not in ("min", "max"):
         raise OptionError(f"mode: expected min or max, got {config['mode']!r}")
 
@@ -238,6 +241,9 @@ def _check_names(arguments: Sequence[str]) -> None:
     groups = (next(iter(entry)) for entry in own.defaults if isinstance(entry, Mapping))
     known = {str(name) for name in (*own, *groups)} - {"defaults"}
     for argument in arguments:
+        bare = argument.lstrip("-")
+        if bare != argument and bare.partition("=")[0] in known:
+            raise OptionError(f"{argument}: settings have no dashes: {bare}")
         named = re.match(r"([A-Za-z_]\w*)[^=]*=", argument)
         if named is not None and named[1] not in known:
             raise unknown("setting", named[1], known)

@@ -145,6 +145,7 @@ def parse_size(text: str, what: str = "scale") -> dict[str, Any]:
     >>> parse_size("height=1.75m"), parse_size("left_knee-left_ankle=430mm")
     ({'units': 'm', 'height': 1.75}, {'units': 'mm', 'left_knee-left_ankle': 430.0})
     """
+    text = str(text)
     found = re.fullmatch(r"(.+)=\s*([0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*([a-z]+)", text.strip())
     if found is None or found[3] not in METRES or not 0 < float(found[2]) < float("inf"):
         raise OptionError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from numbers import Integral
 from typing import Any, Literal
 
 import torch
@@ -51,10 +52,11 @@ class Unrolled(nn.Module):
         self, num_steps: int, *, momentum: float, learnable: bool, grad_steps: int | None, gradient: Gradient
     ) -> None:
         super().__init__()
-        if num_steps < 1 or not 0 <= momentum < 1 or (grad_steps is not None and grad_steps < 0):
+        whole = all(isinstance(x, Integral) for x in (num_steps, 0 if grad_steps is None else grad_steps))
+        if not whole or num_steps < 1 or not 0 <= momentum < 1 or (grad_steps is not None and grad_steps < 0):
             raise OptionError(
-                f"{type(self).__name__}: expected num_steps >= 1, momentum within [0, 1) and grad_steps >= 0 or None, "
-                f"got {num_steps}, {momentum} and {grad_steps}"
+                f"{type(self).__name__}: expected whole num_steps >= 1, grad_steps >= 0 or None, and momentum within "
+                f"[0, 1), got {num_steps!r}, {grad_steps!r} and {momentum!r}"
             )
         if not isinstance(gradient, Implicit) and gradient not in ("unrolled", "implicit"):
             raise OptionError(
@@ -197,10 +199,13 @@ class Unrolled(nn.Module):
         start: Tensor | None,
         skeleton: Skeleton | None = None,
         *,
+        seek: bool = False,
         lengths: Tensor | None = None,
         scales: Tensor | None = None,
     ) -> Tensor:
         """Return the weights (..., T, N) in the dtype of the tracks, 0 where these are not finite.
+
+        Cameras have to be given unless they are what is sought.
 
         Raises:
             ShapeError: the arguments do not fit.
@@ -209,7 +214,7 @@ class Unrolled(nn.Module):
         check_points(tracks, self, "tracks")
         given = {"cameras": cameras, "start": start}
         for what, value in given.items():
-            if value is not None:
+            if value is not None or (what == "cameras" and not seek):
                 check_tensor(value, what, self)
         if tracks.ndim < 3 or tracks.shape[-1] != 2 or (
             cameras is not None and cameras.shape[-3:] != (tracks.shape[-3], 2, 3)

@@ -155,7 +155,7 @@ class UnrolledKCS(Unrolled):
         Raises:
             ShapeError: the shapes do not fit.
         """
-        weights = self._check(tracks, None, weights, None, self.skeleton)
+        weights = self._check(tracks, None, weights, None, self.skeleton, seek=True)
         with torch.no_grad(), full_precision(tracks):
             points, share = self._centred(tracks, weights)
             rest = self.template(tracks)
@@ -168,6 +168,8 @@ class UnrolledKCS(Unrolled):
                 rotations, scales = steady_cameras(fit, continuity)
                 rows.append(rotations[:, :2])
                 sizes.append(scales)
+            if not rows:  # an empty batch
+                return tracks.new_zeros(*tracks.shape[:-2], 2, 3), tracks.new_zeros(tracks.shape[:-2])
             return torch.stack(rows).reshape(*tracks.shape[:-2], 2, 3), torch.stack(sizes).reshape(tracks.shape[:-2])
 
     def forward(
