@@ -408,6 +408,7 @@ def test_what_cannot_be_read_so_leaves_no_trace(clips, tmp_path):
         ({"threshold": 3}, "threshold"),
         ({"fsp": 30}, "reading option"),
         ({"units": "inch"}, "unit of length 'inch'"),
+        ({"suffixes": []}, "suffixes: expected at least one"),
         ({"scale": 1.75}, "expected height=1.75m, .* got '1.75'"),
     ):
         with pytest.raises(kt.KcsError, match=told):

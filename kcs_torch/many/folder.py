@@ -113,6 +113,8 @@ def reconstruct_folder(
         raise OptionError(f"batch: expected at least 1 clip, got {batch}")
     suffixes = [suffixes] if isinstance(suffixes, str) else suffixes
     suffixes = [s if s.startswith(".") else f".{s}" for s in suffixes]
+    if not suffixes:
+        raise OptionError("suffixes: expected at least one, such as .npz, got none")
     for suffix in suffixes:
         ready_writer(Path(f"NAME{suffix}"))
     if up is not None and not any(takes_up(Path(f"x{suffix}")) for suffix in suffixes):
