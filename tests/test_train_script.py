@@ -21,7 +21,7 @@ from omegaconf import OmegaConf  # noqa: E402
 
 from kcs_torch.training import LiftingModule, load_lifter  # noqa: E402
 from kcs_torch.training.run import configs, main, train  # noqa: E402
-from kcs_torch.training.sweep import tabulate  # noqa: E402
+from kcs_torch.training.sweep import RESULT, tabulate  # noqa: E402
 
 SMALL = ("experiment=smoke", "+model.channels=8")
 
@@ -368,6 +368,22 @@ class TestSweeps:
         code, _, err = called(capsys, *SWEEP, "+module.lr=1e-3,-1,1e-4")
         assert code == 2 and "lr: expected a positive number" in err and "Traceback" not in err
         assert [row["run"] for row in rows(tmp_path / "sweep" / "results.csv")] == ["0", "2"]
+
+    @pytest.mark.filterwarnings("ignore:Experiment logs directory")
+    def test_what_had_ended_is_kept(self, tmp_path, monkeypatch, capsys):
+        """A sweep that was stopped goes on: runs without a result are made again, and runs of other settings."""
+        monkeypatch.chdir(tmp_path)
+        assert called(capsys, *SWEEP, "seed=0,1", "+module.lr=1e-3")[0] == 0
+        before = swept(tmp_path)
+        (tmp_path / "sweep" / "1" / RESULT).unlink()
+        times = {k: (tmp_path / "sweep" / k / "lifter.safetensors").stat().st_mtime_ns for k in "01"}
+        code, out, err = called(capsys, *SWEEP, "seed=0,1", "+module.lr=1e-3", "keep=true")
+        assert code == 0 and out.count("had ended, and is kept") == 1, err
+        changed = [(tmp_path / "sweep" / k / "lifter.safetensors").stat().st_mtime_ns != times[k] for k in "01"]
+        assert changed == [False, True]
+        assert [row["val/mpjpe"] for row in swept(tmp_path)] == [row["val/mpjpe"] for row in before]
+        code, out, _ = called(capsys, *SWEEP, "seed=0,1", "+module.lr=1e-4", "keep=true")
+        assert code == 0 and "is kept" not in out
 
     @pytest.mark.filterwarnings("ignore:Experiment logs directory")
     def test_figures_of_an_earlier_sweep_are_not_those_of_a_run_that_fails(self, tmp_path, monkeypatch, capsys):

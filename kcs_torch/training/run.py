@@ -9,7 +9,7 @@ import re
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -153,14 +153,29 @@ def _checkpoint(path: Path, config: Mapping[str, Any]) -> Path:
             f"resume={path}: expected a run's folder, with checkpoints/last.ckpt, or a checkpoint, got none"
         )
     try:
-        then = torch.load(found, map_location="cpu", weights_only=True)["config"]
+        differing = _differing(found, config)
     except Exception:  # whatever torch, zipfile and pickle make of a file that is something else
         raise OptionError(f"resume={found}: expected a checkpoint of a training run, got something else") from None
-    before, now = _flat(then), _flat(config)
-    differing = [key for key in sorted({*before, *now} - {"resume"}) if before.get(key) != now.get(key)]
-    for key in differing:
-        warnings.warn(f"resume: {key} was {before.get(key)}, is {now.get(key)}", KcsWarning, stacklevel=2)
+    for key, before, now in differing:
+        warnings.warn(f"resume: {key} was {before}, is {now}", KcsWarning, stacklevel=2)
     return found.resolve()
+
+
+def _differing(checkpoint: Path, config: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """The settings that a checkpoint's run had otherwise, as they were and as they are."""
+    then = torch.load(checkpoint, map_location="cpu", weights_only=True)["config"]
+    before, now = _flat(then), _flat(config)
+    keys = sorted({*before, *now} - {"resume", "keep"})
+    return [(key, before.get(key), now.get(key)) for key in keys if before.get(key) != now.get(key)]
+
+
+def _ended(config: DictConfig, folder: Path) -> dict[str, float | None] | None:
+    """The figures of a run of the same settings that ended in this folder before; None where there is none."""
+    with suppress(Exception):  # whatever is wrong with its files, it did not end
+        plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+        if not _differing(folder / "checkpoints" / "last.ckpt", plain):
+            return dict(json.loads((folder / RESULT).read_text(encoding="utf-8")))
+    return None
 
 
 def _for_json(value: Any) -> Any:
@@ -216,6 +231,13 @@ def job(config: DictConfig) -> float:
     """Train in the folder that Hydra gives a run, tell what it came to, and return what a sweep optimises."""
     settings = HydraConfig.get()
     folder = Path(settings.runtime.output_dir)
+    ended = _ended(config, folder) if config.keep else None
+    if ended is not None:
+        print(f"{folder}: had ended, and is kept")
+        if settings.mode == RunMode.MULTIRUN:
+            tabulate(Path(settings.sweep.dir))
+        value = ended.get(config.optimise)
+        return (math.inf if config.mode == "min" else -math.inf) if value is None else value
     (folder / RESULT).unlink(missing_ok=True)  # of an earlier run, whose settings Hydra has replaced
     with in_one_line(MisconfigurationException), _said():
         outcome = train(config, folder)
