@@ -106,8 +106,8 @@ def test_confidences_a_little_above_one_are_one(tmp_path):
     assert (tracks.weights == 1).all()
     assert any("above 1" in n for n in tracks.notes)
     percent = load_tracks(write_openpose(tmp_path / "percent", alone(confidence=90.0)))
-    assert (percent.weights == 1).all()
-    assert any("divided by 90" in n for n in percent.notes)
+    assert np.allclose(percent.weights, 0.9)
+    assert any("confidences up to 90 are taken as per cent" in n for n in percent.notes)
 
 
 def test_a_byte_order_mark_is_no_error(tmp_path):

@@ -93,11 +93,19 @@ def test_confidences_a_little_above_one_are_one():
 
 
 def test_confidences_on_another_scale_are_divided():
-    (tracks,) = read(scored(np.linspace(1, 100, 17)))
+    (tracks,) = read(scored(np.linspace(2, 200, 17)))
     weights = tracks.weights[0, :17]
     assert (weights[:5] == 0).all() and (weights[5:].diff() >= 0).all()
     assert weights[8].item() == pytest.approx(50.5 / 98, abs=0.02) and weights[-1] == 1
-    assert any(n.startswith("confidences up to 100: divided by 9") for n in tracks.notes)
+    assert any(n.startswith("confidences up to 200: divided by 19") for n in tracks.notes)
+
+
+def test_confidences_in_per_cent():
+    """Also where no joint is certain: the best of them would count as such."""
+    (tracks,) = read(scored(np.linspace(20, 60, 17)))
+    assert np.allclose(tracks.weights[0, 4:17], np.linspace(0.2, 0.6, 17)[4:])
+    assert (tracks.weights[0, :4] == 0).all()
+    assert "confidences up to 60 are taken as per cent" in tracks.notes
 
 
 def test_negative_confidences_and_blank_joints_are_unseen():

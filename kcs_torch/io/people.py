@@ -26,6 +26,7 @@ SIZE_HINT = "image_size=(width, height) (kcs-torch: --image-size 1920x1080)"
 
 _OVERSHOOT = 1.5  # some networks' confidences pass 1 a little; above this they are on another scale
 _WELL_SEEN = 0.95  # quantile of the confidences that counts as certain where they are on another scale
+_PER_CENT = (50.0, 100.0)  # between these the largest confidence is per cent
 _MOST_IN_FRAME = 100  # people of one frame
 _MOST_NUMBERS = 5e7  # of all tracks together: each person has a place in every frame
 _FPS = 30.0  # assumed for how long somebody may be out of sight, where nothing is known
@@ -166,9 +167,12 @@ def _checked(
     scores = np.concatenate([s.joints[:, 2] for frame in frames for s in frame] or [np.zeros(0)])
     scores = scores[scores > 0]
     largest, scale = float(scores.max(initial=0)), 1.0
-    if largest > _OVERSHOOT:
+    if _PER_CENT[0] < largest <= _PER_CENT[1]:
+        scale = _PER_CENT[1]
+        notes.append(f"confidences up to {largest:.4g} are taken as per cent")
+    elif largest > _OVERSHOOT:
         scale = float(np.quantile(scores, _WELL_SEEN))
-        notes.append(f"confidences up to {largest:.4g}: divided by {scale:.4g}, which 5 % of them pass, and cut at 1")
+        notes.append(f"confidences up to {largest:.4g}: divided by {scale:.4g}, their 95th percentile, and cut at 1")
     elif largest > 1:
         notes.append(f"confidences above 1 (up to {largest:.3g}) are taken as 1")
     out, negative, crowded = [], 0, 0
