@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from kcs_torch.errors import FormatError
+from kcs_torch.io.header import Columns, Header, first_line
 from kcs_torch.io.jsonfile import FARTHEST
 from kcs_torch.io.landmarks import BODIES, VISIBILITIES, Landmarks
 from kcs_torch.io.long import LongHeader
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import read_error
-from kcs_torch.io.wide import Columns, Header, first_line, read_wide
+from kcs_torch.io.wide import read_wide
 from kcs_torch.skeleton import SKELETONS, guess_skeleton
 
 __all__ = ["frame_shape", "npy_shape", "read_csv", "read_npy", "table_kind"]

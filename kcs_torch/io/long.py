@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
+from kcs_torch.io.header import WHO, Header, plain_name
 from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_text
 from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
-from kcs_torch.io.wide import WHO, Header, Row, as_value, opened, place_rows, plain_name
+from kcs_torch.io.wide import Row, as_value, opened, place_rows
 
 __all__ = ["LongHeader", "read_long"]
 

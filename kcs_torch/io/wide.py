@@ -7,10 +7,8 @@ import itertools
 import math
 import re
 import statistics
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,118 +18,19 @@ from numpy.typing import NDArray
 from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.frames import as_track_id
+from kcs_torch.io.header import Columns, Header, delimiter, first_line
 from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_text
 from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import brief, read_error
 
-__all__ = [
-    *("WHO", "Columns", "Header", "Row"),
-    *("as_value", "delimiter", "first_line", "is_missing", "opened", "place_rows", "plain_name", "read_wide"),
-]
+__all__ = ["Row", "as_value", "is_missing", "opened", "place_rows", "read_wide"]
 
 _LIMIT = 2**30  # bytes of a file
-WHO = ("person", "person_id", "pose", "track_id", "hand", "handedness", "id")
-"""What a column is called that tells people apart."""
-_WHAT = "|".join(("x", "y", "z", *CONFIDENCES, *VISIBILITIES))
-_NAMED = re.compile(rf"(?P<name>.+)[_. ](?P<what>{_WHAT})(?: \[(?P<unit>[^\]]*)\])?\Z", re.IGNORECASE | re.DOTALL)
-_NUMBERED = re.compile(rf"(?P<what>{_WHAT})_?(?P<name>[0-9]{{1,4}})\Z", re.IGNORECASE)
-_TIME = re.compile(r"(?:time|timestamp|t)[ _]?[\[(]?(?P<unit>|s|sec|seconds|ms|msec|milliseconds)[\])]?\Z")
-_NAMELESS = re.compile(r"(?:Unnamed: [0-9]+)?\Z")
-_LINE = re.compile(r'(?:[^"\n]+|"[^"]*")*')
 _HEAD = 2**20  # characters of the first line, at most
 _UNEVEN = 0.3  # of a frame, by which times may be off
-
 _MISSING = ("", "na", "n/a", "#n/a", "<na>", "null", "none")
-_FRAME = re.compile(r"frame(?:[ _]?(?:#|no|nr|num|number|id|idx|index))?\.?|index\Z", re.IGNORECASE)
-
-Columns = dict[str, dict[str, int]]
-"""Of each joint the columns by what they hold: x, y, z, confidence, ..."""
-
-
-@dataclass(frozen=True)
-class Header:
-    """The first line of a table.
-
-    Attributes:
-        cells: the columns' names.
-        joints: the columns of the joints that have x and y.
-        halves: columns that are missing, of joints that have x or y only.
-        twice: a column that is there twice; empty where none is.
-        unit: of the coordinates, where the first one tells.
-    """
-
-    cells: list[str]
-    joints: Columns
-    halves: list[str] = field(default_factory=list)
-    twice: str = ""
-    unit: str = ""
-
-    @classmethod
-    def of(cls, line: str) -> Header:
-        """Take a line apart.
-
-        >>> Header.of("frame,nose_x,nose_y,nose_visibility").joints
-        {'nose': {'x': 1, 'y': 2, 'visibility': 3}}
-        """
-        try:
-            line = line.strip("\ufeff\r\n")
-            cells = [] if "\0" in line else next(csv.reader([line], delimiter=delimiter(line)), [])
-        except csv.Error:
-            return cls([], {})
-        cells = [plain_name(cell) for cell in cells]
-        joints: Columns = {}
-        unit = twice = ""
-        for i, cell in enumerate(cells):
-            match = _NUMBERED.match(cell) or _NAMED.match(cell)
-            if match:
-                columns, what = joints.setdefault(match["name"], {}), match["what"].lower()
-                twice = twice or (cell if what in columns else "")
-                columns.setdefault(what, i)
-                unit = unit or match.groupdict().get("unit") or ""
-        whole = {name: columns for name, columns in joints.items() if {"x", "y"} <= set(columns)}
-        halves = [
-            f"{n}_{'y' if 'x' in c else 'x'}" for n, c in joints.items() if n not in whole and {"x", "y"} & set(c)
-        ]
-        return cls(cells, whole, halves, twice, unit)
-
-    @cached_property
-    def number(self) -> int | None:
-        """The column of frame numbers."""
-        return next((i for i, cell in enumerate(self.cells) if _FRAME.fullmatch(cell)), None)
-
-    @cached_property
-    def who(self) -> int | None:
-        """The column that tells people apart."""
-        return self.column(WHO)
-
-    @cached_property
-    def time(self) -> tuple[int, str] | None:
-        """The column of times, and their unit where its name tells."""
-        matches = ((i, _TIME.match(cell.lower())) for i, cell in enumerate(self.cells))
-        return next(((i, match["unit"]) for i, match in matches if match), None)
-
-    def column(self, names: Sequence[str]) -> int | None:
-        """The column that has the first of these names that is there."""
-        lower = [cell.lower() for cell in self.cells]
-        return next((lower.index(name) for name in names if name in lower), None)
-
-    def left_out(self, read: Iterable[int]) -> list[str]:
-        """What the columns of joints that are not among those that are read hold."""
-        used = set(read)
-        out: dict[str, None] = {}
-        for i, cell in enumerate(self.cells):
-            for separator in () if i in used else re.finditer(r"[_. ]", cell):
-                if cell[: separator.start()] in self.joints:
-                    out[re.sub(r" \[[^\]]*\]\Z", "", cell[separator.end() :])] = None
-        return list(out)
-
-    @cached_property
-    def others(self) -> list[int]:
-        """Columns that are of no joint, no frame, no time and nobody."""
-        known = {self.number, self.who, self.time and self.time[0]}
-        of_joints = (_NUMBERED.match(cell) or _NAMED.match(cell) for cell in self.cells)
-        return [i for i, is_joint in enumerate(of_joints) if not is_joint and i not in known]
+_NAMELESS = re.compile(r"(?:Unnamed: [0-9]+)?\Z")
 
 
 class Row(NamedTuple):
@@ -152,11 +51,6 @@ class Row(NamedTuple):
     joints: NDArray[np.float64]
 
 
-def plain_name(cell: str) -> str:
-    """A name without what keeps spreadsheets from taking it for a formula."""
-    return re.sub(r"\A'(?=[=+\-@\t\r])", "", cell.strip())
-
-
 def is_missing(cell: str) -> bool:
     """Whether a cell says that a number is missing, otherwise than by NaN: R writes NA, SQL NULL.
 
@@ -164,22 +58,6 @@ def is_missing(cell: str) -> bool:
     (True, False, False)
     """
     return cell.strip().lower() in _MISSING
-
-
-def first_line(text: str) -> str:
-    r"""The first line of a table, which goes on where a line break stands within quotes.
-
-    >>> first_line('frame,"nose\ntip_x"\n1,2')
-    'frame,"nose\ntip_x"'
-    """
-    whole = _LINE.match(text)
-    end = whole.end() if whole else 0
-    return text[:end] if text[end : end + 1] in ("", "\n") else text.partition("\n")[0]
-
-
-def delimiter(line: str) -> str:
-    """What stands between the cells of a line."""
-    return max(",;\t", key=line.count)
 
 
 @contextmanager

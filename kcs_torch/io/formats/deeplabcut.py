@@ -21,8 +21,9 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.animals import LIMIT, LINE, Animal, bounded_lines, build_animals, frames_of, refuse_3d
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5_pandas import Table, has_column, pandas_group, read_pandas
+from kcs_torch.io.header import delimiter
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief, read_error
-from kcs_torch.io.wide import delimiter, is_missing
+from kcs_torch.io.wide import is_missing
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]

@@ -15,10 +15,10 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.animals import LIMIT, LINE, Animal, bounded_lines, build_animals, frames_of, refuse_3d
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5 import Tree, read_tree
+from kcs_torch.io.header import Header, delimiter, first_line
 from kcs_torch.io.jsonfile import as_frame_number
 from kcs_torch.io.link import link_people
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief, read_error
-from kcs_torch.io.wide import Header, delimiter, first_line
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]

@@ -18,12 +18,13 @@ from kcs_torch.anatomy import places_of_known
 from kcs_torch.errors import FormatError
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.frames import by_number
+from kcs_torch.io.header import Header, first_line
 from kcs_torch.io.landmark_tables import table_kind
 from kcs_torch.io.landmarks import settle
 from kcs_torch.io.long import LongHeader, read_long
 from kcs_torch.io.people import people_tracks
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader
-from kcs_torch.io.wide import Header, first_line, read_wide
+from kcs_torch.io.wide import read_wide
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]
