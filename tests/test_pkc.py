@@ -1,6 +1,7 @@
 """PKC end to end: walks before fixed and turning cameras, what is told of them, and clips that tell little."""
 
 import math
+import warnings
 from dataclasses import replace
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 from numerics import count_operations, normal
 from torch.testing import assert_close
 
-from kcs_torch import PKC, ConvergenceWarning, KcsWarning, OptionError, SfAM, Skeleton, Tracks
+from kcs_torch import PKC, SKELETONS, ConvergenceWarning, KcsWarning, OptionError, SfAM, Skeleton, Tracks
 from kcs_torch.clean import resample, smooth
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_lengths, complete_rotation
@@ -765,3 +766,17 @@ def test_several_clips_at_once():
         assert_close(one.objective, alone.objective, rtol=1e-2, atol=0.5)
         assert len(one.alternatives) == len(alone.alternatives)
     assert method.many([]) == []
+
+
+@pytest.mark.parametrize("width", [1.0, 3.0])
+def test_a_body_unlike_its_template_is_not_searched_again_for_a_change_of_size(width, monkeypatch):
+    """Where the viewpoint turns its template hardly counts, and no other search asks for such small changes."""
+    tried, real = [], PKC._resized
+    monkeypatch.setattr(PKC, "_resized", lambda self, *given: tried.append(given) or real(self, *given))
+    body = SKELETONS["coco17"]
+    body = replace(body, template=tuple((width * x, y, z) for x, y, z in body.template))
+    tracks = random_motion(body, 40, turn=120.0).tracks
+    size = torch.linspace(1, 1.03, 40, dtype=torch.float64)[:, None, None]
+    with warnings.catch_warnings(action="ignore", category=KcsWarning):
+        PKC(steps=10)(Tracks.from_arrays((tracks.points * size)[:, :17], skeleton="coco17", fps=30.0))
+    assert len(tried) == (width == 1.0)

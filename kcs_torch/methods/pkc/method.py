@@ -184,7 +184,8 @@ class PKC(Method):
         else:
             resizing = enough and not changing and size.range >= TRIED  # what is compared must be searched alike
             found = yield from body.search(self.rounds, self.steps, turned if compared and not resizing else None)
-            if resizing:
+            led = compared and body.is_odd(found) and body.turns(found)  # by the viewpoint's turn, not by the template
+            if resizing and not led:
                 other = Body(skeleton, resized, tracks.fps or 30.0, noise, feet)
                 better = yield from self._resized(found, body, other, size)
                 if better is not None:
