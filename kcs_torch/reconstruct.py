@@ -27,6 +27,10 @@ WITHOUT = ("auto", "parallel")
 """What may be asked for in place of intrinsics."""
 
 
+BESIDE = 1e8
+"""Focal lengths off the optical axis from which on a joint's number is that of no image."""
+
+
 def reconstruct(
     tracks: Any,
     *,
@@ -165,14 +169,15 @@ def _before(lens: Intrinsics | str | None, method: Method, tracks: Tracks, camer
     if lens is None:
         lens = "auto" if method.turns_over and cameras is None and may_be_near(tracks) else "parallel"
     if isinstance(lens, Intrinsics):
-        found = reconstruct_perspective(method, tracks, lens, cameras)
-        if not bool(found.points.isfinite().all()):
-            off = (lens.rays(tracks.points)[..., :2].norm(dim=-1) * tracks.seen).amax(1)
+        off = (lens.rays(tracks.points)[..., :2].norm(dim=-1) * tracks.seen).amax(1)
+        inside = bool((off < BESIDE).all())
+        found = reconstruct_perspective(method, tracks, lens, cameras) if inside else None
+        if found is None or not bool(found.points.isfinite().all()):
             frame = int(off.argmax())
             raise OptionError(
-                f"{tracks.source}: intrinsics: expected tracks that such a camera sees, found no finite motion: in "
-                f"frame {frame} a joint lies {float(off[frame]):.3g} focal lengths off the optical axis. Leave out "
-                "what is wrong there, or correct the intrinsics"
+                f"{tracks.source}: intrinsics: expected tracks that such a camera sees: in frame {frame} a joint lies "
+                f"{float(off[frame]):.3g} focal lengths off the optical axis, so that no finite motion is found. Leave "
+                "out what is wrong there, or correct the intrinsics"
             )
         return found
     return method(tracks, cameras) if lens == "parallel" else reconstruct_uncalibrated(method, tracks, cameras)

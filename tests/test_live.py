@@ -171,9 +171,12 @@ def test_arrays_do_as_well(clip):
 
 def test_the_image_may_be_of_any_size_and_place(clip):
     frames = observed(clip)[:45]
-    a = follow(kt.Tracker("coco17", fps=30), frames)[-1].points
-    b = follow(kt.Tracker("coco17", fps=30), 0.01 * frames + 500)[-1].points
-    assert torch.allclose(100 * (b - torch.tensor([500.0, 500, 0])), a, atol=5.0)
+    a, b = (
+        torch.stack([pose.points for pose in follow(kt.Tracker("coco17", fps=30), given)])
+        for given in (frames, 0.01 * frames + 500)
+    )
+    off = (100 * (b - torch.tensor([500.0, 500, 0])) - a).abs().amax(-1)
+    assert off.median() < 0.1 and (off < 5).double().mean() > 0.98  # whose sign is a toss-up, rounding tells
 
 
 def test_without_a_template():

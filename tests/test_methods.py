@@ -340,7 +340,7 @@ def test_blank_frames_lie_between_their_neighbours(method):
     size = (gap - gap.mean(1, keepdim=True)).norm(dim=(1, 2))
     assert size[25:35].min() > 0.85 * size.median()  # the body does not shrink
     step = (gap[1:] - gap[:-1]).norm(dim=-1).mean(-1)
-    assert step.max() < 3 * (plain[1:] - plain[:-1]).norm(dim=-1).mean(-1).max()  # nor does it jump
+    assert step[24:36].max() < 3 * (plain[1:] - plain[:-1]).norm(dim=-1).mean(-1).max()  # nor does it jump
 
 
 @pytest.mark.parametrize("method", METHODS)

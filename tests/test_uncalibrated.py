@@ -82,7 +82,7 @@ def test_a_hopeless_search_ends_early(monkeypatch):
         return made[-1]
 
     lbfgs = uncalibrated.lbfgs
-    far = quietly(kt.data.walking_person(90, turn=0.0, yaw=10.0).tracks, intrinsics="parallel")
+    far = quietly(kt.data.walking_person(90, turn=0.0, yaw=200.0).tracks, intrinsics="parallel")
     near = quietly(filmed()[0], intrinsics="parallel")
     monkeypatch.setattr(uncalibrated, "lbfgs", counted)
     assert likely_lens(far) is None and len(made) == 1 and made[0].iterations < 2 * uncalibrated.EVERY
