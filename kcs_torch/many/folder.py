@@ -104,8 +104,9 @@ def reconstruct_folder(
 
     Raises:
         OptionError: an option is out of range, there is nothing to do, or the folder's results were made otherwise.
+        SkeletonError: there is no skeleton of that name.
         OutputError: the results cannot be written.
-        FormatError: the file that says how they were made is damaged.
+        FormatError: the file that says how they were made is damaged, or that of the skeleton.
     """
     if not 0 <= shard < shards:
         raise OptionError(f"shard: expected a number from 0 to {shards - 1} of shards={shards}, got {shard}")
