@@ -160,7 +160,7 @@ def test_metric_upgrades_of_many_lengths():
     motion, counts = padded(parts), torch.tensor([20, 33, 27])
     starts = torch.stack([ist(motion), normal(3, 6, 3)])
     options = {"smoothness": 0.1, "tolerance": 1e-2, "num_steps": 40}
-    q, defect = metric_upgrade(motion, starts, counts=counts, apart=True, **options)
+    q, defect = metric_upgrade(motion, starts, counts=counts, together=1, **options)
     for k, part in enumerate(parts):
         alone, off = metric_upgrade(part, starts[:, k], **options)
         assert_close(q[:, k], alone)
@@ -170,7 +170,7 @@ def test_metric_upgrades_of_many_lengths():
 def test_cameras_of_many_lengths():
     parts = [walk(n, turn=120.0).points for n in (30, 40, 36)]
     parts = [(x - x.mean(1, keepdim=True)) / x.std() for x in parts]
-    found = orthographic_cameras(padded(parts), apart=True, counts=torch.tensor([30, 40, 36]))
+    found = orthographic_cameras(padded(parts), together=1, counts=torch.tensor([30, 40, 36]))
     for one, part in zip(found, parts, strict=True):
         ours, alone = (complete_rotation(x) for x in (one[: len(part)], orthographic_cameras(part[None])[0]))
         turns = [x[1:] @ x[:-1].mT for x in (ours, alone)]  # the world is anybody's

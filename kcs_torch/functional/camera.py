@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import nearest_rotation
+from kcs_torch.functional.eigen import eigh
 from kcs_torch.functional.ranks import median
 
 __all__ = [
@@ -120,7 +121,7 @@ def factorize(tracks: Tensor, rank: int) -> tuple[Tensor, Tensor]:
         raise ShapeError(f"factorize: expected a rank within 1..{min(2 * frames, joints)}, got {rank}")
     stacked = tracks.mT.flatten(-3, -2)  # (..., 2T, N), rows x1, y1, x2, y2, ...
     if stacked.shape[-2] >= joints:
-        _, vectors = torch.linalg.eigh(stacked.mT @ stacked)
+        _, vectors = eigh(stacked.mT @ stacked)
         shape = vectors.flip(-1)[..., :rank].mT
     else:
         shape = torch.linalg.svd(stacked, full_matrices=False)[2][..., :rank, :]

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import NotFiniteError, ShapeError
+from kcs_torch.functional.eigen import eigh
 
 __all__ = ["LargestSum", "PSDShrink", "ShrinkSingularValues", "applied", "batch_first", "why_failed"]
 
@@ -149,7 +150,7 @@ class PSDShrink(torch.autograd.Function):
 
     @staticmethod
     def forward(matrix: Tensor, threshold: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        value, vector = torch.linalg.eigh(matrix)
+        value, vector = eigh(matrix)
         f = (value - threshold[..., None]).clamp_min(0)
         return (vector * f[..., None, :]) @ vector.mT, value, vector
 
@@ -242,7 +243,7 @@ def rotate(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     Returns ``matrix @ V`` (M, n), its column norms (n), which are the singular values in rising order, and V (n, n).
     """
     work = matrix if tall(matrix) else matrix.mT
-    _, right = torch.linalg.eigh(work.mT @ work)
+    _, right = eigh(work.mT @ work)
     rotated = work @ right
     return rotated, torch.linalg.vector_norm(rotated, dim=-2), right
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.derivatives import LargestSum, PSDShrink, ShrinkSingularValues, applied, why_failed
+from kcs_torch.functional.eigen import eigvalsh
 
 __all__ = ["dct_basis", "log_det", "nuclear_norm", "psd_shrink", "singular_values", "spectral_norm", "svt"]
 
@@ -174,7 +175,7 @@ def singular_values(matrix: Tensor) -> Tensor:
         work = _double(matrix)
         gram = work.mT @ work if work.shape[-2] >= work.shape[-1] else work @ work.mT
         try:
-            values = torch.linalg.eigvalsh(gram)
+            values = eigvalsh(gram)
         except torch.linalg.LinAlgError as error:
             raise why_failed(matrix, error) from None
         return values.clamp_min(0).sqrt().flip(-1).to(matrix.dtype)

@@ -104,9 +104,9 @@ class Method(ABC):
             tracks = self.prepared(tracks)
             inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
-            result = finish(self, tracks, found, size, known, time.perf_counter() - begin)
+            result = self._finished(tracks, found, size, known, time.perf_counter() - begin)
         self._warn(result)
-        return result
+        return _back(result, tracks)
 
     def many(self, tracks: Sequence[Tracks]) -> list[Reconstruction]:
         """Reconstruct several clips, of one length or many: together where the method can, else one by one.
@@ -131,14 +131,23 @@ class Method(ABC):
             found = self.solve_all([inner for inner, _, _ in parts])
             each = (time.perf_counter() - begin) / max(len(tracks), 1)
             rows = zip(tracks, found, parts, strict=True)
-            results = [finish(self, one, estimate, size, known, each) for one, estimate, (_, size, known) in rows]
+            results = [self._finished(one, estimate, size, known, each) for one, estimate, (_, size, known) in rows]
         for result in results:
             self._warn(result)
-        return results
+        return [_back(result, one) for result, one in zip(results, tracks, strict=True)]
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
         """Reconstruct normalised tracks of several clips; one by one unless a method knows better."""
         return [self.solve(one, None) for one in tracks]
+
+    def _finished(
+        self, tracks: Tracks, found: Estimate, size: Tensor, known: Tensor, seconds: float
+    ) -> Reconstruction:
+        """What :func:`finish` makes of an estimate, on the processor: its many small steps would hold up a GPU."""
+        if tracks.points.device.type == "cpu":
+            return finish(self, tracks, found, size, known, seconds)
+        with torch.device("cpu"):
+            return finish(self, tracks.to("cpu"), found.to("cpu"), size.cpu(), known.cpu(), seconds)
 
     def _normalised(self, tracks: Tracks) -> tuple[Tracks, Tensor, Tensor]:
         """Tracks about their middle, of root mean square 1; that size; and the frames (T,) that show something."""
@@ -197,6 +206,12 @@ class Method(ABC):
         """Raise an OptionError for ``field`` unless the rule holds."""
         if not rule:
             raise OptionError(f"{self.name}: {field}: expected {expected}, got {getattr(self, field)!r}")
+
+
+def _back(result: Reconstruction, tracks: Tracks) -> Reconstruction:
+    """A result that was finished on the processor, on the device of the tracks that it was made from."""
+    device = tracks.points.device
+    return result if device.type == "cpu" else result.moved(lambda x: x.to(device), tracks)
 
 
 @contextlib.contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -13,8 +13,8 @@ from kcs_torch.solvers.ist import ist, metric_upgrade
 __all__ = ["orthographic_cameras"]
 
 
-RUN = 8
-"""Clips whose starts are tried together: more would leave the processor's cache."""
+RUN, MANY = 8, 1024
+"""Clips whose starts are tried together: more would leave a processor's cache, or take a GPU's memory."""
 
 
 def orthographic_cameras(
@@ -24,7 +24,7 @@ def orthographic_cameras(
     num_starts: int = 7,
     smoothness: float = 0.1,
     seed: int = 0,
-    apart: bool = False,
+    together: int | None = None,
     counts: Tensor | None = None,
 ) -> Tensor:
     """Estimate orthographic cameras by rank-3K factorisation and metric upgrade.
@@ -40,7 +40,8 @@ def orthographic_cameras(
         num_starts: random starts beside the relaxation's.
         smoothness: weight of the rows' second differences.
         seed: of the random starts.
-        apart: the batch is of different clips, each of which is refined as far as it is alone.
+        together: the batch is of different clips with so many windows each, which are refined as far as a clip is
+            alone; of a single one if None.
         counts: (W,) frames of each clip, where shorter ones are padded with zeros at their end; they have no fewer
             frames than joints, or are all of one length.
 
@@ -66,18 +67,20 @@ def orthographic_cameras(
     relaxed = ist(motion[..., : 3 * ranks[0]], num_steps=30)
     generator = torch.Generator().manual_seed(seed)
     window = torch.arange(windows, device=tracks.device)
+    run = RUN if tracks.device.type == "cpu" else MANY
     cameras, defects = [], []
     for k in ranks:
         part = motion[..., : 3 * k]
         random = torch.randn(num_starts, 1, 3 * k, 3, generator=generator, dtype=torch.float64, device="cpu").to(motion)
         starts = torch.nn.functional.pad(relaxed, (0, 0, 0, 3 * k - relaxed.shape[-2]))
         starts = torch.cat([starts[None], random.expand(-1, windows, -1, -1)])
-        options = {"smoothness": smoothness, "apart": apart}
-        runs = zip(part.split(RUN), starts.split(RUN, 1), count.split(RUN), strict=True)
-        tried = [metric_upgrade(*two, tolerance=0, num_steps=12, counts=n, **options) for *two, n in runs]  # type: ignore
+        runs = zip(part.split(run), starts.split(run, 1), count.split(run), strict=True)
+        options: dict[str, Any] = {"smoothness": smoothness, "num_steps": 12, "tolerance": 0.0}
+        tried = [metric_upgrade(*two, counts=n, **options) for *two, n in runs]
         q, defect = (torch.cat(parts, 1) for parts in zip(*tried, strict=True))
         best = defect.topk(min(2, len(defect)), dim=0, largest=False).indices
-        q, defect = metric_upgrade(part, q[best, window], tolerance=1e-2, num_steps=60, counts=count, **options)  # type: ignore[arg-type]
+        options |= {"num_steps": 60, "tolerance": 1e-2, "together": together}
+        q, defect = metric_upgrade(part, q[best, window], counts=count, **options)
         cameras.append(rows_to_cameras(part @ q[:, :, None])[0])
         defects.append(defect)
     candidates, defect = torch.cat(cameras), torch.cat(defects)  # (C, W, T, 2, 3), (C, W)

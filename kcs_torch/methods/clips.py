@@ -15,9 +15,10 @@ from kcs_torch.types import Tracks
 __all__ = ["Clips", "in_batches"]
 
 FRAMES = 2048
-"""Frames of a batch, padding included, on a processor: more would leave its cache. A GPU takes RATIO times as many."""
+"""Frames of a batch, padding included, on a processor: more would leave its cache."""
 
-RATIO = 64
+SHARE = 128 * 1024
+"""Bytes of a GPU's memory for each frame of a batch: methods take a third of it in double precision."""
 
 SPREAD = 1.5
 """The longest clip of a batch has at most so many times the frames of the shortest: no more than a third is padding."""
@@ -85,6 +86,13 @@ def padded(parts: Sequence[Tensor]) -> Tensor:
     )
 
 
+def batch_frames(device: torch.device) -> int:
+    """Frames of a batch, at most."""
+    if device.type != "cuda":
+        return FRAMES
+    return max(FRAMES, torch.cuda.get_device_properties(device).total_memory // SHARE)
+
+
 def in_batches(
     tracks: Sequence[Tracks],
     solve: Callable[[list[Tracks]], list[Found]],
@@ -103,7 +111,7 @@ def in_batches(
         one = tracks[i]
         batches = groups.setdefault((one.skeleton, one.points.dtype, one.points.device, kind(one)), [])
         last = batches[-1] if batches else []
-        most = FRAMES if one.points.device.type == "cpu" else RATIO * FRAMES
+        most = batch_frames(one.points.device)
         fits = last and (len(last) + 1) * one.num_frames <= most
         if fits and one.num_frames <= SPREAD * tracks[last[0]].num_frames:
             last.append(i)

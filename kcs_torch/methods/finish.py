@@ -96,6 +96,11 @@ class Estimate:
     standing: Tensor | None = None
     doubt: str = ""
 
+    def to(self, device: str) -> Estimate:
+        """The same on another device."""
+        held = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **held, alternatives=tuple(other.to(device) for other in self.alternatives))  # type: ignore[arg-type]
+
 
 def finish(
     method: Method, tracks: Tracks, found: Estimate, size: Tensor, known: Tensor, seconds: float

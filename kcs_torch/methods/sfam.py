@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -129,10 +130,8 @@ class SfAM(Method):
         back = order.argsort()
         local, rows, change = (torch.cat(x, 1)[:, back] for x in zip(*parts, strict=True))
         del parts
-        ends = zip(local, rows if cameras is None else [None] * len(tracks), starts, clips.counts, strict=True)
-        joined = [join_windows(*one) for one in ends]
-        local = padded([x for x, _ in joined])
-        rows = padded([x for _, x in joined if x is not None]) if cameras is None else cameras[None]
+        local, joined = _join(local, rows if cameras is None else None, clips.counts, starts)
+        rows = joined if cameras is None else cameras[None]
         settled = change.amax(1) <= SETTLED
         notes: list[tuple[str, ...]] = [()] * len(tracks)
         if cameras is None:
@@ -179,12 +178,13 @@ class SfAM(Method):
         return local, rows, solution.change.view(first.shape)
 
     def _cameras(self, tracks: Tensor, counts: Tensor | None) -> Tensor:
-        """Cameras (K, V, T, 2, 3) of windows, some at a time: the search tries several starts for each."""
-        if tracks.shape[1] > 1:
-            parts = [[orthographic_cameras(part, self.rank) for part in one.split(SEARCH)] for one in tracks]
-            return torch.stack([torch.cat(one) for one in parts])
-        sizes = None if counts is None else counts[:, 0]
-        return orthographic_cameras(tracks[:, 0], self.rank, apart=True, counts=sizes)[:, None]
+        """Cameras (K, V, T, 2, 3) of windows, some of a long clip at a time: the search tries several starts."""
+        sizes = None if counts is None else counts.flatten()
+        parts = [
+            orthographic_cameras(part.flatten(0, 1), self.rank, together=part.shape[1], counts=sizes)
+            for part in tracks.split(SEARCH, 1)
+        ]
+        return torch.cat([part.unflatten(0, (len(tracks), -1)) for part in parts], 1)
 
     def _smooth(self, tracks: Tensor) -> Tensor:
         """Tracks (T, N, 2) as sums of a few cosines."""
@@ -272,7 +272,7 @@ class SfAM(Method):
 
 
 SEARCH, CHUNK = 32, 8
-"""Windows of one clip whose cameras are searched together; and windows beyond the first ones that are solved together:
+"""Windows of a clip whose cameras are searched together; and windows beyond the first ones that are solved together:
 more would only take memory."""
 
 LEAD = 40
@@ -287,6 +287,25 @@ SHORT = 10
 
 EVEN = 0.05
 """A constant angular velocity explains the cameras where their median deviation is below this share of its turn."""
+
+
+def _join(
+    points: Tensor, cameras: Tensor | None, counts: Sequence[int], starts: Sequence[list[int]]
+) -> tuple[Tensor, Tensor]:
+    """Windows (K, V, T, ...) of clips as one run (K, F, ...) each, padded; clips of one length are joined together.
+
+    Without cameras, the second is empty.
+    """
+    parts: list[tuple[Tensor, Tensor]] = []
+    order = sorted(range(len(counts)), key=lambda i: counts[i])
+    for frames, group in itertools.groupby(order, key=lambda i: counts[i]):
+        index = list(group)
+        some: slice | list[int] = slice(None) if len(index) == len(counts) else index
+        x, r = join_windows(points[some], None if cameras is None else cameras[some], starts[index[0]], frames)
+        parts += zip(x, x[..., :0, :] if r is None else r, strict=True)
+    back = sorted(range(len(order)), key=order.__getitem__)
+    joined, rows = (padded([parts[i][end] for i in back]) for end in (0, 1))
+    return joined, rows
 
 
 def _fill_blank_frames(clips: Clips) -> Clips:

@@ -81,7 +81,7 @@ def metric_upgrade(
     evenness: float = 0.0,
     num_steps: int = 150,
     tolerance: float = 1e-4,
-    apart: bool = False,
+    together: int | None = None,
     counts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Refine Q by Levenberg-Marquardt on the orthonormality defect of the rows ``motion @ Q``.
@@ -99,8 +99,8 @@ def metric_upgrade(
         evenness: weight of the variance of the frames' scales: 0 for weak perspective, 1 for orthographic cameras.
         num_steps: steps, at most; each is kept only where it lowers the cost.
         tolerance: stop where steps lower the cost by less than this share.
-        apart: every motion of the batch stops for itself, with all its starts, and what is beside it makes no
-            difference; else all go on until the last one stops.
+        together: so many neighbours in the batch, with all their starts, go on until the last of them stops, and what
+            is beside them makes no difference: 1, and every motion stops for itself; None, and all are together.
         counts: (...) frames of each motion, where shorter ones are padded with zeros at their end; without evenness.
 
     Returns:
@@ -187,9 +187,11 @@ def metric_upgrade(
         state = iterate(step, state, num_steps=min(CHECK, num_steps - made)).value
         found = found.index_copy(0, left, state[0])
         goes_on = (state[4] > tolerance).any(-1)
+        if together is not None:
+            goes_on = goes_on.view(-1, together).any(-1).repeat_interleave(together)
         if not bool(goes_on.any()):
             break
-        if apart and not bool(goes_on.all()):  # what has settled takes no more steps
+        if together is not None and not bool(goes_on.all()):  # what has settled takes no more steps
             state, left = tuple(x[goes_on] for x in state), left[goes_on]
     q = found.mT.movedim(1, 0).reshape(*shape, rank, 3)
     return q, orthonormality_defect(motion @ q[..., None, :, :]).sum(-1) / count
@@ -220,10 +222,26 @@ def _quadratic_forms(a: Tensor, b: Tensor, evenness: float = 0.0) -> Tensor:
         size = (a[..., row] * a[..., column] + b[..., row] * b[..., column]) / 2
         forms = torch.cat([forms, evenness**0.5 * (size - size.mean(-2, keepdim=True))], -2)
     if forms.shape[-2] > forms.shape[-1] and not forms.requires_grad:  # QR without its Q has no derivative
-        forms = torch.linalg.qr(forms, mode="r").R
+        forms = _triangle(forms)
     place = torch.zeros(rank, rank, dtype=torch.long, device=a.device)
     place[row, column] = place[column, row] = torch.arange(len(row), device=a.device)
     return forms[..., place]
+
+
+def _triangle(matrix: Tensor) -> Tensor:
+    """A triangle R (..., N, N) with R^T R = A^T A for A (..., M, N), M above N.
+
+    GPUs take QR decompositions one after another, Cholesky factors together: theirs is that of A^T A in double
+    precision, with as much on its diagonal as rounding may take away.
+    """
+    if not matrix.is_cuda:
+        return torch.linalg.qr(matrix, mode="r").R
+    wide = matrix.double()
+    gram = wide.mT @ wide
+    diagonal = gram.diagonal(dim1=-2, dim2=-1)
+    slack = 1e-13 * diagonal.sum(-1, keepdim=True) + torch.finfo(gram.dtype).tiny
+    gram = gram + torch.diag_embed(slack.expand_as(diagonal))
+    return torch.linalg.cholesky(gram, upper=True).to(matrix.dtype)
 
 
 def _check(motion: Tensor, name: str) -> None:

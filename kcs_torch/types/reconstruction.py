@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -119,6 +121,16 @@ class Reconstruction:
     def observed(self) -> Tensor:
         """(T, num_observed, 3): the joints of the tracks as they were given, without the virtual ones."""
         return self.points[:, : self.skeleton.num_observed]
+
+    def to(self, *args: Any, **kwargs: Any) -> Reconstruction:
+        """Move or cast the tensors, those of the tracks and of the alternatives too, as ``Tensor.to``."""
+        return self.moved(lambda x: x.to(*args, **kwargs), self.tracks.to(*args, **kwargs))
+
+    def moved(self, move: Callable[[Tensor], Tensor], tracks: Tracks) -> Reconstruction:
+        """The same with ``move`` of its tensors, and made from these tracks."""
+        held = {name: move(value) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        others = tuple(other.moved(move, tracks) for other in self.alternatives)
+        return replace(self, **held, tracks=tracks, alternatives=others)  # type: ignore[arg-type]
 
     def mirrored(self) -> Reconstruction:
         """The other solution that parallel rays admit: depth with the opposite sign.
