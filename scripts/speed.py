@@ -210,43 +210,50 @@ def spent(run: Callable[[], object], runs: int) -> tuple[float, float]:
     return cpu, wall
 
 
-def on_gpu(device: str, batches: list[int], frames: int, names: Sequence[str]) -> Iterator[Row]:
+def on_gpu(device: str, batches: list[int], frames: int, names: Sequence[str], most: float) -> Iterator[Row]:
     """Clips and frames a second of batches on a device, in single precision, and on the CPU in double.
 
     ``SfAM's layer`` is cameras and shape of a stacked batch, without what a :class:`Reconstruction` tells of each clip.
+    What took more than ``most`` seconds is not tried with more clips.
     """
     body = kt.SKELETONS["h36m17"]
     clips = [walking_person(frames, turn=TURN, yaw=7.0 * i).tracks for i in range(16)]
     sfam = kt.SfAM()
 
     def layer(points: torch.Tensor) -> None:
-        rows = torch.cat([orthographic_cameras(part) for part in points.split(256)])
+        rows = orthographic_cameras(points, together=1)
         sfam.shape(points, rows, torch.ones_like(points[..., 0]), body, one_body=False)
 
     for where, dtype in ((device, torch.float32), ("cpu", torch.float64)):
         tracks = [one.to(where).to(dtype) for one in clips]
         stack = torch.stack([one.points - one.points.mean(1, keepdim=True) for one in tracks])
         stack = stack / stack.square().mean((1, 2, 3), keepdim=True).sqrt()
-        for batch in batches:
-            if where == "cpu" and batch > 64:
-                continue  # a core gains nothing from more
-            runs: dict[str, Callable[[], object]] = {
-                name: partial(kt.METHODS[name]().many, [tracks[i % 16] for i in range(batch)]) for name in names
-            }
-            runs["SfAM's layer"] = partial(layer, stack[torch.arange(batch, device=stack.device) % 16])
-            for name, run in runs.items():
-                seconds = []
+        for name in ("SfAM's layer", *names):
+            for batch in batches:
+                if where == "cpu" and batch > 64:
+                    break  # a core gains nothing from more
+                run: Callable[[], object] = (
+                    partial(kt.METHODS[name]().many, [tracks[i % 16] for i in range(batch)])
+                    if name in kt.METHODS
+                    else partial(layer, stack[torch.arange(batch, device=stack.device) % 16])
+                )
                 with torch.no_grad():
-                    for _ in range(2):
-                        start = time.perf_counter()
-                        run()
-                        if where != "cpu":
-                            torch.cuda.synchronize()
-                        seconds.append(time.perf_counter() - start)
-                rate = batch / seconds[-1]
+                    spent = [elapsed(run, where) for _ in range(2)][-1]
+                rate = batch / spent
                 yield {"method": name, "device": where, "batch": batch, "clips a second": rate} | {
                     "frames a second": rate * frames
                 }
+                if spent > most:
+                    break
+
+
+def elapsed(run: Callable[[], object], device: str) -> float:
+    """Seconds that a run takes, what it leaves to a GPU included."""
+    start = time.perf_counter()
+    run()
+    if device != "cpu":
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
 
 
 def peak_memory(names: Sequence[str], counts: list[int]) -> Iterator[Row]:
@@ -312,6 +319,7 @@ def arguments(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--scale", type=int, nargs="+", default=[1000, 100_000], metavar="FRAMES")
     parser.add_argument("--device", default="cuda", help="of the part gpu")
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 4, 16, 64, 256, 1024, 4096], metavar="CLIPS")
+    parser.add_argument("--most", type=float, default=10.0, help="seconds after which it tries no larger batch")
     parser.add_argument("--frames", type=int, default=FRAMES, help="of methods, kernels and joints")
     parser.add_argument("--growth", type=int, nargs="+", default=[100, 300, 1000, 3000, 10000], metavar="FRAMES")
     parser.add_argument("--memory", type=int, nargs="+", default=[1000, 10000], metavar="FRAMES")
@@ -338,7 +346,7 @@ def main(words: list[str] | None = None) -> None:
         "joints": lambda: grow_joints(options.which, options.joints, options.frames, options.runs),
         "batch": lambda: together(options.which, options.short, options.clips, min(options.runs, 3)),
         "scale": lambda: peak_memory(options.which, options.scale),
-        "gpu": lambda: on_gpu(options.device, options.batches, options.frames, options.which),
+        "gpu": lambda: on_gpu(options.device, options.batches, options.frames, options.which, options.most),
     }
     if "gpu" in options.parts and options.device == "cuda" and not torch.cuda.is_available():
         raise SystemExit(

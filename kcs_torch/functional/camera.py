@@ -151,10 +151,38 @@ def rows_to_cameras(rows: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         cameras (..., 2, 3) with orthonormal rows and scales (...), non-negative: ``rows ~ scale * cameras``.
         Rows that vanish or are parallel give an arbitrary valid camera.
+
+    Note:
+        With n the unit normal of the rows' plane, the second row of a camera in this plane is n x c for a first row c.
+        So c.a + (n x c).b = c.(a + b x n) is to be as large as can be, and c is the direction of a + b x n.
     """
-    square = torch.cat([rows, torch.zeros_like(rows[..., :1, :])], -2)
-    cameras = nearest_rotation(square, reflect=True)[..., :2, :]
+    with torch.no_grad():
+        size = rows.abs().amax((-2, -1), keepdim=True)
+        size = torch.where(size > 0, size, torch.ones_like(size))
+    a, b = (rows / size).unbind(-2)
+    normal = torch.linalg.cross(a, b)
+    with torch.no_grad():
+        length = lambda x: torch.linalg.vector_norm(x, dim=-1, keepdim=True)  # noqa: E731
+        firm = length(normal) > 16 * torch.finfo(rows.dtype).eps * torch.maximum(length(a), length(b)).square()
+        spare = _across(torch.where(length(a) >= length(b), a, b))
+    normal = torch.where(firm, normal, spare)
+    normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+    along = a + torch.linalg.cross(b, normal)
+    with torch.no_grad():
+        some = along.any(-1, keepdim=True)
+    along = torch.where(some, along, _across(normal).detach())
+    first = along / torch.linalg.vector_norm(along, dim=-1, keepdim=True)
+    second = torch.linalg.cross(normal, first)  # a right angle, if not quite of length 1 where the plane is uncertain
+    cameras = torch.stack([first, second / torch.linalg.vector_norm(second, dim=-1, keepdim=True)], -2)
     return cameras, (rows * cameras).sum((-2, -1)) / 2
+
+
+def _across(vectors: Tensor) -> Tensor:
+    """Some direction at a right angle to each vector (..., 3), at any length but 0."""
+    least = vectors.abs().argmin(-1, keepdim=True)
+    axis = torch.zeros_like(vectors).scatter_(-1, least, 1.0)
+    found = torch.linalg.cross(vectors, axis)
+    return torch.where(found.any(-1, keepdim=True), found, axis)
 
 
 def viewpoint_turn(cameras: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 __all__ = ["eigh", "eigvalsh"]
 
-BATCHED, MOST = 32, 256
+BATCHED, MOST = 32, 128
 """Rows up to which cuSOLVER takes matrices together, and beyond which one of them keeps a GPU busy enough."""
 
 

@@ -1,4 +1,4 @@
-"""Eigenvectors of many small symmetric matrices at once on a GPU, by Jacobi rotations in Triton kernels.
+"""Eigenvectors of many small symmetric matrices at once on a GPU, by Jacobi rotations in a Triton kernel.
 
 cuSOLVER takes matrices of up to 32 rows in batches and larger ones one after another, each of which leaves nearly the
 whole device idle. Here every matrix has a thread block of its own. A round rotates n/2 disjoint pairs of rows and
@@ -31,15 +31,16 @@ leaves about the square of what it finds."""
 STEPS = 2
 """Of the QR algorithm."""
 
-TILE = 32
-"""Pairs whose columns are rotated at once: a tile for each of a pair's four entries has to fit into registers."""
+TILES = {16: (16, 4), 32: (16, 4), 64: (16, 8)}
+"""For up to so many pairs: how many have their columns rotated at once (a tile for each of a pair's four entries has to
+fit into registers), and the warps of a thread block."""
 
 
 def jacobi(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Return eigenvalues (K, n) in rising order, and eigenvectors (K, n, n) in columns.
 
     Args:
-        matrix: (K, n, n), symmetric, on a GPU; n of 2 or more. NaN and infinity lead to NaN.
+        matrix: (K, n, n), symmetric, on a GPU; n from 2 to 128. NaN and infinity lead to NaN.
     """
     size = matrix.shape[-1]
     peak = matrix.abs().amax((-2, -1), keepdim=True)  # first, so that no square overflows
@@ -58,54 +59,37 @@ def jacobi(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _householder(matrix: Tensor) -> Tensor:
-    """The orthogonal Q^T (K, n, n) of the QR decomposition of (K, n, n)."""
-    size = matrix.shape[-1]
-    out = torch.empty_like(matrix, memory_format=torch.contiguous_format)
-    width = triton.next_power_of_2(size)
-    _reflect[(len(matrix),)](matrix.contiguous(), out, n=size, WIDTH=width, num_warps=8 if width <= 64 else 16)
-    return out
+    """The orthogonal Q^T (K, n, n) of the QR decomposition of (K, n, n).
+
+    Of the reflections I - tau v v^T, which ``geqrf`` yields for many matrices at once, their product is
+    Q = I - V W^-1 V^T with the triangle W of 1 / tau on and v_i . v_j above the diagonal.
+    """
+    packed, tau = torch.geqrf(matrix)
+    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    moves = tau != 0
+    vectors = (packed.tril(-1) + eye) * moves[:, None]
+    inner = (vectors.mT @ vectors).triu(1) + torch.diag_embed(1 / torch.where(moves, tau, torch.ones_like(tau)))
+    return eye - vectors @ torch.linalg.solve_triangular(inner.mT, vectors.mT, upper=False)
 
 
 def _rotate(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Eigenvalues (K, n) of (K, n, n) in no order, and eigenvectors in rows."""
     count, size = matrix.shape[:2]
     even = size + size % 2  # a row of zeros for an odd one to be paired with: it is never turned
-    work = torch.nn.functional.pad(matrix, (0, even - size, 0, even - size)).clone(memory_format=torch.contiguous_format)
+    work = matrix.new_zeros(count, even, even)
+    work[:, :size, :size] = matrix
     vectors = torch.eye(even, dtype=matrix.dtype, device=matrix.device).expand(count, -1, -1).contiguous()
     half = max(16, triton.next_power_of_2(even // 2))
     turns = work.new_empty(count, 2, half)
+    tile, warps = TILES[half]
     _sweeps[(count,)](
-        work, vectors, turns, SMALL[matrix.dtype] ** 2, SWEEPS,
-        n=even, HALF=half, TILE=min(half, TILE), num_warps=4 if half <= 32 else 8,
-    )  # fmt: skip
+        work, vectors, turns, SMALL[matrix.dtype] ** 2, SWEEPS, n=even, HALF=half, TILE=tile, num_warps=warps
+    )
     return work.diagonal(dim1=-2, dim2=-1)[:, :size], vectors[:, :size, :size]
 
 
 @triton.jit
-def _reflect(matrix, out, n: tl.constexpr, WIDTH: tl.constexpr):  # type: ignore[no-untyped-def]  # noqa: N803
-    """Write to out[i] the product of the reflections that make matrix[i] of program i a triangle."""
-    own = tl.program_id(0).to(tl.int64) * n * n
-    line = tl.arange(0, WIDTH)
-    row = line[:, None]
-    column = line[None, :]
-    inside = (row < n) & (column < n)
-    left = tl.load(matrix + own + row * n + column, mask=inside, other=0.0)
-    turn = tl.where(row == column, 1.0, 0.0).to(left.dtype)
-    for k in range(0, n - 1):
-        normal = tl.sum(tl.where(column == k, left, 0.0), axis=1)
-        normal = tl.where(line >= k, normal, 0.0)
-        head = tl.sum(tl.where(line == k, normal, 0.0), axis=0)
-        length = tl.sqrt(tl.sum(normal * normal, axis=0))
-        normal += tl.where(line == k, tl.where(head < 0, -length, length), 0.0)
-        square = length * (length + tl.abs(head))  # half of the normal's
-        scaled = normal / tl.where(square > 0, square, 1.0)
-        left -= scaled[:, None] * tl.sum(normal[:, None] * left, axis=0)[None, :]
-        turn -= scaled[:, None] * tl.sum(normal[:, None] * turn, axis=0)[None, :]
-    tl.store(out + own + row * n + column, turn, mask=inside)
-
-
-@triton.jit
-def _pairs(k, turn, n: tl.constexpr, COUNT: tl.constexpr):  # type: ignore[no-untyped-def]  # noqa: N803
+def _pairs(k, turn, n: tl.constexpr, COUNT: tl.constexpr):  # type: ignore[no-untyped-def]
     """The k-th pair of a round: the last one stays where it is, and the others go round.
 
     They are said to be in order, which they nearly are, so that neighbouring threads take neighbouring columns.
@@ -119,7 +103,7 @@ def _pairs(k, turn, n: tl.constexpr, COUNT: tl.constexpr):  # type: ignore[no-un
 
 @triton.jit
 def _sweeps(  # type: ignore[no-untyped-def]
-    work, vectors, turns, small, sweeps, n: tl.constexpr, HALF: tl.constexpr, TILE: tl.constexpr  # noqa: N803
+    work, vectors, turns, small, sweeps, n: tl.constexpr, HALF: tl.constexpr, TILE: tl.constexpr
 ):  # fmt: skip
     """Diagonalise work[i] of program i in place; vectors[i] collects the rotations, turns[i] holds those of a round."""
     own = tl.program_id(0).to(tl.int64)
@@ -141,7 +125,7 @@ def _sweeps(  # type: ignore[no-untyped-def]
     while (made < sweeps) & (beside > small * whole):
         made += 1
         found = tl.zeros((HALF,), dtype=work.dtype.element_ty)
-        for turn in range(0, n - 1):
+        for turn in range(n - 1):
             p, q = _pairs(k, turn, n, HALF)
             app = tl.load(work + p * n + p, mask=live, other=0.0)
             aqq = tl.load(work + q * n + q, mask=live, other=0.0)

@@ -104,9 +104,7 @@ class Method(ABC):
             tracks = self.prepared(tracks)
             inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
-            result = self._finished(tracks, found, size, known, time.perf_counter() - begin)
-        self._warn(result)
-        return _back(result, tracks)
+        return self._finished(tracks, found, size, known, time.perf_counter() - begin)
 
     def many(self, tracks: Sequence[Tracks]) -> list[Reconstruction]:
         """Reconstruct several clips, of one length or many: together where the method can, else one by one.
@@ -129,12 +127,9 @@ class Method(ABC):
             tracks = [self.prepared(one) for one in tracks]
             parts = [self._normalised(one) for one in tracks]
             found = self.solve_all([inner for inner, _, _ in parts])
-            each = (time.perf_counter() - begin) / max(len(tracks), 1)
-            rows = zip(tracks, found, parts, strict=True)
-            results = [self._finished(one, estimate, size, known, each) for one, estimate, (_, size, known) in rows]
-        for result in results:
-            self._warn(result)
-        return [_back(result, one) for result, one in zip(results, tracks, strict=True)]
+        each = (time.perf_counter() - begin) / max(len(tracks), 1)
+        rows = zip(tracks, found, parts, strict=True)
+        return [self._finished(one, estimate, size, known, each) for one, estimate, (_, size, known) in rows]
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
         """Reconstruct normalised tracks of several clips; one by one unless a method knows better."""
@@ -144,10 +139,17 @@ class Method(ABC):
         self, tracks: Tracks, found: Estimate, size: Tensor, known: Tensor, seconds: float
     ) -> Reconstruction:
         """What :func:`finish` makes of an estimate, on the processor: its many small steps would hold up a GPU."""
-        if tracks.points.device.type == "cpu":
-            return finish(self, tracks, found, size, known, seconds)
-        with torch.device("cpu"):
-            return finish(self, tracks.to("cpu"), found.to("cpu"), size.cpu(), known.cpu(), seconds)
+        device = tracks.points.device
+        if device.type == "cpu":
+            with apart([tracks]):
+                result = finish(self, tracks, found, size, known, seconds)
+            self._warn(result)
+            return result
+        here = tracks.to("cpu")
+        with apart([here]):
+            result = finish(self, here, found.to("cpu"), size.cpu(), known.cpu(), seconds)
+        self._warn(result)
+        return result.moved(lambda x: x.to(device), tracks)
 
     def _normalised(self, tracks: Tracks) -> tuple[Tracks, Tensor, Tensor]:
         """Tracks about their middle, of root mean square 1; that size; and the frames (T,) that show something."""
@@ -206,12 +208,6 @@ class Method(ABC):
         """Raise an OptionError for ``field`` unless the rule holds."""
         if not rule:
             raise OptionError(f"{self.name}: {field}: expected {expected}, got {getattr(self, field)!r}")
-
-
-def _back(result: Reconstruction, tracks: Tracks) -> Reconstruction:
-    """A result that was finished on the processor, on the device of the tracks that it was made from."""
-    device = tracks.points.device
-    return result if device.type == "cpu" else result.moved(lambda x: x.to(device), tracks)
 
 
 @contextlib.contextmanager
