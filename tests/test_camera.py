@@ -24,6 +24,7 @@ from kcs_torch.functional import (
     back_project,
     complete_rotation,
     factorize,
+    nearest_rotation,
     orthonormality_defect,
     project,
     rows_to_cameras,
@@ -95,6 +96,20 @@ def test_rows_to_cameras_finds_the_nearest():
     size = (rows * others).sum((-2, -1), keepdim=True) / 2
     assert ((rows - size * others).square().sum((-2, -1)) >= best).all()
     assert (scales >= 0).all()
+
+
+@pytest.mark.parametrize("apart", [1.0, 1e-3, 1e-5])
+def test_rows_to_cameras_is_the_polar_factor(apart):
+    """By singular values, for rows that are nearly parallel, too."""
+    a, b = normal(50, 3), normal(50, 3, seed=1)
+    rows = torch.stack([a, normal(50, 1, seed=2) * a + apart * b], 1)
+    square = torch.nn.functional.pad(rows, (0, 0, 0, 1))
+    found, scales = rows_to_cameras(rows)
+    polar = nearest_rotation(square, reflect=True)[:, :2]
+    assert_close(found, polar, rtol=0, atol=1e-13 / apart**1.5)
+    assert_close(scales, torch.linalg.svdvals(square).sum(-1) / 2)
+    assert_close(found @ found.mT, torch.eye(2, dtype=torch.float64).expand(50, 2, 2))
+    assert apart < 1e-4 or gradcheck(rows_to_cameras, rows[:3])  # there no finite difference is small enough
 
 
 @pytest.mark.parametrize("dtype", FLOATS)

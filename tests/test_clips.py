@@ -71,6 +71,30 @@ def test_many_clips_are_those_of_one_after_the_other(method):
         assert settled_notes(told) == settled_notes(expected)
 
 
+def test_windows_of_many_clips_are_searched_and_joined_together():
+    """Three windows each, of two lengths that come in turns; a batch has no more operations than one of its clips."""
+    clips = [walk(n, turn=150.0, yaw=20.0 * i) for i, n in enumerate((50, 46, 50, 46))]
+    method = SfAM(window=20, overlap=5, num_steps=20)
+    for one, clip in zip(method.many(clips), clips, strict=True):
+        alone = method(clip)
+        assert_close(one.points, alone.points, rtol=0, atol=1e-6 * float(alone.points.std()))
+        assert_close(one.cameras, alone.cameras, rtol=0, atol=1e-6)
+    alone, together = (count_operations(lambda k=k: method.many(clips[::2][:1] * k)).total for k in (1, 8))
+    assert together < 3.5 * alone  # what is told of each clip is told one after another
+
+
+def test_metric_upgrades_stop_in_groups():
+    """Neighbours that belong together stop together, and what is beside them makes no difference."""
+    easy, hard = normal(20, 2, 6), normal(20, 2, 6, seed=1)
+    easy[:, :, 3:] *= 1e-6
+    motion, starts = torch.stack([easy, hard, hard, easy]), normal(2, 4, 6, 3, seed=2)
+    options = {"tolerance": 1e-3, "num_steps": 200}
+    pairs, _ = metric_upgrade(motion, starts, together=2, **options)
+    for k in (0, 2):
+        alone, _ = metric_upgrade(motion[k : k + 2], starts[:, k : k + 2], **options)
+        assert_close(pairs[:, k : k + 2], alone)
+
+
 def test_clips_settle_each_for_itself():
     """One is far from settled when it ends, the others are settled: each is told so as if it were alone."""
     method = SfAM(num_steps=12, final=0.2)

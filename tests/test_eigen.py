@@ -93,8 +93,8 @@ def test_on_a_gpu(size, batch, dtype):
     spread = 10 ** torch.linspace(0, -10, size)
     matrix = spectra(*spread[None].expand(torch.Size(batch).numel(), -1), dtype=dtype).to(GPU)
     values, vectors = eigh(matrix.unflatten(0, batch))
-    check(matrix, values.flatten(0, -2), vectors.flatten(0, -3), 1e-13 if dtype == torch.float64 else 1e-5)
-    assert_close(eigvalsh(matrix.unflatten(0, batch)), values, rtol=0, atol=1e-5)
+    check(matrix, values.flatten(0, -2), vectors.flatten(0, -3), 1e-13 if dtype == torch.float64 else 1e-4)
+    assert_close(eigvalsh(matrix.unflatten(0, batch)), values, rtol=0, atol=1e-4)
 
 
 @gpu_only

@@ -354,6 +354,19 @@ def test_mirrored_twice_is_itself_and_projects_equally():
     assert again.diagnostics == result.diagnostics
 
 
+def test_moved_and_cast_with_tracks_and_alternatives():
+    result = replace(walk_result(), alternatives=(walk_result().mirrored(),), root_depth=torch.zeros(40).double())
+    single = result.to(torch.float32)
+    for one in (single, *single.alternatives):
+        held = one.tracks.points, one.points, one.cameras, one.uncertainty
+        assert {x.dtype for x in held} == {torch.float32}
+    assert single.root_depth.dtype == torch.float32 and result.points.dtype == torch.float64
+    assert_close(single.points.double(), result.points, rtol=1e-6, atol=1e-6)
+    assert single.diagnostics == result.diagnostics and single.units == result.units
+    away = result.to("meta")
+    assert {away.points.device.type, away.lengths.device.type, away.tracks.weights.device.type} == {"meta"}
+
+
 def full(cameras):
     return torch.cat([cameras, torch.linalg.cross(cameras[:, :1], cameras[:, 1:])], 1)
 

@@ -31,7 +31,7 @@ leaves about the square of what it finds."""
 STEPS = 2
 """Of the QR algorithm."""
 
-TILES = {16: (16, 4), 32: (16, 4), 64: (16, 8)}
+TILES = {16: (16, 4), 32: (32, 8), 64: (32, 8)}
 """For up to so many pairs: how many have their columns rotated at once (a tile for each of a pair's four entries has to
 fit into registers), and the warps of a thread block."""
 
