@@ -9,7 +9,7 @@ import torch
 from numerics import count_operations, normal
 from torch.testing import assert_close
 
-from kcs_torch import KCS, SfAM, Tracks
+from kcs_torch import KCS, METHODS, SfAM, Tracks
 from kcs_torch.data import walking_person
 from kcs_torch.functional import best_path, complete_rotation, orbit
 from kcs_torch.methods import clips as module
@@ -69,6 +69,26 @@ def test_many_clips_are_those_of_one_after_the_other(method):
         told, expected = one.diagnostics, alone.diagnostics
         assert (told.converged, told.iterations) == (expected.converged, expected.iterations)
         assert settled_notes(told) == settled_notes(expected)
+
+
+@pytest.mark.parametrize("name", ["rigid", "pta", "csf", "bmm", "smsr", "local_rigidity"])
+def test_many_clips_by_the_classical_methods(name):
+    """Clips of one length go together, gaps, stiff bodies and all: the result is that of each one alone."""
+    method = METHODS[name]()
+    clips = [*CLIPS[1:4], *(walk(31, turn=90.0, missing=0.1 * k, yaw=20.0 * k, noise=2.0 * k) for k in range(3))]
+    clips.append(
+        replace(clips[0], points=clips[0].points[:1].expand(31, -1, -1), weights=clips[0].weights.expand(31, -1))
+    )
+    for one, clip in zip(method.many(clips), clips, strict=True):
+        alone = method(clip)
+        assert_close(one.points, alone.points, rtol=0, atol=1e-5 * float(alone.points.std()))
+        assert (one.diagnostics.converged, one.diagnostics.iterations) == (
+            alone.diagnostics.converged, alone.diagnostics.iterations
+        )  # fmt: skip
+    if name in ("rigid", "bmm", "smsr"):  # whose shapes go together, too
+        few = [walk(20, turn=90.0, yaw=10.0 * k) for k in range(6)]
+        alone, together = (count_operations(lambda k=k: method.many(few[:k])).total for k in (1, 6))
+        assert together < 3 * alone
 
 
 def test_windows_of_many_clips_are_searched_and_joined_together():

@@ -135,9 +135,7 @@ class Method(ABC):
         """Reconstruct normalised tracks of several clips; one by one unless a method knows better."""
         return [self.solve(one, None) for one in tracks]
 
-    def _finished(
-        self, tracks: Tracks, found: Estimate, size: Tensor, known: Tensor, seconds: float
-    ) -> Reconstruction:
+    def _finished(self, tracks: Tracks, found: Estimate, size: Tensor, known: Tensor, seconds: float) -> Reconstruction:
         """What :func:`finish` makes of an estimate, on the processor: its many small steps would hold up a GPU."""
         device = tracks.points.device
         if device.type == "cpu":

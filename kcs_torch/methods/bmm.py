@@ -6,13 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.spectral import spectral_norm, svt
-from kcs_torch.methods.factorised import Factorised, camera_rows
-from kcs_torch.solvers.iterate import Solution, iterate
+from kcs_torch.methods.factorised import SETTLED, Factorised, camera_rows
+from kcs_torch.solvers.iterate import Solution, iterate, relative_change
 
 __all__ = ["BMM"]
 
@@ -37,6 +36,7 @@ class BMM(Factorised):
     """
 
     name: ClassVar[str] = "bmm"
+    together: ClassVar[bool] = True
     rank: int = 12
     num_steps: int = 100
     mu: float = 0.5
@@ -70,9 +70,5 @@ class BMM(Factorised):
             return shrunk.unflatten(-1, ahead.shape[-2:]), shape
 
         shape, before = iterate(step, (start, start), num_steps=self.num_steps).value
-        change = torch.linalg.vector_norm(shape - before)
-        return Solution(shape, bool(change <= SETTLED * torch.linalg.vector_norm(shape)), self.num_steps)
-
-
-SETTLED = 1e-3
-"""Share of the shape that the last step may change it by."""
+        change = relative_change(before.flatten(-2), shape.flatten(-2))
+        return Solution(shape, bool((change <= SETTLED).all()), self.num_steps, change=change)

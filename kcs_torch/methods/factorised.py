@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from kcs_torch.functional.camera import complete_rotation, factorize, rows_to_cameras
 from kcs_torch.methods.base import Estimate, Method
+from kcs_torch.methods.clips import in_batches
 from kcs_torch.methods.mirror import mirror_sign
 from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.solvers.completion import complete_tracks
@@ -20,7 +21,7 @@ from kcs_torch.solvers.iterate import Solution
 from kcs_torch.solvers.nullspace import null_space_upgrade
 from kcs_torch.types import Tracks
 
-__all__ = ["Factorised", "camera_rows", "fit_basis_shapes", "trajectory_design"]
+__all__ = ["Factorised", "camera_rows", "fit_basis_shapes", "trajectory_design", "upgraded_rows"]
 
 EMPTY = 1e-6
 """Singular values of the tracks below this share of the largest are rounding."""
@@ -33,70 +34,118 @@ FILLED = 0.1
 class Factorised(Method):
     """Cameras by :meth:`find_cameras`, then shapes by :meth:`find_shape`; bones are not looked at.
 
-    Unseen joints are completed first (low rank); they count little in the shape.
+    Unseen joints are completed first (low rank); they count little in the shape. Clips of one length, in which the same
+    joints are seen, go together.
     """
 
     keeps_lengths: ClassVar[bool] = False
     knows_bones: ClassVar[bool] = False
+    together: ClassVar[bool] = False
+    """Whether :meth:`find_shape` takes several clips (..., T, N, 2); else it is called for each."""
 
     @abstractmethod
     def find_cameras(self, tracks: Tensor) -> Tensor:
-        """Camera rows (T, 2, 3) of complete, centred tracks (T, N, 2)."""
+        """Camera rows (..., T, 2, 3) of complete, centred tracks (..., T, N, 2)."""
 
     @abstractmethod
     def find_shape(self, tracks: Tensor, weights: Tensor, cameras: Tensor) -> Solution[Tensor]:
-        """Points (T, N, 3) in the world frame, of complete, centred tracks (T, N, 2) and weights (T, N) above 0."""
+        """Points (T, N, 3) in the world frame, of complete, centred tracks (T, N, 2) and weights (T, N) above 0.
+
+        Of several clips (..., T, N, 2), ``change`` is how much the last step changed each one's shape, a share of it.
+        """
 
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Complete the tracks, find cameras unless they are known, and the shape."""
-        known = tracks.seen.any(0)
+        return self._solve([tracks], cameras)[0]
+
+    def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
+        """Solve clips of one length together."""
+
+        def kind(one: Tracks) -> tuple[int, ...]:
+            return one.num_frames, *one.seen.any(0).nonzero().flatten().tolist()
+
+        return in_batches(tracks, lambda clips: self._solve(clips, None), kind)
+
+    def _solve(self, clips: Sequence[Tracks], cameras: Tensor | None) -> list[Estimate]:
+        """Clips of one skeleton, one length and the same joints seen; known cameras (T, 2, 3) are a single clip's."""
+        body, given = clips[0].skeleton, clips[0].points
+        known = clips[0].seen.any(0)
         # Normal matrices square a design whose columns differ by orders of magnitude.
-        precise = tracks.points if tracks.points.device.type == "mps" else tracks.points.double()
-        seen = tracks.seen[:, known]
-        filled = complete_tracks(precise[:, known], seen)
-        filled = filled - filled.mean(1, keepdim=True)
-        weights = torch.where(seen, tracks.weights[:, known].to(filled), FILLED)
-        weights = torch.where(seen.any(1, keepdim=True), weights, torch.ones_like(weights))
-        rows = self.find_cameras(filled) if cameras is None else cameras.to(filled)
-        solution = self.find_shape(filled, weights, rows)
-        local = solution.value @ complete_rotation(rows).mT
-        points = local.new_zeros(*tracks.points.shape[:2], 3)
-        points[:, known] = local
+        precise = given.dtype if given.device.type == "mps" else torch.float64
+        points, weights = (torch.stack([getattr(one, what) for one in clips]) for what in ("points", "weights"))
+        seen = (weights > 0)[..., known]
+        filled = complete_tracks(points[:, :, known].to(precise), seen)
+        filled = filled - filled.mean(-2, keepdim=True)
+        weights = torch.where(seen, weights[..., known].to(filled), FILLED)
+        weights = torch.where(seen.any(-1, keepdim=True), weights, torch.ones_like(weights))
+        rows = self.find_cameras(filled) if cameras is None else cameras.to(filled)[None]
+        if self.together:
+            every = self.find_shape(filled, weights, rows)
+            local, steps = every.value, [every.iterations] * len(clips)
+            settled = [True] * len(clips) if every.change is None else (every.change <= SETTLED).tolist()
+        else:
+            each = [self.find_shape(*one) for one in zip(filled, weights, rows, strict=True)]
+            local = torch.stack([one.value for one in each])
+            settled, steps = [one.converged for one in each], [one.iterations for one in each]
+        points = local.new_zeros(*points.shape[:-1], 3)
+        points[:, :, known] = local @ complete_rotation(rows).mT
         if cameras is None:  # known cameras know their mirror
-            sign = torch.nn.functional.pad(mirror_sign(points, tracks.skeleton)[None], (2, 0), value=1.0)
+            sign = torch.nn.functional.pad(mirror_sign(points, body)[:, None], (2, 0), value=1.0)[:, None, None]
             points, rows = points * sign, rows * sign
-        points = place_unseen(points, known, tracks.skeleton).to(tracks.points)
-        return Estimate(
-            points,
-            rows.to(tracks.points) if cameras is None else cameras,
-            torch.ones_like(points[:, 0, 0]),
-            solution.converged,
-            solution.iterations,
-        )
+        points, shown = points.to(given), rows.to(given) if cameras is None else cameras[None]
+        one = torch.ones_like(points[0, :, 0, 0])
+        return [
+            Estimate(place_unseen(x, known, body), r, one, *end)
+            for x, r, *end in zip(points, shown, settled, steps, strict=True)
+        ]
+
+
+SETTLED = 1e-3
+"""Share of the shape that the last step may change it by."""
 
 
 def camera_rows(tracks: Tensor, rank: int, *, evenness: float = 1.0, num_steps: int = 150) -> Tensor:
     """Find cameras: rank-3K factorisation, least trace in the null space, then least squares on orthonormality.
 
     Args:
-        tracks: (T, N, 2), complete and centred.
+        tracks: (..., T, N, 2), complete and centred.
         rank: K, at most; clips with fewer than 3K frames or 3K + 1 joints get less.
         evenness: 1 for orthographic cameras, 0 for weak perspective.
         num_steps: of the least squares, at most.
 
     Returns:
-        (T, 2, 3) orthonormal rows; the identity for clips too short or with too few joints to tell (2T < 3 or N < 4).
+        (..., T, 2, 3) orthonormal rows; the identity for clips too short or with too few joints to tell (2T < 3 or
+        N < 4).
     """
-    frames, joints = tracks.shape[:2]
-    if min(2 * frames, joints - 1) < 3:
-        return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(frames, 2, 3)
+    frames, joints = tracks.shape[-3:-1]
     rank = max(1, min(rank, frames // 3, (joints - 1) // 3))
-    motion, _ = factorize(tracks, 3 * rank)
-    size = torch.linalg.vector_norm(motion, dim=(0, 1))
-    told = int((size > EMPTY * size[0]).sum())  # columns of rounding would take part like any other
-    motion = motion[..., : max(3, 3 * math.ceil(told / 3))]
-    q, _ = metric_upgrade(motion, null_space_upgrade(motion), evenness=evenness, num_steps=num_steps, tolerance=1e-6)
-    return rows_to_cameras(motion @ q)[0]
+
+    def upgrade(motion: Tensor) -> Tensor:
+        start = null_space_upgrade(motion)
+        return metric_upgrade(motion, start, evenness=evenness, num_steps=num_steps, tolerance=1e-6, together=1)[0]
+
+    return upgraded_rows(tracks, 3 * rank, upgrade, unit=3)
+
+
+def upgraded_rows(tracks: Tensor, rank: int, upgrade: Callable[[Tensor], Tensor], unit: int = 1) -> Tensor:
+    """Factorise tracks (..., T, N, 2), upgrade their motion (K, T, 2, R), and return camera rows (..., T, 2, 3).
+
+    Columns that are rounding would take part like any other: R is the number of those that are more, 3 or more of them
+    and a multiple of ``unit``.
+    """
+    frames, joints = tracks.shape[-3:-1]
+    batch = tracks.shape[:-3]
+    if min(2 * frames, joints - 1) < 3:
+        return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(*batch, frames, 2, 3)
+    motion, _ = factorize(tracks.reshape(-1, frames, joints, 2), rank)
+    size = torch.linalg.vector_norm(motion, dim=(1, 2))
+    told = (size > EMPTY * size[:, :1]).sum(-1)
+    columns = ((told + unit - 1) // unit * unit).clamp_min(3)
+    rows = motion.new_empty(*motion.shape[:-1], 3)
+    for count in columns.unique().tolist():
+        part = motion[columns == count][..., :count]
+        rows[columns == count] = rows_to_cameras(part @ upgrade(part)[:, None])[0]
+    return rows.view(*batch, frames, 2, 3)
 
 
 def trajectory_design(cameras: Tensor, coefficients: Tensor) -> Tensor:

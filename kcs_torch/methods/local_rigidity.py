@@ -13,15 +13,12 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import back_project, complete_rotation, factorize, project, rows_to_cameras
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rigidity import distance_spread
-from kcs_torch.methods.factorised import Factorised
+from kcs_torch.methods.factorised import SETTLED, Factorised
 from kcs_torch.solvers.ist import ist, metric_upgrade
 from kcs_torch.solvers.iterate import Solution, iterate, relative_change
 from kcs_torch.solvers.lm import fit_bones
 
 __all__ = ["LocalRigidity", "rigid_pairs", "triangulation", "window_cameras"]
-
-SETTLED = 1e-3
-"""Share of the shape that the last step may change it by."""
 
 CHUNK = 256
 """Windows that are factorised at once: more would only take memory."""
@@ -70,10 +67,11 @@ class LocalRigidity(Factorised):
 
     def find_cameras(self, tracks: Tensor) -> Tensor:
         """Rigid windows, joined; the identity for clips with too few frames or joints to tell."""
-        frames, joints = tracks.shape[:2]
+        *batch, frames, joints, _ = tracks.shape
         if min(2 * frames, joints - 1) < 3:
-            return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(frames, 2, 3)
-        return window_cameras(tracks, min(self.window, frames))
+            return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(*batch, frames, 2, 3)
+        found = [window_cameras(one, min(self.window, frames)) for one in tracks.reshape(-1, frames, joints, 2)]
+        return torch.stack(found).view(*batch, frames, 2, 3)
 
     def find_shape(self, tracks: Tensor, weights: Tensor, cameras: Tensor) -> Solution[Tensor]:
         """Triangulate, find rigid pairs, and fit the shapes with their distances constant."""

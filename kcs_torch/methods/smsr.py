@@ -9,19 +9,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.camera import back_project, factorize, project, rows_to_cameras
+from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.spectral import dct_basis, spectral_norm
-from kcs_torch.methods.factorised import Factorised
+from kcs_torch.methods.factorised import SETTLED, Factorised, upgraded_rows
 from kcs_torch.solvers.ist import ist, metric_upgrade
 from kcs_torch.solvers.iterate import Solution, fpc, relative_change
 
 __all__ = ["SMSR"]
-
-NOTHING = 1e-6
-"""Share of the largest singular value below which a column of the motion is rounding."""
-
-SETTLED = 1e-3
-"""Share of the shape that a last step may change it by."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +41,7 @@ class SMSR(Factorised):
     """
 
     name: ClassVar[str] = "smsr"
+    together: ClassVar[bool] = True
     rank: int = 13
     cosines: float = 0.5
     num_steps: int = 100
@@ -65,20 +60,18 @@ class SMSR(Factorised):
 
     def find_cameras(self, tracks: Tensor) -> Tensor:
         """Factorisation, IST and least squares; the identity for clips with too few frames or joints to tell."""
-        frames, joints = tracks.shape[:2]
-        if min(2 * frames, joints - 1) < 3:
-            return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(frames, 2, 3)
-        motion, _ = factorize(tracks, 3 * max(1, min(self.rank, frames // 3, (joints - 1) // 3)))
-        size = torch.linalg.vector_norm(motion, dim=(0, 1))
-        motion = motion[..., : max(3, int((size > NOTHING * size[0]).sum()))]  # Q has no say over what is not there
-        start = ist(motion)
-        return rows_to_cameras(motion @ metric_upgrade(motion, start, evenness=1.0, tolerance=1e-6)[0])[0]
+        frames, joints = tracks.shape[-3:-1]
+
+        def upgrade(motion: Tensor) -> Tensor:
+            return metric_upgrade(motion, ist(motion), evenness=1.0, tolerance=1e-6, together=1)[0]
+
+        return upgraded_rows(tracks, 3 * max(1, min(self.rank, frames // 3, (joints - 1) // 3)), upgrade)
 
     def find_shape(self, tracks: Tensor, weights: Tensor, cameras: Tensor) -> Solution[Tensor]:
         """Smooth the trajectories, then continue from the back-projected tracks to low rank and a small residual."""
-        frames, joints = tracks.shape[:2]
+        frames, joints = tracks.shape[-3:-1]
         basis = dct_basis(frames, math.ceil(self.cosines * frames), dtype=tracks.dtype, device=tracks.device)
-        smooth = torch.einsum("tk,sk,snd->tnd", basis, basis, tracks) if self.cosines < 1 else tracks
+        smooth = torch.einsum("tk,sk,...snd->...tnd", basis, basis, tracks) if self.cosines < 1 else tracks
 
         def gradient(flat: Tensor) -> Tensor:
             residual = project(flat.unflatten(-1, (joints, 3)), cameras) - smooth
@@ -90,5 +83,6 @@ class SMSR(Factorised):
         falling = torch.stack([self.mu * fall**k * size for k in range(self.num_steps)])
         before = fpc(start, gradient, step=self.tau, weights=falling[:-1], steps_per_weight=1).value
         shape = fpc(before, gradient, step=self.tau, weights=falling[-1:], steps_per_weight=1).value
-        settled = bool((relative_change(before, shape) <= SETTLED).all())
-        return Solution(shape.unflatten(-1, (joints, 3)), settled, self.num_steps)
+        change = relative_change(before, shape)
+        shape = shape.unflatten(-1, (joints, 3))
+        return Solution(shape, bool((change <= SETTLED).all()), self.num_steps, change=change)
