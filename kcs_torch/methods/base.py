@@ -152,7 +152,9 @@ class Method(ABC):
     def _normalised(self, tracks: Tracks) -> tuple[Tracks, Tensor, Tensor]:
         """Tracks about their middle, of root mean square 1; that size; and the frames (T,) that show something."""
         # Means over the joints that happen to be seen would jump with every joint that comes and goes.
-        filled = interpolate(tracks.points, tracks.seen)[:, tracks.seen.any(0)]
+        seen, filled = tracks.seen, tracks.points
+        if not bool(seen.all()):
+            filled = interpolate(filled, seen)[:, seen.any(0)]
         middle = filled.mean(1, keepdim=True) if filled.numel() else tracks.points[:, :1] * 0
         size = rms((tracks.points - middle) * tracks.seen[..., None], tracks.weights)
         size = torch.where(size > 0, size, torch.ones_like(size))
@@ -182,8 +184,9 @@ class Method(ABC):
             warnings.warn(f"{tracks.source}: {gone}", KcsWarning, stacklevel=users_level())
         if HEADSTAND in found.notes:
             warnings.warn(f"{tracks.source}: {HEADSTAND}", KcsWarning, stacklevel=users_level())
-        for wrong in what_is_wrong(self, result.points, tracks.skeleton, found.converged):
-            warnings.warn(f"{tracks.source}: {wrong}: {WHY_LOOSE}", KcsWarning, stacklevel=users_level())
+        wrong = [note for note in found.notes if note.endswith(WHY_LOOSE)]
+        for sentence in wrong if found.converged else what_is_wrong(self, result.points, tracks.skeleton, False):
+            warnings.warn(f"{tracks.source}: {sentence}", KcsWarning, stacklevel=users_level())
 
     def unsettled(self, steps: int) -> str:
         """A sentence for those whose iteration stopped at its limit."""

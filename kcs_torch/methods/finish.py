@@ -148,22 +148,24 @@ def _rest(method: Method, body: Skeleton) -> str:
     return "constant lengths alone" if body.rigid and method.keeps_lengths else "nothing"
 
 
-def what_is_wrong(method: Method, points: Tensor, body: Skeleton, settled: bool = True) -> list[str]:
-    """What about points (T, N, 3) tells that they are not the body's, for the user.
+def what_is_wrong(
+    method: Method, points: Tensor, body: Skeleton, settled: bool = True, lengths: Tensor | None = None
+) -> list[str]:
+    """What about points (T, N, 3) tells that they are not the body's, for the user, and why that may be.
 
     Lengths that vary are no news of a solution that did not settle; a body unlike any is why it does not.
     """
-    told = [loose_bones(points, body) if method.keeps_lengths and settled else ""]
-    told.append(odd_body(points, body) if method.knows_template(body) else "")
-    return [sentence for sentence in told if sentence]
+    told = [loose_bones(points, body, lengths) if method.keeps_lengths and settled else ""]
+    told.append(odd_body(points, body, lengths) if method.knows_template(body) else "")
+    return [f"{sentence}: {WHY_LOOSE}" for sentence in told if sentence]
 
 
-def loose_bones(points: Tensor, body: Skeleton) -> str:
-    """Which rigid bones of points (T, N, 3) change their length, for the user; empty where none does."""
+def loose_bones(points: Tensor, body: Skeleton, lengths: Tensor | None = None) -> str:
+    """Which rigid bones of points (T, N, 3), of lengths (T, B), change theirs, for the user; empty where none does."""
     rigid = list(body.rigid)
     if not rigid or not len(points):
         return ""
-    bones = bone_lengths(points, body.bone_index(device=points.device))[:, rigid]
+    bones = (bone_lengths(points, body.bone_index(device=points.device)) if lengths is None else lengths)[:, rigid]
     spread, share = bones.std(0, correction=0), 100 * bone_shares(bones)
     if float(share.median()) > LOOSE:
         return f"bone lengths vary by {float(share.median()):.1f} %"
@@ -179,13 +181,13 @@ def loose_bones(points: Tensor, body: Skeleton) -> str:
     return f"lengths of rigid bones vary: {', '.join(named)}{more}"
 
 
-def odd_body(points: Tensor, body: Skeleton) -> str:
+def odd_body(points: Tensor, body: Skeleton, lengths: Tensor | None = None) -> str:
     """How points (T, N, 3) are unlike any body of the skeleton, for the user; empty where they are not."""
     usual = body.relative_lengths(dtype=points.dtype, device=points.device)
     rigid = list(body.rigid)
     if usual is None or not rigid or not len(points):
         return ""
-    own = median(bone_lengths(points, body.bone_index(device=points.device)), 0)
+    own = median(bone_lengths(points, body.bone_index(device=points.device)) if lengths is None else lengths, 0)
     odd = oddity(own[rigid], usual[rigid])
     middle = points - points.mean(1, keepdim=True)
     wide, far = float(middle[..., :2].norm()), float(middle[..., 2].norm())
@@ -201,7 +203,9 @@ def _placed(tracks: Tracks, found: Estimate, size: Tensor, known: Tensor) -> tup
     """Points (T, N, 3) in the tracks' units and place, and their images (T, N, 2)."""
     points = found.points * size
     seen = points[..., :2] * found.scales[:, None, None]
-    shift = interpolate(_shift(tracks.points - seen, tracks.weights), known[:, None])
+    shift = _shift(tracks.points - seen, tracks.weights)
+    if not bool(known.all()):
+        shift = interpolate(shift, known[:, None])
     return points + torch.nn.functional.pad(shift, (0, 1)), seen + shift
 
 
@@ -233,8 +237,7 @@ def _reconstruction(
         notes.append(f"bone lengths vary by {variation.median:.1f} %: '{method.name}' does not hold them constant")
     if upside_down(tracks.points[..., 1], tracks.seen, body, NEARLY_ALL):
         notes.append(HEADSTAND)
-    for wrong in what_is_wrong(method, points, body):
-        notes.append(f"{wrong}: {WHY_LOOSE}")
+    notes += what_is_wrong(method, points, body, lengths=bones)
     if not body.rigid:
         kind = "no bones" if not body.num_bones else "no rigid bones"
         notes.append(f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown")
