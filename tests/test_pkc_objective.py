@@ -16,7 +16,7 @@ from kcs_torch.methods.pkc import batch
 from kcs_torch.methods.pkc import objective as module
 from kcs_torch.methods.pkc.batch import Task, minimise_all
 from kcs_torch.methods.pkc.objective import BLUR, Objective, Unknowns, bone_noise
-from kcs_torch.methods.pkc.weights import WALK, Weights, at_pace, in_noise, pace_of
+from kcs_torch.methods.pkc.weights import Weights, at_pace, in_noise, pace_of
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.nn import PostureEnergy
 from kcs_torch.skeleton import SKELETONS
@@ -438,14 +438,12 @@ def test_pace_does_not_depend_on_size_and_place():
 
 
 def test_pace_of_a_clip_that_does_not_move():
-    """The whole of it counts as a few frames, however long it is."""
-    still = walk(1).expand(60, -1, -1)
-    assert pace(still) == pytest.approx(60 / WALK)
-    assert pace(0 * still) == pytest.approx(60 / WALK)
-    assert pace(still, 600.0) == 20  # never less than by its rate
-    assert pace(walk(1)) == 1 and pace(walk(2), 60.0) == 2 and pace(walk(2), 15.0) == 0.5
+    """The whole of it counts as four frames, however many there are and however quickly; so does a single image."""
+    still, four = walk(1).expand(60, -1, -1), 4 * Weights().posture
+    for points, rate in ((still, 30.0), (0 * still, 30.0), (still, 600.0), (walk(1), 30.0), (walk(2), 60.0)):
+        assert pace(points, rate) == pytest.approx(len(points) / four)
     named = replace(SKELETONS["h36m17"], template=None, proportions=None)
-    assert pace_of(still[..., :2], named, 60.0) == 2
+    assert pace_of(still[..., :2], named, 60.0) == 2 and pace_of(still[:12, :, :2], named, 60.0) == 12 / four
 
 
 def several():

@@ -382,8 +382,9 @@ class TestSweeps:
         changed = [(tmp_path / "sweep" / k / "lifter.safetensors").stat().st_mtime_ns != times[k] for k in "01"]
         assert changed == [False, True]
         assert [row["val/mpjpe"] for row in swept(tmp_path)] == [row["val/mpjpe"] for row in before]
-        code, out, _ = called(capsys, *SWEEP, "seed=0,1", "+module.lr=1e-4", "keep=true")
+        code, out, err = called(capsys, *SWEEP, "seed=0,1", "+module.lr=1e-4", "keep=true")
         assert code == 0 and "is kept" not in out
+        assert err.count("had ended with other settings, and is replaced") == 2
 
     @pytest.mark.filterwarnings("ignore:Experiment logs directory")
     def test_figures_of_an_earlier_sweep_are_not_those_of_a_run_that_fails(self, tmp_path, monkeypatch, capsys):

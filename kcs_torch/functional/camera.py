@@ -156,6 +156,7 @@ def rows_to_cameras(rows: Tensor) -> tuple[Tensor, Tensor]:
         With n the unit normal of the rows' plane, the second row of a camera in this plane is n x c for a first row c.
         So c.a + (n x c).b = c.(a + b x n) is to be as large as can be, and c is the direction of a + b x n.
     """
+    dtype, rows = rows.dtype, rows.to(torch.promote_types(rows.dtype, torch.float32))
     with torch.no_grad():
         size = rows.abs().amax((-2, -1), keepdim=True)
         size = torch.where(size > 0, size, torch.ones_like(size))
@@ -174,7 +175,7 @@ def rows_to_cameras(rows: Tensor) -> tuple[Tensor, Tensor]:
     first = along / torch.linalg.vector_norm(along, dim=-1, keepdim=True)
     second = torch.linalg.cross(normal, first)  # a right angle, if not quite of length 1 where the plane is uncertain
     cameras = torch.stack([first, second / torch.linalg.vector_norm(second, dim=-1, keepdim=True)], -2)
-    return cameras, (rows * cameras).sum((-2, -1)) / 2
+    return cameras.to(dtype), ((rows * cameras).sum((-2, -1)) / 2).to(dtype)
 
 
 def _across(vectors: Tensor) -> Tensor:

@@ -43,11 +43,13 @@ def incidence(bones: Tensor | Sequence[Sequence[int]], num_joints: int, *, dtype
     low, high = (int(index.min()), int(index.max())) if look else (0, -1)
     if low < 0 or high >= num_joints:
         raise ShapeError(f"bones: expected joint indices 0..{num_joints - 1}, got {low}..{high}")
-    matrix = torch.zeros(num_joints, len(index), dtype=dtype or torch.get_default_dtype(), device=index.device)
-    column = torch.arange(len(index), device=index.device)
-    matrix[index[:, 0], column] = -1
-    matrix[index[:, 1], column] = 1
-    return matrix
+    return signs(index, num_joints, dtype or torch.get_default_dtype())
+
+
+def signs(bones: Tensor, num_joints: int, dtype: torch.dtype) -> Tensor:
+    """The incidence matrix (N, B) of bones (B, 2) that are known to be right; ``torch.func.vmap`` takes it."""
+    joint = torch.arange(num_joints, device=bones.device)[:, None]
+    return (bones[:, 1] == joint).to(dtype) - (bones[:, 0] == joint).to(dtype)
 
 
 def chain_inverse(matrix: Tensor) -> Tensor:

@@ -57,7 +57,9 @@ def svt(matrix: Tensor, threshold: Tensor | float, corner: Tensor | float = math
     level = torch.as_tensor(threshold, dtype=work.dtype, device=matrix.device)
     size = torch.as_tensor(corner, dtype=work.dtype, device=matrix.device)
     least = torch.finfo(work.dtype).tiny ** 0.5  # of which the inverse, and its square in the derivative, are finite
+    level = level.clamp_max(1 / least)  # infinite ones leave nothing either way
     bend = torch.where(size > 0, 1 / torch.where(size > 0, size.clamp_min(least), 1), 0)
+    bend = torch.where(size.isnan(), torch.nan, bend)
     out: Tensor = applied(ShrinkSingularValues, work, level, bend)[0]
     return out.to(matrix.dtype)
 

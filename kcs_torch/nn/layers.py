@@ -176,14 +176,15 @@ class SVT(nn.Module):
         check_points(matrix, self, "matrices")
         level = self.threshold
         if self.relative:
-            level = level * torch.linalg.matrix_norm(matrix)
+            level = level * torch.linalg.matrix_norm(wide(matrix))
         return svt(matrix, level)
 
 
 def full_precision(tensor: Tensor) -> AbstractContextManager[Any]:
     """Suspend autocast on the tensor's device, if it has any: pixels and factorisations need more than three digits."""
     kind = tensor.device.type
-    return torch.autocast(kind, enabled=False) if torch.amp.is_autocast_available(kind) else nullcontext()
+    on = torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind)
+    return torch.autocast(kind, enabled=False) if on else nullcontext()
 
 
 def wide(tensor: Tensor) -> Tensor:

@@ -125,7 +125,8 @@ def gmres(
         tolerance: relative residual at which all are done.
 
     Returns:
-        x (..., *) and relative residuals (...). A singular system gets a least-squares solution, never NaN.
+        x (..., *) and relative residuals (...). A singular system gets a least-squares solution, never NaN; one whose b
+        is not finite gets NaN, which a scaler of gradients looks for.
 
     >>> A = torch.tensor([[2.0, 1.0], [0.0, 4.0]])
     >>> gmres(lambda x: A @ x, torch.tensor([4.0, 4.0]))[0].round(decimals=4).tolist()
@@ -133,6 +134,8 @@ def gmres(
     """
     shape = rhs.shape[rhs.ndim - inner :]
     flat = rhs.flatten(-inner) if inner > 1 else rhs
+    lost = ~flat.isfinite().all(-1, keepdim=True)
+    flat = torch.where(lost, torch.zeros_like(flat), flat)
     # Divided by its largest number first: the square of a far cotangent would leave the range.
     top = flat.abs().amax(-1, keepdim=True)
     flat = flat / torch.where(top > 0, top, torch.ones_like(top))
@@ -164,4 +167,5 @@ def gmres(
             if bool((residual <= tolerance).all()):
                 break
     found = (basis[..., : share.shape[-2], :].mT @ share).squeeze(-1) * norm * top
+    found = torch.where(lost, torch.nan, found)
     return found.unflatten(-1, shape), residual

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import orthonormality_defect
 from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.functional.spectral import psd_shrink
@@ -108,10 +108,19 @@ def metric_upgrade(
 
     Raises:
         ShapeError: R is below 3, or the shapes do not fit.
+        OptionError: the batch is not made of so many neighbours.
     """
     _check(motion, "metric_upgrade")
     if start.shape[-2:] != (motion.shape[-1], 3):
         raise ShapeError(f"metric_upgrade: expected start (..., {motion.shape[-1]}, 3), got {tuple(start.shape)}")
+    if motion.dtype in (torch.float16, torch.bfloat16):  # no factorisation takes these
+        options = {"smoothness": smoothness, "evenness": evenness, "num_steps": num_steps, "tolerance": tolerance}
+        wide = metric_upgrade(motion.float(), start.float(), together=together, counts=counts, **options)  # type: ignore
+        return wide[0].to(motion.dtype), wide[1].to(motion.dtype)
+    total = motion.shape[:-3].numel()
+    whole = type(together) is int and together >= 1
+    if together is not None and (not whole or total % together):
+        raise OptionError(f"metric_upgrade: together: expected a divisor of the {total} motions, got {together!r}")
     a, b = motion[..., 0, :], motion[..., 1, :]
     rank = motion.shape[-1]
     count = motion.new_full((), motion.shape[-3]) if counts is None else counts.to(motion)

@@ -186,24 +186,27 @@ class LiftingModule(lightning.LightningModule):
         if self.critic is not None:
             values["critic"] = generator_loss(self.critic(centre(points)[0])).mean()
             total = total + self.critic_weight * values["critic"]
-        self._advance(optimisers[0], total, self.network)
+        self._advance(optimisers[0], total)
         if self.critic is not None and bool((batch.labelled > 0).any()):
             true = centre(batch.points[batch.labelled > 0])[0]
             rows = torch.randint(len(points), (len(true),), device=true.device)
             cost = critic_loss(self.critic(true), self.critic(centre(points.detach()[rows])[0])).mean()
             values["critic_own"] = cost
-            self._advance(optimisers[1], cost, self.critic)
+            self._advance(optimisers[1], cost)
         self.log_dict({f"train/{name}": value.detach() for name, value in values.items()}, batch_size=len(points))
         self.log("train/loss", total.detach(), prog_bar=True, batch_size=len(points))
 
-    def _advance(self, optimiser: Any, cost: Tensor, trained: nn.Module) -> None:
+    def _advance(self, optimiser: Any, cost: Tensor) -> None:
         size = self.lr * step_share(int(self.step), self.total_steps)
         for group in optimiser.param_groups:  # as it is told now: a checkpoint may hold what an earlier run was told
             group.update(lr=size, weight_decay=self.weight_decay)
         optimiser.zero_grad()
         self.manual_backward(cost)
-        nn.utils.clip_grad_norm_(trained.parameters(), self.clip)
         optimiser.step()
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Cut gradients; what half precision had scaled them by is undone by now."""
+        nn.utils.clip_grad_norm_([p for group in optimizer.param_groups for p in group["params"]], self.clip)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Measure the network on clips with labels."""

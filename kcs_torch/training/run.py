@@ -89,8 +89,10 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         module = instantiate(config.module, _convert_="all")
         savable = _savable(module.network)
         best = Best(folder / "checkpoints", config.optimise, config.mode, resumed)
+        more = instantiate(config.trainer.get("callbacks") or [], _convert_="all")
+        more = more if isinstance(more, list) else [more]
         made: dict[str, Any] = {
-            "callbacks": [Watch(plain), best, Last(folder / "checkpoints")],
+            "callbacks": [Watch(plain), best, Last(folder / "checkpoints"), *more],
             "default_root_dir": folder,
         }
         if "logger" not in config.trainer:
@@ -143,6 +145,11 @@ def _check(config: Mapping[str, Any]) -> None:
     check_threads(config["threads"])
     if config["mode"] not in ("min", "max"):
         raise OptionError(f"mode: expected min or max, got {config['mode']!r}")
+    if "default_root_dir" in config["trainer"]:
+        raise OptionError("trainer: default_root_dir: expected none, as everything goes to hydra.run.dir=...")
+    solver = config.get("solver")
+    if solver is not None and "_target_" not in solver:
+        raise OptionError(f"solver: there is none to set {', '.join(solver)} of: choose one first, as solver=sfam does")
 
 
 def _checkpoint(path: Path, config: Mapping[str, Any]) -> Path:
@@ -238,6 +245,8 @@ def job(config: DictConfig) -> float:
             tabulate(Path(settings.sweep.dir))
         value = ended.get(config.optimise)
         return (math.inf if config.mode == "min" else -math.inf) if value is None else value
+    if config.keep and (folder / RESULT).is_file():
+        print(f"{folder}: had ended with other settings, and is replaced: runs go by their number", file=sys.stderr)
     (folder / RESULT).unlink(missing_ok=True)  # of an earlier run, whose settings Hydra has replaced
     with in_one_line(MisconfigurationException), _said():
         outcome = train(config, folder)
@@ -281,7 +290,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     entry = hydra.main(version_base="1.3", config_path=str(configs()), config_name="train")(job)
     before = sys.argv
     if arguments is not None:
-        sys.argv = [before[0], *arguments]  # Hydra looks nowhere else
+        # Hydra looks nowhere else; and what stands first is what Lightning starts for each further device.
+        sys.argv = [__file__, *arguments]
     flags = [a for a in sys.argv[1:] if a in ("-m", "--multirun")]  # which Hydra takes before overrides only
     sys.argv = [sys.argv[0], *flags, *(a for a in sys.argv[1:] if a not in flags)]
     try:
@@ -291,3 +301,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise SystemExit(2 if wrong and not isinstance(end.__context__, InstantiationException) else end.code) from None
     finally:
         sys.argv = before
+
+
+if __name__ == "__main__":
+    main()

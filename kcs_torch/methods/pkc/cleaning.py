@@ -26,6 +26,9 @@ WINDOW, QUICK = 64, 2.2
 """Frames in which motion and noise are told apart, at 30 a second: two seconds, and up to 120 frames a second about as
 many. And the frequency in Hz from which on what joints do not share is noise rather than motion."""
 
+SHORT, UNTOLD = 12, 0.015
+"""Frames below which a clip does not tell its noise, and what is assumed then: that of good detections."""
+
 HELD = 0.1
 """Standard deviation, a share of the body's size, of joints in frames before the body is first seen and after it was
 last seen, and the largest in gaps."""
@@ -72,7 +75,9 @@ def cleaned(tracks: Tracks, denoise: bool) -> Search[Any, Any, tuple[Tensor, Ten
     noise = (gap_deviation(points, keep, tracks.fps or 30.0, HELD).square() + left**2).sqrt()
     if detected(tracks.weights):
         noise = noise.maximum(detector_deviation(tracks.weights))
-        notes.append("confidences vary as a detector's do: joints may be off by a centimetre or more")
+        notes.append("confidences vary as a detector's do: joints may be off by 3 % of the body's size or more")
+    if len(points) < SHORT:
+        noise = noise.clamp_min(UNTOLD)
     held = _nearest_shown(keep)
     away = held != torch.arange(len(held), device=held.device)
     if bool(away.any()):  # nothing tells what goes on there, and a model of motion would run off

@@ -16,6 +16,9 @@ __all__ = ["Weights", "at_pace", "in_noise", "pace_of"]
 WALK = 4.3
 """Frames in which a walking person's bones change in the image by as much as they stray, at 30 frames a second."""
 
+LEAST = 4.0
+"""Independent frames that any clip counts as, at least."""
+
 CALM, LOOSEST = 0.0008, 8.0
 """Noise of bones' images, for a body of 1.75, at which smoothness counts half: the tracks were smoothed before, and
 where noise lets lengths hold depths only loosely, the smoothest depths are those that move least. And how many times as
@@ -85,16 +88,19 @@ def in_noise(weights: Weights, noise: float) -> Weights:
 
 
 def pace_of(image: Tensor, skeleton: Skeleton, rate: float) -> float:
-    """How many frames tell as much as one of a walking person's at 30 frames a second, at least ``rate / 30``.
+    """How many frames tell as much as one of a walking person's at 30 frames a second, usually at least ``rate / 30``.
 
-    The deviation of the bones' images over that of their changes: the time in which a pose changes into another.
+    The deviation of the bones' images over that of their changes: the time in which a pose changes into another. But no
+    clip, not even a single image, tells less of a body's posture than :data:`LEAST` of such frames: else a template
+    whose proportions are not the body's would have it lean, which makes all bones look shorter.
 
     Args:
         image: (T, N, 2).
         skeleton: with a template or proportions.
         rate: frames a second.
     """
-    least = rate / 30
+    most = len(image) / (LEAST * Weights.posture)
+    least = min(rate / 30, most)
     usual = skeleton.relative_lengths(dtype=image.dtype, device=image.device)
     if len(image) < 3 or usual is None:
         return least
@@ -103,4 +109,4 @@ def pace_of(image: Tensor, skeleton: Skeleton, rate: float) -> float:
     moved = float(vectors.diff(dim=0).square().sum((1, 2)).mean().sqrt())
     spread = float((vectors - vectors.mean(0)).square().sum((1, 2)).mean().sqrt())
     time = spread / moved if moved > spread / len(image) else float(len(image))
-    return max(least, time / WALK)
+    return min(max(least, time / WALK), most)

@@ -44,7 +44,8 @@ class UnrolledKCS(Unrolled):
         final: last threshold; between them they fall geometrically.
         tau: step size.
         momentum: as in :class:`UnrolledFPC`; the method has none.
-        scale_range: factor by which a frame's scale may leave the clip's, where scales are not given.
+        scale_range: factor by which a frame's scale may leave the clip's, where scales are not given; the bounds that
+            follow are constants of the derivative.
         lengths: relative bone lengths that the template's bones are brought to; the template's own if None.
         learnable: as in :class:`UnrolledFPC`.
         learnable_lengths: the relative lengths of the template's bones are parameters, too.
