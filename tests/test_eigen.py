@@ -81,7 +81,8 @@ def test_kernel_passes_nan_on_and_keeps_it_apart(jacobi):
 def test_on_a_processor_it_is_the_library(monkeypatch):
     monkeypatch.setattr(eigen, "_has_triton", lambda: pytest.fail("looked for Triton"))
     matrix = spectra(*torch.linspace(1, 2, 40)[None].expand(50, -1))
-    for ours, theirs in zip((*eigh(matrix), eigvalsh(matrix)), (*torch.linalg.eigh(matrix), torch.linalg.eigvalsh(matrix))):  # noqa: B905, E501
+    library = (*torch.linalg.eigh(matrix), torch.linalg.eigvalsh(matrix))
+    for ours, theirs in zip((*eigh(matrix), eigvalsh(matrix)), library, strict=True):
         assert torch.equal(ours, theirs)
 
 

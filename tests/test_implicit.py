@@ -51,6 +51,14 @@ def test_singular_systems_and_far_cotangents_are_finite(dtype):
     assert_close(found[:2], torch.tensor([1.0, 2.0], dtype=dtype), rtol=1e-4, atol=1e-4)
 
 
+def test_a_cotangent_that_is_not_finite_is_passed_on_and_spoils_no_other():
+    """So that a scaler of gradients sees it, and takes no step."""
+    rhs = torch.tensor([[1.0, 2.0], [torch.inf, 1.0], [torch.nan, 0.0]], dtype=torch.float64)
+    found, residual = gmres(lambda x: 2 * x, rhs)
+    assert_close(found[0], rhs[0] / 2)
+    assert found[1:].isnan().all() and residual.isfinite().all()
+
+
 def settled(step, start):
     with torch.no_grad():
         for _ in range(400):

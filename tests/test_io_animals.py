@@ -260,7 +260,6 @@ def test_a_line_with_the_name_of_the_index_is_no_frame(tmp_path):
         (lambda t: t.replace("bodyparts,snout", "bodyparts", 1), "as many cells in each line"),
         (lambda t: t.replace("0.9", "0.1"), "of 0.3 or more, only 0.1: lower the threshold"),
         (lambda t: re.sub(r"\d+[.]\d+", "nan", t), "no joint is seen in any frame: nothing to reconstruct"),
-        (lambda t: t.replace("0.9", "-0.9", 1), "is negative"),
         (lambda t: t.replace("0.9", "90"), "divide by the largest"),
         (lambda t: t + '4,"' + 200_000 * "1", "damaged text"),
         (lambda t: "scorer,a,a\nbodyparts,b,b\ncoords,x,y\n0,1,2\n", "at least 2 joints"),
@@ -281,6 +280,15 @@ def test_short_lines_are_unseen_there(tmp_path):
     tracks = load_tracks(path)
     assert (~tracks.seen).nonzero().tolist() == [[3, 2]]
     assert tracks.notes == ("1 line ends before the last column: what is missing is unseen", NO_BONES)
+
+
+def test_places_filled_with_minus_one_are_unseen(tmp_path):
+    """As DeepLabCut 3 fills those of animals and joints that are not there."""
+    columns, values = _animal()
+    values[1, 3:6] = -1
+    tracks = load_tracks(write_deeplabcut_csv(tmp_path / "a.csv", columns, values))
+    assert (~tracks.seen).nonzero().tolist() == [[1, 1]]
+    assert "1 joint of negative confidence: taken as unseen" in tracks.notes
 
 
 def test_frames_that_occur_twice_are_told(tmp_path):

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from numerics import BATCHES, DEVICES, FLOATS, leaves_arguments_alone, normal, rotations, turning
+from numerics import BATCHES, DEVICES, FLOATS, HALVES, leaves_arguments_alone, normal, rotations, turning
 from torch.testing import assert_close
 
-from kcs_torch.errors import ShapeError
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import factorize, nearest_rotation, orthonormality_defect, rows_to_cameras
 from kcs_torch.solvers import ist, metric_upgrade
 
@@ -212,6 +212,24 @@ def test_motion_that_does_not_fit(shape):
         ist(torch.zeros(shape))
     with pytest.raises(ShapeError, match="metric_upgrade: expected motion"):
         metric_upgrade(torch.zeros(shape), torch.zeros(3, 3))
+
+
+@pytest.mark.parametrize("together", [0, -1, 4, 1.5, True])
+def test_neighbours_that_do_not_make_the_batch(together):
+    with pytest.raises(OptionError, match="together: expected a divisor of the 6 motions"):
+        metric_upgrade(normal(6, 5, 2, 4), normal(6, 4, 3), together=together)
+
+
+@pytest.mark.parametrize("dtype", HALVES)
+def test_half_precision_is_widened(dtype):
+    motion, start = normal(8, 2, 3).to(dtype), normal(3, 3, seed=1).to(dtype)
+    found, expected = (metric_upgrade(motion.to(d), start.to(d), num_steps=20)[0] for d in (dtype, torch.float32))
+    assert found.dtype == dtype
+    assert_close(found, expected.to(dtype))
+    rows = normal(200, 2, 3).to(dtype)
+    cameras, scales = rows_to_cameras(rows)
+    for ours, wide in zip((cameras, scales), rows_to_cameras(rows.float()), strict=True):
+        assert_close(ours, wide.to(dtype))
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (4, 2), (3,)])

@@ -120,6 +120,17 @@ def test_svt_layer_is_svt():
     assert_close(SVT(0.1, relative=True)(matrix), svt(matrix, 0.1 * size))
 
 
+def test_relative_threshold_in_half_precision():
+    """The norm of many millimetres leaves its range."""
+    matrix = (1000 * normal(100, 51)).half().requires_grad_()
+    found = SVT(0.05, relative=True)(matrix)
+    (slope,) = torch.autograd.grad(found.float().sum(), matrix)
+    assert slope.isfinite().all() and found.abs().max() > 1000
+    everything = normal(4, 3).requires_grad_()
+    (slope,) = torch.autograd.grad(svt(everything, torch.inf).sum(), everything)
+    assert (slope == 0).all()
+
+
 def test_relative_threshold_is_free_of_scale():
     matrix = normal(3, 6, 4)
     layer = SVT(0.1, relative=True)

@@ -120,6 +120,14 @@ class TestARun:
         assert not same(weights(run[1]), weights(tmp_path))
 
 
+def test_callbacks_of_ones_own_join_in(tmp_path):
+    stopping = "{_target_: lightning.pytorch.callbacks.EarlyStopping, monitor: val/mpjpe, patience: 1, min_delta: 1e9}"
+    for given in (stopping, f"[{stopping}]"):
+        folder = tmp_path / str(len(given))
+        train(composed("trainer.max_epochs=9", f"+trainer.callbacks={given}"), folder)
+        assert len(logged(folder, "val/mpjpe")) == 2  # the second epoch brings no 1e9 mm more
+
+
 class Killed(RuntimeError):
     pass
 
@@ -215,6 +223,8 @@ class TestWrongConfigurations:
             ("skeleton=dragon", "unknown skeleton 'dragon'"),
             ("data.window=0", "window: expected at least 1"),
             ("trainer.max_epochs=0", "at least one epoch with validation"),
+            ("+trainer.default_root_dir=elsewhere", "trainer: default_root_dir: expected none"),
+            ("+solver.num_steps=8", "solver: there is none to set num_steps of: choose one first, as solver=sfam does"),
             ("+trainer.limit_val_batches=0", "at least one epoch with validation"),
         ],
     )
@@ -425,6 +435,13 @@ class TestKcsTorchTrain:
         done = started("train", *words, folder=tmp_path)
         assert done.returncode == 0, done.stderr
         assert done.stderr == ""
+        assert load_lifter(tmp_path / "out" / "lifter.safetensors").fps == 30
+
+    def test_several_devices(self, tmp_path):
+        """Lightning starts the process of each further one by this process's own arguments."""
+        words = (*SMALL, "trainer.max_epochs=1", "trainer.devices=2", "hydra.run.dir=out")
+        done = started("train", *words, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
         assert load_lifter(tmp_path / "out" / "lifter.safetensors").fps == 30
 
     @pytest.mark.parametrize("missing", ["hydra", "lightning", "tensorboard", "safetensors"])

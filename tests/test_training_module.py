@@ -7,6 +7,7 @@ import math
 import lightning
 import pytest
 import torch
+from lightning.pytorch.plugins import MixedPrecision
 from torch import nn
 
 import kcs_torch as kt
@@ -254,6 +255,23 @@ def fit(module, epochs, **options):
     )
     trainer.fit(module, datamodule=data_of(), ckpt_path=options.get("ckpt_path"), weights_only=True)
     return trainer
+
+
+@pytest.mark.parametrize("scaled", [False, True], ids=["single", "half"])
+def test_gradients_are_cut_after_their_scale_is_undone(scaled, monkeypatch):
+    """In half precision a scaler multiplies the loss by 65536: gradients that are cut before have no length left."""
+    norms, taken = [], torch.optim.AdamW.step
+
+    def step(self, *rest, **more):
+        out = taken(self, *rest, **more)  # which cuts them first
+        grads = [p.grad for group in self.param_groups for p in group["params"] if p.grad is not None]
+        norms.append(float(torch.linalg.vector_norm(torch.stack([g.norm() for g in grads]))))
+        return out
+
+    monkeypatch.setattr(torch.optim.AdamW, "step", step)
+    plugins = [MixedPrecision("16-mixed", "cpu", torch.amp.GradScaler("cpu"))] if scaled else []
+    fit(module_of(clip=0.05), 2, plugins=plugins)
+    assert len(norms) > 3 and min(norms) > 0.04 and max(norms) < 0.051
 
 
 @pytest.mark.parametrize("options", [{}, {"critic": True}, {"refine": True}], ids=["plain", "critic", "refine"])

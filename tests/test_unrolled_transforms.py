@@ -1,5 +1,6 @@
 """Unrolled solvers and spectral functions under torch.func.vmap, torch.compile and torch.export."""
 
+import io
 import warnings
 
 import pytest
@@ -148,6 +149,21 @@ def test_solvers_export(name):
     tracks, cameras, weights = clips()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        program = torch.export.export(module, (tracks[0], cameras[0]), {"weights": weights[0]}).module()
-    found = program(tracks[1], cameras[1], weights=weights[1])
-    assert_close(found, module(tracks[1], cameras[1], weights=weights[1]))
+        exported = torch.export.export(module, (tracks[0], cameras[0]), {"weights": weights[0]})
+        with io.BytesIO() as file:
+            torch.export.save(exported, file)
+            file.seek(0)
+            loaded = torch.export.load(file)
+    for program in (exported, loaded):
+        found = program.module()(tracks[1], cameras[1], weights=weights[1])
+        assert_close(found, module(tracks[1], cameras[1], weights=weights[1]))
+
+
+@each_solver
+def test_an_ensemble_under_vmap(name):
+    """Parameters and buffers of several solvers, stacked."""
+    modules, (tracks, cameras, _) = [SOLVERS[name]() for _ in range(3)], clips()
+    state = torch.func.stack_module_state(modules)
+    run = lambda p, b: torch.func.functional_call(modules[0], (p, b), (tracks[0], cameras[0]))  # noqa: E731
+    expected = torch.stack([module(tracks[0], cameras[0]) for module in modules])
+    assert_close(vmap(run)(*state), expected)

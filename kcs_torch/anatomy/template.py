@@ -258,9 +258,11 @@ def _place_quadruped(names: Sequence[str]) -> tuple[Point, ...]:
     """An animal on four legs that faces the viewer."""
     places = quadruped_places(names)
     if places is None:
+        unknown = [n for n in names if part_of(n, "animal") is None and part_of(n, "human") is None]
+        got = f"does not know {', '.join(map(repr, unknown))}" if unknown else f"got {', '.join(map(repr, names))}"
         raise SkeletonError(
             "template 'quadruped': expected joints of a front and a hind limb, and a tail, paw or hock, all by known "
-            f"names, got {', '.join(map(repr, names))}. Rename them, or give a position for every joint."
+            f"names, {got}. Rename them, or give a position for every joint."
         )
     hips = PLACES["hip"]
     return tuple((x, round(hips[1] - up, 6), round(hips[2] - forward, 6)) for _, _, (x, up, forward) in places)

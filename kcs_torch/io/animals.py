@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kcs_torch.errors import FormatError
+from kcs_torch.errors import FormatError, counted
 from kcs_torch.io.build import build_tracks, nothing_seen
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.registry import Options, brief
@@ -117,6 +117,7 @@ def build_animals(
         SkeletonError: the joints do not fit the skeleton that the caller wants.
     """
     shared = list(notes)
+    animals = _without_padding(animals, shared)
     whole = [a for a in animals if len(a.joints) >= 2]
     if not whole:
         raise FormatError(f"{path}: expected an animal with at least 2 joints, got none")
@@ -154,6 +155,19 @@ def build_animals(
         )
         people.append(tracks)
     return people
+
+
+def _without_padding(animals: Sequence[Animal], notes: list[str]) -> list[Animal]:
+    """Joints of negative confidence as unseen ones: with -1 trackers fill places for animals and joints not there."""
+    lost = [None if a.confidence is None else np.less(a.confidence, 0) for a in animals]
+    count = sum(int(where.sum()) for where in lost if where is not None)
+    if not count:
+        return list(animals)
+    notes.append(f"{counted(count, 'joint')} of negative confidence: taken as unseen")
+    return [
+        a if where is None or a.confidence is None else a._replace(confidence=np.where(where, 0.0, a.confidence))
+        for a, where in zip(animals, lost, strict=True)
+    ]
 
 
 def _seen(animal: Animal, threshold: float) -> NDArray[np.bool_]:

@@ -225,7 +225,8 @@ def settle(found: Landmarks, path: Path, options: Options, *, shares: bool) -> N
         found.notes.append("the coordinates are pixels already")
     elif shares and size is None:
         raise FormatError(
-            f"{path}: its coordinates are shares of the image, which needs the video's size: give {SIZE_HINT}"
+            f"{path}: its coordinates are shares of the image, which needs the video's size: give {SIZE_HINT}; if they "
+            "are metres, say, in a table, name its format: csv"
         )
     elif small and size is None:
         found.notes.append(f"coordinates are taken as they are: if they are shares of the image, give {SIZE_HINT}")

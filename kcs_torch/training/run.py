@@ -89,8 +89,12 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         module = instantiate(config.module, _convert_="all")
         savable = _savable(module.network)
         best = Best(folder / "checkpoints", config.optimise, config.mode, resumed)
-        more = instantiate(config.trainer.get("callbacks") or [], _convert_="all")
-        more = more if isinstance(more, list) else [more]
+        own = config.trainer
+        more: Any = []
+        if "callbacks" in own:  # to stand beside those of every run
+            more = instantiate(own.callbacks, _convert_="all") or []
+            more = more if isinstance(more, list) else [more]
+            own = OmegaConf.create({name: value for name, value in plain["trainer"].items() if name != "callbacks"})
         made: dict[str, Any] = {
             "callbacks": [Watch(plain), best, Last(folder / "checkpoints"), *more],
             "default_root_dir": folder,
@@ -101,7 +105,7 @@ def train(config: DictConfig, folder: Path) -> Outcome:
             ]
         if "enable_progress_bar" not in config.trainer:
             made["enable_progress_bar"] = sys.stderr.isatty()
-        trainer = instantiate(config.trainer, **made, _convert_="all")
+        trainer = instantiate(own, **made, _convert_="all")
         try:
             trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
         except (Diverged, NotFiniteError):  # a loss or a solver was given NaN
