@@ -111,7 +111,9 @@ def reconstruct_all(
         **fields: of the method.
 
     Returns:
-        A :class:`Reconstruction` of each, in their order.
+        A :class:`Reconstruction` of each, in their order. People before a near camera that nobody has calibrated get a
+        lens of their own each, and x and y from its principal point: their places compare with ``intrinsics`` given, or
+        with "parallel", which leaves everybody where the image has them.
 
     Raises:
         OptionError: as :func:`reconstruct`; or something is not :class:`Tracks`.
