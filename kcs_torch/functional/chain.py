@@ -40,16 +40,14 @@ def incidence(bones: Tensor | Sequence[Sequence[int]], num_joints: int, *, dtype
     index = index_rows(bones)
     # A compiled graph cannot look at numbers, nor are there any on the meta device: the indices were checked before.
     look = index.numel() > 0 and not index.is_meta and not torch.compiler.is_compiling()
-    low, high = (int(index.min()), int(index.max())) if look else (0, -1)
+    try:
+        low, high = (int(index.min()), int(index.max())) if look else (0, -1)
+    except RuntimeError:  # nor can torch.func.vmap
+        low, high = 0, -1
     if low < 0 or high >= num_joints:
         raise ShapeError(f"bones: expected joint indices 0..{num_joints - 1}, got {low}..{high}")
-    return signs(index, num_joints, dtype or torch.get_default_dtype())
-
-
-def signs(bones: Tensor, num_joints: int, dtype: torch.dtype) -> Tensor:
-    """The incidence matrix (N, B) of bones (B, 2) that are known to be right; ``torch.func.vmap`` takes it."""
-    joint = torch.arange(num_joints, device=bones.device)[:, None]
-    return (bones[:, 1] == joint).to(dtype) - (bones[:, 0] == joint).to(dtype)
+    joint, kind = torch.arange(num_joints, device=index.device)[:, None], dtype or torch.get_default_dtype()
+    return (index[:, 1] == joint).to(kind) - (index[:, 0] == joint).to(kind)
 
 
 def chain_inverse(matrix: Tensor) -> Tensor:

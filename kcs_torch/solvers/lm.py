@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.functional.chain import bone_vectors, kcs_matrix, signs
+from kcs_torch.functional.chain import bone_vectors, incidence, kcs_matrix
 from kcs_torch.functional.shapes import broadcast_shapes
 
 __all__ = ["fit_bones"]
@@ -74,8 +74,7 @@ def fit_bones(
         options = {"stiffness": stiffness, "num_steps": num_steps, "damping": damping, "start": begin}
         return fit_bones(points.float(), lengths.float(), bones, **options).to(points.dtype)  # type: ignore[arg-type]
     limits = torch.finfo(points.dtype)
-    anchor_bones = bone_vectors(points, bones)  # which refuses bones of other joints
-    matrix = signs(bones, points.shape[-2], points.dtype)  # (N, B)
+    matrix = incidence(bones, points.shape[-2], dtype=points.dtype)  # (N, B)
     overlap = matrix.mT @ matrix  # (B, B)
     beta = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device)
     beta = beta.clamp_max(1 / (max(len(bones), 1) * limits.eps))  # beyond it the system loses its unit diagonal
@@ -84,6 +83,7 @@ def fit_bones(
     floor = 1e-4 * lengths.detach().abs().mean(-1, keepdim=True)
     tiny = limits.tiny**0.5
     eye = torch.eye(len(bones), dtype=points.dtype, device=points.device)
+    anchor_bones = bone_vectors(points, bones)
     current = points if start is None else start
     share = 1 / (1 + damping)
     for _ in range(num_steps):
