@@ -134,6 +134,7 @@ def test_a_template_that_turns_is_found_again(skeleton):
     turn = torch.stack([angle.cos(), zero, angle.sin(), zero, one, zero, -angle.sin(), zero, angle.cos()], -1)
     points = rest @ turn.view(6, 3, 3).mT
     points = points - points.mean(1, keepdim=True)
+    # Where a quadruped's descent ends; its first steps are nearer, as the prior's mean is no template's own pose.
     assert error(solve(points, skeleton, steps=40).depth[0], points) < 0.35
 
 

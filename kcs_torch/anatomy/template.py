@@ -259,7 +259,7 @@ def _place_quadruped(names: Sequence[str]) -> tuple[Point, ...]:
     places = quadruped_places(names)
     if places is None:
         unknown = [n for n in names if part_of(n, "animal") is None and part_of(n, "human") is None]
-        got = f"does not know {', '.join(map(repr, unknown))}" if unknown else f"got {', '.join(map(repr, names))}"
+        got = f"got {', '.join(map(repr, unknown or names))}" + (", which it does not know" if unknown else "")
         raise SkeletonError(
             "template 'quadruped': expected joints of a front and a hind limb, and a tail, paw or hock, all by known "
             f"names, {got}. Rename them, or give a position for every joint."
