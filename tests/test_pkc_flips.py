@@ -10,11 +10,11 @@ from kcs_torch.functional import bone_vectors, standing
 from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pkc import flips as module
 from kcs_torch.methods.pkc.batch import Task, minimise_all
-from kcs_torch.methods.pkc.flips import flipped, flipped_runs, parts_of, turned, turned_over
+from kcs_torch.methods.pkc.flips import flipped, flipped_runs, parts_of, signs_of, turned_over
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
 from kcs_torch.methods.pkc.objective import Objective, usual_posture
-from kcs_torch.methods.pkc.run_costs import RunCosts, Runs
+from kcs_torch.methods.pkc.run_costs import ParallelRays, RunCosts, Runs
 from kcs_torch.methods.pkc.weights import Weights
 from kcs_torch.skeleton import SKELETONS
 
@@ -45,7 +45,7 @@ def every_flip(depth, parts):
     """All flips of a solution's runs, as depths (K, T, B), and their parts."""
     member = module._members(parts, depth)
     runs = flipped_runs(depth, member, ACCELERATION)
-    return turned(depth, runs, member), runs.part
+    return depth * signs_of(runs, member, len(depth)), runs.part
 
 
 PARTS = [(0,), (1,), (0, 1), (2, 3, 4), (5,)]
@@ -139,15 +139,16 @@ def test_runs_cost_what_the_objective_says(name, noise, frames, monkeypatch):
     objective, own, lengths, member = odd_body(name, frames, noise, anchored=noise > 0)
     runs = flipped_runs(own, member, ACCELERATION)
     assert len(runs.part) >= len(member) / 2
-    depth = objective.joints(turned(own, runs, member))
+    depth = objective.joints(own * signs_of(runs, member, len(own)))
     expected = objective(depth, lengths.expand(len(depth), -1))
-    assert_close(RunCosts(objective, own, lengths)(member, runs), expected, rtol=1e-10, atol=1e-9)
+    costs = RunCosts(objective, ParallelRays(objective, own), lengths)
+    assert_close(costs(member, runs), expected, rtol=1e-10, atol=1e-9)
 
 
 def test_many_runs_take_no_more_operations_than_one():
     """What a part costs in each frame is counted once for all of its runs."""
     objective, own, lengths, member = odd_body("h36m17", 200)
-    costs = RunCosts(objective, own, lengths)
+    costs = RunCosts(objective, ParallelRays(objective, own), lengths)
 
     places = torch.arange(0, 204, 4).expand(len(member), -1)
 
@@ -166,7 +167,7 @@ def test_feet_are_asked_only_of_parts_that_carry_them(name):
     objective.standing = torch.ones(30, len(body.contacts)).double()
     part = torch.arange(len(member))
     runs = Runs(torch.tensor([[0, 15]]).expand(len(member), -1), part, 0 * part, 0 * part + 1)
-    energy = objective.contact(objective.joints(turned(own, runs, member)))
+    energy = objective.contact(objective.joints(own * signs_of(runs, member, len(own))))
     same = (energy - objective.contact(objective.joints(own[None]))).abs() < 1e-9
     carries = objective.carries(member)
     assert 0 < carries.sum() < len(member) and same[~carries].all()

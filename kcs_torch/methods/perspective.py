@@ -83,7 +83,7 @@ def reconstruct_perspective(
     body's apparent size, each round lifts these tracks by the method, then refines depths, lengths and distances of all
     its solutions and of a mirror image together under perspective (:class:`PinholeEnergy`); bones' constant lengths
     tell mirror images apart, and so do feet that stand still. Where the method looks for runs of wrong signs, and the
-    body has a template, they are turned over (:meth:`Scene.turned_over`). Where PKC knows no template, up to
+    body has a template, they are turned over (:meth:`Scene.searched`). Where PKC knows no template, up to
     eight rounds of SfAM go before its own: it does not insist on lengths while depths are still wrong.
 
     Args:
@@ -137,15 +137,16 @@ def _reconstruct(
         cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
     feet = feet_on_ground(tracks, cameras)
     best: _Found | None = None
+    unit: float | None = None
     soft = SOFT if method.turns_over and len(trunk_joints(tracks.skeleton)) < 3 else 0
     while rounds > 0:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)
             known = None if cameras is None else (view.look @ complete_rotation(cameras))[:, :2]
             lifted = (SfAM() if soft else method.following())(_straighten(tracks, view.rays, distance, depth), known)
-        given = lifted, view, distance, depth, rate, feet, steps
+        given = lifted, view, distance, depth, rate, feet, steps, unit
         found = _refine(*given, mirror=cameras is None, flips=method.turns_over, any_focal=any_focal)
-        bodies = found.bodies
+        bodies, unit = found.bodies, found.scene.unit
         moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
         sound = bool(bodies.energy.isfinite().any())
         if sound:
@@ -154,9 +155,10 @@ def _reconstruct(
             soft = soft - 1 if sound and moved >= SETTLED else 0
             continue
         rounds -= 1
-        if best is None or (not bool(bodies.energy[0] >= best.bodies.energy[0]) and bool(bodies.energy[0].isfinite())):
+        better = best is None or bool(bodies.energy[0] < best.bodies.energy[0])
+        if better:
             best = found
-        if moved < SETTLED or not sound:
+        if moved < SETTLED or not sound or not better:
             break
         if any_focal:
             view = View.of(tracks, zoomed(view.lens, float(bodies.focal[0])), rate)
@@ -188,6 +190,7 @@ def _refine(
     rate: float,
     standing: Tensor | None,
     steps: int,
+    unit: float | None,
     *,
     mirror: bool,
     flips: bool,
@@ -203,6 +206,7 @@ def _refine(
         rate: frames a second.
         standing: (T, C) how surely contact points stand still, or None.
         steps: of the refinement.
+        unit: of bodies found before, so that energies compare; that of the lifted one if None.
         mirror: whether depth may have the other sign.
         flips: whether runs of depths may have.
         any_focal: whether the view's focal length is to be found.
@@ -212,11 +216,12 @@ def _refine(
     rays = flat / ahead(distance, depth)[..., None]
     start = torch.stack([o.points[..., 2] for o in others])
     start = start - start.mean(-1, keepdim=True)
-    unit = body_unit(lifted)
+    own = body_unit(lifted)
+    unit = unit or own
     scales = slow_part(lifted.scales.clamp_min(1e-9).log()[:, None], rate)[:, 0].exp()  # a method's own may jump
-    noise = image_noise(lifted, flat, unit, rate)
+    noise = image_noise(lifted, flat, own, rate)
     scene = Scene(lifted.skeleton, rays, noise, rate, unit, standing)
-    parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / unit
+    parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / own
     if parallax < FLAT or not lifted.skeleton.num_bones:
         energy = start.new_tensor([o.objective for o in others])
         number = torch.arange(len(start), device=start.device)
@@ -225,9 +230,9 @@ def _refine(
         return _Found(bodies, others, scene, view, True, lifted.diagnostics.notes)
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
-    bodies = scene.refined(distance / scales, start, steps)
+    bodies = scene.refined(distance / scales * (unit / own), start * (unit / own), steps)
     if flips:
-        bodies = scene.turned_over(bodies, steps)
+        bodies = scene.searched(bodies, steps)
     if any_focal:
         # A foot that comes along its ray seems to stand still, and would make the focal length too short.
         scene = replace(scene, any_focal=True, standing=None)

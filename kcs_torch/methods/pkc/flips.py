@@ -15,11 +15,11 @@ from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.limbs import Limb
 from kcs_torch.methods.pkc.objective import Objective
-from kcs_torch.methods.pkc.run_costs import RunCosts, Runs, inside
+from kcs_torch.methods.pkc.run_costs import ParallelRays, RunCosts, Runs, Turnable, inside
 from kcs_torch.methods.pkc.strides import strides
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["flipped", "flipped_runs", "parts_of", "promising", "turned", "turned_over"]
+__all__ = ["flipped", "flipped_runs", "parts_of", "promising", "signs_of", "turned_over"]
 
 TIMES = 8
 """How often flips are tried at most."""
@@ -116,15 +116,26 @@ def _change(flips: Hypotheses, best: Hypotheses) -> Tensor:
     return (flips.depth - best.depth).square().mean((1, 2)).sqrt()
 
 
-def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypotheses) -> Hypotheses:
-    """The best flips of one run of a solution, at most one a part, best first; they are not refined yet."""
-    own = bone_vectors(best.depth[0, ..., None], objective.bones)[..., 0]
+def flipped(
+    objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypotheses, body: Turnable | None = None
+) -> Hypotheses:
+    """The best flips of one run of a solution, at most one a part, best first; they are not refined yet.
+
+    Args:
+        objective: of one clip.
+        parts: bones whose signs change together.
+        best: the solution.
+        body: the same, if it is not seen along parallel rays.
+    """
+    if body is None:
+        body = ParallelRays(objective, bone_vectors(best.depth[0, ..., None], objective.bones)[..., 0])
+    own = body.own
     member = _members(parts, own)
     runs = flipped_runs(own, member, objective.weights.acceleration)
-    energy = RunCosts(objective, own, best.lengths[0])(member, runs)
+    energy = RunCosts(objective, body, best.lengths[0])(member, runs)
 
     def depths(some: Tensor) -> Tensor:
-        return objective.joints(turned(own, runs.some(some), member))
+        return body.turned(signs_of(runs.some(some), member, len(own)))[0]
 
     if objective.standing is not None:  # contacts only add to the cost: what is hopeless without them stays so
         walks = objective.carries(member)[runs.part]
@@ -138,24 +149,27 @@ def flipped(objective: Objective, parts: Sequence[tuple[int, ...]], best: Hypoth
     found = Hypotheses(depths(order), best.lengths.expand(len(order), -1), energy[order], best.steps)
     if objective.standing is None or not objective.noisy:  # of exact images the motion tells where bones pass the plane
         return found
-    return found.joined(_strides(objective, own, member, runs, best))
+    return found.joined(_strides(objective, body, member, runs, best))
 
 
-def _strides(objective: Objective, own: Tensor, member: Tensor, runs: Runs, best: Hypotheses) -> Hypotheses:
+def _strides(objective: Objective, body: Turnable, member: Tensor, runs: Runs, best: Hypotheses) -> Hypotheses:
     """The best solution with other runs of its legs, by which feet stand; the best few, not refined yet."""
-    bend = _bends(own, member.mT) / (2 * objective.weights.acceleration**2)
-    depth = objective.joints(own * strides(objective, own, member, runs.places, bend))
+    bend = _bends(body.own, member.mT) / (2 * objective.weights.acceleration**2)
+    depth, image = body.turned(strides(objective, body.own, member, runs.places, bend))
     made = Hypotheses(depth, best.lengths.expand(len(depth), -1), best.energy.expand(len(depth)))
-    made = made[_change(made, best) > SLIGHT]
+    some = _change(made, best) > SLIGHT
+    made = made[some]
     if not len(made.depth):
         return made
-    energy = objective(made.depth, made.lengths) + objective.contact(made.depth)
+    seen = None if image is objective.image else image[some]
+    energy = torch.stack(list(objective.terms(made.depth, made.lengths, seen).values())).sum(0)
+    energy = energy + objective.contact(made.depth)
     return replace(made, energy=energy)[energy.argsort()[:STRIDES]]
 
 
-def turned(depth: Tensor, runs: Runs, member: Tensor) -> Tensor:
-    """Depths (T, B) with other signs over runs of frames, for the bones that are members (P, B) of parts: (K, T, B)."""
-    return depth * (1 - 2 * inside(runs, len(depth)).to(depth)[..., None] * member[runs.part][:, None])
+def signs_of(runs: Runs, member: Tensor, frames: int) -> Tensor:
+    """Signs (K, T, B), -1 over runs of frames for the bones that are members (P, B) of their parts."""
+    return 1 - 2 * inside(runs, frames).to(member)[..., None] * member[runs.part][:, None]
 
 
 def _members(parts: Sequence[tuple[int, ...]], depth: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -118,7 +118,12 @@ class PKC(Method):
 
     def following(self) -> PKC:
         """The same without contacts: what stands still in space does not in the image."""
-        return replace(self, contacts=False)
+        return _Followed(**{f.name: getattr(self, f.name) for f in fields(self)} | {"contacts": False})
+
+    @property
+    def _moves(self) -> int:
+        """Rounds of discrete moves; under perspective they are made afterwards, along the rays."""
+        return 0 if isinstance(self, _Followed) else self.rounds
 
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Clean the tracks, try both viewpoints, rank what they give."""
@@ -183,7 +188,7 @@ class PKC(Method):
             found = yield from self._ranked(body, moving)
         else:
             resizing = enough and not changing and size.range >= TRIED  # what is compared must be searched alike
-            found = yield from body.search(self.rounds, self.steps, turned if compared and not resizing else None)
+            found = yield from body.search(self._moves, self.steps, turned if compared and not resizing else None)
             led = compared and body.is_odd(found) and body.turns(found)  # by the viewpoint's turn, not by the template
             if resizing and not led:
                 other = Body(skeleton, resized, tracks.fps or 30.0, noise, feet)
@@ -195,7 +200,7 @@ class PKC(Method):
                 found = body.without_contacts(found)
         if cameras is not None and _turns(cameras):
             found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
-        if polished:
+        if polished and (body.turns(found) or not isinstance(self, _Followed)):
             rival = (yield from turned(body.is_odd(found))) if compared and body.turns(found) else None
             found = yield from body.polished(found, self.steps, rival)
             if self.rounds and self.viewpoint != "moving":
@@ -216,7 +221,7 @@ class PKC(Method):
                 found, rival = replace(found, depth=found.depth * ratio, lengths=found.lengths * ratio), None
             else:
                 rival = None if rival is None else rival * ratio
-                found = yield from body.search(self.rounds, self.steps)
+                found = yield from body.search(self._moves, self.steps)
                 if cameras is not None and _turns(cameras):
                     found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
             found = yield from body.polished(found, self.steps, rival)
@@ -235,7 +240,7 @@ class PKC(Method):
             tried = yield from refined(other.objective, start, self.steps)
             if not bool(tried.energy[0] < before - HOPEFUL):
                 return None
-        new = yield from other.search(self.rounds, self.steps)
+        new = yield from other.search(self._moves, self.steps)
         return new if bool(new.energy[0] < before - BETTER) else None
 
     def _moving(
@@ -314,6 +319,10 @@ class PKC(Method):
             path, said, still = turned if cameras is None else cameras, () if k else notes, not _turns(cameras)
             made.append(Estimate(points, path, one, settled, found.steps, said, spread, value, still=still))
         return replace(made[0], alternatives=tuple(made[1:]))
+
+
+class _Followed(PKC):
+    """Whose solutions are refined, searched and polished under perspective."""
 
 
 def _complete(tracks: Tracks, image: Tensor) -> Tracks:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.methods.pkc.objective import Objective
 
-__all__ = ["RunCosts", "Runs", "inside"]
+__all__ = ["ParallelRays", "RunCosts", "Runs", "Turnable", "inside"]
 
 ROWS = 1024
 """Frames of changed solutions that are looked at together."""
@@ -54,6 +55,31 @@ class Runs(NamedTuple):
         return runs._replace(places=self.places[parts], part=runs.part - parts.start), found
 
 
+class Turnable(Protocol):
+    """A body whose bones may have other signs of depth.
+
+    Attributes:
+        own: (T, B) signed depths of bones.
+    """
+
+    @property
+    def own(self) -> Tensor: ...
+
+    def turned(self, signs: Tensor) -> tuple[Tensor, Tensor]:
+        """Centred depths (K, T, N), and their image (T, N, 2) or (K, T, N, 2), with signs (K, T or 1, B) turned."""
+        ...
+
+
+class ParallelRays(NamedTuple):
+    """A body under parallel rays: whatever the depths, its image is the same."""
+
+    objective: Objective
+    own: Tensor
+
+    def turned(self, signs: Tensor) -> tuple[Tensor, Tensor]:
+        return self.objective.joints(self.own * signs), self.objective.image
+
+
 class _Frames(NamedTuple):
     """What V solutions count in each frame.
 
@@ -79,47 +105,48 @@ class RunCosts:
 
     Args:
         objective: of one clip.
-        own: (T, B) depths of the bones.
+        body: the solution.
         lengths: (B,).
     """
 
-    def __init__(self, objective: Objective, own: Tensor, lengths: Tensor) -> None:
-        self.objective, self.own, self.lengths = objective, own, lengths
-        self.base = self._frames(own[None])
+    def __init__(self, objective: Objective, body: Turnable, lengths: Tensor) -> None:
+        self.objective, self.body, self.lengths = objective, body, lengths
+        self.base = self._frames(torch.ones_like(body.own[None, :1]))
         self.fixed = torch.cat(list(objective.length_terms(lengths[None]).values())).sum()
 
     def __call__(self, member: Tensor, runs: Runs) -> Tensor:
         """Energies (K,) of runs of at least two frames, or of the whole clip; members (P, B) are 1 for parts' bones."""
-        energy = self.own.new_empty(len(runs.part))
-        few = max(1, ROWS // len(self.own))
+        energy = self.lengths.new_empty(len(runs.part))
+        few = max(1, ROWS // len(self.body.own))
         for k in range(0, len(member), few):
             some, index = runs.of(slice(k, k + few))
-            energy[index] = self._energy(self._frames(self.own * (1 - 2 * member[k : k + few, None])), some)
+            energy[index] = self._energy(self._frames(1 - 2 * member[k : k + few, None]), some)
         return energy
 
-    def _frames(self, own: Tensor) -> _Frames:
-        obj, lengths = self.objective, self.lengths.expand(len(own), -1)
-        depth = obj.joints(own)
-        points = torch.cat([obj.image.expand(*depth.shape, 2), depth[..., None]], -1)
+    def _frames(self, signs: Tensor) -> _Frames:
+        obj, lengths = self.objective, self.lengths.expand(len(signs), -1)
+        depth, image = self.body.turned(signs)
+        flat = obj.flat if image is obj.image else bone_vectors(image, obj.bones).square().sum(-1)
+        points = torch.cat([image.expand(*depth.shape, 2), depth[..., None]], -1)
         dz = depth[..., obj.bones[:, 1]] - depth[..., obj.bones[:, 0]]
         hinges = _sized(obj.hinges.bend(points, lengths), points, obj.hinges.joints)
         reach = _sized(-obj.adduction.abduction(points, lengths), points, obj.adduction.joints)
         parts = (
-            obj.strayed(dz, lengths, obj.flat),
-            obj.hinges.firm.to(own) * hinges[0].clamp_max(0).square(),
+            obj.strayed(dz, lengths, flat),
+            obj.hinges.firm.to(depth) * hinges[0].clamp_max(0).square(),
             hinges[1],
             reach[1],
             obj.stance.strayed(points, 1.0)[..., None],
             obj.foreshortening.each(dz, lengths, obj.clear, obj.noise).sum(-1, keepdim=True),
         )
         posture = obj.posture
-        y = (posture.directions(points, lengths) - posture.mean.to(own)) / posture.deviation.to(own)
+        y = (posture.directions(points, lengths) - posture.mean.to(depth)) / posture.deviation.to(depth)
         return _Frames(torch.cat(parts, -1), posture.taken_apart(y.flatten(-2)), reach[0], dz)
 
     def _energy(self, frames: _Frames, runs: Runs) -> Tensor:
         """(K,) of runs of parts, with the frames of solutions in which these are changed throughout."""
         obj, base = self.objective, self.base
-        count, w = len(self.own), obj.weights
+        count, w = len(self.body.own), obj.weights
         total = base.sums.sum(1) + _between(frames.sums - base.sums, runs.part, runs.starts, runs.ends)
         hinges, limbs = len(obj.hinges.joints), len(obj.adduction.joints)
         strayed, wrong, axes, sides, feet, short = total.split([len(self.lengths), hinges, hinges, limbs, 1, 1], -1)

@@ -1,0 +1,101 @@
+"""A body seen along rays whose bones may have other signs of depth: :class:`AlongRays`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.methods.pinhole import NEAREST
+from kcs_torch.methods.pkc.objective import Objective
+
+__all__ = ["AlongRays"]
+
+
+class _Link(NamedTuple):
+    """A bone from a joint that is laid to one that hangs on it; of sense -1 if its parent is the latter."""
+
+    bone: int
+    near: int
+    far: int
+    sense: int
+
+
+class AlongRays:
+    """A body whose joints stay on their rays (u, v, 1), and whose bones keep their lengths, whatever their signs.
+
+    The ray of a bone's far joint meets the sphere about the near joint whose radius is the bone's length twice, as far
+    before the ray's nearest point as behind it. Under parallel rays these are depths z and -z; before a near camera -z
+    would be another length, and what hangs on the bone moves other spheres. Bones are therefore laid one after another,
+    from the trunk's first joint on, which stays where it is.
+
+    Args:
+        objective: of the body's image under parallel rays.
+        rays: (T, N, 2), complete.
+        distance: (T,) of the body, in units of the template.
+        depth: (T, N) of joints, relative to the distance.
+
+    Attributes:
+        own: (T, B) signed depths of bones, each along its far joint's ray.
+    """
+
+    def __init__(self, objective: Objective, rays: Tensor, distance: Tensor, depth: Tensor) -> None:
+        self.objective, self.least = objective, NEAREST * distance
+        self.rays = torch.cat([rays, torch.ones_like(rays[..., :1])], -1)
+        self.square = self.rays.square().sum(-1)  # (T, N)
+        self.far = distance[:, None] + depth
+        self.links = _from_trunk(objective)
+        points = self.rays * self.far[..., None]
+        self.lengths = bone_vectors(points, objective.bones).norm(dim=-1)  # (T, B)
+        self.own = torch.zeros_like(self.lengths)
+        for bone, near, far, sense in self.links:
+            ahead = self.far[:, far] - (self.rays[:, far] * points[:, near]).sum(-1) / self.square[:, far]
+            self.own[:, bone] = sense * ahead * self.square[:, far].sqrt()
+
+    def turned(self, signs: Tensor) -> tuple[Tensor, Tensor]:
+        """Centred depths (K, T, N), and images (K, T, N, 2) under parallel rays, with signs (K, T or 1, B) turned."""
+        return self._laid(torch.where(self.own < 0, -1, 1) * signs, self.lengths, ())
+
+    def laid(self, own: Tensor, lengths: Tensor, given: Collection[int]) -> Tensor:
+        """Centred depths (K, T, N) with other lengths (K, B), and signs that are those of depths of bones (K, T, B).
+
+        Bones that are ``given`` have these depths, whatever their length.
+        """
+        return self._laid(own, lengths[:, None], given)[0]
+
+    def _laid(self, own: Tensor, lengths: Tensor, given: Collection[int]) -> tuple[Tensor, Tensor]:
+        places = list(self.far.expand(len(own), -1, -1).unbind(-1))  # (K, T) each
+        for bone, near, far, sense in self.links:
+            deep, here, square = sense * own[..., bone], places[near], self.square[:, far]
+            if bone in given:
+                there = here + deep
+            else:
+                along = (self.rays[:, far] * self.rays[:, near]).sum(-1) / square * here
+                left = (lengths[..., bone].square() - self.square[:, near] * here.square()) / square
+                reach = (along.square() + left).clamp_min(0).sqrt()
+                there = along + torch.where(deep < 0, -reach, reach)
+            places[far] = torch.maximum(there, self.least)
+        n, complete = self.objective.skeleton.num_observed, self.objective.complete  # virtual joints follow the others
+        ahead = torch.stack(places[:n], -1)
+        depth, image = ahead @ complete, (self.rays[:, :n, :2] * ahead[..., None]).mT @ complete
+        return depth - depth.mean(-1, keepdim=True), (image - image.mean(-1, keepdim=True)).mT
+
+
+def _from_trunk(objective: Objective) -> list[_Link]:
+    """All bones, those nearer to the trunk first; each further piece of a skeleton after its first bone's parent."""
+    left = dict(enumerate(objective.skeleton.bones))
+    reached, links = {int(objective.posture.trunk[0])}, list[_Link]()
+    while left:
+        here = {b: pair for b, pair in left.items() if reached.intersection(pair)}
+        for bone, (parent, child) in here.items():
+            del left[bone]
+            if not reached.issuperset((parent, child)):
+                near, far, sense = (parent, child, 1) if parent in reached else (child, parent, -1)
+                links.append(_Link(bone, near, far, sense))
+                reached.add(far)
+        if not here:
+            reached.add(next(iter(left.values()))[0])
+    return links
