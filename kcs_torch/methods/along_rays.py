@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import NamedTuple
 
 import torch
@@ -57,27 +56,14 @@ class AlongRays:
 
     def turned(self, signs: Tensor) -> tuple[Tensor, Tensor]:
         """Centred depths (K, T, N), and images (K, T, N, 2) under parallel rays, with signs (K, T or 1, B) turned."""
-        return self._laid(torch.where(self.own < 0, -1, 1) * signs, self.lengths, ())
-
-    def laid(self, own: Tensor, lengths: Tensor, given: Collection[int]) -> Tensor:
-        """Centred depths (K, T, N) with other lengths (K, B), and signs that are those of depths of bones (K, T, B).
-
-        Bones that are ``given`` have these depths, whatever their length.
-        """
-        return self._laid(own, lengths[:, None], given)[0]
-
-    def _laid(self, own: Tensor, lengths: Tensor, given: Collection[int]) -> tuple[Tensor, Tensor]:
-        places = list(self.far.expand(len(own), -1, -1).unbind(-1))  # (K, T) each
+        places = list(self.far.expand(len(signs), -1, -1).unbind(-1))  # (K, T) each
+        signs = torch.where(self.own < 0, -1, 1) * signs
         for bone, near, far, sense in self.links:
-            deep, here, square = sense * own[..., bone], places[near], self.square[:, far]
-            if bone in given:
-                there = here + deep
-            else:
-                along = (self.rays[:, far] * self.rays[:, near]).sum(-1) / square * here
-                left = (lengths[..., bone].square() - self.square[:, near] * here.square()) / square
-                reach = (along.square() + left).clamp_min(0).sqrt()
-                there = along + torch.where(deep < 0, -reach, reach)
-            places[far] = torch.maximum(there, self.least)
+            here, square = places[near], self.square[:, far]
+            along = (self.rays[:, far] * self.rays[:, near]).sum(-1) / square * here
+            left = (self.lengths[:, bone].square() - self.square[:, near] * here.square()) / square
+            reach = (along.square() + left).clamp_min(0).sqrt()
+            places[far] = torch.maximum(along + sense * signs[..., bone] * reach, self.least)
         n, complete = self.objective.skeleton.num_observed, self.objective.complete  # virtual joints follow the others
         ahead = torch.stack(places[:n], -1)
         depth, image = ahead @ complete, (self.rays[:, :n, :2] * ahead[..., None]).mT @ complete

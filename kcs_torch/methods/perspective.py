@@ -83,7 +83,7 @@ def reconstruct_perspective(
     body's apparent size, each round lifts these tracks by the method, then refines depths, lengths and distances of all
     its solutions and of a mirror image together under perspective (:class:`PinholeEnergy`); bones' constant lengths
     tell mirror images apart, and so do feet that stand still. Where the method looks for runs of wrong signs, and the
-    body has a template, they are turned over (:meth:`Scene.searched`). Where PKC knows no template, up to
+    body has a template, they are turned over (:meth:`Scene.turned_over`). Where PKC knows no template, up to
     eight rounds of SfAM go before its own: it does not insist on lengths while depths are still wrong.
 
     Args:
@@ -232,7 +232,7 @@ def _refine(
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
     bodies = scene.refined(distance / scales * (unit / own), start * (unit / own), steps)
     if flips:
-        bodies = scene.searched(bodies, steps)
+        bodies = scene.turned_over(bodies, steps)
     if any_focal:
         # A foot that comes along its ray seems to stand still, and would make the focal length too short.
         scene = replace(scene, any_focal=True, standing=None)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.temporal import blend_windows, window_starts
 from kcs_torch.methods.along_rays import AlongRays
@@ -16,11 +16,11 @@ from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
 from kcs_torch.methods.pkc.batch import serve
 from kcs_torch.methods.pkc.body import DAMPING, HOLD, Body
-from kcs_torch.methods.pkc.fixed_view import Lookout, looking
-from kcs_torch.methods.pkc.flips import flipped, promising
+from kcs_torch.methods.pkc.flips import flipped, parts_of, promising
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
-from kcs_torch.methods.pkc.objective import bone_noise
-from kcs_torch.methods.pkc.weights import Weights
+from kcs_torch.methods.pkc.limbs import limbs_of
+from kcs_torch.methods.pkc.objective import Objective, bone_noise
+from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -31,12 +31,11 @@ __all__ = ["Bodies", "Scene", "ahead"]
 BLOCK, OVERLAP = 2000, 100
 """Frames of a long clip that are refined together, at most, and by how many blocks overlap."""
 
-FLIPS, PLACINGS = 8, 3
-"""How often flips are tried in a row, and how often limbs are placed again, at most."""
+FLIPS = 8
+"""How often flips are tried at most."""
 
-FEW, DEARER, GAIN = 3, 10.0, 0.5
-"""How many flips are refined well, and how much dearer than the best they may be before; how much cheaper than it a
-body must be to be taken."""
+FEW, GAIN = 3, 1.0
+"""How many flips are refined well, and how much cheaper than the best a body must be to be taken."""
 
 
 @dataclass(frozen=True)
@@ -135,40 +134,33 @@ class Scene:
         number = torch.arange(len(energy), device=z.device)
         return Bodies(z.transpose(0, 1), far.mT, energy, number, focal)[order]
 
-    def searched(self, found: Bodies, steps: int) -> Bodies:
-        """Bodies, best first, whose best one no discrete move makes better.
+    def turned_over(self, found: Bodies, steps: int) -> Bodies:
+        """Bodies, best first, whose best one no flip of a run of its signs makes better.
 
         Straightened tracks agree with what is wrong in the depths that straightened them, so that no method finds it.
-        Runs of signs are therefore turned over (:func:`kcs_torch.methods.pkc.flips.flipped`) with joints that stay on
-        their rays, limbs are placed again, about mirror images of the trunk, too, and all that is refined under
-        perspective. Bodies without a template, and clips of several blocks, are left as they are.
+        Flips (:func:`kcs_torch.methods.pkc.flips.flipped`) whose joints stay on their rays (:class:`AlongRays`) are
+        therefore refined under perspective. Bodies without a template, and clips of several blocks, are left as they
+        are.
         """
         if len(trunk_joints(self.skeleton)) < 3 or len(self.rays) > BLOCK or not bool(found.energy[0].isfinite()):
             return found
-        found = self._turned_over(found, steps)
-        for _ in range(PLACINGS):
-            better = self._better(found[:1], self._placed(found[:1]), steps)
-            if better is None:
-                break
-            found = self._turned_over(found.joined(better), steps)
-        return found
-
-    def _turned_over(self, found: Bodies, steps: int) -> Bodies:
-        """Bodies, best first, whose best one no flip of a run of its signs makes better."""
         for _ in range(FLIPS):
-            better = self._better(found[:1], self._flips(found[:1]), steps, DEARER)
+            better = self._better(found[:1], self._flips(found[:1]), steps)
             if better is None:
                 break
             found = found.joined(better)
         return found
 
-    def _better(self, best: Bodies, depth: Tensor, steps: int, dearer: float = math.inf) -> Bodies | None:
-        """The best body that depths (H, T, N) lead to, if it is better; they are refined a little, then a few well."""
+    def _better(self, best: Bodies, depth: Tensor, steps: int) -> Bodies | None:
+        """The best body that depths (H, T, N) lead to, if it is better.
+
+        They are refined a little, and a few of those that are already better then well.
+        """
         if not len(depth):
             return None
         distance = best.distance[0]
         tried = self.refined(distance, depth, max(steps // 3, 1), best.focal)[:FEW]
-        tried = tried[tried.energy < best.energy + dearer]
+        tried = tried[tried.energy < best.energy]
         if not len(tried.energy):
             return None
         better = self.refined(distance, tried.depth, steps, best.focal)[:1]
@@ -218,30 +210,18 @@ class Scene:
         image = (self.rays / best.focal * ahead(best.distance, best.depth)[..., None])[0] / self.unit
         return image - image.mean(-2, keepdim=True)
 
-    def _looked_at(self, best: Bodies) -> tuple[Lookout, Hypotheses, AlongRays]:
-        """One body as it were under parallel rays, and along its own."""
+    def _flips(self, best: Bodies) -> Tensor:
+        """Depths (H, T, N) of one body with promising runs of signs turned over."""
         depth, image = best.depth / self.unit, self._image(best)
-        look = looking(self.skeleton, image, self.rate, self.noise, standing=self.standing)
-        objective = look.objective
+        weights = at_pace(Weights(), self.rate, pace_of(image, self.skeleton, self.rate))
+        objective = Objective(self.skeleton, image, weights, self.noise, standing=self.standing)
         points = torch.cat([image[None], depth[..., None]], -1)
         lengths = median(bone_lengths(points, objective.bones), 1)
         now = Hypotheses(depth, lengths, objective(depth, lengths) + objective.contact(depth))
-        along = AlongRays(objective, self.rays / float(best.focal), best.distance[0] / self.unit, depth[0])
-        return look, now, along
-
-    def _flips(self, best: Bodies) -> Tensor:
-        """Depths (H, T, N) of one body with promising runs of signs turned over."""
-        look, now, along = self._looked_at(best)
-        tried = flipped(look.objective, look.parts, now, along)
+        parts = parts_of(self.skeleton, limbs_of(self.skeleton, objective.posture.trunk.tolist()))
+        body = AlongRays(objective, self.rays / float(best.focal), best.distance[0] / self.unit, depth[0])
+        tried = flipped(objective, parts, now, body)
         return tried.depth[promising(tried, now)] * self.unit
-
-    def _placed(self, best: Bodies) -> Tensor:
-        """Depths (H, T, N) of one body with its limbs placed again, and of its mirror images."""
-        look, now, along = self._looked_at(best)
-        placed = run(look.placed(now), serve)
-        own = bone_vectors(placed.depth[..., None], look.objective.bones)[..., 0]
-        limbs = {b for limb in look.limbs for b in limb.bones}
-        return along.laid(own, placed.lengths, set(range(self.skeleton.num_bones)) - limbs) * self.unit
 
 
 def ahead(distance: Tensor, depth: Tensor) -> Tensor:

@@ -107,30 +107,6 @@ def searching(
 
     It ends early with hypotheses that are ``confirmed`` from elsewhere.
     """
-    search = looking(skeleton, image, rate, noise, anchor, weights, standing)
-    first = yield from search.start(anchor)
-    found = yield from search.refine(first, steps, LOOSE)
-    if confirmed is not None and (yield from confirmed(found)):
-        return found
-    for _ in range(rounds):
-        best = found.energy[0]
-        moved = yield from search.moves(found)
-        found = yield from search.refine(moved, steps)
-        if not bool(found.energy[0] < best - 0.5):
-            break
-    return (yield from turned_over(search.objective, search.parts, found, steps)) if rounds else found
-
-
-def looking(
-    skeleton: Skeleton,
-    image: Tensor,
-    rate: float,
-    noise: Tensor,
-    anchor: Tensor | None = None,
-    weights: Weights | None = None,
-    standing: Tensor | None = None,
-) -> Lookout:
-    """What :func:`searching` looks at one clip with; arguments as of :func:`fixed_view`."""
     slow = 30.0 / rate
     pace = pace_of(image, skeleton, rate)
     weights = at_pace(weights or Weights(), rate, pace)
@@ -144,11 +120,22 @@ def looking(
     )
     image = image - image.mean(-2, keepdim=True)
     objective = Objective(skeleton, image, weights, noise, anchor, standing)
-    return Lookout(skeleton, image, objective, costs, TURN * slow)
+    search = _Search(skeleton, image, objective, costs, TURN * slow)
+    first = yield from search.start(anchor)
+    found = yield from search.refine(first, steps, LOOSE)
+    if confirmed is not None and (yield from confirmed(found)):
+        return found
+    for _ in range(rounds):
+        best = found.energy[0]
+        moved = yield from search.moves(found)
+        found = yield from search.refine(moved, steps)
+        if not bool(found.energy[0] < best - 0.5):
+            break
+    return (yield from turned_over(search.objective, search.parts, found, steps)) if rounds else found
 
 
 @dataclass(frozen=True)
-class Lookout:
+class _Search:
     skeleton: Skeleton
     image: Tensor
     objective: Objective
@@ -193,25 +180,21 @@ class Lookout:
 
     def moves(self, found: Hypotheses) -> Search[Any, Any, Hypotheses]:
         """The best, the next ones, and what discrete moves make of the best."""
-        placed = yield from self.placed(found[:1])
-        flips = flipped(self.objective, self.parts, found[:1])[:FLIPS]
-        return Hypotheses(
-            torch.cat([found.depth[:2], placed.depth, flips.depth]),
-            torch.cat([found.lengths[:2], placed.lengths, flips.lengths]),
-            torch.cat([found.energy[:2], placed.energy, torch.full_like(flips.energy, torch.inf)]),
-            found.steps,
-        )
-
-    def placed(self, best: Hypotheses) -> Search[Any, Any, Hypotheses]:
-        """A solution with its limbs placed again, about its trunk as it is, and about its mirror images."""
-        z, length = best.depth[0], best.lengths[0]
+        z, length = found.depth[0], found.lengths[0]
         points = torch.cat([self.image, z[..., None]], -1)
         trunk = Trunk(self.objective.posture.rest, length)
         path, *others = yield from self._settled(self.objective.posture.frame(points), trunk, length)
         near, *turned = yield from self._places([path, *others], trunk, length, [z, *[None] * len(others)])
         again = yield from self._places([path], trunk, None, [z])
-        depth, lengths = (torch.stack(part) for part in zip(near, *again, *turned, strict=True))
-        return Hypotheses(depth, lengths, depth.new_full((len(depth),), torch.inf))
+        new = [near, *again, *turned]
+        flips = flipped(self.objective, self.parts, found[:1])[:FLIPS]
+        made = len(new)
+        return Hypotheses(
+            torch.cat([found.depth[:2], torch.stack([n[0] for n in new]), flips.depth]),
+            torch.cat([found.lengths[:2], torch.stack([n[1] for n in new]), flips.lengths]),
+            torch.cat([found.energy[:2], found.energy.new_full((made + len(flips.energy),), torch.inf)]),
+            found.steps,
+        )
 
     def _trunks(self, anchor: Tensor | None) -> list[Trunk]:
         """The template, and one whose central bones are as long as their longest image."""
