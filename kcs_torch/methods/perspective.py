@@ -145,7 +145,8 @@ def _reconstruct(
             known = None if cameras is None else (view.look @ complete_rotation(cameras))[:, :2]
             lifted = (SfAM() if soft else method.following())(_straighten(tracks, view.rays, distance, depth), known)
         given = lifted, view, distance, depth, rate, feet, steps, unit
-        found = _refine(*given, mirror=cameras is None, flips=method.turns_over, any_focal=any_focal)
+        flips = method.turns_over and (best is not None or not any_focal)  # else a guess is confirmed
+        found = _refine(*given, mirror=cameras is None, flips=flips, any_focal=any_focal)
         bodies, unit = found.bodies, found.scene.unit
         moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
         sound = bool(bodies.energy.isfinite().any())
