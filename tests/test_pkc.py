@@ -114,6 +114,7 @@ def test_feet_do_not_stand_before_a_camera_that_goes_round(frames, yaw):
     assert error(result.points, clip.points) < 0.05
     known = PKC(seed=3).following()
     assert asdict(known) == asdict(PKC(seed=3, contacts=False)) and SfAM().following() == SfAM()
+    assert PKC(seed=3).following(searched=False) == PKC(seed=3, contacts=False)
     body = Body(result.skeleton, clip.tracks.points - clip.tracks.points.mean(1, keepdim=True), 30.0,
                 torch.zeros(frames, 17).double(), standing_feet(clip.tracks))  # fmt: skip
     depth = torch.stack([clip.points[..., 2], 0.5 * clip.points[..., 2]]) * body.factor

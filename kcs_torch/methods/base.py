@@ -73,8 +73,12 @@ class Method(ABC):
         """The tracks that are solved, and that the result names as its own: those given, or mended ones."""
         return tracks
 
-    def following(self) -> Method:
-        """The method for tracks of a camera that turns after the body, by which nothing stands still in the image."""
+    def following(self, searched: bool = True) -> Method:
+        """The method for tracks of a camera that turns after the body, by which nothing stands still in the image.
+
+        Args:
+            searched: whether runs of signs in what it finds are turned over afterwards, under perspective.
+        """
         return self
 
     def __call__(self, tracks: Tracks, cameras: Tensor | None = None) -> Reconstruction:

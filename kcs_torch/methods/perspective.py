@@ -17,7 +17,7 @@ from kcs_torch.methods.detector import detected
 from kcs_torch.methods.finish import HARDLY, WHY_LOOSE, little_turn, what_is_wrong
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
-from kcs_torch.methods.scene import Bodies, Scene, ahead
+from kcs_torch.methods.scene import BLOCK, Bodies, Scene, ahead
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.view import View, lens_note, slow_part, zoomed
 from kcs_torch.nn.posture import trunk_joints
@@ -143,11 +143,12 @@ def _reconstruct(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)
             known = None if cameras is None else (view.look @ complete_rotation(cameras))[:, :2]
-            lifted = (SfAM() if soft else method.following())(_straighten(tracks, view.rays, distance, depth), known)
+            step = SfAM() if soft else method.following(tracks.num_frames <= BLOCK)
+            lifted = step(_straighten(tracks, view.rays, distance, depth), known)
         given = lifted, view, distance, depth, rate, feet, steps, unit
         flips = method.turns_over and (best is not None or not any_focal)  # else a guess is confirmed
         found = _refine(*given, mirror=cameras is None, flips=flips, any_focal=any_focal)
-        bodies, unit = found.bodies, found.scene.unit
+        bodies, unit = found.bodies, None if soft else found.scene.unit
         moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
         sound = bool(bodies.energy.isfinite().any())
         if sound:

@@ -26,7 +26,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.lm import fit_bones
 
-__all__ = ["Bodies", "Scene", "ahead"]
+__all__ = ["BLOCK", "Bodies", "Scene", "ahead"]
 
 BLOCK, OVERLAP = 2000, 100
 """Frames of a long clip that are refined together, at most, and by how many blocks overlap."""

@@ -116,9 +116,10 @@ class PKC(Method):
     def prepared(self, tracks: Tracks) -> Tracks:
         return unswap(without_others(tracks)) if self.denoise else tracks
 
-    def following(self) -> PKC:
+    def following(self, searched: bool = True) -> PKC:
         """The same without contacts: what stands still in space does not in the image."""
-        return _Followed(**{f.name: getattr(self, f.name) for f in fields(self)} | {"contacts": False})
+        kind = _Followed if searched else PKC
+        return kind(**{f.name: getattr(self, f.name) for f in fields(self)} | {"contacts": False})
 
     @property
     def _moves(self) -> int:
