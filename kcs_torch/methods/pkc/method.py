@@ -118,8 +118,9 @@ class PKC(Method):
 
     def following(self, searched: bool = True) -> PKC:
         """The same without contacts: what stands still in space does not in the image."""
-        kind = _Followed if searched else PKC
-        return kind(**{f.name: getattr(self, f.name) for f in fields(self)} | {"contacts": False})
+        if not searched:
+            return replace(self, contacts=False)
+        return _Followed(**{f.name: getattr(self, f.name) for f in fields(self)} | {"contacts": False})
 
     @property
     def _moves(self) -> int:
