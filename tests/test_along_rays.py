@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from kcs_torch.data import random_motion, walking_person
-from kcs_torch.functional import bone_lengths
+from kcs_torch.functional import bone_lengths, bone_vectors
 from kcs_torch.methods.along_rays import AlongRays
 from kcs_torch.methods.pinhole import NEAREST
 from kcs_torch.methods.pkc.flips import flipped_runs, signs_of
@@ -46,7 +46,7 @@ def placed(along, depth, points):
 @pytest.mark.parametrize("name", BODIES)
 def test_without_other_signs_it_is_the_body(name):
     along, objective, points = seen(name, 3.0)
-    depth, image = along.turned(torch.ones(2, 1, objective.skeleton.num_bones).double())
+    depth, image, *_ = along.turned(torch.ones(2, 1, objective.skeleton.num_bones).double())
     assert_close(depth, (points[..., 2] - points[..., 2].mean(1, keepdim=True)).expand(2, -1, -1), rtol=0, atol=1e-8)
     assert_close(image, objective.image.expand(2, -1, -1, -1), rtol=0, atol=1e-8)
 
@@ -57,7 +57,7 @@ def test_bones_keep_their_lengths_and_joints_their_rays(name, seed):
     along, objective, points = seen(name, 2.5)
     body = objective.skeleton
     signs = torch.randint(2, (5, 12, body.num_bones), generator=torch.Generator().manual_seed(seed)).double() * 2 - 1
-    depth, image = along.turned(signs)
+    depth, image, *_ = along.turned(signs)
     found = placed(along, depth, points)
     old, new = (bone_lengths(x, body.bone_index()) for x in (along.rays * along.far[..., None], found))
     kept = (new - old).abs() < 1e-7
@@ -74,8 +74,10 @@ def test_before_a_far_camera_signs_turn_as_under_parallel_rays():
     along, objective, _ = seen("h36m17", 1e5)
     signs = torch.ones(3, 1, 16).double()
     signs[0, :, 2] = signs[1, :, [1, 2]] = signs[2] = -1
-    turned, _ = along.turned(signs)
-    assert_close(turned, ParallelRays(objective, along.own).turned(signs)[0], rtol=0, atol=2e-3)
+    turned, parallel = along.turned(signs), ParallelRays(objective, along.own).turned(signs)
+    assert_close(turned.depth, parallel.depth, rtol=0, atol=2e-3)
+    costs = [one.foreshortened(objective, along.lengths[0]) for one in (turned, parallel)]
+    assert_close(*costs, rtol=0, atol=0.02)
 
 
 def test_a_near_camera_sees_another_length_where_a_depth_is_only_turned_over():
@@ -87,7 +89,7 @@ def test_a_near_camera_sees_another_length_where_a_depth_is_only_turned_over():
     own = points[..., bones[0, 1], 2] - points[..., bones[0, 0], 2]
     only = along.far.clone()
     only[:, bones[0, 1]] -= 2 * own
-    naive, exact = along.rays * only[..., None], placed(along, along.turned(signs)[0], points)[0]
+    naive, exact = along.rays * only[..., None], placed(along, along.turned(signs).depth, points)[0]
     off = [(bone_lengths(x, bones)[:, 0] / along.lengths[:, shin] - 1).abs() for x in (naive, exact)]
     deep = own.abs() > 0.15
     assert off[0][deep].max() > 0.02 and off[1][deep].max() < 1e-9
@@ -98,13 +100,13 @@ def test_a_ray_out_of_reach_is_met_where_it_is_nearest_and_before_the_camera():
     along, objective, points = seen("h36m17", 3.0)
     signs = torch.ones(1, 1, 16).double()
     along.lengths = 0 * along.lengths
-    short = placed(along, along.turned(signs)[0], points)
+    short = placed(along, along.turned(signs).depth, points)
     assert torch.isfinite(short).all()
     near, far = objective.skeleton.bones[0]
     across = ((short[0, :, far] - short[0, :, near]) * along.rays[:, far]).sum(-1)
     assert_close(across, torch.zeros_like(across), rtol=0, atol=1e-9)
     along.lengths = along.lengths + 100
-    behind = placed(along, along.turned(signs)[0], points)
+    behind = placed(along, along.turned(signs).depth, points)
     assert bool((behind[..., 2] > 0.99 * NEAREST * 3.0).all())
 
 
@@ -116,10 +118,20 @@ def test_runs_cost_what_the_objective_says_of_their_own_images(noise):
     member = torch.eye(16).double()
     runs = flipped_runs(along.own, member, objective.weights.acceleration)
     lengths = along.lengths.median(0).values
-    depth, image = along.turned(signs_of(runs, member, 40))
-    expected = torch.stack(list(objective.terms(depth, lengths.expand(len(depth), -1), image).values())).sum(0)
+    signs = torch.cat([torch.ones(1, 40, 16).double(), signs_of(runs, member, 40)])
+    depth, image, *_ = along.turned(signs)
+    size = lengths.expand(len(depth), -1)
+    terms = objective.terms(depth, size, image)
+    far = depth - depth[..., :1] + along.far[:, :1]  # the trunk's first joint is where it was
+    deep = bone_vectors(along.rays * far[..., None], objective.bones)
+    deep = (deep * along.rays[:, objective.bones[:, 1]]).sum(-1)
+    each = objective.foreshortening.each(deep, size, objective.clear, objective.noise)
+    near = 2 * objective.independent * (far[..., objective.bones[:, 1]] / along.far.mean()).log()
+    terms["foreshortening"] = (each - near).sum((1, 2))
+    expected, costs = torch.stack(list(terms.values())).sum(0), RunCosts(objective, along, lengths)
     assert len(runs.part) > 8
-    assert_close(RunCosts(objective, along, lengths)(member, runs), expected, rtol=1e-9, atol=1e-8)
+    assert_close(costs(member, runs), expected[1:], rtol=1e-9, atol=1e-8)
+    assert_close(costs.unchanged, expected[:1], rtol=1e-9, atol=1e-8)
 
 
 def test_pieces_of_a_skeleton_are_all_laid():

@@ -8,7 +8,7 @@ from numerics import CHAIN, normal
 from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
-from kcs_torch.functional import bone_lengths
+from kcs_torch.functional import bone_lengths, bone_vectors
 from kcs_torch.methods import pinhole, plain_body
 from kcs_torch.methods.pinhole import PinholeEnergy
 from kcs_torch.methods.pkc.objective import Objective
@@ -89,10 +89,12 @@ def test_energy_of_a_person_is_that_of_pkc_for_the_straightened_image():
     rest = (path / far).log().square().mean() / (2 * pinhole.STRAY**2)
     rest += (path.diff() * 30 / pinhole.SPEED).square().sum() / (2 * pinhole.INDEPENDENT)
     rest += (path.diff(n=2) / pinhole.ROOT).square().sum() / 2
-    free = alike.foreshortening
-    share = energy.model.clear * free.free.double() / free.correlation
-    middle = (path[..., None] + z)[0][:, skeleton.bone_index()].mean(-1) / far.mean()
-    near = 2 * (share * middle.log()).sum()  # an image at half the distance is four times as likely
+    bones = bone_vectors(torch.cat([image, (path[..., None] + z)[0][..., None]], -1), skeleton.bone_index())
+    ends = skeleton.bone_index()[:, 1]
+    deep = bones[..., 2] + (rays[:, ends] * bones[..., :2]).sum(-1)  # along the rays of their outer ends
+    terms["foreshortening"] = alike.foreshortening.each(deep[None], lengths, energy.model.clear, alike.noise).sum()
+    far_off = (path[..., None] + z)[0][:, ends] / far.mean()
+    near = 2 * (alike.independent * far_off.log()).sum()  # an image at half the distance is four times as likely
     assert_close(energy(state)[0], (sum(terms.values()) + slip + rest - near).reshape(1))
 
 
@@ -103,11 +105,41 @@ def test_images_say_nothing_for_a_small_body_near_by():
     costs = []
     for size in (1.0, 0.5):
         z, path, own = size * depth[None], size * far[None], size * lengths[None]
-        image = rays * (path[..., None] + z)[..., None]
-        costs.append(energy.model.terms(z, own, image)["foreshortening"])
         near = (path[..., None] + z).mT
+        bones = bone_vectors(depth[None, ..., None], skeleton.bone_index())[..., 0] * size
+        costs.append(energy.model.foreshortening.each(bones, own, energy.model.clear).sum((1, 2)))
         costs[-1] -= energy._nearness(near, torch.zeros_like(near))
     assert_close(costs[0], costs[1])
+
+
+@pytest.mark.parametrize("wide", [1.0, 0.4])
+def test_images_are_as_likely_as_directions_drawn_evenly_make_them(wide):
+    """The density of a bone's image is one over its area, that of a piece of the sphere of its directions."""
+    skeleton, rays, depth, far, _ = walk(6)
+    lens = torch.tensor([1 / wide]).double(), torch.tensor([True])
+    energy = PinholeEnergy(skeleton, rays, far, depth[None], 30.0, level(rays), focal=lens)
+    energy.model.foreshortening.eps, bones = 0.0, skeleton.bone_index()
+    laid = energy._laid(energy.start + 0.1 * normal(*energy.start.shape))
+    wide = laid.wide[0]
+    near = energy._nearness(laid.far, torch.zeros_like(laid.far)) + 2 * (energy.share * far.mean().log()).sum()
+    deep = laid.own + (energy.toward * wide * laid.image).sum(1)
+    found = energy.model.foreshortening.each(deep.mT, laid.lengths, energy.model.clear).sum() - near
+    ahead = laid.path[0] / wide + laid.depth[0]  # (N, T) along the optical axis
+    points = torch.cat([energy.rays * laid.far[0], ahead[None]]).permute(2, 1, 0)  # (T, N, 3)
+    expected = torch.zeros(1).double()
+    for b, (start, end) in enumerate(bones.tolist()):
+        for t, joints in enumerate(points):
+            bone = joints[end] - joints[start]
+            across = torch.linalg.qr(torch.cat([bone[:, None], torch.eye(3, 2).double()], 1)).Q[:, 1:] * bone.norm()
+
+            def seen(turn, joints=joints, start=start, bone=bone, across=across):
+                """Where the bone's end is seen by the given camera after a small turn (2,) of the bone."""
+                there = torch.nn.functional.normalize(bone + across @ turn, dim=0) * bone.norm() + joints[start]
+                return there[:2] / there[2] / wide
+
+            area = torch.autograd.functional.jacobian(seen, torch.zeros(2).double()).det().abs()
+            expected += energy.share[b, t] * (area * laid.lengths[0, b] / bone.norm()).log()
+    assert_close(found, expected, rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.parametrize("focal", [False, True], ids=["calibrated", "any focal length"])

@@ -9,7 +9,7 @@ from numerics import count_operations, normal
 from test_pkc_objective import lengths_of, objective, several, walk
 from torch.testing import assert_close
 
-from kcs_torch.functional import bone_lengths
+from kcs_torch.functional import bone_lengths, bone_vectors
 from kcs_torch.methods.pkc.descent import Descent
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.unknowns import Unknowns
@@ -167,7 +167,7 @@ def test_fewer_operations_than_autograd_takes():
 @pytest.mark.parametrize("frames", [1, 3, 12, 80])
 @pytest.mark.parametrize("skeleton", ["h36m17", "coco17", "body25"])
 def test_with_an_image_that_goes_with_the_depths(skeleton, frames, noise):
-    """As autograd through the terms, of two images at once, in depths, lengths and the image; arms reach across."""
+    """As autograd through the terms, of two images at once, in depths, lengths, image and rays; arms reach across."""
     points = walk(frames, skeleton, yaw=90.0)
     found = objective(points, skeleton, noise=noise)
     points[..., found.adduction.joints[-1, 1], 2] -= torch.linspace(-0.4, 0.4, frames)
@@ -176,24 +176,30 @@ def test_with_an_image_that_goes_with_the_depths(skeleton, frames, noise):
     lengths = lengths_of(found, points) * torch.tensor([[1.0], [1.1]])
     ends = found.bones.T
     inside = [(two[:, :, ends[1]] - two[:, :, ends[0]]).detach().permute(0, 3, 2, 1).contiguous(), lengths.log()]
+    inside.append(torch.zeros(2).double())  # logarithms of the rays' size
+    rays = 0.2 * normal(1, 2, len(ends[0]), frames, seed=5)
     tree = found.tree[: found.skeleton.num_observed]
 
-    def value(bones, logs):
+    def value(bones, logs, wide):
         """Of bones (H, 3, B, T), the image's taken as they are."""
         joints = (tree @ bones[:, 2]).mT @ found.complete
         flat = (tree @ bones[:, :2]).permute(0, 3, 2, 1)
         flat = torch.cat([flat, torch.zeros_like(flat[..., :1])], -1)
         image = found.skeleton.complete(flat)[0][..., :2]
-        return sum(found.terms(joints, logs.exp(), image).values())
+        terms = found.terms(joints, logs.exp(), image)
+        own, flat = bone_vectors(joints[..., None], found.bones)[..., 0], bone_vectors(image, found.bones)
+        deep = own + wide.exp()[:, None, None] * (flat.permute(0, 3, 2, 1) * rays).sum(1).mT
+        terms["foreshortening"] = found.foreshortening.each(deep, logs.exp(), found.clear, found.noise).sum((1, 2))
+        return sum(terms.values())
 
     leaves = [x.clone().requires_grad_() for x in inside]
     expected = value(*leaves)
-    drawn, grown = torch.autograd.grad(expected.sum(), leaves)
+    drawn, grown, turned = torch.autograd.grad(expected.sum(), leaves)
     mixed = found.complete.mT @ tree @ inside[0][:, :2]  # virtual joints among them
     image = mixed[:, :, ends[1]] - mixed[:, :, ends[0]]
-    energy, slope, growth, pull = Descent(found).with_image(inside[0][:, 2], lengths, image)
+    energy, slope, growth, pull, wider = Descent(found).with_image(inside[0][:, 2], lengths, image, rays)
     assert_close(energy, expected)
     back = torch.zeros(2, 2, *mixed.shape[2:]).double().index_add_(2, ends[1], pull).index_add_(2, ends[0], -pull)
     pull = (found.complete.mT @ tree).mT @ back
-    for one, other in ((slope, drawn[:, 2]), (growth, grown), (pull, drawn[:, :2])):
+    for one, other in ((slope, drawn[:, 2]), (growth, grown), (pull, drawn[:, :2]), (wider, turned)):
         assert_close(one, other, rtol=1e-8, atol=1e-8 * float(other.abs().amax()))

@@ -10,6 +10,7 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.methods.pinhole import NEAREST
 from kcs_torch.methods.pkc.objective import Objective
+from kcs_torch.methods.pkc.run_costs import Turned
 
 __all__ = ["AlongRays"]
 
@@ -54,8 +55,8 @@ class AlongRays:
             ahead = self.far[:, far] - (self.rays[:, far] * points[:, near]).sum(-1) / self.square[:, far]
             self.own[:, bone] = sense * ahead * self.square[:, far].sqrt()
 
-    def turned(self, signs: Tensor) -> tuple[Tensor, Tensor]:
-        """Centred depths (K, T, N), and images (K, T, N, 2) under parallel rays, with signs (K, T or 1, B) turned."""
+    def turned(self, signs: Tensor) -> Turned:
+        """Bodies with signs (K, T or 1, B) turned."""
         places = list(self.far.expand(len(signs), -1, -1).unbind(-1))  # (K, T) each
         signs = torch.where(self.own < 0, -1, 1) * signs
         for bone, near, far, sense in self.links:
@@ -65,9 +66,12 @@ class AlongRays:
             reach = (along.square() + left).clamp_min(0).sqrt()
             places[far] = torch.maximum(along + sense * signs[..., bone] * reach, self.least)
         n, complete = self.objective.skeleton.num_observed, self.objective.complete  # virtual joints follow the others
-        ahead = torch.stack(places[:n], -1)
-        depth, image = ahead @ complete, (self.rays[:, :n, :2] * ahead[..., None]).mT @ complete
-        return depth - depth.mean(-1, keepdim=True), (image - image.mean(-1, keepdim=True)).mT
+        laid = torch.stack(places[:n], -1)
+        depth, image = laid @ complete, ((self.rays[:, :n, :2] * laid[..., None]).mT @ complete).mT
+        outer = self.objective.bones[:, 1]
+        ahead = (self.rays[:, outer, :2] * bone_vectors(image, self.objective.bones)).sum(-1)
+        over = depth[..., outer] / self.far.mean()
+        return Turned(depth - depth.mean(-1, keepdim=True), image - image.mean(-2, keepdim=True), ahead, over)
 
 
 def _from_trunk(objective: Objective) -> list[_Link]:

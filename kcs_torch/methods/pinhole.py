@@ -134,7 +134,8 @@ class PinholeEnergy:
         self.seen = (complete @ ends).mT.contiguous()  # (B, No) bones of observed joints
         lines = tree[:n].mT @ complete
         self.lines = (lines - lines.mean(-1, keepdim=True)).mT.contiguous()  # (N, B)
-        self.middle = ends.abs() / 2  # (N, B)
+        self.outer = ends.clamp_min(0)  # (N, B) of bones' far ends
+        self.toward = self.rays[:, self.bones[:, 1]]  # (2, B, T) their rays
         path = distance.expand(len(depth), -1)
         wide = torch.ones_like(depth[:, 0, 0]) if focal is None else 1 / focal[0]
         self.free = None if focal is None else focal[1]
@@ -160,8 +161,7 @@ class PinholeEnergy:
             weights = at_pace(Weights(), rate, pace_of(flat, skeleton, rate))
             self.model = Objective(skeleton, flat, weights, noise, standing=standing)
             self.body = Descent(self.model)
-            free = self.model.foreshortening
-            self.share = (self.model.clear * (free.free.to(rays) / free.correlation)).mT  # (B, T)
+            self.share = self.model.independent.mT  # (B, T)
         else:
             slack = math.hypot(Weights().length, float(noise.median()) if noise.numel() else 0.0)
             self.body = PlainBody(skeleton, self.own, slack, self.slow)
@@ -195,15 +195,15 @@ class PinholeEnergy:
         usual = (wide * USUAL / self.path.mean(-1, keepdim=True)).log()  # (H, 1)
         value = value + firm * usual[:, 0].square() / 2
         value = value + change.square().mean(-1) / (2 * STRAY**2)
-        cost, slope, growth, drawn = self.body.with_image(laid.own, laid.lengths, laid.image)
-        value = value + cost
+        rays = self.toward * wide[..., None, None]
+        cost, slope, growth, drawn, shrink = self.body.with_image(laid.own, laid.lengths, laid.image, rays)
+        value, shrink = value + cost, shrink / wide[:, 0]  # in w
         if self.model is not None and self.known:
             value = value - self.model.proportions(laid.lengths)
         n = self.seen.shape[1]
         pull = torch.zeros_like(far)  # in far
         pull[:, :n] = ((self.seen.mT @ drawn) * self.rays[:, :n]).sum(1)
         deep = torch.zeros_like(far)  # in the depth
-        shrink = torch.zeros_like(wide[:, 0])  # in w
         if self.model is not None:
             value = value - self._nearness(far, pull)
             if self.model.standing is not None:
@@ -281,13 +281,13 @@ class PinholeEnergy:
     def _nearness(self, far: Tensor, pull: Tensor) -> Tensor:
         """By how much less likely foreshortened images are along rays than under parallel ones, (H,).
 
-        A direction drawn evenly has an image of density 1 / (2 pi L |d|) under parallel rays, and of (D + z)^2 times
-        that along rays: without it a body would cost less for being small, and near to the camera. The slope is taken
-        from ``pull``.
+        A direction drawn evenly has an image of density 1 / (2 pi L |d|) under parallel rays. With a bone b whose outer
+        end is at the distance s along the optical axis, on the ray r = (u, v, 1), it is s^2 / (2 pi L |b . r|): without
+        s^2 a body would cost less for being small, and near to the camera. The slope is taken from ``pull``.
         """
-        middle = self.middle.mT @ far
-        pull -= self.middle @ (2 * self.share / middle)
-        return 2 * (self.share * (middle / self.path.mean(-1)[:, None, None]).log()).sum((1, 2))
+        ends = self.outer.mT @ far
+        pull -= self.outer @ (2 * self.share / ends)
+        return 2 * (self.share * (ends / self.path.mean(-1)[:, None, None]).log()).sum((1, 2))
 
     @property
     def sizes(self) -> list[int]:

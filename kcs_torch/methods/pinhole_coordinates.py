@@ -22,7 +22,7 @@ STRAY = 0.1
 FREE = 0.1
 """Usual deviation of a length, as a share: how long steps are."""
 
-USUAL, FACTOR = 6.0, 1.5
+USUAL, FACTOR = 4.5, 1.5
 """Usual distance of a camera whose focal length is not known, for a body of 1.75, and by what factor it strays."""
 
 FIRM = math.log(FACTOR) ** -2

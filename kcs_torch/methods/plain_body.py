@@ -42,16 +42,19 @@ class PlainBody:
         out.near = self.near[index]
         return out
 
-    def with_image(self, own: Tensor, lengths: Tensor, bones: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def with_image(
+        self, own: Tensor, lengths: Tensor, bones: Tensor, rays: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """As :meth:`kcs_torch.methods.pkc.descent.Descent.with_image`.
 
         Args:
             own: (H, B, T) depths of bones.
             lengths: (H, B).
             bones: (H, 2, B, T) their image.
+            rays: make no difference here.
 
         Returns:
-            The energy (H,), and its derivatives in depths, log lengths and image.
+            The energy (H,), and its derivatives in depths, log lengths, image and log rays.
         """
         size, frames = lengths[..., None], own.shape[-1]
         off = (bones.square().sum(1) + own.square() - size.square()) / (2 * size)
@@ -65,4 +68,4 @@ class PlainBody:
         away = (own - self.near) / CLOSE
         slope = pull * own + away / CLOSE
         value = value + away.square().sum((1, 2)) / 2 + bend_cost(own, self.smooth, slope)
-        return value, slope, growth, pull[:, None] * bones
+        return value, slope, growth, pull[:, None] * bones, torch.zeros_like(value)

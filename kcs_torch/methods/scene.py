@@ -20,6 +20,7 @@ from kcs_torch.methods.pkc.flips import flipped, parts_of, promising
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
 from kcs_torch.methods.pkc.objective import Objective, bone_noise
+from kcs_torch.methods.pkc.run_costs import RunCosts
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
@@ -217,9 +218,10 @@ class Scene:
         objective = Objective(self.skeleton, image, weights, self.noise, standing=self.standing)
         points = torch.cat([image[None], depth[..., None]], -1)
         lengths = median(bone_lengths(points, objective.bones), 1)
-        now = Hypotheses(depth, lengths, objective(depth, lengths) + objective.contact(depth))
         parts = parts_of(self.skeleton, limbs_of(self.skeleton, objective.posture.trunk.tolist()))
         body = AlongRays(objective, self.rays / float(best.focal), best.distance[0] / self.unit, depth[0])
+        energy = RunCosts(objective, body, lengths[0]).unchanged + objective.contact(depth)
+        now = Hypotheses(depth, lengths, energy)
         tried = flipped(objective, parts, now, body)
         return tried.depth[promising(tried, now)] * self.unit
 

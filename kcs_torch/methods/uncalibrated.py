@@ -30,15 +30,15 @@ FAR = 34.0
 NEAR = 10.0
 """Distance up to which a camera is near: from there on a wrong focal length does more harm than parallel rays."""
 
-BETTER, SEEN = 5.0, 1.0
+BETTER, SEEN = 2.5, -1.0
 """By how much the energy must be lower than of a far body for a near one to be believed; and in a detector's tracks,
-which come from a real camera."""
+which come from a real camera: these are seldom far, and to take a near one for far does the greater harm."""
 
 SECONDS, RATE, STEPS = 5.0, 30.0, 60
 """How much of a clip tells whether a camera is near, at how many frames a second at most, and in how many steps; as
 many again where these do not find back to a far body."""
 
-EVERY, HOPELESS, AWAY = 20, 10.0, 7.5
+EVERY, HOPELESS, AWAY = 20, 10.0, 6.5
 """Every so many steps it may be hopeless: if a near body is dearer by so much, and has gone as far away."""
 
 

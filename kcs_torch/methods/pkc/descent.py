@@ -101,17 +101,25 @@ class Descent:
 
     def at(self, own: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Value (H,) of bones' depths (H, B, T) and lengths (H, B), its derivatives in depths and log lengths."""
-        return self._at(own, lengths, self.image, None)
+        return self._at(own, lengths, self.image)[:3]
 
-    def with_image(self, own: Tensor, lengths: Tensor, bones: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """As :meth:`at`, for another image of the bones, (H, 2, B, T), and the derivative in it.
+    def with_image(
+        self, own: Tensor, lengths: Tensor, bones: Tensor, rays: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """As :meth:`at`, for another image of the bones, (H, 2, B, T), and the derivatives in it and in log rays.
 
-        Its noise and gaps are taken to be those of the objective's own.
+        Its noise and gaps are taken to be those of the objective's own. How likely foreshortened bones are is a matter
+        of their depths along rays (u, v, 1) of their outer ends: (H or 1, 2, B, T), 0 where they are parallel.
         """
-        drawn = torch.empty_like(bones)
-        return *self._at(own, lengths, self.imaged(bones), drawn), drawn
+        drawn, depths = torch.empty_like(bones), (rays * bones).sum(1)  # what rays add to depths
+        value, slope, growth, pull = self._at(own, lengths, self.imaged(bones), drawn, depths)
+        drawn[:, :, self.limbs] += pull[:, None] * rays[:, :, self.limbs]
+        return value, slope, growth, drawn, (pull * depths[:, self.limbs]).sum((1, 2))
 
-    def _at(self, own: Tensor, lengths: Tensor, image: Image, drawn: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def _at(
+        self, own: Tensor, lengths: Tensor, image: Image, drawn: Tensor | None = None, ahead: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As :meth:`at`, with the derivative (H, limbs, T) in what rays add to depths (H, B, T)."""
         count = len(own)
         dz = own if self.mix is None else self.mix @ own
         value, slope, growth = self._lengths(dz, lengths, image, drawn)
@@ -121,14 +129,15 @@ class Descent:
         value = value + self._posture(dz, lengths, image, lines[:, :2], out)
         if len(self.lines) > 2:
             value = value + self._hinges(lengths, image, lines[:, 2:], out)
-        value = value + self._foreshortening(dz, lengths, out)
+        cost, pull = self._foreshortening(dz if ahead is None else dz + ahead, lengths, out)
+        value = value + cost
         value = value + self._sizes(lengths, growth)
         slope.baddbmm_(self.lines.mT.expand(count, -1, -1), out.lines)
         if drawn is not None:
             drawn += self.lines.mT @ out.flat_lines
         if self.mix is not None:
             slope = self.mix.mT @ slope
-        return value, slope, growth
+        return value, slope, growth, pull
 
     # Each term returns its value (H,) and adds its derivatives to the slopes.
 
@@ -313,7 +322,8 @@ class Descent:
             flat[:, :, 2] -= held[:, None] * image.edges[:, :, 2]
         return value
 
-    def _foreshortening(self, dz: Tensor, lengths: Tensor, out: Slopes) -> Tensor:
+    def _foreshortening(self, dz: Tensor, lengths: Tensor, out: Slopes) -> tuple[Tensor, Tensor]:
+        """Value (H,), and its derivative (H, limbs, T) in depths."""
         depth, size = dz.index_select(1, self.limbs), lengths[:, self.limbs]
         least = (self.objective.foreshortening.eps * size).square()[..., None]
         square, grown = depth.square(), least
@@ -327,8 +337,9 @@ class Descent:
         held = self.clear.sum(-1)
         value = held * size.log() + (self.clear * square.log()).sum(-1) / 2
         out.growth.index_add_(1, self.limbs, held + (grown * each).sum(-1))
-        out.depth.index_add_(1, self.limbs, each * depth)
-        return value.sum(-1)
+        pull = each * depth
+        out.depth.index_add_(1, self.limbs, pull)
+        return value.sum(-1), pull
 
     def _sizes(self, lengths: Tensor, growth: Tensor) -> Tensor:
         obj = self.objective

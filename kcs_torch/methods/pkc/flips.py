@@ -135,7 +135,7 @@ def flipped(
     energy = RunCosts(objective, body, best.lengths[0])(member, runs)
 
     def depths(some: Tensor) -> Tensor:
-        return body.turned(signs_of(runs.some(some), member, len(own)))[0]
+        return body.turned(signs_of(runs.some(some), member, len(own))).depth
 
     if objective.standing is not None:  # contacts only add to the cost: what is hopeless without them stays so
         walks = objective.carries(member)[runs.part]
@@ -155,16 +155,17 @@ def flipped(
 def _strides(objective: Objective, body: Turnable, member: Tensor, runs: Runs, best: Hypotheses) -> Hypotheses:
     """The best solution with other runs of its legs, by which feet stand; the best few, not refined yet."""
     bend = _bends(body.own, member.mT) / (2 * objective.weights.acceleration**2)
-    depth, image = body.turned(strides(objective, body.own, member, runs.places, bend))
-    made = Hypotheses(depth, best.lengths.expand(len(depth), -1), best.energy.expand(len(depth)))
-    some = _change(made, best) > SLIGHT
-    made = made[some]
-    if not len(made.depth):
+    turned = body.turned(strides(objective, body.own, member, runs.places, bend))
+    count = len(turned.depth)
+    made = Hypotheses(turned.depth, best.lengths.expand(count, -1), best.energy.expand(count))
+    if not count:
         return made
-    seen = None if image is objective.image else image[some]
-    energy = torch.stack(list(objective.terms(made.depth, made.lengths, seen).values())).sum(0)
-    energy = energy + objective.contact(made.depth)
-    return replace(made, energy=energy)[energy.argsort()[:STRIDES]]
+    image = None if turned.image is objective.image else turned.image
+    terms = objective.terms(made.depth, made.lengths, image)
+    terms["foreshortening"] = turned.foreshortened(objective, best.lengths[0]).sum(1)
+    made = replace(made, energy=torch.stack(list(terms.values())).sum(0) + objective.contact(made.depth))
+    made = made[_change(made, best) > SLIGHT]
+    return made[made.energy.argsort()[:STRIDES]]
 
 
 def signs_of(runs: Runs, member: Tensor, frames: int) -> Tensor:

@@ -170,6 +170,12 @@ class Objective:
         }
         return out | self.length_terms(lengths)
 
+    @property
+    def independent(self) -> Tensor:
+        """How many independent frames each bone's foreshortening counts for, (T, B)."""
+        free = self.foreshortening
+        return self.clear * (free.free.to(self.clear) / free.correlation)
+
     def length_terms(self, lengths: Tensor) -> dict[str, Tensor]:
         """Values (H,) of the terms that know lengths (H, B) alone."""
         out = {"proportions": self.proportions(lengths)}

@@ -10,7 +10,7 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.methods.pkc.objective import Objective
 
-__all__ = ["ParallelRays", "RunCosts", "Runs", "Turnable", "inside"]
+__all__ = ["ParallelRays", "RunCosts", "Runs", "Turnable", "Turned", "inside"]
 
 ROWS = 1024
 """Frames of changed solutions that are looked at together."""
@@ -55,6 +55,29 @@ class Runs(NamedTuple):
         return runs._replace(places=self.places[parts], part=runs.part - parts.start), found
 
 
+class Turned(NamedTuple):
+    """K bodies whose bones have other signs of depth.
+
+    Attributes:
+        depth: (K, T, N), centred.
+        image: (T, N, 2), or (K, T, N, 2) of each, under parallel rays.
+        ahead: (K, T, B) what the rays of bones' outer ends add to the depths along them; None under parallel rays.
+        far: (K, T, B) distances of the outer ends, over the body's; None under parallel rays.
+    """
+
+    depth: Tensor
+    image: Tensor
+    ahead: Tensor | None = None
+    far: Tensor | None = None
+
+    def foreshortened(self, objective: Objective, lengths: Tensor) -> Tensor:
+        """What it costs that bones of lengths (B,) look as short as they do, (K, T)."""
+        dz = bone_vectors(self.depth[..., None], objective.bones)[..., 0]
+        deep = dz if self.ahead is None else dz + self.ahead
+        each = objective.foreshortening.each(deep, lengths.expand(len(dz), -1), objective.clear, objective.noise)
+        return (each if self.far is None else each - 2 * objective.independent * self.far.log()).sum(-1)
+
+
 class Turnable(Protocol):
     """A body whose bones may have other signs of depth.
 
@@ -65,8 +88,8 @@ class Turnable(Protocol):
     @property
     def own(self) -> Tensor: ...
 
-    def turned(self, signs: Tensor) -> tuple[Tensor, Tensor]:
-        """Centred depths (K, T, N), and their image (T, N, 2) or (K, T, N, 2), with signs (K, T or 1, B) turned."""
+    def turned(self, signs: Tensor) -> Turned:
+        """Bodies with signs (K, T or 1, B) turned."""
         ...
 
 
@@ -76,8 +99,8 @@ class ParallelRays(NamedTuple):
     objective: Objective
     own: Tensor
 
-    def turned(self, signs: Tensor) -> tuple[Tensor, Tensor]:
-        return self.objective.joints(self.own * signs), self.objective.image
+    def turned(self, signs: Tensor) -> Turned:
+        return Turned(self.objective.joints(self.own * signs), self.objective.image)
 
 
 class _Frames(NamedTuple):
@@ -123,9 +146,17 @@ class RunCosts:
             energy[index] = self._energy(self._frames(1 - 2 * member[k : k + few, None]), some)
         return energy
 
+    @property
+    def unchanged(self) -> Tensor:
+        """The energy (1,) of the solution itself."""
+        places = torch.tensor([[0, len(self.body.own)]], device=self.lengths.device)
+        first = places[:, 0]
+        return self._energy(self.base, Runs(places, first, first, first + 1))
+
     def _frames(self, signs: Tensor) -> _Frames:
         obj, lengths = self.objective, self.lengths.expand(len(signs), -1)
-        depth, image = self.body.turned(signs)
+        turned = self.body.turned(signs)
+        depth, image = turned.depth, turned.image
         flat = obj.flat if image is obj.image else bone_vectors(image, obj.bones).square().sum(-1)
         points = torch.cat([image.expand(*depth.shape, 2), depth[..., None]], -1)
         dz = depth[..., obj.bones[:, 1]] - depth[..., obj.bones[:, 0]]
@@ -137,7 +168,7 @@ class RunCosts:
             hinges[1],
             reach[1],
             obj.stance.strayed(points, 1.0)[..., None],
-            obj.foreshortening.each(dz, lengths, obj.clear, obj.noise).sum(-1, keepdim=True),
+            turned.foreshortened(obj, self.lengths)[..., None],
         )
         posture = obj.posture
         y = (posture.directions(points, lengths) - posture.mean.to(depth)) / posture.deviation.to(depth)
