@@ -9,7 +9,6 @@ from torch import Tensor
 
 from kcs_torch.functional.ranks import kth_smallest
 from kcs_torch.methods.lockstep import Search
-from kcs_torch.methods.pkc.cleaning import CLEAN
 from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.moving_view import FINER, ROBOT, MovingView, relative_weights, soften, too_long
 from kcs_torch.solvers.procrustean import FINE, Pose
@@ -19,6 +18,9 @@ __all__ = ["fill_gaps", "fillable", "freed", "gaps_of"]
 GAP, SHOWN = 3.0, 0.1
 """How many times as noisy a joint is in a frame that does not show it, at least, as in frames that do; and the share of
 the frames that do, at least."""
+
+EXACT = 0.003
+"""Standard deviation of what is shown in exact tracks while their gaps are filled, a share of the body's size."""
 
 SURER = 0.2
 """Share of a gap's noise that is left where it is filled in space."""
@@ -53,10 +55,10 @@ def fillable(image: Tensor) -> bool:
 
 def freed(moving: MovingView, image: Tensor, noise: Tensor) -> Search[Descent, Pose, MovingView]:
     """Solutions whose x and y, held so far, may leave the image (T, N, 2) in gaps, by their noise (T, N)."""
-    pose, stages = moving.pose, tuple(soften(stage, CLEAN) for stage in FINE)
-    weights, pull = relative_weights(noise, CLEAN), FINER[moving.stiffness]
+    pose, stages = moving.pose, tuple(soften(stage, EXACT) for stage in FINE)
+    weights, pull = relative_weights(noise, EXACT), FINER[moving.stiffness]
     (pose,) = yield [
-        Descent(image, pose.points, pose.rotations, moving.bones, weights, moving.rigid, pull, CLEAN, stages)
+        Descent(image, pose.points, pose.rotations, moving.bones, weights, moving.rigid, pull, EXACT, stages)
     ]
     return replace(moving, pose=pose)
 
