@@ -236,16 +236,18 @@ def test_a_solution_that_hardly_leads_is_doubted():
     assert len(result.alternatives) > 1 and relative(result, depth) > 0.3
 
 
-def test_noise_of_a_body_without_template_is_told_from_its_motion():
+@pytest.mark.parametrize(("noise", "most"), [(0.02, 0.03), (0.0025, 0.005)], ids=["noise", "a little noise"])
+def test_noise_of_a_body_without_template_is_told_from_its_motion(noise, most):
+    """Taken as exact, smoothed tracks with noise of 2 % of the size make errors of 6.4 %; as they are, .25 % 1.2 %."""
     clip = walking_person(60, turn=180)
     body = Skeleton.from_edges(clip.skeleton.bones, 17)
     size = (clip.tracks.points - clip.tracks.points.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()
     shift = torch.randn(60, 17, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    tracks = dataclasses.replace(clip.tracks, points=clip.tracks.points + 0.02 * size * shift, skeleton=body)
+    tracks = dataclasses.replace(clip.tracks, points=clip.tracks.points + noise * size * shift, skeleton=body)
     result = kt.PKC(alternatives=0)(tracks)
     found, mirror = result.points, result.points.new_tensor([1.0, 1.0, -1.0])
     error = min(kt.metrics.mpjpe(one, clip.points, align="rigid") for one in (found, found * mirror))
-    assert float(error / size) < 0.03  # .064 where smoothed tracks are taken as exact
+    assert float(error / size) < most
 
 
 def test_deviations_of_depth_know_of_noise(protocol, shared):

@@ -17,11 +17,12 @@ from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.unseen import gap_deviation, place_unseen, within_reach
 from kcs_torch.types import Tracks
 
-__all__ = ["CLEAN", "cleaned"]
+__all__ = ["CLEAN", "PLAIN", "cleaned"]
 
-CLEAN = 0.0013
+CLEAN, PLAIN = 0.0013, 0.0007
 """Noise below this share of the body's size, .6 mm of a person, is left in the tracks: they count as exact. That of
-motion capture comes to a fifth of it, and where it moves quickly to nine tenths."""
+motion capture comes to a fifth of it, and where it moves quickly to nine tenths. And the same of bodies whose lengths
+no template tells: where tracks count as exact bones do, too, so that a little noise may make all of them wrong."""
 
 WINDOW, QUICK = 64, 2.2
 """Frames in which motion and noise are told apart, at 30 a second: two seconds, and up to 120 frames a second about as
@@ -35,12 +36,15 @@ HELD = 0.1
 last seen, and the largest in gaps."""
 
 
-def cleaned(tracks: Tracks, denoise: bool) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
+def cleaned(
+    tracks: Tracks, denoise: bool, clean: float = CLEAN
+) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
     """Smooth noisy tracks, reject outliers and fill gaps.
 
     Args:
         tracks: of root mean square 1.
         denoise: whether to smooth and reject; else gaps are filled linearly.
+        clean: noise up to which tracks count as exact.
 
     Returns:
         Complete tracks (T, N, 2), the standard deviation (T, N) of the noise that is left in them, and what was done.
@@ -52,20 +56,20 @@ def cleaned(tracks: Tracks, denoise: bool) -> Search[Any, Any, tuple[Tensor, Ten
         rate = tracks.fps or 30.0
         window = WINDOW * round(min(max(rate / 30, 1), 4))
         quick = math.ceil(2 * QUICK * window / rate)
-        (clean,) = yield [Noisy(points, torch.where(keep, tracks.weights, 0), window, quick)]
-        level, left = float(clean.noise.median()), float(clean.left.median())
-        wrong = int((clean.outliers & keep).sum()) + int((tracks.seen & ~keep).sum())
+        (found,) = yield [Noisy(points, torch.where(keep, tracks.weights, 0), window, quick)]
+        level, left = float(found.noise.median()), float(found.left.median())
+        wrong = int((found.outliers & keep).sum()) + int((tracks.seen & ~keep).sum())
         if wrong:
             share = wrong / int(tracks.seen.sum())
             notes.append(f"{counted(wrong, 'detection')} ({100 * share:.1f} %) rejected as outliers")
-        keep = keep & ~clean.outliers
+        keep = keep & ~found.outliers
         exact = keep
-        if level <= CLEAN:
+        if level <= clean:
             left = 0.0
         else:
             exact = torch.zeros_like(keep)
             notes.append(f"tracks smoothed: noise of {100 * level:.1f} % of the body's size")
-        points = torch.where(exact[..., None], points, clean.points)
+        points = torch.where(exact[..., None], points, found.points)
     else:
         points = interpolate(points, tracks.seen)
     known = keep.any(0)
