@@ -637,12 +637,13 @@ def test_small_changes_of_size_are_told(metres):
 
 
 @pytest.mark.parametrize("yaw", [30.0, 60.0])
-@pytest.mark.parametrize("disturb", ["noise", "whole pixels"])
+@pytest.mark.parametrize("disturb", ["noise", "less noise, more frames", "whole pixels"])
 def test_a_little_noise_does_little_harm(disturb, yaw):
     """A millimetre a frame, taken for motion, made bones turn out of the image plane: errors of 33 to 46 mm."""
-    clip = walking_person(100, turn=0.0, yaw=yaw)
-    if disturb == "noise":
-        points = clip.tracks.points + 1.3 * normal(100, 17, 2, seed=1)
+    frames, rate = (400, 120.0) if "frames" in disturb else (100, 30.0)
+    clip = walking_person(frames, turn=0.0, yaw=yaw, fps=rate)
+    if "noise" in disturb:
+        points = clip.tracks.points + (0.5 if "less" in disturb else 1.3) * normal(frames, 17, 2, seed=1)
     else:
         points = (clip.tracks.points / 4).round() * 4  # of a person who is about 440 pixels tall
     found = PKC()(replace(clip.tracks, points=points))

@@ -20,9 +20,10 @@ from kcs_torch.types import Tracks
 __all__ = ["CLEAN", "PLAIN", "cleaned"]
 
 CLEAN, PLAIN = 0.0013, 0.0007
-"""Noise below this share of the body's size, .6 mm of a person, is left in the tracks: they count as exact. That of
-motion capture comes to a fifth of it, and where it moves quickly to nine tenths. And the same of bodies whose lengths
-no template tells: where tracks count as exact bones do, too, so that a little noise may make all of them wrong."""
+"""Noise below this share of the body's size, .6 mm of a person, is left in tracks at 30 frames a second or less: they
+count as exact. That of motion capture comes to a fifth of it, and where it moves quickly to nine tenths; at more frames
+a second less noise does harm. And the same of bodies whose lengths no template tells: where tracks count as exact bones
+do, too, so that a little noise may make all of them wrong."""
 
 WINDOW, QUICK = 64, 2.2
 """Frames in which motion and noise are told apart, at 30 a second: two seconds, and up to 120 frames a second about as
@@ -37,14 +38,14 @@ last seen, and the largest in gaps."""
 
 
 def cleaned(
-    tracks: Tracks, denoise: bool, clean: float = CLEAN
+    tracks: Tracks, denoise: bool, template: bool = True
 ) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
     """Smooth noisy tracks, reject outliers and fill gaps.
 
     Args:
         tracks: of root mean square 1.
         denoise: whether to smooth and reject; else gaps are filled linearly.
-        clean: noise up to which tracks count as exact.
+        template: whether a template tells the body's lengths.
 
     Returns:
         Complete tracks (T, N, 2), the standard deviation (T, N) of the noise that is left in them, and what was done.
@@ -64,7 +65,7 @@ def cleaned(
             notes.append(f"{counted(wrong, 'detection')} ({100 * share:.1f} %) rejected as outliers")
         keep = keep & ~found.outliers
         exact = keep
-        if level <= clean:
+        if level <= (CLEAN * min(1.0, 30 / rate) if template else PLAIN):
             left = 0.0
         else:
             exact = torch.zeros_like(keep)

@@ -18,7 +18,7 @@ from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.batch import Sized, serve
 from kcs_torch.methods.pkc.body import Body, Turned
-from kcs_torch.methods.pkc.cleaning import CLEAN, PLAIN, cleaned
+from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of
 from kcs_torch.methods.pkc.gate import without_others
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
@@ -136,9 +136,7 @@ class PKC(Method):
         return run(together([self._steps(one, None) for one in tracks]), serve)
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
-        points, noise, notes = yield from cleaned(
-            tracks, self.denoise, CLEAN if self.knows_template(tracks.skeleton) else PLAIN
-        )
+        points, noise, notes = yield from cleaned(tracks, self.denoise, self.knows_template(tracks.skeleton))
         standing = standing_feet(replace(tracks, points=points))
         image = points - points.mean(-2, keepdim=True)
         rounding = ROUNDING * torch.finfo(points.dtype).eps * float(points.abs().amax())
