@@ -101,7 +101,7 @@ class Descent:
 
     def at(self, own: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Value (H,) of bones' depths (H, B, T) and lengths (H, B), its derivatives in depths and log lengths."""
-        return self._at(own, lengths, self.image)[:3]
+        return self._at(own, lengths, self.image)
 
     def with_image(
         self, own: Tensor, lengths: Tensor, bones: Tensor, rays: Tensor
@@ -111,33 +111,39 @@ class Descent:
         Its noise and gaps are taken to be those of the objective's own. How likely foreshortened bones are is a matter
         of their depths along rays (u, v, 1) of their outer ends: (H or 1, 2, B, T), 0 where they are parallel.
         """
-        drawn, depths = torch.empty_like(bones), (rays * bones).sum(1)  # what rays add to depths
-        value, slope, growth, pull = self._at(own, lengths, self.imaged(bones), drawn, depths)
+        drawn, ahead = torch.empty_like(bones), (rays * bones).sum(1)  # what rays add to depths
+        pull = torch.zeros_like(ahead[:, self.limbs])
+        found = self._at(own, lengths, self.imaged(bones), drawn, ahead, pull)
         drawn[:, :, self.limbs] += pull[:, None] * rays[:, :, self.limbs]
-        return value, slope, growth, drawn, (pull * depths[:, self.limbs]).sum((1, 2))
+        return *found, drawn, (pull * ahead[:, self.limbs]).sum((1, 2))
 
     def _at(
-        self, own: Tensor, lengths: Tensor, image: Image, drawn: Tensor | None = None, ahead: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """As :meth:`at`, with the derivative (H, limbs, T) in what rays add to depths (H, B, T)."""
+        self,
+        own: Tensor,
+        lengths: Tensor,
+        image: Image,
+        drawn: Tensor | None = None,
+        ahead: Tensor | None = None,
+        pull: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """As :meth:`at`; what rays add to depths (H, B, T), and where to leave slopes in the image and in that."""
         count = len(own)
         dz = own if self.mix is None else self.mix @ own
         value, slope, growth = self._lengths(dz, lengths, image, drawn)
         lines = self.lines @ dz
-        out = Slopes.of(slope, growth, lines, drawn)
+        out = Slopes.of(slope, growth, lines, drawn, pull)
         value = value + bend_cost(dz, 1 / wide(self.weights.acceleration, 2) ** 2, slope, self.time)
         value = value + self._posture(dz, lengths, image, lines[:, :2], out)
         if len(self.lines) > 2:
             value = value + self._hinges(lengths, image, lines[:, 2:], out)
-        cost, pull = self._foreshortening(dz if ahead is None else dz + ahead, lengths, out)
-        value = value + cost
+        value = value + self._foreshortening(dz if ahead is None else dz + ahead, lengths, out)
         value = value + self._sizes(lengths, growth)
         slope.baddbmm_(self.lines.mT.expand(count, -1, -1), out.lines)
         if drawn is not None:
             drawn += self.lines.mT @ out.flat_lines
         if self.mix is not None:
             slope = self.mix.mT @ slope
-        return value, slope, growth, pull
+        return value, slope, growth
 
     # Each term returns its value (H,) and adds its derivatives to the slopes.
 
@@ -322,8 +328,7 @@ class Descent:
             flat[:, :, 2] -= held[:, None] * image.edges[:, :, 2]
         return value
 
-    def _foreshortening(self, dz: Tensor, lengths: Tensor, out: Slopes) -> tuple[Tensor, Tensor]:
-        """Value (H,), and its derivative (H, limbs, T) in depths."""
+    def _foreshortening(self, dz: Tensor, lengths: Tensor, out: Slopes) -> Tensor:
         depth, size = dz.index_select(1, self.limbs), lengths[:, self.limbs]
         least = (self.objective.foreshortening.eps * size).square()[..., None]
         square, grown = depth.square(), least
@@ -339,7 +344,9 @@ class Descent:
         out.growth.index_add_(1, self.limbs, held + (grown * each).sum(-1))
         pull = each * depth
         out.depth.index_add_(1, self.limbs, pull)
-        return value.sum(-1), pull
+        if out.ahead is not None:
+            out.ahead.add_(pull)
+        return value.sum(-1)
 
     def _sizes(self, lengths: Tensor, growth: Tensor) -> Tensor:
         obj = self.objective

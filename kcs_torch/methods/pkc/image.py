@@ -62,6 +62,7 @@ class Slopes(NamedTuple):
         lines: (H, L, T) in the depths of lines, which are sums of bones.
         image: (H, 2, B, T) in the image of bones; None where it is given.
         flat_lines: (H, 2, L, T) in the image of lines; empty where it is given.
+        ahead: (H, limbs, T) in the depths of limbs' bones along their rays; None where these are parallel.
     """
 
     depth: Tensor
@@ -69,12 +70,15 @@ class Slopes(NamedTuple):
     lines: Tensor
     image: Tensor | None
     flat_lines: Tensor
+    ahead: Tensor | None
 
     @classmethod
-    def of(cls, depth: Tensor, growth: Tensor, lines: Tensor, image: Tensor | None) -> Slopes:
+    def of(
+        cls, depth: Tensor, growth: Tensor, lines: Tensor, image: Tensor | None, ahead: Tensor | None = None
+    ) -> Slopes:
         """Those of a first term, and as yet none in lines such as (H, L, T)."""
         shape = (len(lines), 0 if image is None else 2, *lines.shape[1:])
-        return cls(depth, growth, torch.zeros_like(lines), image, lines.new_zeros(shape))
+        return cls(depth, growth, torch.zeros_like(lines), image, lines.new_zeros(shape), ahead)
 
 
 def bend_cost(values: Tensor, weight: Tensor | float, slope: Tensor, time: Tensor | None = None) -> Tensor:
