@@ -10,7 +10,7 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.methods.pinhole import NEAREST
 from kcs_torch.methods.pkc.objective import Objective
-from kcs_torch.methods.pkc.run_costs import Turned
+from kcs_torch.methods.pkc.run_costs import Flipped
 
 __all__ = ["AlongRays"]
 
@@ -55,7 +55,7 @@ class AlongRays:
             ahead = self.far[:, far] - (self.rays[:, far] * points[:, near]).sum(-1) / self.square[:, far]
             self.own[:, bone] = sense * ahead * self.square[:, far].sqrt()
 
-    def turned(self, signs: Tensor) -> Turned:
+    def turned(self, signs: Tensor) -> Flipped:
         """Bodies with signs (K, T or 1, B) turned."""
         places = list(self.far.expand(len(signs), -1, -1).unbind(-1))  # (K, T) each
         signs = torch.where(self.own < 0, -1, 1) * signs
@@ -71,7 +71,7 @@ class AlongRays:
         outer = self.objective.bones[:, 1]
         ahead = (self.rays[:, outer, :2] * bone_vectors(image, self.objective.bones)).sum(-1)
         over = depth[..., outer] / self.far.mean()
-        return Turned(depth - depth.mean(-1, keepdim=True), image - image.mean(-2, keepdim=True), ahead, over)
+        return Flipped(depth - depth.mean(-1, keepdim=True), image - image.mean(-2, keepdim=True), ahead, over)
 
 
 def _from_trunk(objective: Objective) -> list[_Link]:

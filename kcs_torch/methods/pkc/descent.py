@@ -78,9 +78,9 @@ class Descent:
         least = torch.finfo(like.dtype).tiny ** 0.25  # squares of it are not 0
         self.blur = HIDDEN * _early(obj.noise).index_select(1, self.limbs).clamp_min(least)
 
-    def imaged(self, bones: Tensor) -> Image:
-        """What an image of the bones, (K, 2, B, T), decides."""
-        return Image.of(bones, self.lines, self.sides.order, self.outer)
+    def imaged(self, bones: Tensor, rays: Tensor | None = None) -> Image:
+        """What an image of the bones, (K, 2, B, T), decides, and the rays of their outer ends."""
+        return Image.of(bones, self.lines, self.sides.order, self.outer, rays)
 
     def __call__(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Value (H,) and gradient (H, B T + B) of unknowns (H, B T + B)."""
@@ -101,7 +101,8 @@ class Descent:
 
     def at(self, own: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Value (H,) of bones' depths (H, B, T) and lengths (H, B), its derivatives in depths and log lengths."""
-        return self._at(own, lengths, self.image)
+        value, out = self._at(own, lengths, self.image, None)
+        return value, out.depth, out.growth
 
     def with_image(
         self, own: Tensor, lengths: Tensor, bones: Tensor, rays: Tensor
@@ -111,39 +112,26 @@ class Descent:
         Its noise and gaps are taken to be those of the objective's own. How likely foreshortened bones are is a matter
         of their depths along rays (u, v, 1) of their outer ends: (H or 1, 2, B, T), 0 where they are parallel.
         """
-        drawn, ahead = torch.empty_like(bones), (rays * bones).sum(1)  # what rays add to depths
-        pull = torch.zeros_like(ahead[:, self.limbs])
-        found = self._at(own, lengths, self.imaged(bones), drawn, ahead, pull)
-        drawn[:, :, self.limbs] += pull[:, None] * rays[:, :, self.limbs]
-        return *found, drawn, (pull * ahead[:, self.limbs]).sum((1, 2))
+        drawn = torch.empty_like(bones)
+        value, out = self._at(own, lengths, self.imaged(bones, rays), drawn)
+        return value, out.depth, out.growth, drawn, out.rays
 
-    def _at(
-        self,
-        own: Tensor,
-        lengths: Tensor,
-        image: Image,
-        drawn: Tensor | None = None,
-        ahead: Tensor | None = None,
-        pull: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """As :meth:`at`; what rays add to depths (H, B, T), and where to leave slopes in the image and in that."""
+    def _at(self, own: Tensor, lengths: Tensor, image: Image, drawn: Tensor | None) -> tuple[Tensor, Slopes]:
         count = len(own)
         dz = own if self.mix is None else self.mix @ own
         value, slope, growth = self._lengths(dz, lengths, image, drawn)
         lines = self.lines @ dz
-        out = Slopes.of(slope, growth, lines, drawn, pull)
+        out = Slopes.of(slope, growth, lines, drawn)
         value = value + bend_cost(dz, 1 / wide(self.weights.acceleration, 2) ** 2, slope, self.time)
         value = value + self._posture(dz, lengths, image, lines[:, :2], out)
         if len(self.lines) > 2:
             value = value + self._hinges(lengths, image, lines[:, 2:], out)
-        value = value + self._foreshortening(dz if ahead is None else dz + ahead, lengths, out)
+        value = value + self._foreshortening(dz, lengths, image, out)
         value = value + self._sizes(lengths, growth)
         slope.baddbmm_(self.lines.mT.expand(count, -1, -1), out.lines)
         if drawn is not None:
             drawn += self.lines.mT @ out.flat_lines
-        if self.mix is not None:
-            slope = self.mix.mT @ slope
-        return value, slope, growth
+        return value, out if self.mix is None else out._replace(depth=self.mix.mT @ slope)
 
     # Each term returns its value (H,) and adds its derivatives to the slopes.
 
@@ -328,8 +316,12 @@ class Descent:
             flat[:, :, 2] -= held[:, None] * image.edges[:, :, 2]
         return value
 
-    def _foreshortening(self, dz: Tensor, lengths: Tensor, out: Slopes) -> Tensor:
+    def _foreshortening(self, dz: Tensor, lengths: Tensor, image: Image, out: Slopes) -> Tensor:
         depth, size = dz.index_select(1, self.limbs), lengths[:, self.limbs]
+        rays = None if image.rays is None else image.rays[:, :, self.limbs]
+        if rays is not None:
+            ahead = (rays * image.bones[:, :, self.limbs]).sum(1)
+            depth = depth + ahead
         least = (self.objective.foreshortening.eps * size).square()[..., None]
         square, grown = depth.square(), least
         if self.objective.noisy:
@@ -344,8 +336,9 @@ class Descent:
         out.growth.index_add_(1, self.limbs, held + (grown * each).sum(-1))
         pull = each * depth
         out.depth.index_add_(1, self.limbs, pull)
-        if out.ahead is not None:
-            out.ahead.add_(pull)
+        if rays is not None and out.image is not None:
+            out.image.index_add_(2, self.limbs, pull[:, None] * rays)
+            out.rays.add_((pull * ahead).sum((1, 2)))
         return value.sum(-1)
 
     def _sizes(self, lengths: Tensor, growth: Tensor) -> Tensor:

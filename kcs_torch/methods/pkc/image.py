@@ -22,6 +22,7 @@ class Image(NamedTuple):
         turns: (K, hinges, T) each: (u x v) . a = a_z turns_0 + v_z turns_1 - u_z turns_2.
         across: (K, hinges, T) squared lengths of the axes.
         along: (K, limbs, T) of upper arms and thighs along the axes.
+        rays: (K or 1, 2, B, T) u and v of the rays (u, v, 1) of bones' outer ends; None where rays are parallel.
     """
 
     bones: Tensor
@@ -32,9 +33,10 @@ class Image(NamedTuple):
     turns: tuple[Tensor, Tensor, Tensor]
     across: Tensor
     along: Tensor
+    rays: Tensor | None
 
     @classmethod
-    def of(cls, bones: Tensor, lines: Tensor, order: Tensor, outer: list[int]) -> Image:
+    def of(cls, bones: Tensor, lines: Tensor, order: Tensor, outer: list[int], rays: Tensor | None = None) -> Image:
         """That of bones (K, 2, B, T).
 
         Args:
@@ -42,6 +44,7 @@ class Image(NamedTuple):
             lines: (2 + 3 hinges, B) that make of bones the trunk's axes, and the bones and axes of hinges.
             order: (B,) of the bones.
             outer: hinges below upper arms and thighs.
+            rays: as of the image.
         """
         drawn = lines @ bones  # (K, 2, 2 + 3 hinges, T)
         edges = drawn[:, :, 2:].unflatten(2, (3, -1))
@@ -50,7 +53,8 @@ class Image(NamedTuple):
         along = (ux * ax + uy * ay)[:, outer]
         x, y = bones.index_select(2, order).unbind(1)
         plane = drawn[:, :, :2].transpose(1, 2)
-        return cls(bones, bones.square().sum(1), (x, y), plane, edges, turns, ax.square() + ay.square(), along)
+        across = ax.square() + ay.square()
+        return cls(bones, bones.square().sum(1), (x, y), plane, edges, turns, across, along, rays)
 
 
 class Slopes(NamedTuple):
@@ -62,7 +66,7 @@ class Slopes(NamedTuple):
         lines: (H, L, T) in the depths of lines, which are sums of bones.
         image: (H, 2, B, T) in the image of bones; None where it is given.
         flat_lines: (H, 2, L, T) in the image of lines; empty where it is given.
-        ahead: (H, limbs, T) in the depths of limbs' bones along their rays; None where these are parallel.
+        rays: (H,) in the logarithm of the rays' size.
     """
 
     depth: Tensor
@@ -70,15 +74,13 @@ class Slopes(NamedTuple):
     lines: Tensor
     image: Tensor | None
     flat_lines: Tensor
-    ahead: Tensor | None
+    rays: Tensor
 
     @classmethod
-    def of(
-        cls, depth: Tensor, growth: Tensor, lines: Tensor, image: Tensor | None, ahead: Tensor | None = None
-    ) -> Slopes:
+    def of(cls, depth: Tensor, growth: Tensor, lines: Tensor, image: Tensor | None) -> Slopes:
         """Those of a first term, and as yet none in lines such as (H, L, T)."""
         shape = (len(lines), 0 if image is None else 2, *lines.shape[1:])
-        return cls(depth, growth, torch.zeros_like(lines), image, lines.new_zeros(shape), ahead)
+        return cls(depth, growth, torch.zeros_like(lines), image, lines.new_zeros(shape), lines.new_zeros(len(lines)))
 
 
 def bend_cost(values: Tensor, weight: Tensor | float, slope: Tensor, time: Tensor | None = None) -> Tensor:

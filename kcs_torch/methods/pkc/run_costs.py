@@ -10,7 +10,7 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.methods.pkc.objective import Objective
 
-__all__ = ["ParallelRays", "RunCosts", "Runs", "Turnable", "Turned", "inside"]
+__all__ = ["Flipped", "ParallelRays", "RunCosts", "Runs", "Turnable", "inside"]
 
 ROWS = 1024
 """Frames of changed solutions that are looked at together."""
@@ -55,7 +55,7 @@ class Runs(NamedTuple):
         return runs._replace(places=self.places[parts], part=runs.part - parts.start), found
 
 
-class Turned(NamedTuple):
+class Flipped(NamedTuple):
     """K bodies whose bones have other signs of depth.
 
     Attributes:
@@ -88,7 +88,7 @@ class Turnable(Protocol):
     @property
     def own(self) -> Tensor: ...
 
-    def turned(self, signs: Tensor) -> Turned:
+    def turned(self, signs: Tensor) -> Flipped:
         """Bodies with signs (K, T or 1, B) turned."""
         ...
 
@@ -99,8 +99,8 @@ class ParallelRays(NamedTuple):
     objective: Objective
     own: Tensor
 
-    def turned(self, signs: Tensor) -> Turned:
-        return Turned(self.objective.joints(self.own * signs), self.objective.image)
+    def turned(self, signs: Tensor) -> Flipped:
+        return Flipped(self.objective.joints(self.own * signs), self.objective.image)
 
 
 class _Frames(NamedTuple):
