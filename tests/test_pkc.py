@@ -688,14 +688,15 @@ def test_confidences_that_vary_are_a_detector_s():
     clip = walking_person(30, turn=0.0)
     method = PKC(rounds=0)
     weights = torch.rand(clip.tracks.weights.shape, generator=torch.Generator().manual_seed(0)).double() * 0.8 + 0.2
-    unsure = replace(clip.tracks, weights=weights)
+    unsure = replace(clip.tracks, weights=weights, detector=None)
     _, noise, notes = run(cleaned(unsure, denoise=True), serve)
     assert_close(noise, detector.DETECTED / weights.sqrt())
     assert any("detector" in note for note in notes)
     chosen = torch.where(weights > 0.6, 1.0, 0.3)
     for sure in (torch.ones_like(weights), torch.full_like(weights, 0.5), (weights > 0.4).double(), chosen):
-        assert not detector.detected(sure)
-    assert detector.detected(weights) and not detector.detected(torch.zeros_like(weights))
+        assert not detector.detected(replace(clip.tracks, weights=sure, detector=None))
+    assert detector.detected(unsure)
+    assert not detector.detected(replace(unsure, weights=torch.zeros_like(weights)))
     spread = method(unsure).uncertainty.mean()
     assert spread > method(clip.tracks).uncertainty.mean()
 

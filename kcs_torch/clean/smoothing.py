@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from kcs_torch.clean.common import Array, check_tracks, frame_rate, number, rebuilt, runs, share
+from kcs_torch.clean.detector import found_by_detector
 from kcs_torch.clean.filters import FILTERS, Filter
 from kcs_torch.errors import unknown
 from kcs_torch.types import Reconstruction, Tracks
@@ -74,6 +75,8 @@ def smooth(
     if short:
         left = share(short, int(seen.sum()))
         note += f"; {left} detections, in runs of fewer than {chosen.least} frames, were left as they are"
+    if tracks.detector is None and found_by_detector(tracks):  # nothing but what is filtered out may tell it
+        tracks = replace(tracks, detector=True)
     return rebuilt(tracks, torch.from_numpy(moved), tracks.weights[:, :count], note)
 
 

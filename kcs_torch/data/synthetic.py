@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -250,6 +250,7 @@ def _film(
         begins = torch.rand(num_frames + _GAP - 1, seen.shape[1], generator=generator, dtype=torch.float64) < rate
         seen[begins.unfold(0, _GAP, 1).any(-1)] = math.nan
     tracks = Tracks.from_arrays(seen, skeleton=body, fps=fps, units="mm", source=source)
+    tracks = replace(tracks, detector=False)
     return SyntheticClip(tracks=tracks, points=points, cameras=cameras[:, :2].to(dtype))
 
 

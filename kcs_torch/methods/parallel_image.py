@@ -31,7 +31,7 @@ def image_noise(lifted: Reconstruction, flat: Tensor, unit: float, rate: float) 
     stray = (flat - tracks.points).square().sum(-1)[tracks.seen]
     level = math.sqrt(float(stray.median()) / 1.39) / unit / 2 if len(stray) else 0.0  # whatever outliers there are
     share = gap_deviation(off / (size * unit), tracks.seen, rate)
-    return (size * share.maximum(detector_deviation(tracks.weights))).clamp_min(level)
+    return (size * share.maximum(detector_deviation(tracks))).clamp_min(level)
 
 
 def body_unit(lifted: Reconstruction) -> float:

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from kcs_torch.clean.detector import detected
 from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.methods.base import Method, apart, check_cameras
-from kcs_torch.methods.detector import detected
 from kcs_torch.methods.finish import HARDLY, WHY_LOOSE, little_turn, what_is_wrong
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
@@ -165,7 +165,7 @@ def _reconstruct(
         if any_focal:
             view = View.of(tracks, zoomed(view.lens, float(bodies.focal[0])), rate)
     assert best is not None
-    exact = len(trunk_joints(tracks.skeleton)) >= 3 and not detected(tracks.weights)
+    exact = len(trunk_joints(tracks.skeleton)) >= 3 and not detected(tracks)
     if method.turns_over and exact and not best.flat:
         best = replace(best, bodies=best.scene.polished(best.bodies, steps))
     return _assemble(method, tracks, best)
@@ -181,7 +181,7 @@ def _straighten(tracks: Tracks, rays: Tensor, distance: Tensor, depth: Tensor) -
     n = tracks.skeleton.num_observed
     own = torch.where(tracks.seen[..., None], rays * ahead(distance, depth)[..., None], torch.zeros_like(rays))
     points, weights = tracks.skeleton.complete(own[:, :n], tracks.weights[:, :n])
-    return replace(tracks, points=points, weights=weights)
+    return replace(tracks, points=points, weights=weights, detector=detected(tracks))  # told once for all rounds
 
 
 def _refine(

@@ -9,9 +9,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from kcs_torch.clean.detector import detected
 from kcs_torch.errors import KcsWarning, OptionError
 from kcs_torch.methods.base import Method, apart, check_cameras
-from kcs_torch.methods.detector import detected
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.perspective import WIDE, feet_on_ground, reconstruct_perspective
 from kcs_torch.methods.pinhole import PinholeEnergy
@@ -158,7 +158,7 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
             gain = float(cost[0] - cost[1])
             if gain > -unusual(FAR) or hopeless(state, cost):  # to be as far away costs no more than that
                 break
-        better = SEEN if detected(tracks.weights) else BETTER
+        better = SEEN if detected(tracks) else BETTER
         near = gain > better and distance(state) < NEAR
     return Intrinsics(USUAL * unit, USUAL * unit, x, y) if near else None
 

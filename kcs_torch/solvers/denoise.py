@@ -10,12 +10,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.ranks import median, nanmedian
+from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.solvers.completion import complete_tracks
-from kcs_torch.solvers.spectrum import spectrum_floor, temporal_modes, unshared
+from kcs_torch.solvers.spectrum import temporal_modes, unshared, white_power
 
-__all__ = ["Denoised", "denoise_tracks"]
+__all__ = ["Denoised", "Noise", "denoise_tracks", "measure_noise"]
 
 # Bands of temporal modes, each with its own covariance between joints: how joints sway together differs from how
 # they twitch together. Modes 0..2 are the parabola of a window, mode i has about i/2 periods in it.
@@ -29,9 +29,9 @@ _NUMBERS = 2**18  # joints times frames that are judged at once: this takes a hu
 # Of the body's size: below it nothing is gained, and gaps would converge more slowly.
 _LEAST_NOISE = 1e-3
 _TINY = 1e-30
-# The floor of a spectrum is motion where less than the first share of its power is every joint's own, and noise from
-# the second on.
-_SHARED = (0.15, 0.35)
+_STRAY = 6.0, 0.04  # threshold and floor of outliers, see denoise_tracks
+_RESTLESS = (24, 48)  # modes that are hardly motion any more, six to eleven periods a second, but within most filters
+_STEADY, _SEEN = 4, 0.95  # joints that tell the kind of noise, at least, and the share of the frames that show each
 # Noise that lasts for several frames is told where joints do not share the first part of a band's deviation, and surely
 # where not the second.
 _LASTS = (0.08, 0.13)
@@ -63,8 +63,8 @@ def denoise_tracks(
     *,
     window: int = 64,
     quick: int = 12,
-    threshold: float = 6.0,
-    floor: float = 0.04,
+    threshold: float = _STRAY[0],
+    floor: float = _STRAY[1],
 ) -> Denoised:
     r"""Smooth 2D tracks, fill what is unseen and reject outliers; all parameters come from the clip itself.
 
@@ -153,6 +153,60 @@ def denoise_tracks(
     )
 
 
+class Noise(NamedTuple):
+    """What :func:`measure_noise` finds, standard deviations as shares of the body's size.
+
+    Attributes:
+        white: of the noise in the quickest modes.
+        restless: of what joints do not share a few times slower, from six to eleven periods a second.
+        share: of the deviation there that joints do not share: of exact tracks below .06, mostly.
+    """
+
+    white: float
+    restless: float
+    share: float
+
+
+def measure_noise(tracks: Tensor, weights: Tensor, *, window: int = 64) -> Noise | None:
+    """Tell what kind of noise tracks have, without smoothing them.
+
+    White noise is as strong in quick modes as in slower ones. That of detectors and filters is not: it falls off, but
+    unlike motion it is every joint's own. Filters leave nothing at all of the quickest modes.
+
+    Args:
+        tracks: (T, N, 2), finite.
+        weights: (T, N), 0 where unseen.
+        window: frames taken together, two seconds say.
+
+    Returns:
+        The noise of the joints that are seen in nearly all frames, outliers apart; or None where these are fewer than
+        four, or the clip is too short to tell.
+    """
+    values = tracks.detach().double()[None]
+    seen = weights[None] > 0
+    size = _body_size(values, seen)
+    if len(tracks) <= _RESTLESS[0] or not bool(size > _TINY):
+        return None
+    values = values / size
+    seen = seen & ~_each_joint(_stray_from_neighbours, values, seen, *_STRAY)
+    steady = seen[0].double().mean(0) >= _SEEN
+    if int(steady.sum()) < _STEADY:
+        return None
+    values, seen = values[:, :, steady], seen[:, :, steady]
+    points = interpolate(values, seen)
+    frames = points.shape[1]
+    length = min(window, frames)
+    index = torch.tensor(window_starts(frames, length, length // 2), device=tracks.device)[:, None]
+    index = index + torch.arange(length, device=tracks.device)
+    modes = temporal_modes(length).to(points).mT @ (points - points.mean(1, keepdim=True))[:, index].flatten(-2)
+    part = modes[:, :, slice(*_RESTLESS)].flatten(1, 2)
+    _, own = unshared(part)
+    if not bool(own.isfinite()):
+        return None
+    share = own / part.square().mean((1, 2)).clamp_min(_TINY)
+    return Noise(*(math.sqrt(float(power)) for power in (white_power(modes), own, share)))
+
+
 class _Model:
     """The Gaussian of a clip's windows, (K, H, L, M) about the mean: K clips, H windows, L frames, M coordinates."""
 
@@ -167,12 +221,7 @@ class _Model:
         windows, length, size = y.shape[1:]
         self.share = w.mean((1, 2, 3)).clamp_min(1e-3)[:, None, None, None]
         z = self.basis.mT @ (x + w * (y - x))
-        typical = median(z.square().movedim(2, 1).flatten(2), -1) / 0.4549  # of chi-square: blind to impacts
-        floor = spectrum_floor(typical)
-        alone, _ = unshared(z[:, :, length // 2 :].flatten(1, 2))
-        alone = torch.where(alone.isfinite(), alone, floor)
-        own = ((alone / floor.clamp_min(_TINY) - _SHARED[0]) / (_SHARED[1] - _SHARED[0])).clamp(0, 1)
-        self.measured = torch.lerp(alone, torch.maximum(alone, floor), own) / self.share.flatten()
+        self.measured = white_power(z) / self.share.flatten()
         self.noise = self.measured.clamp_min(_LEAST_NOISE**2)
         among = self.share.flatten()
         self.lasting = self._lasting(z, self.measured * among) / among[:, None]

@@ -8,12 +8,26 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-__all__ = ["spectrum_floor", "temporal_modes", "unshared"]
+from kcs_torch.functional.ranks import median
+
+__all__ = ["spectrum_floor", "temporal_modes", "unshared", "white_power", "window_at"]
 
 ENOUGH = 20
 """Modes from which on noise can be told from motion."""
 
+WINDOW = 64
+"""Frames in which motion and noise are told apart, at 30 a second: two seconds, and up to 120 a second as many."""
+
+SHARED = (0.15, 0.35)
+"""The floor of a spectrum is motion where less than the first share of its power is every joint's own, and noise from
+the second on."""
+
 TINY = 1e-30
+
+
+def window_at(rate: float) -> int:
+    """Frames in which motion and noise are told apart, at so many a second."""
+    return WINDOW * round(min(max(rate / 30, 1), 4))
 
 
 def temporal_modes(length: int) -> Tensor:
@@ -42,6 +56,20 @@ def spectrum_floor(power: Tensor) -> Tensor:
     misfit = scale.log() * len(order) + shape.log().sum(-1)
     best = misfit.flatten(1).argmin(1, keepdim=True)
     return (scale * level[:, 0]).flatten(1).gather(1, best)[:, 0]
+
+
+def white_power(modes: Tensor) -> Tensor:
+    """Power (K,) of the white noise in temporal modes (K, H, L, M) of K clips' H windows and M coordinates.
+
+    The level at which the spectrum stops falling, unless joints move together there, and at least what the quicker half
+    of the modes do not share.
+    """
+    typical = median(modes.square().movedim(2, 1).flatten(2), -1) / 0.4549  # of chi-square: blind to impacts
+    floor = spectrum_floor(typical)
+    alone, _ = unshared(modes[:, :, modes.shape[2] // 2 :].flatten(1, 2))
+    alone = torch.where(alone.isfinite(), alone, floor)
+    own = ((alone / floor.clamp_min(TINY) - SHARED[0]) / (SHARED[1] - SHARED[0])).clamp(0, 1)
+    return torch.lerp(alone, torch.maximum(alone, floor), own)
 
 
 def unshared(modes: Tensor) -> tuple[Tensor, Tensor]:

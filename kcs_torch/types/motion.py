@@ -266,7 +266,7 @@ class Motion(Trajectories):
             draw = torch.randn(image.shape, generator=generator, dtype=image.dtype, device=image.device)
             image = image + noise * draw
         count = self.skeleton.num_observed
-        return Tracks.from_arrays(
+        made = Tracks.from_arrays(
             torch.where(self.seen[..., None], image, torch.full_like(image, math.nan))[:, :count],
             self.weights[:, :count],
             skeleton=self.skeleton,
@@ -276,6 +276,7 @@ class Motion(Trajectories):
             source=self.source,
             notes=self.notes,
         )
+        return replace(made, detector=False)
 
     def save(self, path: str | Path) -> Path:
         """Write to a file; its suffix chooses the format (.npz, .bvh, .c3d, .csv, .trc). See :func:`kcs_torch.save`.

@@ -29,10 +29,12 @@ class Tracks(Trajectories):
         units: of ``points``: "px", "mm", ...
         source: where the tracks come from (a file name), for messages.
         notes: what was changed or assumed on the way in, one sentence each.
+        detector: whether a detector found the joints, so that errors last for many frames; None where nobody said so.
     """
 
     units: str = "px"
     source: str = "tracks"
+    detector: bool | None = None
 
     @classmethod
     def from_arrays(

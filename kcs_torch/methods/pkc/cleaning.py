@@ -8,16 +8,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kcs_torch.clean.detector import detected
 from kcs_torch.errors import counted
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.detector import detected, detector_deviation
+from kcs_torch.methods.detector import detector_deviation
 from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.batch import Noisy
 from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.unseen import gap_deviation, place_unseen, within_reach
+from kcs_torch.solvers.spectrum import window_at
 from kcs_torch.types import Tracks
 
-__all__ = ["CLEAN", "PLAIN", "cleaned"]
+__all__ = ["CLEAN", "DETECTIONS", "PLAIN", "cleaned"]
 
 CLEAN, PLAIN = 0.0013, 0.0007
 """Noise below this share of the body's size, .6 mm of a person, is left in tracks at 30 frames a second or less: they
@@ -25,9 +27,11 @@ count as exact. That of motion capture comes to a fifth of it, and where it move
 a second less noise does harm. And the same of bodies whose lengths no template tells: where tracks count as exact bones
 do, too, so that a little noise may make all of them wrong."""
 
-WINDOW, QUICK = 64, 2.2
-"""Frames in which motion and noise are told apart, at 30 a second: two seconds, and up to 120 frames a second about as
-many. And the frequency in Hz from which on what joints do not share is noise rather than motion."""
+DETECTIONS = "joints are taken to be a detector's"
+"""How the note begins that tells of it."""
+
+QUICK = 2.2
+"""Frequency in Hz from which on what joints do not share is noise rather than motion."""
 
 SHORT, UNTOLD = 12, 0.015
 """Frames below which a clip does not tell its noise, and what is assumed then: that of good detections."""
@@ -55,7 +59,7 @@ def cleaned(
     if denoise:
         keep = plausible(points, keep, tracks.skeleton)
         rate = tracks.fps or 30.0
-        window = WINDOW * round(min(max(rate / 30, 1), 4))
+        window = window_at(rate)
         quick = math.ceil(2 * QUICK * window / rate)
         (found,) = yield [Noisy(points, torch.where(keep, tracks.weights, 0), window, quick)]
         level, left = float(found.noise.median()), float(found.left.median())
@@ -79,9 +83,9 @@ def cleaned(
         points = place_unseen(flat, known, tracks.skeleton)[..., :2]
     points = within_reach(points, keep, tracks.skeleton)
     noise = (gap_deviation(points, keep, tracks.fps or 30.0, HELD).square() + left**2).sqrt()
-    if detected(tracks.weights):
-        noise = noise.maximum(detector_deviation(tracks.weights))
-        notes.append("confidences vary as a detector's do: joints may be off by 3 % of the body's size or more")
+    if detected(tracks):
+        noise = noise.maximum(detector_deviation(tracks))
+        notes.append(f"{DETECTIONS}: joints may be off by 3 % of the body's size or more, for many frames")
     if len(points) < SHORT:
         noise = noise.clamp_min(UNTOLD)
     held = _nearest_shown(keep)

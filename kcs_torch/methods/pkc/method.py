@@ -9,11 +9,11 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
+from kcs_torch.clean.detector import detected, found_by_detector
 from kcs_torch.clean.sides import unswap
 from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.methods.base import Estimate, Method
-from kcs_torch.methods.detector import detected
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.batch import Sized, serve
@@ -86,6 +86,8 @@ class PKC(Method):
             fit the tracks nearly as well, of which there are often none.
         contacts: rank solutions by feet that stand still in the image, and so in space, too, unless the camera goes
             round the body; to be switched off for one that follows it.
+        detections: whether joints are a detector's, whose errors last, rather than exact or with white noise. None: as
+            confidences of many values tell, noise that lasts, and noise of a skeleton that detectors have.
         seed: of the random starts.
 
     Raises:
@@ -103,6 +105,7 @@ class PKC(Method):
     steps: int = 30
     alternatives: int = 4
     contacts: bool = True
+    detections: bool | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -114,7 +117,11 @@ class PKC(Method):
         return len(trunk_joints(skeleton)) >= 3
 
     def prepared(self, tracks: Tracks) -> Tracks:
-        return unswap(without_others(tracks)) if self.denoise else tracks
+        tracks = unswap(without_others(tracks)) if self.denoise else tracks
+        told = self.detections
+        if told is None and self.denoise and self.knows_template(tracks.skeleton):
+            told = found_by_detector(tracks)
+        return tracks if told is None or told == detected(tracks) else replace(tracks, detector=told)
 
     def following(self, searched: bool = True) -> PKC:
         """The same without contacts: what stands still in space does not in the image."""
@@ -181,7 +188,7 @@ class PKC(Method):
         still = self.contacts and not _turns(cameras) and self.viewpoint != "moving"
         feet = standing if still else None
         body = Body(skeleton, image, tracks.fps or 30.0, noise, feet)
-        detections = detected(tracks.weights)  # their errors last, and would be taken for motion
+        detections = detected(tracks)  # their errors last, and would be taken for motion
         polished = enough and body.spanned and not detections
         compared = polished and self.viewpoint == "auto"
         turned = self._turned(tracks, image, noise, body.factor)

@@ -1,0 +1,59 @@
+"""Whether a detector found the joints, so that their errors last."""
+
+from __future__ import annotations
+
+from kcs_torch.solvers.denoise import measure_noise
+from kcs_torch.solvers.spectrum import window_at
+from kcs_torch.types import Tracks
+
+__all__ = ["detected", "found_by_detector"]
+
+PARTLY, GRADES = 0.05, 10
+"""Share of confidences below 1, and number of different ones, from which on they are a detector's."""
+
+SKELETONS = (
+    *("ap10k", "body25", "body25b", "coco17", "coco18", "halpe26"),
+    *("hand21", "mediapipe33", "mpi15", "mpii16", "wholebody63"),
+)
+"""Whose joints detectors find: noise in them is a detector's."""
+
+NOISY, LOUD = 0.002, 0.0045
+"""Noise, a share of the body's size, above which joints of such a skeleton are a detector's; and above which those of
+any skeleton are if it lasts. That of motion capture comes to .0027 where a quick motion hides it from the start."""
+
+LASTING, FILTERED = 1.2, 10.0
+"""Noise of a few frames over that of single ones from which on it lasts, and from which on a filter has been there. Of
+white noise it is 1 at most, of eight views of two detectors at 60 frames a second 1.3 to 3, and after a Butterworth
+filter 90 to 560. At 30 frames a second noise that lasts is told only where it has been filtered."""
+
+OWN, SMOOTH, SMOOTHED = 0.05, 0.06, 0.03
+"""Share that joints do not share of what is a few frames long, from which on it is noise; that of a filtered clip, for
+motion capture that was smoothed comes to .05; and of one that has a detector's skeleton."""
+
+
+def detected(tracks: Tracks) -> bool:
+    """Whether a detector found the joints, as is known, or as confidences tell: of many values from 0 to 1."""
+    if tracks.detector is not None:
+        return tracks.detector
+    seen = tracks.weights[tracks.weights > 0]
+    partly = seen[seen < 1]  # nobody would choose so many
+    return len(partly) > PARTLY * len(seen) and len(partly.unique()) > GRADES
+
+
+def found_by_detector(tracks: Tracks) -> bool:
+    """As :func:`detected`; where nothing is known, noise tells, too.
+
+    Noise that lasts for several frames, or that a filter has left, is a detector's, and so is any noise of a skeleton
+    that detectors have.
+    """
+    if detected(tracks) or tracks.detector is not None:
+        return detected(tracks)
+    noise = measure_noise(tracks.points, tracks.weights, window=window_at(tracks.fps or 30.0))
+    if noise is None:
+        return False
+    ratio, known = noise.restless / max(noise.white, 1e-12), tracks.skeleton.name in SKELETONS
+    if ratio > FILTERED:
+        return noise.share > (SMOOTHED if known else SMOOTH)
+    if known:
+        return max(noise.white, noise.restless) > NOISY
+    return ratio > LASTING and noise.share > OWN and noise.restless > LOUD

@@ -1,0 +1,126 @@
+"""Whether a detector found the joints: told by confidences, by the kind of noise, and by the skeleton."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import kcs_torch as kt
+from kcs_torch.clean.detector import FILTERED, LASTING, detected, found_by_detector
+from kcs_torch.data.synthetic import walking_person
+from kcs_torch.functional import align
+from kcs_torch.solvers.denoise import measure_noise
+
+WALK = walking_person(200, turn=0.0, yaw=50.0, skeleton="coco17")
+
+
+def normal(seed: int = 0) -> torch.Tensor:
+    return torch.randn(WALK.tracks.points.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def lasting(seed: int = 0, keep: float = 0.9) -> torch.Tensor:
+    """Noise of deviation 1, of which so much is left in the next frame."""
+    noise = normal(seed)
+    for k in range(1, len(noise)):
+        noise[k] = keep * noise[k - 1] + (1 - keep**2) ** 0.5 * noise[k]
+    return noise
+
+
+def spoilt(noise: torch.Tensor, skeleton: kt.Skeleton | None = None) -> kt.Tracks:
+    """The walk with noise (T, N, 2) in millimetres, of which nobody knows whence it comes."""
+    body = skeleton or WALK.tracks.skeleton
+    count = body.num_observed
+    points, weights = body.complete((WALK.tracks.points + noise)[:, :count], WALK.tracks.weights[:, :count])
+    return replace(WALK.tracks, points=points, weights=weights, skeleton=body, detector=None)
+
+
+CUSTOM = replace(WALK.tracks.skeleton, name="mine")
+
+
+def test_exact_tracks_are_no_detector_s():
+    assert not found_by_detector(spoilt(0 * normal()))
+    assert not found_by_detector(spoilt(0 * normal(), CUSTOM))
+
+
+def test_noise_of_a_detector_s_skeleton_is_a_detector_s():
+    assert found_by_detector(spoilt(4 * normal()))
+    assert not found_by_detector(spoilt(4 * normal(), CUSTOM))  # white noise of anybody's skeleton is just noise
+    assert not found_by_detector(replace(spoilt(4 * normal()), detector=False))
+
+
+def test_noise_that_lasts_is_a_detector_s_of_any_skeleton():
+    rate = 60.0  # where quick modes tell it from white noise
+    noise = normal()
+    noise = 12 * (noise + noise.roll(1, 0) + noise.roll(2, 0)) / 3
+    assert found_by_detector(replace(spoilt(noise, CUSTOM), fps=rate))
+    assert not found_by_detector(replace(spoilt(8 * normal(), CUSTOM), fps=rate))
+
+
+@pytest.mark.parametrize("method", ["butterworth", "savgol", "one-euro"])
+def test_what_smooth_takes_out_is_remembered(method):
+    noisy = spoilt(6 * lasting() + 3 * normal(1))
+    smooth = kt.clean.smooth(noisy, method)
+    assert smooth.detector and detected(smooth)
+    exact = kt.clean.smooth(spoilt(0 * normal()), method)
+    assert exact.detector is None and not found_by_detector(exact)
+
+
+def test_a_filter_of_somebody_else_is_noticed():
+    noisy = spoilt(6 * normal(), CUSTOM)
+    smooth = kt.clean.smooth(replace(noisy, detector=False), cutoff=8.0)
+    assert found_by_detector(replace(smooth, detector=None))
+    assert not found_by_detector(replace(smooth, detector=False))
+
+
+def test_kinds_of_noise():
+    points = WALK.tracks.points
+    size = float((points - points.mean(1, keepdim=True)).norm(dim=-1).median())
+    white = measure_noise(*parts(spoilt(8 * normal())))
+    assert white is not None and white.restless < LASTING * white.white
+    assert 0.8 * 8 / size < white.white < 1.2 * 8 / size
+    fast = replace(spoilt(8 * normal()), fps=60.0)
+    filtered = measure_noise(*parts(kt.clean.smooth(fast)), window=128)
+    assert filtered is not None and filtered.restless > FILTERED * filtered.white
+    exact = measure_noise(*parts(spoilt(0 * normal())))
+    assert exact is not None and exact.restless < 1e-4
+
+
+def test_noise_that_cannot_be_measured():
+    points, weights = parts(spoilt(8 * normal()))
+    assert measure_noise(points[:20], weights[:20]) is None
+    assert measure_noise(points * 0, weights) is None
+    assert measure_noise(points, weights * 0) is None
+    few = weights.clone()
+    few[::3, 3:] = 0  # three joints are always there
+    assert measure_noise(points, few) is None
+    some = weights.clone()
+    some[::3, 12:] = 0
+    assert measure_noise(points, some) is not None
+
+
+def parts(tracks: kt.Tracks) -> tuple[torch.Tensor, torch.Tensor]:
+    return tracks.points, tracks.weights
+
+
+def test_errors_that_last_do_not_become_depth():
+    """Without confidences they were taken for motion, which depth had to explain."""
+    tracks = spoilt(8 * lasting() + 4 * normal(1)).frames(0, 100)
+    truth = WALK.points[:100]
+
+    def error(**fields: object) -> float:
+        found = kt.reconstruct(tracks, intrinsics="parallel", **fields)
+        off = align.centre(found.points)[0] - align.centre(truth)[0]
+        return float(off.norm(dim=-1).mean())
+
+    told, forced, exact = error(), error(detections=True), error(detections=False)
+    assert told == forced
+    assert told < 0.75 * exact
+
+
+def test_a_result_tells_what_its_tracks_were_taken_for():
+    noisy = spoilt(4 * normal()).frames(0, 60)
+    found = kt.reconstruct(noisy, intrinsics="parallel", rounds=0)
+    assert found.tracks.detector and any("detector's" in note for note in found.diagnostics.notes)
+    sure = kt.reconstruct(noisy, intrinsics="parallel", rounds=0, detections=False)
+    assert not sure.tracks.detector and not any("detector's" in note for note in sure.diagnostics.notes)
+    assert float(found.uncertainty.mean()) > float(sure.uncertainty.mean())
