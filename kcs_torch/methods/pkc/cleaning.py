@@ -19,16 +19,13 @@ from kcs_torch.methods.unseen import gap_deviation, place_unseen, within_reach
 from kcs_torch.solvers.spectrum import window_at
 from kcs_torch.types import Tracks
 
-__all__ = ["CLEAN", "DETECTIONS", "PLAIN", "cleaned"]
+__all__ = ["CLEAN", "PLAIN", "cleaned"]
 
 CLEAN, PLAIN = 0.0013, 0.0007
 """Noise below this share of the body's size, .6 mm of a person, is left in tracks at 30 frames a second or less: they
 count as exact. That of motion capture comes to a fifth of it, and where it moves quickly to nine tenths; at more frames
 a second less noise does harm. And the same of bodies whose lengths no template tells: where tracks count as exact bones
 do, too, so that a little noise may make all of them wrong."""
-
-DETECTIONS = "joints are taken to be a detector's"
-"""How the note begins that tells of it."""
 
 QUICK = 2.2
 """Frequency in Hz from which on what joints do not share is noise rather than motion."""
@@ -85,7 +82,7 @@ def cleaned(
     noise = (gap_deviation(points, keep, tracks.fps or 30.0, HELD).square() + left**2).sqrt()
     if detected(tracks):
         noise = noise.maximum(detector_deviation(tracks))
-        notes.append(f"{DETECTIONS}: joints may be off by 3 % of the body's size or more, for many frames")
+        notes.append("taken for a detector's joints: they may be off by 3 % of the body's size or more, frames on end")
     if len(points) < SHORT:
         noise = noise.clamp_min(UNTOLD)
     held = _nearest_shown(keep)
