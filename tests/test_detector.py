@@ -1,5 +1,6 @@
 """Whether a detector found the joints: told by confidences, by the kind of noise, and by the skeleton."""
 
+import warnings
 from dataclasses import replace
 
 import pytest
@@ -63,6 +64,18 @@ def test_what_smooth_takes_out_is_remembered(method):
     assert smooth.detector and detected(smooth)
     exact = kt.clean.smooth(spoilt(0 * normal()), method)
     assert exact.detector is None and not found_by_detector(exact)
+
+
+def test_smooth_warns_of_sides_that_it_would_mix_up():
+    tracks = spoilt(3 * normal())
+    left, right = torch.tensor(tracks.skeleton.mirror).T
+    both, other = torch.cat([left, right]), torch.cat([right, left])
+    tracks.points[50:60, both] = tracks.points[50:60, other]
+    with pytest.warns(kt.KcsWarning, match="swapped back in 10 of 200 .* frames"):
+        kt.clean.smooth(tracks)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        kt.clean.smooth(kt.clean.unswap(tracks))
 
 
 def test_a_filter_of_somebody_else_is_noticed():

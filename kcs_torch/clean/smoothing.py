@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 from typing import overload
 
@@ -12,7 +13,8 @@ import torch
 from kcs_torch.clean.common import Array, check_tracks, frame_rate, number, rebuilt, runs, share
 from kcs_torch.clean.detector import found_by_detector
 from kcs_torch.clean.filters import FILTERS, Filter
-from kcs_torch.errors import unknown
+from kcs_torch.clean.sides import unswap
+from kcs_torch.errors import KcsWarning, unknown, users_level
 from kcs_torch.types import Reconstruction, Tracks
 
 __all__ = ["SMOOTHERS", "smooth"]
@@ -50,6 +52,9 @@ def smooth(
     Raises:
         OptionError: the method is unknown, the rate is unknown, or the cut-off is not below half of it.
 
+    Warns:
+        KcsWarning: the tracks' left and right are swapped in some frames, which :func:`unswap` should mend first.
+
     >>> from kcs_torch.data.synthetic import walking_person
     >>> tracks = walking_person(60, noise=3.0, generator=torch.Generator().manual_seed(0)).tracks
     >>> smooth(tracks, cutoff=4.0).notes[-1]
@@ -75,6 +80,12 @@ def smooth(
     if short:
         left = share(short, int(seen.sum()))
         note += f"; {left} detections, in runs of fewer than {chosen.least} frames, were left as they are"
+    mended = unswap(tracks)
+    if mended is not tracks:
+        message = (
+            f"{tracks.source}: smooth mixes up left and right where a detector swapped them: unswap first (--unswap). "
+        )
+        warnings.warn(message + f"It would say: {mended.notes[-1]}", KcsWarning, stacklevel=users_level())
     if tracks.detector is None and found_by_detector(tracks):  # nothing but what is filtered out may tell it
         tracks = replace(tracks, detector=True)
     return rebuilt(tracks, torch.from_numpy(moved), tracks.weights[:, :count], note)
