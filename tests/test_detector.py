@@ -10,7 +10,7 @@ import kcs_torch as kt
 from kcs_torch.clean.detector import FILTERED, LASTING, detected, found_by_detector
 from kcs_torch.data.synthetic import walking_person
 from kcs_torch.functional import align
-from kcs_torch.solvers.denoise import measure_noise
+from kcs_torch.solvers.noise import measure_noise
 
 WALK = walking_person(200, turn=0.0, yaw=50.0, skeleton="coco17")
 

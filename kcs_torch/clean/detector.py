@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kcs_torch.solvers.denoise import measure_noise
+from kcs_torch.solvers.noise import measure_noise
 from kcs_torch.solvers.spectrum import window_at
 from kcs_torch.types import Tracks
 

@@ -8,6 +8,7 @@ from kcs_torch.solvers.ist import ist, metric_upgrade
 from kcs_torch.solvers.iterate import Solution, fpc, iterate, svt
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.lm import fit_bones
+from kcs_torch.solvers.noise import Noise, measure_noise
 from kcs_torch.solvers.nullspace import null_space_upgrade
 from kcs_torch.solvers.procrustean import procrustean
 from kcs_torch.solvers.sign_filter import SignFilter
@@ -18,6 +19,7 @@ from kcs_torch.solvers.swaps import swapped_frames
 __all__ = [
     "Denoised",
     "Implicit",
+    "Noise",
     "SignFilter",
     "SignPath",
     "Solution",
@@ -32,6 +34,7 @@ __all__ = [
     "ist",
     "iterate",
     "lbfgs",
+    "measure_noise",
     "metric_upgrade",
     "null_space_upgrade",
     "procrustean",

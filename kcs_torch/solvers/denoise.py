@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import itertools
-import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.spectrum import temporal_modes, unshared, white_power
+from kcs_torch.solvers.stray import FLOOR, STRAY, body_size, each_joint, far_off, stray_from_neighbours
 
-__all__ = ["Denoised", "Noise", "denoise_tracks", "measure_noise"]
+__all__ = ["Denoised", "denoise_tracks"]
 
 # Bands of temporal modes, each with its own covariance between joints: how joints sway together differs from how
 # they twitch together. Modes 0..2 are the parabola of a window, mode i has about i/2 periods in it.
@@ -25,18 +23,13 @@ _PRIOR_SAMPLES = 10.0  # modes' worth of belief that joints move independently
 # Estimates and conjugate gradient steps before outliers are judged, and again after: most by the last.
 _ROUNDS = ((2, 40), (1, 40), (1, 60))
 _CHUNK = 256  # windows solved at once: bounds memory
-_NUMBERS = 2**18  # joints times frames that are judged at once: this takes a hundred times the memory
 # Of the body's size: below it nothing is gained, and gaps would converge more slowly.
 _LEAST_NOISE = 1e-3
 _TINY = 1e-30
-_STRAY = 6.0, 0.04  # threshold and floor of outliers, see denoise_tracks
-_RESTLESS = (24, 48)  # modes that are hardly motion any more, six to eleven periods a second, but within most filters
-_STEADY, _SEEN = 4, 0.95  # joints that tell the kind of noise, at least, and the share of the frames that show each
 # Noise that lasts for several frames is told where joints do not share the first part of a band's deviation, and surely
 # where not the second.
 _LASTS = (0.08, 0.13)
 _MORE = 2.0  # power of noise that lasts, over what can be told of it
-_COMMON, _RATIO = 0.7, 1.318  # a quantile of distances, and what it is over the median for a Gaussian in the plane
 
 
 class Denoised(NamedTuple):
@@ -63,8 +56,8 @@ def denoise_tracks(
     *,
     window: int = 64,
     quick: int = 12,
-    threshold: float = _STRAY[0],
-    floor: float = _STRAY[1],
+    threshold: float = STRAY,
+    floor: float = FLOOR,
 ) -> Denoised:
     r"""Smooth 2D tracks, fill what is unseen and reject outliers; all parameters come from the clip itself.
 
@@ -113,7 +106,7 @@ def denoise_tracks(
     shape = tracks.shape
     values = tracks.detach().reshape(-1, *shape[-3:]).double()  # (K, T, N, 2): the spectra span more than float32
     given = weights.detach().reshape(values.shape[:-1]).double()
-    size = _body_size(values, given > 0)
+    size = body_size(values, given > 0)
     unit = torch.where(size > _TINY, size, torch.ones_like(size))[:, None, None, None]
     values = values / unit
     frames, joints = values.shape[1], values.shape[2]
@@ -122,7 +115,7 @@ def denoise_tracks(
     index = torch.tensor(starts, device=tracks.device)[:, None] + torch.arange(length, device=tracks.device)
     model = _Model(length, values, quick)
 
-    outliers = _each_joint(_stray_from_neighbours, values, given > 0, threshold, floor)
+    outliers = each_joint(stray_from_neighbours, values, given > 0, threshold, floor)
     points = values
     for last, (rounds, steps) in enumerate(_ROUNDS, start=1 - len(_ROUNDS)):
         live = torch.where(outliers, torch.zeros_like(given), given)
@@ -139,7 +132,7 @@ def denoise_tracks(
         if last == 0:
             break
         error = (values - points).norm(dim=-1) / (1 - model.leverage()[:, None] * live).clamp_min(1e-3)
-        outliers = _each_joint(_far, error, given > 0, threshold, floor)
+        outliers = each_joint(far_off, error, given > 0, threshold, floor)
     noise, left = (
         (power.sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints).reshape(*shape[:-3], joints).to(tracks.dtype)
         for power in (model.measured + model.lasting.mean(1), model.left)
@@ -151,60 +144,6 @@ def denoise_tracks(
         outliers.reshape(weights.shape),
         left,
     )
-
-
-class Noise(NamedTuple):
-    """What :func:`measure_noise` finds, standard deviations as shares of the body's size.
-
-    Attributes:
-        white: of the noise in the quickest modes.
-        restless: of what joints do not share a few times slower, from six to eleven periods a second.
-        share: of the deviation there that joints do not share: of exact tracks below .06, mostly.
-    """
-
-    white: float
-    restless: float
-    share: float
-
-
-def measure_noise(tracks: Tensor, weights: Tensor, *, window: int = 64) -> Noise | None:
-    """Tell what kind of noise tracks have, without smoothing them.
-
-    White noise is as strong in quick modes as in slower ones. That of detectors and filters is not: it falls off, but
-    unlike motion it is every joint's own. Filters leave nothing at all of the quickest modes.
-
-    Args:
-        tracks: (T, N, 2), finite.
-        weights: (T, N), 0 where unseen.
-        window: frames taken together, two seconds say.
-
-    Returns:
-        The noise of the joints that are seen in nearly all frames, outliers apart; or None where these are fewer than
-        four, or the clip is too short to tell.
-    """
-    values = tracks.detach().double()[None]
-    seen = weights[None] > 0
-    size = _body_size(values, seen)
-    if len(tracks) <= _RESTLESS[0] or not bool(size > _TINY):
-        return None
-    values = values / size
-    seen = seen & ~_each_joint(_stray_from_neighbours, values, seen, *_STRAY)
-    steady = seen[0].double().mean(0) >= _SEEN
-    if int(steady.sum()) < _STEADY:
-        return None
-    values, seen = values[:, :, steady], seen[:, :, steady]
-    points = interpolate(values, seen)
-    frames = points.shape[1]
-    length = min(window, frames)
-    index = torch.tensor(window_starts(frames, length, length // 2), device=tracks.device)[:, None]
-    index = index + torch.arange(length, device=tracks.device)
-    modes = temporal_modes(length).to(points).mT @ (points - points.mean(1, keepdim=True))[:, index].flatten(-2)
-    part = modes[:, :, slice(*_RESTLESS)].flatten(1, 2)
-    _, own = unshared(part)
-    if not bool(own.isfinite()):
-        return None
-    share = own / part.square().mean((1, 2)).clamp_min(_TINY)
-    return Noise(*(math.sqrt(float(power)) for power in (white_power(modes), own, share)))
 
 
 class _Model:
@@ -334,56 +273,3 @@ def _fill(values: Tensor, seen: Tensor) -> Tensor:
         points = centre + interpolate(values - centre, seen)
     centre = points.mean(2, keepdim=True)
     return complete_tracks(values - centre, seen, num_steps=20) + centre
-
-
-def _each_joint(judge: Callable[..., Tensor], values: Tensor, seen: Tensor, *limits: float) -> Tensor:
-    """(K, T, N) what a judge that looks at each joint by itself says, of few joints at a time where clips are long."""
-    few = max(1, _NUMBERS // max(values.shape[0] * values.shape[1], 1))
-    parts = zip(values.split(few, 2), seen.split(few, 2), strict=True)
-    return torch.cat([judge(*part, *limits) for part in parts], 2)
-
-
-def _stray_from_neighbours(values: Tensor, seen: Tensor, threshold: float, floor: float) -> Tensor:
-    """(K, T, N) outliers against the median of straight lines through a joint's nearest seen frames."""
-    frames = values.shape[1]
-    if frames < 5:
-        return torch.zeros_like(seen)
-    time = torch.arange(frames, device=values.device)[:, None].expand(seen.shape)
-    order = torch.where(seen, time, time + frames).argsort(1)
-    rank, count = seen.cumsum(1) - 1, seen.sum(1, keepdim=True)
-
-    def neighbour(k: int) -> tuple[Tensor, Tensor]:
-        at = order.gather(1, (rank + k).clamp(0, frames - 1))
-        held = values.gather(1, at[..., None].expand(values.shape))
-        there = (rank + k >= 0) & (rank + k < count)
-        return at.to(values.dtype), torch.where(there[..., None], held, torch.full_like(held, math.nan))
-
-    near = {k: neighbour(k) for k in (-3, -2, -1, 1, 2, 3)}
-    lines = []
-    for a, b in ((-1, 1), (-2, 1), (-1, 2), (-2, 2), (-3, 3), (-2, -1), (1, 2)):
-        (start, first), (stop, last) = near[a], near[b]
-        gap = torch.where(stop == start, torch.ones_like(stop), stop - start)
-        lines.append(first + ((time - start) / gap)[..., None] * (last - first))
-    error = (values - nanmedian(torch.stack(lines), 0)).norm(dim=-1)
-    return _far(error, seen & error.isfinite(), threshold, floor)
-
-
-def _far(error: Tensor, seen: Tensor, threshold: float, floor: float, spread: int = 8) -> Tensor:
-    """(K, T, N), True where a seen joint's error, in body sizes, is far above what is usual for it."""
-    known = torch.where(seen, error, torch.full_like(error, math.nan))
-    # Of a Gaussian's distances the quantile is at the median. It is above it where a joint is still most of the time
-    # and then swings: no quick stride is an outlier, no outliers are as common.
-    clip = torch.maximum(nanmedian(known, 1, keepdim=True), known.nanquantile(_COMMON, 1, keepdim=True) / _RATIO)
-    around = torch.nn.functional.pad(known.mT, (spread, spread), value=math.nan).unfold(-1, 2 * spread + 1, 1)
-    # Bounded, as near the ends of a clip one outlier may spoil the prediction of all that is around.
-    usual = torch.maximum(clip, torch.minimum(nanmedian(around, -1).mT, 4 * clip)).nan_to_num(0.0)
-    return seen & (error > threshold * usual + floor)
-
-
-def _body_size(values: Tensor, seen: Tensor) -> Tensor:
-    """(K,) median distance of the seen joints from the mean of their frame's seen joints."""
-    kept = seen[..., None].to(values.dtype)
-    centre = (values * kept).sum(2, keepdim=True) / kept.sum(2, keepdim=True).clamp_min(1)
-    distance = (values - centre).norm(dim=-1)
-    distance = torch.where(seen, distance, torch.full_like(distance, math.nan))
-    return nanmedian(distance.flatten(1), 1).nan_to_num(0.0)

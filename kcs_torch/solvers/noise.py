@@ -1,0 +1,77 @@
+"""What kind of noise tracks have."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.temporal import interpolate, window_starts
+from kcs_torch.solvers.spectrum import temporal_modes, unshared, white_power
+from kcs_torch.solvers.stray import FLOOR, STRAY, body_size, each_joint, stray_from_neighbours
+
+__all__ = ["Noise", "measure_noise"]
+
+RESTLESS = (24, 48)
+"""Modes that are hardly motion any more, six to eleven periods a second, but within most filters."""
+
+STEADY, SEEN = 4, 0.95
+"""Joints that tell the kind of noise, at least, and the share of the frames that show each."""
+
+TINY = 1e-30
+
+
+class Noise(NamedTuple):
+    """What :func:`measure_noise` finds, standard deviations as shares of the body's size.
+
+    Attributes:
+        white: of the noise in the quickest modes.
+        restless: of what joints do not share a few times slower, from six to eleven periods a second.
+        share: of the deviation there that joints do not share: of exact tracks below .06, mostly.
+    """
+
+    white: float
+    restless: float
+    share: float
+
+
+def measure_noise(tracks: Tensor, weights: Tensor, *, window: int = 64) -> Noise | None:
+    """Tell what kind of noise tracks have, without smoothing them.
+
+    White noise is as strong in quick modes as in slower ones. That of detectors and filters is not: it falls off, but
+    unlike motion it is every joint's own. Filters leave nothing at all of the quickest modes.
+
+    Args:
+        tracks: (T, N, 2), finite.
+        weights: (T, N), 0 where unseen.
+        window: frames taken together, two seconds say.
+
+    Returns:
+        The noise of the joints that are seen in nearly all frames, outliers apart; or None where these are fewer than
+        four, or the clip is too short to tell.
+    """
+    values = tracks.detach().double()[None]
+    seen = weights[None] > 0
+    size = body_size(values, seen)
+    if len(tracks) <= RESTLESS[0] or not bool(size > TINY):
+        return None
+    values = values / size
+    seen = seen & ~each_joint(stray_from_neighbours, values, seen, STRAY, FLOOR)
+    steady = seen[0].double().mean(0) >= SEEN
+    if int(steady.sum()) < STEADY:
+        return None
+    values, seen = values[:, :, steady], seen[:, :, steady]
+    points = interpolate(values, seen)
+    frames = points.shape[1]
+    length = min(window, frames)
+    index = torch.tensor(window_starts(frames, length, length // 2), device=tracks.device)[:, None]
+    index = index + torch.arange(length, device=tracks.device)
+    modes = temporal_modes(length).to(points).mT @ (points - points.mean(1, keepdim=True))[:, index].flatten(-2)
+    part = modes[:, :, slice(*RESTLESS)].flatten(1, 2)
+    _, own = unshared(part)
+    if not bool(own.isfinite()):
+        return None
+    share = own / part.square().mean((1, 2)).clamp_min(TINY)
+    return Noise(*(math.sqrt(float(power)) for power in (white_power(modes), own, share)))

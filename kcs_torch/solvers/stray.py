@@ -1,0 +1,75 @@
+"""Detections that stray from what their surroundings predict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.ranks import nanmedian
+
+__all__ = ["FLOOR", "STRAY", "body_size", "each_joint", "far_off", "stray_from_neighbours"]
+
+STRAY, FLOOR = 6.0, 0.04
+"""Of outliers: usual distances from what is predicted, and the share of the body's size beside."""
+
+NUMBERS = 2**18
+"""Joints times frames that are judged at once: this takes a hundred times the memory."""
+
+COMMON, RATIO = 0.7, 1.318
+"""A quantile of distances, and what it is over the median for a Gaussian in the plane."""
+
+
+def each_joint(judge: Callable[..., Tensor], values: Tensor, seen: Tensor, *limits: float) -> Tensor:
+    """(K, T, N) what a judge that looks at each joint by itself says, of few joints at a time where clips are long."""
+    few = max(1, NUMBERS // max(values.shape[0] * values.shape[1], 1))
+    parts = zip(values.split(few, 2), seen.split(few, 2), strict=True)
+    return torch.cat([judge(*part, *limits) for part in parts], 2)
+
+
+def stray_from_neighbours(values: Tensor, seen: Tensor, threshold: float, floor: float) -> Tensor:
+    """(K, T, N) outliers against the median of straight lines through a joint's nearest seen frames."""
+    frames = values.shape[1]
+    if frames < 5:
+        return torch.zeros_like(seen)
+    time = torch.arange(frames, device=values.device)[:, None].expand(seen.shape)
+    order = torch.where(seen, time, time + frames).argsort(1)
+    rank, count = seen.cumsum(1) - 1, seen.sum(1, keepdim=True)
+
+    def neighbour(k: int) -> tuple[Tensor, Tensor]:
+        at = order.gather(1, (rank + k).clamp(0, frames - 1))
+        held = values.gather(1, at[..., None].expand(values.shape))
+        there = (rank + k >= 0) & (rank + k < count)
+        return at.to(values.dtype), torch.where(there[..., None], held, torch.full_like(held, math.nan))
+
+    near = {k: neighbour(k) for k in (-3, -2, -1, 1, 2, 3)}
+    lines = []
+    for a, b in ((-1, 1), (-2, 1), (-1, 2), (-2, 2), (-3, 3), (-2, -1), (1, 2)):
+        (start, first), (stop, last) = near[a], near[b]
+        gap = torch.where(stop == start, torch.ones_like(stop), stop - start)
+        lines.append(first + ((time - start) / gap)[..., None] * (last - first))
+    error = (values - nanmedian(torch.stack(lines), 0)).norm(dim=-1)
+    return far_off(error, seen & error.isfinite(), threshold, floor)
+
+
+def far_off(error: Tensor, seen: Tensor, threshold: float, floor: float, spread: int = 8) -> Tensor:
+    """(K, T, N), True where a seen joint's error, in body sizes, is far above what is usual for it."""
+    known = torch.where(seen, error, torch.full_like(error, math.nan))
+    # Of a Gaussian's distances the quantile is at the median. It is above it where a joint is still most of the time
+    # and then swings: no quick stride is an outlier, no outliers are as common.
+    clip = torch.maximum(nanmedian(known, 1, keepdim=True), known.nanquantile(COMMON, 1, keepdim=True) / RATIO)
+    around = torch.nn.functional.pad(known.mT, (spread, spread), value=math.nan).unfold(-1, 2 * spread + 1, 1)
+    # Bounded, as near the ends of a clip one outlier may spoil the prediction of all that is around.
+    usual = torch.maximum(clip, torch.minimum(nanmedian(around, -1).mT, 4 * clip)).nan_to_num(0.0)
+    return seen & (error > threshold * usual + floor)
+
+
+def body_size(values: Tensor, seen: Tensor) -> Tensor:
+    """(K,) median distance of the seen joints from the mean of their frame's seen joints."""
+    kept = seen[..., None].to(values.dtype)
+    centre = (values * kept).sum(2, keepdim=True) / kept.sum(2, keepdim=True).clamp_min(1)
+    distance = (values - centre).norm(dim=-1)
+    distance = torch.where(seen, distance, torch.full_like(distance, math.nan))
+    return nanmedian(distance.flatten(1), 1).nan_to_num(0.0)
