@@ -137,3 +137,7 @@ def test_a_result_tells_what_its_tracks_were_taken_for():
     sure = kt.reconstruct(noisy, intrinsics="parallel", rounds=0, detections=False)
     assert not sure.tracks.detector and not any("detector's" in note for note in sure.diagnostics.notes)
     assert float(found.uncertainty.mean()) > float(sure.uncertainty.mean())
+    hint = "detections=True"
+    mine = kt.reconstruct(spoilt(4 * normal(), CUSTOM).frames(0, 60), intrinsics="parallel", rounds=0)
+    assert any(hint in note for note in mine.diagnostics.notes)
+    assert not any(hint in note for one in (found, sure) for note in one.diagnostics.notes)

@@ -30,6 +30,8 @@ do, too, so that a little noise may make all of them wrong."""
 QUICK = 2.2
 """Frequency in Hz from which on what joints do not share is noise rather than motion."""
 
+HINT = "If a detector found the joints, detections=True allows for its errors, which last"
+
 SHORT, UNTOLD = 12, 0.015
 """Frames below which a clip does not tell its noise, and what is assumed then: that of good detections."""
 
@@ -70,7 +72,9 @@ def cleaned(
             left = 0.0
         else:
             exact = torch.zeros_like(keep)
-            notes.append(f"tracks smoothed: noise of {100 * level:.1f} % of the body's size")
+            smoothed = f"tracks smoothed: noise of {100 * level:.1f} % of the body's size"
+            untold = tracks.detector is None and not detected(tracks)
+            notes.append(f"{smoothed}. {HINT}" if template and untold else smoothed)
         points = torch.where(exact[..., None], points, found.points)
     else:
         points = interpolate(points, tracks.seen)
