@@ -100,7 +100,10 @@ def test_kinds_of_noise():
 
 def test_noise_that_cannot_be_measured():
     points, weights = parts(spoilt(8 * normal()))
-    assert measure_noise(points[:20], weights[:20]) is None
+    assert measure_noise(points[:11], weights[:11]) is None
+    for frames in (12, 20, 30):
+        short = measure_noise(points[:frames], weights[:frames])
+        assert short is not None and short.white > 0.005 and short.restless == 0
     assert measure_noise(points * 0, weights) is None
     assert measure_noise(points, weights * 0) is None
     few = weights.clone()

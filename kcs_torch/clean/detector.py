@@ -18,8 +18,9 @@ SKELETONS = (
 """Whose joints detectors find: noise in them is a detector's."""
 
 NOISY, LOUD = 0.002, 0.0045
-"""Noise, a share of the body's size, above which joints of such a skeleton are a detector's; and above which those of
-any skeleton are if it lasts. That of motion capture comes to .0027 where a quick motion hides it from the start."""
+"""Noise, a share of the body's size, above which joints of such a skeleton are a detector's; and above which they are
+in clips too short to tell it well, and those of any skeleton if it lasts. That of motion capture comes to .0027 where a
+quick motion looks like it."""
 
 LASTING, FILTERED = 1.2, 10.0
 """Noise of a few frames over that of single ones from which on it lasts, and from which on a filter has been there. Of
@@ -55,5 +56,5 @@ def found_by_detector(tracks: Tracks) -> bool:
     if ratio > FILTERED:
         return noise.share > (SMOOTHED if known else SMOOTH)
     if known:
-        return max(noise.white, noise.restless) > NOISY
+        return max(noise.white, noise.restless) > (NOISY if noise.restless > 0 else LOUD)
     return ratio > LASTING and noise.share > OWN and noise.restless > LOUD

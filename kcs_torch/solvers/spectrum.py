@@ -80,7 +80,7 @@ def unshared(modes: Tensor) -> tuple[Tensor, Tensor]:
     """
     count, size = modes.shape[1:]
     if count < ENOUGH or size < 8:
-        return (torch.full_like(modes[:, 0, 0], math.inf),) * 2
+        return (modes.new_full((len(modes),), math.inf),) * 2
     usual, found = _white_spectrum(count, size).to(modes), torch.linalg.eigvalsh(modes.mT @ modes)
     rank = min(size, count)
     first = size - rank + rank // 8  # virtual joints are no measurements
