@@ -47,6 +47,8 @@ def test_noise_of_a_detector_s_skeleton_is_a_detector_s():
     assert found_by_detector(spoilt(4 * normal()))
     assert not found_by_detector(spoilt(4 * normal(), CUSTOM))  # white noise of anybody's skeleton is just noise
     assert not found_by_detector(replace(spoilt(4 * normal()), detector=False))
+    plain = replace(WALK.tracks.skeleton, template=None, spread=None)  # nothing was measured of such bodies
+    assert not found_by_detector(spoilt(4 * normal(), plain))
 
 
 def test_noise_that_lasts_is_a_detector_s_of_any_skeleton():
@@ -100,7 +102,8 @@ def test_kinds_of_noise():
 
 def test_noise_that_cannot_be_measured():
     points, weights = parts(spoilt(8 * normal()))
-    assert measure_noise(points[:11], weights[:11]) is None
+    for frames in (0, 1, 11):
+        assert measure_noise(points[:frames], weights[:frames]) is None
     for frames in (12, 20, 30):
         short = measure_noise(points[:frames], weights[:frames])
         assert short is not None and short.white > 0.005 and short.restless == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.noise import measure_noise
 from kcs_torch.solvers.spectrum import window_at
 from kcs_torch.types import Tracks
@@ -42,19 +43,20 @@ def detected(tracks: Tracks) -> bool:
 
 
 def found_by_detector(tracks: Tracks) -> bool:
-    """As :func:`detected`; where nothing is known, noise tells, too.
+    """As :func:`detected`; where nothing is known of a body with a template, noise tells, too.
 
     Noise that lasts for several frames, or that a filter has left, is a detector's, and so is any noise of a skeleton
     that detectors have.
     """
-    if detected(tracks) or tracks.detector is not None:
-        return detected(tracks)
+    known = detected(tracks)
+    if known or tracks.detector is not None or len(trunk_joints(tracks.skeleton)) < 3:
+        return known
     noise = measure_noise(tracks.points, tracks.weights, window=window_at(tracks.fps or 30.0))
     if noise is None:
         return False
-    ratio, known = noise.restless / max(noise.white, 1e-12), tracks.skeleton.name in SKELETONS
+    ratio, usual = noise.restless / max(noise.white, 1e-12), tracks.skeleton.name in SKELETONS
     if ratio > FILTERED:
-        return noise.share > (SMOOTHED if known else SMOOTH)
-    if known:
+        return noise.share > (SMOOTHED if usual else SMOOTH)
+    if usual:
         return max(noise.white, noise.restless) > (NOISY if noise.restless > 0 else LOUD)
     return ratio > LASTING and noise.share > OWN and noise.restless > LOUD

@@ -12,7 +12,7 @@ from kcs_torch.functional.temporal import interpolate, window_starts
 from kcs_torch.solvers.spectrum import temporal_modes, unshared, white_power
 from kcs_torch.solvers.stray import FLOOR, STRAY, body_size, each_joint, stray_from_neighbours
 
-__all__ = ["Noise", "measure_noise"]
+__all__ = ["SHORT", "Noise", "measure_noise"]
 
 RESTLESS = (24, 48)
 """Modes that are hardly motion any more, six to eleven periods a second, but within most filters."""
@@ -55,10 +55,12 @@ def measure_noise(tracks: Tensor, weights: Tensor, *, window: int = 64) -> Noise
         The noise of the joints that are seen in nearly all frames, outliers apart, its slower part 0 in clips of fewer
         than about 45 frames; or None where these joints are fewer than four, or frames fewer than twelve.
     """
+    if len(tracks) < SHORT:
+        return None
     values = tracks.detach().double()[None]
     seen = weights[None] > 0
     size = body_size(values, seen)
-    if len(tracks) < SHORT or not bool(size > TINY):
+    if not bool(size > TINY):
         return None
     values = values / size
     seen = seen & ~each_joint(stray_from_neighbours, values, seen, STRAY, FLOOR)

@@ -16,6 +16,7 @@ from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.batch import Noisy
 from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.unseen import gap_deviation, place_unseen, within_reach
+from kcs_torch.solvers.noise import SHORT
 from kcs_torch.solvers.spectrum import window_at
 from kcs_torch.types import Tracks
 
@@ -32,8 +33,8 @@ QUICK = 2.2
 
 HINT = "If a detector found the joints, detections=True allows for its errors, which last"
 
-SHORT, UNTOLD = 12, 0.015
-"""Frames below which a clip does not tell its noise, and what is assumed then: that of good detections."""
+UNTOLD = 0.015
+"""Noise that is assumed where a clip is too short to tell it: that of good detections."""
 
 HELD = 0.1
 """Standard deviation, a share of the body's size, of joints in frames before the body is first seen and after it was

@@ -118,10 +118,10 @@ class PKC(Method):
 
     def prepared(self, tracks: Tracks) -> Tracks:
         tracks = unswap(without_others(tracks)) if self.denoise else tracks
-        told = tracks.detector if self.detections is None else self.detections
-        if told is None and self.denoise and self.knows_template(tracks.skeleton):
-            told = True if found_by_detector(tracks) and not detected(tracks) else None  # what confidences tell is told
-        return tracks if told == tracks.detector else replace(tracks, detector=told)
+        told = self.detections
+        if told is None and self.denoise and not detected(tracks) and found_by_detector(tracks):
+            told = True
+        return tracks if told in (None, tracks.detector) else replace(tracks, detector=told)
 
     def following(self, searched: bool = True) -> PKC:
         """The same without contacts: what stands still in space does not in the image."""
