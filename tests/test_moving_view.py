@@ -230,7 +230,7 @@ def test_bodies_that_fit_nearly_as_well_are_among_the_alternatives(count):
 
 
 def test_a_solution_that_hardly_leads_is_doubted():
-    tracks, depth, skeleton = chain(6, 102)
+    tracks, depth, skeleton = chain(5, 109)
     with pytest.warns(KcsWarning, match=r"fit the tracks nearly as well \(see the alternatives\)"):
         result = kt.reconstruct(tracks, skeleton=skeleton, fps=30)
     assert len(result.alternatives) > 1 and relative(result, depth) > 0.3

@@ -62,7 +62,8 @@ def bone_paths(tracks: Tensor, bones: Tensor, count: int = 6) -> BonePaths:
     flat = bone_vectors(tracks, bones).movedim(-2, 0)  # (B, T, 2)
     square = flat.square().sum(-1)
     longest = square.amax(-1).sqrt().clamp_min(torch.finfo(flat.dtype).tiny ** 0.25)
-    size = longest[:, None] * flat.new_tensor(LONGER)  # (B, L)
+    between = _peak(square).sqrt().maximum(longest)
+    size = torch.cat([longest[:, None] * flat.new_tensor(LONGER), between[:, None]], 1)  # (B, L)
     depth = (size.square()[..., None] - square[:, None]).clamp_min(0).sqrt()  # (B, L, T)
     deviation = _acceleration(flat).sqrt().clamp_min(1e-4 * longest)
     steps = (depth / deviation[:, None, None]).flatten(0, 1)[..., None]
@@ -124,6 +125,22 @@ def nearest_paths(paths: BonePaths, depth: Tensor) -> Tensor:
     bone = torch.arange(depth.shape[1], device=depth.device)
     sign = torch.where(inner.gather(-1, index) < 0, -1.0, 1.0).to(depth)
     return sign * paths.depth[bone, index[..., 0]]
+
+
+def _peak(square: Tensor) -> Tensor:
+    """The largest value (...) that (..., T) take, or parabolas through three in a row do between them.
+
+    A bone's squared image is such a parabola where it passes through the image plane, which it hardly ever does at the
+    very time of a frame.
+    """
+    most = square.amax(-1)
+    if square.shape[-1] < 3:
+        return most
+    before, middle, after = square[..., :-2], square[..., 1:-1], square[..., 2:]
+    slope, bend = (after - before) / 2, (before + after - 2 * middle).clamp_max(0)
+    above = (middle >= before) & (middle >= after) & (bend < 0)
+    rise = torch.where(above, slope.square() / torch.where(above, -2 * bend, 1), 0)
+    return most.maximum((middle + rise).amax(-1))
 
 
 def _acceleration(flat: Tensor) -> Tensor:

@@ -38,6 +38,8 @@ __all__ = [
     "length_energy",
     "motion_energy",
     "procrustean",
+    "rotations_over_time",
+    "steadiness",
     "track_energy",
 ]
 
@@ -283,10 +285,13 @@ def length_energy(points: Tensor, rigid: Tensor, stiffness: Tensor, slack: float
     """sum_p s_p T/2 log((v_p + d^2) / (v_p + (reach d)^2)), v_p the variance of a length over time, (...)."""
     if len(rigid) == 0:
         return points.new_zeros(points.shape[:-3])
-    size = safe_norm(bone_vectors(points, rigid))
-    spread = size.var(-2, unbiased=False)
-    ratio = (spread + slack**2) / (spread + (reach * slack) ** 2)
-    return points.shape[-3] / 2 * (stiffness * ratio.log()).sum(-1)
+    spread = safe_norm(bone_vectors(points, rigid)).var(-2, unbiased=False)
+    return (stiffness * steadiness(spread, points.shape[-3], slack, reach)).sum(-1)
+
+
+def steadiness(spread: Tensor, frames: int, slack: float, reach: float = REACH) -> Tensor:
+    """T/2 log((v + d^2) / (v + (reach d)^2)) of variances v over time (...): the less, the steadier."""
+    return frames / 2 * ((spread + slack**2) / (spread + (reach * slack) ** 2)).log()
 
 
 def track_energy(points: Tensor, tracks: Tensor, weights: Tensor, noise: float, reach: float = REACH) -> Tensor:
@@ -311,6 +316,22 @@ def align_rotations(points: Tensor, rotations: Tensor, bones: Tensor, *, num_ste
     for _ in range(num_steps):
         rotations = nearest_rotation(vectors.mT @ (vectors @ rotations).mean(-3, keepdim=True))
     return rotations
+
+
+def rotations_over_time(vectors: Tensor) -> Tensor:
+    """Rotations (..., T, 3, 3) from which :func:`align_rotations` may start: what turns each frame onto the one before.
+
+    Args:
+        vectors: (..., T, B, 3) bones.
+    """
+    turn = nearest_rotation(vectors[..., 1:, :, :].mT @ vectors[..., :-1, :, :])
+    first = torch.eye(3, dtype=turn.dtype, device=turn.device).expand(*vectors.shape[:-3], 1, 3, 3)
+    total = torch.cat([first, turn], -3)
+    step = 1
+    while step < total.shape[-3]:  # products of the last frames, of twice as many each time
+        total = torch.cat([total[..., :step, :, :], total[..., step:, :, :] @ total[..., :-step, :, :]], -3)
+        step *= 2
+    return total
 
 
 def _precision(points: Tensor, tracks: Tensor, weights: Tensor, noise: float) -> Tensor:

@@ -12,16 +12,21 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence, points_from_bones
 from kcs_torch.methods.lockstep import Search
 from kcs_torch.solvers.bone_paths import BonePaths, nearest_paths
-from kcs_torch.solvers.lifts import turning_cameras
-from kcs_torch.solvers.procrustean import Pose, Stage, align_rotations
+from kcs_torch.solvers.corners import Corners, agreeing_paths
+from kcs_torch.solvers.procrustean import Pose, Stage, align_rotations, rotations_over_time
 
-__all__ = ["Assembly", "followed"]
+__all__ = ["SLACK", "TIGHT", "WORTH", "Assembly", "followed"]
 
-ALL, DRAWN = 256, 64
-"""Combinations of all bones' likeliest paths, before or behind the image plane, and of paths that are drawn by cost."""
+COMBINED = 256
+"""Combinations of bones' paths that are aligned."""
 
-SPREAD = 5.0
-"""Cost of a path that is drawn e times more seldom."""
+WORTH = 20.0
+"""Weight of how likely the path of each bone is by itself: a bone keeps its direction for about so many frames, which
+the other terms count one by one."""
+
+TIGHT, SLACK = 10.0, 0.003
+"""Weight of each length of a tree whose bones are rigid, and of each distance that an angle keeps; and their standard
+deviation where solutions are compared."""
 
 TOP, KEEP = 12, 4
 """Starts that go on after the first stage and after the second."""
@@ -51,31 +56,35 @@ class Assembly:
         image: (T, N, 2), of these frames.
         bones: (B, 2), a tree of the joints.
         paths: of the bones, at these frames.
+        corners: where bones meet whose angle may be kept.
         stages: that settle starts whose bones are as good as constant.
         value: (H,) of solutions; the lowest is best.
         descend: a search that settles starts by some of the stages.
-        seed: of random numbers.
     """
 
     image: Tensor
     bones: Tensor
     paths: BonePaths
+    corners: Corners
     stages: tuple[Stage, ...]
     value: Callable[[Pose], Tensor]
     descend: Callable[[Pose, tuple[Stage, ...]], Search[Any, Any, Pose]]
-    seed: int
 
     def near(self, found: Pose) -> Search[Any, Any, Pose]:
         """Solutions, best first: those that are given, settled, the paths nearest to them, and changes of one bone."""
-        return (yield from self._changed(_joined(found, self._nearest(found)), MANY))
+        pose = yield from self._settled(_joined(found, self._nearest(found)))
+        return (yield from self._changed(pose, MANY))
 
     def searched(self, found: Pose) -> Search[Any, Any, Pose]:
-        """As :meth:`near`, with all combinations of paths beside it; for few bones."""
-        return (yield from self._changed(_joined(found, self._nearest(found), self._combined()), FEW))
+        """As :meth:`near`, with the combinations of paths that keep most angles beside it; for few bones."""
+        pose = yield from self._settled(_joined(found, self._nearest(found)))
+        exact = self._agreeing()
+        exact = yield from self.descend(exact[self.value(exact).argsort()[:TOP]], self.stages[-1:])
+        pose = _joined(pose, exact)
+        return (yield from self._changed(pose[self.value(pose).argsort()[:KEEP]], FEW))
 
-    def _changed(self, found: Pose, kept: tuple[int, int, int]) -> Search[Any, Any, Pose]:
-        """Solutions, settled, best first; the best takes other paths of single bones while that makes it better."""
-        pose = yield from self._settled(found)
+    def _changed(self, pose: Pose, kept: tuple[int, int, int]) -> Search[Any, Any, Pose]:
+        """Solutions, best first, of which the best takes other paths of single bones while that makes it better."""
         for _ in range(TIMES):
             best, depth = self.value(pose)[0], self._changes(pose)
             if not len(depth):
@@ -102,24 +111,12 @@ class Assembly:
     def _nearest(self, found: Pose) -> Pose:
         return self._placed(nearest_paths(self.paths, _depths(found.points, self.bones)), found.rotations)
 
-    def _combined(self) -> Pose:
-        """Bones' likeliest paths with all signs (or some), and paths drawn by their cost, before turning cameras."""
-        depth, cost = self.paths
-        count = len(depth)
-        generator = torch.Generator().manual_seed(self.seed)
-        draw = lambda *size: torch.randint(0, 2, size, generator=generator, device="cpu")  # noqa: E731
-        if 2 ** (count - 1) <= ALL:
-            bits = torch.arange(count, device="cpu")
-            index = torch.arange(2 ** (count - 1), device="cpu")[:, None] >> bits
-            signs = torch.cat([index & 1, draw(DRAWN, count)])
-        else:
-            signs = draw(ALL + DRAWN, count)
-        likely = (-cost / SPREAD).softmax(-1).double().cpu()
-        drawn = likely.multinomial(DRAWN, replacement=True, generator=generator).mT  # (DRAWN, B)
-        which = torch.cat([torch.zeros_like(signs[DRAWN:]), drawn]).to(depth.device)
-        made = (1 - 2 * signs).to(depth)[..., None] * depth[torch.arange(count, device=depth.device), which]
-        degrees = 360 * torch.rand(len(made), generator=generator, dtype=torch.float64, device="cpu")
-        return self._placed(made, turning_cameras(degrees, depth.shape[-1], dtype=depth.dtype, device=depth.device))
+    def _agreeing(self) -> Pose:
+        """Bones' paths that keep most angles, each frame aligned with the one before it at first."""
+        flat = bone_vectors(self.image, self.bones).movedim(-2, 0)
+        depth = agreeing_paths(self.paths, flat, self.corners, COMBINED, worth=WORTH, stiffness=TIGHT, slack=SLACK)
+        vectors = bone_vectors(_lifted(self.image, depth, self.bones), self.bones)
+        return self._placed(depth, rotations_over_time(vectors))
 
     def _changes(self, pose: Pose) -> Tensor:
         """The best with another path, or the mirror image, of one bone, (H, B, T)."""

@@ -15,11 +15,12 @@ from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.lockstep import Search, together
+from kcs_torch.methods.pkc.assembly import TIGHT
 from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.fixed_view import searching
 from kcs_torch.methods.pkc.gaps import fill_gaps, gaps_of
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
-from kcs_torch.methods.pkc.moving_view import TIGHT, soften
+from kcs_torch.methods.pkc.moving_view import soften
 from kcs_torch.methods.pkc.objective import Objective, bone_noise, usual_posture
 from kcs_torch.methods.pkc.trunk import image_scale
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of

@@ -13,12 +13,13 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.lockstep import Search, run
-from kcs_torch.methods.pkc.assembly import Assembly, followed
+from kcs_torch.methods.pkc.assembly import SLACK, TIGHT, WORTH, Assembly, followed
 from kcs_torch.methods.pkc.descents import Descent, descend_all
 from kcs_torch.nn.unrolled import UnrolledFPC
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.bone_paths import bone_paths, path_energy
 from kcs_torch.solvers.camera_path import CameraPath, choose_path, settle_path
+from kcs_torch.solvers.corners import corners_of
 from kcs_torch.solvers.lifts import random_lifts, turning_cameras
 from kcs_torch.solvers.procrustean import (
     COARSE,
@@ -35,7 +36,6 @@ from kcs_torch.solvers.procrustean import (
 __all__ = [
     "FINER",
     "ROBOT",
-    "TIGHT",
     "MovingView",
     "moving_view",
     "relative_weights",
@@ -51,11 +51,8 @@ TURNS = (30.0, 60.0, 90.0, 120.0, 180.0, 360.0)
 KEPT = (12, 6, 3)
 """Starts that go on after each of the coarse stages."""
 
-RANKING = Stage(1e-5, 0, 1.0, 1.0, 0.003)
+RANKING = Stage(1e-5, 0, 1.0, 1.0, SLACK)
 """Scales at which finished starts are compared: the poses and their changes count alike."""
-
-TIGHT = 10.0
-"""Weight of each length of a tree in the fine stages: bones that are said to be rigid keep their length."""
 
 LOOSE, LOOSER = 0.3, 0.1
 """Weight of each length where the links are no tree (markers, say), in the coarse stages and in the fine ones."""
@@ -68,10 +65,6 @@ SAME = 0.05
 
 OTHER = 0.1
 """Root mean square difference of depths from which on solutions are different bodies."""
-
-WORTH = 20.0
-"""Weight of how likely the path of each bone is by itself: a bone keeps its direction for about so many frames, which
-the other terms count one by one."""
 
 NEAR = 6.0
 """How much dearer than the best, for each frame compared, another solution may be to be given beside it: what leads by
@@ -96,8 +89,8 @@ FARTHER = 1.8
 people in noise of 1 to 4 % of their size, and with 30 % missing, before a camera that goes round by 180 degrees."""
 
 ROBOT = 10
-"""Up to as many joints, twenty times the random starts are tried: they are cheap, and little else decides. Nor does one
-solution fill gaps for another: where it is wrong, so are they."""
+"""Up to as many joints, twenty times the random starts are tried, and angles between bones may be kept: few bones leave
+much undecided. Nor does one solution fill gaps for another: where it is wrong, so are they."""
 
 
 @dataclass(frozen=True)
@@ -207,6 +200,8 @@ def searching(
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
     held = is_tree and exact and noise == 0 and len(rigid) == joints - 1
+    corners = corners_of(rigid if held and joints <= ROBOT else rigid[:0])
+    fixed = torch.cat([rigid, corners.ends])
     if too_long(image):
         noise, weights = 0.0, None
     first = torch.cat([image, start[..., 2:] - start[..., 2:].mean(1, keepdim=True)], -1)[None]
@@ -219,15 +214,16 @@ def searching(
         tracks: Tensor, pose: Pose, pull: float, stages: tuple[Stage, ...], weights: Tensor | None
     ) -> Search[Descent, Pose, Pose]:
         sigma, sure = (noise, weights) if stages[0].eps <= max(FREEING, 0.1 * noise**2) else (0.0, None)
-        (found,) = yield [Descent(tracks, pose.points, pose.rotations, bones, sure, rigid, pull, sigma, stages)]
+        links = fixed if pull == TIGHT else rigid
+        (found,) = yield [Descent(tracks, pose.points, pose.rotations, bones, sure, links, pull, sigma, stages)]
         return found
 
     def value(pose: Pose) -> Tensor:
         """How solutions are ranked, (H,)."""
         stage = soften(RANKING, noise)
-        pull = image.new_full((len(rigid),), TIGHT if held else loose)
+        pull = image.new_full((len(fixed),), TIGHT if held else loose)
         total = motion_energy(pose.points, pose.rotations, bones, stage)
-        total = total + length_energy(pose.points, rigid, pull, stage.slack)
+        total = total + length_energy(pose.points, fixed, pull, stage.slack)
         if noise > 0:  # who leaves the tracks moves as simply as he likes
             tracks, sure = (image, weights) if pose.points.shape[1] == frames else (few, few_weights)
             sure = torch.ones_like(tracks[..., 0]) if sure is None else sure
@@ -254,8 +250,8 @@ def searching(
     if paths is not None:
         mine, pose = pose.points[(order == 0).to(image.device)], pose[value(pose).argsort()[:GIVEN]]
         assembly = Assembly(
-            few, bones, paths.at(pick), (*coarse[-1:], *fine), value,
-            lambda pose, stages: descend(few, pose, TIGHT, stages, few_weights), seed,
+            few, bones, paths.at(pick), corners, (*coarse[-1:], *fine), value,
+            lambda pose, stages: descend(few, pose, TIGHT, stages, few_weights),
         )  # fmt: skip
         pose = yield from (assembly.searched(pose) if joints <= ROBOT else assembly.near(pose))
         near = (pose.points[:, None] - mine).square().sum(-1).mean((-2, -1)) < SAME**2
@@ -274,7 +270,8 @@ def searching(
         stages = coarse if bool(own.any()) else coarse[-1:]
         pose = replace(pose, points=points, rotations=turned)
         del first, start, points, turned  # of long clips they are large
-        pose = yield from descend(image, pose, loose, stages, weights)
+        if paths is None or bool(own.any()) or joints > ROBOT:
+            pose = yield from descend(image, pose, loose, stages, weights)
     if len(pick) < frames or not is_tree:  # else the finest stages have seen all frames
         if not is_tree:
             bones = spread(pose.points[0])
