@@ -195,8 +195,25 @@ def test_turned_clips_show_the_same_body_with_the_same_noise():
     torch.testing.assert_close(other.points[..., 1], batch.points[..., 1], atol=1e-3, rtol=1e-4)
 
 
+def test_turned_clips_stay_where_they_are():
+    """Points are in the place of the tracks, as a loss that moves neither takes them to be."""
+    batch = batch_of()
+    place = torch.cat([900 + 100 * torch.randn(6, 5, 1, 2), torch.zeros(6, 5, 1, 1)], -1)
+    tracks = batch.tracks + place[..., :2] * batch.weights[..., None]
+    torch.manual_seed(0)
+    near = turned(batch, 1.0)
+    torch.manual_seed(0)
+    far = turned(batch._replace(tracks=tracks, points=batch.points + place), 1.0)
+    torch.testing.assert_close(far.points, near.points + place, atol=1e-3, rtol=1e-5)
+    torch.testing.assert_close(far.tracks - tracks, near.tracks - batch.tracks, atol=1e-3, rtol=1e-5)
+
+
 def test_losses_see_clips_of_one_size():
     batch = batch_of()
+    half = unit_size(Batch(*(20 * value.half() if value.ndim > 3 else value.half() for value in batch)))
+    assert half.tracks.dtype == half.points.dtype == torch.float16
+    torch.testing.assert_close(half.tracks.float(), unit_size(batch).tracks, atol=2e-3, rtol=2e-3)
+    torch.testing.assert_close(half.points.float(), unit_size(batch).points, atol=2e-3, rtol=2e-3)
     small, large = unit_size(batch), unit_size(batch._replace(tracks=50 * batch.tracks, points=50 * batch.points))
     torch.testing.assert_close(small.tracks, large.tracks)
     torch.testing.assert_close(small.points, large.points)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional import centre, orbit
+from kcs_torch.nn.layers import wide
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.training.batch import Batch
 
@@ -38,23 +39,27 @@ def mirrored(batch: Batch, skeleton: Skeleton, share: float = 0.5) -> Batch:
 def turned(batch: Batch, share: float = 0.5) -> Batch:
     """Show clips from another side, each with the probability ``share``, where their 3D is known or reconstructed.
 
-    The body is turned about the image's vertical by any angle; how far the tracks were from its projection (noise) and
-    which joints are hidden stay as they are.
+    The body is turned about the image's vertical through the middle of each frame's joints, by any angle; how far the
+    tracks were from its projection (noise) and which joints are hidden stay as they are.
     """
     known = (batch.labelled > 0) | (batch.pseudo > 0).any(-1).all(-1)
     chosen = known & (torch.rand(len(batch.tracks), device=batch.tracks.device) < share)
     angle = 360 * torch.rand(len(batch.tracks), dtype=batch.points.dtype, device=batch.tracks.device)
-    points = centre(batch.points)[0]
+    points, middle = centre(batch.points)
     anew = points @ orbit(angle).mT[:, None]
     tracks = batch.tracks + (anew - points)[..., :2] * (batch.weights > 0)[..., None]
     pick = chosen[:, None, None, None]
-    return batch._replace(tracks=torch.where(pick, tracks, batch.tracks), points=torch.where(pick, anew, batch.points))
+    return batch._replace(
+        tracks=torch.where(pick, tracks, batch.tracks), points=torch.where(pick, anew + middle, batch.points)
+    )
 
 
 def unit_size(batch: Batch) -> Batch:
     """Bring every clip to root mean square 1, so that losses do not depend on units."""
-    seen = (batch.weights > 0).to(batch.tracks)
-    about = centre(batch.tracks, seen)[0] * seen[..., None]
+    tracks = wide(batch.tracks)
+    seen = (batch.weights > 0).to(tracks)
+    about = centre(tracks, seen)[0] * seen[..., None]
     size = (about.square().sum((-3, -2, -1)) / seen.sum((-2, -1)).clamp_min(1)).sqrt()
     size = torch.where(size > 0, size, torch.ones_like(size))[:, None, None, None]
-    return batch._replace(tracks=batch.tracks / size, points=batch.points / size)
+    points = (wide(batch.points) / size).to(batch.points.dtype)
+    return batch._replace(tracks=(tracks / size).to(batch.tracks.dtype), points=points)
