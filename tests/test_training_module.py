@@ -341,8 +341,8 @@ def sizes(module):
     """The size of each step that the module makes from here on."""
     seen, advance = [], module._advance
 
-    def spy(optimiser, *rest):
-        advance(optimiser, *rest)
+    def spy(optimiser, *rest, **more):
+        advance(optimiser, *rest, **more)
         seen.extend(group["lr"] for group in optimiser.param_groups)
 
     module._advance = spy
@@ -357,6 +357,20 @@ def test_steps_rise_and_fall_over_all_epochs():
     assert seen[-1] == 0.1 * step_share(19, 20) < 0.002
     long = [step_share(step, 100) for step in range(100)]
     assert long[:5] == [0.2, 0.4, 0.6, 0.8, 1.0] and long[5:] == sorted(long[5:], reverse=True)
+
+
+@pytest.mark.parametrize("scaled", [False, True], ids=["single", "half"])
+def test_steps_of_a_critic_are_none_of_max_steps(scaled):
+    critic = kt.nn.KCSCritic(BODY, width=8)
+    before = copy.deepcopy(critic.state_dict())
+    module = module_of(critic=critic)
+    seen = sizes(module)
+    plugins = [MixedPrecision("16-mixed", "cpu", torch.amp.GradScaler("cpu"))] if scaled else []
+    trainer = lightning.Trainer(max_steps=6, accelerator="cpu", plugins=plugins, **QUIET)
+    trainer.fit(module, datamodule=data_of())
+    assert int(module.step) == trainer.global_step == 6
+    assert seen == [module.lr * step_share(step, 6) for step in range(6) for _ in range(2)]
+    assert not all(torch.equal(before[name], value) for name, value in critic.state_dict().items())
 
 
 def test_a_run_that_goes_on_for_longer_has_the_steps_of_a_longer_one(tmp_path):

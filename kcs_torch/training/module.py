@@ -192,17 +192,20 @@ class LiftingModule(lightning.LightningModule):
             rows = torch.randint(len(points), (len(true),), device=true.device)
             cost = critic_loss(self.critic(true), self.critic(centre(points.detach()[rows])[0])).mean()
             values["critic_own"] = cost
-            self._advance(optimisers[1], cost)
+            self._advance(optimisers[1], cost, counts=False)
         self.log_dict({f"train/{name}": value.detach() for name, value in values.items()}, batch_size=len(points))
         self.log("train/loss", total.detach(), prog_bar=True, batch_size=len(points))
 
-    def _advance(self, optimiser: Any, cost: Tensor) -> None:
+    def _advance(self, optimiser: Any, cost: Tensor, *, counts: bool = True) -> None:
         size = self.lr * step_share(int(self.step), self.total_steps)
         for group in optimiser.param_groups:  # as it is told now: a checkpoint may hold what an earlier run was told
             group.update(lr=size, weight_decay=self.weight_decay)
         optimiser.zero_grad()
         self.manual_backward(cost)
-        optimiser.step()
+        if counts:
+            optimiser.step()
+        else:  # Lightning adds up what its own optimisers do: max_steps would be half as many batches
+            self.trainer.strategy.optimizer_step(optimiser.optimizer, lambda: None)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Cut gradients; what half precision had scaled them by is undone by now."""
