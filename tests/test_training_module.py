@@ -460,6 +460,20 @@ def test_a_refined_network_keeps_to_the_tracks_and_can_be_saved(tmp_path):
         save_lifter(tmp_path / "other.safetensors", kt.nn.RefinedLifter(network.network, nn.Identity()))
 
 
+@pytest.mark.parametrize("gradient", ["unrolled", "implicit", kt.solvers.Implicit(7, 1e-3, 5, 0.1)], ids=str)
+@pytest.mark.parametrize("solver", ["UnrolledFPC", "UnrolledSfAM"])
+def test_files_tell_how_a_solver_is_differentiated(tmp_path, solver, gradient):
+    """An implicit gradient is that of a fixed point, which the solver goes on to."""
+    torch.manual_seed(0)
+    options = {"num_steps": 3, "mu": 0.1, "gradient": gradient}
+    own = kt.nn.UnrolledFPC(**options) if solver == "UnrolledFPC" else kt.nn.UnrolledSfAM(BODY, **options)
+    network = kt.nn.RefinedLifter(kt.nn.TemporalLifter(BODY, channels=8), own).eval()
+    again = load_lifter(save_lifter(tmp_path / "a.safetensors", network)).network.eval()
+    assert again.solver.implicit == own.implicit
+    tracks = 300 * torch.randn(1, 9, 17, 2)
+    assert torch.equal(again(tracks), network(tracks))
+
+
 @pytest.mark.parametrize("corner", [0.3, math.inf])
 @pytest.mark.parametrize("solver", ["UnrolledFPC", "UnrolledSfAM"])
 def test_files_from_before_corners_were_learned(tmp_path, corner, solver):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import astuple
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.registry import need, read_error
 from kcs_torch.nn import MLPLifter, RefinedLifter, TemporalLifter, UnrolledFPC, UnrolledSfAM
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.solvers import Implicit
 from kcs_torch.training.lifter import Lifter
 
 __all__ = ["NETWORKS", "load_lifter", "save_lifter"]
@@ -152,7 +154,10 @@ def _build(path: Path, facts: Any, tensors: Mapping[str, Tensor]) -> nn.Module:
             return network
         own: dict[str, Any] = {} if solver == "UnrolledFPC" else {"skeleton": skeleton}
         # What names no corner has none: its file says so, or is older than corners.
-        return RefinedLifter(network, SOLVERS[solver](**own, **{"corner": math.inf, **more}))
+        given = {"corner": math.inf, **more}
+        if "gradient" in given:
+            given["gradient"] = Implicit(*given["gradient"])
+        return RefinedLifter(network, SOLVERS[solver](**own, **given))
 
     try:
         skeleton = Skeleton.from_dict(facts.get("skeleton") or {}, source=str(path))
@@ -197,6 +202,8 @@ def _solver_options(solver: UnrolledFPC | UnrolledSfAM) -> dict[str, Any]:
     options: dict[str, Any] = {"num_steps": solver.num_steps, "momentum": solver.momentum}
     if math.isfinite(solver.corner):
         options["corner"] = solver.corner
+    if solver.implicit is not None:  # its fixed point is what the network gives
+        options["gradient"] = list(astuple(solver.implicit))
     if isinstance(solver, UnrolledSfAM):
         options["articulate_from"] = solver.first / solver.num_steps
         if solver.has_lengths:
