@@ -117,7 +117,7 @@ def main(arguments: list[str]) -> None:
     shares = sorted({share for one in found.values() for share in one}, key=float)
     seeds = sorted({seed for one in found.values() for row in one.values() for seed in row})
     print(f"test/{options['metric']}, mm, mean ± standard deviation over seeds {', '.join(map(str, seeds))}\n")
-    print(f"| share of windows with labels | {' | '.join(f'{100 * float(s):g} %' for s in shares)} |")
+    print(f"| share of frames with labels | {' | '.join(f'{100 * float(s):g} %' for s in shares)} |")
     print("|---|" + "---|" * len(shares))
     for name, row in found.items():
         print(f"| {name} | {' | '.join(cell(list(row[s].values())) if s in row else '' for s in shares)} |")

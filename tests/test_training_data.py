@@ -317,7 +317,7 @@ def test_a_finite_set_stays_the_same_and_fresh_cameras_do_not(folder):
 def test_the_labelled_share_is_exact(folder, share):
     data = module(folder, labelled=share, steps_per_epoch=60)
     total = 144
-    expected = max(1, round(share * total)) if share else 0
+    expected = 3 * max(1, math.floor(share * 48)) if share else 0  # windows that share no frame, each from three views
     seen, blind = data.labelled_items, data.unlabelled_items
     assert len(seen) == expected and len(blind) == total - expected
     assert sorted([*seen.tolist(), *blind.tolist()]) == list(range(total))
@@ -331,13 +331,34 @@ def test_the_labelled_share_is_exact(folder, share):
     assert count == {0.0: 0, 1.0: 480}.get(share, 240)
 
 
-def test_smaller_shares_are_among_greater_ones(folder):
-    chosen = [set(module(folder, labelled=s).labelled_items.tolist()) for s in (0.01, 0.05, 0.25, 1.0)]
+@pytest.mark.parametrize(("window", "stride"), [(10, 3), (10, 1), (10, 17), (60, 10)])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 0.3, 0.7, 1.0])
+def test_no_more_frames_than_the_labelled_share_show_their_truth(folder, window, stride, share):
+    data = module(folder, window=window, stride=stride, labelled=share)
+    data.setup("fit")
+    cut = data.sets["train"]
+    frames = cut.starts[:, None] + torch.arange(window)  # of each window
+    shown = torch.zeros(len(cut.points), dtype=torch.bool)
+    shown[frames[data.labelled_items // 3].flatten()] = True  # in any view
+    count = len(frames.unique())
+    limit = max(share * count, window if share else 0)
+    assert limit - window < int(shown.sum()) <= limit
+    inside = shown[frames].all(1)  # all that shows its truth in every frame is labelled, from all views
+    for items, kind in ((data.labelled_items, inside), (data.unlabelled_items, ~inside)):
+        assert sorted(items.tolist()) == kind.repeat_interleave(3).nonzero()[:, 0].tolist()
+    if share == 1:
+        assert inside.all()
+
+
+@pytest.mark.parametrize("stride", [3, 10])
+def test_smaller_shares_are_among_greater_ones(folder, stride):
+    options = {"stride": stride}
+    chosen = [set(module(folder, labelled=s, **options).labelled_items.tolist()) for s in (0.01, 0.05, 0.25, 1.0)]
     assert all(a < b for a, b in itertools.pairwise(chosen))
-    other = set(module(folder, labelled=0.25, seed=1).labelled_items.tolist())
+    other = set(module(folder, labelled=0.25, seed=1, **options).labelled_items.tolist())
     assert other != chosen[2]
     views = {item % 3 for item in chosen[2]}
-    assert views == {0, 1, 2}  # of each view by itself
+    assert views == {0, 1, 2}
 
 
 def test_batches_mix_as_asked(folder):
@@ -347,7 +368,7 @@ def test_batches_mix_as_asked(folder):
 
 
 def test_few_labelled_windows_come_equally_often(folder):
-    data = module(folder, labelled=0.02, steps_per_epoch=9)  # 3 of them, 4 in each batch
+    data = module(folder, labelled=0.02, steps_per_epoch=9)  # one from three views, 4 in each batch
     assert len(data.labelled_items) == 3
     drawn = [tuple(p[0, 0].tolist()) for batch in data.train_dataloader() for p in batch.points[batch.labelled == 1]]
     assert sorted(drawn.count(key) for key in set(drawn)) == [12, 12, 12]

@@ -30,8 +30,8 @@ class TracksDataModule(lightning.LightningDataModule):
 
     A batch depends on the seed, the epoch and its number in it, and on nothing else: training that is resumed from a
     checkpoint sees what it would have seen. By default the data set is finite: each clip has ``views`` cameras, and
-    their tracks with their noise and hidden joints stay the same. Which windows are labelled is drawn for each view by
-    itself, and those of a smaller share are among those of a greater one.
+    their tracks with their noise and hidden joints stay the same. Which frames show their truth is drawn for all views
+    together, and those of a smaller share are among those of a greater one.
 
     Args:
         train: files of 3D motion (any that :func:`kcs_torch.load_motion` reads), a pattern such as ``cmu/*.npz``, or
@@ -56,7 +56,8 @@ class TracksDataModule(lightning.LightningDataModule):
             window then shows its truth from every side.
         batch_size: windows.
         steps_per_epoch: batches of an epoch; as many as show every window about once if None.
-        labelled: share of the training windows (of each view) with their truth.
+        labelled: share of the training windows' frames that show their truth, at most, but one window of frames at
+            least. A window is labelled where all of its frames show it; the others use none of it.
         labelled_per_batch: share of a batch that is taken from these, where there are others.
         unlabelled: False leaves out those without truth: the same steps on labelled windows only.
         pseudo: a :class:`kcs_torch.Method` or its name, whose reconstructions are the labels of unlabelled windows.
@@ -186,18 +187,19 @@ class TracksDataModule(lightning.LightningDataModule):
 
     @property
     def labelled_items(self) -> Tensor:
-        """Training items with their truth: the first ones of an order that the seed alone chooses."""
-        return self._order()[: self._num_labelled()]
+        """Training items with their truth, which the seed alone chooses."""
+        return self._items(labelled=True)
 
     @property
     def unlabelled_items(self) -> Tensor:
         """Training items without truth."""
-        return self._order()[self._num_labelled() :]
+        return self._items(labelled=False)
 
     def train_dataloader(self) -> BatchLoader:
         """Mixed batches, labelled windows first."""
         items = self._set("train")
-        seen, blind = self.labelled_items, self.unlabelled_items if self.unlabelled else self._order()[:0]
+        seen, blind = self.labelled_items, self.unlabelled_items
+        blind = blind if self.unlabelled else blind[:0]
         share = 1.0 if not len(blind) else self.labelled_per_batch if len(seen) else 0.0
         first = round(share * self.batch_size)
         if len(seen) and len(blind) and self.batch_size > 1 and 0 < share < 1:
@@ -292,11 +294,9 @@ class TracksDataModule(lightning.LightningDataModule):
         """The skeleton that was asked for, or that of the training files."""
         return self.body if self.body is not None or split == "train" else self._set("train").skeleton
 
-    def _order(self) -> Tensor:
-        count = len(self._set("train"))
-        return torch.randperm(count, generator=generator_of(self.seed, "labels"))
-
-    def _num_labelled(self) -> int:
-        """As many as the share says, but one at least of any share."""
-        share = self.labelled * len(self._set("train"))
-        return max(round(share), 1) if share > 0 else 0
+    def _items(self, *, labelled: bool) -> Tensor:
+        """Training items of one kind, in random order."""
+        train = self._set("train")
+        order = torch.randperm(len(train), generator=generator_of(self.seed, "labels"))
+        shown = train.revealed(self.labelled, generator_of(self.seed, "revealed"))
+        return order[shown[order // self.views] == labelled]

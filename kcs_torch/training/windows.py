@@ -153,6 +153,24 @@ class FilmedWindows:
         first = sum(len(c.points) for c in self.clips[:clip])
         return slice(first, first + len(self.clips[clip].points))
 
+    def revealed(self, share: float, generator: torch.Generator) -> Tensor:
+        """Which windows have their truth (W,), if a share of all their frames has: those that have it in every frame.
+
+        Windows are drawn one after another, each with its frames from all views, as long as these are no more than the
+        share, but one window at least of any share: what a smaller share reveals, a greater one does too.
+
+        Args:
+            share: of the frames that are in any window.
+            generator: of the order.
+        """
+        count, frames = len(self.starts), len(self.points)
+        drawn = torch.full((frames + self.window - 1,), count)
+        drawn[self.starts + self.window - 1] = torch.randperm(count, generator=generator)
+        turn = drawn.unfold(0, self.window, 1).amin(-1)  # at which each frame is shown
+        shown = torch.bincount(turn, minlength=count)[:count].cumsum(0)
+        turns = max(int((shown <= share * shown[-1]).sum()), 1) if share > 0 else 0
+        return turn.unfold(0, self.window, 1).amax(-1)[self.starts] < turns
+
     def batch(self, items: Tensor, labelled: Tensor, fresh: torch.Generator | None = None) -> Batch:
         """Put items together.
 
