@@ -520,6 +520,15 @@ def test_training_goes_on_from_a_checkpoint_as_if_it_had_not_stopped(folder, tmp
     assert len(set(whole.seen)) == 14
 
 
+@pytest.mark.filterwarnings("ignore:.*does not have many workers", "ignore:.*LeafSpec", "ignore:You requested to over")
+@pytest.mark.parametrize("fresh", [False, True])
+def test_overfitting_shows_the_same_batches_in_every_epoch(folder, tmp_path, fresh):
+    network = Counting()
+    data = module(folder, ["s[1-3]*"], val="s4*", labelled=0.5, fresh_cameras=fresh)
+    trainer(tmp_path, max_epochs=3, overfit_batches=2, enable_checkpointing=False).fit(network, datamodule=data)
+    assert network.seen == network.seen[:2] * 3 and network.seen[0] != network.seen[1]
+
+
 @pytest.mark.skipif(not CMU.is_dir(), reason="needs the CMU motion files beside the project")
 def test_cmu_motion_by_subjects():
     data = TracksDataModule(

@@ -211,7 +211,10 @@ class TracksDataModule(lightning.LightningDataModule):
         mark = torch.arange(self.batch_size) < first
         steps = self.steps_per_epoch or math.ceil(len(items) / self.batch_size)
 
+        still = getattr(self.trainer, "overfit_batches", 0) > 0  # the same few batches, again and again
+
         def make(epoch: int, step: int) -> Batch:
+            epoch = 0 if still else epoch
             count = epoch * steps + step
             drawn = torch.cat([deck.draw(count * size, size) for deck, size in decks])
             fresh = generator_of(self.seed, "fresh", epoch, step) if self.fresh_cameras else None
