@@ -276,6 +276,12 @@ class TestCommandLine:
         assert "Traceback" not in err and "Warning" not in err
         assert json.loads((tmp_path / "result.json").read_text())["val/mpjpe"] == logged(tmp_path, "val/mpjpe")[0]
 
+    def test_a_fast_run_for_debugging_is_not_tested(self, tmp_path, capsys):
+        code, out, err = called(capsys, *SMALL, "+trainer.fast_dev_run=true", f"hydra.run.dir={tmp_path}")
+        assert code == 0 and "val/mpjpe" in out and "test/" not in out, err
+        assert json.loads((tmp_path / "result.json").read_text())["val/mpjpe"] > 0
+        assert not (tmp_path / "lifter.safetensors").exists()
+
     @pytest.mark.parametrize(
         ("argument", "told"),
         [

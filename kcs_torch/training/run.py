@@ -53,7 +53,8 @@ class Outcome:
         value: what a sweep optimises: the metric named by ``optimise``, at the epoch where it was best. Infinite,
             and worse than any other, where it never was a number.
         metrics: the figures of the test clips, by the weights of that epoch.
-        lifter: the file of these weights, for :func:`kcs_torch.training.load_lifter`; None where they are no good.
+        lifter: the file of these weights, for :func:`kcs_torch.training.load_lifter`; None where they are no good, or
+            with ``fast_dev_run``, which tests and saves nothing.
     """
 
     value: float
@@ -121,6 +122,8 @@ def train(config: DictConfig, folder: Path) -> Outcome:
             if trainer.interrupted and (folder / "checkpoints" / "last.ckpt").is_file():
                 print(f"stopped: resume={folder} goes on", file=sys.stderr)
             raise
+        if trainer.fast_dev_run and config.optimise in trainer.callback_metrics:  # which keeps no checkpoints to test
+            return Outcome(float(trainer.callback_metrics[config.optimise]), {}, None)
         if best.best_model_score is None:
             raise OptionError("train: expected at least one epoch with validation, got none: see the group trainer")
         tested = trainer.test(module, datamodule=data, ckpt_path=best.best_model_path, verbose=False, weights_only=True)
