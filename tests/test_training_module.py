@@ -399,6 +399,17 @@ def test_options_of_the_trainer_that_mean_nothing_here_are_told(options, told):
     assert int(module.step) == 0
 
 
+def test_network_and_critic_need_a_strategy_that_finds_unused_parameters():
+    trainer = lambda name: lightning.Trainer(strategy=name, accelerator="cpu", devices=1, **QUIET)  # noqa: E731
+    alone, both = module_of(), module_of(critic=kt.nn.KCSCritic(BODY, width=8))
+    both.trainer = trainer("ddp")
+    with pytest.raises(kt.OptionError, match="strategy: .*ddp_find_unused_parameters_true"):
+        both.configure_callbacks()
+    for module, name in ((both, "ddp_find_unused_parameters_true"), (both, "auto"), (alone, "ddp")):
+        module.trainer = trainer(name)
+        assert module.configure_callbacks() == []
+
+
 def test_training_brings_the_error_down():
     torch.manual_seed(0)
     network = kt.nn.TemporalLifter(BODY, channels=32, dilations=(1,), dropout=0.0)

@@ -118,7 +118,7 @@ class LiftingModule(lightning.LightningModule):
         """Look at the trainer's options, here, as this is what Lightning asks for before it looks at them itself.
 
         Raises:
-            OptionError: one is set that means nothing to network and critic, which take steps in turn.
+            OptionError: one is set that does not go with network and critic, which take steps in turn.
         """
         for name, usual, instead in (
             ("gradient_clip_val", None, "the module cuts gradients: LiftingModule(clip=...), +module.clip=..."),
@@ -127,6 +127,12 @@ class LiftingModule(lightning.LightningModule):
             value = getattr(self.trainer, name)
             if value not in (usual, 0):
                 raise OptionError(f"trainer: {name}: expected {usual}, got {value!r}: {instead}")
+        found = getattr(self.trainer.strategy, "_ddp_kwargs", None)  # of DDP alone
+        if self.critic is not None and found is not None and not found.get("find_unused_parameters"):
+            raise OptionError(
+                "trainer: strategy: expected one that finds unused parameters, as network and critic take steps in "
+                "turn: ddp_find_unused_parameters_true"
+            )
         return []
 
     def on_fit_start(self) -> None:
