@@ -81,6 +81,25 @@ def test_gradients():
     assert gradcheck(lambda m: euler_angles("YZX", m), random_rotations(4))
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 3.1e-3, 3.2e-3, 1.0, math.pi])
+def test_second_derivatives(size):
+    """At 0 they were NaN; on either side of where the series ends they are the same."""
+    vectors = size * torch.nn.functional.normalize(normal(3, 3), dim=-1)
+    assert torch.autograd.gradgradcheck(rotation_matrix, vectors.requires_grad_())
+    assert torch.autograd.gradgradcheck(lambda a: euler_rotation("ZXY", a), vectors)
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_second_derivatives_by_hand(dtype):
+    hessian = torch.autograd.functional.hessian
+    for size in (0.0, 1e-6, 1e-3):
+        found = hessian(lambda v: rotation_matrix(v)[1, 1], torch.tensor([0, size, 0], dtype=dtype))
+        assert_close(found, torch.diag(torch.tensor([-1.0, 0, -1])).to(dtype), rtol=0, atol=1e-6)
+    for angle in (0.0, 1e-6, 3e-3, 0.5):
+        found = hessian(lambda a: euler_rotation("X", a)[1, 1], torch.tensor([angle], dtype=dtype))
+        assert found.item() == pytest.approx(-math.cos(angle), abs=1e-6)
+
+
 def test_a_turn_and_its_vector_have_derivatives_that_undo_each_other_at_rest():
     there_and_back = lambda v: rotation_vector(rotation_matrix(v))  # noqa: E731
     for vector in (torch.zeros(3).double(), 1e-9 * normal(3), normal(3)):
@@ -94,6 +113,22 @@ def test_angle_is_the_length_of_the_vector_between():
     assert_close(rotation_angle(first, second), roma.rotmat_geodesic_distance(first, second))
     assert rotation_angle(first, first).max() == 0
     assert_close(rotation_angle(EYE, torch.diag(torch.tensor([1.0, -1, -1])).double()).item(), math.pi)
+
+
+def test_angle_is_exact_and_has_a_slope_up_to_a_half_turn():
+    """The arcsine of a number near 1 knows half of its digits, and had no finite derivative at 1."""
+    axes, first = torch.nn.functional.normalize(normal(20, 3), dim=-1), random_rotations(20)
+    for angle in (0.0, 1e-9, 1.0, 1.69, 1.7, 3.0, math.pi - 1e-5, math.pi - 1e-9, math.pi):
+        leaf = (angle * axes).requires_grad_()
+        found = rotation_angle(first, first @ rotation_matrix(leaf))
+        assert_close(found, torch.full_like(found, angle), rtol=0, atol=1e-14)
+        (slope,) = torch.autograd.grad(found.sum(), leaf)
+        if 1e-6 < angle < math.pi - 1e-6:
+            assert_close(slope, axes, rtol=0, atol=1e-9)
+        assert (slope.norm(dim=-1) < 1.5).all()
+    for half in (EYE, torch.diag(torch.tensor([1.0, -1, -1])).double()):
+        (slope,) = finite(rotation_angle, EYE.clone(), half)[:1]
+        assert not slope.any()
 
 
 @pytest.mark.parametrize("order", ORDERS)

@@ -13,6 +13,9 @@ __all__ = ["euler_angles", "euler_rotation", "rotation_angle", "rotation_matrix"
 
 AXES = "XYZ"
 
+SMALL = 1e-5
+"""Squared angle below which three terms of a series tell its functions to rounding."""
+
 
 def rotation_matrix(vectors: Tensor) -> Tensor:
     """Return exp([v]) = cos(a) I + sin(a)/a [v] + (1 - cos(a))/a^2 v v^T, a = |v|: the rotation about v by |v| radians.
@@ -21,20 +24,24 @@ def rotation_matrix(vectors: Tensor) -> Tensor:
         vectors: (..., 3).
 
     Returns:
-        (..., 3, 3). Differentiable, also where the angle is 0.
+        (..., 3, 3). Differentiable, also where the angle is 0, and twice.
 
     >>> rotation_matrix(torch.tensor([0.0, 0.0, torch.pi / 2])).round(decimals=5).abs().tolist()
     [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
     x, y, z = vectors.unbind(-1)
     square = x * x + y * y + z * z
-    still = square == 0
-    angle = torch.where(still, square, torch.where(still, 1, square).sqrt())
-    cosine, sine, versine = angle.cos(), (angle / math.pi).sinc(), (angle / math.tau).sinc().square() / 2
-    a, b, c = sine * x, sine * y, sine * z
-    u, v, w = versine * x, versine * y, versine * z
-    xy, yz, zx = u * y, v * z, w * x
-    rows = [u * x + cosine, xy - c, zx + b, xy + c, v * y + cosine, yz - a, zx - b, yz + a, w * z + cosine]
+    small = square < SMALL
+    angle = torch.where(small, 1, square).sqrt()
+    half = angle / 2
+    # The unit quaternion (cosine, sine v), of the squared angle: so its derivatives have no gap at 0.
+    cosine = torch.where(small, 1 + square * (square / 384 - 1 / 8), half.cos())
+    sine = torch.where(small, 1 / 2 + square * (square / 3840 - 1 / 48), half.sin() / angle)
+    u, v, w = sine * x, sine * y, sine * z
+    i, j, k = 2 * u, 2 * v, 2 * w
+    a, b, c = cosine * i, cosine * j, cosine * k
+    xx, yy, zz, xy, yz, zx = u * i, v * j, w * k, u * j, v * k, w * i
+    rows = [1 - yy - zz, xy - c, zx + b, xy + c, 1 - xx - zz, yz - a, zx - b, yz + a, 1 - xx - yy]
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
@@ -74,9 +81,17 @@ def rotation_vector(matrices: Tensor) -> Tensor:
 
 
 def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
-    """Return the angle (...) in radians between rotations (..., 3, 3): |A - B| = 2 sqrt(2) sin(angle / 2)."""
-    apart = torch.linalg.matrix_norm(first - second) / math.sqrt(8)
-    return 2 * apart.clamp_max(1).asin()
+    """Return the angle (...) in radians between rotations (..., 3, 3): |A - B| = 2 sqrt(2) sin(angle / 2).
+
+    The derivative is 0 where they are equal or a half turn apart, at which it has a kink.
+    """
+    sine = torch.linalg.matrix_norm(first - second) / math.sqrt(8)  # of half the angle
+    far = sine > 0.75
+    turn = first.mT @ second
+    both = torch.linalg.matrix_norm(turn - turn.mT) / math.sqrt(32)  # sine times cosine, exact near a half turn
+    cosine = both / torch.where(far, sine, 1)
+    rest = 2 * torch.where(far, cosine, sine).clamp_max(1).asin()
+    return torch.where(far, math.pi - rest, rest)
 
 
 def euler_rotation(order: str, angles: Tensor) -> Tensor:
