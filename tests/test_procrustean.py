@@ -3,6 +3,7 @@
 import pytest
 import roma
 import torch
+from numerics import finite, normal
 from torch.autograd import gradcheck
 
 from kcs_torch.data.synthetic import walking_person
@@ -265,10 +266,20 @@ def test_distances_and_tree_find_the_rigid_parts():
     assert torch.allclose(mean[0, 3], apart.mean()) and torch.allclose(spread[0, 3], apart.std(correction=0))
     weighted = distance_spread(points, torch.ones(60, 6, dtype=torch.float64))
     assert torch.allclose(weighted[1], spread) and torch.allclose(weighted[0], mean)
+    assert distance_spread(torch.full((4, 2, 3), torch.nan))[1].isnan().all()
     tree = rigid_tree(spread + 1e-3 * mean)
     assert {frozenset(p) for p in tree.tolist()} == {frozenset(p) for p in BONES.tolist()}
     with pytest.raises(ShapeError):
         rigid_tree(torch.zeros(2, 3))
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+def test_distances_have_a_gradient(weighted):
+    """A joint is at no distance from itself, which never varies: two square roots of 0."""
+    weights = normal(5, 4, seed=1).abs() if weighted else None
+    for points in (normal(5, 4, 3), torch.zeros(5, 4, 3)):
+        finite(lambda x: torch.stack(distance_spread(x, weights)), points)
+    assert gradcheck(lambda x: distance_spread(x, weights), normal(5, 4, 3).requires_grad_())
 
 
 def test_jitter_tells_noise_from_motion():

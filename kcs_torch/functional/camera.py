@@ -9,8 +9,10 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import nearest_rotation
+from kcs_torch.functional.angles import angle_between
 from kcs_torch.functional.eigen import eigh
 from kcs_torch.functional.ranks import median
+from kcs_torch.functional.rotation import rotation_angle
 
 __all__ = [
     "back_project",
@@ -197,12 +199,12 @@ def viewpoint_turn(cameras: Tensor) -> Tensor:
         exact for a path; of directions scattered at random it may miss a fifth.
     """
     view = complete_rotation(cameras)[..., 2, :]  # (..., T, 3)
-    far = (view @ view.mean(-2, keepdim=True).mT).squeeze(-1).argmin(-1, keepdim=True)
-    for _ in range(2):  # the farthest from the mean, the farthest from that, and once more
-        anchor = view.gather(-2, far[..., None].expand(*far.shape, 3))
-        cosine = (view @ anchor.mT).squeeze(-1)
-        far = cosine.argmin(-1, keepdim=True)
-    return torch.rad2deg(torch.arccos(cosine.amin(-1).clamp(-1, 1)))
+    far = view.mean(-2, keepdim=True)
+    for _ in range(3):  # the farthest from the mean, the farthest from that, and once more
+        anchor = far
+        index = (view - anchor).square().sum(-1).argmax(-1)
+        far = view.gather(-2, index[..., None, None].expand(*index.shape, 1, 3))
+    return torch.rad2deg(angle_between(anchor, far)).squeeze(-1)
 
 
 def camera_disagreement(first: Tensor, second: Tensor) -> Tensor:
@@ -221,8 +223,7 @@ def camera_disagreement(first: Tensor, second: Tensor) -> Tensor:
         mirror = torch.tensor([1.0, 1.0, depth], dtype=first.dtype, device=first.device)
         source = complete_rotation(first * mirror)
         gauge = nearest_rotation((source.mT @ target).sum(-3))
-        trace = ((source @ gauge[..., None, :, :]) * target).sum((-2, -1))
-        angles.append(median(torch.rad2deg(torch.arccos(((trace - 1) / 2).clamp(-1, 1))), -1))
+        angles.append(median(torch.rad2deg(rotation_angle(source @ gauge[..., None, :, :], target)), -1))
     return torch.minimum(*angles)
 
 

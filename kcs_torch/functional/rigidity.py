@@ -20,18 +20,19 @@ def distance_spread(points: Tensor, weights: Tensor | None = None) -> tuple[Tens
         weights: (..., T, N); a pair counts in a frame as much as the lesser of its joints. All 1 where None.
 
     Returns:
-        mean (..., N, N) and standard deviation (..., N, N), both 0 for pairs never seen together.
+        mean (..., N, N) and standard deviation (..., N, N), both 0 for pairs never seen together. Their
+        derivatives are 0 where they are 0.
     """
     offset = points[..., :, None, :] - points[..., None, :, :]
-    distance = offset.square().sum(-1).sqrt()  # (..., T, N, N)
+    distance = _root(offset.square().sum(-1))  # (..., T, N, N)
     if weights is None:
         mean = distance.mean(-3)
-        return mean, (distance - mean[..., None, :, :]).square().mean(-3).sqrt()
+        return mean, _root((distance - mean[..., None, :, :]).square().mean(-3))
     share = torch.minimum(weights[..., :, None], weights[..., None, :])
     total = share.sum(-3)
     total = torch.where(total > 0, total, torch.ones_like(total))
     mean = (share * distance).sum(-3) / total
-    return mean, ((share * (distance - mean[..., None, :, :]).square()).sum(-3) / total).sqrt()
+    return mean, _root((share * (distance - mean[..., None, :, :]).square()).sum(-3) / total)
 
 
 def rigid_tree(cost: Tensor) -> Tensor:
@@ -62,3 +63,9 @@ def rigid_tree(cost: Tensor) -> Tensor:
         pairs.append((parent, child))
         inside[child] = True
     return torch.tensor(pairs, dtype=torch.long, device=cost.device).reshape(-1, 2)
+
+
+def _root(squares: Tensor) -> Tensor:
+    """Square roots, with derivative 0 where a square is 0; NaN stays."""
+    zero = squares == 0
+    return torch.where(zero, 0, torch.where(zero, 1, squares).sqrt())
