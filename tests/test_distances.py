@@ -101,6 +101,19 @@ def test_joint_distance_is_finite_where_poses_coincide(how, dtype, kind):
         assert not grad.any()
 
 
+@each_alignment
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_joint_distance_of_poses_that_are_one_point_has_a_bounded_derivative(how, dtype):
+    """What centring leaves of them is rounding, and was taken for a pose of size 1."""
+    target = normal(4, 7, 3, seed=1, dtype=dtype)
+    weights = torch.full((4, 7), 0.3, dtype=dtype)
+    for far in (0.3, 1.0, 3000.0):
+        points = (far * normal(4, 1, 3, dtype=dtype)).expand(4, 7, 3).clone().requires_grad_()
+        for one, other in ((points, target), (target, points)):
+            (grad,) = torch.autograd.grad(JointDistance(how)(one, other, weights).sum(), points)
+            assert grad.abs().max() < 2, far
+
+
 def test_joint_distance_lowers_and_needs_no_mirror():
     points, target = pair()
     mirrored = target * torch.tensor([1.0, 1.0, -1.0])

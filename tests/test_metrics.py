@@ -55,6 +55,16 @@ def test_mirrors_are_not_undone():
     assert float(e3d(mirrored, truth)) < 1e-9  # which papers allow
 
 
+@pytest.mark.parametrize("root", [None, 0])
+def test_what_only_a_negative_scale_would_bring_nearer_shrinks_to_the_root(root):
+    truth = clip()
+    middle = truth.mean(-2, keepdim=True) if root is None else truth[..., root, None, :]
+    assert torch.allclose(align(-truth, truth, "scale", root=root), middle.expand_as(truth))
+    assert float(mpjpe(-truth, truth, align="scale", root=root)) == pytest.approx(
+        float((truth - middle).norm(dim=-1).mean())
+    )
+
+
 @pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
 def test_batches_are_many_clips(batch):
     truth, pred = clip(*batch), clip(*batch, seed=1)

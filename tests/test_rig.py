@@ -1,8 +1,10 @@
 """Rotations found from joints: forward kinematics meets every joint of bones that keep their length."""
 
+import math
+
 import pytest
 import torch
-from numerics import rotations
+from numerics import gradcheck, normal, rotations
 from samples import walking_motion
 
 import kcs_torch as kt
@@ -41,6 +43,27 @@ def test_minimal_turn_of_the_odd_cases():
     assert torch.allclose((back @ eye[..., None])[..., 0], -eye)
     nearly = eye + 1e-9
     assert proper(minimal_turn(eye, -nearly))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_minimal_turn_near_a_half_turn_is_as_exact_as_elsewhere(dtype):
+    """1 + cosine cancels there: matrices were no rotations, and half turns missed the target."""
+    generator, few = torch.Generator().manual_seed(0), 16 * torch.finfo(dtype).eps
+    a, aside = torch.nn.functional.normalize(torch.randn(2, 50, 3, generator=generator, dtype=torch.float64), dim=-1)
+    across = torch.nn.functional.normalize(torch.linalg.cross(a, aside), dim=-1)
+    for degrees in (89, 91, 120, 179, 179.9, 179.99, 179.9999, 179.999999, 180):
+        b = kt.functional.rotation_matrix(math.radians(degrees) * across) @ a[..., None]
+        turn = minimal_turn(3 * a.to(dtype), b[..., 0].to(dtype)).double()
+        assert (turn @ turn.mT - torch.eye(3, dtype=torch.float64)).abs().max() < few, degrees
+        assert (turn @ a[..., None] - b).abs().max() < few, degrees
+        turned = kt.functional.rotation_angle(turn, torch.eye(3, dtype=torch.float64)).rad2deg()
+        assert torch.allclose(turned, torch.full_like(turned, degrees), atol=1e3 * few, rtol=0), degrees
+
+
+def test_minimal_turn_gradient():
+    a, b = normal(2, 20, 3)
+    for target in (b, -b, -a + 0.1 * b, a.clone()):
+        assert gradcheck(minimal_turn, a, target)
 
 
 @pytest.mark.parametrize("skeleton", ["coco17", "h36m17", "body25", "halpe26", "cmu31", "mediapipe33", "smpl24"])

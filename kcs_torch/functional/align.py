@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, unknown
-from kcs_torch.functional.chain import unit_size
+from kcs_torch.functional.chain import LOST, largest, unit_size
 from kcs_torch.functional.derivatives import applied, batch_first
 
 __all__ = ["ALIGNMENTS", "centre", "minimal_turn", "nearest_rotation", "procrustes", "similarity", "superpose"]
@@ -16,7 +16,7 @@ __all__ = ["ALIGNMENTS", "centre", "minimal_turn", "nearest_rotation", "procrust
 ALIGNMENTS = {
     "none": "as it stands",
     "root": "the root joint of each frame moved onto the true one",
-    "scale": "the root joint of each frame moved onto the true one, and each frame scaled about it",
+    "scale": "the root joint of each frame moved onto the true one, and each frame scaled about it, never mirrored",
     "rigid": "each frame moved and turned, not scaled",
     "similarity": "each frame moved, turned and scaled (Procrustes)",
     "sequence": "each frame moved; all frames turned and scaled by the same (Procrustes over the clip)",
@@ -71,13 +71,18 @@ def minimal_turn(source: Tensor, target: Tensor) -> Tensor:
     o = torch.zeros_like(x)
     spin = torch.stack([torch.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
     cosine = (a * b).sum(-1)[..., None, None]
-    opposite = cosine < -1 + 1e-6
+    back = cosine < 0
     eye = torch.eye(3, dtype=a.dtype, device=a.device)
-    turn = eye + spin + spin @ spin / torch.where(opposite, torch.ones_like(cosine), 1 + cosine)
-    normal = torch.linalg.cross(a, eye[a.abs().argmin(-1)])  # of the half turn
-    normal = torch.nn.functional.normalize(normal, dim=-1)
-    half = 2 * normal[..., :, None] * normal[..., None, :] - eye
-    return torch.where(still[..., None, None], eye, torch.where(opposite, half, turn))
+    turn = eye + spin + spin @ spin / torch.where(back, torch.ones_like(cosine), 1 + cosine)
+    # Farther than a right angle 1 + cosine cancels: a half turn about a, then one about the middle between a and b.
+    apart, middle = a - b, a + b
+    far = torch.where(back[..., 0], apart.square().sum(-1, keepdim=True), 1)
+    middle = middle - (middle * apart).sum(-1, keepdim=True) / far * apart  # lengths of 1 are so up to rounding only
+    opposite = middle.detach().abs().amax(-1, keepdim=True) < LOST * torch.finfo(a.dtype).eps
+    middle = torch.where(opposite, torch.linalg.cross(a, eye[a.abs().argmin(-1)]), middle)
+    half = lambda axis: 2 * axis[..., :, None] * axis[..., None, :] - eye  # noqa: E731
+    over = half(torch.nn.functional.normalize(middle, dim=-1)) @ half(a)
+    return torch.where(still[..., None, None], eye, torch.where(back, over, turn))
 
 
 def nearest_rotation(matrix: Tensor, *, reflect: bool = False) -> Tensor:
@@ -161,6 +166,9 @@ def superpose(
 ) -> Tensor:
     """Move a motion onto another in the way named, by least squares; never mirrored.
 
+    A pose that only a negative scale would bring nearer shrinks to its root, and one whose joints coincide up to
+    rounding stays a point: neither size nor turn have a derivative there.
+
     Args:
         source: (..., T, N, 3), finite.
         target: (..., T, N, 3), finite.
@@ -178,6 +186,9 @@ def superpose(
     if how == "none":
         return source
     mass = torch.ones_like(target[..., 0]) if weights is None else weights.to(target)
+    sequence = how == "sequence"
+    over, counts = 3 if sequence else 2, mass[..., None] > 0
+    lost = [LOST * torch.finfo(x.dtype).eps * largest(x, over, counts) for x in (source, target)]  # by centring
     if how in ("root", "scale") and root is not None:
         mean = target[..., root, None, :]
         source, target = source - source[..., root, None, :], target - mean
@@ -186,12 +197,10 @@ def superpose(
         target, mean = centre(target, mass)
     if how == "root":
         return source + mean
-    sequence = how == "sequence"
     whole = (lambda x: x.flatten(-3, -2)[..., None, :, :]) if sequence else (lambda x: x)
-    over, counts = 3 if sequence else 2, mass[..., None] > 0
-    unit = unit_size(source, over, counts)  # neither turn nor fitted scale depend on it
+    unit = unit_size(source, over, counts, lost[0])  # neither turn nor fitted scale depend on it
     if how != "scale":
-        goal = unit_size(target, over, counts)
+        goal = unit_size(target, over, counts, lost[1])
         turn = nearest_rotation(whole(unit * mass[..., None]).mT @ whole(goal))
         source, unit = source @ turn, unit @ turn
     if how == "rigid":
@@ -199,7 +208,7 @@ def superpose(
     heavy = unit * mass[..., None]
     size = whole(heavy * unit).sum((-2, -1))
     overlap = whole(heavy * target).sum((-2, -1))
-    factor = overlap / torch.where(size > 0, size, torch.ones_like(size))
+    factor = (overlap / torch.where(size > 0, size, torch.ones_like(size))).clamp_min(0)
     return unit * factor[..., None, None] + mean
 
 

@@ -19,6 +19,9 @@ __all__ = [
     "pose_matrix",
 ]
 
+LOST = 16.0
+"""Distances and sizes below this, in rounding errors of the points, are none."""
+
 
 def incidence(bones: Tensor | Sequence[Sequence[int]], num_joints: int, *, dtype: torch.dtype | None = None) -> Tensor:
     """Return C with +1 at each bone's child and -1 at its parent, so that bones are ``C.mT @ points``.
@@ -180,20 +183,27 @@ def pose_matrix(
     return matrix / torch.where(size > 0, size, torch.ones_like(size))[..., None, None]
 
 
-def unit_size(values: Tensor, dimensions: int, counts: Tensor | None = None) -> Tensor:
-    """Divide by the largest magnitude over the last so many dimensions, which is a constant for autograd.
+def unit_size(values: Tensor, dimensions: int, counts: Tensor | None = None, lost: Tensor | None = None) -> Tensor:
+    """Divide by the :func:`largest` magnitude over the last so many dimensions.
 
     For what does not depend on scale: squares of the result neither under- nor overflow, nor do their inverses. What is
-    smaller than any unit would have it counts as 0, so that its derivative is bounded; NaN stays NaN. The largest is
-    sought where ``counts``, which broadcasts against the values, is True.
+    smaller than any unit would have it, or no larger than what is ``lost`` to rounding, counts as 0, so that its
+    derivative is bounded; NaN stays NaN.
     """
-    over = tuple(range(-dimensions, 0))
-    size = values.detach().abs()
+    top, least = largest(values, dimensions, counts), torch.finfo(values.dtype).tiny ** 0.25
+    tiny = top <= (least if lost is None else lost.clamp_min(least))
+    return torch.where(tiny, torch.zeros_like(values), values / torch.where(tiny, torch.ones_like(top), top))
+
+
+def largest(values: Tensor, dimensions: int, counts: Tensor | None = None) -> Tensor:
+    """The largest magnitude over the last so many dimensions, which are kept; a constant for autograd.
+
+    It is sought where ``counts``, which broadcasts against the values, is True; 0 where there is nothing.
+    """
+    over, size = tuple(range(-dimensions, 0)), values.detach().abs()
     if counts is not None:
         size = torch.where(counts, size, torch.zeros_like(size))
-    top = size.amax(over, keepdim=True) if size.numel() else size.sum(over, keepdim=True)
-    tiny = top <= torch.finfo(values.dtype).tiny ** 0.25
-    return torch.where(tiny, torch.zeros_like(values), values / torch.where(tiny, torch.ones_like(top), top))
+    return size.amax(over, keepdim=True) if size.numel() else size.sum(over, keepdim=True)
 
 
 def safe_norm(vectors: Tensor) -> Tensor:

@@ -25,7 +25,8 @@ class JointDistance(nn.Module):
     It is :func:`kcs_torch.metrics.mpjpe` frame by frame, with the derivative 0 where a joint is on its target.
 
     Args:
-        align: a name in :data:`kcs_torch.metrics.ALIGNMENTS`; never mirrored.
+        align: a name in :data:`kcs_torch.metrics.ALIGNMENTS`; never mirrored: of a pose that only a negative scale
+            would bring nearer its root is left, and no derivative.
         root: index of the root joint for ``root`` and ``scale``; the middle of all joints if None.
 
     Raises:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import perspective, pinhole_translation
+from kcs_torch.functional.chain import LOST
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_clip, check_weights, huber_square
 from kcs_torch.nn.layers import check_tensor, full_precision, known, narrow, seen_weights, wide
@@ -19,9 +20,6 @@ __all__ = ["PerspectiveEnergy"]
 
 BEHIND = 0.01
 """What a distance behind the camera counts for, beside the body's size: one joint has none."""
-
-LOST = 16.0
-"""Distances and sizes below this, in rounding errors of the points, are none."""
 
 
 class PerspectiveEnergy(nn.Module):
