@@ -5,7 +5,7 @@ import math
 import pytest
 import scipy.integrate
 import torch
-from numerics import BODY, CHAIN, finite, gradcheck, normal, same_as_loop
+from numerics import BODY, CHAIN, HALVES, finite, gradcheck, normal, same_as_loop
 from test_posture import BONES, KINDS, MAN, POSTURE, WALK, degenerate
 from torch.testing import assert_close
 
@@ -155,6 +155,19 @@ def test_odd_bones_are_borne_but_not_odd_twins():
     arm = usual.clone()
     arm[MAN.mirror_bones[0][0]] *= 1.6
     assert energy(arm) > 100
+
+
+@pytest.mark.parametrize("dtype", HALVES)
+@pytest.mark.parametrize("weighted", [True, False])
+def test_proportions_in_half_precision(dtype, weighted):
+    """Of what is squared most digits were lost, and what was large was infinite."""
+    energy, weights = ProportionEnergy(MAN), torch.rand(16, generator=torch.Generator().manual_seed(0))
+    for spread in (0.02, 0.2, 2.5):
+        lengths = (POSTURE.rest_lengths * (spread * normal(4, 16)).exp()).to(dtype)
+        exact = energy(lengths.double(), weights if weighted else None).clamp_max(torch.finfo(dtype).max)
+        value = energy(lengths, weights.to(dtype) if weighted else None)
+        assert value.dtype == dtype
+        assert_close(value.double(), exact, rtol=2e-2, atol=0)
 
 
 def test_proportion_gradient_batches_and_errors():

@@ -142,6 +142,9 @@ class ProportionEnergy(SkeletonModule):
             if weights.shape[-1:] != (count,) or not fit_together(weights.shape, lengths.shape):
                 got = f"got {tuple(weights.shape)} for lengths {tuple(lengths.shape)}"
                 raise ShapeError(f"ProportionEnergy: expected weights (..., {count}), {got}")
+        return narrow(self._energy(wide(lengths), weights), lengths)
+
+    def _energy(self, lengths: Tensor, weights: Tensor | None) -> Tensor:
         tiny = torch.finfo(lengths.dtype).tiny
         if weights is not None:
             lengths = torch.where(weights > 0, lengths, self.usual.to(lengths))
