@@ -114,6 +114,19 @@ def test_wrong_calls():
         ENERGY(normal(4, 17, 2))
     with pytest.raises(ShapeError, match=r"StanceEnergy: expected weights"):
         ENERGY(normal(4, 17, 3), None, torch.ones(3))
+    for size in (np.ones(3), [1.0, 2.0, 3.0]):
+        with pytest.raises(ShapeError, match=r"StanceEnergy: expected a tensor of size, got .*use torch\.as_tensor"):
+            ENERGY(normal(3, 4, 17, 3), size)
+    with pytest.raises(ShapeError, match=r"StanceEnergy: expected size"):
+        ENERGY(normal(3, 4, 17, 3), torch.ones(2))
+
+
+@pytest.mark.parametrize("size", [0.0, 1, 1.7, np.float64(1.7)])
+def test_a_size_may_be_a_number(size):
+    points = normal(3, 4, 17, 3)
+    value = ENERGY(points, size)
+    assert_close(value, ENERGY(points, torch.full((3,), float(size), dtype=torch.float64)), rtol=1e-12, atol=0)
+    finite(lambda x: ENERGY(x, size), points)
 
 
 def test_leaning_backward_costs_more_than_leaning_forward():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Real
 from pathlib import Path
 
 import torch
@@ -83,7 +84,7 @@ class StanceEnergy(SkeletonModule):
             (...), without unit.
 
         Raises:
-            ShapeError: the shapes do not fit.
+            ShapeError: the shapes do not fit, or the size is neither a number nor a tensor.
         """
         each = self.strayed(points, size, weights)
         if weights is None:
@@ -101,7 +102,9 @@ class StanceEnergy(SkeletonModule):
         self.check(points, clip=True)
         if points.shape[-1] != 3:
             raise ShapeError(f"StanceEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
-        check_beside(size if isinstance(size, Tensor) else None, "size", (), points, self)
+        if isinstance(size, (int, float, Real)):
+            size = torch.tensor(float(size), dtype=torch.float64)
+        check_beside(size, "size", (), points, self)
         joints = weights is not None and weighs_joints(weights, points, self)
         with full_precision(points):
             points = wide(known_points(points, weights, self))
@@ -114,8 +117,7 @@ class StanceEnergy(SkeletonModule):
                 known = square.new_ones(square.shape[-1]) if share is None else (share > 0).any(-2).to(square)
                 size = (known * usual_size(square, share)).sum(-1)
                 size = size / some((known * self.posture.rest_lengths.to(square)).sum(-1))
-            if isinstance(size, Tensor):
-                size = torch.where(size > 0, size, torch.inf).to(vectors)[..., None, None]
+            size = torch.where(size > 0, size, torch.inf).to(vectors)[..., None, None]
             way = (self.line.to(vectors) @ vectors)[..., None, :] @ self.posture.frame(points)  # (..., T, 1, 3)
             off = way[..., 0, ::2] / size - self.usual.to(vectors)
             back = off[..., 1].clamp_min(0).square()
