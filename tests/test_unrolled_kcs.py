@@ -5,7 +5,7 @@ import warnings
 
 import pytest
 import torch
-from numerics import BODY, FLOATS, finite, leaves_arguments_alone, normal, same_as_loop
+from numerics import BODY, FLOATS, HALVES, finite, leaves_arguments_alone, normal, same_as_loop
 from test_unrolled import KINDS, scene, with_parameters
 from torch.testing import assert_close
 
@@ -203,6 +203,19 @@ def test_weights_and_scales_may_have_another_precision():
     value = module(tracks, cameras, weights=weights, scales=torch.linspace(0.5, 0.6, 6))
     scales = torch.linspace(0.5, 0.6, 6, dtype=torch.float32).double()
     assert_close(module(tracks, cameras, weights=weights.double(), scales=scales), value)
+
+
+@pytest.mark.parametrize("dtype", HALVES)
+@pytest.mark.parametrize("frames", [1, 30, 31])
+def test_half_precision_is_widened_inside(dtype, frames):
+    """A span of its own, an odd number of frames, had the scale 0 / 0; and squares of pixels are out of range."""
+    clip = walking_person(frames, skeleton="h36m17", dtype=torch.float32, turn=120.0)
+    tracks, cameras, module = clip.tracks.points.to(dtype), clip.cameras.to(dtype), UnrolledKCS("h36m17", 3)
+    pairs = [(module(tracks, cameras), module(tracks.float(), cameras.float()))]
+    pairs += zip(module.find_cameras(tracks), module.find_cameras(tracks.float()), strict=True)
+    for rough, exact in pairs:
+        assert rough.dtype == dtype
+        assert_close(rough.float(), exact, rtol=2 * torch.finfo(dtype).eps, atol=torch.finfo(dtype).eps)
 
 
 def test_what_does_not_fit():

@@ -21,7 +21,7 @@ from kcs_torch.nn.deviation import (
     template_scale,
 )
 from kcs_torch.nn.energies import centred_residual
-from kcs_torch.nn.layers import full_precision, known
+from kcs_torch.nn.layers import full_precision, known, narrow, wide
 from kcs_torch.nn.steps import continuation
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.skeleton import Skeleton, get_skeleton
@@ -158,8 +158,8 @@ class UnrolledKCS(Unrolled):
         """
         weights = self._check(tracks, None, weights, None, self.skeleton, seek=True)
         with torch.no_grad(), full_precision(tracks):
-            points, share = self._centred(tracks, weights)
-            rest = self.template(tracks)
+            points, share = self._centred(wide(tracks), wide(weights))
+            rest = self.template(points)
             low, high = self._bounds(points, share, rest)
             rows, sizes = [], []
             clips = (x.reshape(-1, *x.shape[tracks.ndim - 3 :]) for x in (points, share, low, high))
@@ -171,7 +171,8 @@ class UnrolledKCS(Unrolled):
                 sizes.append(scales)
             if not rows:  # an empty batch
                 return tracks.new_zeros(*tracks.shape[:-2], 2, 3), tracks.new_zeros(tracks.shape[:-2])
-            return torch.stack(rows).reshape(*tracks.shape[:-2], 2, 3), torch.stack(sizes).reshape(tracks.shape[:-2])
+            scales = torch.stack(sizes).reshape(tracks.shape[:-2])
+            return torch.stack(rows).reshape(*tracks.shape[:-2], 2, 3).to(tracks.dtype), narrow(scales, tracks)
 
     def forward(
         self,
@@ -217,24 +218,24 @@ class UnrolledKCS(Unrolled):
         With ``measure`` it tells whether the last step stood still, which waits for the device.
         """
         weights = self._check(tracks, cameras, weights, start, self.skeleton, scales=scales)
-        threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         with full_precision(tracks):
-            points, share = self._centred(tracks, weights)
-            rest = self.template(tracks)
-            matrix, inverse = self.matrix.to(tracks), self.inverse.to(tracks)
+            points, share = self._centred(wide(tracks), wide(weights))
+            rows, rest = wide(cameras), self.template(points)
+            threshold, step = self._values("threshold", points), self._values("step", points)
+            matrix, inverse = self.matrix.to(points), self.inverse.to(points)
             if scales is None:
                 with torch.no_grad():
                     low, high = self._bounds(points, share, rest)
-                scales = frame_scales(rest, points, cameras, share, low, high)
-            scales = scales.to(tracks.dtype)
+                scales = frame_scales(rest, points, rows, share, low, high)
+            scales = scales.to(points.dtype)
             size = scales.mean(-1)[..., None, None, None]
-            given = (deviation_goal(rest, points / scales[..., None, None], cameras, share), cameras, share)
+            given = (deviation_goal(rest, points / scales[..., None, None], rows, share), rows, share)
             top = deviation_scale(*given, matrix=matrix, arrangement=self.arrangement)
             if start is None:
                 batch = broadcast_shapes(points.shape[:-3], cameras.shape[:-3], scales.shape[:-1])
                 begin = points.new_zeros(*batch, points.shape[-3], 3, len(self.bones))
             else:
-                begin = bone_vectors(start.to(tracks.dtype) / size - rest, self.bones).mT
+                begin = bone_vectors(start.to(points.dtype) / size - rest, self.bones).mT
             solution = self._run(
                 lambda state, k: deviation_step(
                     state, *given, threshold[k] * top, step[k],
@@ -245,7 +246,7 @@ class UnrolledKCS(Unrolled):
                 depends_on=(tracks, cameras, weights, scales),
             )  # fmt: skip
             value = size * (rest + (solution.value @ inverse.mT).mT)
-        return Solution(value, solution.converged, solution.iterations)
+        return Solution(narrow(value, tracks), solution.converged, solution.iterations)
 
     def _centred(self, tracks: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Tracks about the seen joints' middle, 0 where unseen, and weights (..., T, N)."""
