@@ -29,7 +29,7 @@ from kcs_torch.nn import (
     SmoothnessEnergy,
     SymmetryEnergy,
 )
-from kcs_torch.nn.layers import inverse_softplus
+from kcs_torch.nn.layers import inverse_softplus, narrow
 from kcs_torch.skeleton import SKELETONS
 
 BONES = BODY.bone_index()
@@ -228,6 +228,16 @@ def test_the_kcs_matrix_of_millimetres_is_finite_in_half_precision(dtype):
         assert_close(layer(points), exact)
     assert torch.isfinite(layer(points.to(dtype))).all() and exact.max() > torch.finfo(torch.float16).max
     assert_close(level(points.to(dtype)).float(), level(points), rtol=0.05, atol=0.05)
+
+
+@pytest.mark.parametrize("dtype", HALVES)
+def test_what_no_precision_holds_is_the_largest_number(dtype):
+    top = torch.finfo(dtype).max
+    wide = torch.tensor([torch.inf, -torch.inf, 3e38, 1.5, torch.nan], requires_grad=True)
+    value = narrow(wide, torch.zeros((), dtype=dtype))
+    assert value[:2].tolist() == [top, -top] and value[3] == 1.5 and value[4].isnan()
+    (grad,) = torch.autograd.grad(value[:4].sum(), wide)
+    assert grad[2:4].tolist() == [1, 1] and grad.isfinite().all()
 
 
 def test_confidences_are_no_coordinate():

@@ -2,9 +2,10 @@ import math
 
 import pytest
 import torch
+from numerics import HALVES
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.nn import CameraHead, MLPLifter, TemporalLifter
+from kcs_torch.nn import CameraHead, MLPLifter, RefinedLifter, TemporalLifter, UnrolledSfAM
 from kcs_torch.nn.networks import orthonormal_rows
 from kcs_torch.nn.normalise import neighbours, normalise_tracks
 from kcs_torch.skeleton import SKELETONS
@@ -279,6 +280,29 @@ def test_it_answers_in_the_dtype_of_the_tracks():
     network = TemporalLifter("h36m17", channels=8)  # float32
     assert network(tracks, weights).dtype == torch.float64
     assert network(tracks.float(), weights.float()).dtype == torch.float32
+
+
+@pytest.mark.parametrize("dtype", HALVES)
+@pytest.mark.parametrize(("size", "aside"), [(0.01, 0.0), (100.0, 500.0), (300.0, 4000.0), (8000.0, 30000.0)])
+def test_half_precision_is_widened_inside(dtype, size, aside):
+    """Sums over joints, and squares, leave the range of float16 at a body of 260 pixels, or 3900 pixels aside."""
+    tracks = (size * clip(9, dtype=torch.float32)[0] + aside).to(dtype)
+    refined = RefinedLifter(LIFTERS["temporal"]("h36m17"), UnrolledSfAM("h36m17", 2))
+    for network in (*(make("h36m17") for make in LIFTERS.values()), CameraHead("h36m17", width=16), refined):
+        rough, exact = (network.eval()(x) for x in (tracks, tracks.float()))
+        if isinstance(rough, tuple):
+            rough, exact = (torch.cat([rows.flatten(-2), scale[..., None]], -1) for rows, scale in (rough, exact))
+        digits = torch.finfo(dtype).eps
+        near = (aside + 4 * size) * digits if network is refined else 1e-6  # what it starts from is rounded
+        assert rough.dtype == dtype
+        torch.testing.assert_close(rough.float(), exact, rtol=digits, atol=near)
+
+
+@pytest.mark.parametrize("far", [1e19, 2e38])
+def test_sums_of_large_numbers_stay_in_range(far):
+    tracks = far * clip(9, dtype=torch.float32)[0].clamp(0, 1)
+    for make in LIFTERS.values():
+        assert make("h36m17").eval()(tracks).isfinite().all()
 
 
 def test_vmap_over_clips(lifter):

@@ -197,8 +197,9 @@ def narrow(value: Tensor, like: Tensor) -> Tensor:
     if value.dtype == like.dtype:
         return value
     top = torch.finfo(like.dtype).max
-    # In this order: beside a value that is far larger, its largest number would be lost to rounding.
-    return (value - value.detach() + value.detach().clamp(-top, top)).to(like.dtype)
+    # In this order: beside a value that is far larger, its largest number would be lost to rounding. Infinity less
+    # itself is NaN.
+    return ((value - value.detach()).nan_to_num() + value.detach().clamp(-top, top)).to(like.dtype)
 
 
 def known(values: Tensor, weights: Tensor | None) -> Tensor:

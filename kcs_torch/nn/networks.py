@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.nn.layers import SkeletonModule, check_beside, check_joints, check_points, check_tensor
+from kcs_torch.nn.layers import SkeletonModule, check_beside, check_joints, check_points, check_tensor, narrow
 from kcs_torch.nn.normalise import NormalisedTracks, neighbours, normalise_tracks
 from kcs_torch.skeleton import Skeleton
 
@@ -95,7 +95,7 @@ class _Network(SkeletonModule):
     def run(
         self, tracks: Tensor, weights: Tensor | None, scale: Tensor | None = None
     ) -> tuple[Tensor, NormalisedTracks]:
-        """The ``outputs`` numbers of each frame (..., T, outputs), and what they were made from."""
+        """The ``outputs`` numbers of each frame (..., T, outputs), and what they were made from, both widened."""
         check_points(tracks, self, "tracks")
         check_joints(self, self.skeleton, tracks, "tracks (..., T, {}, 2)")
         if weights is not None:
@@ -112,7 +112,7 @@ class _Network(SkeletonModule):
         known = normalise_tracks(tracks, weights, scale)
         frames = torch.cat([known.local.flatten(-2), known.seen], -1).to(self.enter.weight.dtype)
         hidden = self.blocks(self.enter(neighbours(frames, self.steps)))
-        return self.leave(self.norm(hidden)).to(tracks.dtype), known
+        return self.leave(self.norm(hidden)).to(known.local.dtype), known
 
 
 class _Lifter(_Network):
@@ -135,7 +135,7 @@ class _Lifter(_Network):
         answer, known = self.run(tracks, weights, scale)
         answer = answer.unflatten(-1, (-1, 3))
         image = (known.local + answer[..., :2]) * known.scale + known.middle
-        return torch.cat([image, answer[..., 2:] * known.scale], -1)
+        return narrow(torch.cat([image, answer[..., 2:] * known.scale], -1), tracks)
 
 
 class MLPLifter(_Lifter):
@@ -271,7 +271,8 @@ class CameraHead(_Network):
         """
         answer, known = self.run(tracks, weights)
         rows = answer[..., :6].unflatten(-1, (2, 3)) + torch.eye(3, dtype=answer.dtype, device=answer.device)[:2]
-        return orthonormal_rows(rows), known.scale[..., 0, 0] * answer[..., 6].clamp(-LOG_RANGE, LOG_RANGE).exp()
+        scale = known.scale[..., 0, 0] * answer[..., 6].clamp(-LOG_RANGE, LOG_RANGE).exp()
+        return orthonormal_rows(rows).to(tracks.dtype), narrow(scale, tracks)
 
 
 LOG_RANGE = 4.0

@@ -8,14 +8,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcs_torch.functional.chain import largest
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.nn.layers import seen_weights
+from kcs_torch.nn.layers import seen_weights, wide
+from kcs_torch.nn.masks import safe_root, some
 
 __all__ = ["NormalisedTracks", "neighbours", "normalise_tracks"]
 
 
 class NormalisedTracks(NamedTuple):
-    """Tracks as networks see them.
+    """Tracks as networks see them, at least in single precision.
 
     Attributes:
         local: (..., T, N, 2) about the middle of each frame, divided by ``scale``; 0 where unseen.
@@ -33,19 +35,20 @@ class NormalisedTracks(NamedTuple):
 def normalise_tracks(tracks: Tensor, weights: Tensor | None, scale: Tensor | None = None) -> NormalisedTracks:
     """Centre tracks (..., T, N, 2) in each frame and divide them by the size of the clip, or by a given ``scale``."""
     seen = seen_weights(tracks, weights) > 0
+    tracks = wide(tracks)
     mask = seen.to(tracks.dtype)
     tracks = torch.where(seen[..., None], tracks, torch.zeros_like(tracks))
+    top = some(largest(tracks, 3))  # divided out first, so that neither sums nor squares overflow
+    tracks = tracks / top
     count = mask.sum(-1)[..., None, None]  # (..., T, 1, 1)
     middle = tracks.sum(-2, keepdim=True) / count.clamp_min(1)
     middle = interpolate(middle, count[..., 0] > 0)
     local = (tracks - middle) * mask[..., None]
     if scale is None:
-        top = local.abs().amax((-3, -2, -1), keepdim=True)  # divided out first, so that no square overflows
-        share = local / torch.where(top > 0, top, torch.ones_like(top))
-        square = share.square().sum((-3, -2, -1), keepdim=True) / count.sum(-3, keepdim=True).clamp_min(1)
-        root = torch.where(square > 0, square, torch.ones_like(square)).sqrt()  # no square root of 0: its slope
-        scale = top * torch.where(square > 0, root, torch.zeros_like(root))
-    return NormalisedTracks(local / torch.where(scale > 0, scale, torch.ones_like(scale)), mask, middle, scale)
+        size = safe_root(local.square().sum((-3, -2, -1), keepdim=True) / count.sum(-3, keepdim=True).clamp_min(1))
+        return NormalisedTracks(local / some(size), mask, middle * top, size * top)
+    scale = wide(scale)
+    return NormalisedTracks(local / some(scale / top), mask, middle * top, scale)
 
 
 def neighbours(frames: Tensor, steps: Sequence[int]) -> Tensor:

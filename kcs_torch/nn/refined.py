@@ -9,7 +9,9 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import SkeletonError
 from kcs_torch.functional import centre
-from kcs_torch.nn.layers import seen_weights
+from kcs_torch.functional.chain import largest
+from kcs_torch.nn.layers import narrow, seen_weights, wide
+from kcs_torch.nn.masks import some
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["RefinedLifter"]
@@ -55,11 +57,12 @@ class RefinedLifter(nn.Module):
         Raises:
             ShapeError: the tracks are not of the network's skeleton.
         """
-        points, middle = centre(self.network(tracks, weights))
+        points = wide(self.network(tracks, weights))
+        top = some(largest(points, 3))  # divided out first, so that neither sums nor squares overflow
+        points, middle = centre(points / top)
         weights = seen_weights(tracks, weights)
-        tracks = torch.where(weights[..., None] > 0, tracks, points[..., :2] + middle[..., :2])
-        size = points[..., :2].square().mean((-3, -2, -1), keepdim=True).sqrt().detach()
-        size = torch.where(size > 0, size, torch.ones_like(size))
-        cameras = torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(*tracks.shape[:-2], 2, 3)
-        refined: Tensor = self.solver((tracks - middle[..., :2]) / size, cameras, weights=weights, start=points / size)
-        return refined * size + middle
+        image = torch.where(weights[..., None] > 0, wide(tracks) / top, points[..., :2] + middle[..., :2])
+        size = some(points[..., :2].square().mean((-3, -2, -1), keepdim=True).sqrt().detach())
+        cameras = torch.eye(3, dtype=image.dtype, device=image.device)[:2].expand(*image.shape[:-2], 2, 3)
+        refined: Tensor = self.solver((image - middle[..., :2]) / size, cameras, weights=weights, start=points / size)
+        return narrow((refined * size + middle) * top, tracks)
