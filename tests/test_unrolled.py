@@ -756,6 +756,18 @@ def test_grades_of_bones_without_length_are_finite(dtype):
         assert ((rigidity >= 0) & (rigidity <= 1)).all()
 
 
+@pytest.mark.parametrize("dtype", HALVES)
+def test_half_precision_is_widened_inside(dtype):
+    """Singular values of tracks in millimetres leave the range of float16: the answer was 0 everywhere, or NaN."""
+    tracks, cameras, weights = (x.to(dtype) for x in scene(BODY, "gaps"))
+    for scale in (1.0, 1e4):
+        far = scale * tracks
+        for module in (UnrolledFPC(4), UnrolledSfAM(BODY, 4)):
+            rough, exact = module(far, cameras, weights=weights), module(far.float(), cameras.float(), weights=weights)
+            assert rough.dtype == dtype
+            assert_close(rough.float(), exact, rtol=0.02, atol=0.02 * scale)
+
+
 def test_step_without_bones_is_plain():
     tracks, cameras, weights = scene(BODY, "gaps")
     shape, level, step = normal(6, 7, 3), torch.tensor(0.3).double(), 0.5

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
-from kcs_torch.nn.layers import full_precision, known
+from kcs_torch.nn.layers import full_precision, known, narrow, wide
 from kcs_torch.nn.steps import continuation, data_scale, shape_step, start_shape
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.solvers.iterate import Solution
@@ -100,7 +101,8 @@ class UnrolledFPC(Unrolled):
         With ``measure`` it tells whether the last step stood still, which waits for the device.
         """
         weights = self._check(tracks, cameras, weights, start)
-        tracks = known(tracks, weights)
+        given, tracks = tracks, wide(known(tracks, weights))
+        cameras, weights = wide(cameras), wide(weights)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
@@ -109,9 +111,10 @@ class UnrolledFPC(Unrolled):
             def advance(shape: Tensor, k: int) -> Tensor:
                 return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corners[k])
 
-            return self._run(
+            solution = self._run(
                 advance,
                 start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype),
                 measure=measure,
                 depends_on=(tracks, cameras, weights),
             )
+        return replace(solution, value=narrow(solution.value, given))

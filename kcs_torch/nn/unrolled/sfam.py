@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
-from kcs_torch.nn.layers import full_precision, known
+from kcs_torch.nn.layers import full_precision, known, narrow, wide
 from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape, to_scale
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.skeleton import Skeleton, get_skeleton
@@ -146,7 +147,8 @@ class UnrolledSfAM(Unrolled):
             The solution; ``change`` is that of the last step, (...).
         """
         weights = self._check(tracks, cameras, weights, start, self.skeleton, lengths=None if one_body else lengths)
-        tracks = known(tracks, weights)
+        given, tracks = tracks, wide(known(tracks, weights))
+        cameras, weights = wide(cameras), wide(weights)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         stiffness = self._values("stiffness", tracks)
         relative = one_body or lengths is None
@@ -188,10 +190,11 @@ class UnrolledSfAM(Unrolled):
             begin = start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype)
             if inside is not None:
                 begin = begin * inside[..., None, None]
-            return self._run(
+            solution = self._run(
                 advance,
                 begin,
                 inner=begin.ndim if one_body else 3,
                 measure=measure,
                 depends_on=(tracks, cameras, weights, lengths),
             )
+        return replace(solution, value=narrow(solution.value, given))
