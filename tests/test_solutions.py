@@ -32,6 +32,15 @@ def test_each_solution_goes_in_front_of_all_others():
     assert all(s.alternatives == () for s in third.alternatives)
 
 
+def test_what_is_doubtful_of_the_best_is_so_of_the_others():
+    result = several()
+    unsure = replace(result, diagnostics=replace(result.diagnostics, doubt="depth is a guess: why"))
+    assert "depth is a guess" not in repr(result) and repr(unsure).endswith(", depth is a guess)")
+    other = unsure.solution(2)
+    assert other.diagnostics.doubt == "depth is a guess: why" and other.diagnostics.notes[-1] == "depth is a guess: why"
+    assert result.solution(2).diagnostics.doubt == ""
+
+
 @pytest.mark.parametrize("number", [0, 4, -1, "2", 1.0, True])
 def test_other_numbers_are_refused(number):
     with pytest.raises(OptionError, match=r"walk\.npz: solution: expected a number from 1 to 3"):
@@ -49,6 +58,17 @@ def test_the_mirror_image_is_told():
     assert found.mirrored and str(found) == "the mirror image in depth"
     depth = result.points[..., 2] - result.points[..., 2].mean(1, keepdim=True)
     assert found.rms == pytest.approx(2 * float(depth.square().mean().sqrt()), rel=1e-3)
+
+
+def test_what_is_nearly_the_mirror_image_is_not_called_it():
+    result = walk_result(skeleton="h36m17")
+    mirror = result.mirrored()
+    points = mirror.points.clone()
+    points[:, :2, 2] += torch.tensor([20.0, -20.0])
+    found = difference(result, replace(mirror, points=points))
+    assert found.mirrored and found.beside_mirror == pytest.approx(20 * (2 / 17) ** 0.5, rel=1e-3)
+    assert str(found) == f"nearly the mirror image in depth, {found.beside_mirror:.3g} {result.units} from it"
+    assert difference(result, mirror).beside_mirror == 0
 
 
 def test_a_flipped_forearm_is_named_with_its_share_of_frames():

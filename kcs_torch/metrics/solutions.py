@@ -18,6 +18,9 @@ LEVEL = 0.1
 MIRRORED = 0.3
 """A mirror image's depths add up to less than this share of their difference."""
 
+EXACT = 1e-3
+"""And those of the mirror image itself to less than this share."""
+
 FEW = 0.05
 """Share of frames in which a bone must be flipped to be named."""
 
@@ -30,15 +33,21 @@ class Difference:
         rms: root mean square distance of the joints, each pose about its own middle in depth, in the solutions' unit.
         mirrored: whether it is nearly the mirror image in depth.
         flipped: bones that tip the other way in depth, and the share of frames in which they do; most often first.
+        beside_mirror: root mean square distance in depth from the mirror image, 0 where it is just that.
+        units: the solutions'.
     """
 
     rms: float
     mirrored: bool
     flipped: dict[str, float]
+    beside_mirror: float = 0.0
+    units: str = ""
 
     def __str__(self) -> str:
-        if self.mirrored:
+        if self.mirrored and not self.beside_mirror:
             return "the mirror image in depth"
+        if self.mirrored:
+            return f"nearly the mirror image in depth, {f'{self.beside_mirror:.3g} {self.units}'.rstrip()} from it"
         if not self.flipped:
             return "depths differ, no bone tips the other way"
         some = [f"{bone} in {100 * share:.0f} %" for bone, share in list(self.flipped.items())[:4]]
@@ -70,7 +79,7 @@ def difference(best: Reconstruction, other: Reconstruction) -> Difference:
     depth = both[..., 2] - both[..., 2].mean(-1, keepdim=True)
     apart = torch.cat([(both[1] - both[0])[..., :2], (depth[1] - depth[0])[..., None]], -1)
     rms = float(apart.square().sum(-1).mean().sqrt())
-    add, subtract = depth.sum(0).square().mean().sqrt(), (depth[1] - depth[0]).square().mean().sqrt()
+    add, subtract = (float(z.square().mean().sqrt()) for z in (depth.sum(0), depth[1] - depth[0]))
     body = best.skeleton
     flipped: dict[str, float] = {}
     if body.num_bones:
@@ -79,4 +88,5 @@ def difference(best: Reconstruction, other: Reconstruction) -> Difference:
         share = (steep & (tips[0, ..., 2] * tips[1, ..., 2] < 0)).double().mean(0)
         order = share.argsort(descending=True, stable=True).tolist()
         flipped = {body.bone_names[b]: float(share[b]) for b in order if share[b] >= FEW}
-    return Difference(rms, bool(add < MIRRORED * subtract), flipped)
+    beside = 0.0 if add <= EXACT * subtract else add
+    return Difference(rms, add < MIRRORED * subtract, flipped, beside, best.units)

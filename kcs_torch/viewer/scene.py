@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import OptionError, OutputError
+from kcs_torch.metrics.solutions import EXACT, MIRRORED
 from kcs_torch.types import Reconstruction
 from kcs_torch.types.intake import FARTHEST
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
@@ -153,8 +154,9 @@ def _label(best: Reconstruction, other: Reconstruction, number: int) -> str:
 def _difference(best: Reconstruction, other: Reconstruction) -> str:
     ours, theirs = ((z - np.nanmean(z, 1, keepdims=True)) for z in (_points(r)[..., 2] for r in (best, other)))
     apart = np.sqrt(np.nanmean((ours - theirs) ** 2, 0))
-    if np.sqrt(np.nanmean((ours + theirs) ** 2)) < 0.3 * np.sqrt(np.nanmean(apart**2)):
-        return "mirror image"
+    add, subtract = np.sqrt(np.nanmean((ours + theirs) ** 2)), np.sqrt(np.nanmean(apart**2))
+    if add < MIRRORED * subtract:
+        return "mirror image" if add <= EXACT * subtract else "nearly the mirror image"
     most = np.argsort(-np.nan_to_num(apart))
     worst = [best.skeleton.joints[j] for j in most if apart[j] > 0.6 * apart[most[0]]]
     more = f" and {len(worst) - 2} more" if len(worst) > 2 else ""
