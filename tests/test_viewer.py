@@ -79,6 +79,10 @@ def two_people(result):
     return [result, replace(other, scales=result.scales[:6], uncertainty=None)]
 
 
+def doubtful(result, doubt="depth is <little> more than a guess: it hardly turns. It should"):
+    return replace(result, diagnostics=replace(result.diagnostics, notes=(doubt,), doubt=doubt))
+
+
 # ---------------------------------------------------------------------- the page
 
 
@@ -195,6 +199,9 @@ def test_alternatives_are_told_apart(result):
         "2 mirror image · objective 3.0",
         "3 other depth of left_wrist · objective 7.2",
     ]
+    nearly = replace(others[0], points=arm * torch.tensor([1.0, 1.0, -1.0]))
+    mirrored = scene(player(replace(result, alternatives=(nearly,))))
+    assert mirrored["people"][0]["solutions"][1]["label"].startswith("2 nearly the mirror image")
     assert np.allclose(shown(data, 2)[..., 2], arm[..., 2] - data["middle"][2], atol=1e-4 * np.ptp(arm.numpy()))
 
 
@@ -259,6 +266,17 @@ def test_title_and_summary_are_on_the_page(result):
     assert Page(player(result, title="A & B")).all("title")[0]["text"] == "A & B"
 
 
+def test_doubts_are_in_the_head_of_the_page(result):
+    def told(people):
+        return [e["text"] for e in Page(player(people)).all("p") if e.get("class") == "doubt"]
+
+    assert told(result) == []
+    assert told(doubtful(result)) == ["depth is <little> more than a guess: it hardly turns. It should"]
+    both = [doubtful(one) for one in two_people(result)]
+    assert told(both) == ["depth is <little> more than a guess: person 0, person 1"]
+    assert told([result, both[1]]) == ["depth is <little> more than a guess: person 1"]
+
+
 def test_a_template_value_that_looks_like_a_key_stays(result):
     assert Page(player(result, title="@@DATA@@")).all("title")[0]["text"] == "@@DATA@@"
 
@@ -310,6 +328,38 @@ def test_sheet_shows_three_rows_of_frames(result):
         "frame 11 (0.44 s)",
     ]
     assert len(sheet(result, frames=50).axes) == 3 * 12  # no frame twice
+
+
+def test_sheet_tells_doubts(result):
+    assert sheet(result)._suptitle.get_text().endswith("not converged after 80 iterations")
+    assert sheet(doubtful(result))._suptitle.get_text().endswith("\ndepth is <little> more than a guess")
+
+
+def test_sheet_shows_frames_in_which_the_body_is_seen(result):
+    weights = result.tracks.weights.clone()
+    weights[[0, 1, 6, 11]] = 0
+    part = replace(result, tracks=replace(result.tracks, weights=weights))
+    titles = [a.get_title().split(" (")[0] for a in sheet(part, frames=3).axes[:3]]
+    assert titles == ["frame 2", "frame 7", "frame 10"]
+    assert len(sheet(replace(part, tracks=replace(part.tracks, weights=0 * weights)), frames=3).axes) == 9
+
+
+def test_sheet_of_wide_bodies_goes_on_below(result):
+    turned = replace(
+        result,
+        points=result.points[..., [1, 0, 2]],
+        tracks=replace(result.tracks, points=result.tracks.points[..., [1, 0]]),
+    )
+    for one, columns in ((result, 7), (turned, 4)):
+        figure = sheet(one, frames=7)
+        assert len(figure.axes) == 3 * 7
+        assert figure.axes[0].get_gridspec().ncols == columns
+        width, height = figure.get_size_inches()
+        assert 0.8 < width / height < 2
+        figure.canvas.draw()
+        boxes = [a.get_window_extent() for a in figure.axes]
+        used = sum(box.width * box.height for box in boxes) / figure.bbox.width / figure.bbox.height
+        assert used > 0.55, used
 
 
 def test_sheet_draws_bones_in_the_colours_of_their_sides(result):

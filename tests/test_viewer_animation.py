@@ -17,6 +17,7 @@ from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.io import save, save_people
 from kcs_torch.viewer import animation
 from kcs_torch.viewer.animation import GIF, MP4, Pace, pace
+from kcs_torch.viewer.film import Film
 
 needs_ffmpeg = pytest.mark.skipif(not shutil.which("ffmpeg"), reason="needs ffmpeg (Debian: apt-get install ffmpeg)")
 
@@ -55,6 +56,13 @@ def test_pictures_are_different_and_of_one_size(result):
     for half in (pictures[..., : width // 2, :], pictures[..., width // 2 :, :]):
         for colour in ((0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00)):  # both sides in both pictures
             assert (np.abs(half.astype(int) - colour).max(-1) < 30).mean() > 5e-4
+
+
+def test_doubts_are_in_the_head(result):
+    unsure = replace(result, diagnostics=replace(result.diagnostics, doubt="depth is a guess: why"))
+    film = Film([result, unsure], 1.0)
+    film.picture(0, 0.0)
+    assert film.head.get_text().endswith(" · depth is a guess")
 
 
 def test_several_people_are_in_one_film(result):

@@ -54,6 +54,11 @@ class Diagnostics:
     loosest_bone: str = ""
 
     @property
+    def brief_doubt(self) -> str:
+        """The doubt without its reasons, which follow a colon."""
+        return self.doubt.partition(":")[0]
+
+    @property
     def variation(self) -> BoneVariation:
         """What the three fields say of bones' lengths; ``str`` makes words of it."""
         return BoneVariation(self.bone_variation, self.largest_bone_variation, self.loosest_bone)
@@ -106,7 +111,8 @@ class Reconstruction:
         return (
             f"Reconstruction({self.method} of {self.tracks.source!r}: points {tuple(self.points.shape)}, {self.units}, "
             f"viewpoint turn {found.viewpoint_turn:.0f} degrees, bone variation {found.variation}, "
-            f"{'converged' if found.converged else 'not converged'})"
+            f"{'converged' if found.converged else 'not converged'}"
+            f"{', ' if found.doubt else ''}{found.brief_doubt})"
         )
 
     @property
@@ -163,6 +169,8 @@ class Reconstruction:
     def solution(self, number: int) -> Reconstruction:
         """The solution of this number, with all the others as its alternatives: 1 is this one, 2 the first alternative.
 
+        What makes this one doubtful makes the others doubtful.
+
         Raises:
             OptionError: there is none.
         """
@@ -173,7 +181,11 @@ class Reconstruction:
                 + (": this method or clip has one solution only" if count == 1 else "")
             )
         every = (replace(self, alternatives=()), *self.alternatives)
-        return replace(every[number - 1], alternatives=(*every[: number - 1], *every[number:]))
+        chosen, doubt = every[number - 1], self.diagnostics.doubt
+        if doubt and not chosen.diagnostics.doubt:
+            facts = chosen.diagnostics
+            chosen = replace(chosen, diagnostics=replace(facts, notes=(*facts.notes, doubt), doubt=doubt))
+        return replace(chosen, alternatives=(*every[: number - 1], *every[number:]))
 
     def in_space(self) -> Tensor:
         """(T, N, 3): the points with the root's depth path added, so that a walking body moves through space.

@@ -56,6 +56,8 @@ class Film:
             axis.set_title(title, fontsize=9, pad=3)
         title = f"{', '.join(dict.fromkeys(r.method for r in people))}: {files_named(r.tracks for r in people)}"
         self.title = printable(title)[:90]
+        doubts = dict.fromkeys(r.diagnostics.brief_doubt for r in people if r.diagnostics.doubt)
+        self.doubt = "".join(f" · {doubt}" for doubt in doubts)
         self.head = self.figure.suptitle("", fontsize=10, y=0.985, parse_math=False)
         self.artists: list[tuple[Any, Any, list[str]]] = []  # bones, joints, the bones' colours
         self.tags = [
@@ -92,7 +94,7 @@ class Film:
         """Put everything where it is in a frame."""
         pace = f" · {self.faster:.3g} times faster" if self.faster > 1.01 else ""
         when = f" · {frame / self.fps:.2f} s" if self.fps else ""
-        self.head.set_text(f"{self.title}\nframe {frame} of {self.total}{when}{pace}")
+        self.head.set_text(f"{self.title}\nframe {frame} of {self.total}{when}{pace}{self.doubt}")
         self.floor.set_segments(list(self.space.floor(yaw)))
         count = len(self.points)
         for k in range(count):

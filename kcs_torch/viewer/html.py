@@ -11,7 +11,7 @@ from typing import Any
 from kcs_torch.types import Reconstruction
 from kcs_torch.types.people import files_named, shared
 from kcs_torch.viewer.scene import scene_of
-from kcs_torch.viewer.summary import summarise
+from kcs_torch.viewer.summary import doubts, summarise
 
 __all__ = ["player"]
 
@@ -52,10 +52,12 @@ def player(
     data = scene_of(people, names)
     if title is None:
         title = f"{', '.join(dict.fromkeys(r.method for r in people))}: {files_named(r.tracks for r in people)}"
+    called = [person["name"] for person in data["people"]]
     folder = Path(__file__).parent / "page"
     parts = {
         "TITLE": html.escape(title),
         "SUMMARY": html.escape(_head(people, data["step"])),
+        "DOUBTS": "".join(f'<p class="doubt">{html.escape(doubt)}</p>' for doubt in doubts(people, called)),
         "NOTES": "".join(f"<li>{html.escape(note)}</li>" for note in _notes(people, data)),
         "DATA": _script_safe(json.dumps(data, allow_nan=False)),
         "STYLE": (folder / "player.css").read_text(encoding="utf-8"),

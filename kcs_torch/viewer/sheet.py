@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,18 +22,21 @@ if TYPE_CHECKING:
 __all__ = ["sheet"]
 
 TURN = 75.0  # degrees; of the view from the side
+SIDE, WIDEST = 2.3, 2.6  # inches: the height of a picture, and the width of one, at most
+ASPECT = 1.4  # width over height that a sheet comes near to
 LOST = 4.0  # a box is this many times larger than 99 % of its points before the others are left out
 
 
 def sheet(result: Reconstruction, *, frames: int = 8, turn: float = TURN) -> Figure:
-    """Draw key frames, evenly spread over the clip: tracks above, 3D from the camera and from the side below.
+    """Draw key frames: tracks above, 3D from the camera and from the side below.
 
-    The left side of the body is blue, the right vermilion. All pictures of a row have one scale.
+    They are spread evenly over the frames in which anything is seen of the body; frames of wide bodies go on below. The
+    left side of the body is blue, the right vermilion. All pictures of one kind have one scale.
 
     Args:
         result: the motion, (T, N, 3).
         frames: how many, at least 1.
-        turn: degrees by which the lowest row looks from the side.
+        turn: degrees by which the lowest pictures look from the side.
 
     Returns:
         A matplotlib figure, of no window; ``figure.savefig(path)`` writes it.
@@ -52,32 +56,40 @@ def sheet(result: Reconstruction, *, frames: int = 8, turn: float = TURN) -> Fig
     if not np.isfinite(points).all(-1).any():
         raise OutputError("a picture needs at least one joint at a finite place")
     tracks = result.tracks.points.detach().cpu().double().numpy()
-    tracks = np.where(result.tracks.seen.cpu().numpy()[..., None], tracks, np.nan)
-    chosen = np.unique(np.linspace(0, len(points) - 1, frames).round().astype(int))
+    seen = result.tracks.seen.cpu().numpy()
+    tracks = np.where(seen[..., None], tracks, np.nan)
+    shown = np.flatnonzero(seen.any(1)) if seen.any() else np.arange(len(points))
+    chosen = shown[np.unique(np.linspace(0, len(shown) - 1, frames).round().astype(int))]
     angle = np.radians(turn)
     right = np.array([np.cos(angle), 0, np.sin(angle)])  # the camera's x axis, turned about the vertical
     away = np.array([-np.sin(angle), 0, np.cos(angle)])
-    rows = [
+    kinds = [
         ("tracks", tracks[chosen], None),
         ("3D, from the camera", points[chosen][..., :2], points[chosen][..., 2]),
         (f"3D, turned {turn:g}°", np.stack([points @ right, points[..., 1]], -1)[chosen], (points @ away)[chosen]),
     ]
-    return _draw(result, chosen, rows, Figure, FigureCanvasAgg)
+    return _draw(result, chosen, kinds, Figure, FigureCanvasAgg)
 
 
-def _draw(result: Reconstruction, chosen: NDArray[Any], rows: list[Any], figure_type: Any, canvas_type: Any) -> Figure:
-    halves = [_half_width(places) for _, places, _ in rows]
-    height = 2.3  # of a row; a column is as wide as its poses
-    width = height * float(np.clip(max(h[0] / h[1] for h in halves), 0.5, 1.6)) + 0.08
-    size = (max(width * len(chosen) + 0.4, 6.4), height * len(rows) + 0.8)
+def _draw(result: Reconstruction, chosen: NDArray[Any], kinds: list[Any], figure_type: Any, canvas_type: Any) -> Figure:
+    halves = [_half_width(places) for _, places, _ in kinds]
+    shapes = [float(h[0] / h[1]) for h in halves]
+    width = min(max(SIDE * max(shapes), SIDE / 2), WIDEST)
+    heights = [min(SIDE, width / shape) for shape in shapes]
+    columns, size = _arrange(len(chosen), width + 0.08, sum(heights) + 0.25)
+    bands = math.ceil(len(chosen) / columns)
     figure = figure_type(figsize=size, dpi=130, layout="constrained")
     canvas_type(figure)
-    axes = figure.subplots(len(rows), len(chosen), squeeze=False)
+    axes = figure.subplots(bands * len(kinds), columns, squeeze=False, height_ratios=heights * bands)
+    axes = axes.reshape(bands, len(kinds), columns).swapaxes(0, 1)  # by kind, band and column
     title = [f"{result.method}: {Path(result.tracks.source).name}", summarise(result)]
-    lines = [line for text in title for line in textwrap.wrap(text, int(14 * size[0]))]
-    figure.suptitle(printable("\n".join(lines)), fontsize=9, parse_math=False)
-    for (label, places, depths), half, line in zip(rows, halves, axes, strict=True):
-        for i, axis in enumerate(line):
+    title += [result.diagnostics.brief_doubt] if result.diagnostics.doubt else []
+    words = [line for text in title for line in textwrap.wrap(text, int(14 * size[0]))]
+    figure.suptitle(printable("\n".join(words)), fontsize=9, parse_math=False)
+    for (label, places, depths), half, lines in zip(kinds, halves, axes, strict=True):
+        for spare in lines.flat[len(chosen) :]:
+            spare.remove()
+        for i, axis in enumerate(lines.flat[: len(chosen)]):
             _body(axis, result, places[i], None if depths is None else depths[i])
             middle = _middle(places[i])
             axis.set_xlim(middle[0] - half[0], middle[0] + half[0])
@@ -89,8 +101,16 @@ def _draw(result: Reconstruction, chosen: NDArray[Any], rows: list[Any], figure_
                 spine.set_color("#dddddd")
             if label == "tracks":
                 axis.set_title(_when(int(chosen[i]), result.fps), fontsize=8)
-        line[0].set_ylabel(label, fontsize=9)
+        for line in lines:
+            line[0].set_ylabel(label, fontsize=9)
     return figure
+
+
+def _arrange(count: int, width: float, height: float) -> tuple[int, tuple[float, float]]:
+    """How many columns let pictures of this size make a sheet of good shape, and the sheet's size, in inches."""
+    bands = [(math.ceil(count / number), number) for number in range(1, count + 1)]
+    sizes = [(columns, (max(width * columns + 0.4, 6.4), height * number + 0.6)) for columns, number in bands]
+    return min(sizes, key=lambda one: abs(math.log(one[1][0] / one[1][1] / ASPECT)))
 
 
 def _body(axis: Any, result: Reconstruction, places: NDArray[Any], depth: NDArray[Any] | None) -> None:

@@ -1,13 +1,14 @@
-"""A result in one line of words."""
+"""Results in one line of words, and what is doubtful about them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from kcs_torch.errors import counted
 from kcs_torch.types import Reconstruction
 
-__all__ = ["summarise"]
+__all__ = ["doubts", "summarise"]
 
 
 def summarise(result: Reconstruction) -> str:
@@ -24,6 +25,16 @@ def summarise(result: Reconstruction) -> str:
         "converged" if d.converged else f"not converged after {d.iterations} iterations",
     ]
     return " · ".join(f for f in facts if f)
+
+
+def doubts(results: Sequence[Reconstruction], names: Sequence[str]) -> list[str]:
+    """Say whose depth is hardly to be believed: of one body with the reasons, of several a line for those alike."""
+    if len(results) == 1:
+        return [result.diagnostics.doubt for result in results if result.diagnostics.doubt]
+    who: dict[str, list[str]] = {}
+    for result, name in zip(results, names, strict=True):
+        who.setdefault(result.diagnostics.brief_doubt, []).append(name)
+    return [f"{doubt}: {', '.join(who[doubt])}" for doubt in who if doubt]
 
 
 def _fact(text: str, value: float) -> str:
