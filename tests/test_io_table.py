@@ -363,6 +363,23 @@ def test_some_joints_of_coco_are_no_landmarks(tmp_path):
     assert visible.skeleton.name == "mediapipe33"
 
 
+@pytest.mark.parametrize("name", ["coco17", "h36m17", "mpii16", "ap10k", "wholebody63"])
+def test_names_that_others_have_too_are_no_landmarks(tmp_path, name):
+    """In metres, which are small numbers; capitals and blanks do not matter for COCO's."""
+    names = SKELETONS[name].joints[: SKELETONS[name].num_observed]
+    path = write_table(tmp_path / "a.csv", names, ("x", "y"))
+    header, *rows = path.read_text().splitlines()
+    small = [",".join([row.split(",")[0], *(str(float(x) / 1000) for x in row.split(",")[1:])]) for row in rows]
+    tracks = load_tracks(lines(path, header, *small))
+    assert detect_format(path) == "csv" and tracks.skeleton.name == name
+    assert np.allclose(tracks.points[:, : len(names)], person(4, len(names))[..., :2] / 1000)
+    if name == "coco17":
+        lines(path, header.replace("left_", "Left ").replace("right_", "Right "), *small)
+        assert load_tracks(path).skeleton.name == name
+    deep = write_table(tmp_path / "b.csv", names, ("x", "y", "z"))
+    assert detect_motion_format(deep) == "csv" and load_motion(deep).skeleton.name == name
+
+
 def test_which_way_is_up_is_told_where_it_is_assumed(tmp_path):
     path = write_table(tmp_path / "a.csv", ("snout", "tail"), ("x", "y", "z"))
     assert any("point up" in note for note in load_motion(path).notes)

@@ -10,7 +10,7 @@ from functools import cached_property
 
 from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES
 
-__all__ = ["WHO", "Columns", "Header", "delimiter", "first_line", "plain_name"]
+__all__ = ["WHO", "Columns", "Header", "Layout", "delimiter", "first_line", "plain_name"]
 
 WHO = ("person", "person_id", "pose", "track_id", "hand", "handedness", "id")
 """What a column is called that tells people apart."""
@@ -24,6 +24,9 @@ _LINE = re.compile(r'(?:[^"\n]+|"[^"]*")*')
 
 Columns = dict[str, dict[str, int]]
 """Of each joint the columns by what they hold: x, y, z, confidence, ..."""
+
+Layout = tuple[tuple[str, ...] | None, list[dict[str, int]]]
+"""The names of joints, None where they have numbers only, and the columns of each."""
 
 
 @dataclass(frozen=True)

@@ -10,17 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.header import Columns, Header, first_line
+from kcs_torch.io.header import Columns, Header, Layout, first_line
 from kcs_torch.io.jsonfile import FARTHEST
 from kcs_torch.io.landmarks import BODIES, VISIBILITIES, Landmarks
 from kcs_torch.io.long import LongHeader
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import read_error
 from kcs_torch.io.wide import read_wide
-from kcs_torch.skeleton import SKELETONS, guess_skeleton
+from kcs_torch.skeleton import SKELETONS, Skeleton, guess_skeleton
 
-__all__ = ["frame_shape", "npy_shape", "read_csv", "read_npy", "table_kind"]
+__all__ = ["frame_shape", "npy_shape", "read_csv", "read_npy", "some_joints", "table_kind"]
 
+SOME = 10  # names of a body from which on a table is taken for one of it
 _LIMIT = 2**30  # bytes of a file
 
 
@@ -30,12 +31,19 @@ def _named() -> frozenset[str]:
     return frozenset(j for b in BODIES.values() for j in SKELETONS[b].joints[: SKELETONS[b].num_observed])
 
 
+@cache
+def _own() -> frozenset[str]:
+    """Names that no other detector's skeleton has."""
+    others = (body for name, body in SKELETONS.items() if name not in BODIES.values())
+    return _named().difference(*(body.joints for body in others))
+
+
 def table_kind(text: str) -> str:
     """Tell what a table with columns or rows for each joint holds, by the beginning of its text.
 
     Returns:
-        "landmarks" of MediaPipe, by their names or numbers; "motion", where every joint has z; other "tracks"; empty
-        where it is no such table.
+        "landmarks" of MediaPipe, by their numbers, or by names or visibilities that nobody else's have; "motion", where
+        every joint has z; other "tracks"; empty where it is no such table.
 
     >>> table_kind("frame,a_x,a_y,b_x,b_y"), table_kind("a_x,a_y,a_z,b_x,b_y,b_z"), table_kind("track,frame,a_x,a_y")
     ('tracks', 'motion', '')
@@ -49,10 +57,12 @@ def table_kind(text: str) -> str:
         long = LongHeader.of(line)
         return "" if long is None else "motion" if long.deep else "tracks"
     deep = all("z" in columns for columns in header.joints.values())
-    if deep and lower == ["frame", "time [s]"] and not any(set(c) & set(VISIBILITIES) for c in header.joints.values()):
+    visible = any(set(columns) & set(VISIBILITIES) for columns in header.joints.values())
+    if deep and lower == ["frame", "time [s]"] and not visible:
         return "motion"  # as results are written, of whatever joints
     names = {_plain(name) for name in header.joints}
-    if len(_named() & names) >= 10 or (len(names) >= 21 and all(name.isdecimal() for name in names)):
+    named = len(_named() & names) >= SOME and (visible or bool(_own() & names))
+    if named or (len(names) >= 21 and all(name.isdecimal() for name in names)):
         return "landmarks"
     return "motion" if deep else "tracks"
 
@@ -66,7 +76,24 @@ def read_csv(path: Path) -> Landmarks:
     return read_wide(path, _layout)
 
 
-def _layout(joints: Columns, notes: list[str]) -> tuple[tuple[str, ...] | None, list[dict[str, int]]]:
+def some_joints(joints: Columns, body: Skeleton, notes: list[str]) -> Layout | None:
+    """The layout of a table with most joints of a body in any order, others unseen; None of other tables.
+
+    Args:
+        joints: the table's columns.
+        body: whose joints they may be.
+        notes: what is lacking is added to them.
+    """
+    marks = {_plain(name): columns for name, columns in joints.items()}
+    names = body.joints[: body.num_observed]
+    if not SOME <= len(marks) == len(joints) or not set(marks) <= set(names):
+        return None
+    if lacking := ", ".join(name for name in names if name not in marks):
+        notes.append(f"these joints of {body.name} have no columns x and y, so they are unseen: {lacking}")
+    return names, [marks.get(name, {}) for name in names]
+
+
+def _layout(joints: Columns, notes: list[str]) -> Layout:
     """The joints' names, and the columns of each; None where they are the usual ones, by number."""
     marks = {_plain(name): columns for name, columns in joints.items()}
     if all(n.isdecimal() for n in marks):
@@ -76,14 +103,10 @@ def _layout(joints: Columns, notes: list[str]) -> tuple[tuple[str, ...] | None, 
                 notes.append(f"of {len(marks)} numbered landmarks the first {count} are read, as the pose")
                 marks = dict(list(marks.items())[:count])
         return None, list(marks.values())
-    visible = any(set(columns) & set(VISIBILITIES) for columns in marks.values())
-    for body in () if guess_skeleton(list(marks), ordered=False) else (SKELETONS["coco17"], SKELETONS[BODIES[33]]):
-        names = body.joints[: body.num_observed]
-        if not set(marks) < set(names) or (visible and len(names) != 33):  # only MediaPipe writes visibilities
-            continue
-        lacking = ", ".join(name for name in names if name not in marks)
-        notes.append(f"these joints of {body.name} have no columns x and y, so they are unseen: {lacking}")
-        return names, [marks.get(name, {}) for name in names]
+    if guess_skeleton(list(marks), ordered=False) is None:
+        found = some_joints(joints, SKELETONS[BODIES[33]], notes)
+        if found is not None:
+            return found
     return tuple(marks), list(marks.values())
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.frames import as_track_id
-from kcs_torch.io.header import Columns, Header, delimiter, first_line
+from kcs_torch.io.header import Columns, Header, Layout, delimiter, first_line
 from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_text
 from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
 from kcs_torch.io.people import Sighting
@@ -84,7 +84,7 @@ def opened(path: Path) -> Iterator[tuple[str, Iterator[list[str]]]]:
 
 def read_wide(
     path: Path,
-    arrange: Callable[[Columns, list[str]], tuple[tuple[str, ...] | None, list[dict[str, int]]]] | None = None,
+    arrange: Callable[[Columns, list[str]], Layout] | None = None,
     *,
     depth: bool = False,
 ) -> Landmarks:

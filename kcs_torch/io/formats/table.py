@@ -18,13 +18,14 @@ from kcs_torch.anatomy import places_of_known
 from kcs_torch.errors import FormatError
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.frames import by_number
-from kcs_torch.io.header import Header, first_line
-from kcs_torch.io.landmark_tables import table_kind
+from kcs_torch.io.header import Columns, Header, Layout, first_line
+from kcs_torch.io.landmark_tables import some_joints, table_kind
 from kcs_torch.io.landmarks import settle
 from kcs_torch.io.long import LongHeader, read_long
 from kcs_torch.io.people import people_tracks
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader
 from kcs_torch.io.wide import read_wide
+from kcs_torch.skeleton import SKELETONS
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]
@@ -60,7 +61,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
             f"{path}: expected 2D tracks, got 3D motion (x, y, z): kcs_torch.load_motion reads it; "
             "leave the columns z out if these are tracks with depths"
         )
-    found = read_long(path) if _is_long(probe) else read_wide(path)
+    found = read_long(path) if _is_long(probe) else read_wide(path, _layout)
     settle(found, path, options, shares=False)
     frames = by_number(found.frames, found.notes)
     return people_tracks(
@@ -103,6 +104,11 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         up=up,
         notes=found.notes,
     )
+
+
+def _layout(joints: Columns, notes: list[str]) -> Layout:
+    """The table's own, but for some joints of COCO the whole body."""
+    return some_joints(joints, SKELETONS["coco17"], notes) or (tuple(joints), list(joints.values()))
 
 
 def _is_long(probe: Probe) -> bool:
