@@ -93,7 +93,7 @@ def reconstruct(
     if find:
         tracks = with_found_bones(tracks)
     chosen = method_named(method, fields)
-    lacking = no_bones(tracks.skeleton.num_joints)
+    lacking = no_bones(tracks.skeleton)
     if chosen.knows_bones and lacking in tracks.notes:
         warnings.warn(f"{tracks.source}: {lacking}", KcsWarning, stacklevel=users_level())
     return _before(lens, chosen, tracks, cameras)
@@ -152,7 +152,7 @@ def with_found_bones(tracks: Tracks) -> Tracks:
     Args:
         tracks: of a body that moves.
     """
-    said = no_bones(tracks.skeleton.num_joints)
+    said = no_bones(tracks.skeleton)
     return replace(tracks, skeleton=find_skeleton(tracks), notes=tuple(note for note in tracks.notes if note != said))
 
 

@@ -29,6 +29,7 @@ from kcs_torch.io.formats import sleap
 from kcs_torch.io.motion import detect_motion_format
 from kcs_torch.io.pickles import load_arrays
 from kcs_torch.io.registry import Probe
+from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.intake import no_bones
 
 pytest.importorskip("h5py")
@@ -62,7 +63,7 @@ FILES = {  # frames, joints of the first animal, and the unseen share in per cen
     "sleap/minimal_instance.000_centered_pair_low_quality.analysis.csv": (1, ("A", "B"), [0]),
     "sleap/predictions.analysis.h5": (3000, FLY, [1.67, 2.24]),
 }
-NO_BONES = no_bones(3)
+NO_BONES = no_bones(Skeleton.from_edges([], 3, tree=False))
 OTHERS = {
     "deeplabcut/reachingDEMO_3D.h5": "got 3D motion .*load_motion reads",
     "sleap/points3d.h5": "got 3D motion .*load_motion reads",

@@ -466,6 +466,30 @@ def test_joints_are_matched_by_name_with_a_given_skeleton():
     assert torch.equal(wider.points, points)
 
 
+def test_names_that_are_but_numbers_tell_an_order():
+    points, names = grid(joints=21), [f"hand{i}" for i in range(21)]
+    tracks = Tracks.from_arrays(points, skeleton="hand21", joint_names=names)
+    assert torch.equal(tracks.points, points)
+    order = "joints taken in their order as those of skeleton 'hand21', where names differ: hand0 for wrist, hand1 for"
+    assert tracks.notes[0].startswith(order)
+    mixed = Tracks.from_arrays(points, skeleton="hand21", joint_names=names[::-1])
+    assert torch.equal(mixed.points, points.flip(1)) and "matched by name" in mixed.notes[0]
+
+
+def test_skeletons_are_offered_where_names_may_be_theirs():
+    def offered(*names):
+        (note,) = (n for n in Tracks.from_arrays(grid(joints=33), joint_names=names).notes if "no bones" in n)
+        return "33 joints fit mediapipe33" in note
+
+    names = SKELETONS["mediapipe33"].joints[:33]
+    assert offered(*(f"point_{i}" for i in range(33)))
+    assert offered("head", *names[1:])
+    assert not offered(*(f"{a}_finger{i}" for i in range(11) for a in ("left", "right", "water")))
+    assert not offered(*names[1:], "nose tip")  # another order
+    (note,) = (n for n in Tracks.from_arrays(grid(joints=33)).notes if "no bones" in n)
+    assert "33 joints fit mediapipe33" in note
+
+
 def test_joints_of_another_spelling_are_matched_by_name():
     names = SKELETONS["body25"].joints
     points = torch.randn(4, 25, 2, dtype=torch.float64)

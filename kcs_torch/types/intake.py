@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from numbers import Real
@@ -66,14 +67,27 @@ def fitting(num_joints: int) -> list[str]:
     return [body.name for body in SKELETONS.values() if body.num_observed == num_joints]
 
 
-def no_bones(num_joints: int) -> str:
-    """What to say of tracks that come without bones."""
-    fits = fitting(num_joints)
-    choice = f" ({num_joints} joints fit {', '.join(fits)})" if fits else ""
+def no_bones(body: Skeleton) -> str:
+    """What to say of tracks whose skeleton has no bones."""
+    fits = [name for name in fitting(body.num_joints) if _may_be(body.joints, SKELETONS[name])]
+    choice = f" ({body.num_joints} joints fit {', '.join(fits)})" if fits else ""
     return (
         "no bones are given, so joints are taken as points that move freely: give a skeleton"
         f"{choice}, or skeleton='auto' (--skeleton auto) to find the bones"
     )
+
+
+def _numbered(names: Sequence[str]) -> bool:
+    """Whether names differ by numbers at their ends alone, so that their order is all that they tell."""
+    return len({re.sub(r"[0-9]+\Z", "", name) for name in names}) == 1
+
+
+def _may_be(names: Sequence[str], body: Skeleton) -> bool:
+    """Whether joints may be those of a body of as many: by their names, unless these are but numbers."""
+    if _numbered(names):
+        return True
+    found = map_joints(names, body.joints[: body.num_observed])
+    return all(i in (None, j) for j, i in enumerate(found)) and MOST_LACKING * found.count(None) <= len(found)
 
 
 def choose_skeleton(
@@ -145,7 +159,8 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
         return None
     exact = {n: i for i, n in enumerate(names)}
     found = [exact.get(n) for n in wanted] if exact.keys() >= set(wanted) else map_joints(names, wanted)
-    missing = [n for n, i in zip(wanted, found, strict=True) if i is None]
+    ordered = _numbered(names) and found == list(range(len(names)))
+    missing = [n for n, i in zip(wanted, found, strict=True) if i is None or ordered]
     if not missing:
         spare = len(names) - len(wanted)
         notes.append(f"joints matched by name with skeleton '{body.name}'" + (f"; {spare} left out" if spare else ""))

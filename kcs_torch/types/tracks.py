@@ -88,7 +88,7 @@ class Tracks(Trajectories):
         )
         body, remarks = taken.skeleton, taken.notes
         if skeleton is None and not body.bones:
-            remarks.append(no_bones(body.num_joints))
+            remarks.append(no_bones(body))
         xy, weights = body.complete(taken.points, taken.weights)
         remarks += unseen_notes(weights, body)
         return cls(xy, weights, body, taken.fps, units, source, tuple(remarks))
