@@ -4,7 +4,7 @@ import json
 
 import pytest
 from matplotlib.image import imread
-from samples import walk_result
+from samples import walk_result, walking_motion
 from test_cli import QUICK, run
 
 from kcs_torch.io import save
@@ -57,6 +57,19 @@ def test_lift_of_everybody_makes_one_page_of_all(openpose_folder, tmp_path):
     assert len(people(tmp_path / "walk.html")) == 2
     assert len(people(tmp_path / "walk_0.html")) == 1
     assert json.loads(done.stdout)["together"] == [str(tmp_path / "walk.html")]
+
+
+def test_view_shows_motion(tmp_path):
+    """Alone and beside a result; it has no mirror image, and tracks are to be lifted first."""
+    save(walking_motion(4), tmp_path / "m.npz")
+    save(walk_result(4, name="r.npz"), tmp_path / "r.npz")
+    run("view", tmp_path / "m.npz", "-o", tmp_path / "m.html")
+    assert len(people(tmp_path / "m.html")) == 1
+    run("view", tmp_path / "m.npz", tmp_path / "r.npz", "-o", tmp_path / "both.html", "--scale", "height=1.75m")
+    assert len(people(tmp_path / "both.html")) == 2
+    assert "--mirror: expected a result" in run("view", tmp_path / "m.npz", "--mirror", code=2).stderr
+    save(walk_result(4).tracks, tmp_path / "t.npz")
+    assert "got 2D tracks: lift them first" in run("view", tmp_path / "t.npz", code=2).stderr
 
 
 def test_view_shows_several_results_together(tmp_path):

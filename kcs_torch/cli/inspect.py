@@ -20,13 +20,13 @@ from kcs_torch.cli.options import (
     check_outputs,
     image_size,
 )
-from kcs_torch.cli.outputs import Scale, Units, Up, Written, check_up, parse_scale, sized, write_files
+from kcs_torch.cli.outputs import Scale, Units, Up, Written, check_up, parse_scale, write_files
 from kcs_torch.cli.pictures import check_picture, write_picture
 from kcs_torch.cli.report import answer, one_line, print_json, progress
 from kcs_torch.errors import counted
 
 if TYPE_CHECKING:
-    from kcs_torch.types import Tracks
+    from kcs_torch.types import Motion, Reconstruction, Tracks
 
 __all__ = ["info", "view"]
 
@@ -140,7 +140,8 @@ def view(
         list[Path],
         typer.Argument(
             metavar="RESULT...",
-            help="A result of `kcs-torch lift` (.npz), or several of the same clip, shown together.",
+            help="A result of `kcs-torch lift` (.npz), 3D motion (.trc, .c3d, .bvh, .amc, .npz), or several of "
+            "the same clip, shown together.",
             show_default=False,
         ),
     ],
@@ -160,10 +161,12 @@ def view(
     scale: Scale = None,
     units: Units = None,
 ) -> None:
-    """Show results: write a page with a 3D player, a sheet of key frames, a film."""
+    """Show results, and 3D motion: write a page with a 3D player, a sheet of key frames, a film."""
     with answer():
         from kcs_torch.errors import OptionError
-        from kcs_torch.io import load_reconstruction, save_people
+        from kcs_torch.io import save_people
+        from kcs_torch.io.formats.pages import as_result
+        from kcs_torch.types import Motion
 
         outputs = output or [results[0].with_suffix(".html")]
         size = parse_scale(scale)
@@ -177,12 +180,29 @@ def view(
         people = []
         for result in results:
             with progress(f"reading {result}"):
-                motion = load_reconstruction(result)
-            people.append(sized(motion.mirrored() if mirror else motion, size))
+                motion = _moving(result, mirror)
+            people.append(motion if size is None else motion.scaled(**size))
         if len(people) == 1:
             written = write_files(people[0], outputs, up, units)
         else:
             written = Written()
             for path in outputs:
-                written.attempt(path, partial(save_people, people, path))
+                together = [as_result(one) if isinstance(one, Motion) else one for one in people]
+                written.attempt(path, partial(save_people, together, path))
         written.tell()
+
+
+def _moving(path: Path, mirror: bool) -> Reconstruction | Motion:
+    """A result, or its mirror image; or motion, which has none."""
+    from kcs_torch.errors import FormatError, OptionError
+    from kcs_torch.io import load_any
+    from kcs_torch.types import Reconstruction, Tracks
+
+    data = load_any(path)
+    if isinstance(data, Tracks):
+        raise FormatError(f"{path}: expected a result or 3D motion, got 2D tracks: lift them first (kcs-torch lift)")
+    if not mirror:
+        return data
+    if not isinstance(data, Reconstruction):
+        raise OptionError(f"--mirror: expected a result of `kcs-torch lift`, got 3D motion in {path}")
+    return data.mirrored()
