@@ -1,6 +1,7 @@
 """BVH files: real ones and ours, both against an independent reader; by hand; and damaged ones."""
 
 import random
+import re
 import warnings
 from dataclasses import replace
 
@@ -210,6 +211,12 @@ def test_real_motion_of_constant_bones_is_within_a_millimetre(shared, tmp_path, 
     path = save(motion, tmp_path / "w.bvh", notes=[])
     found = 10 * theirs(path, motion.skeleton.joints)
     assert np.linalg.norm(found - motion.points.numpy(), axis=-1).max() < 1
+
+
+def test_rounding_is_no_residual(tmp_path):
+    notes: list[str] = []
+    save(walking_motion(1), tmp_path / "w.bvh", notes=notes)
+    assert any(re.match(r"the file's joints agree: less than 0\.000\d cm from ours\Z", note) for note in notes)
 
 
 def test_the_residual_is_the_one_that_is_told(tmp_path):

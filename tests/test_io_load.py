@@ -1,6 +1,7 @@
 """Formats by content, the lists of formats, and choosing people."""
 
 import gzip
+import re
 import sys
 
 import pytest
@@ -91,6 +92,14 @@ def test_nothing_there(tmp_path):
         load_tracks("a\0b")
     with pytest.raises(FormatError, match="neither"):
         load_tracks("/dev/null")
+
+
+def test_folders_of_folders_name_them(tmp_path):
+    for name in ("vid10", "vid2", ".hidden"):
+        (tmp_path / "sub" / name).mkdir(parents=True)
+    message = "expected a folder with tracks, got one that holds only folders (vid2, vid10): give one of them, such as "
+    with pytest.raises(FormatError, match=re.escape(message + str(tmp_path / "sub" / "vid2"))):
+        load_tracks(tmp_path / "sub")
 
 
 @pytest.mark.parametrize("path", [None, 3, b"w.npz", ["w.npz"]])

@@ -164,7 +164,9 @@ def test_other_files_are_left_out(tmp_path):
     (folder / ".hidden.json").write_text("no JSON at all")
     tracks = load_tracks(folder)
     assert tracks.num_frames == 4
-    assert any("1 files that are not .json" in n for n in tracks.notes)
+    assert "1 file that is not .json is left out" in tracks.notes
+    (folder / "more.txt").write_text("and on Tuesday")
+    assert "2 files that are not .json are left out" in load_tracks(folder).notes
 
 
 def test_two_recordings_in_a_folder_are_chosen_by_the_beginning_of_the_names(tmp_path):

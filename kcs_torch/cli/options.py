@@ -50,7 +50,8 @@ UseSkeleton = Annotated[
     typer.Option(
         "--skeleton",
         metavar="NAME|FILE",
-        help="A built-in skeleton (see `kcs-torch skeletons`) or a YAML or JSON file; that of TRACKS if not given.",
+        help="A built-in skeleton (see `kcs-torch skeletons`) or a YAML or JSON file; that of the file or of the "
+        "detector if not given.",
     ),
 ]
 Threshold = Annotated[

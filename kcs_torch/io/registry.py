@@ -100,7 +100,7 @@ class Probe:
             self.is_folder = self.path.is_dir()
             if not self.is_file and not self.files:
                 if self.is_folder:
-                    raise FormatError(f"{path}: expected a folder with tracks, got an empty one")
+                    raise FormatError(f"{path}: expected a folder with tracks, got {_folders(self.path)}")
                 if self.path.exists():
                     raise FormatError(f"{path}: expected a file or a folder, got neither")
                 raise FormatError(f"{path}: there is no such file or folder")
@@ -282,6 +282,15 @@ def need(package: str, what: str, error: type[KcsError]) -> ModuleType:
     except ImportError as reason:
         name = package.partition(".")[0]
         raise error(f"{what}: needs the package {name} ({reason}): pip install {name}") from None
+
+
+def _folders(path: Path) -> str:
+    """What a folder without files is, in words."""
+    names = sorted((f.name for f in path.iterdir() if f.is_dir() and not f.name.startswith(".")), key=natural_key)
+    if not names:
+        return "an empty one"
+    listed = f"{', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"
+    return f"one that holds only folders ({listed}): give one of them, such as {path / names[0]}"
 
 
 def brief(value: Any, most: int = 100) -> str:

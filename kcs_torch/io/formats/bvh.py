@@ -34,6 +34,7 @@ from kcs_torch.types.size import METRES
 __all__ = ["MOTION_READERS", "WRITERS"]
 
 _NODES = 10_000  # joints of one file
+_NOISE = 1e-6  # of a body's size: what files do not resolve
 _CHANNEL = re.compile(r"([xyz])(position|rotation)\Z", re.IGNORECASE)
 
 
@@ -215,11 +216,11 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
     extra = [name for node, name in enumerate(rig.names) if node not in set(rig.joints)]
     if extra:
         saving.notes.append(f"joints without length were added, which turn single bones: {', '.join(extra)}")
-    told = (
-        f"the file's joints are up to {float(off.max()):.3g} {motion.units or 'units'} from ours "
-        f"({float(off.mean()):.3g} on average)"
-    )
-    limit = 0.01 / METRES[motion.units] if motion.units in METRES else 2e-3 * float(rig.offsets.norm(dim=-1).sum())
+    units, size = motion.units or "units", float(rig.offsets.norm(dim=-1).sum())
+    told = f"the file's joints are up to {float(off.max()):.3g} {units} from ours ({float(off.mean()):.3g} on average)"
+    if float(off.max()) < _NOISE * size:
+        told = f"the file's joints agree: less than {_NOISE * size:.1g} {units} from ours"
+    limit = 0.01 / METRES[motion.units] if motion.units in METRES else 2e-3 * size
     if float(off.max()) > limit:
         saving.warnings.append(f"{told}: BVH has one length for each bone")
     else:

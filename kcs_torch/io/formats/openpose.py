@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kcs_torch.errors import FormatError
+from kcs_torch.errors import FormatError, counted
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.jsonfile import FARTHEST, kind, outline, read_json, short
 from kcs_torch.io.layout import mean_bone
@@ -69,7 +69,9 @@ def _frame_files(probe: Probe, notes: list[str]) -> tuple[Sequence[Path], list[i
         suffixes = sorted({f.suffix or f.name for f in probe.files})
         raise FormatError(f"{probe.path}: expected a folder of OpenPose .json files, got {', '.join(suffixes[:5])}")
     if len(files) < len(probe.files):
-        notes.append(f"{len(probe.files) - len(files)} files that are not .json are left out")
+        others = len(probe.files) - len(files)
+        are = "is" if others == 1 else "are"
+        notes.append(f"{counted(others, 'file')} that {are} not .json {are} left out")
     names = [_NAME.match(f.stem) for f in files]
     prefixes = sorted({m["prefix"] for m in names if m and m["number"]})
     if len(prefixes) > 1:
