@@ -596,6 +596,13 @@ def test_a_rigid_bone_that_changes_its_length_is_named():
     (told,) = [str(w.message) for w in caught if "rigid bones vary" in str(w.message)]
     assert "walking_person: lengths of rigid bones vary: right_elbow-right_wrist by 40 %: joints may" in told
     assert any("right_elbow-right_wrist by 40 %" in note for note in found.notes)
+    weights = CLIP.tracks.weights.clone()
+    weights[:, 16] = 0
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = Stretching()(replace(CLIP.tracks, weights=weights)).diagnostics
+    assert any("never seen" in str(w.message) for w in caught)
+    assert not any("rigid bones vary" in told for told in (*found.notes, *(str(w.message) for w in caught)))
 
 
 def test_joints_in_another_order_are_warned_of():

@@ -189,7 +189,7 @@ class Method(ABC):
         if HEADSTAND in found.notes:
             warnings.warn(f"{tracks.source}: {HEADSTAND}", KcsWarning, stacklevel=users_level())
         wrong = [note for note in found.notes if note.endswith(WHY_LOOSE)]
-        for sentence in wrong if found.converged else what_is_wrong(self, result.points, tracks.skeleton, False):
+        for sentence in wrong if found.converged else what_is_wrong(self, result.points, tracks, False):
             warnings.warn(f"{tracks.source}: {sentence}", KcsWarning, stacklevel=users_level())
 
     def unsettled(self, steps: int) -> str:

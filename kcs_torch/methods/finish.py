@@ -149,20 +149,26 @@ def _rest(method: Method, body: Skeleton) -> str:
 
 
 def what_is_wrong(
-    method: Method, points: Tensor, body: Skeleton, settled: bool = True, lengths: Tensor | None = None
+    method: Method, points: Tensor, tracks: Tracks, settled: bool = True, lengths: Tensor | None = None
 ) -> list[str]:
     """What about points (T, N, 3) tells that they are not the body's, for the user, and why that may be.
 
-    Lengths that vary are no news of a solution that did not settle; a body unlike any is why it does not.
+    Lengths that vary are no news of a solution that did not settle, and none of bones whose ends the tracks never show;
+    a body unlike any is why it does not settle.
     """
-    told = [loose_bones(points, body, lengths) if method.keeps_lengths and settled else ""]
+    body = tracks.skeleton
+    told = [loose_bones(points, body, lengths, tracks.seen.any(0)) if method.keeps_lengths and settled else ""]
     told.append(odd_body(points, body, lengths) if method.knows_template(body) else "")
     return [f"{sentence}: {WHY_LOOSE}" for sentence in told if sentence]
 
 
-def loose_bones(points: Tensor, body: Skeleton, lengths: Tensor | None = None) -> str:
-    """Which rigid bones of points (T, N, 3), of lengths (T, B), change theirs, for the user; empty where none does."""
-    rigid = list(body.rigid)
+def loose_bones(points: Tensor, body: Skeleton, lengths: Tensor | None = None, seen: Tensor | None = None) -> str:
+    """Which rigid bones of points (T, N, 3), of lengths (T, B), change theirs, for the user; empty where none does.
+
+    Only bones between joints that are ``seen`` (N,) count.
+    """
+    ever = [True] * body.num_joints if seen is None else seen.tolist()
+    rigid = [b for b in body.rigid if all(ever[joint] for joint in body.bones[b])]
     if not rigid or not len(points):
         return ""
     bones = (bone_lengths(points, body.bone_index(device=points.device)) if lengths is None else lengths)[:, rigid]
@@ -237,7 +243,7 @@ def _reconstruction(
         notes.append(f"bone lengths vary by {variation.median:.1f} %: '{method.name}' does not hold them constant")
     if upside_down(tracks.points[..., 1], tracks.seen, body, NEARLY_ALL):
         notes.append(HEADSTAND)
-    notes += what_is_wrong(method, points, body, lengths=bones)
+    notes += what_is_wrong(method, points, tracks, lengths=bones)
     if not body.rigid:
         kind = "no bones" if not body.num_bones else "no rigid bones"
         notes.append(f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown")

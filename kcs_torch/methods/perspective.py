@@ -283,7 +283,7 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
     if not k and (little := little_turn(method, body, float(viewpoint_turn(cameras)))):
         notes.append(little)
     if not k:
-        notes.extend(what_is_wrong(method, points, body))
+        notes.extend(what_is_wrong(method, points, tracks))
     notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
     if scene.any_focal:
         notes.append(lens_note(intrinsics, tracks.units))
