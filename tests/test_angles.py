@@ -385,10 +385,34 @@ def test_command_tells_and_writes(saved):
     assert lines[1].split() == ["degrees", "least", "mean", "most", "deviation"]
     knee = result.degrees["left_knee"]
     told = [float(w) for w in next(line for line in lines if line.startswith("left_knee")).split()[1:]]
-    expected = [knee.min(), knee.mean(), knee.max(), result.deviation["left_knee"].mean()]
+    seen = result.seen["left_knee"]
+    knee = knee[seen]
+    expected = [knee.min(), knee.mean(), knee.max(), result.deviation["left_knee"][seen].mean()]
     assert told == pytest.approx([float(v) for v in expected], abs=0.06)
     assert lines[-1] == f"wrote {saved / 'a.csv'}"
     assert len(table_of(saved / "a.csv")) == 9 and len(table_of(saved / "a.csv")[0]) == 10
+
+
+def test_command_leaves_out_frames_that_do_not_show_the_joints(saved):
+    """A result has a place for each; the table holds all of them."""
+    result = walk_result(8)
+    weights = torch.ones_like(result.tracks.weights)
+    weights[2:5, result.skeleton.index("left_ankle")] = 0
+    points = result.points.clone()
+    points[3, result.skeleton.index("left_ankle")] += 1e4
+    kt.save(replace(result, points=points, tracks=replace(result.tracks, weights=weights)), saved / "r.npz")
+    done = run(saved / "r.npz", "--joint", "left_knee", "--joint", "right_knee", "-o", saved / "a.csv")
+    found = kt.io.load_reconstruction(saved / "r.npz").angles()
+    assert found.seen["left_knee"].tolist() == [True] * 2 + [False] * 3 + [True] * 3 and found.seen["right_knee"].all()
+    shown = found.degrees["left_knee"][found.seen["left_knee"]]
+    least, mean, most, _ = (float(word) for word in done.stdout.splitlines()[2].split()[1:])
+    assert (least, mean, most) == pytest.approx((float(shown.min()), float(shown.mean()), float(shown.max())), abs=0.06)
+    assert "note: left out, as a joint is unseen: 3 frames of left_knee\n" in done.stdout
+    assert all(row[2] for row in table_of(saved / "a.csv"))
+    weights[:, result.skeleton.index("left_ankle")] = 0
+    kt.save(replace(result, tracks=replace(result.tracks, weights=weights)), saved / "r.npz")
+    knee = json.loads(run(saved / "r.npz", "--joint", "left_knee", "--json").stdout)["angles"]["left_knee"]
+    assert knee["frames"] == 0 and knee["least"] is None and knee["mean"] is None
 
 
 def test_command_takes_motion_and_joints(saved):

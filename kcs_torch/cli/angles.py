@@ -106,17 +106,19 @@ def _named(words: str) -> str | list[str]:
 
 
 def _facts(found: JointAngles) -> dict[str, dict[str, Any]]:
-    """Of each angle how far it goes, in degrees; NaN where it is never known."""
+    """Of each angle how far it goes in the frames that show its joints, in degrees; NaN where none does."""
     facts = {}
     for name, values in found.degrees.items():
-        known = values[values.isfinite()]
+        seen = found.seen[name] & values.isfinite()
+        known = values[seen]
         least, most = (float(known.amin()), float(known.amax())) if len(known) else (float("nan"),) * 2
-        deviation = None if found.deviation is None else float(found.deviation[name].mean())
+        deviation = None if found.deviation is None else float(found.deviation[name][seen].mean())
         facts[name] = {
             "least": least,
             "mean": float(known.mean()),
             "most": most,
             "deviation": deviation,
+            "frames": len(known),
             "signed": name in found.signed,
         }
     return facts
@@ -134,4 +136,8 @@ def _spoken(found: JointAngles, facts: dict[str, dict[str, Any]], source: str) -
         deviation = "unknown" if row["deviation"] is None else f"{row['deviation']:.1f}"
         numbers = "".join(f"{row[key]:>8.1f}" for key in ("least", "mean", "most"))
         lines.append(f"{name:<{wide}}{numbers}{deviation:>11}")
+    unseen = {name: frames - row["frames"] for name, row in facts.items() if row["frames"] < frames}
+    if unseen:
+        listed = ", ".join(f"{counted(count, 'frame')} of {name}" for name, count in unseen.items())
+        lines.append(f"note: left out, as a joint is unseen: {listed}")
     return "\n".join(lines)

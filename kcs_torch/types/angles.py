@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -37,6 +37,7 @@ class JointAngles:
         signed: names of the hinges whose hyperextension is negative; all others are 0 to 180.
         fps: frames per second, or None where unknown.
         source: where the motion comes from, for messages.
+        seen: (T,) by name: whether all three joints are seen; where they are not, a result's angle is filled in.
     """
 
     degrees: dict[str, Tensor]
@@ -44,6 +45,7 @@ class JointAngles:
     signed: tuple[str, ...] = ()
     fps: float | None = None
     source: str = "angles"
+    seen: dict[str, Tensor] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         frames = len(next(iter(self.degrees.values())))
@@ -66,6 +68,7 @@ def angles_of(
     body: Skeleton,
     joints: Joints | None,
     *,
+    filled_in: bool = False,
     uncertainty: Tensor | None = None,
     fps: float | None = None,
     source: str = "angles",
@@ -77,6 +80,7 @@ def angles_of(
         seen: (T, N).
         body: the skeleton.
         joints: which; all hinges if None.
+        filled_in: whether unseen joints have places, so that their angles are known.
         uncertainty: (T, N) standard deviation along z, or None.
         fps: frames per second.
         source: for messages.
@@ -84,7 +88,9 @@ def angles_of(
     chosen = _chosen(body, joints)
     index = torch.tensor([chain for chain, _ in chosen.values()], device=points.device)
     above, here, below = (points[:, i] for i in index.unbind(-1))
-    axis, known = torch.zeros_like(here), seen[:, index].all(-1)
+    axis, shown = torch.zeros_like(here), seen[:, index].all(-1)
+    known = shown | filled_in
+    seen = seen | filled_in
     filled, ever = interpolate(torch.where(seen[..., None], points, 0), seen), seen.any(0)
     signed = []
     for k, (name, (_, hinge)) in enumerate(chosen.items()):
@@ -98,7 +104,8 @@ def angles_of(
         deviation = _deviation(angle.detach(), upper.detach(), lower.detach(), axis, uncertainty.detach()[:, index])
     columns = torch.where(known, angle.rad2deg(), torch.full_like(angle, math.nan)).unbind(1)
     spread = None if deviation is None else dict(zip(chosen, deviation.rad2deg().unbind(1), strict=True))
-    return JointAngles(dict(zip(chosen, columns, strict=True)), spread, tuple(signed), fps, source)
+    sights = dict(zip(chosen, shown.unbind(1), strict=True))
+    return JointAngles(dict(zip(chosen, columns, strict=True)), spread, tuple(signed), fps, source, sights)
 
 
 def _deviation(angle: Tensor, upper: Tensor, lower: Tensor, axis: Tensor, depths: Tensor) -> Tensor:

@@ -221,18 +221,19 @@ class Reconstruction:
                 180 without a sign; all hinges of the skeleton if None. Names may be spelt in any usual way.
 
         Returns:
-            Degrees by name: that of the joint for a hinge, ``parent-joint-child`` for a triple.
+            Degrees by name: that of the joint for a hinge, ``parent-joint-child`` for a triple. ``seen`` tells the
+            frames whose joints were all seen; in others the angle rests on how the method filled them in.
 
         Raises:
             SkeletonError: there is no such joint.
             OptionError: the skeleton has no hinges, or not this one; a triple is none.
         """
-        seen = torch.ones_like(self.points[..., 0], dtype=torch.bool)
         return angles_of(
             self.points,
-            seen,
+            self.tracks.seen.to(self.points.device),
             self.skeleton,
             joints,
+            filled_in=True,
             uncertainty=self.uncertainty,
             fps=self.fps,
             source=self.tracks.source,
