@@ -377,6 +377,7 @@ def test_a_wrong_call_of_the_script_is_a_line(tmp_path, root, words, told):
     command = [sys.executable, str(root / "scripts" / "reconstruct_many.py"), *words]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 1 and told in done.stderr and "Traceback" not in done.stderr
+    assert {path.name for path in tmp_path.iterdir()} <= {"in", "out"}  # Hydra leaves nothing unasked
 
 
 def test_names_of_results_are_distinct_whatever_clips_are_called(tmp_path):
