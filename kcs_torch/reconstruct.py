@@ -17,6 +17,7 @@ from kcs_torch.methods.uncalibrated import may_be_near, reconstruct_uncalibrated
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.intake import no_bones
+from kcs_torch.types.people import file_and_person
 
 __all__ = ["method_named", "reconstruct", "reconstruct_all", "with_found_bones"]
 
@@ -119,6 +120,9 @@ def reconstruct_all(
         OptionError: as :func:`reconstruct`; or something is not :class:`Tracks`.
         ShapeError: the intrinsics have the wrong shape or values.
 
+    Warns:
+        KcsWarning: as :func:`reconstruct`; or people of one file got lenses of their own.
+
     >>> from kcs_torch.data.synthetic import walking_person
     >>> both = reconstruct_all([walking_person(40).tracks, walking_person(30, yaw=60).tracks], method="kcs")
     >>> [len(one.points) for one in both]
@@ -131,8 +135,10 @@ def reconstruct_all(
         check_tracks(one, f"reconstruct_all: item {i}")
     chosen = method_named(method, fields)
     lens = _lens(intrinsics)
-    if isinstance(lens, Intrinsics) or lens == "auto":
+    if isinstance(lens, Intrinsics):
         return [_before(lens, chosen, one) for one in people]
+    if lens == "auto":
+        return _apart([_before(lens, chosen, one) for one in people])
     if lens == "parallel" or not chosen.turns_over:
         return chosen.many(people)
     with warnings.catch_warnings():
@@ -143,6 +149,26 @@ def reconstruct_all(
             found[i] = reconstruct_uncalibrated(chosen, one, lifted=lifted)
         else:
             chosen._warn(lifted)
+    return _apart(found)
+
+
+def _apart(found: list[Reconstruction]) -> list[Reconstruction]:
+    """The same; the user is told where people of one file got lenses of their own."""
+    clips: dict[str, list[Reconstruction]] = {}
+    for one in found:
+        file, person = one.tracks.source, file_and_person(one.tracks.source)[1]
+        if person:
+            clips.setdefault(file.removesuffix(f", {person}"), []).append(one)
+    for file, people in clips.items():
+        near = sum(one.distance is not None for one in people)
+        if near and len(people) > 1:
+            each = "got a lens and an origin of their own each" if near > 1 else "got a lens and an origin of its own"
+            message = (
+                f"{file}: {near} of {len(people)} people {each}, as the camera seems near: their places and sizes do "
+                "not compare. Give the camera's intrinsics (kcs-torch: --intrinsics FX,FY,CX,CY), or 'parallel', which "
+                "leaves everybody where the image has them"
+            )
+            warnings.warn(message, KcsWarning, stacklevel=users_level())
     return found
 
 

@@ -16,6 +16,7 @@ from samples import walk_result
 from kcs_torch.errors import FormatError, KcsError, SkeletonError
 from kcs_torch.io import archive, load_people, load_reconstruction, load_tracks, save
 from kcs_torch.skeleton import SKELETONS, Skeleton
+from kcs_torch.types import Intrinsics
 
 quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -260,6 +261,7 @@ def solutions():
     facts = replace(best.diagnostics, notes=("the mirror image in depth",), reprojection_rms=2 / 3)
     mirror = replace(best.mirrored(), objective=-100.0, diagnostics=facts)
     other = replace(best, points=best.points + 1 / 3, objective=float("nan"), distance=far, uncertainty=None)
+    other = replace(other, intrinsics=Intrinsics(900.0, 1100.0, 1 / 3, -5.0))
     return replace(best, alternatives=(mirror, replace(other, root_depth=None, lengths=best.lengths / 3)))
 
 
@@ -272,7 +274,7 @@ def test_objective_and_alternatives_come_back_exactly(tmp_path):
             assert same(getattr(theirs, name), getattr(ours, name)), name
         assert repr(theirs.objective) == repr(ours.objective)
         assert repr(theirs.diagnostics) == repr(ours.diagnostics)
-        assert (theirs.method, theirs.units) == (ours.method, ours.units)
+        assert (theirs.method, theirs.units, theirs.intrinsics) == (ours.method, ours.units, ours.intrinsics)
         assert theirs.tracks is back.tracks
 
 
@@ -350,6 +352,7 @@ def test_results_are_tracks_again(tmp_path):
         ("alternatives", np.array(np.nan), "'alternatives': expected how many"),
         ("alternative1_points3d_all", np.zeros((12, 3, 3)), "'alternative1_points3d_all': expected"),
         ("alternative2_diagnostics", np.array("{}"), "'alternative2_diagnostics'"),
+        ("alternative2_intrinsics", np.array([-1.0, 1, 0, 0]), "expected positive focal lengths"),
     ],
 )
 def test_damaged_results_are_told(tmp_path, key, value, message):

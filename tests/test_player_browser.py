@@ -11,6 +11,7 @@ from matplotlib.image import imread
 from samples import walk_result
 
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.types import Intrinsics
 from kcs_torch.viewer import player
 
 EVIL = '</script><script>document.title = "ran"</script><img src=x onerror="document.title = 1">'
@@ -188,6 +189,32 @@ def test_the_mirror_before_a_lens_is_the_librarys(page, result):
     points = near.points.numpy()
     wanted = near.mirrored().points[0].numpy() - np.median(points, axis=(0, 1))
     assert np.allclose(joints(browser), wanted, atol=1e-3 * np.ptp(points))
+
+
+def test_people_before_lenses_of_their_own_stand_side_by_side(page, result):
+    """Mirrored about their own lines of sight; and their images stay where they are."""
+    far = 4 * float(result.points.abs().max())
+    distance = torch.full((40,), far, dtype=torch.float64)
+    lens = Intrinsics(far, far, 0.0, 0.0)
+    space = result.points + torch.nn.functional.pad(distance[:, None, None], (2, 0))
+    people = [
+        replace(
+            result,
+            distance=distance,
+            root_depth=None,
+            alternatives=(),
+            intrinsics=(own := replace(lens, cx=lens.cx + x)),
+            tracks=replace(result.tracks, points=own.project(space)),
+        )
+        for x in (0.0, 900.0)
+    ]
+    browser = page(people)
+    assert np.allclose(joints(browser, 1) - joints(browser, 0), [900, 0, 0], atol=1)
+    click(browser, "mirror")
+    assert np.allclose(joints(browser, 1) - joints(browser, 0), [900, 0, 0], atol=1)
+    click(browser, "mirror")
+    first, second = (np.array(browser.run(f"player.image({k})")).reshape(-1, 2) for k in range(2))
+    assert np.allclose(second - first, [900, 0], atol=1)
 
 
 def test_walk_in_space_adds_the_path(page, result):

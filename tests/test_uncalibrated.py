@@ -150,7 +150,29 @@ def test_several_bodies_as_each_by_itself():
         assert (one.distance is None) == (alone.distance is None)
         assert_close(one.points, alone.points, rtol=0, atol=0.02 * float(alone.points.abs().max()))
     assert both[0].distance is not None and both[1].distance is None
+    found = both[0].intrinsics
+    middle = near.points[near.seen].mean(0)
+    assert abs(found.cx - middle[0]) < 0.2 * found.fx and both[1].intrinsics is None
     assert all(one.distance is None for one in kt.reconstruct_all([near, far], intrinsics="parallel"))
+
+
+def test_people_of_one_file_with_lenses_of_their_own_are_warned_of():
+    """Of clips that have nothing to do with each other nothing is said, nor where all have one lens, or none."""
+    near, far = filmed(frames=30)[0], kt.data.walking_person(30, turn=0.0, yaw=60.0).tracks
+    together = [replace(one, source=f"shots/a, b.json, person {k}") for k, one in enumerate((near, far))]
+
+    def told(people, **options):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            kt.reconstruct_all(people, **options)
+        return [str(one.message) for one in caught if "origin" in str(one.message)]
+
+    (message,) = told([near, *together])
+    assert message.startswith("shots/a, b.json: 1 of 2 people got a lens and an origin of its own")
+    assert "--intrinsics FX,FY,CX,CY" in message and "'parallel'" in message
+    assert told([near, far]) == told(together, intrinsics="parallel") == told(together[:1]) == []
+    assert len(told(together, intrinsics="auto", method="kcs")) == 1
+    assert told(together, intrinsics=(1500, 1500, 500, 500), method="kcs") == []
 
 
 @pytest.mark.parametrize("fps", [30.0, 90.0])

@@ -14,9 +14,10 @@ from samples import walk_result
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.io import save
 from kcs_torch.skeleton import SKELETONS, Skeleton
-from kcs_torch.types import Diagnostics, Reconstruction, Tracks
+from kcs_torch.types import Diagnostics, Intrinsics, Reconstruction, Tracks
 from kcs_torch.viewer import player, sheet
 from kcs_torch.viewer.colours import COLOURS, bone_keys, bone_side, joint_keys
+from kcs_torch.viewer.film import Film
 from kcs_torch.viewer.summary import summarise
 
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)>&amp;\u2028'
@@ -156,6 +157,32 @@ def test_before_a_known_lens_the_projection_is_a_pinholes(result):
     middle = np.median(image.numpy()[result.tracks.seen.numpy()], axis=0)
     assert np.allclose(data["people"][0]["lens"], [900, 1100, 320 - middle[0], 240 - middle[1]], rtol=1e-6, atol=1e-3)
     assert np.allclose(unpack(data["people"][0]["path"]), distance)
+
+
+def test_people_before_lenses_of_their_own_stand_as_in_the_image(result):
+    """Each a metre from a lens whose principal point is the middle of what it sees, in millimetres or metres."""
+    distance = torch.full((12,), 2000.0, dtype=torch.float64)
+
+    def seen_at(x, y, units=1.0):
+        lens = Intrinsics(1000.0, 1000.0, x, y)
+        space = result.points + torch.nn.functional.pad(distance[:, None, None], (2, 0))
+        tracks = replace(result.tracks, points=lens.project(space))
+        return replace(result, points=units * result.points, distance=units * distance, intrinsics=lens, tracks=tracks)
+
+    one, other, small = seen_at(100, 200), seen_at(700, 250), seen_at(700, 250, 1e-3)
+    data = scene(player([one, other]))
+    shifts = [p["shift"] for p in data["people"]]
+    assert np.allclose(shifts, [[200, 400, 0], [1400, 500, 0]])  # a pixel is two units wide there
+    apart = shown(data, person=1) - shown(data, person=0)
+    assert np.allclose(apart, [1200, 100, 0], atol=1e-3 * np.ptp(result.points.numpy()))
+    film = Film([one, other], 1.0)
+    assert np.allclose(film.points[1] - film.points[0], [1200, 100, 0])
+    assert scene(player([one, small]))["people"][1]["shift"] == pytest.approx([1.4, 0.5, 0])
+    for people in ([other], [other, other]):
+        assert all(p["shift"] == [0, 0, 0] for p in scene(player(people))["people"])
+    assert scene(player([result, other]))["people"][0]["shift"] == [0, 0, 0]
+    told = [any("side by side" in e["text"] for e in Page(player([one, k])).all("li")) for k in (other, one)]
+    assert told == [True, False]
 
 
 def test_lost_points_do_not_cost_the_body_its_digits(result):

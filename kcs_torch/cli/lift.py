@@ -104,7 +104,8 @@ def lift(
         typer.Option(
             metavar="NUMBER|all",
             help="Which person, counted from 0, the most visible first; or all: each in a separate file (OUT_0, "
-            "OUT_1), and pages, films and recordings also of all together (OUT).",
+            "OUT_1), and pages, films and recordings also of all together (OUT). Their places in the files compare if "
+            "--intrinsics are given, or parallel.",
         ),
     ] = None,
     fps: Annotated[
@@ -118,7 +119,8 @@ def lift(
         typer.Option(
             metavar="FX,FY,CX,CY|auto|parallel",
             help="Focal lengths and principal point of the camera in pixels; auto: the focal length is found from the "
-            "tracks, if the camera is near (what pkc does unless told otherwise); parallel: the camera is far away.",
+            "tracks, if the camera is near (what pkc does unless told otherwise), for each person separately; "
+            "parallel: the camera is far away, and people are where the image has them.",
             show_default=False,
         ),
     ] = None,

@@ -304,5 +304,6 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
         objective=float(bodies.energy[k]),
         root_depth=root - root[0],
         distance=root,
+        intrinsics=intrinsics,
         alternatives=(),
     ).remeasured()

@@ -15,6 +15,7 @@ from kcs_torch.functional import bone_lengths
 from kcs_torch.functional.ranks import median
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.angles import JointAngles, Joints, angles_of
+from kcs_torch.types.intrinsics import Intrinsics
 from kcs_torch.types.size import size_factor
 from kcs_torch.types.tracks import Tracks
 from kcs_torch.types.variation import BoneVariation, bone_variation
@@ -86,6 +87,7 @@ class Reconstruction:
         alternatives: further solutions of the same tracks, best first: the mirror image, limbs flipped in depth.
         distance: (T,) depth of the body's middle before a camera of known intrinsics, or None. Then x and y are the
             camera's, and :meth:`in_space` projects onto the image; the unit is one pixel at the mean distance.
+        intrinsics: of this camera, as they were given or found.
     """
 
     points: Tensor
@@ -101,6 +103,7 @@ class Reconstruction:
     root_depth: Tensor | None = None
     alternatives: tuple[Reconstruction, ...] = ()
     distance: Tensor | None = None
+    intrinsics: Intrinsics | None = None
 
     def __post_init__(self) -> None:
         if not self.units:

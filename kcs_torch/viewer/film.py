@@ -13,6 +13,7 @@ from kcs_torch.types.people import files_named
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.draw import new_figure
 from kcs_torch.viewer.names import person_names, printable
+from kcs_torch.viewer.together import points_together
 
 __all__ = ["Film"]
 
@@ -32,7 +33,7 @@ class Film:
         total = max(len(r.points) for r in people)
         self.fps = next((r.fps for r in people if r.fps), None)
         self.total, self.faster = total, faster
-        self.points = [r.points.detach().cpu().double().numpy() for r in people]
+        self.points = points_together(people)
         seen = [r.tracks.seen.cpu().numpy() for r in people]
         tracks = [r.tracks.points.detach().cpu().double().numpy() for r in people]
         self.tracks = [np.where(s[..., None], x, np.nan) for x, s in zip(tracks, seen, strict=True)]

@@ -79,6 +79,8 @@ def _notes(people: Sequence[Reconstruction], data: dict[str, Any]) -> list[str]:
     notes = []
     if len(people) > 1:
         notes.append("how far people stand behind each other is not known: each is at a depth of its own")
+        if any(any(person["shift"]) for person in data["people"]):
+            notes.append("lenses were found for each person separately: they stand side by side as in the image")
     told = [list(dict.fromkeys((*r.diagnostics.notes, *r.tracks.notes))) for r in people]
     common = shared(told)
     for one, person in zip(told, data["people"], strict=True):

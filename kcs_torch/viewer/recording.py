@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.types import Reconstruction
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.names import clip_rate, person_names, printable
+from kcs_torch.viewer.together import points_together
 
 __all__ = ["need_rerun", "save_recording"]
 
@@ -43,8 +45,8 @@ def save_recording(results: Reconstruction | Sequence[Reconstruction], path: str
     try:
         recording.save(str(path), default_blueprint=rrb.Blueprint(layout, collapse_panels=True))
         recording.log("space", rr.ViewCoordinates.RDF, static=True)
-        for name, result in zip(person_names(people), people, strict=True):
-            _log(recording, rr, name, result)
+        for name, result, points in zip(person_names(people), people, points_together(people), strict=True):
+            _log(recording, rr, name, result, points)
         recording.flush()
         recording.disconnect()
     except (OSError, RuntimeError) as error:
@@ -65,9 +67,8 @@ def need_rerun() -> tuple[Any, Any]:
     return rr, rrb
 
 
-def _log(recording: Any, rr: Any, name: str, result: Reconstruction) -> None:
+def _log(recording: Any, rr: Any, name: str, result: Reconstruction, points: NDArray[np.float64]) -> None:
     body = result.skeleton
-    points = result.points.detach().cpu().double().numpy()
     seen = result.tracks.seen.cpu().numpy()
     places = result.tracks.points.detach().cpu().double().numpy()
     bones = body.bone_index().numpy()

@@ -17,6 +17,7 @@ from kcs_torch.types.intake import FARTHEST
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.names import clip_rate, person_names
 from kcs_torch.viewer.summary import summarise
+from kcs_torch.viewer.together import beside, points_together
 
 __all__ = ["MOST_NUMBERS", "scene_of"]
 
@@ -47,7 +48,8 @@ def scene_of(results: Sequence[Reconstruction], names: Sequence[str] | None = No
         raise OptionError(f"player: expected {len(results)} names, got {len(names)}")
     total = max(len(r.points) for r in results)
     step = max(1, math.ceil(sum(map(_numbers, results)) / MOST_NUMBERS))
-    finite = [p[np.isfinite(p).all(-1)] for p in map(_points, results)]
+    shifts = beside(results)
+    finite = [p[np.isfinite(p).all(-1)] for p in points_together(results)]
     for name, known in zip(names, finite, strict=True):
         if not len(known):
             raise OutputError(f"{name}: an HTML page needs at least one joint at a finite place")
@@ -65,7 +67,8 @@ def scene_of(results: Sequence[Reconstruction], names: Sequence[str] | None = No
         "middle": middle.tolist(),
         "colours": COLOURS,
         "people": [
-            _person(r, n, slice(None, None, step), middle, middle2d) for r, n in zip(results, names, strict=True)
+            _person(r, n, slice(None, None, step), middle, middle2d, shift)
+            for r, n, shift in zip(results, names, shifts, strict=True)
         ],
     }
 
@@ -81,8 +84,11 @@ def _numbers(result: Reconstruction) -> int:
     return frames * (joints * (3 * solutions + 4) + 6 * solutions + 8)
 
 
-def _person(result: Reconstruction, name: str, frames: slice, middle: Array, middle2d: Array) -> dict[str, Any]:
-    body, tracks = result.skeleton, result.tracks
+def _person(
+    result: Reconstruction, name: str, frames: slice, middle: Array, middle2d: Array, shift: Array
+) -> dict[str, Any]:
+    """One of the people, whose points are to be shifted and are told about the scene's middle."""
+    body, tracks, middle = result.skeleton, result.tracks, middle - shift
     weights = tracks.weights.detach().cpu().double().numpy()[frames]
     places = tracks.points.detach().cpu().double().numpy()[frames] - middle2d
     path = result.root_depth if result.distance is None else result.distance
@@ -90,6 +96,7 @@ def _person(result: Reconstruction, name: str, frames: slice, middle: Array, mid
     return {
         "name": name,
         "summary": summarise(result),
+        "shift": shift.tolist(),
         "frames": len(weights),
         "joints": list(body.joints),
         "sides": joint_keys(body),

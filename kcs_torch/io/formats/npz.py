@@ -7,7 +7,7 @@ Tracks are ``points2d`` (T, N, 2) with NaN where unseen, ``confidence`` (T, N), 
 - ``points3d_all`` (T, M, 3) and ``joint_names_all`` (M,): with the virtual joints, which come last; ``bones`` (B, 2)
   are (parent, child) indices into them and ``lengths`` (B,) their lengths;
 - ``cameras`` (T, 2, 3), ``scales`` (T,), ``units3d``, ``method``, ``objective``, and where they are known
-  ``uncertainty`` (T, M), ``root_depth`` (T,) and ``distance`` (T,);
+  ``uncertainty`` (T, M), ``root_depth`` (T,), ``distance`` (T,) and ``intrinsics`` (fx, fy, cx, cy);
 - ``skeleton``, ``diagnostics`` and ``notes`` as JSON text;
 - ``alternatives``, how many other solutions there are, best first: what belongs to number 1 begins with
   ``alternative1_`` (``alternative1_points3d_all``, ...). Tracks and skeleton are those of the result.
@@ -35,7 +35,7 @@ from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, Saving, Writer
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types import Diagnostics, Motion, Reconstruction, Tracks
+from kcs_torch.types import Diagnostics, Intrinsics, Motion, Reconstruction, Tracks
 from kcs_torch.types.axes import AXES, from_y_up
 
 __all__ = ["MOTION_READERS", "READERS", "WRITERS", "load_reconstruction"]
@@ -154,6 +154,8 @@ def _solution_out(result: Reconstruction) -> dict[str, Any]:
         "objective": np.float64(result.objective),
         "diagnostics": np.array(json.dumps(_diagnostics_out(result.diagnostics))),
     }
+    if result.intrinsics is not None:
+        arrays["intrinsics"] = np.array(dataclasses.astuple(result.intrinsics), np.float64)
     maybe = {"uncertainty": result.uncertainty, "root_depth": result.root_depth, "distance": result.distance}
     return arrays | {key: plain(value) for key, value in maybe.items() if value is not None}
 
@@ -244,9 +246,17 @@ def _solution_in(file: Archive, tracks: Tracks, prefix: str = "") -> Reconstruct
         uncertainty=maybe("uncertainty", t, m),
         root_depth=maybe("root_depth", t),
         distance=maybe("distance", t),
+        intrinsics=None if (lens := maybe("intrinsics", 4)) is None else _lens_in(file, lens),
         units=file.text(prefix + "units3d") if prefix + "units3d" in file else "",
         objective=file.number(prefix + "objective") if prefix + "objective" in file else math.nan,
     )
+
+
+def _lens_in(file: Archive, values: Tensor) -> Intrinsics:
+    try:
+        return Intrinsics(*values.tolist())
+    except KcsError as error:
+        raise FormatError(f"{file.path}: {error}") from None
 
 
 def read_motion(path: Path, options: MotionOptions) -> Motion:

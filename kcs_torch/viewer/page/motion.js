@@ -21,6 +21,7 @@ const TRUNKS = [data.colours.centre, "#009e73", "#b5548f", "#b98300", "#56b4e9"]
 people.forEach((person, k) => {
   person.number = k;
   person.chosen = 0;
+  person.middle = data.middle.map((m, a) => m - person.shift[a]);  // where its own origin is
   person.count = person.joints.length;
   person.colours = { ...data.colours, centre: TRUNKS[k % TRUNKS.length] };
   for (const key of ["path", "fit", "tracks", "weights", "spread"]) if (person[key]) person[key] = unpack(person[key]);
@@ -34,7 +35,7 @@ people.forEach((person, k) => {
 const place = (person, t) => {
   const { points, centres } = person.solutions[person.chosen], n = person.count, out = new Float64Array(3 * n);
   for (let i = 0; i < 3 * n; i++) out[i] = points[3 * n * t + i] + centres[3 * t + i % 3];
-  const [mx, my, mz] = data.middle, far = person.lens ? person.path[t] : 0;
+  const [mx, my, mz] = person.middle, far = person.lens ? person.path[t] : 0;
   for (let i = 0; i < 3 * n; i += 3) {
     if (state.mirror && person.lens) {  // each joint moves along its ray
       const depth = out[i + 2] + mz, near = Math.max(far - depth, 0.01 * far), ratio = near / (far + depth);
@@ -51,7 +52,7 @@ const place = (person, t) => {
 
 // Where the camera sees those joints in the image: [x, y] one after another.
 const project = (person, t, joints) => {
-  const out = new Float64Array(2 * person.count), [mx, my, mz] = data.middle;
+  const out = new Float64Array(2 * person.count), [mx, my, mz] = person.middle;
   const shift = person.lens ? person.path[t] - (state.walk ? person.path[t] - person.home : 0) : 0;
   for (let j = 0; j < person.count; j++) {
     const x = joints[3 * j], y = joints[3 * j + 1];

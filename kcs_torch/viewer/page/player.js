@@ -153,5 +153,6 @@ document.querySelectorAll("canvas").forEach(canvas => resized.observe(canvas));
 window.player = {
   state, show, play: () => setPlaying(true), pause: () => setPlaying(false),
   joints: k => Array.from(place(people[k], state.frame)),
+  image: k => Array.from(project(people[k], state.frame, place(people[k], state.frame))),
   spots: () => spots.map(({ x, y, person, joint }) => ({ x, y, name: person.joints[joint] })),
 };
