@@ -405,9 +405,9 @@ def test_view_writes_beside_the_result(lifted, tmp_path):
 
 
 def test_view_of_tracks_says_what_it_wants(shared, tmp_path):
-    tracks = shared / "data" / "cmu" / "cmu_35_01.npz"
+    tracks = shared / "data" / "video2d" / "mediapipe_dancer.npz"
     done = run("view", tracks, "-o", tmp_path / "a.html", code=2)
-    assert done.stderr.startswith("error: ") and "cmu_35_01.npz" in done.stderr
+    assert done.stderr.startswith("error: ") and "mediapipe_dancer.npz: expected a result" in done.stderr
     assert not list(tmp_path.iterdir())
 
 

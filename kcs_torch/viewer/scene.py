@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import OptionError, OutputError
-from kcs_torch.metrics.solutions import EXACT, MIRRORED
 from kcs_torch.types import Reconstruction
 from kcs_torch.types.intake import FARTHEST
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
@@ -25,6 +24,7 @@ MOST_NUMBERS = 3_000_000
 """A page holds no more numbers than this, of two bytes each: about 8 MB as text. Longer clips show every n-th frame."""
 
 LOST = 4.0  # points this many times farther from the body's middle than 99.5 % of them are drawn at that distance
+MIRRORED, EXACT = 0.3, 1e-3  # as of kcs_torch.metrics.difference
 WHOLE = 32767  # of 16-bit integers; -32768 stands for NaN
 Array = NDArray[np.float64]
 
