@@ -286,6 +286,18 @@ def test_closing_ends_the_thread_and_keeps_the_window(clip):
         tracker.update(frames[0])
 
 
+def test_the_direction_in_which_bones_are_written_changes_nothing(clip):
+    body = kt.SKELETONS["coco17"]
+    other = replace(body, bones=tuple(b[::-1] for b in body.bones))
+    fields = {"fps": 30, "window": 24, "method": kt.PKC(steps=2, rounds=0)}
+    found = []
+    for skeleton in (body, other):
+        with kt.Tracker(skeleton, **fields) as tracker:
+            found.append(torch.stack([p.points for p in follow(tracker, observed(clip)[:40])]))
+            assert tracker.tracks().skeleton == skeleton
+    torch.testing.assert_close(*found)
+
+
 def test_bad_options():
     for options in ({"fps": 0}, {"fps": "fast"}, {"window": 3}, {"period": 0.5}, {"threshold": 2}, {"method": "kcs"}):
         with pytest.raises(kt.OptionError, match=next(iter(options))):

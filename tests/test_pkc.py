@@ -9,7 +9,7 @@ import torch
 from numerics import count_operations, normal
 from torch.testing import assert_close
 
-from kcs_torch import PKC, SKELETONS, ConvergenceWarning, KcsWarning, OptionError, SfAM, Skeleton, Tracks
+from kcs_torch import PKC, SKELETONS, ConvergenceWarning, KcsWarning, OptionError, SfAM, Skeleton, Tracks, reconstruct
 from kcs_torch.clean import resample, smooth
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import (
@@ -814,6 +814,19 @@ def test_several_clips_at_once():
         assert_close(one.objective, alone.objective, rtol=1e-2, atol=0.5)
         assert len(one.alternatives) == len(alone.alternatives)
     assert method.many([]) == []
+
+
+@pytest.mark.parametrize(
+    ("flipped", "frames", "lens"), [({2}, 14, "parallel"), (range(16), 14, "parallel"), ({2}, 3, (1500, 1500, 0, 0))]
+)
+def test_the_direction_in_which_bones_are_written_changes_nothing(flipped, frames, lens):
+    tracks = walking_person(frames, yaw=60.0).tracks
+    body = tracks.skeleton
+    other = replace(body, bones=tuple(b[::-1] if i in flipped else b for i, b in enumerate(body.bones)))
+    usual, found = (reconstruct(replace(tracks, skeleton=s), intrinsics=lens, steps=4, rounds=0) for s in (body, other))
+    assert found.skeleton == found.tracks.skeleton == other
+    assert_close(found.points, usual.points, rtol=0, atol=1e-6 * float(usual.points.abs().max()))
+    assert_close(found.lengths, usual.lengths)
 
 
 @pytest.mark.parametrize("width", [1.0, 3.0])

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from kcs_torch.functional import bone_vectors
 from kcs_torch.methods.pkc import placing as module
-from kcs_torch.methods.pkc.limbs import SignCosts, limbs_of, waves
+from kcs_torch.methods.pkc.limbs import SignCosts, limbs_of, outward, waves
 from kcs_torch.methods.pkc.placing import limb_paths, placing
 from kcs_torch.methods.pkc.trunk import mirror, trunk_turns
 from kcs_torch.nn import PostureEnergy
@@ -40,6 +40,25 @@ def test_limbs_hold_every_bone_beyond_the_trunk_once(body):
         if limb.entry is not None:
             assert body.bones[limb.before][1] == body.bones[limb.bones[0]][0] == limb.entry.joint
     assert {h for limb in limbs for h in (limb.inner, limb.entry)} - {None} == set(body.hinges)
+
+
+def turned(body, bones):
+    """The skeleton with some of its bones written (child, parent)."""
+    return replace(body, bones=tuple(b[::-1] if i in bones else b for i, b in enumerate(body.bones)))
+
+
+@each_skeleton
+def test_bones_are_directed_away_from_the_trunk_however_they_are_written(body):
+    assert outward(body) is body
+    assert outward(turned(body, range(body.num_bones))) == body
+    trunk = trunk_joints(body)
+    for i in range(body.num_bones):
+        other = turned(body, {i})
+        assert trunk_joints(other) == trunk
+        assert outward(other) == body or set(body.bones[i]) <= set(trunk)
+        found = limbs_of(outward(other), trunk)
+        assert {limb.bones for limb in found} == {limb.bones for limb in limbs_of(body, trunk)}
+    assert outward(CHAIN) is CHAIN
 
 
 def test_arms_and_legs_of_a_person():

@@ -17,6 +17,7 @@ from kcs_torch.live.frame import Sight, take_frame
 from kcs_torch.live.pose import Chain, LivePose
 from kcs_torch.live.solve import Solution, solve_window
 from kcs_torch.methods.pkc import PKC
+from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Reconstruction, Tracks
@@ -121,13 +122,13 @@ class Tracker:
         self.units, self.threshold, self.wait = units, least, bool(wait)
         self.method = PKC() if method is None else method
         self._filter: BodyFilter | ChainFilter
-        early = EARLY
+        self._body, early = outward(body), EARLY
         if len(trunk_joints(body)) >= 3:
-            self._filter, self._delay = BodyFilter(body, rate), DELAY
+            self._filter, self._delay = BodyFilter(self._body, rate), DELAY
         else:
-            self._filter, early, self._delay = ChainFilter(body, rate), EARLY[-1:], 1.0
+            self._filter, early, self._delay = ChainFilter(self._body, rate), EARLY[-1:], 1.0
         self._early = [min(max(LEAST, round(share * window)), window) for share in early]
-        self._chain = Chain(body, self._filter.body, rate)
+        self._chain = Chain(self._body, self._filter.body, rate)
         self._thread = ThreadPoolExecutor(1, "kcs_torch.live")
         self._closed = False
         self._frame = -1
@@ -236,7 +237,7 @@ class Tracker:
             if not self._due:
                 self._due.append(self._frame + self.period)
             image, weights = torch.stack(list(self._image)), torch.stack(list(self._weights))
-            self._solving = self._thread.submit(solve_window, self.method, self.skeleton, image, weights, self.fps)
+            self._solving = self._thread.submit(solve_window, self.method, self._body, image, weights, self.fps)
             self._asked = self._frame
             self._ready = self._frame + max(1, round(self._delay * len(image)))
 

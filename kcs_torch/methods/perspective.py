@@ -16,6 +16,7 @@ from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.finish import HARDLY, WHY_LOOSE, little_turn, what_is_wrong
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
+from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
 from kcs_torch.methods.scene import BLOCK, Bodies, Scene, ahead
 from kcs_torch.methods.sfam import SfAM
@@ -222,7 +223,7 @@ def _refine(
     unit = unit or own
     scales = slow_part(lifted.scales.clamp_min(1e-9).log()[:, None], rate)[:, 0].exp()  # a method's own may jump
     noise = image_noise(lifted, flat, own, rate)
-    scene = Scene(lifted.skeleton, rays, noise, rate, unit, standing)
+    scene = Scene(outward(lifted.skeleton), rays, noise, rate, unit, standing)
     parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / own
     if parallax < FLAT or not lifted.skeleton.num_bones:
         energy = start.new_tensor([o.objective for o in others])

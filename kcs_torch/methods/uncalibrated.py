@@ -17,6 +17,7 @@ from kcs_torch.methods.perspective import WIDE, feet_on_ground, reconstruct_pers
 from kcs_torch.methods.pinhole import PinholeEnergy
 from kcs_torch.methods.pinhole_coordinates import USUAL, unusual
 from kcs_torch.methods.pkc import PKC
+from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.view import View, lens_note
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -138,7 +139,7 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
         depth = (depth - depth.mean(-1, keepdim=True)).expand(2, -1, -1)
         standing = None if feet is None else feet[some]
         energy = PinholeEnergy(
-            tracks.skeleton, view.rays, path, depth, rate, noise[some], standing=standing, focal=lens
+            outward(tracks.skeleton), view.rays, path, depth, rate, noise[some], standing=standing, focal=lens
         )
 
         def distance(state: Tensor) -> float:

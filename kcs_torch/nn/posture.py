@@ -15,6 +15,7 @@ from kcs_torch.nn.layers import SkeletonModule, check_beside, full_precision, na
 from kcs_torch.nn.lengths import LEAST, usual_size
 from kcs_torch.nn.masks import bone_share, known_points, safe_root, some, weighs_joints
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.skeleton.graph import find_pieces
 
 __all__ = ["PostureEnergy", "trunk_joints"]
 
@@ -223,16 +224,11 @@ class PostureEnergy(SkeletonModule):
 
 
 def trunk_joints(skeleton: Skeleton) -> list[int]:
-    """Joints that bones of little spread connect to the root; none without a template or spreads."""
+    """Joints of the largest piece that bones of little spread hold together; none without a template or spreads."""
     if skeleton.template is None or skeleton.spread is None or not skeleton.is_tree:
         return []
-    children = {b for _, b in skeleton.bones}
-    trunk = {next(a for a, _ in skeleton.bones if a not in children)}
-    for _ in skeleton.bones:
-        trunk |= {
-            b for (a, b), s in zip(skeleton.bones, skeleton.spread, strict=True) if a in trunk and s < TRUNK_SPREAD
-        }
-    return sorted(trunk)
+    firm = [bone for bone, s in zip(skeleton.bones, skeleton.spread, strict=True) if s < TRUNK_SPREAD]
+    return max(find_pieces(skeleton.num_joints, firm), key=len)
 
 
 def _hinge_facts(body: Skeleton, rest: Tensor) -> tuple[Tensor, set[int]]:

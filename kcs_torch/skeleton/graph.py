@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-__all__ = ["find_cycle", "find_parts", "find_pieces", "find_twins"]
+__all__ = ["direct_bones", "find_cycle", "find_parts", "find_pieces", "find_twins"]
 
 Pair = tuple[int, int]
 
@@ -29,6 +29,22 @@ def find_pieces(num_joints: int, bones: Sequence[Pair]) -> list[list[int]]:
     for i in range(num_joints):
         groups.setdefault(find(i), []).append(i)
     return sorted(groups.values())
+
+
+def direct_bones(bones: Sequence[Pair], root: int) -> list[Pair]:
+    """Return the bones of a tree, in their order, each directed away from a joint.
+
+    >>> direct_bones([(0, 1), (2, 1)], root=0)
+    [(0, 1), (1, 2)]
+    """
+    reached, out = {root}, dict(enumerate(bones))
+    for _ in bones:
+        for i, (a, b) in out.items():
+            if b in reached and a not in reached:
+                out[i] = b, a
+            if a in reached or b in reached:
+                reached |= {a, b}
+    return list(out.values())
 
 
 def find_cycle(num_joints: int, bones: Sequence[Pair]) -> list[int] | None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Hinge, Skeleton
+from kcs_torch.skeleton.graph import direct_bones
 
-__all__ = ["Limb", "SignCosts", "limbs_of", "waves"]
+__all__ = ["Limb", "SignCosts", "limbs_of", "outward", "waves"]
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,34 @@ def waves(limbs: Sequence[Limb]) -> list[list[Limb]]:
     return [out[key] for key in sorted(out)]
 
 
+def outward(skeleton: Skeleton) -> Skeleton:
+    """The skeleton with its bones directed away from a joint of its trunk, if it has one, whichever way they were.
+
+    This joint is one of no side, from which hinges' bones lead outwards; of several, that which turns the fewest bones,
+    or leaves the fewest: where bones run (parent, child) the skeleton comes back itself.
+    """
+    trunk = trunk_joints(skeleton)
+    if len(trunk) < 3:
+        return skeleton
+    hinged = {bone for hinge in skeleton.hinges for bone in hinge.bones}
+    given = set(skeleton.bones)
+
+    def cost(root: int) -> tuple[int, bool, int]:
+        bones = direct_bones(skeleton.bones, root)
+        turned = len(given.difference(bones))
+        return len(hinged.difference(bones)), skeleton.side(root) != "centre", min(turned, len(given) - turned)
+
+    bones = tuple(direct_bones(skeleton.bones, min(trunk, key=cost)))
+    return skeleton if bones == skeleton.bones else replace(skeleton, bones=bones)
+
+
 def limbs_of(skeleton: Skeleton, trunk: list[int]) -> list[Limb]:
-    """Chains of one or two bones that reach every joint beyond the trunk, nearer ones first; hinges join two bones."""
+    """Chains of one or two bones that reach every joint beyond the trunk, nearer ones first; hinges join two bones.
+
+    Args:
+        skeleton: whose bones are directed outwards.
+        trunk: its joints.
+    """
     bones = skeleton.bones
     arrives = {b: i for i, (_, b) in enumerate(bones)}
     order, queue = [], list(trunk)

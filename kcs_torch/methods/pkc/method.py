@@ -22,6 +22,7 @@ from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of
 from kcs_torch.methods.pkc.gate import without_others
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
+from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
 from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights, settled
 from kcs_torch.methods.pkc.moving_view import searching as turning
@@ -143,6 +144,7 @@ class PKC(Method):
         return run(together([self._steps(one, None) for one in tracks]), serve)
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
+        tracks = replace(tracks, skeleton=outward(tracks.skeleton))
         points, noise, notes = yield from cleaned(tracks, self.denoise, self.knows_template(tracks.skeleton))
         standing = standing_feet(replace(tracks, points=points))
         image = points - points.mean(-2, keepdim=True)
