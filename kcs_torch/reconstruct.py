@@ -12,7 +12,7 @@ from kcs_torch.errors import KcsWarning, OptionError, ShapeError, unknown, users
 from kcs_torch.methods import METHODS
 from kcs_torch.methods.base import Method, check_tracks
 from kcs_torch.methods.found import find_skeleton
-from kcs_torch.methods.perspective import reconstruct_perspective
+from kcs_torch.methods.perspective import WIDE, reconstruct_perspective
 from kcs_torch.methods.uncalibrated import may_be_near, reconstruct_uncalibrated
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
@@ -202,6 +202,12 @@ def _before(lens: Intrinsics | str | None, method: Method, tracks: Tracks, camer
         found = reconstruct_perspective(method, tracks, lens, cameras) if inside else None
         if found is None or not bool(found.points.isfinite().all()):
             frame = int(off.argmax())
+            if float(off[frame]) < WIDE:
+                raise OptionError(
+                    f"{tracks.source}: intrinsics: no finite motion is found before such a camera: correct them, leave "
+                    "out frames that show hardly anything of the body, or take rays to be parallel "
+                    "(intrinsics='parallel')"
+                )
             raise OptionError(
                 f"{tracks.source}: intrinsics: expected tracks that such a camera sees: in frame {frame} a joint lies "
                 f"{float(off[frame]):.3g} focal lengths off the optical axis, so that no finite motion is found. Leave "

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import sys
 import warnings
 from dataclasses import dataclass, replace
 
@@ -397,6 +398,30 @@ def test_a_frame_far_beside_the_camera_is_told(method, factor):
     points[5] *= factor
     with pytest.raises(kt.OptionError, match="in frame 5 a joint lies .* focal lengths off the optical axis"):
         reconstruct(replace(tracks, points=points), method=method, intrinsics=(500.0, 500.0, 0.0, 0.0))
+
+
+def test_solutions_that_are_not_finite_are_dropped(monkeypatch):
+    real = perspective._refine
+
+    def refined(*given, **options):
+        found = real(*given, **options)
+        found.bodies.distance[1:] = torch.nan
+        return found
+
+    tracks, _ = filmed(frames=8)
+    given = {"intrinsics": LENS, "method": "pkc", "steps": 3, "rounds": 0, "alternatives": 2}
+    assert reconstruct(tracks, **given).alternatives
+    monkeypatch.setattr(perspective, "_refine", refined)
+    assert reconstruct(tracks, **given).alternatives == ()
+
+
+def test_no_angle_is_blamed_where_all_are_small(monkeypatch):
+    tracks, _ = filmed(frames=3)
+    lost = reconstruct(tracks, method="sfam")
+    lost = replace(lost, points=lost.points * torch.nan)
+    monkeypatch.setattr(sys.modules["kcs_torch.reconstruct"], "reconstruct_perspective", lambda *given: lost)
+    with pytest.raises(kt.OptionError, match="no finite motion.*'parallel'"):
+        kt.reconstruct(tracks, intrinsics=LENS)
 
 
 def test_a_focal_length_in_another_unit_is_told():

@@ -46,6 +46,18 @@ def test_gaps_and_outliers_do_not_change_the_size():
     torch.testing.assert_close(found.path, size / size.mean(), rtol=0.03, atol=0)
 
 
+def test_the_size_stays_where_nothing_is_seen_any_more_and_goes_straight_on_between():
+    clip = walking_person(60, turn=0, yaw=20)
+    image, _ = grown(clip, 1.5)
+    seen = torch.ones(image.shape[:2], dtype=torch.bool)
+    seen[15:25] = seen[40:] = False
+    path, _ = size_path(image, seen, clip.skeleton, 5.0)
+    torch.testing.assert_close(path[40:], path[39].expand(20))
+    slope = path.log().diff()[14:25]
+    torch.testing.assert_close(slope, slope.mean().expand(11))
+    assert 1.15 < float(path.amax() / path.amin()) < 1.45  # of 1.32 in the frames that are seen
+
+
 def test_clips_together_as_alone():
     """Of many lengths, rates and skeletons; one with a joint that is never seen, one that shows nobody, one frame."""
     clips = []

@@ -250,6 +250,8 @@ def _assemble(method: Method, tracks: Tracks, found: _Found) -> Reconstruction:
     bodies, unit = found.bodies, found.scene.unit
     keep: list[int] = []
     for k, depth in enumerate(bodies.depth):
+        if keep and not bool(depth.isfinite().all() & bodies.distance[k].isfinite().all()):
+            continue
         apart = [float((depth - bodies.depth[j]).square().mean().sqrt()) for j in keep]
         if len(keep) <= max(1, len(found.lifted[0].alternatives)) and all(a > APART * unit for a in apart):
             keep.append(k)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.clips import Clips, in_batches, padded
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
@@ -125,10 +126,19 @@ def _paths(
     use = (weight.sum(1, keepdim=True) >= 3) & (top > 0)
     weight = weight * use
     value = (length / torch.where(use, top, 1)).clamp_min(0.05).log()
+    waves = _told(waves, weight.sum(-1) > 0, counts)
     _, plain = _regress(value, weight, waves[..., :0])
     path, spread = _regress(value, weight, waves)
     mean = path.sum(1) / torch.tensor(counts, dtype=path.dtype, device=path.device)
     return (path - mean[:, None]).exp(), torch.where(use[:, 0], 1 - spread / plain, 0)
+
+
+def _told(waves: Tensor, told: Tensor, counts: Sequence[int]) -> Tensor:
+    """Waves (K, T, W), straight over frames of which nothing is told (K, T), and constant where a clip ends so."""
+    held = interpolate(waves[..., None, :], told[..., None])[..., 0, :]
+    time = torch.arange(waves.shape[1], device=waves.device)
+    inside = time < torch.tensor(counts, device=waves.device)[:, None]
+    return torch.where(inside[..., None], held, 0)
 
 
 def _regress(value: Tensor, weight: Tensor, waves: Tensor, steps: int = 40) -> tuple[Tensor, Tensor]:
