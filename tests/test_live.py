@@ -1,5 +1,6 @@
 """The live mode: one frame at a time, causal, of bounded memory, and near the offline method."""
 
+import math
 import threading
 import time
 from dataclasses import replace
@@ -296,6 +297,17 @@ def test_the_direction_in_which_bones_are_written_changes_nothing(clip):
             found.append(torch.stack([p.points for p in follow(tracker, observed(clip)[:40])]))
             assert tracker.tracks().skeleton == skeleton
     torch.testing.assert_close(*found)
+
+
+def test_bones_that_have_not_been_seen_leave_no_nan():
+    lost = [math.nan, math.nan]
+    with kt.Tracker(kt.Skeleton(["a", "b", "c"], [(0, 1), (1, 2)]), fps=30) as tracker:
+        first = tracker.update([[1.0, 2.0], lost, lost])
+        two = tracker.update([[1.0, 2.0], lost, [3.0, 3.0]])
+        all_seen = tracker.update([[1.0, 2.0], [2.0, 4.0], [3.0, 3.0]])
+    assert bool(first.uncertainty.isinf().all()) and bool(first.points.isfinite().all())
+    for pose in (two, all_seen):
+        assert bool(pose.uncertainty.isfinite().all()) and bool((pose.uncertainty > 0).all())
 
 
 def test_bad_options():

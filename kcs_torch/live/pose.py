@@ -31,7 +31,8 @@ class LivePose:
         frame: its number, from 0.
         points: (N, 3) in the camera frame, in the units of the tracks: x and y in the image, depth relative to the
             body's middle. NaN until a joint has been seen.
-        uncertainty: (N,) standard deviation of the depths, in the same units; infinite until a joint has been seen.
+        uncertainty: (N,) standard deviation of the depths, in the same units; infinite until a joint, or
+            without a template a bone, has been seen.
         seen: (N,) bool, False where a joint is placed by prediction.
         ready: whether the body's bone lengths have been found; before, they are the template's.
         delay: frames since the window ended from which the bone lengths come; -1 before there is one.
@@ -84,7 +85,7 @@ class Chain:
         return (points - points.mean(0) + middle) / shape.factor
 
     def deviation(self, dz: Tensor, shape: Shape, doubt: Tensor, age: Tensor, found: bool) -> Tensor:
-        """Standard deviation of the joints' depths (N,), in the tracks' units.
+        """Standard deviation of the joints' depths (N,), in the tracks' units; infinite while no bone has a length.
 
         Args:
             dz: (B,) depths of the bones, in the template's units.
@@ -94,6 +95,10 @@ class Chain:
             found: whether the bones' lengths have been found.
         """
         length = shape.lengths
+        known = length > 0  # of a body without a template bones that have not been seen have no length
+        if not bool(known.any()):
+            return torch.full_like(age, torch.inf)
+        length = torch.where(known, length, length[known].mean())
         off = length * (FOUND if found else USUAL) / (dz.abs() / length).clamp_min(FLAT)
         variance = self.tree.square() @ (off.square() + doubt * (2 * dz).square())
         variance = variance + (age * (DRIFT / self.fps)).clamp_max(FARTHEST).square()
