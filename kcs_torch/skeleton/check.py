@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+from kcs_torch.anatomy import Hinge
 from kcs_torch.errors import SkeletonError
 from kcs_torch.skeleton.parse import index_pairs
 
@@ -78,6 +79,10 @@ def _check_motion(body: Skeleton, where: str) -> None:
     n = body.num_joints
     joined = {frozenset(b) for b in body.bones}
     for hinge in body.hinges:
+        if not isinstance(hinge, Hinge):
+            raise SkeletonError(
+                f"{where}: hinges: expected kcs_torch.skeleton.Hinge, got {hinge!r}; Skeleton.from_names takes mappings"
+            )
         used = (hinge.parent, hinge.joint, hinge.child, hinge.left, hinge.right)
         if not all(0 <= i < n for i in used) or hinge.left == hinge.right:
             raise SkeletonError(f"{where}: {hinge}: expected joint indices in 0..{n - 1}, left and right different")

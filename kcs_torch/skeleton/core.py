@@ -17,7 +17,7 @@ from kcs_torch.skeleton.check import as_tuples, check_facts, check_tree
 from kcs_torch.skeleton.files import as_mapping, check_mapping, read_mapping
 from kcs_torch.skeleton.graph import find_cycle, find_pieces, find_twins
 from kcs_torch.skeleton.mapping import map_joints
-from kcs_torch.skeleton.parse import arguments, facts_by_names, index_pairs
+from kcs_torch.skeleton.parse import arguments, facts_by_names, index_pairs, listed
 
 __all__ = ["Skeleton"]
 
@@ -158,7 +158,8 @@ class Skeleton:
         """
         from kcs_torch.skeleton.builtin import guess_skeleton  # the built-in ones are made by this class
 
-        names = tuple(f"joint{i}" for i in range(joints)) if isinstance(joints, int) else tuple(map(str, joints))
+        names = [f"joint{i}" for i in range(joints)] if isinstance(joints, int) else listed(joints, "joints", name)
+        names = tuple(map(str, names))
         pairs = index_pairs(edges, name)
         plain = cls(joints=names, bones=tuple(pairs), name=name, tree=tree)
         return replace(plain, **facts_by_names(names, pairs, guess_skeleton(names)))

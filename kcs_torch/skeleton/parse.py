@@ -22,7 +22,7 @@ from kcs_torch.errors import SkeletonError, unknown
 if TYPE_CHECKING:
     from kcs_torch.skeleton.core import Skeleton
 
-__all__ = ["arguments", "facts_by_names", "find_mirror", "index_pairs"]
+__all__ = ["arguments", "facts_by_names", "find_mirror", "index_pairs", "listed"]
 
 Pair = tuple[int, int]
 Point = tuple[float, float, float]
@@ -35,7 +35,7 @@ def index_pairs(edges: Iterable[Sequence[int]], name: str, what: str = "edges") 
         SkeletonError: an edge of the skeleton of that name is no pair of whole numbers.
     """
     pairs = []
-    for edge in edges:
+    for edge in listed(edges, what, name):
         try:
             ends = tuple(map(float, edge))
         except (TypeError, ValueError):
@@ -68,8 +68,8 @@ def arguments(
     for what, mapping in (("virtual", virtual), ("proportions", proportions), ("spread", spread)):
         if not isinstance(mapping, (Mapping, type(None))):
             raise SkeletonError(f"{what} of skeleton '{name}': expected a mapping from names, got {mapping!r}")
-    virtual = {str(v): _listed(s, f"virtual joint '{v}'", name) for v, s in (virtual or {}).items()}
-    joints = _listed(list(joints) if isinstance(joints, str) else joints, "joints", name)
+    virtual = {str(v): listed(s, f"virtual joint '{v}'", name) for v, s in (virtual or {}).items()}
+    joints = listed(list(joints) if isinstance(joints, str) else joints, "joints", name)
     if any(isinstance(joint, bool) for joint in joints):
         raise SkeletonError(
             f"joints of skeleton '{name}': expected names, got True or False: YAML reads on, off, yes and no as such, "
@@ -85,7 +85,7 @@ def arguments(
 
     def pairs(items: Iterable[tuple[str, str]], what: str) -> tuple[Pair, ...]:
         out = []
-        for item in _listed(items, what, name):
+        for item in listed(items, what, name):
             if not isinstance(item, (list, tuple)) or len(item) != 2:
                 raise SkeletonError(f"{what} of skeleton '{name}': expected pairs of joint names, got {item!r}")
             out.append((at(item[0], what), at(item[1], what)))
@@ -110,9 +110,9 @@ def arguments(
     if hinges is None:
         bends = hinges_by_names(names, bone_pairs)
     else:
-        given = _listed(hinges, "hinges", name)
+        given = listed(hinges, "hinges", name)
         bends = tuple(_read_hinge(h, names, bone_pairs, twins, f"hinges of skeleton '{name}'") for h in given)
-    stand = None if contacts is None else _listed(contacts, "contacts", name)
+    stand = None if contacts is None else listed(contacts, "contacts", name)
     return {
         "joints": names,
         "bones": bone_pairs,
@@ -245,7 +245,7 @@ def _read_template(
     return tuple(tuple(given[n]) for n in names if n in given)  # type: ignore[misc]
 
 
-def _listed(items: Iterable[Any], what: str, name: str) -> tuple[Any, ...]:
+def listed(items: Iterable[Any], what: str, name: str) -> tuple[Any, ...]:
     """The items of a list, which a word is none of.
 
     Raises:
