@@ -60,7 +60,16 @@ def check_sound(result, before=True):
 def test_intrinsics_from_numbers_and_from_a_matrix():
     matrix = [[1500, 0, 960], [0, 1480, 540], [0, 0, 1]]
     wanted = Intrinsics(*LENS)
-    for value in (LENS, list(LENS), np.array(LENS), torch.tensor(LENS), matrix, np.array(matrix), wanted):
+    for value in (
+        LENS,
+        list(LENS),
+        np.array(LENS),
+        torch.tensor(LENS),
+        matrix,
+        np.array(matrix),
+        wanted,
+        np.array(LENS, ">f4"),
+    ):
         assert Intrinsics.of(value) == wanted
     assert wanted.focal == pytest.approx(math.sqrt(1500 * 1480))
 
@@ -101,6 +110,11 @@ def test_rays_of_nothing_and_of_what_is_not_known():
         ((1500, 1500, math.inf, 0), kt.OptionError, "finite"),
         ([[1500, 50, 0], [0, 1500, 0], [0, 0, 1]], kt.OptionError, "without skew.*undistort"),
         ([[1500, 0, 0], [0, 1500, 0], [0, 0, 2]], kt.OptionError, "without skew"),
+        ([[1500, 0, 0], [0, 1500, 0], [0, 0, 2]], kt.OptionError, "divide it by its last number"),
+        (np.full((3, 3), math.nan), kt.OptionError, "give finite numbers"),
+        (np.array([1500, 1500, 960, 540j]), kt.ShapeError, "expected real numbers, got complex128"),
+        ((10**400, 1500, 0, 0), kt.OptionError, "finite numbers"),
+        (((10**400, 0, 0), (0, 1500, 0), (0, 0, 1)), kt.ShapeError, "fx, fy, cx, cy"),
     ],
 )
 def test_bad_intrinsics_are_told(value, kind, says):

@@ -19,6 +19,7 @@ from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton
 
 __all__ = [
     "FARTHEST",
+    "RATES",
     "Intake",
     "as_floats",
     "as_number",
@@ -32,8 +33,14 @@ __all__ = [
 FARTHEST = 1e30  # of coordinates: their sums are finite in single precision, in which pages are written
 
 
-def as_floats(value: Any, what: str, ndim: int) -> Tensor:
-    """An array-like as a floating tensor of ``ndim`` dimensions; tensors keep their device and single precision.
+RATES = 1e-6, 1e6
+"""Frames a second, lowest and highest: a frame in eleven days, and a million a second."""
+
+
+def as_floats(value: Any, what: str, ndim: int | None) -> Tensor:
+    """An array-like as a floating tensor of ``ndim`` dimensions, or of any number if that is None.
+
+    Tensors keep their device and single precision.
 
     What a masked array masks is NaN.
 
@@ -44,13 +51,13 @@ def as_floats(value: Any, what: str, ndim: int) -> Tensor:
         try:
             array = np.asanyarray(value)
             value = torch.as_tensor(array if np.iscomplexobj(array) else np.ma.filled(array.astype(np.float64), np.nan))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             kind = f"one of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
             hint = "; kcs_torch.load_tracks reads files" if isinstance(value, (str, Path)) else ""
             raise ShapeError(f"{what}: expected an array of numbers, got {kind}{hint}") from None
     if value.is_complex():
         raise ShapeError(f"{what}: expected real numbers, got {str(value.dtype).removeprefix('torch.')}")
-    if value.ndim != ndim:
+    if ndim is not None and value.ndim != ndim:
         raise ShapeError(f"{what}: expected {ndim} dimensions, got shape {tuple(value.shape)}")
     if value.dtype in (torch.float16, torch.bfloat16):
         return value.float()  # no factorisation takes half precision
@@ -58,8 +65,11 @@ def as_floats(value: Any, what: str, ndim: int) -> Tensor:
 
 
 def as_number(value: Any) -> float | None:
-    """A real number as a float; None for anything else."""
-    return float(value) if isinstance(value, Real) else None
+    """A real number as a float; None for anything else, and for whole numbers that are larger than any float."""
+    try:
+        return float(value) if isinstance(value, Real) else None
+    except OverflowError:
+        return None
 
 
 def fitting(num_joints: int) -> list[str]:
@@ -239,6 +249,11 @@ def take_in(
         raise ShapeError(f"{source}: fps: expected a positive number, got {fps!r}; leave it out where it is not known")
     if rate is not None and not math.isfinite(rate):
         rate = None
+    if rate is not None and not RATES[0] <= rate <= RATES[1]:
+        raise ShapeError(
+            f"{source}: fps: expected {RATES[0]:g} to {RATES[1]:g} frames a second, got {rate:g}; leave it out where "
+            "it is not known"
+        )
     least = as_number(threshold)
     if least is None or not 0 <= least <= 1:
         raise OptionError(f"{source}: threshold: expected a confidence within 0..1, got {threshold!r}")

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import perspective
+from kcs_torch.types.intake import as_floats
 
 __all__ = ["Intrinsics"]
 
@@ -47,24 +48,33 @@ class Intrinsics:
         """
         if isinstance(value, Intrinsics):
             return value
-        if isinstance(value, (tuple, list)) and len(value) == 4 and all(isinstance(x, (int, float)) for x in value):
-            return cls(*map(float, value))  # without tensors, so that torch.compile follows
         what = "intrinsics: expected (fx, fy, cx, cy) or a matrix K (3, 3)"
-        try:
-            matrix = torch.as_tensor(value, dtype=torch.float64).cpu()
-        except (TypeError, ValueError, RuntimeError):
-            raise ShapeError(f"{what}, got {value!r}") from None
+        if isinstance(value, (tuple, list)) and len(value) == 4 and all(isinstance(x, (int, float)) for x in value):
+            try:
+                return cls(*map(float, value))  # without tensors, so that torch.compile follows
+            except OverflowError:
+                raise OptionError(f"{what} of finite numbers, got {value!r}") from None
+        if isinstance(value, str):
+            raise ShapeError(f"{what}, got {value!r}")
+        matrix = as_floats(value, what, None).double()
         if matrix.shape not in ((4,), (3, 3)):
             raise ShapeError(f"{what}, got shape {tuple(matrix.shape)}")
-        if matrix.ndim == 2:
-            (fx, skew, cx), (tilt, fy, cy), last = matrix.tolist()
-            if abs(skew) > 1e-3 * abs(fx) or tilt != 0 or last != [0, 0, 1]:
-                raise OptionError(
-                    "intrinsics: expected K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] without skew, got "
-                    f"{matrix.tolist()}: undistort the tracks first"
-                )
-            return cls(fx, fy, cx, cy)
-        return cls(*matrix.tolist())
+        if matrix.ndim == 1:
+            return cls(*matrix.tolist())
+        (fx, skew, cx), (tilt, fy, cy), last = matrix.tolist()
+        hint = ""
+        if not bool(matrix.isfinite().all()):
+            hint = "give finite numbers"
+        elif tilt != 0 or last != [0, 0, 1]:
+            hint = "divide it by its last number, or transpose it, where it is written otherwise"
+        elif abs(skew) > 1e-3 * abs(fx):
+            hint = "undistort the tracks first"
+        if hint:
+            raise OptionError(
+                "intrinsics: expected K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] without skew, got "
+                f"{matrix.tolist()}: {hint}"
+            )
+        return cls(fx, fy, cx, cy)
 
     @property
     def focal(self) -> float:
