@@ -355,6 +355,12 @@ def test_as_good_as_the_authors_code(method, figures_of):
 
 
 @quiet
+@quiet
+def test_any_tolerance_will_do():
+    tracks = band_limited()[0]
+    assert bool(PTA(tolerance=1e300)(tracks).points.isfinite().all())
+
+
 @pytest.mark.parametrize("method", ["pta", "csf"])
 def test_the_papers_own_ranks_give_the_papers_figures(method, figures_of):
     """Neither worse nor better: the same mathematics."""

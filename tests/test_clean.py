@@ -463,6 +463,7 @@ MISTAKES = {
     "cutoff text": (lambda t: kt.clean.smooth(t, cutoff="6"), "got '6'"),
     "no rate": (lambda t: kt.clean.smooth(replace(t, fps=None)), r"give fps=\.\.\. \(kcs-torch: --fps\)"),
     "bad rate": (lambda t: kt.clean.smooth(t, fps=-1), "smooth: fps: expected a positive number"),
+    "endless rate": (lambda t: kt.clean.smooth(t, fps=10**400), "smooth: fps: expected a positive number"),
     "gate": (lambda t: kt.clean.gate(t, threshold=0), "gate: threshold"),
     "gate's floor": (lambda t: kt.clean.gate(t, floor=-1), "gate: floor"),
     "gate's reach": (lambda t: kt.clean.gate(t, reach=0), "gate: reach"),

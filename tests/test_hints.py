@@ -18,6 +18,8 @@ from kcs_torch.types.hints import is_a, spoken
         (True, int | bool, True),
         ("1", float, False),
         (1, float, True),
+        (10**400, float, False),
+        (10**400, int, False),
         (np.float32(1), float, True),
         (float("nan"), float, False),
         (None, int | None, True),

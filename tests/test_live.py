@@ -311,7 +311,16 @@ def test_bones_that_have_not_been_seen_leave_no_nan():
 
 
 def test_bad_options():
-    for options in ({"fps": 0}, {"fps": "fast"}, {"window": 3}, {"period": 0.5}, {"threshold": 2}, {"method": "kcs"}):
+    for options in (
+        {"fps": 0},
+        {"fps": "fast"},
+        {"fps": 1e12, "window": 30},
+        {"fps": 10**400},
+        {"window": 3},
+        {"period": 0.5},
+        {"threshold": 2},
+        {"method": "kcs"},
+    ):
         with pytest.raises(kt.OptionError, match=next(iter(options))):
             kt.Tracker("coco17", **{"fps": 30, **options})
     loop = kt.SKELETONS["coco17"].with_links([("left_wrist", "right_wrist")])

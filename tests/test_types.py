@@ -271,9 +271,15 @@ def test_confidence_of_what_is_nan_does_not_count():
         Tracks.from_arrays(torch.where(seen[..., None] > 0, grid(), NAN), 1 - seen)
 
 
-@pytest.mark.parametrize("fps", [0, -25.0, -INF, "25", [25]])
+@pytest.mark.parametrize("fps", [0, -25.0, -INF, "25", [25], 10**400])
 def test_bad_fps(fps):
     with pytest.raises(ShapeError, match="fps: expected a positive number, got"):
+        Tracks.from_arrays(grid(), fps=fps)
+
+
+@pytest.mark.parametrize("fps", [1e10, 1e20, 1e-78])
+def test_absurd_fps(fps):
+    with pytest.raises(ShapeError, match="fps: expected 1e-06 to 1e\\+06 frames a second, got"):
         Tracks.from_arrays(grid(), fps=fps)
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.types import Tracks
+from kcs_torch.types.intake import as_number
 
 __all__ = ["Array", "body_size", "check_tracks", "frame_rate", "number", "rebuilt", "runs", "share"]
 
@@ -32,11 +33,12 @@ def number(value: Any, what: str, expected: str, *, above: float = 0.0, below: f
     Raises:
         OptionError: it is something else; the message says what was expected.
     """
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+    found = None if isinstance(value, bool) else as_number(value)
+    if found is None:
         raise OptionError(f"{what}: expected {expected}, got {value!r}")
-    if not above < float(value) < below:
-        raise OptionError(f"{what}: expected {expected}, got {float(value):g}")
-    return float(value)
+    if not above < found < below:
+        raise OptionError(f"{what}: expected {expected}, got {found:g}")
+    return found
 
 
 def frame_rate(own: float | None, given: float | None, what: str, source: str) -> float:

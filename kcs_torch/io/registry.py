@@ -21,7 +21,7 @@ from kcs_torch.errors import FormatError, KcsError, OptionError
 from kcs_torch.io.folders import natural_key, sibling_files
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
-from kcs_torch.types.intake import as_number
+from kcs_torch.types.intake import RATES, as_number
 
 if TYPE_CHECKING:
     from kcs_torch.io.hdf5 import Tree
@@ -303,10 +303,13 @@ def check_fps(fps: float | None) -> None:
     """Make sure that the rate that a caller gives is one.
 
     Raises:
-        OptionError: it is not positive and finite.
+        OptionError: it is out of range.
     """
-    if fps is not None and not 0 < (as_number(fps) or 0) < float("inf"):
-        raise OptionError(f"fps (--fps): expected a positive number, got {fps!r}; leave it out where it is not known")
+    if fps is not None and not RATES[0] <= (as_number(fps) or 0) <= RATES[1]:
+        raise OptionError(
+            f"fps (--fps): expected a positive number, got {fps!r}; leave it out where it is not known "
+            f"(frames a second, {RATES[0]:g} to {RATES[1]:g})"
+        )
 
 
 def read_error(path: Any, error: BaseException) -> FormatError:

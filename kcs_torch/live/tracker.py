@@ -22,7 +22,7 @@ from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Reconstruction, Tracks
 from kcs_torch.types.hints import is_a
-from kcs_torch.types.intake import as_number
+from kcs_torch.types.intake import RATES, as_number
 
 __all__ = ["Tracker"]
 
@@ -107,8 +107,10 @@ class Tracker:
                 "kcs_torch.find_skeleton finds one from a clip"
             )
         rate, least = as_number(fps), as_number(threshold)
-        if rate is None or not 0 < rate < float("inf"):
-            raise OptionError(f"Tracker: fps: expected a positive number, got {fps!r}")
+        if rate is None or not RATES[0] <= rate <= RATES[1]:
+            raise OptionError(
+                f"Tracker: fps: expected a positive number, {RATES[0]:g} to {RATES[1]:g} frames a second, got {fps!r}"
+            )
         if least is None or not 0 <= least <= 1:
             raise OptionError(f"Tracker: threshold: expected a confidence within 0..1, got {threshold!r}")
         if method is not None and not isinstance(method, PKC):

@@ -89,7 +89,7 @@ class PTA(Factorised):
             kept = (value > self.cutoff**2 * value[-1]) & (value > 0)
             told = (vector.mT @ goal[: 3 * rank]).square().sum(-1) / torch.where(kept, value, torch.ones_like(value))
             error = energy - (told * kept).sum()
-            if bool(error <= max(self.tolerance**2, ROUNDING) * energy):
+            if bool(error <= max(self.tolerance * self.tolerance, ROUNDING) * energy):
                 return rank
             free = 1 - int(kept.sum()) / (2 * frames)
             if free < FREE:

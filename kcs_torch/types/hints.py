@@ -38,7 +38,10 @@ def is_a(value: Any, hint: Any) -> bool:
     if hint in (int, float):
         if isinstance(value, bool) or not isinstance(value, numbers.Integral if hint is int else numbers.Real):
             return False
-        return not math.isnan(value)
+        try:
+            return not math.isnan(value)
+        except OverflowError:  # larger than any float
+            return False
     return isinstance(value, hint) if isinstance(hint, type) else True
 
 
