@@ -20,6 +20,7 @@ from kcs_torch.functional import (
     project,
     similarity,
 )
+from kcs_torch.methods.mirror import mirror_sign
 
 NAN = math.nan
 CLIP = walking_person(40, turn=60.0)
@@ -285,6 +286,17 @@ def test_known_cameras_tell_where_the_template_stands(turn):
     if turn:
         rotation, _ = procrustes(centred(known.points[30]), centred(clip.points[30]))
         assert (rotation.trace() - 1) / 2 > math.cos(math.radians(12))  # and it faces the right way
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+def test_without_a_template_hinges_tell_the_mirror_image():
+    clip = random_motion(BODY, 24, turn=120.0, generator=torch.Generator().manual_seed(0)).tracks
+    body = replace(BODY, template=None, spread=None)
+    for side in (1.0, -1.0):
+        found = KCS()(replace(clip, skeleton=body, points=clip.points * torch.tensor([side, 1.0]).to(clip.points)))
+        assert float(mirror_sign(centred(found.points), body)) == 1.0
+        image = project(centred(found.points) @ complete_rotation(found.cameras), found.cameras)
+        assert_close(image, centred(found.points)[..., :2])
 
 
 @pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")

@@ -18,6 +18,7 @@ from kcs_torch.functional.chain import bone_lengths, chain_inverse, incidence
 from kcs_torch.functional.ranks import median
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.clips import Clips, in_batches, padded
+from kcs_torch.methods.mirror import mirror_sign
 from kcs_torch.methods.template import clip_scale, rigid_shape
 from kcs_torch.nn.deviation import Arrangement, deviation_goal, deviation_scale, deviation_step, frame_scales
 from kcs_torch.nn.steps import continuation
@@ -157,6 +158,11 @@ class KCS(Method):
             kept = zip(clips.cut(points), clips.cut(clips.weights > 0), strict=True)
             points = padded([self._constant_bones(one, body, seen) for one, seen in kept])
         points = points - points.mean(-2, keepdim=True)
+        if cameras is None and any(notes):
+            stand_in = torch.tensor([bool(note) for note in notes], device=points.device)  # of either mirror image
+            flip = torch.ones_like(points[:, :1, 0])
+            flip[..., 2] = torch.where(stand_in, mirror_sign(points, body, clips.inside), 1)[:, None]
+            points, rotations = points * flip[:, None], complete_rotation(rotations[..., :2, :] * flip[:, None])
         each = [clips.cut(x) for x in (points, rotations[..., :2, :], scales / mean)]
         ends = zip(*each, converged.tolist(), made.tolist(), notes, strict=True)
         return [Estimate(x, rows, own, good, steps, note) for x, rows, own, good, steps, note in ends]
