@@ -277,6 +277,19 @@ def test_bad_fps(fps):
         Tracks.from_arrays(grid(), fps=fps)
 
 
+@pytest.mark.parametrize("far", [1e15, -1e28])
+def test_a_joint_that_lies_absurdly_far_away_is_told(far):
+    points = grid() + 0.0
+    points[3, 5, 1] = far
+    with pytest.raises(ShapeError, match="frame 3, joint 'joint5' lies .* times as far"):
+        Tracks.from_arrays(points)
+    confidence = torch.ones(points.shape[:2])
+    confidence[3, 5] = 0
+    Tracks.from_arrays(points, confidence)
+    half = torch.where(torch.arange(17)[:, None] == 5, grid(), 7.0) + 1e-16 * grid()  # lies at one point
+    assert Tracks.from_arrays(half).num_frames == 4
+
+
 @pytest.mark.parametrize("fps", [1e10, 1e20, 1e-78])
 def test_absurd_fps(fps):
     with pytest.raises(ShapeError, match="fps: expected 1e-06 to 1e\\+06 frames a second, got"):

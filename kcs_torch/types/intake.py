@@ -33,6 +33,12 @@ __all__ = [
 FARTHEST = 1e30  # of coordinates: their sums are finite in single precision, in which pages are written
 
 
+STRAY = 1e12
+"""Distance from the clip's middle, over its median, from which on a joint's number is that of no body."""
+
+ROUNDING = 8.0
+"""Distance from the clip's middle, over where this is and the machine precision, up to which it is none."""
+
 RATES = 1e-6, 1e6
 """Frames a second, lowest and highest: a frame in eleven days, and a million a second."""
 
@@ -306,6 +312,16 @@ def take_in(
     if not seen.any():
         raise ShapeError(
             f"{source}: no joint is seen in any frame (confidence threshold {threshold:g}): nothing to reconstruct"
+        )
+    middle = xy[seen].median(0).values
+    off = (xy - middle).abs().amax(-1)
+    usual = off[seen].median()
+    stray = seen & (off > STRAY * usual) & (usual > ROUNDING * torch.finfo(xy.dtype).eps * middle.abs().max())
+    if stray.any():
+        where, most = label(*stray.nonzero()[0]), float(off[stray].max() / usual)
+        raise ShapeError(
+            f"{source}: points: {where} lies {most:.3g} times as far from the clip's middle as half of all joints do: "
+            "write NaN where a joint is unseen"
         )
     xy = torch.where(seen[..., None], xy, torch.zeros_like(xy))
     return Intake(xy, weights, body, rate, remarks)
