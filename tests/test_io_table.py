@@ -22,6 +22,7 @@ from kcs_torch.io import (
 )
 from kcs_torch.io.registry import Probe
 from kcs_torch.skeleton import SKELETONS
+from kcs_torch.types import Motion
 
 LEG = ("hip", "left knee", "Foot")
 
@@ -209,6 +210,18 @@ def result():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", kt.KcsWarning)
         return kt.reconstruct(kt.data.walking_person(12, skeleton="coco17", fps=30).tracks, method="kcs")
+
+
+def test_joints_of_no_name_have_no_columns(tmp_path):
+    motion = Motion.from_arrays(torch.randn(3, 2, 3), joint_names=["a", " "])
+    with pytest.raises(kt.OutputError, match="that of joint 1 is blank"):
+        kt.save(motion, tmp_path / "walk.csv")
+    assert not list(tmp_path.iterdir())
+
+
+def test_coordinates_as_large_as_tracks_may_have_are_read_back(tmp_path, result):
+    back = load_motion(kt.save(Motion.of(result).scaled(units="", factor=1e24), tmp_path / "walk.csv"))
+    assert torch.allclose(back.points / 1e24, Motion.of(result).points, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("height", [None, 1.7], ids=["pixels", "metres"])

@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.header import WHO, Header, plain_name
-from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_text
+from kcs_torch.io.jsonfile import as_frame_number, as_text
 from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
 from kcs_torch.io.wide import Row, as_value, opened, place_rows
+from kcs_torch.types.intake import FARTHEST
 
 __all__ = ["LongHeader", "read_long"]
 
 _MOST = 5e7  # coordinates of all frames, those between the file's included
 _MOST_JOINTS = 2000
-_FARTHEST_TIME = 1e30
 _PARTS = ("joint", "joint_name", "keypoint", "bodypart", "body_part", "part", "landmark", "node", "marker", "name")
 _WHO = ("person", "individual", "individuals", "animal", "subject", "track", "instance", *WHO)
 _SLEAP = ["track", "frame_idx", "instance.score"]
@@ -156,7 +156,7 @@ class _Table:
     def _value(self, line: int, k: int, text: str) -> float:
         column = self.columns[k]
         name = "" if column is None else self.header.cells[column]
-        return as_value(text, f"{self.path}: row {line}", name, _FARTHEST_TIME if k == 1 else FARTHEST)
+        return as_value(text, f"{self.path}: row {line}", name)
 
     def landmarks(self) -> Landmarks:
         """The joints of each person in each frame."""
@@ -168,7 +168,7 @@ class _Table:
         if not len(values):
             return out
         with np.errstate(invalid="ignore"):
-            far = np.argwhere(np.abs(values) > [FARTHEST, _FARTHEST_TIME, *[FARTHEST] * 3])
+            far = np.argwhere(np.abs(values) > FARTHEST)
         for i, k in far[:1].tolist():
             self._value(self.lines[i], k, f"{values[i, k]}")
         places, frame = np.unique(self._places(values), return_inverse=True)

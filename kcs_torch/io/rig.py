@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -84,10 +85,12 @@ def fit_rig(points: Tensor, body: Skeleton, *, up: str = "y") -> Rig:
         OutputError: the skeleton is no tree.
     """
     check_tree(body)
+    lengths = bone_lengths(points, body.bones).mean(0)
+    scale = 2.0 ** math.frexp(float(lengths.sum()))[1]  # a power of two, which rounds nothing
+    points, lengths = points / scale, lengths / scale
     rest = points[0]
     if body.template is not None:
         rest = from_y_up(to_y_up(body.template_points(dtype=points.dtype, device=points.device), "-y"), up)
-    lengths = bone_lengths(points, body.bones).mean(0)
     grain = _RIGID * float(lengths.sum())
     length = {frozenset(bone): size for bone, size in zip(body.bones, lengths, strict=True)}
 
@@ -128,7 +131,8 @@ def fit_rig(points: Tensor, body: Skeleton, *, up: str = "y") -> Rig:
             turns.append(eye)
             worlds[node[child]] = worlds[parent]
     joints = [node[i] for i in range(body.num_joints)]
-    return Rig(names, parents, torch.stack(offsets), torch.stack(turns, 1), points[:, start], joints)
+    place = points[:, start] * scale
+    return Rig(names, parents, torch.stack(offsets) * scale, torch.stack(turns, 1), place, joints)
 
 
 def _walk(body: Skeleton) -> tuple[list[int], dict[int, list[int]], int]:

@@ -19,10 +19,11 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.frames import as_track_id
 from kcs_torch.io.header import Columns, Header, Layout, delimiter, first_line
-from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_text
+from kcs_torch.io.jsonfile import as_frame_number, as_text
 from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import brief, read_error
+from kcs_torch.types.intake import FARTHEST
 
 __all__ = ["Row", "as_value", "is_missing", "opened", "place_rows", "read_wide"]
 
@@ -176,7 +177,7 @@ def _row(
 ) -> Row:
     if len(cells) != len(header.cells):
         raise FormatError(f"{where}: expected {len(header.cells)} values as in the first row, got {len(cells)}")
-    value = lambda i, most=FARTHEST: as_value(cells[i], where, header.cells[i], most)  # noqa: E731
+    value = lambda i: as_value(cells[i], where, header.cells[i])  # noqa: E731
     number, time = None, math.nan
     if header.number is not None:
         number = as_frame_number(value(header.number))
@@ -184,20 +185,20 @@ def _row(
             name, got = header.cells[header.number], as_text(cells[header.number])
             raise FormatError(f"{where}: '{name}': expected a whole number, got {got}")
     if header.time is not None:
-        time = value(header.time[0], 1e30)
+        time = value(header.time[0])
     who = 0 if header.who is None else as_track_id(cells[header.who])  # one row a frame is one body
     joints = [[value(c) if c >= 0 else none for c, none in zip(three, blank, strict=True)] for three in columns]
     return Row(where, number, time, who, np.array(joints))
 
 
-def as_value(cell: str, where: str, name: str, most: float) -> float:
+def as_value(cell: str, where: str, name: str) -> float:
     """The number in a cell, NaN if it is missing; an error with file, row and column if it is none, or too large."""
     try:
         value = math.nan if is_missing(cell) else float(cell)
     except ValueError:
         hint = " (write decimals with a point)" if re.fullmatch(r"-?[0-9]+,[0-9]+", cell) else ""
         raise FormatError(f"{where}: '{name}': expected a number, got '{as_text(cell)}'{hint}") from None
-    if not (math.isnan(value) or abs(value) <= most):
+    if not (math.isnan(value) or abs(value) <= FARTHEST):
         raise FormatError(f"{where}: '{name}': expected a coordinate or a visibility, got {value:.3g}")
     return value
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kcs_torch.errors import OutputError
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import Saving, Writer
 from kcs_torch.types import Motion, Reconstruction
@@ -41,6 +42,9 @@ def write_motion_csv(motion: Motion, path: Path, saving: Saving) -> None:
 def _write_rows(
     points: NDArray[Any], moved: Reconstruction | Motion, more: dict[str, NDArray[Any]], path: Path
 ) -> None:
+    blank = [i for i, joint in enumerate(moved.skeleton.joints) if not joint.strip()]
+    if blank:
+        raise OutputError(f"a table's columns need joint names, and that of joint {blank[0]} is blank: name it")
     unit = f" [{moved.units}]" if moved.units else ""
     header = [f"{cell(joint)}_{axis}{unit}" for joint in moved.skeleton.joints for axis in "xyz"]
     header += [f"{name}{unit}" for name in more]
