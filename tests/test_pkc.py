@@ -829,6 +829,18 @@ def test_the_direction_in_which_bones_are_written_changes_nothing(flipped, frame
     assert_close(found.lengths, usual.lengths)
 
 
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+@pytest.mark.parametrize("joints", ["ab", "abc"])
+@pytest.mark.parametrize("frames", [1, 24])
+def test_bodies_of_two_or_three_joints_keep_their_lengths(joints, frames):
+    body = Skeleton(joints, [(i, i + 1) for i in range(len(joints) - 1)])
+    tracks = random_motion(body, frames, turn=90.0, generator=torch.Generator().manual_seed(0)).tracks
+    found = PKC()(tracks)
+    lengths = bone_lengths(found.points, body.bone_index())
+    assert_close(lengths, lengths.mean(0).expand_as(lengths), rtol=1e-6, atol=0)
+    assert_close(found.points[..., :2], tracks.points, rtol=0, atol=1e-6 * float(tracks.points.abs().max()))
+
+
 @pytest.mark.parametrize("width", [1.0, 3.0])
 def test_a_body_unlike_its_template_is_not_searched_again_for_a_change_of_size(width, monkeypatch):
     """Where the viewpoint turns its template hardly counts, and no other search asks for such small changes."""

@@ -21,6 +21,7 @@ from kcs_torch.methods.pkc.body import Body, Turned
 from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of
 from kcs_torch.methods.pkc.gate import without_others
+from kcs_torch.methods.pkc.held import with_lengths_held
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
@@ -59,8 +60,8 @@ BETTER, HOPEFUL, FEW = 5.0, 2.5, 2
 """By how much the objective must fall for a change of size to be believed; by how much, if hypotheses are refined with
 it, for a new search to be made; and how many are."""
 
-LEAST_FRAMES = 12
-"""Frames from which on the viewpoint may have turned."""
+LEAST_FRAMES, LEAST_JOINTS = 12, 4
+"""Frames and joints from which on the viewpoint's turn may tell depth."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,7 @@ class PKC(Method):
             raise OptionError(
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
-        enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= 4
+        enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= LEAST_JOINTS
         changing, resized = size.sure, image / size.path[:, None, None]
         if changing:
             image = resized
@@ -186,6 +187,8 @@ class PKC(Method):
                 (first,) = (yield [seen]) if cameras is None else [SfAM().solve(seen, cameras)]
                 said = (*notes, "so few frames or joints are solved by sfam", *first.notes)
                 made = replace(first, notes=said)
+                if tracks.num_joints < LEAST_JOINTS:
+                    made = replace(made, points=with_lengths_held(image, first.points, skeleton))
             return _with_size(made, size) if changing else made
         still = self.contacts and not _turns(cameras) and self.viewpoint != "moving"
         feet = standing if still else None
