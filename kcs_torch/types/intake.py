@@ -34,10 +34,7 @@ FARTHEST = 1e30  # of coordinates: their sums are finite in single precision, in
 
 
 STRAY = 1e12
-"""Distance from the clip's middle, over its median, from which on a joint's number is that of no body."""
-
-ROUNDING = 8.0
-"""Distance from the clip's middle, over where this is and the machine precision, up to which it is none."""
+"""Distance from the clip's middle, over its median or over 1, from which on a joint's number is that of no body."""
 
 RATES = 1e-6, 1e6
 """Frames a second, lowest and highest: a frame in eleven days, and a million a second."""
@@ -313,14 +310,13 @@ def take_in(
         raise ShapeError(
             f"{source}: no joint is seen in any frame (confidence threshold {threshold:g}): nothing to reconstruct"
         )
-    middle = xy[seen].median(0).values
-    off = (xy - middle).abs().amax(-1)
-    usual = off[seen].median()
-    stray = seen & (off > STRAY * usual) & (usual > ROUNDING * torch.finfo(xy.dtype).eps * middle.abs().max())
+    off = (xy - xy[seen].median(0).values).abs().amax(-1)
+    usual = float(off[seen].median())
+    stray = seen & (off > STRAY * max(usual, 1.0))
     if stray.any():
-        where, most = label(*stray.nonzero()[0]), float(off[stray].max() / usual)
+        where, most = label(*stray.nonzero()[0]), float(off[stray].max())
         raise ShapeError(
-            f"{source}: points: {where} lies {most:.3g} times as far from the clip's middle as half of all joints do: "
+            f"{source}: points: {where} lies {most:.3g} off the clip's middle, half of all joints within {usual:.3g}: "
             "write NaN where a joint is unseen"
         )
     xy = torch.where(seen[..., None], xy, torch.zeros_like(xy))
