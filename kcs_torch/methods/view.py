@@ -62,8 +62,8 @@ def lens_note(lens: Intrinsics, units: str) -> str:
     """What is told of a lens that was found."""
     focal, x, y = (f"{v:.0f}" if lens.focal > 100 else f"{v:.4g}" for v in (lens.focal, lens.cx, lens.cy))
     return (
-        f"focal length of {focal} {units} found from the tracks, principal point taken to be ({x}, {y}), from which x "
-        "and y are measured"
+        f"focal length of {focal} {units} found from the tracks, a guess: the true one may be half or twice as long; "
+        f"principal point taken to be ({x}, {y}), from which x and y are measured"
     )
 
 
