@@ -310,7 +310,7 @@ def take_in(
         raise ShapeError(
             f"{source}: no joint is seen in any frame (confidence threshold {threshold:g}): nothing to reconstruct"
         )
-    off = (xy - xy[seen].median(0).values).abs().amax(-1)
+    off = (xy - xy[seen].median(0).values).detach().abs().amax(-1)
     usual = float(off[seen].median())
     stray = seen & (off > STRAY * max(usual, 1.0))
     if stray.any():
