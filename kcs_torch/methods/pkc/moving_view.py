@@ -89,8 +89,9 @@ FARTHER = 1.8
 people in noise of 1 to 4 % of their size, and with 30 % missing, before a camera that goes round by 180 degrees."""
 
 ROBOT = 10
-"""Up to as many joints, twenty times the random starts are tried, and angles between bones may be kept: few bones leave
-much undecided. Nor does one solution fill gaps for another: where it is wrong, so are they."""
+"""Up to as many joints, angles between bones may be kept, and in noise, which hides the bones' paths, twenty times the
+random starts are tried: few bones leave much undecided. Nor does one solution fill gaps for another: where it is wrong,
+so are they."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ def searching(
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
     held = is_tree and exact and noise == 0 and len(rigid) == joints - 1
-    corners = corners_of(rigid if held and joints <= ROBOT else rigid[:0])
+    corners = corners_of(rigid if is_tree and joints <= ROBOT else rigid[:0])
     fixed = torch.cat([rigid, corners.ends])
     if too_long(image):
         noise, weights = 0.0, None
@@ -235,7 +236,8 @@ def searching(
 
     pick = torch.arange(0, frames, max(1, -(-frames // coarse_frames)), device=image.device)
     few, few_weights = image[pick], None if weights is None else weights[pick]
-    made = _starts(few, bones, turns, lifts if joints > ROBOT else 20 * lifts, frames, pick, seed)
+    unsure = joints <= ROBOT and not held
+    made = _starts(few, bones, turns, 20 * lifts if unsure else lifts, frames, pick, seed)
     points = torch.cat([first[:, pick], *(p for p, _ in made)])
     turned = align_rotations(points, torch.cat([rotations[None, pick], *(r for _, r in made)]), bones)
     zero = points.new_zeros(len(points))
@@ -243,7 +245,7 @@ def searching(
     order = torch.arange(len(points))
     for stage, kept in zip(coarse, KEPT, strict=True):
         pose = yield from descend(few, pose, loose, (stage,), few_weights)
-        best = pose.objective.argsort()[: kept if joints > ROBOT else 3 * kept]
+        best = pose.objective.argsort()[: 3 * kept if unsure else kept]
         pose, order = pose[best], order[best.cpu()]
     pose = yield from descend(few, pose, FINER[loose], fine, few_weights)
     lead, paths = 0.0, bone_paths(image, bones) if held and lifts > 0 and frames <= LONG else None
