@@ -196,7 +196,6 @@ MOVING_VARIANTS = {
     "no coarse stages": Variant(changes=(constant(MOVING, "COARSE", ()), constant(MOVING, "KEPT", ()))),
     "SfAM's guess as the only start": Variant(changes=(constant(MOVING, "_starts", lambda *_: []),)),
     "no paths of single bones": Variant(changes=(constant(MOVING, "bone_paths", lambda *_: None),)),
-    "no angles kept": Variant(changes=((MOVING, "corners_of", lambda find: lambda bones: find(bones[:0])),)),
 }
 VARIANTS = {"fixed": FIXED_VARIANTS, "moving": MOVING_VARIANTS}
 
