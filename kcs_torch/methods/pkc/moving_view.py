@@ -201,7 +201,7 @@ def searching(
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
     held = is_tree and exact and noise == 0 and len(rigid) == joints - 1
-    corners = corners_of(rigid if is_tree and joints <= ROBOT else rigid[:0])
+    corners = corners_of(rigid if held and joints <= ROBOT else rigid[:0])
     fixed = torch.cat([rigid, corners.ends])
     if too_long(image):
         noise, weights = 0.0, None
