@@ -9,8 +9,7 @@ import kcs_torch as kt
 from kcs_torch.functional import bone_vectors
 from kcs_torch.solvers.bone_paths import BonePaths, bone_paths
 from kcs_torch.solvers.corners import agreeing_paths, corners_of
-from kcs_torch.solvers.lifts import turning_cameras
-from kcs_torch.solvers.procrustean import rotations_over_time
+from kcs_torch.solvers.lifts import rotations_over_time, turning_cameras
 
 CHAIN = [(i, i + 1) for i in range(7)]
 

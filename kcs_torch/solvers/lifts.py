@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence, safe_norm
 from kcs_torch.functional.rotation import rotation_matrix
 
-__all__ = ["random_lifts", "turning_cameras"]
+__all__ = ["random_lifts", "rotations_over_time", "turning_cameras"]
 
 
 def turning_cameras(
@@ -21,6 +22,24 @@ def turning_cameras(
     angle = torch.deg2rad(torch.as_tensor(degrees, dtype=dtype, device=device))
     time = torch.linspace(-0.5, 0.5, frames, dtype=dtype, device=device) if frames > 1 else angle.new_zeros(1)
     return rotation_matrix(torch.nn.functional.pad((angle[:, None] * time)[..., None], (1, 1)))
+
+
+def rotations_over_time(vectors: Tensor) -> Tensor:
+    """Return rotations (..., T, 3, 3) that turn each frame's bones onto those of the one before, one after another.
+
+    From these :func:`kcs_torch.solvers.procrustean.align_rotations` may start.
+
+    Args:
+        vectors: (..., T, B, 3) bones.
+    """
+    turn = nearest_rotation(vectors[..., 1:, :, :].mT @ vectors[..., :-1, :, :])
+    first = torch.eye(3, dtype=turn.dtype, device=turn.device).expand(*vectors.shape[:-3], 1, 3, 3)
+    total = torch.cat([first, turn], -3)
+    step = 1
+    while step < total.shape[-3]:  # products of the last frames, of twice as many each time
+        total = torch.cat([total[..., :step, :, :], total[..., step:, :, :] @ total[..., :-step, :, :]], -3)
+        step *= 2
+    return total
 
 
 def random_lifts(

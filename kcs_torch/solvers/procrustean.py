@@ -38,7 +38,6 @@ __all__ = [
     "length_energy",
     "motion_energy",
     "procrustean",
-    "rotations_over_time",
     "steadiness",
     "track_energy",
 ]
@@ -316,22 +315,6 @@ def align_rotations(points: Tensor, rotations: Tensor, bones: Tensor, *, num_ste
     for _ in range(num_steps):
         rotations = nearest_rotation(vectors.mT @ (vectors @ rotations).mean(-3, keepdim=True))
     return rotations
-
-
-def rotations_over_time(vectors: Tensor) -> Tensor:
-    """Rotations (..., T, 3, 3) from which :func:`align_rotations` may start: what turns each frame onto the one before.
-
-    Args:
-        vectors: (..., T, B, 3) bones.
-    """
-    turn = nearest_rotation(vectors[..., 1:, :, :].mT @ vectors[..., :-1, :, :])
-    first = torch.eye(3, dtype=turn.dtype, device=turn.device).expand(*vectors.shape[:-3], 1, 3, 3)
-    total = torch.cat([first, turn], -3)
-    step = 1
-    while step < total.shape[-3]:  # products of the last frames, of twice as many each time
-        total = torch.cat([total[..., :step, :, :], total[..., step:, :, :] @ total[..., :-step, :, :]], -3)
-        step *= 2
-    return total
 
 
 def _precision(points: Tensor, tracks: Tensor, weights: Tensor, noise: float) -> Tensor:

@@ -13,7 +13,8 @@ from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence, p
 from kcs_torch.methods.lockstep import Search
 from kcs_torch.solvers.bone_paths import BonePaths, nearest_paths
 from kcs_torch.solvers.corners import Corners, agreeing_paths
-from kcs_torch.solvers.procrustean import Pose, Stage, align_rotations, rotations_over_time
+from kcs_torch.solvers.lifts import rotations_over_time
+from kcs_torch.solvers.procrustean import Pose, Stage, align_rotations
 
 __all__ = ["SLACK", "TIGHT", "WORTH", "Assembly", "followed"]
 

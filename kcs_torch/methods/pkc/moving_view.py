@@ -201,13 +201,15 @@ def searching(
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
     held = is_tree and exact and noise == 0 and len(rigid) == joints - 1
-    corners = corners_of(rigid if held and joints <= ROBOT else rigid[:0])
-    fixed = torch.cat([rigid, corners.ends])
+    small = joints <= ROBOT
+    unsure = small and not held
     if too_long(image):
         noise, weights = 0.0, None
     first = torch.cat([image, start[..., 2:] - start[..., 2:].mean(1, keepdim=True)], -1)[None]
     spread = lambda points: rigid_tree(distance_spread(points)[1])  # noqa: E731
     bones = skeleton.bone_index(device=image.device) if is_tree else spread(first[0])
+    corners = corners_of(bones if held and small else bones[:0])
+    fixed = torch.cat([rigid, corners.ends])
     coarse, fine = (tuple(soften(s, noise) for s in stages) for stages in (COARSE, FINE))
     loose = 1.0 if is_tree else LOOSE
 
@@ -236,7 +238,6 @@ def searching(
 
     pick = torch.arange(0, frames, max(1, -(-frames // coarse_frames)), device=image.device)
     few, few_weights = image[pick], None if weights is None else weights[pick]
-    unsure = joints <= ROBOT and not held
     made = _starts(few, bones, turns, 20 * lifts if unsure else lifts, frames, pick, seed)
     points = torch.cat([first[:, pick], *(p for p, _ in made)])
     turned = align_rotations(points, torch.cat([rotations[None, pick], *(r for _, r in made)]), bones)
@@ -255,10 +256,10 @@ def searching(
             few, bones, paths.at(pick), corners, (*coarse[-1:], *fine), value,
             lambda pose, stages: descend(few, pose, TIGHT, stages, few_weights),
         )  # fmt: skip
-        pose = yield from (assembly.searched(pose) if joints <= ROBOT else assembly.near(pose))
+        pose = yield from (assembly.searched(pose) if small else assembly.near(pose))
         near = (pose.points[:, None] - mine).square().sum(-1).mean((-2, -1)) < SAME**2
         order = 1 - near.any(-1).long().cpu()  # some are the first guess's still
-        lead = _lead(pose, value(pose)) if joints <= ROBOT else 0.0
+        lead = _lead(pose, value(pose)) if small else 0.0
     best = _distinct(pose, value(pose), alternatives)
     pose, order = pose[best], order[best.cpu()]
 
@@ -272,7 +273,7 @@ def searching(
         stages = coarse if bool(own.any()) else coarse[-1:]
         pose = replace(pose, points=points, rotations=turned)
         del first, start, points, turned  # of long clips they are large
-        if paths is None or bool(own.any()) or joints > ROBOT:
+        if paths is None or bool(own.any()) or not small:
             pose = yield from descend(image, pose, loose, stages, weights)
     if len(pick) < frames or not is_tree:  # else the finest stages have seen all frames
         if not is_tree:
