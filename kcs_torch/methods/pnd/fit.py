@@ -142,7 +142,8 @@ def expect(
         likelihood = -white.square().sum((1, 2)) / 2 - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         likelihood = torch.where(info == 0, likelihood, -torch.inf) + (size - count[index]) / 2 * level.log()
         # Gradient in the camera's rows: G^-1 ((w - P M) Y^T - P S), summed over joints.
-        free = freed(whiten.view(chunk, size, 2, joints), soft[:, None], axis[:, None])
+        free = whiten.view(chunk, size, 2, joints)  # L^-1, back before the weights and the loss of the translation
+        free = soft[:, None, None] * (free - axis[:, None, None] * (axis[:, None, None] * free).sum(-1, keepdim=True))
         pull = (free.reshape(chunk, size, size).mT @ white).view(chunk, 2, joints)
         spread = free.transpose(1, 2).reshape(chunk, 2, -1) @ gain.view(chunk, size, 3, joints).permute(
             0, 1, 3, 2
