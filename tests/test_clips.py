@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from kcs_torch import KCS, METHODS, SfAM, Tracks
 from kcs_torch.data import walking_person
 from kcs_torch.functional import best_path, complete_rotation, orbit
+from kcs_torch.methods import PND
 from kcs_torch.methods import clips as module
 from kcs_torch.methods.cameras import orthographic_cameras
 from kcs_torch.methods.clips import Clips, in_batches, padded
@@ -55,8 +56,8 @@ CLIPS = [
 
 @pytest.mark.parametrize(
     "method",
-    [KCS(), KCS(arrangement="frames", scale_range=math.inf, bone_steps=2), SfAM(), SfAM(trajectories=9)],
-    ids=["kcs", "kcs in frames", "sfam", "sfam, few cosines"],
+    [KCS(), KCS(arrangement="frames", scale_range=math.inf, bone_steps=2), SfAM(), SfAM(trajectories=9), PND()],
+    ids=["kcs", "kcs in frames", "sfam", "sfam, few cosines", "pnd"],
 )
 def test_many_clips_are_those_of_one_after_the_other(method):
     """Of any length, with gaps and without; the world in which cameras are told is anybody's."""
@@ -71,7 +72,7 @@ def test_many_clips_are_those_of_one_after_the_other(method):
         assert settled_notes(told) == settled_notes(expected)
 
 
-@pytest.mark.parametrize("name", ["rigid", "pta", "csf", "bmm", "smsr", "local_rigidity"])
+@pytest.mark.parametrize("name", ["rigid", "pta", "csf", "bmm", "smsr", "local_rigidity", "pnd"])
 def test_many_clips_by_the_classical_methods(name):
     """Clips of one length go together, gaps, stiff bodies and all: the result is that of each one alone."""
     method = METHODS[name]()

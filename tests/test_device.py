@@ -16,7 +16,7 @@ def walk(turn, frames=45):
     return walking_person(frames, turn=turn, noise=3.0, missing=0.05, generator=torch.Generator().manual_seed(0)).tracks
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", (*METHODS, "pnd"))
 @pytest.mark.parametrize("turn", [0.0, 150.0])
 @pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
 def test_everything_is_made_where_the_tracks_are(name, turn):

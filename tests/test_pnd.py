@@ -1,18 +1,22 @@
 """PND: its distribution, its steps against the Gaussian written out, and shapes that follow its model."""
 
 import math
+from dataclasses import fields, replace
 
 import pytest
 import torch
-from numerics import normal, rotations
+from numerics import count_operations, normal, rotations
 from test_baselines_later import centre, error, figures, quiet, tumbling
 from torch.testing import assert_close
 
 import kcs_torch as kt
+from kcs_torch.data import walking_person
 from kcs_torch.functional import camera_disagreement, complete_rotation
 from kcs_torch.methods import PND
+from kcs_torch.methods.clips import padded
 from kcs_torch.methods.pnd import ProcrusteanNormal, align_to_mean, fit_procrustean_normal, procrustean_tangent
-from kcs_torch.methods.pnd.fit import FARTHEST, expect, freed
+from kcs_torch.methods.pnd import fit as module
+from kcs_torch.methods.pnd.fit import FARTHEST, Image, expect
 
 PND2 = {"pickup": (0.0193, 0.1142), "yoga": (0.0169, 0.1046)}  # the authors' improved code: e3d, e3d_world
 
@@ -51,6 +55,20 @@ def test_aligned_shapes_lie_in_the_tangent_space():
     assert_close(found.aligned.mean(0), found.mean, rtol=0, atol=1e-6)
 
 
+def test_shapes_are_aligned_clip_by_clip():
+    """Padding counts in no mean, median or moment; frames that show nearly nothing have a place by the others'."""
+    parts = [procrustean(n, seed=n)[0] @ rotations(n).mT for n in (20, 11)]
+    parts[1][3] *= 1e-6
+    inside = torch.arange(20) < torch.tensor([[20], [11]])
+    views = padded([rotations(20), rotations(11)])
+    found = ProcrusteanNormal.of_shapes(padded(parts), views, spread=0.1, inside=inside)
+    for k, part in enumerate(parts):
+        alone = vars(ProcrusteanNormal.of_shapes(part, views[k, : len(part)], spread=0.1))
+        ours = taken(found, k)
+        assert_close({name: x[: len(alone[name])] for name, x in vars(ours).items()}, alone)
+        assert not ours.scales[len(part) :].any() and not ours.aligned[len(part) :].any()
+
+
 def case(frames=40, joints=8, weights=None, seed=0):
     """A model away from its optimum, and tracks: what the E-step is tested on."""
     shapes, _ = procrustean(frames, joints, seed=seed)
@@ -60,12 +78,26 @@ def case(frames=40, joints=8, weights=None, seed=0):
     return now, tracks, weights
 
 
+def stacked(*records):
+    """Models of single clips as one of several, or a single one as a batch of one."""
+    kind = type(records[0])
+    return kind(*(torch.stack([getattr(one, field.name) for one in records]) for field in fields(kind)))
+
+
+def taken(record, k):
+    """One clip of several."""
+    return type(record)(*(getattr(record, field.name)[k] for field in fields(record)))
+
+
 def e_step(now, tracks, weights, level):
-    root = weights.sqrt()
-    unit = root / root.norm(dim=1, keepdim=True)
-    count = 2 * ((weights > 0).sum(1) - 1)
-    image = freed(tracks.mT, root, unit)
-    return expect(now, image, root, unit, count, torch.tensor(level).double(), 0.0)
+    one = torch.ones(1).double()
+    return taken(expect(stacked(now), Image.of(tracks[None], weights[None]), level * one, 0 * one), 0)
+
+
+def fit(tracks, weights, start, **options):
+    """Of a single clip."""
+    fitted, history, change = fit_procrustean_normal(tracks[None], weights[None], stacked(start), **options)
+    return taken(fitted, 0), history[:, 0], change[0]
 
 
 def gaussian(now, tracks, weights, level, t):
@@ -145,7 +177,7 @@ def test_the_likelihood_falls_in_no_step():
     wrong = torch.linalg.matrix_exp(0.1 * (lambda x: x - x.mT)(normal(60, 3, 3, seed=6))) @ view
     start = ProcrusteanNormal.of_shapes(centre(rough), wrong, spread=0.1)
     for fall in (0.3, 0.9):
-        _, history, _ = fit_procrustean_normal(tracks, weights, start, num_steps=60, noise=0.1, final=1e-9, fall=fall)
+        _, history, _ = fit(tracks, weights, start, num_steps=60, noise=0.1, final=1e-9, fall=fall)
         assert len(history) == 61 and history[-1] > history[0] + 100
         assert (history.diff() > -1e-9 * history[-1].abs()).all()
 
@@ -156,10 +188,104 @@ def test_the_noise_is_that_of_the_tracks():
     exact = shapes @ view.mT
     tracks = exact[..., :2] + sigma * normal(200, 16, 2, seed=9)
     start = ProcrusteanNormal.of_shapes(exact, view)
-    fitted, _, _ = fit_procrustean_normal(tracks, torch.ones(200, 16).double(), start, num_steps=60, noise=0.05)
+    fitted, _, _ = fit(tracks, torch.ones(200, 16).double(), start, num_steps=60, noise=0.05)
     miss = (centre(tracks) - centre(fitted.shapes())[..., :2]).square().mean().sqrt()
     assert float(miss) == pytest.approx(sigma, rel=0.15)  # what is left is the noise, neither more nor less
     assert (fitted.shapes() - exact).norm() / exact.norm() < 0.05
+
+
+def problem(frames, weights=None, depth=0.1, noise=0.003):
+    """Tracks and weights of 10 joints, and a start whose depth and rotations are off."""
+    shapes, _ = procrustean(frames, 10, seed=frames)
+    view = rotations(frames, seed=2)
+    tracks = (shapes @ view.mT)[..., :2] + noise * normal(frames, 10, 2, seed=9)
+    rough = torch.cat([tracks, (shapes @ view.mT)[..., 2:] + depth * normal(frames, 10, 1, seed=4)], -1)
+    wrong = torch.linalg.matrix_exp(depth * (lambda x: x - x.mT)(normal(frames, 3, 3, seed=6))) @ view
+    start = ProcrusteanNormal.of_shapes(centre(rough), wrong, spread=0.1)
+    return tracks, torch.ones(frames, 10).double() if weights is None else weights, start
+
+
+def flat_problem(frames):
+    """The same with a start that knows nothing of depth or rotations: some of its steps are undone."""
+    tracks, weights, _ = problem(frames, soft(frames))
+    flat = torch.nn.functional.pad(tracks, (0, 1)) + 1e-3 * normal(frames, 10, 3)
+    return tracks, weights, ProcrusteanNormal.of_shapes(centre(flat), rotations(frames, seed=5))
+
+
+def padded_problems(problems):
+    """As one batch."""
+    starts = [one for _, _, one in problems]
+    over_time = (padded([getattr(one, name) for one in starts]) for name in ("rotations", "scales", "aligned"))
+    start = ProcrusteanNormal(*(torch.stack([getattr(x, name) for x in starts]) for name in ("mean", "covariance")),
+                              *over_time)  # fmt: skip
+    return *(padded([one[k] for one in problems]) for k in (0, 1)), start
+
+
+def soft(frames, least=0.3):
+    weights = torch.rand(frames, 10, generator=torch.Generator().manual_seed(frames)).double()
+    return torch.where(weights < least, 0.0, weights)
+
+
+def test_clips_of_a_batch_are_fitted_each_for_itself(monkeypatch):
+    """Noise, damping, steps undone and the end are each clip's own, whatever lengths and weights are beside it."""
+    sizes = []
+
+    def counted(now, *others):
+        sizes.append(len(now.mean))
+        return expect(now, *others)
+
+    monkeypatch.setattr(module, "expect", counted)
+    problems = [problem(40, depth=0.4), problem(20, soft(20, 0.0)), problem(33, soft(33), noise=0.03), flat_problem(6)]
+    options = {"num_steps": 25, "noise": 1e-3, "final": 1e-9, "fall": 0.5}
+    tracks, weights, start = padded_problems(problems)
+    fitted, history, change = fit_procrustean_normal(tracks, weights, start, **options)
+    assert {1, 4} == set(sizes)  # some steps were undone, of one clip only
+    for k, one in enumerate(problems):
+        alone, likelihood, moved = fit(*one, **options)
+        frames = len(one[0])
+        assert_close(history[:, k], likelihood, rtol=1e-9, atol=1e-6)
+        assert_close(change[k], moved, rtol=1e-4, atol=1e-9)
+        assert_close(fitted.shapes()[k, :frames], alone.shapes(), rtol=0, atol=1e-7)
+        assert not fitted.shapes()[k, frames:].any()
+
+
+def test_a_clip_that_ends_early_leaves_the_others_going(monkeypatch):
+    calls = []
+
+    def broken(now, data, *others):
+        calls.append(found := expect(now, data, *others))
+        lost = (data.frames == 20) & torch.tensor(len(calls) > 4)
+        return replace(found, likelihood=torch.where(lost, torch.nan, found.likelihood))
+
+    monkeypatch.setattr(module, "expect", broken)
+    problems = [problem(30, depth=1e-3), problem(20, depth=1e-3)]
+    options = {"num_steps": 8, "noise": 0.1, "fall": 0.9}
+    fitted, history, change = fit_procrustean_normal(*padded_problems(problems), **options)
+    for k, one in enumerate(problems):
+        calls.clear()
+        alone, likelihood, moved = fit(*one, **options)
+        assert len(likelihood) == (9, 4)[k]
+        assert_close(history[: len(likelihood), k], likelihood)
+        assert_close(change[k], moved)
+        assert_close(fitted.shapes()[k, : len(one[0])], alone.shapes())
+
+
+@pytest.mark.parametrize("chunk", [1, 70, 250, 10**6])
+def test_how_many_frames_go_together_makes_no_difference(monkeypatch, chunk):
+    tracks, weights, start = padded_problems([problem(14, soft(14)), problem(20), problem(6), problem(11, soft(11))])
+    one = torch.ones(4).double()
+    whole = expect(start, Image.of(tracks, weights), 1e-3 * one, one)
+    monkeypatch.setattr(module, "CHUNK", chunk)
+    assert_close(vars(expect(start, Image.of(tracks, weights), 1e-3 * one, one)), vars(whole))
+
+
+@quiet
+def test_a_batch_takes_few_more_operations_than_a_clip(monkeypatch):
+    """Sixteen clips of nearly one length, where caches do not bound how many frames go together, as on a GPU."""
+    monkeypatch.setattr(module, "CHUNK", module.GPU_CHUNK)
+    clips = [walking_person(n, turn=150.0, yaw=3.0 * n).tracks for n in range(24, 40)]
+    one, many = (count_operations(lambda c=some: PND(num_steps=20).many(c)).total for some in (clips[-1:], clips))
+    assert many < 3 * one
 
 
 @quiet

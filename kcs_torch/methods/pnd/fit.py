@@ -1,9 +1,10 @@
-"""Expectation maximisation of a Procrustean normal distribution from 2D tracks."""
+"""Expectation maximisation of Procrustean normal distributions from 2D tracks."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -11,10 +12,10 @@ from torch import Tensor
 from kcs_torch.functional.rotation import rotation_matrix
 from kcs_torch.methods.pnd.distribution import ProcrusteanNormal, align_to_mean, second_moment, unit_mean
 
-__all__ = ["Expectation", "expect", "fit_procrustean_normal", "freed", "maximise"]
+__all__ = ["Expectation", "Image", "expect", "fit_procrustean_normal", "maximise"]
 
-CHUNK = 32
-"""Frames whose matrices are made at once: more would not stay in the processor's caches."""
+CHUNK, GPU_CHUNK = 1024, 32 * 1024
+"""Joints of the frames whose matrices are made at once: on a processor more would not stay in its caches."""
 
 FARTHEST = 0.2
 """Radians that a step may turn a frame by, at most, and the change of its log scale."""
@@ -29,8 +30,8 @@ def fit_procrustean_normal(
     noise: float = 0.015,
     final: float = 1e-6,
     fall: float = 0.88,
-) -> tuple[ProcrusteanNormal, Tensor, float]:
-    """Fit a Procrustean normal distribution to 2D tracks by EM; the likelihood falls in no step but one undone next.
+) -> tuple[ProcrusteanNormal, Tensor, Tensor]:
+    """Fit Procrustean normal distributions to 2D tracks by EM; no likelihood falls in any step but one undone next.
 
     E-step: with the tracks w = P vec(Y) + e, e ~ N(0, s I / weight), P the two rows of c R for each joint, and any
     translation, the posterior of Y has the mean M + K (w - P M) and covariance S - K P S, K = S P^T G^-1,
@@ -39,49 +40,86 @@ def fit_procrustean_normal(
     the complete likelihood tells nothing of them where there is little noise.
 
     Args:
-        tracks: w (T, N, 2), finite.
-        weights: (T, N), 0 where unseen; 1 is the noise's own variance.
-        start: to start from.
+        tracks: w (K, T, N, 2) of K clips, finite.
+        weights: (K, T, N), 0 where unseen; 1 is the noise's own variance. Frames without any, behind the others, are
+            padding.
+        start: to start from, of K clips.
         num_steps: EM steps.
         noise: first s, a share of the deformation's variance.
         final: least s, a share of the tracks' variance.
         fall: s falls by no more than this factor in a step.
 
     Returns:
-        The fit, with posterior means as its shapes; the log-likelihood (num_steps + 1,) at the start and after each
-        step; and the share of the shapes that the last step changed.
+        The fits, with posterior means as their shapes; the log-likelihoods (num_steps + 1, K) at the start and after
+        each step; and the share of each clip's shapes that its last step changed (K,). A clip whose likelihood is no
+        number after a step ends before it; fewer steps are made when all have ended.
     """
-    root = weights.sqrt()
-    unit = root / torch.linalg.vector_norm(root, dim=1, keepdim=True)
-    image = freed(tracks.mT, root, unit)  # (T, 2, N)
-    power = image.square().sum() / (2 * weights.sum())
+    data = Image.of(tracks, weights)
+    power = data.values.square().sum((1, 2, 3)) / (2 * weights.sum((1, 2)))
     least = final * power + torch.finfo(tracks.dtype).tiny
-    level = noise * start.covariance.diagonal().mean() * start.scales.square().mean()
-    level = torch.maximum(level, least)
-    count = 2 * ((weights > 0).sum(1) - 1).clamp_min(0)
-    now, history, damping = start, [], 1e-3
-    found = expect(now, image, root, unit, count, level, damping)
-    history.append(found.likelihood)
-    change = math.inf
+    deformation = start.covariance.diagonal(dim1=1, dim2=2).mean(1)
+    level = torch.maximum(noise * deformation * start.scales.square().sum(1) / data.frames, least)
+    damping, change = torch.full_like(level, 1e-3), torch.full_like(level, torch.inf)
+    now, found = start, expect(start, data, level, damping)
+    history, going = [found.likelihood], torch.ones_like(level, dtype=torch.bool)
     for _ in range(num_steps):
         after = torch.maximum(found.noise, least)
         after = torch.where(after < level, torch.maximum(after, fall * level), after)
-        trial = maximise(now, found)
-        result = expect(trial, image, root, unit, count, after, damping)
-        if not bool(result.likelihood >= found.likelihood):  # NaN, too: the plain M-step cannot fall
-            damping = min(damping * 10, 1e6)
-            trial = replace(now, covariance=second_moment(found.aligned - now.mean, now.mean, found.rest))
-            result = expect(trial, image, root, unit, count, after, damping)
-        else:
-            damping = max(damping / 3, 1e-4)
-        if not bool(result.likelihood.isfinite()):
+        trial = maximise(now, found, data.inside)
+        result = expect(trial, data, after, damping)
+        worse = ~(result.likelihood >= found.likelihood)  # NaN, too: the plain M-step cannot fall
+        damping = torch.where(worse, (damping * 10).clamp_max(1e6), (damping / 3).clamp_min(1e-4))
+        undone = (worse & going).nonzero().flatten()
+        if len(undone):
+            plain, last, image = _some(now, undone), _some(found, undone), _some(data, undone)
+            moment = second_moment(last.aligned, plain.mean, image.inside, last.rest)
+            plain = replace(plain, covariance=moment)
+            trial = _put(trial, undone, plain)
+            result = _put(result, undone, expect(plain, image, after[undone], damping[undone]))
+        going = going & result.likelihood.isfinite()
+        ended = (~going).nonzero().flatten()
+        if len(ended) == len(going):
             break
-        before = now.scales[:, None, None] * (found.aligned @ now.rotations.mT)
+        if len(ended):
+            trial, result = _put(trial, ended, _some(now, ended)), _put(result, ended, _some(found, ended))
+        before = now.scales[..., None, None] * (found.aligned @ now.rotations.mT)
         now, found, level = trial, result, after
-        shape = now.scales[:, None, None] * (found.aligned @ now.rotations.mT)
-        change = float(torch.linalg.vector_norm(shape - before) / torch.linalg.vector_norm(shape))
+        shape = now.scales[..., None, None] * (found.aligned @ now.rotations.mT)
+        moved = torch.linalg.vector_norm(shape - before, dim=(1, 2, 3))
+        change = torch.where(going, moved / torch.linalg.vector_norm(shape, dim=(1, 2, 3)), change)
         history.append(found.likelihood)
     return replace(now, aligned=found.aligned), torch.stack(history), change
+
+
+@dataclass(frozen=True)
+class Image:
+    """Tracks of K clips, each frame weighed, which makes noise white, and without its translation.
+
+    Attributes:
+        values: (K, T, 2, N), 0 in the padding.
+        root: square roots of the weights (K, T, N); some that are not all 0 in the padding.
+        unit: the same (K, T, N), of norm 1 in each frame.
+        count: numbers (K, T) that a frame tells.
+        inside: (K, T), False in the padding.
+        frames: (K,) that are no padding.
+    """
+
+    values: Tensor
+    root: Tensor
+    unit: Tensor
+    count: Tensor
+    inside: Tensor
+    frames: Tensor
+
+    @classmethod
+    def of(cls, tracks: Tensor, weights: Tensor) -> Image:
+        """Of tracks (K, T, N, 2) and their weights (K, T, N), all 0 in the padding and nowhere else."""
+        inside = (weights > 0).any(-1)
+        root = torch.where(inside[..., None], weights, weights[:, :1]).sqrt()
+        unit = root / torch.linalg.vector_norm(root, dim=-1, keepdim=True)
+        values = freed(tracks.mT.contiguous() * root[..., None, :], unit)
+        count = 2 * ((weights > 0).sum(-1) - 1).clamp_min(0)
+        return cls(torch.where(inside[..., None, None], values, 0), root, unit, count, inside, inside.sum(-1))
 
 
 @dataclass(frozen=True)
@@ -89,11 +127,11 @@ class Expectation:
     """What the E-step finds.
 
     Attributes:
-        likelihood: log p(tracks), but for a constant.
-        aligned: posterior means (T, N, 3).
-        rest: sum over frames of the posterior covariances (3N, 3N).
-        steps: (T, 4) by which rotations (camera's frame) and log scales should move.
-        noise: the variance that the M-step gives it.
+        likelihood: log p(tracks) of each clip (K,), but for a constant.
+        aligned: posterior means (K, T, N, 3), 0 in the padding.
+        rest: sum over a clip's frames of the posterior covariances (K, 3N, 3N).
+        steps: (K, T, 4) by which rotations (camera's frame) and log scales should move.
+        noise: the variance (K,) that the M-step gives it.
     """
 
     likelihood: Tensor
@@ -103,85 +141,121 @@ class Expectation:
     noise: Tensor
 
 
-def expect(
-    now: ProcrusteanNormal, image: Tensor, root: Tensor, unit: Tensor, count: Tensor, level: Tensor, damping: float
-) -> Expectation:
+def expect(now: ProcrusteanNormal, data: Image, level: Tensor, damping: Tensor) -> Expectation:
     """E-step, a few frames at a time, and the Gauss-Newton step of each frame's rotation and scale.
 
-    All matrices of a frame are in the weighted image without its translation, where noise is white.
+    Args:
+        now: of K clips; scales are 0 in the padding, which takes part in nothing then.
+        data: of K clips.
+        level: s (K,).
+        damping: of the Gauss-Newton steps (K,), a share of the normal matrix's diagonal.
     """
-    frames, _, joints = image.shape
+    clips, frames, _, joints = data.values.shape
     size, three = 2 * joints, 3 * joints
-    mean, covariance = now.mean.mT.contiguous(), now.covariance.reshape(3, -1).contiguous()
-    axes = torch.eye(3, dtype=image.dtype, device=image.device)
+    mean, covariance = now.mean.mT.contiguous(), now.covariance.reshape(clips, 3, -1)
+    pairs = covariance.view(clips, 3, joints, 3, joints).transpose(2, 3).reshape(clips, 9, -1)
+    axes = torch.eye(3, dtype=mean.dtype, device=mean.device)
     spin = -torch.linalg.cross(axes[:, None].expand(3, 3, 3), axes[None].expand(3, 3, 3), dim=-1)  # (3, 3, 3)
-    even = bool((root == root[:1, :1]).all())  # then nothing weighs the image, and S has no translation
-    eye = torch.eye(size, dtype=image.dtype, device=image.device)
+    eye, four = (torch.eye(n, dtype=mean.dtype, device=mean.device) for n in (size, 4))
     inner = torch.zeros_like(now.covariance)
-    parts = []
-    for index in torch.arange(frames, device=image.device).split(CHUNK):
-        turn, scale, soft, axis = now.rotations[index], now.scales[index, None, None], root[index], unit[index]
-        camera, chunk = scale * turn[:, :2], len(index)  # (t, 2, 3)
-        across = (camera.reshape(-1, 3) @ covariance).view(chunk, 2, joints, three)
-        if not even:
-            across = freed(across.mT, soft[:, None], axis[:, None]).mT
-        across = across.reshape(chunk, size, three)  # P S
-        square = camera[:, None] @ across.view(chunk, size, 3, joints)  # (t, 2N, 2, N)
+    aligned, steps = mean.new_zeros(clips, frames, 3, joints), mean.new_zeros(clips, frames, 4)
+    likelihood, miss = mean.new_zeros(2, clips, frames)
+    levels, dampings = level[:, None].expand(clips, frames), damping[:, None].expand(clips, frames)
+    most = (CHUNK if mean.device.type == "cpu" else GPU_CHUNK) // joints
+    for clip, time in _blocks(data.frames.tolist(), max(1, most)):
+        some = clip, time
+        few, span = data.count[some].shape
+        chunk = few * span
+        turn, image, soft, axis = (x[some].flatten(0, 1) for x in (now.rotations, data.values, data.root, data.unit))
+        scale, here, damp = (x[some].reshape(chunk, 1, 1) for x in (now.scales, levels, dampings))
+        even = bool((soft == soft[:, :1]).all())  # then nothing weighs a frame's image, and S has no translation
+        camera = scale * turn[:, :2]  # (t, 2, 3)
+        rows, twice = camera.view(few, -1, 3), camera[:, :, None, :, None] * camera[:, None, :, None, :]
+        across = (rows @ covariance[clip]).view(chunk, size, three)  # P S
+        square = (twice.view(few, -1, 9) @ pairs[clip]).view(chunk, 2, 2, joints, joints)  # P S P^T
         if even:
-            square = square * soft[0, 0].square()
-            across = across * soft[0, 0]
+            square = square * soft[:, :1, None, None, None].square()
         else:
-            square = freed(square, soft[:, None], axis[:, None])
-        square = square.reshape(chunk, size, size) + level * eye
+            for _ in range(2):  # from both sides
+                square = freed(square * soft[:, None, None, None], axis[:, None, None]).mT
+        square = square.transpose(2, 3).reshape(chunk, size, size) + here * eye
         factor, info = torch.linalg.cholesky_ex(square)
         whiten = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)  # G = L L^T, this is L^-1
-        off = image[index] - freed(camera @ mean, soft, axis)
-        white = whiten @ off.reshape(chunk, size, 1)
-        gain = whiten @ across
-        posterior = mean + (gain.mT @ white).view(chunk, 3, joints)
-        likelihood = -white.square().sum((1, 2)) / 2 - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        likelihood = torch.where(info == 0, likelihood, -torch.inf) + (size - count[index]) / 2 * level.log()
+        # Applied to an image as it is: weighed, without its translation, and white.
+        free = whiten.view(chunk, size, 2, joints)
+        free = ((free if even else freed(free, axis[:, None])) * soft[:, None, None]).view(chunk, size, size)
+        off = image - freed((rows @ mean[clip]).view(chunk, 2, joints) * soft[:, None], axis)
+        white = whiten @ off.view(chunk, size, 1)
+        gain = free @ across
+        posterior = ((gain.mT @ white).view(few, span, 3, joints) + mean[clip, None]).flatten(0, 1)
+        told = -white.square().sum((1, 2)) / 2 - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        likelihood[some] = torch.where(info == 0, told, -torch.inf).view(few, span)
         # Gradient in the camera's rows: G^-1 ((w - P M) Y^T - P S), summed over joints.
-        free = whiten.view(chunk, size, 2, joints)  # L^-1, back before the weights and the loss of the translation
-        free = soft[:, None, None] * (free - axis[:, None, None] * (axis[:, None, None] * free).sum(-1, keepdim=True))
-        pull = (free.reshape(chunk, size, size).mT @ white).view(chunk, 2, joints)
-        spread = free.transpose(1, 2).reshape(chunk, 2, -1) @ gain.view(chunk, size, 3, joints).permute(
-            0, 1, 3, 2
-        ).reshape(chunk, -1, 3)
-        slope = pull @ posterior.mT - spread
+        pull = (free.mT @ white).view(chunk, 2, joints)
+        left = free.view(chunk, size, 2, joints).transpose(1, 2).reshape(chunk, 2, -1)
+        right = gain.view(chunk, size, 3, joints).transpose(1, 2).reshape(chunk, 3, -1)
+        slope = pull @ posterior.mT - left @ right.mT
         ways = torch.cat([(scale[:, None] * (spin @ turn[:, None]))[:, :, :2], camera[:, None]], 1)  # (t, 4, 2, 3)
         gradient = (slope[:, None] * ways).sum((2, 3))
-        moves = free.reshape(chunk, size, size) @ (ways @ posterior[:, None]).reshape(chunk, 4, size).mT
+        moves = free @ (ways.view(chunk, 8, 3) @ posterior).view(chunk, 4, size).mT
         normal = moves.mT @ moves
-        normal = normal + torch.diag_embed(damping * normal.diagonal(dim1=-2, dim2=-1)) + 1e-9 * axes.new_ones(4).diag()
+        normal = normal + (damp * normal + 1e-9) * four
         solver, _ = torch.linalg.cholesky_ex(normal)
-        step = torch.cholesky_solve(gradient[..., None], solver)[..., 0]
-        miss = (whiten.mT @ white).square().sum((1, 2)) - whiten.square().sum((1, 2))
-        flat = gain.reshape(-1, three)
-        inner += flat.mT @ flat
-        parts.append((likelihood, posterior, step, miss))
-    likelihood, posterior, step, miss = (torch.cat(part) for part in zip(*parts, strict=True))
-    far = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
-    step = torch.where(far.isfinite(), step * (FARTHEST / far.clamp_min(FARTHEST)), torch.zeros_like(step))
-    noise = (level * frames * size + level.square() * miss.sum()) / count.sum().clamp_min(1)
-    return Expectation(likelihood.sum(), posterior.mT, frames * now.covariance - inner, step, noise)
+        steps[some] = torch.cholesky_solve(gradient[..., None], solver).view(few, span, 4)
+        miss[some] = ((whiten.mT @ white).square().sum((1, 2)) - whiten.square().sum((1, 2))).view(few, span)
+        aligned[some] = posterior.view(few, span, 3, joints)
+        flat = gain.view(few, -1, three)
+        inner[clip] += flat.mT @ flat
+    far = torch.linalg.vector_norm(steps, dim=-1, keepdim=True)
+    steps = torch.where(far.isfinite(), steps * (FARTHEST / far.clamp_min(FARTHEST)), 0)
+    likelihood = likelihood + (size - data.count) / 2 * levels.log()
+    noise = level * data.frames * size + level.square() * torch.where(data.inside, miss, 0).sum(1)
+    return Expectation(
+        torch.where(data.inside, likelihood, 0).sum(1),
+        torch.where(data.inside[..., None, None], aligned, 0).mT,
+        data.frames[:, None, None] * now.covariance - inner,
+        steps,
+        noise / data.count.sum(1).clamp_min(1),
+    )
 
 
-def maximise(now: ProcrusteanNormal, found: Expectation) -> ProcrusteanNormal:
+def maximise(now: ProcrusteanNormal, found: Expectation, inside: Tensor) -> ProcrusteanNormal:
     """M-step: rotations and scales by their steps, the mean, all aligned to it, and the covariance about it."""
-    mean = unit_mean(found.aligned.mean(0), found.aligned)
-    turn, factor = align_to_mean(found.aligned, mean)
-    aligned = (found.aligned @ turn) * factor[:, None, None]
+    mean = unit_mean(found.aligned)
+    turn, factor = align_to_mean(found.aligned, mean, inside)
+    aligned = (found.aligned @ turn) * factor[..., None, None]
     return ProcrusteanNormal(
         mean,
-        second_moment(aligned - mean, mean, found.rest),
-        rotation_matrix(found.steps[:, :3]) @ now.rotations @ turn,
-        now.scales * found.steps[:, 3].exp() / factor,
+        second_moment(aligned, mean, inside, found.rest),
+        rotation_matrix(found.steps[..., :3]) @ now.rotations @ turn,
+        now.scales * found.steps[..., 3].exp() / factor,
         aligned,
     )
 
 
-def freed(values: Tensor, root: Tensor, unit: Tensor) -> Tensor:
-    """Weigh the joints (last dimension) and take off the translation that fits best."""
-    weighed = values * root[:, None]
-    return weighed - unit[:, None] * (unit[:, None] * weighed).sum(-1, keepdim=True)
+def freed(weighed: Tensor, unit: Tensor) -> Tensor:
+    """Take the translation that fits best off joints (last dimension) that are weighed."""
+    return weighed - unit[..., None, :] * (unit[..., None, :] * weighed).sum(-1, keepdim=True)
+
+
+def _blocks(counts: list[int], most: int) -> Iterator[tuple[slice, slice]]:
+    """All frames of clips, no more than ``most`` at once: of one clip, or of neighbours that are short."""
+    few = max(1, most // max(counts))
+    for first in range(0, len(counts), few):
+        longest = max(counts[first : first + few])
+        for begin in range(0, longest, most // few):
+            yield slice(first, first + few), slice(begin, min(begin + most // few, longest))
+
+
+Record = TypeVar("Record", ProcrusteanNormal, Image, Expectation)
+
+
+def _some(record: Record, index: Tensor) -> Record:
+    """Some of the clips, (k,) of their numbers."""
+    return type(record)(*(getattr(record, field.name)[index] for field in fields(record)))
+
+
+def _put(record: Record, index: Tensor, values: Record) -> Record:
+    """The clips (k,) of ``index`` replaced."""
+    pairs = ((getattr(record, field.name), getattr(values, field.name)) for field in fields(record))
+    return type(record)(*(whole.index_copy(0, index, part) for whole, part in pairs))

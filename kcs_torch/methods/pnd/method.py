@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.methods.base import Estimate, Method
+from kcs_torch.methods.clips import in_batches, padded
 from kcs_torch.methods.pnd.distribution import ProcrusteanNormal
 from kcs_torch.methods.pnd.fit import fit_procrustean_normal
 from kcs_torch.methods.sfam import SfAM
@@ -24,6 +26,9 @@ FEWEST = 3
 
 SETTLED = 5e-3
 """Share of the shapes that the last step may change them by."""
+
+NUMBERS, GPU_NUMBERS = 2**20, 2**25
+"""Numbers in the covariances of the clips that are fitted together, at most."""
 
 
 @dataclass(frozen=True)
@@ -67,25 +72,70 @@ class PND(Method):
 
     def solve(self, tracks: Tracks, cameras: Tensor | None) -> Estimate:
         """Start from low rank, fit, and take the posterior mean of the shapes."""
-        given = tracks.points
+        return self._solve([tracks], cameras)[0]
+
+    def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
+        """Solve clips in which equally many joints are seen as one batch, padded to one length."""
+        return in_batches(tracks, lambda clips: self._solve(clips, None), lambda one: int(one.seen.any(0).sum()))
+
+    def _solve(self, clips: Sequence[Tracks], cameras: Tensor | None) -> list[Estimate]:
+        """Clips of one skeleton with equally many joints seen; known cameras (T, 2, 3) are those of a single clip."""
+        given = clips[0].points
         if given.device.type != "mps":  # what the noise leaves of a covariance is small beside the shapes
-            tracks = replace(tracks, points=given.double(), weights=tracks.weights.double())
-        known = tracks.seen.any(0)
-        start = SfAM(beta=0.0, camera_path="free").solve(tracks, None if cameras is None else cameras.to(tracks.points))
-        points, rows, settled, steps = start.points, start.cameras, True, 1
-        local = points[:, known] - points[:, known].mean(1, keepdim=True)
-        if local.shape[1] > 3 and bool(local.isfinite().all()) and bool(local.square().sum() > 0):
-            seen = tracks.seen[:, known]
-            thin = seen.sum(1, keepdim=True) < FEWEST
-            weights = torch.where(thin, torch.ones_like(local[..., 0]), tracks.weights[:, known])
-            image = torch.where((seen & ~thin)[..., None], tracks.points[:, known], local[..., :2])
-            first = ProcrusteanNormal.of_shapes(local, complete_rotation(rows), spread=self.spread)
-            fitted, _, change = fit_procrustean_normal(
-                image, weights, first, num_steps=self.num_steps, noise=self.noise, final=self.final, fall=self.fall
+            clips = [replace(one, points=one.points.double(), weights=one.weights.double()) for one in clips]
+        start = SfAM(beta=0.0, camera_path="free")
+        if cameras is None:
+            found = start.solve_all(clips)
+        else:
+            found = [start.solve(clips[0], cameras.to(clips[0].points))]
+        found = [replace(one, converged=True, iterations=1) for one in found]
+        parts = [_seen_part(one, first.points) for one, first in zip(clips, found, strict=True)]
+        bodies = [i for i, (_, _, local) in enumerate(parts) if _is_body(local)]
+        most = max(1, (NUMBERS if given.device.type == "cpu" else GPU_NUMBERS) // (3 * clips[0].num_joints) ** 2)
+        for some in (bodies[i : i + most] for i in range(0, len(bodies), most)):
+            fitted = self._fit([parts[i] for i in some], [found[i].cameras for i in some])
+            for i, (shapes, rows, settled) in zip(some, fitted, strict=True):
+                points = found[i].points.clone()
+                points[:, clips[i].seen.any(0)] = shapes
+                found[i] = replace(found[i], points=points, cameras=rows, converged=settled, iterations=self.num_steps)
+        shown = [one.cameras.to(given) for one in found] if cameras is None else [cameras]
+        return [
+            replace(
+                x,
+                points=place_unseen(x.points, one.seen.any(0), one.skeleton).to(given),
+                cameras=rows,
+                scales=x.scales.to(given),
             )
-            points = points.clone()
-            points[:, known] = fitted.shapes()
-            rows, settled, steps = fitted.rotations[:, :2], change <= SETTLED, self.num_steps
-        points = place_unseen(points, known, tracks.skeleton).to(given)
-        one = torch.ones_like(points[:, 0, 0])
-        return Estimate(points, rows.to(given) if cameras is None else cameras, one, settled, steps)
+            for one, x, rows in zip(clips, found, shown, strict=True)
+        ]
+
+    def _fit(
+        self, parts: Sequence[tuple[Tensor, Tensor, Tensor]], cameras: Sequence[Tensor]
+    ) -> list[tuple[Tensor, Tensor, bool]]:
+        """Shapes (T, N, 3) and camera rows of clips, and whether they settled, from what :func:`_seen_part` tells."""
+        image, weights, local = (padded(x) for x in zip(*parts, strict=True))
+        inside, frames = (weights > 0).any(-1), [len(x) for x in cameras]
+        first = ProcrusteanNormal.of_shapes(
+            local, complete_rotation(padded(cameras)), spread=self.spread, inside=inside
+        )
+        fitted, _, change = fit_procrustean_normal(
+            image, weights, first, num_steps=self.num_steps, noise=self.noise, final=self.final, fall=self.fall
+        )
+        found = zip(fitted.shapes(), fitted.rotations, (change <= SETTLED).tolist(), frames, strict=True)
+        return [(shapes[:n], turn[:n, :2], settled) for shapes, turn, settled, n in found]
+
+
+def _seen_part(tracks: Tracks, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Tracks, weights and start (T, N, 3), centred, of the joints that are seen at all."""
+    known = tracks.seen.any(0)
+    local = start[:, known] - start[:, known].mean(1, keepdim=True)
+    seen = tracks.seen[:, known]
+    thin = seen.sum(1, keepdim=True) < FEWEST
+    weights = torch.where(thin, torch.ones_like(local[..., 0]), tracks.weights[:, known])
+    image = torch.where((seen & ~thin)[..., None], tracks.points[:, known], local[..., :2])
+    return image, weights, local
+
+
+def _is_body(local: Tensor) -> bool:
+    """Whether there is something to fit in shapes (T, N, 3)."""
+    return local.shape[1] > 3 and bool(local.isfinite().all()) and bool(local.square().sum() > 0)
