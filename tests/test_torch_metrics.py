@@ -56,6 +56,16 @@ def test_mpjpe_and_pck_are_the_functions_over_all_clips(how):
     assert_close(fed(share, PRED, TRUTH, WEIGHTS).compute().double(), expected, rtol=1e-6, atol=0)
 
 
+def test_metrics_reset_in_inference_mode_go_on_outside_of_it():
+    metric = kt.metrics.MPJPE()
+    with torch.inference_mode():
+        metric.update(PRED[:3], TRUTH[:3])
+        metric.reset()
+        metric.update(PRED[:3], TRUTH[:3])
+    metric.update(PRED[3:], TRUTH[3:])
+    assert_close(metric.compute().double(), mpjpe(PRED, TRUTH, align="root").mean(), rtol=1e-6, atol=0)
+
+
 def test_e3d_and_bone_deviation_are_means_over_clips():
     assert_close(fed(kt.metrics.E3D(), PRED, TRUTH).compute().double(), e3d(PRED, TRUTH).mean(), rtol=1e-6, atol=0)
     expected = e3d(PRED, TRUTH, weights=WEIGHTS).mean()

@@ -383,6 +383,19 @@ def test_a_run_that_goes_on_for_longer_has_the_steps_of_a_longer_one(tmp_path):
     assert {group["weight_decay"] for group in trainer.optimizers[0].param_groups} == {0.5}
 
 
+def test_a_module_trains_again_under_another_trainer_after_it_was_validated():
+    """Lightning validates in inference mode, and what was made there may not be changed in training."""
+    module = module_of()
+    first = fit(module, 2)
+    first.validate(module, datamodule=data_of(), verbose=False)
+    seen = sizes(module)
+    fit(module, 1)
+    assert seen == [module.lr * step_share(step, 4) for step in range(4)] and int(module.step) == 4
+    first.fit_loop.max_epochs = 3
+    first.fit(module, datamodule=data_of())  # the trainer goes on where it was, and so do the steps
+    assert int(module.step) == 12
+
+
 @pytest.mark.parametrize(
     ("options", "told"),
     [

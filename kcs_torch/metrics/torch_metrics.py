@@ -46,8 +46,8 @@ class _Mean(Metric):
     def _add(self, values: Tensor, mass: Tensor) -> None:
         mass = mass.to(values).expand(values.shape)
         values = torch.where(mass > 0, values, torch.zeros_like(values))  # NaN where nothing counts
-        self.total += (values.detach().double() * mass).sum()
-        self.count += mass.double().sum()
+        self.total = self.total + (values.detach().double() * mass).sum()  # not in place: Lightning validates in
+        self.count = self.count + mass.double().sum()  # inference mode, whose tensors nothing may change later
 
     def compute(self) -> Tensor:
         """Return the mean over all that has been added; NaN where nothing counted."""

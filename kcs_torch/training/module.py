@@ -152,6 +152,11 @@ class LiftingModule(lightning.LightningModule):
                     "same order in data, network, losses, solver and critic"
                 )
 
+    def on_train_start(self) -> None:
+        """Begin where the trainer is: what an earlier one counted would leave only the smallest steps."""
+        self._counted = False
+        self.step.fill_(self.trainer.global_step)
+
     def on_train_epoch_end(self) -> None:
         """Stop where nothing was learnt from.
 
