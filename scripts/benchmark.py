@@ -37,7 +37,7 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.methods import METHODS
-from kcs_torch.training.configured import check_threads, in_one_line, method_of
+from kcs_torch.training.configured import check_switch, check_threads, in_one_line, method_of
 
 FACTS = (
     *("suite", "case", "method", "options", "cameras", "intrinsics", "frames", "joints"),
@@ -177,6 +177,7 @@ def main(config: DictConfig) -> None:
     global failed
     with in_one_line():
         check_threads(config.threads)
+        check_switch("cameras", config.cameras)
     torch.set_num_threads(config.threads)
     warnings.simplefilter("ignore", kt.KcsWarning)  # the column "converged" says it
     job = HydraConfig.get()

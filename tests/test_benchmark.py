@@ -104,10 +104,11 @@ def test_wrong_choices(script, folder):
     ("words", "told"),
     [
         (["method=sfam", "+method.foo=3"], "error: unknown option of method 'sfam' 'foo': choices are "),
+        (["method=sfam", "cameras=no"], "error: cameras: expected true or false, got 'no'"),
         (["method=sfam", "+method.beta=much"], "error: sfam: beta: expected a finite number, got 'much'"),
     ],
 )
-def test_wrong_fields_of_the_method(root, folder, words, told):
+def test_wrong_settings_are_a_line(root, folder, words, told):
     done = benchmark(root, folder, "suite=turn", *words)
     assert done.returncode == 1 and told in done.stderr and "Traceback" not in done.stderr
 

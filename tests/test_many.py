@@ -272,6 +272,10 @@ def test_results_in_the_input_are_no_clips(tmp_path):
     ("options", "words"),
     [
         ({"batch": 0}, "batch"),
+        ({"batch": 2.5}, "batch: expected a whole number, got 2.5"),
+        ({"shards": "two"}, "shards: expected a whole number, got 'two'"),
+        ({"everybody": "no"}, "everybody: expected true or false, got 'no'"),
+        ({"retry": "no"}, "retry: expected true or false, got 'no'"),
         ({"pattern": "*.xyz"}, "found none"),
         ({"suffixes": [".doc"]}, "suffix"),
         ({"beta": 1}, "beta"),

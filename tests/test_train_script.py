@@ -225,7 +225,9 @@ class TestWrongConfigurations:
             ("trainer.max_epochs=0", "at least one epoch with validation"),
             ("+trainer.default_root_dir=elsewhere", "trainer: default_root_dir: expected none"),
             ("+solver.num_steps=8", "solver: there is none to set num_steps of: choose one first, as solver=sfam does"),
-            ("+trainer.limit_val_batches=0", "at least one epoch with validation"),
+            ("+trainer.limit_val_batches=0", "at least one epoch with validation, got none: .*limit_val_batches is 0"),
+            ("+trainer.check_val_every_n_epoch=9", "one epoch with validation, got none: .*n_epoch=9, .*max_epochs="),
+            ("+trainer.max_steps=1", "at least one epoch with validation, got none: see the group trainer"),
         ],
     )
     def test_in_values(self, tmp_path, override, told):
@@ -234,6 +236,18 @@ class TestWrongConfigurations:
                 train(composed(override), tmp_path)
             except hydra.errors.InstantiationException as error:
                 raise error.__cause__ from None
+
+    def test_files_without_validation_are_told_before_anything_is_trained(self, tmp_path):
+        points = kt.data.walking_person(20).points
+        motion = kt.Motion.from_arrays(points, skeleton="h36m17", units="mm", up="-y", fps=30)
+        kt.save(motion, tmp_path / "walk.npz")
+        files = [f"data.{split}={names}" for split, names in {"train": "walk.npz", "val": "[]", "test": "[]"}.items()]
+        with hydra.initialize_config_dir(version_base="1.3", config_dir=str(configs())):
+            words = ["data=files", f"data.folder={tmp_path}", "skeleton=h36m17", "+data.window=9", *files]
+            config = hydra.compose("train", overrides=words)
+        with pytest.raises(kt.OptionError, match=r"got none: data\.val is empty"):
+            train(config, tmp_path / "run")
+        assert not list(tmp_path.glob("run/**/*.ckpt"))
 
     @pytest.mark.parametrize("solver", ["none", "sfam"])
     def test_divergence_is_the_worst_value(self, tmp_path, solver):
@@ -297,6 +311,7 @@ class TestCommandLine:
             ("+module.lr=abc", "error: module.lr: expected a finite number, got 'abc'"),
             ("trainer.max_epochs=hello", "error: trainer.max_epochs: expected a whole number or none, got 'hello'"),
             ("data.fresh_cameras=maybe", "error: data.fresh_cameras: expected true or false, got 'maybe'"),
+            ("keep=no", "error: keep: expected true or false, got 'no'"),
             ("optimise=???", "error: optimise: expected a value, got none: add optimise="),
             ("+trainer.acelerator=cpu", "trainer: .*unexpected keyword argument 'acelerator'"),
             ("trainer.accelerator=abacus", "abacus"),

@@ -23,6 +23,7 @@ from kcs_torch.many.record import claim, settings_of
 from kcs_torch.methods.base import Method
 from kcs_torch.reconstruct import method_named, reconstruct_all, with_found_bones
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
+from kcs_torch.types.hints import is_a, spoken
 from kcs_torch.types.size import METRES, parse_size
 
 __all__ = ["Outcome", "reconstruct_folder"]
@@ -108,6 +109,11 @@ def reconstruct_folder(
         OutputError: the results cannot be written.
         FormatError: the file that says how they were made is damaged, or that of the skeleton.
     """
+    numbers, switches = {"shard": shard, "shards": shards, "batch": batch}, {"everybody": everybody, "retry": retry}
+    for kind, given in ((int, numbers), (bool, switches)):
+        for name, value in given.items():
+            if not is_a(value, kind):
+                raise OptionError(f"{name}: expected {spoken(kind)}, got {value!r}")
     if not 0 <= shard < shards:
         raise OptionError(f"shard: expected a number from 0 to {shards - 1} of shards={shards}, got {shard}")
     if batch < 1:

@@ -70,6 +70,21 @@ class Watch(Callback):
     def __init__(self, config: dict[str, Any]) -> None:
         self.config = config
 
+    def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
+        """Make sure, before the first epoch is spent, that there will be a validation to choose the best one by.
+
+        Raises:
+            OptionError: there will be none.
+        """
+        every, last = trainer.check_val_every_n_epoch, trainer.max_epochs
+        reasons = {
+            "trainer.limit_val_batches is 0": trainer.limit_val_batches == 0,
+            f"trainer.check_val_every_n_epoch={every}, trainer.max_epochs={last}": every and 0 <= last < every,
+            "data.val is empty": trainer.datamodule.val_dataloader() == [],
+        }
+        if trainer.ckpt_path is None and (found := [reason for reason, holds in reasons.items() if holds]):
+            raise OptionError(f"train: expected at least one epoch with validation, got none: {found[0]}")
+
     def on_save_checkpoint(self, trainer: Any, pl_module: Any, checkpoint: dict[str, Any]) -> None:
         """Add the configuration."""
         checkpoint["config"] = self.config

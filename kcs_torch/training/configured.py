@@ -19,7 +19,15 @@ from kcs_torch.errors import KcsError, OptionError
 from kcs_torch.methods import Method
 from kcs_torch.types.hints import is_a, spoken
 
-__all__ = ["WrongConfiguration", "check_threads", "check_values", "check_whole", "in_one_line", "method_of"]
+__all__ = [
+    "WrongConfiguration",
+    "check_switch",
+    "check_threads",
+    "check_values",
+    "check_whole",
+    "in_one_line",
+    "method_of",
+]
 
 
 class WrongConfiguration(CompactHydraException):
@@ -52,6 +60,16 @@ def check_whole(name: str, value: Any, least: int, most: int) -> None:
     """
     if type(value) is not int or not least <= value <= most:
         raise OptionError(f"{name}: expected a whole number within {least}..{most}, got {value!r}")
+
+
+def check_switch(name: str, value: Any) -> None:
+    """Make sure that a setting is true or false: Hydra takes ``no`` and ``off`` for words, which count as true.
+
+    Raises:
+        OptionError: it is not.
+    """
+    if not isinstance(value, bool):
+        raise OptionError(f"{name}: expected {spoken(bool)}, got {value!r}")
 
 
 def check_threads(value: Any) -> None:

@@ -30,7 +30,7 @@ from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.training.callbacks import Best, Diverged, Last, Watch
 from kcs_torch.training.checkpoint import describe, save_lifter
-from kcs_torch.training.configured import check_threads, check_values, check_whole, in_one_line
+from kcs_torch.training.configured import check_switch, check_threads, check_values, check_whole, in_one_line
 from kcs_torch.training.sweep import RESULT, tabulate
 
 __all__ = ["Outcome", "configs", "job", "main", "train"]
@@ -245,6 +245,8 @@ def job(config: DictConfig) -> float:
     """Train in the folder that Hydra gives a run, tell what it came to, and return what a sweep optimises."""
     settings = HydraConfig.get()
     folder = Path(settings.runtime.output_dir)
+    with in_one_line():
+        check_switch("keep", config.keep)
     ended = _ended(config, folder) if config.keep else None
     if ended is not None:
         print(f"{folder}: had ended, and is kept")
