@@ -90,6 +90,7 @@ _MODULES = (
     "functional",
     "io",
     "live",
+    "many",
     "methods",
     "metrics",
     "nn",

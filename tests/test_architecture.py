@@ -182,6 +182,12 @@ def test_help_loads_without_torch():
     assert not loaded(code) & {"torch", "numpy"}
 
 
+def test_every_module_with_a_page_is_an_attribute_of_the_package():
+    pages = re.findall(r"^api/(\w+)$", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    code = "import kcs_torch as kt\nfor name in {}: getattr(kt, name)"
+    loaded(code.format([name for name in pages if name != "kcs_torch"]))
+
+
 def test_public_names_exist_and_are_listed():
     import kcs_torch as kt
 

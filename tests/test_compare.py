@@ -31,9 +31,10 @@ def test_figures_are_those_of_the_functions():
     assert found.bone_deviation > 0.01 > found.bone_deviation_truth
     assert (found.frames, found.units, found.root, found.pck_within) == (20, "m", "pelvis", 0.15)
     assert found.notes == ()
-    assert compare(pred, truth, align=["none"]).mpjpe == {
-        "none": pytest.approx(float(mpjpe(pred.points, truth.points, align="none")))
-    }
+    for align in (["none"], "none"):
+        assert compare(pred, truth, align=align).mpjpe == {
+            "none": pytest.approx(float(mpjpe(pred.points, truth.points, align="none")))
+        }
 
 
 def test_joints_are_matched_by_name_and_not_by_order():

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import similarity, superpose
 from kcs_torch.metrics import ALIGNMENTS, align, bone_deviation, e3d, mpjpe, pck
+from kcs_torch.skeleton import SKELETONS
 
 BONES = [(0, 1), (1, 2), (2, 3), (0, 4)]
 
@@ -153,6 +154,13 @@ def test_bone_deviation_is_the_protocols_figure():
     expected = np.sort(length.std(0) / length.mean(0))
     assert float(bone_deviation(points, BONES)) in (pytest.approx(expected[1]), pytest.approx(expected[2]))
     assert float(bone_deviation(points[:1].expand(9, -1, -1), BONES)) < 1e-7
+
+
+def test_bone_deviation_takes_the_rigid_bones_of_a_skeleton():
+    body = SKELETONS["h36m17"]
+    points = torch.randn(9, 17, 3, generator=torch.Generator().manual_seed(0))
+    expected = bone_deviation(points, [body.bones[i] for i in body.rigid])
+    assert bone_deviation(points, body) == bone_deviation(points, "h36m17") == expected
 
 
 def test_pck_counts_joints():

@@ -63,7 +63,7 @@ def compare(
     pred: Motion,
     truth: Motion,
     *,
-    align: Sequence[str] | None = None,
+    align: str | Sequence[str] | None = None,
     root: str | None = None,
     mirror: bool = False,
     within: float | None = None,
@@ -75,8 +75,8 @@ def compare(
     Args:
         pred: of any skeleton and unit.
         truth: of any skeleton and unit; joints that it does not see do not count.
-        align: names in :data:`~kcs_torch.metrics.ALIGNMENTS`; all that make sense if None: those without a scale need
-            a known size of both, ``none`` has to be asked for.
+        align: one or more names in :data:`~kcs_torch.metrics.ALIGNMENTS`; all that make sense if None: those without a
+            scale need a known size of both, ``none`` has to be asked for.
         root: name of the truth's root joint; a pelvis, if None and there is one.
         mirror: compare the prediction's mirror image in depth.
         within: distance for PCK in the truth's unit; 150 mm if None.
@@ -192,9 +192,10 @@ def _same_frames(pred: Motion, truth: Motion, notes: list[str]) -> tuple[Motion,
     )
 
 
-def _alignments(align: Sequence[str] | None, ratio: float | None, pred: Motion, truth: Motion) -> list[str]:
+def _alignments(align: str | Sequence[str] | None, ratio: float | None, pred: Motion, truth: Motion) -> list[str]:
     if align is None:
         return [how for how in ALIGNMENTS if how in _SIZED or (ratio is not None and how != "none")]
+    align = [align] if isinstance(align, str) else align
     for how in align:
         if how not in ALIGNMENTS:
             raise unknown("alignment", how, ALIGNMENTS)

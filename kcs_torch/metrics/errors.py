@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -12,8 +13,12 @@ from kcs_torch.functional import bone_lengths, centre, nearest_rotation
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.metrics.align import align as aligned
 from kcs_torch.metrics.align import check_tensors
+from kcs_torch.skeleton import Skeleton, get_skeleton
 
-__all__ = ["bone_deviation", "distances", "e3d", "mpjpe", "pck"]
+__all__ = ["Bones", "bone_deviation", "bone_pairs", "distances", "e3d", "mpjpe", "pck"]
+
+Bones = Tensor | Sequence[tuple[int, int]] | str | Path | Skeleton
+"""What :func:`bone_pairs` takes."""
 
 
 def mpjpe(
@@ -107,14 +112,12 @@ def e3d(pred: Tensor, truth: Tensor, *, weights: Tensor | None = None) -> Tensor
     return _mean(distance, weights) / ((spread.mean(-1) * known).sum(-1) / known.sum(-1))
 
 
-def bone_deviation(
-    points: Tensor, bones: Sequence[tuple[int, int]] | Tensor, *, weights: Tensor | None = None
-) -> Tensor:
+def bone_deviation(points: Tensor, bones: Bones, *, weights: Tensor | None = None) -> Tensor:
     """Median over the bones of their length's standard deviation over the mean: how far they are from rigid.
 
     Args:
         points: (..., T, N, 3).
-        bones: (B, 2) joint indices.
+        bones: (B, 2) joint indices, or a :class:`~kcs_torch.Skeleton` (a name, a file), whose rigid bones are taken.
         weights: (..., T, N), 0 where a joint is unknown, whatever stands there; all 1 if None.
 
     Returns:
@@ -128,9 +131,7 @@ def bone_deviation(
     0.1
     """
     check_tensors(points=points, weights=weights)
-    index = torch.as_tensor(bones, device=points.device)
-    if index.ndim != 2 or not len(index):
-        raise ShapeError(f"bones: expected pairs of joints, got shape {tuple(index.shape)}")
+    index = bone_pairs(bones).to(points.device)
     points = points.to(torch.promote_types(points.dtype, torch.float32))
     lengths = bone_lengths(points, index)  # (..., T, B)
     mass = torch.ones_like(lengths)
@@ -141,6 +142,22 @@ def bone_deviation(
     mean = (lengths * mass).sum(-2) / count
     spread = ((lengths - mean[..., None, :]).square() * mass).sum(-2).div(count).sqrt()
     return nanmedian(spread / mean, -1)
+
+
+def bone_pairs(bones: Bones) -> Tensor:
+    """The (B, 2) joint indices of bones; of a skeleton, of those that are rigid.
+
+    Raises:
+        ShapeError: there are no bones.
+        SkeletonError: there is no skeleton of that name.
+    """
+    if isinstance(bones, (str, Path, Skeleton)):
+        body = get_skeleton(bones)
+        bones = body.bone_index()[list(body.rigid)]
+    index = torch.as_tensor(bones)
+    if index.ndim != 2 or not len(index):
+        raise ShapeError(f"bones: expected pairs of joints, got shape {tuple(index.shape)}")
+    return index
 
 
 def distances(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,8 +10,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.align import check_alignment
 from kcs_torch.metrics.align import check_tensors
-from kcs_torch.metrics.errors import bone_deviation, distances, e3d
-from kcs_torch.skeleton import Skeleton, get_skeleton
+from kcs_torch.metrics.errors import Bones, bone_deviation, bone_pairs, distances, e3d
 
 try:
     from torchmetrics import Metric
@@ -154,14 +152,9 @@ class BoneDeviation(_Mean):
 
     higher_is_better = False
 
-    def __init__(self, bones: Any, **options: Any) -> None:
+    def __init__(self, bones: Bones, **options: Any) -> None:
         super().__init__(**options)
-        if isinstance(bones, (str, Path, Skeleton)):
-            body = get_skeleton(bones)
-            bones = body.bone_index()[list(body.rigid)]
-        self.bones = torch.as_tensor(bones)
-        if self.bones.ndim != 2 or not len(self.bones):
-            raise ShapeError(f"BoneDeviation: expected pairs of joints, got shape {tuple(self.bones.shape)}")
+        self.bones = bone_pairs(bones)
 
     def update(self, points: Tensor, weights: Tensor | None = None) -> None:
         """Add a batch of clips (..., T, N, 3) with weights (..., T, N), 0 where a joint is unknown."""
