@@ -305,6 +305,11 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=150, help="of most clips, at most; synthetic ones have up to 60")
     parser.add_argument("--csv", type=Path, help="also write every run here")
     options = parser.parse_args(words)
+    wanted = {suite for part in options.parts for suite in PARTS[part]}
+    if options.suites and not wanted & set(options.suites):
+        parser.error(f"--parts {' '.join(options.parts)}: has none of the suites {', '.join(options.suites)}")
+    if options.csv:
+        options.csv.parent.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", kt.KcsWarning)
     there = suites if (options.shared / "protocol").is_dir() else SYNTHETIC

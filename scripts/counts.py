@@ -138,6 +138,8 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--csv", type=Path, help="also write the rows here")
     options = parser.parse_args(words)
+    if options.csv:
+        options.csv.parent.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", kt.KcsWarning)  # of short clips
     rates = limits()

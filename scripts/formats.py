@@ -54,6 +54,8 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--image-size", metavar="WIDTHxHEIGHT", help="of the videos of MediaPipe's files")
     options = parser.parse_args()
+    if not options.folder.is_dir():
+        parser.error(f"{options.folder}: expected a folder, found none")
     warnings.simplefilter("ignore", kt.KcsWarning)
     print("| file | format | frames | joints | people | unseen, % |\n|---|---|---|---|---|---|")
     left = []

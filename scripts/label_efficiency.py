@@ -7,7 +7,7 @@
 Reads results.csv of the sweeps, and prints a Markdown table: mean and standard deviation over the seeds of the test
 error, for each share of labels, a row for each experiment and whatever else was swept. The methods that need no
 training lift the same test clips, of the same seeds, and are scored on the same windows; so is the flat guess, which is
-the tracks with depth 0.
+the tracks with depth 0. Where the runs were tested on different data (noise, say), there is a table for each.
 
     metric=pa_mpjpe     the figure
     methods=[]          training-free methods beside the networks
@@ -35,7 +35,11 @@ from kcs_torch.training.module import ALIGNED
 from kcs_torch.training.pseudo import pseudo_labels
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-SHOWN = ("run", "experiment", "data.labelled", "seed")
+SHOWN = ("run", "experiment", "data.labelled", "seed", "keep")
+FILMED = "folder test up units file_units fps window views pitch noise occlusion clips"
+TESTED = ("data", "skeleton", *(f"data.{name}" for name in FILMED.split()))
+"""Settings that change what a network is tested on."""
+
 OPTIONS = {"metric": "pa_mpjpe", "methods": "[]", "experiment": "", "shared": "../shared", "cache": ""}
 
 
@@ -62,10 +66,22 @@ def runs_of(folders: list[Path], metric: str) -> dict[str, dict[str, dict[int, f
     return found
 
 
-def untrained(method: str, seed: int, experiment: str, shared: str, cache: str, metric: str) -> float:
+def tested_on(folders: list[Path]) -> list[tuple[str, ...]]:
+    """What the runs set of their test data: one where all of them were tested on the same."""
+    found = []
+    for folder in folders:
+        with (folder / "results.csv").open(newline="", encoding="utf-8") as file:
+            found += [tuple(f"{n}={row[n]}" for n in TESTED if row.get(n)) for row in csv.DictReader(file)]
+    return list(dict.fromkeys(found))
+
+
+def untrained(
+    method: str, seed: int, experiment: str, shared: str, cache: str, metric: str, settings: tuple[str, ...] = ()
+) -> float:
     """The test error of a training-free method, or of the flat guess, on the windows that networks are tested on."""
+    own = [f"++{s}" if s.startswith("data.") else s for s in settings]
     with initialize_config_dir(version_base="1.3", config_dir=str(CONFIGS)):
-        config = compose("train", overrides=[f"experiment={experiment}", f"seed={seed}", f"shared={shared}"])
+        config = compose("train", overrides=[f"experiment={experiment}", f"seed={seed}", f"shared={shared}", *own])
     data = instantiate(config.data, _convert_="all")
     data.setup("test")
     windows = data.sets["test"]
@@ -121,12 +137,14 @@ def main(arguments: list[str]) -> None:
     print("|---|" + "---|" * len(shares))
     for name, row in found.items():
         print(f"| {name} | {' | '.join(cell(list(row[s].values())) if s in row else '' for s in shares)} |")
-    print("\n| without training | |\n|---|---|")
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", kt.KcsWarning)
-    for name in ["flat", *methods]:
-        each = [untrained(name, s, experiment, options["shared"], options["cache"], options["metric"]) for s in seeds]
-        print(f"| {name} | {cell(each)} |", flush=True)
+    given = (options["shared"], options["cache"], options["metric"])
+    for settings in tested_on(folders):
+        print(f"\n| {', '.join(['without training', *settings])} | |\n|---|---|")
+        for name in ["flat", *methods]:
+            each = [untrained(name, seed, experiment, *given, settings) for seed in seeds]
+            print(f"| {name} | {cell(each)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -100,6 +100,8 @@ def main() -> None:
     options = parser.parse_args()
     if (options.inputs is None) != (options.truth is None):
         parser.error("--inputs and --truth go together")
+    if options.inputs is not None and not any(options.inputs.glob("*.npz")):
+        parser.error(f"--inputs {options.inputs}: expected a folder with .npz files of tracks, found none")
     torch.set_num_threads(1)
     head = f"{'clip':<32}{'frames':>7}{'fps':>7}{'offline':>8}{'ms: med':>8}{'99 %':>7}{'worst':>7}"
     print(f"{head}{'mm: all':>8}{'ready':>9}{'offline':>9}{'sure':>9}")

@@ -222,6 +222,8 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--sequences", type=int, default=len(ORBIT), help="of each part, at most")
     parser.add_argument("--csv", type=Path, help="also write every run here")
     options = parser.parse_args(words)
+    if options.csv:
+        options.csv.parent.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", kt.KcsWarning)
     bench = Bench(options.shared, options.frames, options.sequences)

@@ -333,6 +333,8 @@ def arguments(words: list[str] | None) -> argparse.Namespace:
 def main(words: list[str] | None = None) -> None:
     """Measure what is asked for and print one table a part."""
     options = arguments(words)
+    if options.csv:
+        options.csv.parent.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(options.threads)
     warnings.simplefilter("ignore", kt.KcsWarning)  # of short clips that do not settle
     if options.peak:

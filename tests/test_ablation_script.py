@@ -89,13 +89,19 @@ def test_figures_are_the_protocols(script, shared, protocol):
         assert script.e3d(points, truth) == pytest.approx(expected["e3d"], rel=1e-6)
 
 
+def test_suites_of_another_part_are_told(script, capsys):
+    with pytest.raises(SystemExit):
+        script.main(["--suites", "arm", "--parts", "fixed"])
+    assert "--parts fixed: has none of the suites arm" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("part", "suite", "variant"),
     [("fixed", "walk", "no discrete moves"), ("moving", "tree", "SfAM's guess as the only start")],
 )
 def test_script(script, part, suite, variant, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(script, "YAWS", (0.0, 90.0))  # fewer clips
-    path = tmp_path / "runs.csv"
+    path = tmp_path / "made" / "runs.csv"
     script.main(["--suites", suite, "--frames", "12", "--variants", variant, "--csv", str(path)])
     title, head, line, *rows = filter(None, capsys.readouterr().out.splitlines())
     assert title == part and head == f"| | {suite} | ms a frame |" and set(line) == {"|", "-"}

@@ -58,3 +58,16 @@ def test_methods_lift_the_test_data_of_the_runs(script, tmp_path, monkeypatch, c
     script.main([str(sweep)])
     script.main([str(sweep), "experiment=labels"])
     assert asked == ["smoke", "labels"] and "| smoke | 7.0 |" in capsys.readouterr().out
+
+
+def test_methods_lift_test_data_with_the_settings_of_the_runs(script, tmp_path):
+    """The flat guess errs by as much as the tracks, which have the noise that the networks were tested with."""
+    runs = [run(k, 7.0, experiment="smoke", seed=3, keep=True, **{"data.noise": 5 + k // 2}) for k in range(4)]
+    runs[1]["seed"] = runs[3]["seed"] = 4
+    sweep = write(tmp_path / "sweep", runs)
+    assert script.tested_on([sweep]) == [("data.noise=5",), ("data.noise=6",)]
+    assert list(script.runs_of([sweep], "pa_mpjpe")) == ["smoke data.noise=5", "smoke data.noise=6"]
+    clean, noisy = (
+        script.untrained("flat", 3, "smoke", "nowhere", "", "mpjpe", settings) for settings in ((), ("data.noise=300",))
+    )
+    assert noisy > clean + 50

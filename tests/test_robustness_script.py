@@ -59,7 +59,7 @@ def test_true_lengths_and_cameras_are_those_of_the_case(script, shared):
 
 
 def test_script(script, shared, tmp_path, capsys):
-    table = tmp_path / "runs.csv"
+    table = tmp_path / "made" / "runs.csv"
     script.main(["--sequences", "1", "--frames", "40", "--seeds", "2", "--shared", str(shared), "--csv", str(table)])
     shown = capsys.readouterr().out
     with table.open(newline="", encoding="utf-8") as file:

@@ -2,6 +2,8 @@
 
 import csv
 import runpy
+import subprocess
+import sys
 
 import naive
 import pytest
@@ -58,7 +60,7 @@ def test_after_the_context_the_fast_parts_are_back():
 @pytest.mark.parametrize("part", ["memory", "methods", "kernels", "growth", "joints", "batch", "scale", "gpu"])
 def test_script(root, tmp_path, capsys, part):
     script = runpy.run_path(str(root / "scripts" / "speed.py"))
-    table = tmp_path / "speed.csv"
+    table = tmp_path / "made" / "speed.csv"
     sizes = ["--frames", "12", "--growth", "12", "--memory", "12", "--joints", "5", "--runs", "1"]
     sizes += [
         "--which",
@@ -94,6 +96,19 @@ def test_script_says_that_there_is_no_gpu(root):
         script["main"](["--parts", "gpu"])
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["live.py", "--inputs", "nowhere", "--truth", "nowhere"], "--inputs nowhere: expected a folder with .npz"),
+        (["formats.py", "nowhere"], "nowhere: expected a folder, found none"),
+    ],
+)
+def test_folders_that_are_not_there_are_told(root, tmp_path, words, told):
+    command = [sys.executable, str(root / "scripts" / words[0]), *words[1:]]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr
+
+
 def test_counts_of_operations(root, tmp_path, capsys):
     """By hand for one product and one sum; and a row for each method and camera."""
     script = runpy.run_path(str(root / "scripts" / "counts.py"))
@@ -102,7 +117,7 @@ def test_counts_of_operations(root, tmp_path, capsys):
         (left @ right).mT.add(1)
     assert (made.calls, made.matrix, made.other) == (2, 2 * 4 * 3 * 5 * 2, 24)
     assert made.bytes == 8 * (60 + 40 + 24) + 8 * (24 + 24)
-    table = tmp_path / "counts.csv"
+    table = tmp_path / "made" / "counts.csv"
     script["main"](["--methods", "kcs", "sfam", "--frames", "12", "--csv", str(table)])
     with table.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
