@@ -172,6 +172,17 @@ def test_unseen_feet_do_not_stand_nor_tell_the_top_speed():
     assert (standing(torch.full((9, 2, 2), 3.0), torch.ones(9, 2)) == 1).all()
 
 
+def test_unseen_feet_may_be_nan_and_numbers_may_be_short():
+    image, weights = normal(60, 2, 2).cumsum(0), torch.ones(60, 2).double()
+    weights[20, 1] = 0
+    spoiled = image.clone()
+    spoiled[20, 1] = torch.nan
+    assert_close(standing(spoiled, weights), standing(image, weights))
+    assert_close(standing(spoiled, torch.ones_like(weights)), standing(image, weights))
+    assert_close(standing(spoiled.half(), weights.half()), standing(image, weights).half(), atol=0.05, rtol=0)
+    assert standing(image[None][:0], weights[None][:0]).shape == (0, 60, 2)
+
+
 def test_standing_takes_batches():
     same_as_loop(lambda p, w: standing(p, (w > -1).double()), (9, 3, 2), (9, 3))
 

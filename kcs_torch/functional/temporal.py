@@ -68,7 +68,7 @@ def standing(image: Tensor, weights: Tensor) -> Tensor:
 
     Args:
         image: (..., T, C, 2) of points that touch the ground now and then, not centred.
-        weights: (..., T, C), 0 where unseen.
+        weights: (..., T, C), 0 where unseen, whatever stands there; NaN counts as unseen, too.
 
     Returns:
         (..., T, C) in 0..1; 0 where a point or its neighbours in time are unseen, and in clips of one or two frames.
@@ -78,13 +78,14 @@ def standing(image: Tensor, weights: Tensor) -> Tensor:
     >>> standing(torch.stack([x, 0 * x], -1)[:, None], torch.ones(7, 1)).flatten()
     tensor([1.0000e+00, 1.0000e+00, 1.0000e+00, 1.7e-04, 8.3e-16, 8.3e-16, 8.3e-16])
     """
-    if image.shape[-3] < 3 or not image.shape[-2]:
+    if image.shape[-3] < 3 or not image.numel():
         return torch.zeros_like(weights)
-    move = image[..., 2:, :, :] - image[..., :-2, :, :]
+    seen = (weights > 0) & image.isfinite().all(-1)
+    known = torch.where(seen[..., None], image, 0.0).to(torch.promote_types(image.dtype, torch.float32))
+    move = known[..., 2:, :, :] - known[..., :-2, :, :]
     move = move / move.abs().amax((-3, -2, -1), keepdim=True).clamp_min(torch.finfo(move.dtype).tiny)  # no overflow
     speed = move.norm(dim=-1) / 2
     speed = torch.cat([speed[..., :1, :], speed, speed[..., -1:, :]], -2)
-    seen = weights > 0
     seen = (
         seen
         & torch.cat([seen[..., :1, :], seen[..., :-1, :]], -2)
@@ -92,7 +93,7 @@ def standing(image: Tensor, weights: Tensor) -> Tensor:
     )
     top = torch.nanquantile(torch.where(seen, speed, torch.nan).flatten(-2), 0.95, dim=-1)[..., None, None]
     still = torch.exp(-0.5 * (speed / (0.12 * top).clamp_min(torch.finfo(speed.dtype).tiny)).square())
-    return torch.where(seen, still, torch.zeros_like(still))
+    return torch.where(seen, still, torch.zeros_like(still)).to(image)
 
 
 def window_starts(length: int, window: int, overlap: int) -> list[int]:
