@@ -466,6 +466,7 @@ def test_what_files_may_not_be(folder, tmp_path):
 @pytest.mark.parametrize("options", [
     {"window": 0}, {"stride": 0}, {"views": 0}, {"noise": -1.0}, {"noise": math.nan}, {"occlusion": 1.0},
     {"labelled": 1.5}, {"labelled": -0.1}, {"labelled_per_batch": 2.0}, {"pitch": (20, 0)}, {"fps": 0.0},
+    {"pitch": (20,)}, {"pitch": (0, "b")},
     {"batch_size": 0}, {"steps_per_epoch": 0}, {"pseudo_trust": 0.0}, {"clips": 0},
     {"labelled": 0.5, "batch_size": 1}, {"labelled": 0.0, "unlabelled": False},
     {"pseudo": "pck"}, {"pseudo": "pkc", "fresh_cameras": True},

@@ -19,6 +19,7 @@ from kcs_torch.training.loader import BatchLoader, Deck
 from kcs_torch.training.pseudo import pseudo_labels
 from kcs_torch.training.seeds import generator_of
 from kcs_torch.training.windows import FilmedWindows
+from kcs_torch.types.hints import is_a
 
 __all__ = ["TracksDataModule"]
 
@@ -108,13 +109,16 @@ class TracksDataModule(lightning.LightningDataModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        low, high = (float(p) for p in pitch)
         rules = {
             "fps": (fps is None or 0 < fps < math.inf, fps, "a positive number or None"),
             "window": (window >= 1, window, "at least 1 frame"),
             "stride": (stride is None or stride >= 1, stride, "at least 1 frame or None"),
             "views": (views >= 1, views, "at least 1 camera"),
-            "pitch": (-90 <= low <= high <= 90, pitch, "two angles within -90..90 degrees, the smaller one first"),
+            "pitch": (
+                is_a(pitch, tuple[float, float]) and -90 <= pitch[0] <= pitch[1] <= 90,
+                pitch,
+                "two angles within -90..90 degrees, the smaller one first",
+            ),
             "noise": (0 <= noise < math.inf, noise, "a number not below 0"),
             "occlusion": (0 <= occlusion < 1, occlusion, "a share of at least 0 and below 1"),
             "batch_size": (batch_size >= 1, batch_size, "at least 1"),
@@ -144,7 +148,12 @@ class TracksDataModule(lightning.LightningDataModule):
         self.files = {"train": train, "val": val, "test": test}
         self.folder, self.body, self.up, self.units, self.fps = folder, skeleton, up, units, fps
         self.file_units = file_units
-        self.window, self.stride, self.views, self.pitch = window, stride or window, views, (low, high)
+        self.window, self.stride, self.views, self.pitch = (
+            window,
+            stride or window,
+            views,
+            (float(pitch[0]), float(pitch[1])),
+        )
         self.noise, self.occlusion, self.fresh_cameras = noise, occlusion, fresh_cameras
         self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
         self.labelled, self.labelled_per_batch, self.unlabelled = labelled, labelled_per_batch, unlabelled

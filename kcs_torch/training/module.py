@@ -101,11 +101,10 @@ class LiftingModule(lightning.LightningModule):
         self.lr, self.weight_decay, self.clip, self.seed = lr, weight_decay, clip, seed
         self.register_buffer("step", torch.zeros((), dtype=torch.long))
         self._counted = False  # whether any clip has counted in any loss
-        bones = isinstance(skeleton, Skeleton) and bool(skeleton.rigid)
         self.measured = nn.ModuleDict()
         for stage in ("val", "test"):
             metrics: dict[str, nn.Module] = {name: MPJPE(align=align) for name, align in ALIGNED.items()}
-            if bones:
+            if isinstance(skeleton, Skeleton) and skeleton.rigid:
                 metrics["bone_deviation"] = BoneDeviation(skeleton)
             self.measured[stage] = nn.ModuleDict(metrics)
 
