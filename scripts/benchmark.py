@@ -36,11 +36,13 @@ import numpy as np
 import torch
 
 import kcs_torch as kt
+from kcs_torch.io.atomic import atomic_path
 from kcs_torch.methods import METHODS
 from kcs_torch.training.configured import check_switch, check_threads, in_one_line, method_of
 
+MEASURED = ("suite", "case", "method", "options", "cameras", "intrinsics")
 FACTS = (
-    *("suite", "case", "method", "options", "cameras", "intrinsics", "frames", "joints"),
+    *(*MEASURED, "frames", "joints"),
     *("seconds", "cpu_seconds", "ms_per_frame", "converged"),
 )
 failed = 0  # cases of all jobs; Hydra hands no exit code through
@@ -146,14 +148,36 @@ def table(rows: list[dict[str, Any]], figures: tuple[str, ...]) -> str:
     return "\n".join(lines)
 
 
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """The rows of a CSV file; none where there is no file."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
 def write_rows(path: Path, rows: list[dict[str, Any]], columns: tuple[str, ...]) -> None:
-    """Write rows to a CSV file, after those that an earlier job of the same sweep wrote."""
-    new = not path.exists()
-    with path.open("a", newline="", encoding="utf-8") as file:
+    """Write rows to a CSV file, whole or not at all; of those that measured the same only the last."""
+    latest: dict[tuple[str, ...], dict[str, Any]] = {}
+    for row in rows:
+        what = tuple(str(row[name]) for name in MEASURED)
+        latest.pop(what, None)
+        latest[what] = row
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
-        if new:
-            writer.writeheader()
-        writer.writerows(rows)
+        writer.writeheader()
+        writer.writerows(latest.values())
+
+
+def tabulate(folder: Path, columns: tuple[str, ...]) -> None:
+    """Write the rows of all runs below a sweep's folder to one file.
+
+    Every run does so at its end, and who writes looks again afterwards, so that nobody's rows are lost.
+    """
+    read: list[Path] = []
+    while len(found := sorted(folder.glob("*/**/results.csv"), key=lambda path: path.stat().st_mtime_ns)) > len(read):
+        read = found
+        write_rows(folder / "results.csv", [row for path in read for row in read_rows(path)], columns)
 
 
 def make_papers(paper: DictConfig, shared: Path, folder: Path) -> None:
@@ -194,12 +218,16 @@ def main(config: DictConfig) -> None:
     options = {k: v for k, v in OmegaConf.to_container(config.method).items() if k != "_target_"}
     name = job.runtime.choices.method
     text = " ".join(f"{k}={v}" for k, v in options.items())
+    asked = {
+        "cameras": "true" if config.cameras else "estimated",
+        "intrinsics": {None: "none", False: "none", True: "true"}.get(config.intrinsics, config.intrinsics),
+    }
     rows: list[dict[str, Any]] = []
     stopped = False
     suites = config.suite if isinstance(config.suite, str) else list(config.suite)
     for suite, case in chosen(protocol, suites, str(config.case)):
         label = protocol.case_name(case)
-        row: dict[str, Any] = {"suite": suite, "case": label, "method": name, "options": text}
+        row: dict[str, Any] = {"suite": suite, "case": label, "method": name, "options": text} | asked
         try:
             given = protocol, shared / "data", case, method, folder / suite / f"{label}.npz"
             row |= run_case(*given, config.cameras, config.intrinsics)
@@ -217,9 +245,10 @@ def main(config: DictConfig) -> None:
         raise SystemExit(f"case={config.case}: matches no case of suite={config.suite}")
     columns = (*FACTS, *protocol.FIGURES, "error")
     folder.mkdir(parents=True, exist_ok=True)
-    write_rows(folder / "results.csv", rows, columns)
+    own = folder / "results.csv"
+    write_rows(own, read_rows(own) + rows, columns)
     if job.mode == RunMode.MULTIRUN:
-        write_rows(Path(job.sweep.dir) / "results.csv", rows, columns)
+        tabulate(Path(job.sweep.dir), columns)
     print(f"\n{table(rows, protocol.FIGURES)}\n{folder / 'results.csv'}")
     if stopped:
         raise SystemExit("stopped: these are the cases that were done")

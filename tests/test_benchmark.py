@@ -70,6 +70,15 @@ def test_multirun_writes_predictions_and_one_table(root, folder):
         assert len(rows(folder / "out" / method / "results.csv")) == 2
 
 
+def test_what_is_measured_again_in_its_folder_replaces_what_was(root, folder):
+    for methods in ("kcs,rigid", "rigid"):  # the second run of rigid has another number, and a folder of its own
+        done = benchmark(root, folder, "-m", f"method={methods}", "suite=turn", "hydra.sweep.dir=again")
+        assert done.returncode == 0, done.stderr
+    table = rows(folder / "again" / "results.csv")
+    assert [(r["method"], r["case"]) for r in table] == [(m, c) for m in ("kcs", "rigid") for c in ("case_a", "case_b")]
+    assert table[2:] == rows(folder / "again" / "0_rigid" / "results.csv") != rows(folder / "again/1_rigid/results.csv")
+
+
 def test_a_failing_case_is_a_row_and_an_exit_code(root, folder):
     done = benchmark(root, folder, "method=sfam", "suite=[broken]", "hydra.run.dir=out", "+method.beta=0.5")
     assert done.returncode == 1
