@@ -24,8 +24,12 @@ from kcs_torch.nn import (
     BoneLengthEnergy,
     BoneLengths,
     BoneVectors,
+    JointDistance,
+    KCSDistance,
     KCSMatrix,
     LowRankEnergy,
+    PerspectiveEnergy,
+    ReprojectionEnergy,
     SmoothnessEnergy,
     SymmetryEnergy,
 )
@@ -100,6 +104,24 @@ def test_results_follow_dtype_and_device(layer, dtype, device):
 def test_wrong_joint_count_names_the_skeleton(layer, shape):
     with pytest.raises(ShapeError, match=r"\(\.\.\., 7, 3\) for skeleton 'body7', got"):
         layer(torch.zeros(shape))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("module", "told"),
+    [
+        (SVT(0.3, learnable=True), "SVT(threshold=0.3, relative=False)"),
+        (KCSMatrix(BODY, normalise=True), "KCSMatrix(skeleton='body7', normalise=True)"),
+        (KCSDistance(BODY), "KCSDistance(skeleton='body7', squared=True, scale_free=False)"),
+        (JointDistance("similarity"), "JointDistance(align='similarity', root=None)"),
+        (LowRankEnergy("log_det"), "LowRankEnergy(kind='log_det', eps=0.001)"),
+        (SmoothnessEnergy(3), "SmoothnessEnergy(order=3)"),
+        (ReprojectionEnergy(huber=2.0), "ReprojectionEnergy(translation=True, huber=2.0)"),
+        (PerspectiveEnergy(), "PerspectiveEnergy(translation=True, huber=None, nearest=0.15)"),
+    ],
+)
+def test_modules_tell_their_settings(module, told):
+    assert repr(module) == told
 
 
 @each_layer

@@ -56,6 +56,11 @@ def test_mpjpe_and_pck_are_the_functions_over_all_clips(how):
     assert_close(fed(share, PRED, TRUTH, WEIGHTS).compute().double(), expected, rtol=1e-6, atol=0)
 
 
+def test_metrics_tell_their_settings():
+    assert repr(kt.metrics.MPJPE("scale", root=1)) == "MPJPE(align='scale', root=1)"
+    assert repr(kt.metrics.PCK(150.0)) == "PCK(threshold=150, align='root', root=None)"
+
+
 def test_metrics_reset_in_inference_mode_go_on_outside_of_it():
     metric = kt.metrics.MPJPE()
     with torch.inference_mode():

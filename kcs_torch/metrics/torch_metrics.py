@@ -78,6 +78,9 @@ class MPJPE(_Mean):
         check_alignment(align, root)
         self.align, self.root = align, root
 
+    def extra_repr(self) -> str:
+        return f"align={self.align!r}, root={self.root!r}"
+
     def update(self, pred: Tensor, truth: Tensor, weights: Tensor | None = None) -> None:
         """Add a batch of clips.
 
@@ -118,6 +121,9 @@ class PCK(MPJPE):
         if not threshold >= 0:
             raise OptionError(f"PCK: expected a threshold of at least 0, got {threshold}")
         self.threshold = threshold
+
+    def extra_repr(self) -> str:
+        return f"threshold={self.threshold:g}, {super().extra_repr()}"
 
     def _measure(self, pred: Tensor, truth: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         distance, mass = super()._measure(pred, truth, weights)

@@ -12,7 +12,7 @@ from kcs_torch.functional.align import check_alignment, superpose
 from kcs_torch.functional.chain import pose_matrix, safe_norm
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_clip, check_weights
-from kcs_torch.nn.layers import SkeletonModule, check_tensor, full_precision, known, narrow, seen_weights, wide
+from kcs_torch.nn.layers import SkeletonModule, check_tensor, full_precision, known, narrow, seen_weights, shown, wide
 from kcs_torch.nn.masks import bone_share, some
 from kcs_torch.skeleton import Skeleton
 
@@ -40,6 +40,9 @@ class JointDistance(nn.Module):
         super().__init__()
         check_alignment(align, root)
         self.align, self.root = align, root
+
+    def extra_repr(self) -> str:
+        return shown(self, "align", "root")
 
     def forward(self, points: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return the mean distance of each frame.
@@ -98,6 +101,9 @@ class KCSDistance(SkeletonModule):
     def __init__(self, skeleton: str | Path | Skeleton, *, squared: bool = True, scale_free: bool = False) -> None:
         super().__init__(skeleton)
         self.squared, self.scale_free = squared, scale_free
+
+    def extra_repr(self) -> str:
+        return f"{super().extra_repr()}, {shown(self, 'squared', 'scale_free')}"
 
     def forward(self, points: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return the distance of each pose.

@@ -26,6 +26,7 @@ from kcs_torch.nn.layers import (
     known,
     narrow,
     seen_weights,
+    shown,
     wide,
 )
 from kcs_torch.nn.masks import bone_share, safe_root, some
@@ -118,6 +119,9 @@ class ReprojectionEnergy(nn.Module):
             raise OptionError(f"ReprojectionEnergy: expected a positive huber length or None, got {huber}")
         self.translation, self.huber = translation, huber
 
+    def extra_repr(self) -> str:
+        return shown(self, "translation", "huber")
+
     def forward(
         self, points: Tensor, tracks: Tensor, cameras: Tensor | None = None, weights: Tensor | None = None
     ) -> Tensor:
@@ -191,6 +195,9 @@ class LowRankEnergy(nn.Module):
             raise OptionError(f"LowRankEnergy: expected kind 'nuclear' or 'log_det' and eps > 0, got {shown} and {eps}")
         self.kind, self.eps = kind, eps
 
+    def extra_repr(self) -> str:
+        return shown(self, "kind", "eps")
+
     def forward(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return the energy of each clip.
 
@@ -256,6 +263,9 @@ class SmoothnessEnergy(nn.Module):
             shown = order if isinstance(order, (int, float)) else f"a {type(order).__name__}"
             raise OptionError(f"SmoothnessEnergy: expected a whole order >= 1, got {shown}")
         self.order = order
+
+    def extra_repr(self) -> str:
+        return shown(self, "order")
 
     def forward(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return (..., T) of points (..., T, N, D); a difference weighs as much as the least of its frames."""

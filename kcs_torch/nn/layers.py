@@ -81,6 +81,11 @@ def check_joints(module: nn.Module, skeleton: Skeleton, points: Tensor, form: st
     raise ShapeError(message)
 
 
+def shown(module: nn.Module, *names: str) -> str:
+    """Settings of a module, as its text tells them."""
+    return ", ".join(f"{name}={getattr(module, name)!r}" for name in names)
+
+
 class SkeletonModule(nn.Module):
     """Base of modules that know a skeleton: holds its bones as a buffer and checks what comes in."""
 
@@ -140,6 +145,9 @@ class KCSMatrix(SkeletonModule):
         super().__init__(skeleton)
         self.normalise = normalise
 
+    def extra_repr(self) -> str:
+        return f"{super().extra_repr()}, {shown(self, 'normalise')}"
+
     def forward(self, points: Tensor) -> Tensor:
         self.check(points)
         with full_precision(points):
@@ -171,6 +179,9 @@ class SVT(nn.Module):
     @property
     def threshold(self) -> Tensor | float:
         return self.fixed if self.raw is None else nn.functional.softplus(self.raw)
+
+    def extra_repr(self) -> str:
+        return f"threshold={float(torch.as_tensor(self.threshold).detach()):g}, {shown(self, 'relative')}"
 
     def forward(self, matrix: Tensor) -> Tensor:
         check_points(matrix, self, "matrices")

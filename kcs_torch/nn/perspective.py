@@ -12,7 +12,7 @@ from kcs_torch.functional.camera import perspective, pinhole_translation
 from kcs_torch.functional.chain import LOST
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_clip, check_weights, huber_square
-from kcs_torch.nn.layers import check_tensor, full_precision, known, narrow, seen_weights, wide
+from kcs_torch.nn.layers import check_tensor, full_precision, known, narrow, seen_weights, shown, wide
 from kcs_torch.nn.masks import safe_root, some
 from kcs_torch.types.intrinsics import Intrinsics
 
@@ -52,6 +52,9 @@ class PerspectiveEnergy(nn.Module):
                 f"got {huber} and {nearest}"
             )
         self.translation, self.huber, self.nearest = translation, huber, nearest
+
+    def extra_repr(self) -> str:
+        return shown(self, "translation", "huber", "nearest")
 
     def forward(self, points: Tensor, tracks: Tensor, intrinsics: Any, weights: Tensor | None = None) -> Tensor:
         """Return the energy of each frame.
