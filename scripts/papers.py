@@ -130,11 +130,12 @@ def number(value: float) -> str:
 
 
 def plot(part: Part, rows: list[Row], path: Path) -> None:
-    """Lines over a number, bars over names; a panel a figure."""
+    """Lines over a number, points over names (bars have no foot on a logarithmic axis); a panel a figure."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     from matplotlib import pyplot as plt
+    from matplotlib.ticker import LogFormatter
 
     shown, panels = plt.subplots(1, len(part.figures), figsize=(6 * len(part.figures) + 2, 4.5), squeeze=False)
     settings = list(dict.fromkeys(row["setting"] for row in rows))
@@ -146,14 +147,20 @@ def plot(part: Part, rows: list[Row], path: Path) -> None:
         for i, (setting, (*values, _)) in enumerate(mean.items()):
             style: dict[str, Any] = {"label": setting, "color": colours[setting]}
             if names:
-                axes.bar(place + 0.8 * (i / len(mean) - 0.5), values, 0.8 / len(mean), align="edge", **style)
+                axes.plot(place + 0.8 * ((i + 0.5) / len(mean) - 0.5), values, "o", **style)
             else:
                 axes.plot(place, values, marker="o", **style)
         if names:
             axes.set_xticks(place, top, rotation=30, ha="right")
+            axes.set_xlim(-0.5, len(top) - 0.5)
             axes.set_yscale("log")
+            axes.grid(axis="y", which="both", alpha=0.3)
         if part.log:
             axes.set(xscale="log", yscale="log")
+        for axis in (axes.xaxis, axes.yaxis):
+            if axis.get_scale() == "log":  # plain numbers: 30, not 3 x 10^1
+                axis.set_major_formatter(LogFormatter())
+                axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
         axes.set(xlabel=part.at, ylabel=figure)
     lines = {name: line for axes in panels[0] for line, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     shown.suptitle(part.title, fontsize=10)

@@ -140,6 +140,24 @@ def test_parts_yield_finite_figures(papers, settings, name):
     assert len(papers.markdown(part, rows).splitlines()) > 5
 
 
+@pytest.mark.parametrize("log", [False, True])
+def test_plots_over_names_are_points_with_plain_numbers(papers, tmp_path, monkeypatch, log):
+    """A bar on a logarithmic axis begins wherever the axis does, so that its height tells nothing."""
+    from matplotlib import pyplot as plt
+
+    made = []
+    monkeypatch.setattr(plt, "close", made.append)
+    at = [10, 100] if log else ["x", "y"]
+    rows = [{"setting": name, "at": at[i], "e3d": 30.0 * (i + 1)} for name in "ab" for i in range(2)]
+    papers.plot(papers.Part("title", "at", ("e3d",), None, log=log), rows, tmp_path / "plot.png")
+    (axes,) = made[0].axes
+    assert not axes.patches and [list(line.get_ydata()) for line in axes.lines] == [[30.0, 60.0]] * 2
+    labels = [label.get_text() for label in axes.get_yticklabels(which="both")]
+    assert any(labels) and not any("10^" in label for label in labels)
+    monkeypatch.undo()
+    plt.close(made[0])
+
+
 def test_one_command_writes_rows_tables_and_plots(root, shared, tmp_path):
     words = ["paper.parts=[rounds,growth]", "paper.walks=1", "paper.frames=100", "paper.methods=[kcs]"]
     command = [sys.executable, str(root / "scripts" / "benchmark.py"), *words, f"shared={shared}", "hydra.run.dir=out"]
