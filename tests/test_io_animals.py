@@ -275,6 +275,16 @@ def test_damaged_csv_is_told(tmp_path, change, message):
     assert str(path) in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("cell", "got"), [("abc", "got 'abc' for y of"), ('"1,5"', r"got '1,5' \(write decimals with a point\) for y of")]
+)
+def test_a_cell_without_a_number_is_named(tmp_path, cell, got):
+    path = write_deeplabcut_csv(tmp_path / "a.csv", *_animal())
+    path.write_text(re.sub(r"\n1,([^,]*),[^,]*,", rf"\n1,\1,{cell},", path.read_text(), count=1))
+    with pytest.raises(FormatError, match=rf"a\.csv: line 5: expected numbers, {got} 'snout'"):
+        load_tracks(path)
+
+
 def test_short_lines_are_unseen_there(tmp_path):
     path = write_deeplabcut_csv(tmp_path / "a.csv", *_animal())
     path.write_text(path.read_text().rstrip().rpartition(",")[0].rpartition(",")[0])
@@ -567,11 +577,17 @@ def test_sleap_csv_with_a_frame_twice(tmp_path):
         ([["a", 10**30, 0.9, *CELLS]], "line 2: expected a frame number"),
         ([["a", 1.5, 0.9, *CELLS]], "line 2: expected a frame number, got 1.5"),
         ([["a", 0, 0.9, "left", *CELLS[1:]]], "line 2: expected numbers"),
+        ([["a", 0, 0.9, CELLS[0], "left", *CELLS[2:]]], r"line 2: expected numbers, got 'left' for '\w+\.y'"),
     ],
 )
 def test_damaged_sleap_csv_is_told(tmp_path, lines, message):
     with pytest.raises(FormatError, match=message):
         load_tracks(write_sleap_csv(tmp_path / "a.csv", lines))
+
+
+def test_sleap_csv_that_r_wrote_again(tmp_path):
+    tracks = load_tracks(write_sleap_csv(tmp_path / "a.csv", [["a", 0, "NA", "NA", "NA", "NA", *CELLS[3:]]]))
+    assert tracks.seen[0].tolist() == [False, True, True]
 
 
 def test_sleap_csv_without_places(tmp_path):

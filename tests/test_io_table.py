@@ -118,6 +118,15 @@ def test_people_by_a_column(tmp_path):
     assert a.points[:, 0, 0].diff().tolist() == [1, 1, 1]
 
 
+@pytest.mark.parametrize("order", [lambda rows: rows, sorted], ids=["in turns", "one after the other"])
+@pytest.mark.parametrize("column", ["animal", "individual", "track", "person"])
+def test_animals_without_numbers_of_frames_are_told_apart(tmp_path, column, order):
+    rows = order([f"{who},{100 * at + t},5,{100 * at + t},50" for t in range(4) for at, who in ((1, "b"), (7, "a"))])
+    people = load_people(lines(tmp_path / "a.csv", f"{column},hip_x,hip_y,foot_x,foot_y", *rows))
+    assert sorted(one.points[:, 0, 0].tolist() for one in people) == [[100, 101, 102, 103], [700, 701, 702, 703]]
+    assert any("each person's rows are counted from 0" in note for note in people[0].notes)
+
+
 @pytest.mark.parametrize(
     ("column", "times", "fps", "seen"),
     [

@@ -12,7 +12,10 @@ from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES
 
 __all__ = ["WHO", "Columns", "Header", "Layout", "delimiter", "first_line", "plain_name"]
 
-WHO = ("person", "person_id", "pose", "track_id", "hand", "handedness", "id")
+WHO = (
+    *("person", "individual", "individuals", "animal", "subject", "track", "instance"),
+    *("person_id", "pose", "track_id", "hand", "handedness", "id"),
+)
 """What a column is called that tells people apart."""
 
 _WHAT = "|".join(("x", "y", "z", *CONFIDENCES, *VISIBILITIES))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
-from kcs_torch.io.header import WHO, Header, plain_name
+from kcs_torch.io.header import Header, plain_name
 from kcs_torch.io.jsonfile import as_frame_number, as_text
 from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
 from kcs_torch.io.wide import Row, as_value, opened, place_rows
@@ -24,7 +24,6 @@ __all__ = ["LongHeader", "read_long"]
 _MOST = 5e7  # coordinates of all frames, those between the file's included
 _MOST_JOINTS = 2000
 _PARTS = ("joint", "joint_name", "keypoint", "bodypart", "body_part", "part", "landmark", "node", "marker", "name")
-_WHO = ("person", "individual", "individuals", "animal", "subject", "track", "instance", *WHO)
 _SLEAP = ["track", "frame_idx", "instance.score"]
 _UNIT = re.compile(r" \[(?P<unit>[^\]]*)\]\Z")
 
@@ -74,7 +73,7 @@ class LongHeader:
             {name: lower.index(name) for name in held if name in lower},
             header.number,
             header.time,
-            header.column(_WHO),
+            header.who,
             next((name for name in (*held, lower[joint]) if lower.count(name) > 1), ""),
             unit["unit"] if unit else "",
         )

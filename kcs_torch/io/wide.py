@@ -7,6 +7,7 @@ import itertools
 import math
 import re
 import statistics
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,7 +26,7 @@ from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import brief, read_error
 from kcs_torch.types.intake import FARTHEST
 
-__all__ = ["Row", "as_value", "is_missing", "opened", "place_rows", "read_wide"]
+__all__ = ["Row", "as_value", "is_missing", "not_a_number", "opened", "place_rows", "read_wide"]
 
 _LIMIT = 2**30  # bytes of a file
 _HEAD = 2**20  # characters of the first line, at most
@@ -59,6 +60,16 @@ def is_missing(cell: str) -> bool:
     (True, False, False)
     """
     return cell.strip().lower() in _MISSING
+
+
+def not_a_number(cell: str) -> str:
+    """What a cell says that should hold a number, for messages, with a hint where decimals have a comma.
+
+    >>> print(not_a_number("1,5"))
+    got '1,5' (write decimals with a point)
+    """
+    hint = " (write decimals with a point)" if re.fullmatch(r"-?[0-9]+,[0-9]+", cell.strip()) else ""
+    return f"got '{as_text(cell)}'{hint}"
 
 
 @contextmanager
@@ -196,8 +207,7 @@ def as_value(cell: str, where: str, name: str) -> float:
     try:
         value = math.nan if is_missing(cell) else float(cell)
     except ValueError:
-        hint = " (write decimals with a point)" if re.fullmatch(r"-?[0-9]+,[0-9]+", cell) else ""
-        raise FormatError(f"{where}: '{name}': expected a number, got '{as_text(cell)}'{hint}") from None
+        raise FormatError(f"{where}: '{name}': expected a number, {not_a_number(cell)}") from None
     if not (math.isnan(value) or abs(value) <= FARTHEST):
         raise FormatError(f"{where}: '{name}': expected a coordinate or a visibility, got {value:.3g}")
     return value
@@ -208,7 +218,7 @@ def _numbers(rows: Sequence[Row], notes: list[str]) -> list[int]:
     if rows and rows[0].number is not None:
         return [row.number or 0 for row in rows]
     if any(math.isnan(row.time) for row in rows):
-        return list(range(len(rows)))
+        return _counted(rows, notes)
     times = sorted({row.time for row in rows})
     step = statistics.median_low([b - a for a, b in itertools.pairwise(times)] or [1.0])
     exact = [min((time - times[0]) / step, 1e300) for time in times]
@@ -218,6 +228,19 @@ def _numbers(rows: Sequence[Row], notes: list[str]) -> list[int]:
         frames = list(range(len(times)))
     frame = dict(zip(times, frames, strict=True))
     return [frame[row.time] for row in rows]
+
+
+def _counted(rows: Sequence[Row], notes: list[str]) -> list[int]:
+    """The frame of each row by the order of the rows: of those of each person, where there are several."""
+    so_far = Counter[Hashable]()
+    if not 1 < len({row.who for row in rows}) < len(rows):
+        return list(range(len(rows)))
+    notes.append("nothing numbers the frames: each person's rows are counted from 0 (call a column 'frame' that does)")
+    frames = []
+    for row in rows:
+        frames.append(so_far[row.who])
+        so_far[row.who] += 1
+    return frames
 
 
 def _rate(times: dict[int, float], unit: str, notes: list[str]) -> float | None:

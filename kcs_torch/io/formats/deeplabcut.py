@@ -23,7 +23,7 @@ from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5_pandas import Table, has_column, pandas_group, read_pandas
 from kcs_torch.io.header import delimiter
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief, read_error
-from kcs_torch.io.wide import is_missing
+from kcs_torch.io.wide import is_missing, not_a_number
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]
@@ -163,9 +163,10 @@ def _read_csv(path: Path, coords: Sequence[str], notes: list[str]) -> Table:
                 if not rows and not any(values) and not any(c.isdigit() for c in "".join(line[:first])):
                     continue  # pandas may write the name of the index in a line of its own
                 try:
-                    numbers.extend([math.nan if is_missing(v) else float(v) for v in values])
-                except ValueError as error:
-                    raise FormatError(f"{path}: line {lines.line_num}: expected numbers: {brief(error)}") from None
+                    numbers.extend([_number(v) for v in values])
+                except ValueError:
+                    names = [columns[i][1:] for i in take]
+                    raise FormatError(f"{path}: line {lines.line_num}: {_wrong(names, values)}") from None
                 rows.append(tuple(line[:first]))
     except OSError as error:
         raise read_error(path, error) from None
@@ -180,6 +181,21 @@ def _read_csv(path: Path, coords: Sequence[str], notes: list[str]) -> Table:
     if left:
         notes.append(f"columns left out: {brief(', '.join(dict.fromkeys(c[-1] or c[0] for c in left)))}")
     return Table([columns[i] for i in take], np.frombuffer(numbers).reshape(-1, len(take)), rows)
+
+
+def _number(cell: str) -> float:
+    return math.nan if is_missing(cell) else float(cell)
+
+
+def _wrong(names: Sequence[tuple[str, ...]], cells: Sequence[str]) -> str:
+    """Which of these columns' cells is the first that holds no number, for messages."""
+    for (*whose, part, coord), cell in zip(names, cells, strict=True):
+        try:
+            _number(cell)
+        except ValueError:
+            animal = f" of '{brief(whose[0])}'" if whose else ""
+            return f"expected numbers, {not_a_number(cell)} for {coord} of '{brief(part)}'{animal}"
+    return "expected numbers"
 
 
 def _header(lines: Iterator[list[str]], path: Path) -> list[list[str]]:
