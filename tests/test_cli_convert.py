@@ -227,6 +227,8 @@ def test_score_names_what_it_compares(scored):
     assert "Pelvis of each frame moved" in rows["root"]
     assert "no bones in the truth" in told
     assert "mirror image" not in told
+    assert f"note: {scored / 'truth.trc'}: y is taken to point up: give up=... (kcs-torch: --truth-up)" in told
+    assert "taken to point up" not in run("score", scored / "pred.npz", scored / "truth.trc", "--truth-up", "y").output
 
 
 def test_score_as_json(scored):

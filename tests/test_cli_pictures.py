@@ -72,6 +72,17 @@ def test_view_shows_motion(tmp_path):
     assert "got 2D tracks: lift them first" in run("view", tmp_path / "t.npz", code=2).stderr
 
 
+def test_view_says_how_motion_was_read(tmp_path):
+    """Which axis is taken to point up, and how to tell; and nothing of a method, as none made it."""
+    save(walking_motion(4), tmp_path / "m.trc")
+    told = run("view", tmp_path / "m.trc", "-o", tmp_path / "m.html").stderr
+    assert f"note: {tmp_path / 'm.trc'}: y is taken to point up: give up=... (kcs-torch: --from-up)" in told
+    assert not any(word in people(tmp_path / "m.html")[0]["summary"] for word in ("turn", "reprojection", "converged"))
+    assert "taken to" not in run("view", tmp_path / "m.trc", "--from-up", "-y", "-o", tmp_path / "n.html").stderr
+    first, second = (people(tmp_path / name)[0] for name in ("m.html", "n.html"))
+    assert first != second
+
+
 def test_view_shows_several_results_together(tmp_path):
     for name in ("a.npz", "b.npz"):
         save(walk_result(4, name=name), tmp_path / name)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from kcs_torch.cli.convert import FromUp
 from kcs_torch.cli.options import (
     AsJson,
     FormatName,
@@ -160,6 +161,7 @@ def view(
     up: Up = None,
     scale: Scale = None,
     units: Units = None,
+    from_up: FromUp = None,
 ) -> None:
     """Show results, and 3D motion: write a page with a 3D player, a sheet of key frames, a film."""
     with answer():
@@ -177,10 +179,12 @@ def view(
             )
         for result in results:
             outputs = check_outputs(outputs, source=str(result))
-        people = []
+        people, notes = [], []
         for result in results:
             with progress(f"reading {result}"):
-                motion = _moving(result, mirror)
+                motion = _moving(result, mirror, from_up)
+            if isinstance(motion, Motion):
+                notes += [f"{result}: {note}" for note in motion.notes]
             people.append(motion if size is None else motion.scaled(**size))
         if len(people) == 1:
             written = write_files(people[0], outputs, up, units)
@@ -189,16 +193,16 @@ def view(
             for path in outputs:
                 together = [as_result(one) if isinstance(one, Motion) else one for one in people]
                 written.attempt(path, partial(save_people, together, path))
-        written.tell()
+        written.tell(notes)
 
 
-def _moving(path: Path, mirror: bool) -> Reconstruction | Motion:
+def _moving(path: Path, mirror: bool, up: str | None) -> Reconstruction | Motion:
     """A result, or its mirror image; or motion, which has none."""
     from kcs_torch.errors import FormatError, OptionError
     from kcs_torch.io import load_any
     from kcs_torch.types import Reconstruction, Tracks
 
-    data = load_any(path)
+    data = load_any(path, up=up)
     if isinstance(data, Tracks):
         raise FormatError(f"{path}: expected a result or 3D motion, got 2D tracks: lift them first (kcs-torch lift)")
     if not mirror:

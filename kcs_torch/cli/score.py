@@ -83,6 +83,8 @@ def score(
             theirs = load_motion(truth, format=truth_format, up=truth_up, fps=truth_fps, units=from_units)
             theirs = _cut(theirs, truth_frames, "--truth-frames")
         found = compare(ours, theirs, align=align or None, root=root, mirror=mirror, within=within)
+        read = [*_notes(ours, pred, "--pred-up"), *_notes(theirs, truth, "--truth-up")]
+        found = dataclasses.replace(found, notes=(*found.notes, *read))
         if as_json:
             print_json(dataclasses.asdict(found))
         else:
@@ -98,8 +100,13 @@ def _motion(path: str, size: dict[str, Any] | None, *, format: str | None, **opt
     if kind_of(path, format) == "result":
         data = load_any(path, format=format, **options)
         assert isinstance(data, Reconstruction)
-        return dataclasses.replace(Motion.of(sized(data, size)), source=path)
+        return dataclasses.replace(Motion.of(sized(data, size)), source=path, notes=())
     return sized(load_motion(path, format=format, **options), size)
+
+
+def _notes(motion: Motion, path: str, up: str) -> list[str]:
+    """What was assumed when a file was read; its axes matter where bodies are compared without turning them."""
+    return [f"{path}: {note.replace('--from-up', up)}" for note in motion.notes]
 
 
 def _cut(motion: Motion, frames: str | None, option: str) -> Motion:
@@ -138,9 +145,10 @@ def _spoken(found: Comparison, pred: str, truth: str, mirror: bool) -> str:
     if math.isnan(found.bone_deviation):
         del rows["bone deviation"]
     lines += [f"{name:<16}{text}" for name, text in rows.items()]
+    lines += [f"note: {one_line(note)}" for note in found.notes]
     better = [how for how in found.mpjpe if found.mirrored[how] < 0.98 * found.mpjpe[how]]
     if better:
         shown = ", ".join(f"{how} {found.mirrored[how]:.4g}{unit}" for how in better)
         how = "without" if mirror else "with"
         lines.append(f"note: the mirror image in depth is closer ({shown}): score it {how} --mirror")
-    return "\n".join([*lines, *(f"note: {one_line(note)}" for note in found.notes)])
+    return "\n".join(lines)

@@ -59,10 +59,14 @@ def build_motion(
         longest = _longest(points)
         if longest in (None, "y"):
             remarks.append(
-                "y is taken to point up: give up=... if it does not (results written as CSV have y down: -y)"
+                "y is taken to point up: give up=... (kcs-torch: --from-up) if it does not (results written as CSV "
+                "have y down: -y)"
             )
         else:
-            remarks.append(f"y is taken to point up, but the body is longest along {longest}: give up=... if it stands")
+            remarks.append(
+                f"y is taken to point up, but the body is longest along {longest}: give up=... (kcs-torch: --from-up) "
+                "if it stands"
+            )
     return Motion.from_arrays(
         points,
         up=axis,

@@ -22,7 +22,7 @@ def summarise(result: Reconstruction) -> str:
         _fact("unseen {:.1f} %", 100 * d.unseen_share),
         f"bone variation {d.variation}" if math.isfinite(d.bone_variation) else "",
         _fact(f"reprojection {{:.3g}} {result.tracks.units}", d.reprojection_rms),
-        "converged" if d.converged else f"not converged after {d.iterations} iterations",
+        ("converged" if d.iterations else "") if d.converged else f"not converged after {d.iterations} iterations",
     ]
     return " · ".join(f for f in facts if f)
 

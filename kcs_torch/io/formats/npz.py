@@ -275,7 +275,9 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         raise FormatError(f"{path}: 'points3d': expected shape (frames, joints, 3), got {tuple(points.shape)}")
     notes = _json(file, "notes", list) if "notes" in file else []
     if "up" not in file and options.up is None:
-        notes.append("the axes are taken to be the camera's, y down: give up=... if they are not")
+        notes.append(
+            "the axes are taken to be the camera's, y down: give up=... (kcs-torch: --from-up) if they are not"
+        )
     axis = file.text("up") if "up" in file else "-y"
     if axis not in AXES:
         raise FormatError(f"{path}: 'up': expected one of {', '.join(AXES)}, got {axis[:20]!r}")

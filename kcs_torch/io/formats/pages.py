@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -86,13 +87,13 @@ def as_result(motion: Motion) -> Reconstruction:
         motion.tracks(yaw=20.0, pitch=8.0),
         "3D motion",
         Diagnostics(
-            viewpoint_turn=0.0,
+            viewpoint_turn=math.nan,
             unseen_share=float((~motion.seen).double().mean()),
             bone_variation=variation.median,
-            reprojection_rms=0.0,
+            reprojection_rms=math.nan,
             converged=True,
             iterations=0,
-            notes=("3D motion of a file, filmed from the side: no method made it",),
+            notes=(*motion.notes, "3D motion of a file, filmed from the side: no method made it"),
             largest_bone_variation=variation.largest,
             loosest_bone=variation.bone,
         ),

@@ -92,7 +92,8 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
     up = None if options.up else _up(names, points)
     if up is not None:
         found.notes.append(
-            f"{up} is taken to point up, as the head is above the feet there: give up=... if it does not"
+            f"{up} is taken to point up, as the head is above the feet there: give up=... (kcs-torch: --from-up) if it "
+            "does not"
         )
     return build_motion(
         torch.from_numpy(points),
