@@ -50,6 +50,20 @@ def test_unseen_bones_and_bones_of_no_length_are_no_news():
     assert bone_variation(torch.ones(1, 4), BODY) == (0, 0, "a-b")
 
 
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+def test_bones_between_joints_that_nobody_saw_do_not_count():
+    """Their places are made up, and so is how far they are from each other."""
+    links = kt.Skeleton.from_names(
+        list("abcdefg"), [(p, q) for p, q in zip("abdef", "bcefg", strict=True)], tree=False
+    )  # the second piece is never seen
+    points = kt.data.random_motion(BODY, 30, turn=120, generator=torch.Generator().manual_seed(0)).tracks.points
+    points = torch.cat([points[:, :3], torch.full_like(points[:, :4], math.nan)], 1)
+    found = kt.reconstruct(points, skeleton=links, method="pkc")
+    lengths = bone_lengths(found.points, links.bone_index())
+    expected = bone_variation(lengths[:, :2], kt.Skeleton.from_names(list("abc"), [("a", "b"), ("b", "c")]))
+    assert found.diagnostics.variation == expected == found.remeasured().diagnostics.variation
+
+
 @pytest.mark.parametrize("method", ["pkc", "sfam"])
 @pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
 def test_a_joint_that_nobody_saw_has_no_bone_that_varies(method):

@@ -230,7 +230,7 @@ def _reconstruction(
     """One solution, whose place is known."""
     body = tracks.skeleton
     bones = bone_lengths(points, body.bone_index(device=points.device))
-    variation = bone_variation(bones, body)
+    variation = bone_variation(bones, body, tracks.seen.any(0))
     turn = float(viewpoint_turn(found.cameras))
     notes = list(found.notes)
     if little := little_turn(method, body, turn):

@@ -31,7 +31,8 @@ class Diagnostics:
         viewpoint_turn: degrees by which the camera turned about the body, largest angle between two frames.
             Depth is weakly determined below about 30 degrees.
         unseen_share: share of joints without a measurement.
-        bone_variation: median over rigid bones of the length's standard deviation over its mean, per cent.
+        bone_variation: median over rigid bones of the length's standard deviation over its mean, per cent; bones whose
+            ends no frame shows do not count.
         reprojection_rms: root mean square of seen joints' reprojection error, in the tracks' units.
         converged: whether the stopping rule was met.
         iterations: how many steps were made.
@@ -160,7 +161,7 @@ class Reconstruction:
     def remeasured(self) -> Reconstruction:
         """The same with the lengths that the bones of its points have, and with how much these vary."""
         bones = bone_lengths(self.points, self.skeleton.bone_index(device=self.points.device))
-        variation = bone_variation(bones, self.skeleton)
+        variation = bone_variation(bones, self.skeleton, self.tracks.seen.any(0))
         facts = replace(
             self.diagnostics,
             bone_variation=variation.median,

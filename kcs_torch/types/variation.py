@@ -32,18 +32,20 @@ class BoneVariation(NamedTuple):
         return f"{self.median:.2f} % (median){most}"
 
 
-def bone_variation(lengths: Tensor, body: Skeleton) -> BoneVariation:
+def bone_variation(lengths: Tensor, body: Skeleton, seen: Tensor | None = None) -> BoneVariation:
     """Say how much the rigid bones of a body change their length: the median bone, and the one that does most.
 
     Args:
         lengths: (T, B) of all its bones, NaN where unseen.
         body: the skeleton.
+        seen: (N,) joints that some frame shows, all if None: the places of others are made up, and so are their bones.
 
     >>> arm = Skeleton.from_names(list("abc"), [("a", "b"), ("b", "c")])
     >>> str(bone_variation(torch.tensor([[1.0, 9.0], [1.0, 11.0]]), arm))
     '0.00 % (median), at most 10.00 % (b-c)'
     """
-    rigid = list(body.rigid)
+    ever = [True] * body.num_joints if seen is None else seen.tolist()
+    rigid = [b for b in body.rigid if all(ever[joint] for joint in body.bones[b])]
     shares = 100 * bone_shares(lengths)[rigid]
     known = shares.nan_to_num(-1.0)
     if not rigid or float(known.max()) < 0:
