@@ -326,5 +326,7 @@ def test_bad_options():
     loop = kt.SKELETONS["coco17"].with_links([("left_wrist", "right_wrist")])
     with pytest.raises(kt.SkeletonError, match="one tree"):
         kt.Tracker(loop)
+    with pytest.raises(kt.SkeletonError, match="got 'auto'; kcs_torch.find_skeleton finds one from a clip"):
+        kt.Tracker("auto")
     with pytest.raises(kt.ShapeError, match="nothing to reconstruct"):
         kt.Tracker("coco17").result()

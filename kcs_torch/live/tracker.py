@@ -56,13 +56,15 @@ class Tracker:
     trunk's shape and the signs so far come from the window of the newest frames, solved by :class:`kcs_torch.PKC` as
     before a fixed viewpoint: when a third of the window has come, when it is full, then every ``period`` frames. A
     window is solved in a thread of its own while frames go on; :meth:`close`, or the end of a ``with`` block, ends it.
-    What a solve finds is taken over a fixed number of frames later, a third of the window's. Where frames come faster,
-    or the machine is slow, that one update waits for the thread, unless ``wait`` is False.
+    What a solve finds is taken over a fixed number of frames later, a third of the window's; without a template, all of
+    the window's. Where frames come faster, or the machine is slow, that one update waits for the thread, unless
+    ``wait`` is False.
 
     Bone lengths in the tracks' units change when a window has been solved, not between: so does the size of a body that
-    comes nearer. The camera is taken to move little. Without a template the viewpoint has to turn: depths are 0 and
-    ``ready`` is False until a full window has been solved, which takes seconds. All work is done on the CPU in double
-    precision; poses come back on the device and in the dtype of the input. Memory does not grow beyond the window.
+    comes nearer. The camera is taken to move little. Without a template the viewpoint has to turn: depths are guesses
+    and ``ready`` is False until a full window has been solved, two windows from the start. All work is done on the CPU
+    in double precision; poses come back on the device and in the dtype of the input. Memory does not grow beyond the
+    window.
 
     Args:
         skeleton: name, file or :class:`kcs_torch.Skeleton`; its bones form a tree.
@@ -100,10 +102,10 @@ class Tracker:
         wait: bool = True,
         method: PKC | None = None,
     ) -> None:
-        body = get_skeleton(skeleton)
-        if not body.is_tree:
+        body = None if skeleton == "auto" else get_skeleton(skeleton)
+        if body is None or not body.is_tree:
             raise SkeletonError(
-                f"Tracker: expected a skeleton whose bones form one tree, got '{body.name}'; "
+                f"Tracker: expected a skeleton whose bones form one tree, got '{body.name if body else skeleton}'; "
                 "kcs_torch.find_skeleton finds one from a clip"
             )
         rate, least = as_number(fps), as_number(threshold)
