@@ -60,6 +60,19 @@ def test_joints_that_nothing_holds_together_are_warned_of():
     assert not body.rigid and body.is_tree
 
 
+@pytest.mark.parametrize("frames", [1, 30])
+def test_bones_of_a_body_at_rest_are_warned_of(frames):
+    """Any tree would do: lengths that do not vary say nothing there."""
+    points = torch.randn(1, 5, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).expand(frames, 5, 3)
+    for source in (points, Tracks.from_arrays(points[..., :2])):
+        with pytest.warns(KcsWarning, match=r"a body at rest: all joints keep their distances.*Give the skeleton"):
+            find_skeleton(source)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        find_skeleton(points[:, :2])  # of two joints there is one bone
+        find_skeleton(swinging_body()[0])
+
+
 def test_bad_input():
     with pytest.raises(ShapeError, match="at least 2 joints"):
         find_skeleton(torch.zeros(4, 1, 3))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import KcsWarning, OptionError, ShapeError, users_level
-from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.methods.sfam import SfAM
@@ -44,6 +44,9 @@ def find_skeleton(
     Raises:
         ShapeError: there are no two joints, or points that are not finite (T, N, 3).
         OptionError: ``rigid_below`` is negative.
+
+    Warns:
+        KcsWarning: no joints keep their distance; or the body is at rest, so that bones are a guess.
 
     >>> import kcs_torch as kt
     >>> points = torch.zeros(20, 3, 3)
@@ -86,6 +89,14 @@ def find_skeleton(
         warnings.warn(
             f"find_skeleton: no two joints keep their distance within {100 * rigid_below:g} %, so that no lengths hold "
             "the joints together: give the skeleton, if you know it, or tracks in which the viewpoint turns further",
+            KcsWarning,
+            stacklevel=users_level(),
+        )
+    sway = bone_vectors(source, bones).std(0, correction=0).norm(dim=-1)
+    if len(bones) > 1 and bool((sway <= rigid_below * lengths).all()):
+        warnings.warn(
+            "find_skeleton: a single frame, or a body at rest: all joints keep their distances, and bones join the "
+            "nearest. Give the skeleton, if you know it, or tracks in which the body moves",
             KcsWarning,
             stacklevel=users_level(),
         )
