@@ -413,6 +413,8 @@ def test_command_leaves_out_frames_that_do_not_show_the_joints(saved):
     kt.save(replace(result, tracks=replace(result.tracks, weights=weights)), saved / "r.npz")
     knee = json.loads(run(saved / "r.npz", "--joint", "left_knee", "--json").stdout)["angles"]["left_knee"]
     assert knee["frames"] == 0 and knee["least"] is None and knee["mean"] is None
+    row = run(saved / "r.npz", "--joint", "left_knee").stdout.splitlines()[2]
+    assert row.split() == ["left_knee", "unseen", "unknown"]
 
 
 def test_command_takes_motion_and_joints(saved):

@@ -151,3 +151,14 @@ def test_sides_are_swapped_back_before_anything_else(file, tmp_path):
     got, _, person = lifted(tmp_path / "swapped.npz", tmp_path, "--unswap", "--gate")
     same(got, kt.clean.gate(kt.clean.unswap(kt.load_tracks(tmp_path / "swapped.npz"))))
     assert [note.split(":")[0] for note in person["cleaning"]] == ["unswap", "gate"]
+
+
+def test_sides_that_need_no_swap_are_told(file, tmp_path):
+    assert lifted(file, tmp_path, "--unswap")[2]["cleaning"] == ["unswap: nothing swapped"]
+    np.savez(
+        tmp_path / "stick.npz",
+        points2d=np.random.default_rng(0).normal(size=(12, 4, 2)),
+        edges=[[0, 1], [1, 2], [2, 3]],
+    )
+    told = lifted(tmp_path / "stick.npz", tmp_path, "--unswap")[2]["cleaning"]
+    assert told == ["unswap: nothing swapped: skeleton 'stick' has no left and right"]

@@ -133,8 +133,10 @@ def _spoken(found: JointAngles, facts: dict[str, dict[str, Any]], source: str) -
         f"{'degrees':<{wide}}{'least':>8}{'mean':>8}{'most':>8}{'deviation':>11}",
     ]
     for name, row in facts.items():
-        deviation = "unknown" if row["deviation"] is None else f"{row['deviation']:.1f}"
-        numbers = "".join(f"{row[key]:>8.1f}" for key in ("least", "mean", "most"))
+        deviation = "unknown" if row["deviation"] is None or not row["frames"] else f"{row['deviation']:.1f}"
+        numbers = (
+            "".join(f"{row[key]:>8.1f}" for key in ("least", "mean", "most")) if row["frames"] else f"{'unseen':>24}"
+        )
         lines.append(f"{name:<{wide}}{numbers}{deviation:>11}")
     unseen = {name: frames - row["frames"] for name, row in facts.items() if row["frames"] < frames}
     if unseen:

@@ -112,7 +112,11 @@ def cleaner(
             except OptionError as error:
                 raise OptionError(f"--frames: {str(error).removeprefix('trim: ')}") from None
         if unswap:
-            tracks = step.unswap(tracks)
+            swapped = step.unswap(tracks)
+            if swapped is tracks:
+                why = "" if tracks.skeleton.mirror else f": skeleton '{tracks.skeleton.name}' has no left and right"
+                swapped = replace(tracks, notes=(*tracks.notes, f"unswap: nothing swapped{why}"))
+            tracks = swapped
         if gate:
             tracks = step.gate(tracks)
         if fill is not None:
