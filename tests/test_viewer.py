@@ -1,6 +1,7 @@
 """The player page and the sheet of key frames."""
 
 import base64
+import itertools
 import json
 import sys
 from dataclasses import replace
@@ -13,6 +14,7 @@ from samples import walk_result
 
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.io import save
+from kcs_torch.reconstruct import reconstruct
 from kcs_torch.skeleton import SKELETONS, Skeleton
 from kcs_torch.types import Diagnostics, Intrinsics, Reconstruction, Tracks
 from kcs_torch.viewer import player, sheet
@@ -355,6 +357,20 @@ def test_sheet_shows_three_rows_of_frames(result):
         "frame 11 (0.44 s)",
     ]
     assert len(sheet(result, frames=50).axes) == 3 * 12  # no frame twice
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+def test_labels_of_flat_bodies_stay_beside_their_pictures():
+    joints = [f"s{i}" for i in range(8)]
+    snake = Skeleton.from_names(joints, list(itertools.pairwise(joints)))
+    along, time = torch.arange(8.0), torch.linspace(0, 6, 20)[:, None]
+    points = torch.stack([100 * along.expand(20, 8), 10 * (along + time).sin()], -1)
+    figure = sheet(reconstruct(points, skeleton=snake, method="sfam", fps=30))
+    figure.canvas.draw()
+    named = [axis for axis in figure.axes if axis.get_ylabel()]
+    assert [axis.get_ylabel().split()[0].rstrip(",") for axis in named[:3]] == ["tracks", "3D", "3D"]
+    for axis in named:
+        assert axis.yaxis.label.get_window_extent().height < axis.get_window_extent().height, axis.get_ylabel()
 
 
 def test_sheet_tells_doubts(result):

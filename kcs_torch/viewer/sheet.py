@@ -24,6 +24,7 @@ __all__ = ["sheet"]
 TURN = 75.0  # degrees; of the view from the side
 SIDE, WIDEST = 2.3, 2.6  # inches: the height of a picture, and the width of one, at most
 ASPECT = 1.4  # width over height that a sheet comes near to
+LETTERS = 12.0  # of a label that fit beside an inch of a picture
 LOST = 4.0  # a box is this many times larger than 99 % of its points before the others are left out
 
 
@@ -86,7 +87,7 @@ def _draw(result: Reconstruction, chosen: NDArray[Any], kinds: list[Any], figure
     title += [result.diagnostics.brief_doubt] if result.diagnostics.doubt else []
     words = [line for text in title for line in textwrap.wrap(text, int(14 * size[0]))]
     figure.suptitle(printable("\n".join(words)), fontsize=9, parse_math=False)
-    for (label, places, depths), half, lines in zip(kinds, halves, axes, strict=True):
+    for (label, places, depths), half, lines, height in zip(kinds, halves, axes, heights, strict=True):
         for spare in lines.flat[len(chosen) :]:
             spare.remove()
         for i, axis in enumerate(lines.flat[: len(chosen)]):
@@ -102,7 +103,7 @@ def _draw(result: Reconstruction, chosen: NDArray[Any], kinds: list[Any], figure
             if label == "tracks":
                 axis.set_title(_when(int(chosen[i]), result.fps), fontsize=8)
         for line in lines:
-            line[0].set_ylabel(label, fontsize=9)
+            line[0].set_ylabel(textwrap.fill(label, max(int(LETTERS * height), 9)), fontsize=9)
     return figure
 
 
