@@ -305,6 +305,8 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=150, help="of most clips, at most; synthetic ones have up to 60")
     parser.add_argument("--csv", type=Path, help="also write every run here")
     options = parser.parse_args(words)
+    if options.cases < 1:
+        parser.error(f"--cases: expected at least 1, got {options.cases}")
     wanted = {suite for part in options.parts for suite in PARTS[part]}
     if options.suites and not wanted & set(options.suites):
         parser.error(f"--parts {' '.join(options.parts)}: has none of the suites {', '.join(options.suites)}")

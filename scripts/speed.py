@@ -327,7 +327,10 @@ def arguments(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--runs", type=int, default=5, help="of which the median is taken")
     parser.add_argument("--csv", type=Path, help="also write all rows here")
     parser.add_argument("--peak", nargs=2, metavar=("METHOD", "FRAMES"), help=argparse.SUPPRESS)
-    return parser.parse_args(words)
+    options = parser.parse_args(words)
+    if options.runs < 1:
+        parser.error(f"--runs: expected at least 1, got {options.runs}")
+    return options
 
 
 def main(words: list[str] | None = None) -> None:

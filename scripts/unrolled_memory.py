@@ -57,7 +57,8 @@ def measure(layer: Unrolled, tracks: Tensor, cameras: Tensor) -> tuple[float, fl
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--solvers", nargs="*", default=["fpc", "sfam", "kcs", "pkc"])
+    solvers = ["fpc", "sfam", "kcs", "pkc"]
+    parser.add_argument("--solvers", nargs="*", choices=solvers, default=solvers)
     parser.add_argument("--steps", type=int, nargs="*", default=[10, 100, 300])
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--compile", action="store_true")

@@ -95,6 +95,12 @@ def test_suites_of_another_part_are_told(script, capsys):
     assert "--parts fixed: has none of the suites arm" in capsys.readouterr().err
 
 
+def test_less_than_a_case_is_told(script, capsys):
+    with pytest.raises(SystemExit):
+        script.main(["--cases", "-3"])
+    assert "--cases: expected at least 1, got -3" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("part", "suite", "variant"),
     [("fixed", "walk", "no discrete moves"), ("moving", "tree", "SfAM's guess as the only start")],

@@ -89,6 +89,21 @@ def test_script(root, tmp_path, capsys, part):
         assert float(next(row[name] for name in least if row.get(name))) > 0
 
 
+@pytest.mark.parametrize(
+    ("name", "words", "told"),
+    [
+        ("speed", ["--runs", "0"], "--runs: expected at least 1, got 0"),
+        ("layers", ["--skeleton", "foo"], "argument --skeleton: invalid choice: 'foo'"),
+        ("unrolled_memory", ["--solvers", "zz"], "argument --solvers: invalid choice: 'zz'"),
+    ],
+)
+def test_wrong_options_are_told(root, monkeypatch, capsys, name, words, told):
+    monkeypatch.setattr(sys, "argv", [name, *words])
+    with pytest.raises(SystemExit):
+        runpy.run_path(str(root / "scripts" / f"{name}.py"), run_name="__main__")
+    assert told in capsys.readouterr().err
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is here")
 def test_script_says_that_there_is_no_gpu(root):
     script = runpy.run_path(str(root / "scripts" / "speed.py"))
