@@ -43,7 +43,7 @@ def bones_of(frames=40, seed=0):
 
 def every_flip(depth, parts):
     """All flips of a solution's runs, as depths (K, T, B), and their parts."""
-    member = module._members(parts, depth)
+    member = module.members(parts, depth)
     runs = flipped_runs(depth, member, ACCELERATION)
     return depth * signs_of(runs, member, len(depth)), runs.part
 
@@ -128,7 +128,7 @@ def odd_body(name, frames, noise=0.0, anchored=False):
     own = bone_vectors(points, objective.bones)[..., 2]
     own = bone_vectors(objective.joints(own)[..., None], objective.bones)[..., 0]
     parts = parts_of(body, limbs_of(body, objective.posture.trunk.tolist()))
-    return objective, own, 1.05 * usual.rest_lengths, module._members(parts, own)
+    return objective, own, 1.05 * usual.rest_lengths, module.members(parts, own)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 4, 5, 30])

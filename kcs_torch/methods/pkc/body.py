@@ -29,7 +29,7 @@ from kcs_torch.solvers.camera_path import choose_path, view_energy
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.procrustean import COARSE, FINE, Stage, align_rotations
 
-__all__ = ["TOLD", "Body", "Turned"]
+__all__ = ["LONG", "ONE", "POLISH", "TOLD", "Body", "Turned", "alike"]
 
 Turned = Callable[[bool], Search[Any, Any, Tensor]]
 """Depths (T, N) that the viewpoint's turn tells, in the template's units; from many starts if so, else from one."""
@@ -121,13 +121,17 @@ class Body:
         image = self.image if image is None else image
         return nearest_rotation(self.objective.posture.frame(torch.cat([image, depth[..., None]], -1)))
 
+    def joints(self, depth: Tensor) -> Tensor:
+        """Joints (H, T, N, 3) of depths (H, T, N), in the template's units."""
+        return torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
+
     def bodies(self, found: Hypotheses) -> Tensor:
         """Joints (H, T, N, 3) of hypotheses, in units of the image; bones keep their lengths as far as noise allows.
 
         Where the image is exact, only depth may differ from frame to frame. Where it is not, joints move by the least
         that makes bones as constant as the model takes them to be, which is SfAM's articulated step.
         """
-        points = torch.cat([self.image.expand(*found.depth.shape, 2), found.depth[..., None]], -1)
+        points = self.joints(found.depth)
         goal = self.objective
         if goal.noisy:
             stiffness = goal.rigid * (goal.noise / goal.weights.length).square()
@@ -141,7 +145,7 @@ class Body:
 
     def rank(self, depth: Tensor, steps: int) -> Search[Any, Any, Hypotheses]:
         """Depths (H, T, N) from elsewhere, refined on the objective, best first."""
-        points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
+        points = self.joints(depth)
         lengths = median(bone_lengths(points, self.objective.bones), 1)
         usual = self.objective.posture.rest_lengths
         lengths = torch.where(lengths > 1e-3 * usual, lengths, usual)
@@ -163,7 +167,7 @@ class Body:
         if self.skeleton.mirror:
             other = yield from refined(self.objective, other[:1], steps)
         found = found.joined(other)
-        points = torch.cat([self.image.expand(*found.depth.shape, 2), found.depth[..., None]], -1)
+        points = self.joints(found.depth)
         flip = points.new_tensor([1.0, 1.0, -1.0])
         frames = self.objective.weights.posture
         own, mirrored = (view_energy(p, cameras, correlation=frames) for p in (points, points * flip))
@@ -223,8 +227,8 @@ class Body:
                 rivals = rivals.joined(replace(ranked, depth=other, energy=found.energy[0] + LEAD + dearer / LESS))
             elif bool(dearer[0] < CLOSE):
                 rivals = rivals.joined(replace(ranked, depth=other))
-        depth, image, value = yield from self._descended(rivals.depth, (COARSE[-1], *POLISH) if around else POLISH)
-        points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
+        depth, image, value = yield from self.descended(rivals.depth, (COARSE[-1], *POLISH) if around else POLISH)
+        points = self.joints(depth)
         lengths = median(bone_lengths(points, bones), 1)
         best = (rivals.energy + value / ONE).argsort()[: len(pick)]
         return replace(
@@ -239,7 +243,7 @@ class Body:
         image, noise = fill_gaps(self.image, polished, self.noise)
         return Body(self.skeleton, image / self.factor, self.rate, noise / self.factor, self.objective.standing)
 
-    def _descended(
+    def descended(
         self, depth: Tensor, stages: tuple[Stage, ...]
     ) -> Search[Any, Any, tuple[Tensor, Tensor | None, Tensor]]:
         """Depths (H, T, N) after stages of the moving viewpoint's descent, in blocks of long clips, and its values.
@@ -252,7 +256,7 @@ class Body:
         if self.objective.noisy:  # where gaps were filled, at least
             level = max(level, LEVEL)
         sure = (level * size / self.noise.clamp_min(level * size)).square() if level > 0 else None
-        points = torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1) / size
+        points = self.joints(depth) / size
         turned = align_rotations(points, torch.stack([self.frames(one) for one in depth]), bones)
         rigid, soft = bones[list(skeleton.rigid)], tuple(soften(stage, level) for stage in stages)
         anchor = float(size / HELD) ** 2

@@ -19,7 +19,7 @@ from kcs_torch.methods.pkc.run_costs import ParallelRays, RunCosts, Runs, Turnab
 from kcs_torch.methods.pkc.strides import strides
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["flipped", "flipped_runs", "parts_of", "promising", "signs_of", "turned_over"]
+__all__ = ["flipped", "flipped_runs", "members", "parts_of", "promising", "signs_of", "turned_over"]
 
 TIMES = 8
 """How often flips are tried at most."""
@@ -130,7 +130,7 @@ def flipped(
     if body is None:
         body = ParallelRays(objective, bone_vectors(best.depth[0, ..., None], objective.bones)[..., 0])
     own = body.own
-    member = _members(parts, own)
+    member = members(parts, own)
     runs = flipped_runs(own, member, objective.weights.acceleration)
     energy = RunCosts(objective, body, best.lengths[0])(member, runs)
 
@@ -173,7 +173,7 @@ def signs_of(runs: Runs, member: Tensor, frames: int) -> Tensor:
     return 1 - 2 * inside(runs, frames).to(member)[..., None] * member[runs.part][:, None]
 
 
-def _members(parts: Sequence[tuple[int, ...]], depth: Tensor) -> Tensor:
+def members(parts: Sequence[tuple[int, ...]], depth: Tensor) -> Tensor:
     """1 for the bones of each part, (P, B), of depths (T, B)."""
     member = depth.new_zeros(len(parts), depth.shape[1])
     for row, part in zip(member, parts, strict=True):

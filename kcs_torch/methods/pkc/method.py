@@ -16,6 +16,7 @@ from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.lockstep import Search, run, together
 from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
+from kcs_torch.methods.pkc.around import turned_around
 from kcs_torch.methods.pkc.batch import Sized, serve
 from kcs_torch.methods.pkc.body import Body, Turned
 from kcs_torch.methods.pkc.cleaning import cleaned
@@ -216,7 +217,7 @@ class PKC(Method):
             found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
         if polished and (body.turns(found) or not isinstance(self, _Followed)):
             rival = (yield from turned(body.is_odd(found))) if compared and body.turns(found) else None
-            found = yield from body.polished(found, self.steps, rival)
+            found = yield from self._polished(body, found, rival)
             if self.rounds and self.viewpoint != "moving":
                 found, body = yield from self._filled(found, body, cameras, rival)
         made = self._from_hypotheses(found, body, cameras, notes, detections)
@@ -238,8 +239,15 @@ class PKC(Method):
                 found = yield from body.search(self._moves, self.steps)
                 if cameras is not None and _turns(cameras):
                     found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
-            found = yield from body.polished(found, self.steps, rival)
+            found = yield from self._polished(body, found, rival)
         return found, body
+
+    def _polished(self, body: Body, found: Hypotheses, rival: Tensor | None) -> Search[Any, Any, Hypotheses]:
+        """Hypotheses, the best polished, and with other signs where the viewpoint's turn, depths (T, N), doubts it."""
+        found = yield from body.polished(found, self.steps, rival)
+        if rival is None or not self._moves or not body.turns(found):
+            return found
+        return (yield from turned_around(body, found, rival))
 
     def _resized(self, found: Hypotheses, body: Body, other: Body, size: Size) -> Search[Any, Any, Hypotheses | None]:
         """Hypotheses of a body whose size in the image changes, if they explain the tracks better; else None.
