@@ -153,6 +153,16 @@ def test_times_place_frames_and_tell_the_rate(tmp_path, column, times, fps, seen
     assert load_tracks(path, fps=50).fps == 50
 
 
+@pytest.mark.parametrize(("fps", "unit", "digits"), [(30, 1000, 0), (29.97, 1, 3), (240, 1000, 0)])
+def test_times_may_be_rounded(tmp_path, fps, unit, digits):
+    kept = [i for i in range(3000) if i % 40 != 9 and not 1000 <= i < 1300]  # many short gaps, and a long one
+    rows = (f"{unit * i / fps:.{digits}f},{i},2,3,4" for i in kept)
+    tracks = load_tracks(lines(tmp_path / "a.csv", "timestamp,a_x,a_y,b_x,b_y", *rows))
+    assert tracks.seen.all(1).nonzero().flatten().tolist() == kept
+    assert tracks.fps == pytest.approx(fps, rel=1e-4)
+    assert not any("uneven" in note for note in tracks.notes)
+
+
 def test_frames_go_before_times_and_their_steps_are_frames(tmp_path):
     path = lines(tmp_path / "a.csv", "frame,time,a_x,a_y,b_x,b_y", *(f"{5 * i},{i / 6},1,2,3,4" for i in (0, 1, 3)))
     tracks = load_tracks(path)

@@ -31,6 +31,7 @@ __all__ = ["Row", "as_value", "is_missing", "not_a_number", "opened", "place_row
 _LIMIT = 2**30  # bytes of a file
 _HEAD = 2**20  # characters of the first line, at most
 _UNEVEN = 0.3  # of a frame, by which times may be off
+_SKIPPED = 1.5  # frames from one row to the next from which on some are missing between
 _MISSING = ("", "na", "n/a", "#n/a", "<na>", "null", "none")
 _NAMELESS = re.compile(r"(?:Unnamed: [0-9]+)?\Z")
 
@@ -220,14 +221,27 @@ def _numbers(rows: Sequence[Row], notes: list[str]) -> list[int]:
     if any(math.isnan(row.time) for row in rows):
         return _counted(rows, notes)
     times = sorted({row.time for row in rows})
-    step = statistics.median_low([b - a for a, b in itertools.pairwise(times)] or [1.0])
-    exact = [min((time - times[0]) / step, 1e300) for time in times]
-    frames = [round(number) for number in exact]
-    if len(set(frames)) < len(frames) or any(abs(a - b) > _UNEVEN for a, b in zip(exact, frames, strict=True)):
+    frames = _even(times)
+    if frames is None:
         notes.append("the times are uneven: frames are taken in their order, at the mean rate")
         frames = list(range(len(times)))
     frame = dict(zip(times, frames, strict=True))
     return [frame[row.time] for row in rows]
+
+
+def _even(times: Sequence[float]) -> list[int] | None:
+    """The frame of each time, ascending and rounded, to milliseconds say; None where they lie at no even distances."""
+    steps = [b - a for a, b in itertools.pairwise(times)]
+    if not steps:
+        return [0] * len(times)
+    usual = statistics.median_low(steps)
+    step = statistics.fmean(one for one in steps if one < _SKIPPED * usual)
+    frames = list(itertools.accumulate((round(min(one / step, 1e300)) for one in steps), initial=0))
+    if len(set(frames)) < len(frames):
+        return None
+    step = (times[-1] - times[0]) / frames[-1]  # of all, as rounding adds up from gap to gap
+    off = (abs((time - times[0]) / step - frame) for time, frame in zip(times, frames, strict=True))
+    return frames if max(off) <= _UNEVEN else None
 
 
 def _counted(rows: Sequence[Row], notes: list[str]) -> list[int]:
