@@ -51,10 +51,15 @@ def test_track_ids_go_before_places():
     assert "people are followed by the file's own track ids" in first.notes
 
 
-@pytest.mark.parametrize("ids", [[[0] * 6, [0] * 6], [[1, 1, 1, None, 1, 1], [2] * 6]], ids=["twice", "missing"])
-def test_ids_that_do_not_say_who_is_who_are_no_ids(ids):
+@pytest.mark.parametrize(
+    ("ids", "say"),
+    [([[0] * 6, [0] * 6], "stands twice in frame 0"), ([[1, 1, 1, None, 1, 1], [2] * 6], "is missing in frame 3")],
+    ids=["twice", "missing"],
+)
+def test_ids_that_do_not_say_who_is_who_are_no_ids(ids, say):
     a, b = read(two([0, 1, 1, 0, 1, 0], ids))
     assert np.allclose(numbers(a), A) and np.allclose(numbers(b), B)
+    assert f"a track id {say}: people are followed by their places, not by the ids" in a.notes
 
 
 @pytest.mark.parametrize(
@@ -138,6 +143,12 @@ def test_other_numbers_of_joints_are_told():
         read(frames)
     with pytest.raises(FormatError, match="people in at least one of 3 frames, got none"):
         read([[], [], []])
+
+
+def test_people_without_any_seen_joint_are_told():
+    nobody = [[s._replace(joints=s.joints * [1, 1, 0]) for s in frame] for frame in two()]
+    with pytest.raises(FormatError, match="got none with a joint that is seen: every confidence is 0"):
+        read(nobody)
 
 
 @pytest.mark.parametrize(

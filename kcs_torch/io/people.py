@@ -79,15 +79,17 @@ def people_tracks(
         SkeletonError: the joints do not fit the skeleton.
     """
     remarks = list(notes)
+    listed = any(frames)
     frames = _without_zeros(_checked(frames, source, measured, remarks), measured, remarks)
     if not measured:
         frames = _in_pixels(frames, options.image_size, remarks)
     everybody = [s.joints for frame in frames for s in frame]
     if not everybody:
-        raise FormatError(f"{source}: expected people in at least one of {len(frames)} frames, got none")
+        why = " with a joint that is seen: every confidence is 0, or every place missing" if listed else ""
+        raise FormatError(f"{source}: expected people in at least one of {len(frames)} frames, got none{why}")
     if names is None and skeleton is None:
         skeleton, names = choose_layout(everybody, options, source, remarks)
-    people = _by_ids(frames)
+    people = _by_ids(frames, remarks)
     if people is None:
         gap = max(round(min(options.fps or fps or _FPS, 1e6)), 1)
         people = follow_people([np.array([s.joints for s in frame]) for frame in frames], max_gap=gap)
@@ -199,13 +201,16 @@ def _checked(
     return out
 
 
-def _by_ids(frames: Sequence[Sequence[Sighting]]) -> list[list[tuple[int, int]]] | None:
+def _by_ids(frames: Sequence[Sequence[Sighting]], notes: list[str]) -> list[list[tuple[int, int]]] | None:
     """(frame, index) of each person by track ids, the most seen first; None where they do not say who is who."""
     people: dict[Hashable, list[tuple[int, int]]] = {}
     amount: dict[Hashable, float] = {}
     for t, frame in enumerate(frames):
         ids = [s.track for s in frame]
         if None in ids or len(set(ids)) < len(ids):
+            if any(s.track is not None for found in frames for s in found):
+                wrong = "is missing" if None in ids else "stands twice"
+                notes.append(f"a track id {wrong} in frame {t}: people are followed by their places, not by the ids")
             return None
         for i, sighting in enumerate(frame):
             people.setdefault(sighting.track, []).append((t, i))
