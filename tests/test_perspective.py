@@ -162,6 +162,13 @@ def test_in_metres_the_person_is_where_they_are():
     assert float((1000 * result.in_space() - truth).norm(dim=-1).mean()) > 0  # measured, not copied
 
 
+def test_the_turn_that_is_told_is_that_of_the_cameras():
+    found = reconstruct(filmed(yaw=70)[0], method="kcs", intrinsics=LENS)  # the camera looks after the person
+    for one in (found, *found.alternatives):
+        turn = float(kt.functional.viewpoint_turn(one.cameras))
+        assert one.diagnostics.viewpoint_turn == pytest.approx(turn, abs=1e-6)
+
+
 @pytest.mark.parametrize("method", ["kcs", "pkc"])
 def test_body_off_the_optical_axis(method):
     """Seen 30 degrees from the axis the same scene gives the same body, and a better one than parallel rays."""

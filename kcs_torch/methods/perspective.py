@@ -283,7 +283,8 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
     if not (k or before.converged):
         notes.append(method.unsettled(before.iterations))
     cameras = (found.view.look.mT @ complete_rotation(lifted.cameras))[:, :2]
-    if not k and (little := little_turn(method, body, float(viewpoint_turn(cameras)))):
+    turn = float(viewpoint_turn(cameras))
+    if not k and (little := little_turn(method, body, turn)):
         notes.append(little)
     if not k:
         notes.extend(what_is_wrong(method, points, tracks))
@@ -292,6 +293,7 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
         notes.append(lens_note(intrinsics, tracks.units))
     facts = replace(
         before,
+        viewpoint_turn=turn,
         reprojection_rms=float(off.square().sum(-1).mean().sqrt()),
         notes=tuple(notes),
         doubt="" if k else found.lifted[0].diagnostics.doubt,
