@@ -143,6 +143,27 @@ def test_solvers_compile_without_a_break(name):
 
 
 @each_solver
+def test_solvers_compile_for_clips_of_any_length(name):
+    """Without guards on the corner or the scale's range, and with batches of symbols that broadcast."""
+    module = {
+        "fpc": lambda: UnrolledFPC(1, corner=0.1),
+        "sfam": lambda: UnrolledSfAM(BODY, 1, articulate_from=0.0),
+        "kcs": lambda: UnrolledKCS(BODY, 1, template=normal(7, 3)),
+        "pkc": lambda: UnrolledPKC(BODY, 1, noise=0.1, final=1e-1),
+    }[name]()
+    tracks, cameras, weights = clips()
+    torch._dynamo.reset()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what Dynamo says of itself
+        compiled = torch.compile(module, backend="eager", fullgraph=True, dynamic=True)
+        for frames in (slice(None), slice(1, None)):
+            part = tracks[:, frames], cameras[:, frames]
+            found = compiled(*part, weights=weights[:, frames])
+            assert_close(found, module(*part, weights=weights[:, frames]))
+    torch._dynamo.reset()
+
+
+@each_solver
 def test_solvers_export(name):
     """As a program of plain operators, which another clip of the same size runs through."""
     module = SOLVERS[name]()

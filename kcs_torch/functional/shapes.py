@@ -23,7 +23,7 @@ def broadcast_shapes(*shapes: Sequence[int]) -> tuple[int, ...]:
         common = [1] * (len(shape) - len(common)) + common
         for k in range(1, len(shape) + 1):
             if shape[-k] != 1:
-                if common[-k] not in (1, shape[-k]):
+                if common[-k] != 1 and common[-k] != shape[-k]:
                     told = ", ".join(str(tuple(each)) for each in shapes)
                     raise ShapeError(f"batch dimensions: expected sizes that are equal or 1, got {told}")
                 common[-k] = shape[-k]

@@ -158,7 +158,7 @@ class Unrolled(nn.Module):
         """Corner (...) of each step in the unit of the singular values: of the module, or one share (...) for all."""
         if share is not None:
             return [corner_of(share, scale)] * self.num_steps
-        if not math.isfinite(self.corner):
+        if not hasattr(self, "raw_corner"):
             return [math.inf] * self.num_steps
         return (self._values("corner", scale).clamp_min(SHARPEST) * scale[..., None]).unbind(-1)
 

@@ -257,6 +257,6 @@ class UnrolledKCS(Unrolled):
     def _bounds(self, points: Tensor, weights: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
         """Least and greatest scale (..., T)."""
         scale = template_scale(points, weights, rest, self.rigid)
-        if math.isinf(self.scale_range):
+        if self.scale_range == math.inf:
             return torch.zeros_like(scale), torch.full_like(scale, math.inf)
         return scale / self.scale_range, scale * self.scale_range
