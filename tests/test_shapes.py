@@ -1,4 +1,4 @@
-"""Batch dimensions of several tensors, as torch has them."""
+"""Batch dimensions of several tensors, as torch has them, and shapes that functions refuse in our words."""
 
 import subprocess
 import sys
@@ -8,8 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from kcs_torch import functional as F
 from kcs_torch.errors import ShapeError
-from kcs_torch.functional.shapes import broadcast_shapes
+from kcs_torch.functional.shapes import broadcast_shapes, check_core
 
 SHAPES = st.lists(st.lists(st.integers(0, 3), max_size=3).map(tuple), max_size=4)
 
@@ -35,3 +36,77 @@ def test_methods_do_without_the_symbols_of_torch():
     )
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+CLIP, IMAGE, ROWS, TURNS = (torch.rand(2, 5, *core) for core in ((4, 3), (4, 2), (2, 3), (3, 3)))
+MASS, WAY = torch.ones(2, 5, 4), torch.rand(2, 5, 3)
+# What a function is called with, and for each argument a shape that does not fit.
+REFUSED = {
+    "angle_between": ({"first": WAY, "second": WAY}, {"first": (), "second": (5, 2)}),
+    "back_project": ({"tracks": IMAGE, "cameras": ROWS}, {"tracks": (5, 4, 3), "cameras": (5, 3, 3)}),
+    "best_path": (
+        {"cost": torch.rand(2, 5, 3), "transition": torch.rand(2, 4, 3, 3)},
+        {"cost": (3,), "transition": (2, 5, 3, 3)},
+    ),
+    "bone_vectors": ({"points": CLIP, "bones": [(0, 1)]}, {"points": (3,)}),
+    "camera_disagreement": ({"first": ROWS, "second": ROWS}, {"first": (5, 3, 3), "second": (4, 2, 3)}),
+    "centre": ({"points": CLIP, "weights": MASS}, {"points": (3,), "weights": (2, 5, 4, 1)}),
+    "complete_rotation": ({"cameras": ROWS}, {"cameras": (5, 3, 3)}),
+    "distance_spread": ({"points": CLIP, "weights": MASS}, {"points": (5, 4, 2), "weights": (4, 4)}),
+    "euler_angles": ({"order": "XYZ", "matrices": TURNS}, {"matrices": (5, 2, 3)}),
+    "euler_rotation": ({"order": "XYZ", "angles": WAY}, {"angles": (5, 2)}),
+    "factorize": ({"tracks": IMAGE, "rank": 3}, {"tracks": (5, 4, 3)}),
+    "flexion": ({"upper": WAY, "lower": WAY, "axis": WAY}, {"upper": (2,), "lower": (5, 2), "axis": ()}),
+    "interpolate": ({"values": CLIP, "seen": MASS > 0}, {"values": (4, 3)}),
+    "jitter": ({"values": CLIP[0], "seen": MASS[0] > 0}, {"values": (2, 5, 4, 3), "seen": (2, 5, 4)}),
+    "joint_angles": ({"points": CLIP, "joints": [(0, 1, 2)]}, {"points": (3,)}),
+    "log_det": ({"matrix": TURNS @ TURNS.mT, "eps": torch.ones(5)}, {"matrix": (3,), "eps": (4,)}),
+    "minimal_turn": ({"source": WAY, "target": WAY}, {"source": (5, 2), "target": (5, 4)}),
+    "nearest_rotation": ({"matrix": TURNS}, {"matrix": (5, 2, 3)}),
+    "orthonormality_defect": ({"rows": ROWS}, {"rows": (5, 3, 3)}),
+    "perspective": ({"points": CLIP + 1, "intrinsics": torch.ones(4)}, {"points": (4, 4), "intrinsics": (3, 3)}),
+    "pinhole_translation": (
+        {"points": CLIP, "rays": IMAGE, "weights": MASS},
+        {"points": (2, 5, 4, 4), "rays": (2, 5, 3, 2), "weights": (2, 5, 4, 1)},
+    ),
+    "pose_matrix": ({"points": CLIP, "bones": [(0, 1)]}, {"points": (3,)}),
+    "procrustes": (
+        {"source": CLIP, "target": CLIP, "weights": MASS},
+        {"source": (3,), "target": (5, 3, 3), "weights": (5, 1)},
+    ),
+    "project": ({"points": CLIP, "cameras": ROWS}, {"points": (5, 4, 2), "cameras": (5, 2, 2)}),
+    "psd_shrink": ({"matrix": TURNS, "threshold": torch.ones(5)}, {"matrix": (3,), "threshold": (4,)}),
+    "rotation_angle": ({"first": TURNS, "second": TURNS}, {"first": (5, 2, 3), "second": (3,)}),
+    "rotation_matrix": ({"vectors": WAY}, {"vectors": (5, 2)}),
+    "rotation_vector": ({"matrices": TURNS}, {"matrices": (5, 2, 3)}),
+    "rows_to_cameras": ({"rows": ROWS}, {"rows": (5, 3, 3)}),
+    "scatter_log_det": ({"values": WAY, "eps": 1.0}, {"values": (3,)}),
+    "similarity": ({"source": CLIP, "target": CLIP}, {"source": (4, 3), "target": (2, 1, 4, 3)}),
+    "standing": ({"image": IMAGE, "weights": MASS}, {"image": (5, 4, 3), "weights": (2, 4, 4)}),
+    "superpose": (
+        {"source": CLIP, "target": CLIP, "how": "rigid", "weights": MASS},
+        {"source": (4, 3), "target": (2, 1, 4, 3), "weights": (2, 5, 1)},
+    ),
+    "svt": ({"matrix": WAY, "threshold": 1.0, "corner": torch.ones(2)}, {"threshold": (3,), "corner": (3,)}),
+    "viewpoint_turn": ({"cameras": ROWS}, {"cameras": (2, 3)}),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_does_not_fit_is_told_by_its_name(name):
+    """Torch told of sizes at dimensions; some functions answered, with what nobody had asked for."""
+    function, (arguments, wrong) = getattr(F, name), REFUSED[name]
+    function(**arguments)
+    for what, shape in wrong.items():
+        with pytest.raises(ShapeError, match=rf"{name}: .*{what}.*expected .*got"):
+            function(**{**arguments, what: torch.ones(shape)})
+    if isinstance(arguments[what], torch.Tensor) and name not in ("jitter", "log_det", "psd_shrink", "svt"):
+        with pytest.raises(ShapeError, match=f"{name}: {what}: expected a tensor, got list: use torch.as_tensor"):
+            function(**{**arguments, what: [1.0]})
+
+
+def test_cores_have_letters_for_any_size():
+    check_core(torch.zeros(7, 2, 5, 3), "points", "T", "N", 3)
+    check_core(torch.zeros(()), "size")
+    with pytest.raises(ShapeError, match=r"points: expected shape \(\.\.\., T, N, 3\), got \(5, 3\)"):
+        check_core(torch.zeros(5, 3), "points", "T", "N", 3)

@@ -19,8 +19,19 @@ from numerics import (
 )
 from torch.testing import assert_close
 
-from kcs_torch.errors import NotFiniteError, ShapeError
-from kcs_torch.functional import dct_basis, log_det, nuclear_norm, psd_shrink, singular_values, spectral_norm, svt
+from kcs_torch.errors import NotFiniteError, OptionError, ShapeError
+from kcs_torch.functional import (
+    dct_basis,
+    log_det,
+    nearest_rotation,
+    nuclear_norm,
+    procrustes,
+    psd_shrink,
+    scatter_log_det,
+    singular_values,
+    spectral_norm,
+    svt,
+)
 
 
 def plain_svt(matrix, threshold, corner=math.inf):
@@ -456,6 +467,54 @@ def test_nan_is_refused_in_our_words(function, recorded):
     matrix[1, 2, 3] = torch.nan
     with pytest.raises(NotFiniteError, match=r"finite numbers, got NaN.*\(2, 5, 5\).*weights of 0"):
         function(matrix.requires_grad_(recorded))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        *(lambda x: svt(x, 0.5), lambda x: psd_shrink(x, 0.5), nuclear_norm, spectral_norm, singular_values),
+        *(lambda x: log_det(x @ x.mT, 0.5), nearest_rotation),
+    ],
+)
+def test_whole_numbers_are_refused(function):
+    """They came back cut off to whole numbers."""
+    with pytest.raises(ShapeError, match=r"floating point, got .*torch\.int64"):
+        function(torch.tensor([[2, 1], [0, 3]]))
+
+
+@pytest.mark.parametrize("options", [{"threshold": -0.1}, {"threshold": 1.0, "corner": -1.0}])
+def test_svt_refuses_negative_numbers(options):
+    with pytest.raises(OptionError, match=r"svt: (threshold|corner): expected a number that is not negative, got -"):
+        svt(normal(4, 3), **options)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        *(lambda x: svt(x, 0.5), lambda x: psd_shrink(x, 0.5), nuclear_norm, singular_values),
+        *(lambda x: scatter_log_det(x, 0.5), nearest_rotation),
+    ],
+    ids=["svt", "psd_shrink", "nuclear_norm", "singular_values", "scatter_log_det", "nearest_rotation"],
+)
+def test_autocast_takes_no_digits(function):
+    """Rotations failed, as no determinant takes half precision; others lost what their products rounded."""
+    matrix = normal(2, 5, 5, dtype=torch.float32).requires_grad_()
+    with torch.autocast("cpu", torch.bfloat16):
+        found = function(matrix)
+        assert procrustes(matrix, matrix)[0].isfinite().all()
+    plain = function(matrix)
+    assert torch.equal(found, plain)
+    if plain.requires_grad:
+        assert_close(*(torch.autograd.grad(x.square().sum(), matrix)[0] for x in (found, plain)))
+
+
+@pytest.mark.parametrize("dtype", HALVES)
+def test_scatter_in_half_precision(dtype):
+    values = normal(6, 4, dtype=dtype)
+    (grad,) = finite(lambda x: scatter_log_det(x, 0.5), values)
+    found = scatter_log_det(values, 0.5)
+    assert found.dtype == grad.dtype == dtype
+    assert_close(found.double(), scatter_log_det(values.double(), 0.5), rtol=1e-2, atol=0)
 
 
 def test_psd_shrink_refuses_what_is_not_square():

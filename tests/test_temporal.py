@@ -183,6 +183,16 @@ def test_unseen_feet_may_be_nan_and_numbers_may_be_short():
     assert standing(image[None][:0], weights[None][:0]).shape == (0, 60, 2)
 
 
+def test_standing_of_whole_pixels_is_no_whole_number():
+    """It was 0 or 1, cut off; and of short clips of the weights' type."""
+    image = torch.tensor([0, 0, 0, 0, 10, 30, 60, 90])[:, None, None].expand(-1, 1, 2)
+    found = standing(image, torch.ones(8, 1))
+    assert_close(found, standing(image.float(), torch.ones(8, 1)))
+    assert bool(((found > 0.001) & (found < 0.999)).any())
+    short = standing(torch.zeros(2, 2, 1, 2), torch.ones(2, 1, dtype=torch.bool))
+    assert (short.dtype, short.shape) == (torch.float32, (2, 2, 1))
+
+
 def test_standing_takes_batches():
     same_as_loop(lambda p, w: standing(p, (w > -1).double()), (9, 3, 2), (9, 3))
 

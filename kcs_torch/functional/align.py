@@ -10,6 +10,8 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.functional.chain import LOST, largest, unit_size
 from kcs_torch.functional.derivatives import applied, batch_first
+from kcs_torch.functional.precision import wide
+from kcs_torch.functional.shapes import check_core
 
 __all__ = ["ALIGNMENTS", "centre", "minimal_turn", "nearest_rotation", "procrustes", "similarity", "superpose"]
 
@@ -26,7 +28,7 @@ ALIGNMENTS = {
 
 def check_alignment(how: str, root: int | None = None) -> None:
     """Raise an OptionError unless ``how`` names an alignment, and ``root`` is an index or None."""
-    if how not in ALIGNMENTS:
+    if not isinstance(how, str) or how not in ALIGNMENTS:
         raise unknown("alignment", how, ALIGNMENTS)
     if root is not None and (isinstance(root, bool) or not isinstance(root, int)):
         raise OptionError(f"root: expected the index of a joint, as skeleton.index('pelvis') gives, got {root!r}")
@@ -36,15 +38,20 @@ def centre(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tenso
     """Subtract the weighted mean over joints.
 
     Args:
-        points: (..., N, D).
+        points: (..., N, D), finite.
         weights: (..., N), 0 where a joint does not count; all 1 where None. All-zero weights give the mean 0.
 
     Returns:
         centred points (..., N, D) and the mean (..., 1, D).
+
+    Raises:
+        ShapeError: they are not of these shapes.
     """
+    check_core(points, "centre: points", "N", "D")
     if weights is None:
         mean = points.mean(-2, keepdim=True)
     else:
+        check_core(weights, "centre: weights", points.shape[-2])
         total = weights.sum(-1)[..., None, None]
         total = torch.where(total > 0, total, torch.ones_like(total))
         mean = (points * weights[..., None]).sum(-2, keepdim=True) / total
@@ -61,9 +68,14 @@ def minimal_turn(source: Tensor, target: Tensor) -> Tensor:
     Returns:
         (..., 3, 3); the identity where either is zero, a half turn about some normal where they are opposite.
 
+    Raises:
+        ShapeError: one of them is not (..., 3).
+
     >>> minimal_turn(torch.tensor([2.0, 0, 0]), torch.tensor([0.0, 3, 0])).tolist()
     [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
+    check_core(source, "minimal_turn: source", 3)
+    check_core(target, "minimal_turn: target", 3)
     a, b = torch.nn.functional.normalize(source, dim=-1), torch.nn.functional.normalize(target, dim=-1)
     a, b = torch.broadcast_tensors(a, b)
     still = (a.square().sum(-1) < 0.5) | (b.square().sum(-1) < 0.5)
@@ -97,10 +109,13 @@ def nearest_rotation(matrix: Tensor, *, reflect: bool = False) -> Tensor:
         values are safe, and directions in which the rotation is arbitrary have the derivative 0.
 
     Raises:
-        ShapeError: it holds NaN.
+        ShapeError: it is not square, not in floating point, or holds NaN.
     """
-    wide = matrix.to(torch.promote_types(matrix.dtype, torch.float32))  # no LAPACK takes half precision
-    out: Tensor = applied(_Polar, wide, reflect)[0]
+    check_core(matrix, "nearest_rotation: matrix", "D", "D")
+    if matrix.shape[-1] != matrix.shape[-2] or not matrix.is_floating_point():
+        got = f"{tuple(matrix.shape)} of {matrix.dtype}"
+        raise ShapeError(f"nearest_rotation: matrix: expected square ones in floating point, got {got}")
+    out: Tensor = applied(_Polar, wide(matrix), reflect)[0]  # no LAPACK takes half precision
     return out.to(matrix.dtype)
 
 
@@ -110,8 +125,8 @@ def procrustes(
     """Return the rotation Q that minimises sum_n w_n |source_n Q - target_n|^2 for centred point sets.
 
     Args:
-        source: (..., N, D), centred.
-        target: (..., N, D), centred.
+        source: (..., N, D), centred and finite.
+        target: (..., N, D), centred and finite.
         weights: (..., N) or None.
         reflect: True also admits reflections.
 
@@ -126,8 +141,13 @@ def procrustes(
     >>> torch.allclose(Q, torch.eye(3)), round(scale.item(), 5)
     (True, 2.0)
     """
+    check_core(source, "procrustes: source", "N", "D")
+    check_core(target, "procrustes: target", "N", "D")
     if source.shape[-2:] != target.shape[-2:]:
-        raise ShapeError(f"procrustes: expected equal shapes, got {tuple(source.shape)} and {tuple(target.shape)}")
+        got = f"{tuple(source.shape)} and {tuple(target.shape)}"
+        raise ShapeError(f"procrustes: source and target: expected equal shapes, got {got}")
+    if weights is not None:
+        check_core(weights, "procrustes: weights", source.shape[-2])
     left = source if weights is None else source * weights[..., None]
     rotation = nearest_rotation(left.mT @ target, reflect=reflect)
     size = (left * source).sum((-2, -1))
@@ -150,7 +170,12 @@ def similarity(
 
     Returns:
         (..., T, N, D).
+
+    Raises:
+        ShapeError: the shapes differ.
     """
+    check_core(source, "similarity: source", "T", "N", "D")
+    check_core(target, "similarity: target", *source.shape[-3:])
     a, _ = centre(source)
     b, mean = centre(target)
     flat = (lambda x: x.flatten(-3, -2)) if sequence else (lambda x: x)
@@ -181,8 +206,13 @@ def superpose(
 
     Raises:
         OptionError: there is no such alignment.
+        ShapeError: they are not of these shapes.
     """
     check_alignment(how, root)
+    check_core(source, "superpose: source", "T", "N", 3)
+    check_core(target, "superpose: target", *source.shape[-3:])
+    if weights is not None:
+        check_core(weights, "superpose: weights", *source.shape[-3:-1])
     if how == "none":
         return source
     mass = torch.ones_like(target[..., 0]) if weights is None else weights.to(target)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import index_rows, safe_norm, unit_size
+from kcs_torch.functional.shapes import check_core
 
 __all__ = ["angle_between", "flexion", "joint_angles"]
 
@@ -26,9 +27,14 @@ def angle_between(first: Tensor, second: Tensor) -> Tensor:
         (...) in radians, 0 to pi. 0 with the derivative 0 where a vector has no length; the derivative is 0 also where
         the vectors are parallel, at which it has a kink.
 
+    Raises:
+        ShapeError: they have not as many coordinates.
+
     >>> angle_between(torch.tensor([1.0, 0, 0]), torch.tensor([[0.0, 2, 0], [-1, 0, 0], [0, 0, 0]])).tolist()
     [1.5707963705062866, 3.1415927410125732, 0.0]
     """
+    check_core(first, "angle_between: first", "D")
+    check_core(second, "angle_between: second", first.shape[-1])
     return _between(_unit(first), _unit(second))
 
 
@@ -46,15 +52,21 @@ def flexion(upper: Tensor, lower: Tensor, axis: Tensor | None = None) -> Tensor:
         way, about an axis within 60 degrees of the reverse of ``axis``: a limb that turns about itself bends sideways
         at times, which is not the wrong way. 0 with the derivative 0 where a bone has no length.
 
+    Raises:
+        ShapeError: they are not (..., 3).
+
     >>> thigh, shank = torch.tensor([0.0, 1, 0]), torch.tensor([0.0, 1, 1])
     >>> left = torch.tensor([1.0, 0, 0])  # y is down and z away from the viewer, whom the person faces
     >>> flexion(thigh, shank, left).rad2deg().item(), flexion(thigh, shank, -left).rad2deg().item()
     (45.0, -45.0)
     """
+    check_core(upper, "flexion: upper", 3)
+    check_core(lower, "flexion: lower", 3)
     first, second = _unit(upper), _unit(lower)
     angle = _between(first, second)
     if axis is None:
         return angle
+    check_core(axis, "flexion: axis", 3)
     turn = torch.linalg.cross(first.detach(), second.detach())
     along = (turn * _unit(axis.detach())).sum(-1)
     return torch.where(along < -AGAINST * safe_norm(turn), -angle, angle)
@@ -77,6 +89,7 @@ def joint_angles(points: Tensor, joints: Tensor | Sequence[Sequence[int]]) -> Te
     >>> joint_angles(arm, [(0, 1, 2)]).rad2deg().tolist()
     [90.0]
     """
+    check_core(points, "joint_angles: points", "N", "D")
     index = index_rows(joints, points.shape[-2], what="joints", form=("parent", "joint", "child"))
     above, here, below = (points.index_select(-2, i) for i in index.to(points.device).unbind(-1))
     return angle_between(here - above, below - here)

@@ -11,8 +11,10 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.angles import angle_between
 from kcs_torch.functional.eigen import eigh
+from kcs_torch.functional.precision import wide
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rotation import rotation_angle
+from kcs_torch.functional.shapes import check_core
 
 __all__ = [
     "back_project",
@@ -34,7 +36,12 @@ def project(points: Tensor, cameras: Tensor) -> Tensor:
 
     >>> project(torch.tensor([[[1.0, 2, 3]]]), torch.eye(3)[None, :2]).tolist()
     [[[1.0, 2.0]]]
+
+    Raises:
+        ShapeError: they are not of these shapes.
     """
+    check_core(points, "project: points", "N", 3)
+    check_core(cameras, "project: cameras", 2, 3)
     return points @ cameras.mT
 
 
@@ -48,9 +55,14 @@ def perspective(points: Tensor, intrinsics: Tensor) -> Tensor:
     Returns:
         (..., 2), in the unit of the intrinsics.
 
+    Raises:
+        ShapeError: the points are not (..., 3), or the intrinsics not (..., 4).
+
     >>> perspective(torch.tensor([1.0, 2.0, 4.0]), torch.tensor([100.0, 100.0, 50.0, 0.0])).tolist()
     [75.0, 50.0]
     """
+    check_core(points, "perspective: points", 3)
+    check_core(intrinsics, "perspective: intrinsics", 4)
     return intrinsics[..., :2] * points[..., :2] / points[..., 2:] + intrinsics[..., 2:]
 
 
@@ -58,18 +70,24 @@ def pinhole_translation(points: Tensor, rays: Tensor, weights: Tensor) -> Tensor
     """Return the t that minimises sum_n w_n |(x + t_x, y + t_y) - ray (z + t_z)|^2: where a body stands.
 
     Args:
-        points: (..., N, 3), about any origin.
-        rays: (..., N, 2) where the joints are seen, as X/Z and Y/Z.
+        points: (..., N, 3), about any origin; finite.
+        rays: (..., N, 2) where the joints are seen, as X/Z and Y/Z; finite.
         weights: (..., N), 0 where unseen.
 
     Returns:
         (..., 3). Where all rays are the same one, the distance is arbitrary: ten times the body's size.
+
+    Raises:
+        ShapeError: they are not of these shapes.
 
     >>> X = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 1]])
     >>> t = torch.tensor([1.0, 2, 5])
     >>> pinhole_translation(X, (X + t)[:, :2] / (X + t)[:, 2:], torch.ones(3)).round(decimals=4).tolist()
     [1.0, 2.0, 5.0]
     """
+    check_core(points, "pinhole_translation: points", "N", 3)
+    check_core(rays, "pinhole_translation: rays", points.shape[-2], 2)
+    check_core(weights, "pinhole_translation: weights", points.shape[-2])
     share = weights[..., None]
     total = share.sum(-2, keepdim=True)
     total = torch.where(total > 0, total, torch.ones_like(total))
@@ -88,7 +106,13 @@ def pinhole_translation(points: Tensor, rays: Tensor, weights: Tensor) -> Tensor
 
 
 def back_project(tracks: Tensor, cameras: Tensor) -> Tensor:
-    """Return R_t^T w_t, the adjoint of :func:`project`: (..., T, N, 2) to (..., T, N, 3)."""
+    """Return R_t^T w_t, the adjoint of :func:`project`: (..., T, N, 2) to (..., T, N, 3).
+
+    Raises:
+        ShapeError: the tracks are not (..., N, 2), or the cameras not (..., 2, 3).
+    """
+    check_core(tracks, "back_project: tracks", "N", 2)
+    check_core(cameras, "back_project: cameras", 2, 3)
     return tracks @ cameras
 
 
@@ -100,7 +124,11 @@ def complete_rotation(cameras: Tensor) -> Tensor:
 
     Returns:
         (..., 3, 3) rotations, world to camera.
+
+    Raises:
+        ShapeError: the cameras are not (..., 2, 3).
     """
+    check_core(cameras, "complete_rotation: cameras", 2, 3)
     return torch.cat([cameras, torch.linalg.cross(cameras[..., :1, :], cameras[..., 1:, :])], -2)
 
 
@@ -116,8 +144,9 @@ def factorize(tracks: Tensor, rank: int) -> tuple[Tensor, Tensor]:
         orthonormal rows.
 
     Raises:
-        ShapeError: the rank is out of range.
+        ShapeError: the tracks are not (..., T, N, 2), or the rank is out of range.
     """
+    check_core(tracks, "factorize: tracks", "T", "N", 2)
     frames, joints = tracks.shape[-3:-1]
     if not 1 <= rank <= min(2 * frames, joints):
         raise ShapeError(f"factorize: expected a rank within 1..{min(2 * frames, joints)}, got {rank}")
@@ -139,7 +168,11 @@ def orthonormality_defect(rows: Tensor) -> Tensor:
 
     Returns:
         (...).
+
+    Raises:
+        ShapeError: the rows are not pairs.
     """
+    check_core(rows, "orthonormality_defect: rows", 2, "D")
     a, b = rows[..., 0, :], rows[..., 1, :]
     return ((a.square().sum(-1) - b.square().sum(-1)) / 2).square() + (a * b).sum(-1).square()
 
@@ -154,11 +187,15 @@ def rows_to_cameras(rows: Tensor) -> tuple[Tensor, Tensor]:
         cameras (..., 2, 3) with orthonormal rows and scales (...), non-negative: ``rows ~ scale * cameras``.
         Rows that vanish or are parallel give an arbitrary valid camera.
 
+    Raises:
+        ShapeError: the rows are not (..., 2, 3).
+
     Note:
         With n the unit normal of the rows' plane, the second row of a camera in this plane is n x c for a first row c.
         So c.a + (n x c).b = c.(a + b x n) is to be as large as can be, and c is the direction of a + b x n.
     """
-    dtype, rows = rows.dtype, rows.to(torch.promote_types(rows.dtype, torch.float32))
+    check_core(rows, "rows_to_cameras: rows", 2, 3)
+    dtype, rows = rows.dtype, wide(rows)
     with torch.no_grad():
         size = rows.abs().amax((-2, -1), keepdim=True)
         size = torch.where(size > 0, size, torch.ones_like(size))
@@ -197,7 +234,11 @@ def viewpoint_turn(cameras: Tensor) -> Tensor:
     Returns:
         (...). Turning about the optical axis does not count: it tells nothing of depth. Found in three sweeps, which is
         exact for a path; of directions scattered at random it may miss a fifth.
+
+    Raises:
+        ShapeError: the cameras are not (..., T, 2, 3).
     """
+    check_core(cameras, "viewpoint_turn: cameras", "T", 2, 3)
     view = complete_rotation(cameras)[..., 2, :]  # (..., T, 3)
     far = view.mean(-2, keepdim=True)
     for _ in range(3):  # the farthest from the mean, the farthest from that, and once more
@@ -216,7 +257,12 @@ def camera_disagreement(first: Tensor, second: Tensor) -> Tensor:
 
     Returns:
         (...).
+
+    Raises:
+        ShapeError: the paths are not of these shapes.
     """
+    check_core(first, "camera_disagreement: first", "T", 2, 3)
+    check_core(second, "camera_disagreement: second", first.shape[-3], 2, 3)
     target = complete_rotation(second)
     angles = []
     for depth in (1.0, -1.0):

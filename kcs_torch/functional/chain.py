@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional.shapes import check_core
 
 __all__ = [
     "bone_lengths",
@@ -96,11 +97,12 @@ def bone_vectors(points: Tensor, bones: Tensor | Sequence[Sequence[int]]) -> Ten
         (..., B, D), in the unit of the points.
 
     Raises:
-        ShapeError: ``bones`` is not (B, 2).
+        ShapeError: ``bones`` is not (B, 2), a list that has other indices, or the points are not (..., N, D).
 
     >>> bone_vectors(torch.tensor([[0.0, 0], [1, 2]]), [(0, 1)]).tolist()
     [[1.0, 2.0]]
     """
+    check_core(points, "bone_vectors: points", "N", "D")
     index = index_rows(bones, points.shape[-2]).to(points.device)
     return points.index_select(-2, index[:, 1]) - points.index_select(-2, index[:, 0])
 
@@ -164,6 +166,7 @@ def pose_matrix(
     >>> pose_matrix(torch.tensor([[0.0, 0], [3, 0], [4, 2]]), [(0, 1), (1, 2)]).tolist()
     [[9.0, 3.0], [3.0, 5.0]]
     """
+    check_core(points, "pose_matrix: points", "N", "D")
     parents, children = index_rows(bones, points.shape[-2]).to(points.device).unbind(-1)
     rows = points.mT
     across = rows.index_select(-1, children) - rows.index_select(-1, parents)  # (..., D, B)
@@ -229,6 +232,8 @@ def index_rows(
 ) -> Tensor:
     """Rows of joint indices, (B, 2) for bones; those of a list are among so many joints, or any if None.
 
+    Those of a tensor are not looked at, which would wait for its device.
+
     Raises:
         ShapeError: the rows are not of this form, or a list has other indices.
     """
@@ -241,6 +246,6 @@ def index_rows(
             if joints is not None and not all(0 <= i < joints for i in row):
                 raise ShapeError(f"{what}: expected joint indices 0..{joints - 1}, got {row}")
         return torch.tensor(listed, dtype=torch.long).reshape(-1, len(form))
-    if rows.ndim != 2 or rows.shape[-1] != len(form):
-        raise ShapeError(f"{what}: expected {shape}, got {tuple(rows.shape)}")
+    if rows.ndim != 2 or rows.shape[-1] != len(form) or rows.is_floating_point():
+        raise ShapeError(f"{what}: expected {shape}, got {tuple(rows.shape)} of {rows.dtype}")
     return rows

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kcs_torch.errors import NotFiniteError, ShapeError
 from kcs_torch.functional.eigen import eigh
+from kcs_torch.functional.precision import full_precision
 
 __all__ = ["LargestSum", "PSDShrink", "ShrinkSingularValues", "applied", "batch_first", "why_failed"]
 
@@ -22,13 +23,16 @@ __all__ = ["LargestSum", "PSDShrink", "ShrinkSingularValues", "applied", "batch_
 def applied(function: type[torch.autograd.Function], *inputs: Any) -> Any:
     """``function.apply``, or its plain forward where nothing is recorded: a Function costs as much as ten steps.
 
+    Autocast is suspended: its products would lose the digits that factorisations need, in types that few of them take.
+
     Raises:
         NotFiniteError: the first input holds NaN, so that its factorisation failed.
         ShapeError: it failed for another reason.
     """
     call: Any = function.apply if torch.is_grad_enabled() else function.forward
     try:
-        return call(*inputs)
+        with full_precision(inputs[0]):
+            return call(*inputs)
     except torch.linalg.LinAlgError as error:
         raise why_failed(inputs[0], error) from None
 

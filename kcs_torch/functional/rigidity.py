@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional.precision import wide
+from kcs_torch.functional.shapes import check_core
 
 __all__ = ["distance_spread", "rigid_tree"]
 
@@ -16,18 +18,23 @@ def distance_spread(points: Tensor, weights: Tensor | None = None) -> tuple[Tens
     """Return the mean and the standard deviation over time of the distances between all joints.
 
     Args:
-        points: (..., T, N, 3).
+        points: (..., T, N, 3), finite.
         weights: (..., T, N); a pair counts in a frame as much as the lesser of its joints. All 1 where None.
 
     Returns:
         mean (..., N, N) and standard deviation (..., N, N), both 0 for pairs never seen together. Their
         derivatives are 0 where they are 0.
+
+    Raises:
+        ShapeError: they are not of these shapes.
     """
+    check_core(points, "distance_spread: points", "T", "N", 3)
     offset = points[..., :, None, :] - points[..., None, :, :]
     distance = _root(offset.square().sum(-1))  # (..., T, N, N)
     if weights is None:
         mean = distance.mean(-3)
         return mean, _root((distance - mean[..., None, :, :]).square().mean(-3))
+    check_core(weights, "distance_spread: weights", *points.shape[-3:-1])
     share = torch.minimum(weights[..., :, None], weights[..., None, :])
     total = share.sum(-3)
     total = torch.where(total > 0, total, torch.ones_like(total))
@@ -50,9 +57,9 @@ def rigid_tree(cost: Tensor) -> Tensor:
     >>> rigid_tree(torch.tensor([[0.0, 1, 9], [1, 0, 2], [9, 2, 0]])).tolist()
     [[0, 1], [1, 2]]
     """
-    joints = len(cost)
     if cost.ndim != 2 or cost.shape[0] != cost.shape[1]:
         raise ShapeError(f"rigid_tree: expected a cost of each pair (N, N), got {tuple(cost.shape)}")
+    joints, cost = len(cost), wide(cost)
     cost = torch.nan_to_num(cost, nan=torch.finfo(cost.dtype).max)
     inside = torch.zeros(joints, dtype=torch.bool, device=cost.device)
     inside[:1] = True

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
+from kcs_torch.functional.shapes import check_core
 
 __all__ = ["euler_angles", "euler_rotation", "rotation_angle", "rotation_matrix", "rotation_vector"]
 
@@ -26,9 +27,13 @@ def rotation_matrix(vectors: Tensor) -> Tensor:
     Returns:
         (..., 3, 3). Differentiable, also where the angle is 0, and twice.
 
+    Raises:
+        ShapeError: the vectors are not (..., 3).
+
     >>> rotation_matrix(torch.tensor([0.0, 0.0, torch.pi / 2])).round(decimals=5).abs().tolist()
     [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
+    check_core(vectors, "rotation_matrix: vectors", 3)
     x, y, z = vectors.unbind(-1)
     square = x * x + y * y + z * z
     small = square < SMALL
@@ -54,12 +59,16 @@ def rotation_vector(matrices: Tensor) -> Tensor:
     Returns:
         (..., 3). Differentiable, also at the identity; where R is a half turn, v and -v are one rotation.
 
+    Raises:
+        ShapeError: the matrices are not (..., 3, 3).
+
     Through the unit quaternion, whose outer square is linear in R: a row of it far from 0 is the quaternion up to a
     factor, however large or small the angle is (Markley 2008).
 
     >>> rotation_vector(rotation_matrix(torch.tensor([0.1, -2.0, 0.5]))).round(decimals=5).tolist()
     [0.10000000149011612, -2.0, 0.5]
     """
+    check_core(matrices, "rotation_vector: matrices", 3, 3)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in matrices.unbind(-2))
     outer = torch.stack(
         [
@@ -84,7 +93,12 @@ def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
     """Return the angle (...) in radians between rotations (..., 3, 3): |A - B| = 2 sqrt(2) sin(angle / 2).
 
     The derivative is 0 where they are equal or a half turn apart, at which it has a kink.
+
+    Raises:
+        ShapeError: one of them is not (..., 3, 3).
     """
+    check_core(first, "rotation_angle: first", 3, 3)
+    check_core(second, "rotation_angle: second", 3, 3)
     sine = torch.linalg.matrix_norm(first - second) / math.sqrt(8)  # of half the angle
     far = sine > 0.75
     turn = first.mT @ second
@@ -106,12 +120,14 @@ def euler_rotation(order: str, angles: Tensor) -> Tensor:
 
     Raises:
         OptionError: there is another letter.
+        ShapeError: the angles are not as many.
 
     >>> torch.allclose(euler_rotation("ZX", torch.tensor([0.3, 0.0])), rotation_matrix(torch.tensor([0, 0, 0.3])))
     True
     """
     if not set(order) <= set(AXES):
         raise OptionError(f"euler_rotation: expected axes X, Y and Z, got {order!r}")
+    check_core(angles, "euler_rotation: angles", len(order))
     eye = torch.eye(3, dtype=angles.dtype, device=angles.device)
     total = eye.expand(*angles.shape[:-1], 3, 3)
     for axis, angle in zip(order, angles.unbind(-1), strict=True):
@@ -131,9 +147,11 @@ def euler_angles(order: str, matrices: Tensor) -> Tensor:
 
     Raises:
         OptionError: the order is another one.
+        ShapeError: the matrices are not (..., 3, 3).
     """
     if sorted(order) != list(AXES):
         raise OptionError(f"euler_angles: expected X, Y and Z in some order, got {order!r}")
+    check_core(matrices, "euler_angles: matrices", 3, 3)
     i, j, k = (AXES.index(axis) for axis in order)
     sign = 1 if (j - i) % 3 == 1 else -1
     r = matrices

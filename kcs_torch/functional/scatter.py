@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError
 from kcs_torch.functional.derivatives import applied, batch_first
-from kcs_torch.functional.shapes import broadcast_shapes
+from kcs_torch.functional.precision import wide
+from kcs_torch.functional.shapes import broadcast_shapes, check_core
 
 __all__ = ["inverse_scatter", "scatter_log_det"]
 
@@ -18,7 +18,7 @@ def scatter_log_det(values: Tensor, eps: Tensor | float) -> Tensor:
     """Return T/2 log det(X^T X / T + eps I) of the rows X: what a Gaussian of unknown covariance charges for them.
 
     The derivative in the values is X (X^T X / T + eps I)^-1, from the factorisation that the value needs: no SVD, and
-    finite for any input as long as eps is positive.
+    finite for any input as long as eps is positive; NaN where rounding leaves nothing of eps beside the squares.
 
     Args:
         values: (..., T, D), centred by the caller where a mean is to be free.
@@ -33,11 +33,11 @@ def scatter_log_det(values: Tensor, eps: Tensor | float) -> Tensor:
     >>> scatter_log_det(torch.zeros(4, 3), 1.0).item()
     0.0
     """
-    if values.ndim < 2:
-        raise ShapeError(f"scatter_log_det: expected values (..., T, D), got {tuple(values.shape)}")
-    level = torch.as_tensor(eps, dtype=values.dtype, device=values.device)
-    out: Tensor = applied(_ScatterLogDet, values, level)[0]
-    return out
+    check_core(values, "scatter_log_det: values", "T", "D")
+    work = wide(values)  # no LAPACK takes half precision
+    level = torch.as_tensor(eps, dtype=work.dtype, device=values.device)
+    out: Tensor = applied(_ScatterLogDet, work, level)[0]
+    return out.to(values.dtype)
 
 
 def inverse_scatter(values: Tensor, eps: Tensor | float) -> Tensor:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
+
+from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 
-__all__ = ["broadcast_shapes", "fit_together"]
+__all__ = ["broadcast_shapes", "check_core", "fit_together"]
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> tuple[int, ...]:
@@ -37,3 +40,24 @@ def fit_together(one: Sequence[int], other: Sequence[int]) -> bool:
     (True, False)
     """
     return all(a == b or 1 in (a, b) for a, b in zip(one[::-1], other[::-1], strict=False))
+
+
+def check_core(value: Any, what: str, *core: int | str) -> None:
+    """Raise a ShapeError unless ``value`` is a tensor (..., *core), in which letters stand for any size.
+
+    >>> import torch
+    >>> check_core(torch.zeros(5, 2, 4), "project: cameras", 2, 3)
+    Traceback (most recent call last):
+    kcs_torch.errors.ShapeError: project: cameras: expected shape (..., 2, 3), got (5, 2, 4)
+    """
+    if not isinstance(value, Tensor):
+        name = what.rpartition(" ")[2]
+        raise ShapeError(f"{what}: expected a tensor, got {type(value).__name__}: use torch.as_tensor({name})")
+    shape, sizes = value.shape, len(core)
+    if len(shape) >= sizes:
+        for size, wanted in zip(shape[len(shape) - sizes :], core, strict=True):
+            if size != wanted and not isinstance(wanted, str):
+                break
+        else:
+            return
+    raise ShapeError(f"{what}: expected shape (..., {', '.join(map(str, core))}), got {tuple(shape)}")

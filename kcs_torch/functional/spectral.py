@@ -18,9 +18,11 @@ import math
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.derivatives import LargestSum, PSDShrink, ShrinkSingularValues, applied, why_failed
 from kcs_torch.functional.eigen import eigvalsh
+from kcs_torch.functional.precision import wide
+from kcs_torch.functional.shapes import check_core, fit_together
 
 __all__ = ["dct_basis", "log_det", "nuclear_norm", "psd_shrink", "singular_values", "spectral_norm", "svt"]
 
@@ -45,7 +47,8 @@ def svt(matrix: Tensor, threshold: Tensor | float, corner: Tensor | float = math
         (..., M, N). Differentiable once, in all arguments; a second derivative raises ``RuntimeError``.
 
     Raises:
-        ShapeError: fewer than 2 dimensions, or NaN.
+        ShapeError: fewer than 2 dimensions, whole numbers, NaN, or a threshold or corner that does not broadcast.
+        OptionError: a number for the threshold or the corner is negative.
 
     Cai, Candes, Shen 2010; Ma, Goldfarb, Chen 2011 (the shrinkage of FPC); Candes, Wakin, Boyd 2008 (reweighting).
 
@@ -54,8 +57,8 @@ def svt(matrix: Tensor, threshold: Tensor | float, corner: Tensor | float = math
     """
     _check_matrix(matrix, "svt")
     work = _double(matrix)
-    level = torch.as_tensor(threshold, dtype=work.dtype, device=matrix.device)
-    size = torch.as_tensor(corner, dtype=work.dtype, device=matrix.device)
+    level = _level(threshold, "svt: threshold", work, sign=True)
+    size = _level(corner, "svt: corner", work, sign=True)
     least = torch.finfo(work.dtype).tiny ** 0.5  # of which the inverse, and its square in the derivative, are finite
     level = level.clamp_max(1 / least)  # infinite ones leave nothing either way
     bend = torch.where(size > 0, 1 / torch.where(size > 0, size.clamp_min(least), 1), 0)
@@ -85,8 +88,8 @@ def psd_shrink(matrix: Tensor, threshold: Tensor | float) -> Tensor:
     _check_matrix(matrix, "psd_shrink")
     if matrix.shape[-1] != matrix.shape[-2]:
         raise ShapeError(f"psd_shrink: expected square matrices, got {tuple(matrix.shape)}")
-    work = _single(matrix)
-    level = torch.as_tensor(threshold, dtype=work.dtype, device=matrix.device)
+    work = wide(matrix)
+    level = _level(threshold, "psd_shrink: threshold", work)
     out: Tensor = applied(PSDShrink, (work + work.mT) / 2, level)[0]
     return out.to(matrix.dtype)
 
@@ -150,8 +153,8 @@ def log_det(matrix: Tensor, eps: Tensor | float) -> Tensor:
     _check_matrix(matrix, "log_det")
     if matrix.shape[-1] != matrix.shape[-2]:
         raise ShapeError(f"log_det: expected square matrices, got {tuple(matrix.shape)}")
-    work = _single(matrix)
-    level = torch.as_tensor(eps, dtype=work.dtype, device=matrix.device)
+    work = wide(matrix)
+    level = _level(eps, "log_det: eps", work)
     eye = torch.eye(matrix.shape[-1], dtype=work.dtype, device=matrix.device)
     try:
         factor = torch.linalg.cholesky(work + level[..., None, None] * eye)
@@ -171,8 +174,10 @@ def singular_values(matrix: Tensor) -> Tensor:
         (..., min(M, N)), accurate to about 1e-8 times the largest.
 
     Raises:
+        ShapeError: fewer than 2 dimensions.
         NotFiniteError: the matrix holds NaN.
     """
+    _check_matrix(matrix, "singular_values")
     with torch.no_grad():
         work = _double(matrix)
         gram = work.mT @ work if work.shape[-2] >= work.shape[-1] else work @ work.mT
@@ -214,19 +219,26 @@ def dct_basis(
     return basis
 
 
-def _single(matrix: Tensor) -> Tensor:
-    """Half precision is widened, as no LAPACK takes it; the result is cast back."""
-    return matrix.float() if matrix.dtype in (torch.float16, torch.bfloat16) else matrix
-
-
 def _double(matrix: Tensor) -> Tensor:
     """A Gram matrix squares the singular values: in single precision it would lose those below 3e-4 of the largest.
 
     MPS devices know no double precision.
     """
-    return _single(matrix) if matrix.device.type == "mps" else matrix.double()
+    return wide(matrix) if matrix.device.type == "mps" else matrix.double()
 
 
 def _check_matrix(matrix: Tensor, name: str) -> None:
-    if matrix.ndim < 2:
-        raise ShapeError(f"{name}: expected a matrix (..., M, N), got shape {tuple(matrix.shape)}")
+    check_core(matrix, f"{name}: matrix", "M", "N")
+    if not matrix.is_floating_point():
+        raise ShapeError(f"{name}: expected a matrix in floating point, got {matrix.dtype}")
+
+
+def _level(value: Tensor | float, name: str, matrix: Tensor, *, sign: bool = False) -> Tensor:
+    """A number or a tensor that broadcasts against (...), for matrices (..., M, N); with ``sign`` not negative."""
+    if sign and not isinstance(value, Tensor) and not value >= 0:
+        raise OptionError(f"{name}: expected a number that is not negative, got {value}")
+    level = torch.as_tensor(value, dtype=matrix.dtype, device=matrix.device)
+    if not fit_together(level.shape, matrix.shape[:-2]):
+        expected = f"a number, or a tensor that broadcasts against {tuple(matrix.shape[:-2])}"
+        raise ShapeError(f"{name}: expected {expected}, got {tuple(level.shape)} for matrices {tuple(matrix.shape)}")
+    return level

@@ -8,8 +8,9 @@ import math
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError
-from kcs_torch.functional.shapes import broadcast_shapes
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.precision import wide
+from kcs_torch.functional.shapes import broadcast_shapes, check_core
 
 __all__ = ["best_path", "blend_windows", "interpolate", "jitter", "standing", "window_starts"]
 
@@ -23,7 +24,11 @@ def interpolate(values: Tensor, seen: Tensor) -> Tensor:
 
     Returns:
         (..., T, N, D). A joint never seen takes the mean of the seen joints of each frame (0 where there is none).
+
+    Raises:
+        ShapeError: the values are not (..., T, N, D).
     """
+    check_core(values, "interpolate: values", "T", "N", "D")
     frames = values.shape[-3]
     seen = seen.expand(values.shape[:-1])
     time = torch.arange(frames, device=values.device)[:, None].expand(seen.shape)
@@ -54,7 +59,13 @@ def jitter(values: Tensor, seen: Tensor, *, order: int = 4) -> Tensor:
 
     Returns:
         A scalar in the unit of the values; 0 for clips with no more than ``order`` frames in a row.
+
+    Raises:
+        ShapeError: the values are not those of one clip, or ``seen`` is of another shape.
     """
+    for name, value, form in (("values", values, "(T, N, D)"), ("seen", seen, "(T, N)")):
+        if value.ndim != form.count(",") + 1 or value.shape[:2] != values.shape[:2]:
+            raise ShapeError(f"jitter: {name}: expected shape {form} of one clip, got {tuple(value.shape)}")
     if len(values) <= order:
         return values.new_zeros(())
     change = values.diff(n=order, dim=0)[seen.unfold(0, order + 1, 1).all(-1)]
@@ -74,14 +85,20 @@ def standing(image: Tensor, weights: Tensor) -> Tensor:
         (..., T, C) in 0..1; 0 where a point or its neighbours in time are unseen, and in clips of one or two frames.
         The top speed is the 0.95 quantile over frames and points.
 
+    Raises:
+        ShapeError: they are not of these shapes.
+
     >>> x = torch.tensor([0.0, 0, 0, 0, 1, 2, 3])
     >>> standing(torch.stack([x, 0 * x], -1)[:, None], torch.ones(7, 1)).flatten()
     tensor([1.0000e+00, 1.0000e+00, 1.0000e+00, 1.7e-04, 8.3e-16, 8.3e-16, 8.3e-16])
     """
-    if image.shape[-3] < 3 or not image.numel():
-        return torch.zeros_like(weights)
+    check_core(image, "standing: image", "T", "C", 2)
+    check_core(weights, "standing: weights", *image.shape[-3:-1])
     seen = (weights > 0) & image.isfinite().all(-1)
-    known = torch.where(seen[..., None], image, 0.0).to(torch.promote_types(image.dtype, torch.float32))
+    dtype = image.dtype if image.is_floating_point() else torch.float32
+    if image.shape[-3] < 3 or not image.numel():
+        return torch.zeros_like(seen, dtype=dtype)
+    known = torch.where(seen[..., None], wide(image), 0.0)
     move = known[..., 2:, :, :] - known[..., :-2, :, :]
     move = move / move.abs().amax((-3, -2, -1), keepdim=True).clamp_min(torch.finfo(move.dtype).tiny)  # no overflow
     speed = move.norm(dim=-1) / 2
@@ -93,7 +110,7 @@ def standing(image: Tensor, weights: Tensor) -> Tensor:
     )
     top = torch.nanquantile(torch.where(seen, speed, torch.nan).flatten(-2), 0.95, dim=-1)[..., None, None]
     still = torch.exp(-0.5 * (speed / (0.12 * top).clamp_min(torch.finfo(speed.dtype).tiny)).square())
-    return torch.where(seen, still, torch.zeros_like(still)).to(image)
+    return torch.where(seen, still, torch.zeros_like(still)).to(dtype)
 
 
 def window_starts(length: int, window: int, overlap: int) -> list[int]:
@@ -151,10 +168,15 @@ def best_path(cost: Tensor, transition: Tensor) -> Tensor:
     Returns:
         (..., T) states. Where several paths cost the same, the result may mix them.
 
+    Raises:
+        ShapeError: they are not of these shapes.
+
     >>> best_path(torch.tensor([[0.0, 1], [1, 0], [0, 1]]), torch.ones(2, 2, 2) - torch.eye(2)).tolist()
     [0, 0, 0]
     """
+    check_core(cost, "best_path: cost", "T", "S")
     frames, states = cost.shape[-2:]
+    check_core(transition, "best_path: transition", max(frames - 1, 0), states, states)
     if frames == 1:
         return cost.argmin(-1)
     batch = broadcast_shapes(cost.shape[:-2], transition.shape[:-3])

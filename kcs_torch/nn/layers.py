@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_lengths, bone_vectors, pose_matrix
+from kcs_torch.functional.precision import full_precision, wide
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.spectral import svt
 from kcs_torch.skeleton import Skeleton, get_skeleton
@@ -189,18 +189,6 @@ class SVT(nn.Module):
         if self.relative:
             level = level * torch.linalg.matrix_norm(wide(matrix))
         return svt(matrix, level)
-
-
-def full_precision(tensor: Tensor) -> AbstractContextManager[Any]:
-    """Suspend autocast on the tensor's device, if it has any: pixels and factorisations need more than three digits."""
-    kind = tensor.device.type
-    on = torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind)
-    return torch.autocast(kind, enabled=False) if on else nullcontext()
-
-
-def wide(tensor: Tensor) -> Tensor:
-    """At least in single precision: squares of millimetres or pixels leave the range of half precision."""
-    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
 def narrow(value: Tensor, like: Tensor) -> Tensor:
