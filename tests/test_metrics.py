@@ -219,6 +219,56 @@ def test_bones_of_joints_that_are_nan_count_where_they_are_seen():
         assert torch.equal(bone_deviation(gone, bones, weights=weights), bone_deviation(points, bones, weights=weights))
 
 
+def test_what_weighs_nothing_may_be_nan():
+    """The functions refused it, their classes did not."""
+    truth, pred, weights = clip(), clip(seed=1), torch.ones(12, 6, dtype=torch.float64)
+    weights[3, 1] = weights[5:7, 4] = 0
+    gone, lost = (torch.where(weights[..., None] > 0, x, torch.nan) for x in (truth, pred))
+    for figure in (mpjpe, e3d, lambda *a, **k: pck(*a, 1.0, **k)):
+        leaf = lost.clone().requires_grad_()
+        found = figure(leaf, gone, weights=weights)
+        assert torch.equal(found, figure(pred, truth, weights=weights))
+        if found.requires_grad:
+            assert torch.autograd.grad(found, leaf)[0].isfinite().all()
+
+
+def test_deviation_of_bones_has_a_derivative_where_they_are_constant():
+    """The root of a variance of 0 has none, and one such bone made that of the others NaN."""
+    points = clip()
+    points[:, 1] = points[:, 0] + torch.tensor([0.0, 2.0, 0.0])
+    points[:, 3] = points[:, 2]  # no length
+    weights = torch.ones(12, 6, dtype=torch.float64)
+    weights[:, 5] = 0
+    for frames in (12, 1):
+        for mass in (None, weights[:frames]):
+            leaf = points[:frames].clone().requires_grad_()
+            value = bone_deviation(leaf, [(0, 1), (2, 3), (1, 4), (4, 5), (1, 2)], weights=mass)
+            (grad,) = torch.autograd.grad(value, leaf)
+            assert value.isfinite() and grad.isfinite().all()
+    few = points.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: bone_deviation(x, [(0, 1), (1, 2), (1, 4)]), few)
+    flat = points.detach() * torch.tensor([1.0, 1.0, 0.0])
+    truth = flat.clone().requires_grad_()
+    (grad,) = torch.autograd.grad(e3d(clip(seed=1), truth), truth)
+    assert grad.isfinite().all()
+
+
+def test_bones_that_points_have_not_are_told():
+    """Torch told of indices, or took the wrong joints of a skeleton without a word."""
+    for bones, told in (
+        ([(0, 6)], r"bones: expected joint indices 0..5, got \(0, 6\)"),
+        ([(0.5, 1)], r"bones: expected shape \(B, 2\) of indices"),
+        ([(0, 1, 2)], r"bones: expected shape \(B, 2\) of indices"),
+        ("h36m17", r"expected points of the 17 joints of skeleton 'h36m17', got 6 joints"),
+    ):
+        with pytest.raises(ShapeError, match=told):
+            bone_deviation(clip(), bones)
+    with pytest.raises(ShapeError, match=r"bone_deviation: weights: expected shape \(\.\.\., 12, 6\), got \(6,\)"):
+        bone_deviation(clip(), BONES, weights=torch.ones(6))
+    with pytest.raises(ShapeError, match=r"bone_deviation: points: expected shape \(\.\.\., T, N, 3\)"):
+        bone_deviation(clip()[0], BONES)
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_bone_deviation_of_half_precision_in_millimetres(dtype):
     points = (300 * clip(frames=1) + 10 * clip(frames=300, seed=1)).to(dtype)

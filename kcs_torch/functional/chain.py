@@ -223,6 +223,12 @@ def safe_norm(vectors: Tensor) -> Tensor:
     return torch.where(zero, torch.zeros_like(square), root * scale.squeeze(-1))
 
 
+def safe_root(squares: Tensor) -> Tensor:
+    """Square roots, with derivative 0 where a square is 0; NaN stays."""
+    zero = squares == 0
+    return torch.where(zero, 0, torch.where(zero, 1, squares).sqrt())
+
+
 def index_rows(
     rows: Tensor | Sequence[Sequence[int]],
     joints: int | None = None,

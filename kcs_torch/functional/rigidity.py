@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional.chain import safe_root
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.shapes import check_core
 
@@ -30,16 +31,16 @@ def distance_spread(points: Tensor, weights: Tensor | None = None) -> tuple[Tens
     """
     check_core(points, "distance_spread: points", "T", "N", 3)
     offset = points[..., :, None, :] - points[..., None, :, :]
-    distance = _root(offset.square().sum(-1))  # (..., T, N, N)
+    distance = safe_root(offset.square().sum(-1))  # (..., T, N, N)
     if weights is None:
         mean = distance.mean(-3)
-        return mean, _root((distance - mean[..., None, :, :]).square().mean(-3))
+        return mean, safe_root((distance - mean[..., None, :, :]).square().mean(-3))
     check_core(weights, "distance_spread: weights", *points.shape[-3:-1])
     share = torch.minimum(weights[..., :, None], weights[..., None, :])
     total = share.sum(-3)
     total = torch.where(total > 0, total, torch.ones_like(total))
     mean = (share * distance).sum(-3) / total
-    return mean, _root((share * (distance - mean[..., None, :, :]).square()).sum(-3) / total)
+    return mean, safe_root((share * (distance - mean[..., None, :, :]).square()).sum(-3) / total)
 
 
 def rigid_tree(cost: Tensor) -> Tensor:
@@ -70,9 +71,3 @@ def rigid_tree(cost: Tensor) -> Tensor:
         pairs.append((parent, child))
         inside[child] = True
     return torch.tensor(pairs, dtype=torch.long, device=cost.device).reshape(-1, 2)
-
-
-def _root(squares: Tensor) -> Tensor:
-    """Square roots, with derivative 0 where a square is 0; NaN stays."""
-    zero = squares == 0
-    return torch.where(zero, 0, torch.where(zero, 1, squares).sqrt())

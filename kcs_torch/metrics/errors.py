@@ -10,9 +10,11 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import bone_lengths, centre, nearest_rotation
+from kcs_torch.functional.chain import index_rows, safe_root
+from kcs_torch.functional.precision import wide
 from kcs_torch.functional.ranks import nanmedian
+from kcs_torch.functional.shapes import check_core
 from kcs_torch.metrics.align import align as aligned
-from kcs_torch.metrics.align import check_tensors
 from kcs_torch.skeleton import Skeleton, get_skeleton
 
 __all__ = ["Bones", "bone_deviation", "bone_pairs", "distances", "e3d", "mpjpe", "pck"]
@@ -31,14 +33,14 @@ def mpjpe(
         truth: (..., T, N, 3).
         align: a name in :data:`~kcs_torch.metrics.ALIGNMENTS`: ``similarity`` gives PA-MPJPE, ``scale`` N-MPJPE,
             ``rigid`` the 3D error of kinematic chain space.
-        weights: (..., T, N), 0 where a joint of the truth is unknown; all 1 if None.
+        weights: (..., T, N), 0 where a joint of the truth is unknown, whatever stands there; all 1 if None.
         root: index of the root joint for ``root`` and ``scale``; the middle of all joints if None.
 
     Returns:
         (...), in the unit of the truth; NaN where nothing counts.
 
     Raises:
-        ShapeError: the shapes differ.
+        ShapeError: the shapes differ, or a number that counts is not finite.
         OptionError: there is no such alignment.
 
     >>> truth = torch.zeros(1, 2, 3)
@@ -89,14 +91,15 @@ def e3d(pred: Tensor, truth: Tensor, *, weights: Tensor | None = None) -> Tensor
     Args:
         pred: (..., T, N, 3).
         truth: (..., T, N, 3).
-        weights: (..., T, N), 0 where a joint of the truth is unknown; all 1 if None.
+        weights: (..., T, N), 0 where a joint of the truth is unknown, whatever stands there; all 1 if None.
 
     Returns:
-        (...), without unit.
+        (...), without unit; NaN where nothing counts, or the truth is a point.
 
     Raises:
-        ShapeError: the shapes differ.
+        ShapeError: the shapes differ, or a number that counts is not finite.
     """
+    pred, truth = known(pred, weights), known(truth, weights)
     pred = aligned(pred, truth, "none", weights=weights)  # checks the shapes; at least in single precision
     truth = truth.to(pred)
     mass = torch.ones_like(truth[..., 0]) if weights is None else weights.to(truth)
@@ -107,9 +110,9 @@ def e3d(pred: Tensor, truth: Tensor, *, weights: Tensor | None = None) -> Tensor
         distance = (source @ turn[..., None, :, :] - target).norm(dim=-1)
     count = mass.sum(-1, keepdim=True)
     count = torch.where(count > 0, count, torch.ones_like(count))
-    spread = ((target.square() * mass[..., None]).sum(-2) / count).sqrt()  # (..., T, 3)
-    known = (mass.sum(-1) > 0).to(mass)
-    return _mean(distance, weights) / ((spread.mean(-1) * known).sum(-1) / known.sum(-1))
+    spread = safe_root((target.square() * mass[..., None]).sum(-2) / count)  # (..., T, 3)
+    some = (mass.sum(-1) > 0).to(mass)
+    return _mean(distance, weights) / ((spread.mean(-1) * some).sum(-1) / some.sum(-1))
 
 
 def bone_deviation(points: Tensor, bones: Bones, *, weights: Tensor | None = None) -> Tensor:
@@ -121,42 +124,46 @@ def bone_deviation(points: Tensor, bones: Bones, *, weights: Tensor | None = Non
         weights: (..., T, N), 0 where a joint is unknown, whatever stands there; all 1 if None.
 
     Returns:
-        (...), a share: 0.01 is 1 per cent.
+        (...), a share: 0.01 is 1 per cent; NaN where no bone is known. The derivative is 0 where a length is constant.
 
     Raises:
-        ShapeError: there are no bones.
+        ShapeError: there are no bones, or the shapes do not fit them.
 
     >>> points = torch.tensor([[[0.0, 0, 0], [0, 9, 0]], [[0, 0, 0], [0, 11, 0]]])
     >>> round(bone_deviation(points, [(0, 1)]).item(), 4)
     0.1
     """
-    check_tensors(points=points, weights=weights)
-    index = bone_pairs(bones).to(points.device)
-    points = points.to(torch.promote_types(points.dtype, torch.float32))
-    lengths = bone_lengths(points, index)  # (..., T, B)
-    mass = torch.ones_like(lengths)
+    check_core(points, "bone_deviation: points", "T", "N", 3)
+    index = bone_pairs(bones, points.shape[-2]).to(points.device)
+    mass = torch.ones_like(points[..., 0], dtype=torch.bool)
     if weights is not None:
-        mass = (weights[..., index[:, 0]] > 0).to(points) * (weights[..., index[:, 1]] > 0).to(points)
-        lengths = torch.where(mass > 0, lengths, torch.zeros_like(lengths))
-    count = mass.sum(-2)
-    mean = (lengths * mass).sum(-2) / count
-    spread = ((lengths - mean[..., None, :]).square() * mass).sum(-2).div(count).sqrt()
-    return nanmedian(spread / mean, -1)
+        check_core(weights, "bone_deviation: weights", *points.shape[-3:-1])
+        mass = mass & (weights > 0)
+    lengths = bone_lengths(wide(torch.where(mass[..., None], points, 0.0)), index)  # (..., T, B)
+    share = (mass[..., index[:, 0]] & mass[..., index[:, 1]]).to(lengths)
+    count = share.sum(-2).clamp_min(1)
+    mean = (lengths * share).sum(-2) / count
+    spread = safe_root(((lengths - mean[..., None, :]).square() * share).sum(-2) / count)
+    there = mean > 0
+    return nanmedian(torch.where(there, spread / torch.where(there, mean, 1), torch.nan), -1)
 
 
-def bone_pairs(bones: Bones) -> Tensor:
+def bone_pairs(bones: Bones, joints: int | None = None) -> Tensor:
     """The (B, 2) joint indices of bones; of a skeleton, of those that are rigid.
 
     Raises:
-        ShapeError: there are no bones.
+        ShapeError: there are no bones, or they are not those of so many ``joints``.
         SkeletonError: there is no skeleton of that name.
     """
     if isinstance(bones, (str, Path, Skeleton)):
         body = get_skeleton(bones)
+        if joints not in (None, body.num_joints):
+            expected = f"points of the {body.num_joints} joints of skeleton '{body.name}'"
+            raise ShapeError(f"bones: expected {expected}, got {joints} joints")
         bones = body.bone_index()[list(body.rigid)]
-    index = torch.as_tensor(bones)
-    if index.ndim != 2 or not len(index):
-        raise ShapeError(f"bones: expected pairs of joints, got shape {tuple(index.shape)}")
+    index = index_rows(bones, joints)
+    if not len(index):
+        raise ShapeError("bones: expected pairs of joints, got none")
     return index
 
 
@@ -164,10 +171,18 @@ def distances(
     pred: Tensor, truth: Tensor, align: str, weights: Tensor | None, root: int | None
 ) -> tuple[Tensor, Tensor | None]:
     """Distances (..., T, N) after alignment, and how much each counts: nothing where the root is needed and unknown."""
+    pred, truth = known(pred, weights), known(truth, weights)
     distance = (aligned(pred, truth, align, weights=weights, root=root) - truth).norm(dim=-1)
     if weights is not None and root is not None and align in ("root", "scale"):
         weights = weights * (weights[..., root, None] > 0)
     return distance, weights
+
+
+def known(points: Tensor, weights: Tensor | None) -> Tensor:
+    """Points, 0 where they do not count; what is no tensor or does not fit is told later."""
+    if not (isinstance(points, Tensor) and isinstance(weights, Tensor) and weights.shape == points.shape[:-1]):
+        return points
+    return torch.where(weights[..., None] > 0, points, torch.zeros((), dtype=points.dtype, device=points.device))
 
 
 def _mean(values: Tensor, weights: Tensor | None) -> Tensor:

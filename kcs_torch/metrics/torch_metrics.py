@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.errors import OptionError
 from kcs_torch.functional.align import check_alignment
-from kcs_torch.metrics.align import check_tensors
 from kcs_torch.metrics.errors import Bones, bone_deviation, bone_pairs, distances, e3d
+from kcs_torch.skeleton import get_skeleton
 
 try:
     from torchmetrics import Metric
@@ -95,7 +96,6 @@ class MPJPE(_Mean):
         self._add(*self._measure(pred, truth, weights))
 
     def _measure(self, pred: Tensor, truth: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-        pred, truth = _known(pred, weights), _known(truth, weights)
         distance, mass = distances(pred, truth, self.align, weights, self.root)
         return distance, torch.ones_like(distance) if mass is None else mass
 
@@ -140,7 +140,7 @@ class E3D(_Mean):
 
     def update(self, pred: Tensor, truth: Tensor, weights: Tensor | None = None) -> None:
         """Add a batch of clips, as :meth:`MPJPE.update`."""
-        value = e3d(_known(pred, weights), _known(truth, weights), weights=weights)
+        value = e3d(pred, truth, weights=weights)
         some = torch.ones_like(value) if weights is None else (weights > 0).flatten(-2).any(-1)
         self._add(value, some)
 
@@ -160,19 +160,10 @@ class BoneDeviation(_Mean):
 
     def __init__(self, bones: Bones, **options: Any) -> None:
         super().__init__(**options)
-        self.bones = bone_pairs(bones)
+        self.bones = get_skeleton(bones) if isinstance(bones, (str, Path)) else bones
+        bone_pairs(self.bones)
 
     def update(self, points: Tensor, weights: Tensor | None = None) -> None:
         """Add a batch of clips (..., T, N, 3) with weights (..., T, N), 0 where a joint is unknown."""
-        value = bone_deviation(_known(points, weights), self.bones, weights=weights)
+        value = bone_deviation(points, self.bones, weights=weights)
         self._add(value, ~torch.isnan(value))
-
-
-def _known(points: Tensor, weights: Tensor | None) -> Tensor:
-    """Points, 0 where they do not count."""
-    check_tensors(points=points, weights=weights)
-    if weights is None:
-        return points
-    if weights.shape != points.shape[:-1]:
-        raise ShapeError(f"weights: expected shape {tuple(points.shape[:-1])}, got {tuple(weights.shape)}")
-    return torch.where(weights[..., None] > 0, points, torch.zeros_like(points))
