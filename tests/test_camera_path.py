@@ -8,7 +8,7 @@ import torch
 from numerics import DEVICES, FLOATS, leaves_arguments_alone, normal, rotations
 from torch.testing import assert_close
 
-from kcs_torch.errors import ShapeError
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import nearest_rotation
 from kcs_torch.solvers import constant_path
 from kcs_torch.solvers.camera_path import _left_jacobian, choose_path, settle_path, smooth_path, view_energy
@@ -108,6 +108,18 @@ def test_left_jacobian_is_the_derivative_of_the_exponential():
 def test_shapes_that_do_not_fit(shape):
     with pytest.raises(ShapeError, match="constant_path: expected"):
         constant_path(torch.zeros(shape))
+    with pytest.raises(ShapeError, match="smooth_path: expected"):
+        smooth_path(torch.zeros(shape))
+
+
+def test_paths_of_several_clips_or_of_no_kind_are_told():
+    """Batches ended in sizes at dimensions; a name that is none was taken for auto."""
+    with pytest.raises(ShapeError, match=r"smooth_path: expected rotations \(T, 3, 3\)"):
+        smooth_path(torch.eye(3).expand(2, 12, 3, 3))
+    with pytest.raises(ShapeError, match=r"choose_path: expected rotations \(T, 3, 3\)"):
+        choose_path(torch.eye(3).expand(2, 12, 3, 3))
+    with pytest.raises(OptionError, match="unknown camera path 'constnat': did you mean 'constant'"):
+        choose_path(torch.eye(3).expand(12, 3, 3), "constnat")
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -259,6 +259,10 @@ def test_what_does_not_fit_is_said():
     for options, words in (
         ({"width": 0}, "width and num_layers >= 1"),
         ({"num_layers": 0}, "width and num_layers >= 1"),
+        ({"width": 2.5}, "width and num_layers >= 1, got 2.5"),
+        ({"parts": 3}, "lists of bones"),
+        ({"parts": [3]}, "lists of bones"),
+        ({"parts": [[0.5]]}, r"bone indices 0\.\.5, got 0.5"),  # it was bone 0
         ({"parts": "arms"}, "expected 'limbs'"),
         ({"parts": []}, "lists of bones"),
         ({"parts": ["hip-neck"]}, "lists of bones"),

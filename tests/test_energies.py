@@ -785,6 +785,43 @@ def test_tracks_may_be_whole_pixels():
     assert ReprojectionEnergy()(points.half(), tracks).dtype == torch.float16
 
 
+@pytest.mark.parametrize(
+    ("energy", "options"),
+    [
+        (ContactEnergy, {"slip": 0.0, "change": -1.0, "num_steps": 1.5}),
+        (ForeshorteningEnergy, {"correlation": 0.0, "eps": -0.1}),
+        (PostureEnergy, {"strength": 0.0, "kappa": -1.0, "correlation": float("nan")}),
+        (ProportionEnergy, {"spread": 0.0, "twins": -0.03, "excess": "wide"}),
+        (StanceEnergy, {"sway": 0.0, "fold": -0.1}),
+    ],
+)
+def test_numbers_that_make_no_energy_are_refused(energy, options):
+    """They made NaN, infinite or negative ones."""
+    for name, value in options.items():
+        with pytest.raises(OptionError, match=f"{energy.__name__}: {name}: expected a (positive|whole) number"):
+            energy(TRUNK, **{name: value})
+
+
+def test_parts_of_energies_check_what_they_are_given():
+    """Of another skeleton's joints the trunk was found; a negative stiffness gave NaN, whole numbers were cut off."""
+    points = normal(5, 17, 3)
+    for wrong in (points[:, :16], points[..., :2]):
+        with pytest.raises(ShapeError, match=r"PostureEnergy: expected points \(\.\.\., T, (17|N), 3\)"):
+            POSTURE.frame(wrong)
+    with pytest.raises(ShapeError, match=r"expected lengths \(\.\.\., 16\)"):
+        BoneLengthEnergy(TRUNK).prox(points, torch.ones(5, 17))
+    with pytest.raises(ShapeError, match="expected a tensor of lengths, got list"):
+        BoneLengthEnergy(TRUNK).prox(points, [1.0] * 16)
+    with pytest.raises(OptionError, match="stiffness: expected a number that is not negative, got -1"):
+        BoneLengthEnergy(TRUNK).prox(points, torch.ones(16).double(), -1.0)
+    with pytest.raises(ShapeError, match="LowRankEnergy: expected points in floating point"):
+        LowRankEnergy().prox(points.long(), 1.0)
+    with pytest.raises(ShapeError, match=r"LowRankEnergy: expected points \(\.\.\., T, N, D\)"):
+        LowRankEnergy().prox(points[0], 1.0)
+    with pytest.raises(ShapeError, match="expected a tensor of cameras, got NoneType"):
+        ReprojectionEnergy().grad(points, points[..., :2], None)
+
+
 def test_unknown_skeletons_are_named():
     with pytest.raises(SkeletonError, match="h36m17"):
         BoneLengthEnergy("h36m18")

@@ -212,6 +212,12 @@ def test_svt_takes_numbers_in_floating_point_alone(matrix):
         SVT(0.3)(matrix)
 
 
+def test_a_relative_threshold_takes_matrices_alone():
+    for relative in (False, True):
+        with pytest.raises(ShapeError, match=r"SVT: matrix: expected shape \(\.\.\., M, N\), got \(5,\)"):
+            SVT(0.3, relative=relative)(torch.ones(5))
+
+
 @pytest.mark.parametrize("threshold", [-0.1, float("nan"), float("inf")])
 @pytest.mark.parametrize("learnable", [False, True])
 def test_svt_layer_thresholds_out_of_range(threshold, learnable):

@@ -6,6 +6,7 @@ import torch
 from numerics import FLOATS, count_operations, leaves_arguments_alone, normal, rotations
 from torch.testing import assert_close
 
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.solvers import lbfgs
 from kcs_torch.solvers.lbfgs import History
 
@@ -242,3 +243,15 @@ def test_energies_with_corners():
     found = lbfgs(lambda x: x.abs().sum(-1), start, num_steps=200)
     assert torch.isfinite(found.value).all()
     assert (found.value.abs().sum(-1) < 0.1 * start.abs().sum(-1)).all()
+
+
+def test_what_is_no_problem_in_rows_is_told():
+    square = lambda x: x.square().sum(-1)  # noqa: E731
+    with pytest.raises(ShapeError, match=r"lbfgs: start: expected problems in rows \(H, D\), got \(3,\)"):
+        lbfgs(square, torch.ones(3))
+    with pytest.raises(ShapeError, match=r"lbfgs: energy: expected a value of each row, \(H,\), got shape \(\) of 2"):
+        lbfgs(lambda x: x.square().sum(), torch.ones(2, 3))
+    with pytest.raises(OptionError, match="lbfgs: memory: expected at least 1 pair, got 0"):
+        lbfgs(square, torch.ones(2, 3), memory=0)
+    nothing = lbfgs(square, torch.ones(0, 3))
+    assert nothing.value.shape == (0, 3) and nothing.iterations == 0

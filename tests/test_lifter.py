@@ -126,7 +126,7 @@ CHANGES = {
     "endless blocks": (lambda f: f["options"].update(num_blocks=10**6), "fewer weights"),
     "endless width": (lambda f: f["options"].update(width=10**12), "out of range"),
     "a text for a number": (lambda f: f["options"].update(width="16"), "out of range"),
-    "half a number": (lambda f: f["options"].update(width=16.5), "options"),
+    "half a number": (lambda f: f["options"].update(width=16.5), "width: expected a whole number, .* got 16.5"),
     "an even window": (lambda f: f["options"].update(window=2), "odd"),
     "nested options": (lambda f: f["options"].update(width=[[1]]), "out of range"),
     "no skeleton": (lambda f: f.pop("skeleton"), "joints"),

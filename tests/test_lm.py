@@ -308,3 +308,10 @@ def test_shapes_that_do_not_fit():
         fit_bones(points, lengths[:4], BONES["tree"])
     with pytest.raises(ShapeError, match="points"):
         fit_bones(points[0], lengths, BONES["tree"])
+    with pytest.raises(ShapeError, match=r"fit_bones: start: expected shape \(\.\.\., 7, 3\), got"):
+        fit_bones(points, lengths, BONES["tree"], start=points[..., :2])
+
+
+def test_bones_may_be_a_list():
+    points, lengths = problem("tree")
+    assert torch.equal(fit_bones(points, lengths, BONES["tree"].tolist()), fit_bones(points, lengths, BONES["tree"]))

@@ -383,8 +383,15 @@ def test_orthonormal_rows_keep_what_is_one_already():
         lambda: TemporalLifter("h36m17", dilations=(0,)),
         lambda: TemporalLifter("h36m17", channels=-3),
         lambda: CameraHead("h36m17", num_blocks=-1),
+        lambda: MLPLifter("h36m17", width=2.5),
+        lambda: MLPLifter("h36m17", window=3.0),
+        lambda: TemporalLifter("h36m17", dilations=(1.5,)),  # it was 1
+        lambda: TemporalLifter("h36m17", dilations=3),
     ],
-    ids=["even window", "no width", "blocks", "dropout", "dilation", "channels", "camera blocks"],
+    ids=[
+        *("even window", "no width", "blocks", "dropout", "dilation", "channels", "camera blocks"),
+        *("half a width", "no whole window", "half a dilation", "dilations that are one"),
+    ],
 )
 def test_wrong_options(make):
     with pytest.raises(OptionError, match="expected"):

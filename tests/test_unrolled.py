@@ -656,6 +656,8 @@ def test_weights_and_lengths_may_have_another_precision(layer):
         {"num_steps": 0},
         {"tau": 0.0},
         {"tau": math.nan},
+        {"tau": math.inf},
+        {"mu": math.inf},
         {"mu": 0.0},
         {"final": 0.0},
         {"mu": 0.1, "final": 0.2},

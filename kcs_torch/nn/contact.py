@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.shapes import fit_together
-from kcs_torch.nn.layers import SkeletonModule, check_tensor, known, narrow, wide
+from kcs_torch.nn.layers import SkeletonModule, check_positive, check_tensor, check_whole, known, narrow, wide
 from kcs_torch.nn.masks import weighs_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.standing import RIDGE, root_velocity
@@ -29,6 +29,9 @@ class ContactEnergy(SkeletonModule):
         slip: s, in units of the points per frame.
         change: a, of the root's velocity from frame to frame.
         num_steps: reweightings that find the best velocity where none is given.
+
+    Raises:
+        OptionError: a number is out of range.
     """
 
     contacts: Tensor
@@ -37,6 +40,8 @@ class ContactEnergy(SkeletonModule):
         self, skeleton: str | Path | Skeleton, *, slip: float = 0.006, change: float = 0.004, num_steps: int = 10
     ) -> None:
         super().__init__(skeleton)
+        check_positive(self, slip=slip, change=change)
+        check_whole(self, 0, num_steps=num_steps)
         self.slip, self.change, self.num_steps = slip, change, num_steps
         contacts = torch.tensor(self.skeleton.contacts, dtype=torch.long)
         self.register_buffer("contacts", contacts, persistent=False)

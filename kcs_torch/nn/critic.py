@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -68,8 +69,8 @@ class KCSCritic(SkeletonModule):
         spectral: bool = False,
     ) -> None:
         super().__init__(skeleton)
-        if width < 1 or num_layers < 1:
-            raise OptionError(f"KCSCritic: expected width and num_layers >= 1, got {width} and {num_layers}")
+        if not all(hasattr(x, "__index__") and x >= 1 for x in (width, num_layers)):
+            raise OptionError(f"KCSCritic: expected whole width and num_layers >= 1, got {width!r} and {num_layers!r}")
         self.combined = combined
         self.parts = self._parts(parts)
         pairs = [torch.combinations(torch.tensor(part), with_replacement=True) for part in self.parts]
@@ -188,8 +189,8 @@ class KCSCritic(SkeletonModule):
             if bone not in names:
                 raise unknown(f"bone of skeleton '{self.skeleton.name}'", bone, names)
             return names.index(bone)
-        if not 0 <= bone < len(names):
-            raise OptionError(f"KCSCritic: parts: expected bone indices 0..{len(names) - 1}, got {bone}")
+        if not hasattr(bone, "__index__") or not 0 <= bone < len(names):
+            raise OptionError(f"KCSCritic: parts: expected bone indices 0..{len(names) - 1}, got {bone!r}")
         return int(bone)
 
     def extra_repr(self) -> str:
@@ -252,7 +253,8 @@ def _network(size: int, width: int, num_layers: int, spectral: bool) -> nn.Seque
 
 
 def _named(parts: Iterable[Sequence[int | str]]) -> list[Sequence[int | str]]:
-    listed = list(parts)
-    if not listed or any(isinstance(part, str) or not len(part) for part in listed):
+    given: Any = parts
+    listed = list(given) if isinstance(given, Iterable) else [given]
+    if not listed or any(isinstance(part, str) or not hasattr(part, "__len__") or not len(part) for part in listed):
         raise OptionError(f"KCSCritic: parts: expected lists of bones, none of them empty, got {listed!r}")
     return listed

@@ -95,8 +95,16 @@ class BoneLengthEnergy(SkeletonModule):
 
         Returns:
             (..., T, N, 3).
+
+        Raises:
+            ShapeError: the shapes do not fit.
+            OptionError: a number for the stiffness, or ``num_steps``, is negative.
         """
         self.check(points, clip=True)
+        check_tensor(lengths, "lengths", self)
+        check_lengths(lengths, points, self)
+        if not isinstance(stiffness, Tensor) and not stiffness >= 0:
+            raise OptionError(f"BoneLengthEnergy: stiffness: expected a number that is not negative, got {stiffness}")
         beta = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device) * self.rigid.to(points.dtype)
         with full_precision(points):
             return fit_bones(points, lengths[..., None, :], self.bones, stiffness=beta, num_steps=num_steps)
@@ -172,6 +180,7 @@ class ReprojectionEnergy(nn.Module):
 
     def grad(self, points: Tensor, tracks: Tensor, cameras: Tensor, weights: Tensor | None = None) -> Tensor:
         """Gradient in ``points`` of the plain least-squares energy, R^T (w o residual): (..., T, N, 3)."""
+        check_tensor(cameras, "cameras", self)
         residual = self.residual(points, tracks, cameras, weights)
         return back_project(residual * seen_weights(tracks, weights)[..., None], cameras)
 
@@ -244,6 +253,7 @@ class LowRankEnergy(nn.Module):
 
     def prox(self, points: Tensor, threshold: Tensor | float) -> Tensor:
         """Singular value shrinkage of S#, the nuclear norm's proximal map: (..., T, N, D)."""
+        check_clip(points, self)
         return svt(points.flatten(-2), threshold).unflatten(-1, points.shape[-2:])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from numbers import Real
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_lengths, bone_vectors, pose_matrix
 from kcs_torch.functional.precision import full_precision, wide
-from kcs_torch.functional.shapes import fit_together
+from kcs_torch.functional.shapes import check_core, fit_together
 from kcs_torch.functional.spectral import svt
 from kcs_torch.skeleton import Skeleton, get_skeleton
 
@@ -79,6 +79,22 @@ def check_joints(module: nn.Module, skeleton: Skeleton, points: Tensor, form: st
         virtual = ", ".join(skeleton.joints[skeleton.num_observed :])
         message += f": without its virtual joints {virtual}, which skeleton.complete(points, weights) appends to both"
     raise ShapeError(message)
+
+
+def check_positive(module: nn.Module, **options: Any) -> None:
+    """Raise an OptionError unless all options are positive numbers."""
+    for name, value in options.items():
+        if not isinstance(value, Real) or not float(value) > 0:
+            raise OptionError(f"{type(module).__name__}: {name}: expected a positive number, got {value!r}")
+
+
+def check_whole(module: nn.Module, least: int, **options: Any) -> None:
+    """Raise an OptionError unless all options are whole numbers, ``least`` or more."""
+    for name, value in options.items():
+        if not isinstance(value, Integral) or value < least:
+            raise OptionError(
+                f"{type(module).__name__}: {name}: expected a whole number, at least {least}, got {value!r}"
+            )
 
 
 def shown(module: nn.Module, *names: str) -> str:
@@ -185,6 +201,7 @@ class SVT(nn.Module):
 
     def forward(self, matrix: Tensor) -> Tensor:
         check_points(matrix, self, "matrices")
+        check_core(matrix, "SVT: matrix", "M", "N")
         level = self.threshold
         if self.relative:
             level = level * torch.linalg.matrix_norm(wide(matrix))

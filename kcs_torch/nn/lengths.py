@@ -12,7 +12,16 @@ from kcs_torch.errors import ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_lengths, check_weights
-from kcs_torch.nn.layers import SkeletonModule, check_beside, check_points, check_tensor, known, narrow, wide
+from kcs_torch.nn.layers import (
+    SkeletonModule,
+    check_beside,
+    check_points,
+    check_positive,
+    check_tensor,
+    known,
+    narrow,
+    wide,
+)
 from kcs_torch.nn.masks import bone_share, safe_root, some
 from kcs_torch.skeleton import Skeleton
 
@@ -41,12 +50,16 @@ class ForeshorteningEnergy(SkeletonModule):
         skeleton: bones of its trunk, where it has one, do not count.
         correlation: tau, frames that tell as much as one independent frame.
         eps: share of the length below which depths are not told apart.
+
+    Raises:
+        OptionError: a number is not positive.
     """
 
     free: Tensor
 
     def __init__(self, skeleton: str | Path | Skeleton, *, correlation: float = 10.0, eps: float = 0.1) -> None:
         super().__init__(skeleton)
+        check_positive(self, correlation=correlation, eps=eps)
         self.correlation, self.eps = correlation, eps
         self.register_buffer("free", free_bones(self.skeleton), persistent=False)
 
@@ -114,6 +127,7 @@ class ProportionEnergy(SkeletonModule):
 
     Raises:
         SkeletonError: the skeleton knows no lengths.
+        OptionError: a number is not positive.
     """
 
     usual: Tensor
@@ -126,6 +140,7 @@ class ProportionEnergy(SkeletonModule):
         usual = self.skeleton.relative_lengths(dtype=torch.float64)
         if usual is None:
             raise SkeletonError(f"skeleton '{self.skeleton.name}' has neither proportions nor a template")
+        check_positive(self, spread=spread, twins=twins, excess=excess)
         self.spread, self.twins, self.excess = spread, twins, excess
         self.register_buffer("usual", usual, persistent=False)
         pairs = torch.tensor(self.skeleton.mirror_bones, dtype=torch.long).reshape(-1, 2)

@@ -9,7 +9,8 @@ depth, both in the unit of the clip and nearly 0 before training.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,15 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.nn.layers import SkeletonModule, check_beside, check_joints, check_points, check_tensor, narrow
+from kcs_torch.nn.layers import (
+    SkeletonModule,
+    check_beside,
+    check_joints,
+    check_points,
+    check_tensor,
+    check_whole,
+    narrow,
+)
 from kcs_torch.nn.normalise import NormalisedTracks, neighbours, normalise_tracks
 from kcs_torch.skeleton import Skeleton
 
@@ -59,12 +68,10 @@ class _Network(SkeletonModule):
     ) -> None:
         super().__init__(skeleton)
         kind = type(self).__name__
-        if width < 1 or not 0 <= dropout < 1 or any(d < 0 for d in dilations):
-            raise OptionError(
-                f"{kind}: expected a positive width, a dropout within [0, 1) and dilations from 1, got "
-                f"{width}, {dropout:g} and {tuple(dilations)}"
-            )
-        if window < 1 or window % 2 == 0:
+        check_whole(self, 1, width=width, window=window)
+        if not 0 <= dropout < 1:
+            raise OptionError(f"{kind}: dropout: expected a share within [0, 1), got {dropout:g}")
+        if window % 2 == 0:
             raise OptionError(
                 f"{kind}: window: expected an odd number of frames, the middle one is lifted, got {window}"
             )
@@ -165,8 +172,7 @@ class MLPLifter(_Lifter):
         dropout: float = 0.1,
         window: int = 1,
     ) -> None:
-        if num_blocks < 0:
-            raise OptionError(f"MLPLifter: num_blocks: expected at least 0, got {num_blocks}")
+        check_whole(self, 0, num_blocks=num_blocks)
         super().__init__(skeleton, width=width, dropout=dropout, window=window, dilations=(0,) * num_blocks)
         self._options = {"width": width, "num_blocks": num_blocks, "dropout": dropout, "window": window}
 
@@ -203,9 +209,10 @@ class TemporalLifter(_Lifter):
         dilations: Sequence[int] = (1, 3, 9),
         dropout: float = 0.1,
     ) -> None:
+        given: Any = dilations
+        if not isinstance(given, Iterable) or not all(isinstance(d, Integral) and int(d) >= 1 for d in given):
+            raise OptionError(f"TemporalLifter: dilations: expected whole numbers from 1, got {dilations!r}")
         dilations = tuple(int(d) for d in dilations)
-        if min(dilations, default=1) < 1:
-            raise OptionError(f"TemporalLifter: dilations: expected whole numbers from 1, got {dilations}")
         super().__init__(skeleton, width=channels, dropout=dropout, window=1, dilations=dilations)
         self._options = {"channels": channels, "dilations": list(dilations), "dropout": dropout}
 
@@ -244,8 +251,7 @@ class CameraHead(_Network):
         dropout: float = 0.1,
         window: int = 1,
     ) -> None:
-        if num_blocks < 0:
-            raise OptionError(f"CameraHead: num_blocks: expected at least 0, got {num_blocks}")
+        check_whole(self, 0, num_blocks=num_blocks)
         super().__init__(skeleton, width=width, dropout=dropout, window=window, dilations=(0,) * num_blocks, outputs=7)
         self._options = {"width": width, "num_blocks": num_blocks, "dropout": dropout, "window": window}
 

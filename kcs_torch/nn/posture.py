@@ -11,7 +11,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.nn.energies import check_lengths
-from kcs_torch.nn.layers import SkeletonModule, check_beside, full_precision, narrow, wide
+from kcs_torch.nn.layers import SkeletonModule, check_beside, check_positive, full_precision, narrow, wide
 from kcs_torch.nn.lengths import LEAST, usual_size
 from kcs_torch.nn.masks import bone_share, known_points, safe_root, some, weighs_joints
 from kcs_torch.skeleton import Skeleton
@@ -55,6 +55,7 @@ class PostureEnergy(SkeletonModule):
 
     Raises:
         SkeletonError: the skeleton has no template, no spreads or no trunk.
+        OptionError: a number is not positive.
 
     >>> energy = PostureEnergy("h36m17")
     >>> energy(torch.randn(4, 30, 17, 3)).shape
@@ -81,6 +82,7 @@ class PostureEnergy(SkeletonModule):
     ) -> None:
         super().__init__(skeleton)
         body = self.skeleton
+        check_positive(self, strength=strength, kappa=kappa, correlation=correlation)
         self.strength, self.kappa, self.correlation = strength, kappa, correlation
         trunk = trunk_joints(body)
         if len(trunk) < 3:
@@ -116,7 +118,11 @@ class PostureEnergy(SkeletonModule):
 
         Args:
             points: (..., T, N, 3).
+
+        Raises:
+            ShapeError: the points are not of this skeleton.
         """
+        self._check(points)
         part = points.index_select(-2, self.trunk)
         part = part - part.mean(-2, keepdim=True)
         first, second = (self.affine.to(part) @ part).unbind(-2)  # images of the trunk's two long axes
@@ -130,9 +136,7 @@ class PostureEnergy(SkeletonModule):
 
         Half precision comes back as single.
         """
-        self.check(points, clip=True)
-        if points.shape[-1] != 3:
-            raise ShapeError(f"PostureEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
+        self._check(points)
         check_lengths(lengths, points, self)
         joints = weights is not None and weighs_joints(weights, points, self)
         with full_precision(points):
@@ -205,6 +209,11 @@ class PostureEnergy(SkeletonModule):
             scatter = (off * each).mT @ off + pull * (mean.mT @ mean)
             each = count[..., None] if isinstance(count, Tensor) else count
             return narrow(self.of_scatter(scatter, each).sum(-1), points)
+
+    def _check(self, points: Tensor) -> None:
+        self.check(points, clip=True)
+        if points.shape[-1] != 3:
+            raise ShapeError(f"PostureEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
 
     def taken_apart(self, rows: Tensor) -> Tensor:
         """Bones' coordinates (..., T, 3B) in each of the halves, (..., S, T, K)."""

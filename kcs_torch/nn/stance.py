@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.errors import ShapeError
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
-from kcs_torch.nn.layers import SkeletonModule, check_beside, full_precision, narrow, wide
+from kcs_torch.nn.layers import SkeletonModule, check_beside, check_positive, full_precision, narrow, wide
 from kcs_torch.nn.lengths import usual_size
 from kcs_torch.nn.masks import bone_share, known_points, some, weighs_joints
 from kcs_torch.nn.posture import PostureEnergy
@@ -51,9 +51,7 @@ class StanceEnergy(SkeletonModule):
 
     def __init__(self, skeleton: str | Path | Skeleton, *, sway: float = 0.06, fold: float = 0.15) -> None:
         super().__init__(skeleton)
-        for name, value in (("sway", sway), ("fold", fold)):
-            if not value > 0:
-                raise OptionError(f"StanceEnergy: {name}: expected a positive number, got {value}")
+        check_positive(self, sway=sway, fold=fold)
         self.sway, self.fold = sway, fold
         self.posture = PostureEnergy(self.skeleton)
         feet, body = list(self.skeleton.contacts), self.skeleton

@@ -25,9 +25,9 @@ def continuation(num_weights: int, mu: float = 0.5, final: float = 1e-5) -> list
     >>> [round(w, 3) for w in continuation(3, 1.0, 0.01)]
     [1.0, 0.1, 0.01]
     """
-    if num_weights < 1 or not 0 < final <= mu:
+    if num_weights < 1 or not 0 < final <= mu < math.inf:
         raise OptionError(
-            f"continuation: expected num_weights >= 1 and 0 < final <= mu, got {num_weights}, {final} and {mu}"
+            f"continuation: expected num_weights >= 1 and 0 < final <= mu, finite, got {num_weights}, {final} and {mu}"
         )
     ratio = (final / mu) ** (1 / max(num_weights - 1, 1))
     return [mu * ratio**k for k in range(num_weights)]

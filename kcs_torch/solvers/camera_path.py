@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError
+from kcs_torch.errors import ShapeError, unknown
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.ranks import median, nanmedian
 from kcs_torch.functional.rotation import rotation_angle, rotation_matrix, rotation_vector
@@ -19,6 +19,7 @@ from kcs_torch.solvers.lbfgs import lbfgs
 __all__ = ["CameraPath", "choose_path", "constant_path", "settle_path", "smooth_path", "view_energy"]
 
 CameraPath = Literal["auto", "free", "smooth", "constant"]
+KINDS: tuple[CameraPath, ...] = get_args(CameraPath)
 
 EVEN = 0.05
 """A path explains rotations where their median deviation from it is below this share of its length ..."""
@@ -103,7 +104,14 @@ def smooth_path(rotations: Tensor, *, waves: int = WAVES, num_steps: int = ROUND
     Raises:
         ShapeError: ``rotations`` is not (T, 3, 3) with T >= 2.
     """
+    _check_rotations(rotations, "smooth_path", 2)
     return _smoothed(rotations, *constant_path(rotations), waves, num_steps)
+
+
+def _check_rotations(rotations: Tensor, name: str, least: int) -> None:
+    if rotations.ndim != 3 or rotations.shape[1:] != (3, 3) or len(rotations) < least:
+        some = f" of {least} frames or more" if least else ""
+        raise ShapeError(f"{name}: expected rotations (T, 3, 3){some}, got {tuple(rotations.shape)}")
 
 
 def _smoothed(rotations: Tensor, base: Tensor, angle: Tensor, waves: int, num_steps: int) -> tuple[Tensor, Tensor]:
@@ -131,7 +139,14 @@ def choose_path(rotations: Tensor, kind: CameraPath = "auto") -> tuple[Tensor, C
 
     Returns:
         The path (T, 3, 3), its kind, and its angle to each rotation (T,), in radians. Clips below 10 frames are free.
+
+    Raises:
+        ShapeError: ``rotations`` is not (T, 3, 3).
+        OptionError: there is no such kind.
     """
+    if kind not in KINDS:
+        raise unknown("camera path", kind, KINDS)
+    _check_rotations(rotations, "choose_path", 0)
     zero = rotations.new_zeros(len(rotations))
     if kind == "free" or len(rotations) < 10:
         return rotations, "free", zero

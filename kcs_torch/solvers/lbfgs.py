@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.solvers.iterate import Solution
 
 __all__ = ["History", "lbfgs"]
@@ -56,10 +57,18 @@ def lbfgs(
         The minimisers (H, D); whether all settled within ``num_steps``; where they were ``memory`` steps
         earlier; and their energies (H,).
 
+    Raises:
+        ShapeError: ``start`` is not (H, D), or ``energy`` gives no value of each row.
+        OptionError: ``memory`` is below 1.
+
     >>> goal = torch.tensor([[1.0, 2.0], [3.0, -1.0]], dtype=torch.float64)
     >>> lbfgs(lambda x: ((x - goal) ** 2).sum(-1), torch.zeros_like(goal)).value.round(decimals=4).tolist()
     [[1.0, 2.0], [3.0, -1.0]]
     """
+    if start.ndim != 2:
+        raise ShapeError(f"lbfgs: start: expected problems in rows (H, D), got {tuple(start.shape)}")
+    if memory < 1:
+        raise OptionError(f"lbfgs: memory: expected at least 1 pair, got {memory}")
 
     def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
         if slopes:
@@ -69,6 +78,9 @@ def lbfgs(
         with torch.enable_grad():
             x = x.detach().requires_grad_()
             value = energy(x)
+            if value.shape != x.shape[:1]:
+                got = f"shape {tuple(value.shape)} of {len(x)}"
+                raise ShapeError(f"lbfgs: energy: expected a value of each row, (H,), got {got}")
             (gradient,) = torch.autograd.grad(value.sum(), x)
         return value.detach(), gradient
 
@@ -93,7 +105,7 @@ def lbfgs(
         index, *last = (torch.cat(column) for column in zip(*found, (index, *last), strict=True))
         last = [column[index.argsort()] for column in last]
     x, before, value, made, resting = last
-    return Solution(x, num_steps > 0 and bool(resting.all()), int(made.max()), before, value)
+    return Solution(x, num_steps > 0 and bool(resting.all()), max(made.tolist(), default=0), before, value)
 
 
 class _Rows:

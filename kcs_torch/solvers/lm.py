@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.functional.chain import bone_vectors, incidence, kcs_matrix
-from kcs_torch.functional.shapes import broadcast_shapes
+from kcs_torch.functional.chain import bone_vectors, incidence, index_rows, kcs_matrix
+from kcs_torch.functional.shapes import broadcast_shapes, check_core
 
 __all__ = ["fit_bones"]
 
@@ -15,7 +17,7 @@ __all__ = ["fit_bones"]
 def fit_bones(
     points: Tensor,
     lengths: Tensor,
-    bones: Tensor,
+    bones: Tensor | Sequence[Sequence[int]],
     *,
     stiffness: Tensor | float = 1.5,
     num_steps: int = 3,
@@ -60,7 +62,11 @@ def fit_bones(
     >>> A.round(decimals=3).tolist()
     [[-0.5, 0.0, 0.0], [1.5, 0.0, 0.0]]
     """
-    if points.ndim < 2 or lengths.shape[-1:] != bones.shape[:1]:
+    check_core(points, "fit_bones: points", "N", "D")
+    bones = index_rows(bones, points.shape[-2])
+    if start is not None:
+        check_core(start, "fit_bones: start", *points.shape[-2:])
+    if lengths.shape[-1:] != bones.shape[:1]:
         raise ShapeError(
             f"fit_bones: expected points (..., N, D) and lengths (..., {len(bones)}), "
             f"got {tuple(points.shape)} and {tuple(lengths.shape)}"

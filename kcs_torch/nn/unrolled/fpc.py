@@ -59,8 +59,8 @@ class UnrolledFPC(Unrolled):
         gradient: Gradient = "unrolled",
     ) -> None:
         super().__init__(num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
-        if not (tau > 0 and corner > 0):
-            raise OptionError(f"{type(self).__name__}: expected tau > 0 and corner > 0, got {tau} and {corner}")
+        if not (0 < tau < math.inf and corner > 0):
+            raise OptionError(f"{type(self).__name__}: expected finite tau > 0 and corner > 0, got {tau} and {corner}")
         self._hold_corner(corner)
         self._positive("threshold", continuation(num_steps, mu, final))
         self._positive("step", [tau] * num_steps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -69,10 +70,10 @@ class UnrolledSfAM(Unrolled):
         gradient: Gradient = "unrolled",
     ) -> None:
         super().__init__(num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
-        if not (tau > 0 and beta > 0 and corner > 0) or not 0 <= articulate_from <= 1:
+        if not (0 < tau < math.inf and beta > 0 and corner > 0) or not 0 <= articulate_from <= 1:
             raise OptionError(
-                f"UnrolledSfAM: expected tau, beta and corner > 0 and articulate_from in 0..1, got {tau}, {beta}, "
-                f"{corner} and {articulate_from}"
+                f"UnrolledSfAM: expected tau (finite), beta and corner > 0 and articulate_from in 0..1, got {tau}, "
+                f"{beta}, {corner} and {articulate_from}"
             )
         self.skeleton = get_skeleton(skeleton)
         self.rigid = list(self.skeleton.rigid)
