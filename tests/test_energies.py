@@ -596,6 +596,15 @@ def test_half_precision(energy, dtype):
     assert_close(value.double(), energy(points.double()), rtol=0.05, atol=0.1)
 
 
+def test_energies_of_long_clips_stay_in_the_range_of_half_precision():
+    """A thousand frames of ProcrusteanEnergy were infinite."""
+    points = (400 * normal(1000, 17, 3, dtype=torch.float32)).half().requires_grad_()
+    for energy in (ProcrusteanEnergy(TRUNK), PostureEnergy(TRUNK), LowRankEnergy(), LowRankEnergy("log_det")):
+        value = energy(points)
+        (grad,) = torch.autograd.grad(value, points)
+        assert value.isfinite() and grad.isfinite().all()
+
+
 def test_modules_move_their_buffers_and_save_no_state():
     energy = BoneLengthEnergy(BODY).to(torch.float32)
     assert energy(clip(dtype=torch.float32)).dtype == torch.float32

@@ -12,7 +12,7 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.nn.energies import check_weights
-from kcs_torch.nn.layers import SkeletonModule, check_beside, full_precision, known
+from kcs_torch.nn.layers import SkeletonModule, check_beside, full_precision, known, narrow, wide
 from kcs_torch.nn.masks import bone_share, safe_root, some
 from kcs_torch.skeleton import Skeleton
 
@@ -72,8 +72,7 @@ class ProcrusteanEnergy(SkeletonModule):
             expected = f"points (..., T, {points.shape[-2]}, 3) and rotations (..., T, 3, 3) or None"
             raise ShapeError(f"ProcrusteanEnergy: expected {expected}, got points {tuple(points.shape)}")
         with full_precision(points):
-            wide = known(points, weights).to(torch.promote_types(points.dtype, torch.float32))
-            vectors = bone_vectors(wide, self.bones)
+            vectors = bone_vectors(wide(known(points, weights)), self.bones)
             share = None if weights is None else bone_share(weights, self.bones).to(vectors.dtype)[..., None]
             if rotations is None:
                 rotations = _align(vectors, self.num_steps, share)
@@ -81,7 +80,7 @@ class ProcrusteanEnergy(SkeletonModule):
             rows, seen = self._rows(aligned, share)
             floor = rows.new_zeros(rows.shape[:-2]) + self.eps
             least = rows.shape[-2] * rows.shape[-1] / 2 * floor.log()  # what a clip at rest is charged
-            return ((scatter_log_det(rows, floor) - least) * seen).to(points.dtype)
+            return narrow((scatter_log_det(rows, floor) - least) * seen, points)
 
     def _rows(self, aligned: Tensor, share: Tensor | None) -> tuple[Tensor, Tensor | float]:
         """Scaled deviations or changes (..., T, 3B) of aligned bones, and the share of the rows that counts."""

@@ -12,7 +12,7 @@ from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.nn.energies import centred_residual
-from kcs_torch.nn.layers import full_precision, known
+from kcs_torch.nn.layers import full_precision, known, narrow
 from kcs_torch.nn.majorise import majorise_step, turn_onto_mean
 from kcs_torch.nn.steps import continuation, estimate_lengths, start_shape, to_scale
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
@@ -186,7 +186,7 @@ class UnrolledPKC(Unrolled):
             solution = self._run(advance, begin, measure=measure, depends_on=depends_on)
             points, turned = split(solution.value)
             value = size * (points @ turned.mT @ world)
-        return Solution(value.to(tracks.dtype), solution.converged, solution.iterations)
+        return Solution(narrow(value, tracks), solution.converged, solution.iterations)
 
 
 def _root_mean_square(values: Tensor, weights: Tensor) -> Tensor:
