@@ -20,7 +20,7 @@ from kcs_torch.solvers.noise import SHORT
 from kcs_torch.solvers.spectrum import window_at
 from kcs_torch.types import Tracks
 
-__all__ = ["CLEAN", "PLAIN", "cleaned"]
+__all__ = ["CLEAN", "HELD", "PLAIN", "cleaned"]
 
 CLEAN, PLAIN = 0.0013, 0.0007
 """Noise below this share of the body's size, .6 mm of a person, is left in tracks at 30 frames a second or less: they

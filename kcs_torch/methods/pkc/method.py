@@ -25,6 +25,7 @@ from kcs_torch.methods.pkc.gate import without_others
 from kcs_torch.methods.pkc.held import with_lengths_held
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.limbs import outward
+from kcs_torch.methods.pkc.long_gaps import lengthened, shortened
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
 from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights, settled
 from kcs_torch.methods.pkc.moving_view import searching as turning
@@ -146,6 +147,15 @@ class PKC(Method):
         return run(together([self._steps(one, None) for one in tracks]), serve)
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
+        kept = shortened(tracks)
+        if kept is None:
+            return (yield from self._whole(tracks, cameras))
+        some = replace(tracks, points=tracks.points[kept], weights=tracks.weights[kept])
+        found = yield from self._whole(some, None if cameras is None else cameras[kept])
+        return lengthened(found, kept, tracks, cameras)
+
+    def _whole(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
+        """Solve tracks without long gaps."""
         tracks = replace(tracks, skeleton=outward(tracks.skeleton))
         points, noise, notes = yield from cleaned(tracks, self.denoise, self.knows_template(tracks.skeleton))
         standing = standing_feet(replace(tracks, points=points))

@@ -1,0 +1,72 @@
+"""Long gaps in which nobody is seen: solved as short ones, so that what is guessed there does not lead the rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.align import nearest_rotation
+from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.temporal import interpolate
+from kcs_torch.methods.base import Estimate
+from kcs_torch.methods.pkc.cleaning import HELD
+from kcs_torch.methods.unseen import gap_deviation
+from kcs_torch.types import Tracks
+
+__all__ = ["lengthened", "shortened"]
+
+LONGEST = 0.25
+"""Seconds that a gap may last; of longer ones only so many frames are solved. What fills a gap bends as little as it
+may, and over more than a second that leads through poses that no body makes."""
+
+SHOWN = 2
+"""Joints that a frame has to show so as not to be of a gap."""
+
+
+def shortened(tracks: Tracks) -> Tensor | None:
+    """Indices (T',) of the frames that are solved, evenly spread over gaps that last too long; None if none do.
+
+    What is unseen at the clip's ends is no gap.
+    """
+    shown = tracks.seen.sum(-1) >= min(SHOWN, tracks.num_joints)
+    most = max(2, round(LONGEST * (tracks.fps or 30.0)))
+    frames = shown.nonzero().flatten()
+    if not len(frames) or not bool((frames.diff() > most + 1).any()):
+        return None
+    keep = torch.ones_like(shown)
+    for before, after in zip(frames[:-1].tolist(), frames[1:].tolist(), strict=True):
+        missing = after - before - 1
+        if missing > most:
+            keep[before + 1 : after] = False
+            share = torch.arange(1, most + 1, device=frames.device) / (most + 1)
+            keep[before + (share * (missing + 1)).round().long()] = True
+    return keep.nonzero().flatten()
+
+
+def lengthened(found: Estimate, kept: Tensor, tracks: Tracks, cameras: Tensor | None) -> Estimate:
+    """An estimate of some frames of the tracks as one of all, linear in time between them.
+
+    How unsure places in a gap are goes by how long it really is. ``cameras`` (T, 2, 3) that are known stay as they are.
+    """
+    frames = tracks.num_frames
+    known = torch.zeros(frames, 1, dtype=torch.bool, device=kept.device)
+    known[kept] = True
+
+    def all_of(values: Tensor) -> Tensor:
+        out = values.new_zeros(frames, 1, values[0].numel())
+        out[kept] = values.reshape(len(kept), 1, -1)
+        return interpolate(out, known).reshape(frames, *values.shape[1:])
+
+    points = all_of(found.points)
+    unseen = gap_deviation(points[..., :2], tracks.seen, tracks.fps or 30.0, HELD)
+    return replace(
+        found,
+        points=points,
+        cameras=nearest_rotation(all_of(complete_rotation(found.cameras)))[:, :2] if cameras is None else cameras,
+        scales=all_of(found.scales),
+        deviation=None if found.deviation is None else all_of(found.deviation).maximum(unseen),
+        standing=None if found.standing is None else all_of(found.standing),
+        alternatives=tuple(lengthened(other, kept, tracks, cameras) for other in found.alternatives),
+    )

@@ -1,0 +1,71 @@
+"""Gaps in which nobody is seen for long are solved as short ones."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+import kcs_torch as kt
+from kcs_torch.data import walking_person
+from kcs_torch.functional import superpose
+from kcs_torch.methods.pkc.long_gaps import shortened
+
+
+def hidden(tracks, *gaps):
+    weights = tracks.weights.clone()
+    for gap in gaps:
+        weights[gap] = 0
+    return replace(tracks, weights=weights)
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return walking_person(90, turn=0.0, yaw=40.0)
+
+
+def test_frames_that_are_solved(walk):
+    tracks = replace(walk.tracks, fps=30.0)
+    assert shortened(tracks) is None
+    assert shortened(hidden(tracks, slice(0, 30), slice(60, 90))) is None  # ends are no gaps
+    assert shortened(hidden(tracks, slice(20, 28))) is None  # as long as a gap may be
+    kept = shortened(hidden(tracks, slice(20, 60), slice(70, 73)))
+    assert kept.tolist()[:20] == list(range(20)) and kept.tolist()[-30:] == list(range(60, 90))
+    assert len(kept) == 58 and bool((kept.diff() > 0).all()) and int(kept.diff().amax()) <= 5
+    assert len(shortened(replace(hidden(tracks, slice(20, 60)), fps=60.0))) == 65
+
+
+def test_long_gap_of_a_synthetic_walk(walk):
+    """Frames beside it are right, and nothing is sure in its middle."""
+    tracks = hidden(walk.tracks, slice(25, 65))
+    result = kt.reconstruct(tracks, intrinsics="parallel")
+    assert result.points.shape == walk.points.shape and bool(torch.isfinite(result.points).all())
+    seen = tracks.seen.any(-1)
+    there, truth = result.points[seen], walk.points[seen] - walk.points[seen].mean(1, keepdim=True)
+    off = (superpose(there, truth, "rigid") - truth).norm(dim=-1).mean()
+    assert off < 0.05 * truth.square().mean().sqrt()
+    assert result.uncertainty[45].amin() > 2 * result.uncertainty[seen].median()
+    assert len(result.cameras) == 90
+    assert_close(result.cameras @ result.cameras.mT, torch.eye(2).double().expand(90, 2, 2), rtol=0, atol=1e-8)
+
+
+def test_cameras_that_are_known_go_with_their_frames():
+    clip = walking_person(80, turn=120.0)
+    tracks = hidden(clip.tracks, slice(25, 55))
+    result = kt.reconstruct(tracks, cameras=clip.cameras)
+    assert_close(result.cameras.abs(), clip.cameras[:, :2].abs(), rtol=0, atol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.errors.KcsWarning", "ignore::kcs_torch.errors.ConvergenceWarning")
+def test_frames_beside_a_long_gap_are_not_led_astray(shared):
+    """Two walks, a near camera and noise of two pixels: 74 and 81 mm where all of the gap is solved, 17 and 25 so."""
+    motion = kt.load_motion(shared / "data" / "cmu" / "cmu_07_02.npz", up="y")
+    motion = motion.frames(0, 150 * max(1, round(motion.fps / 30)), max(1, round(motion.fps / 30)))
+    for yaw in (30, 120):
+        film = {"yaw": yaw, "pitch": 10, "intrinsics": (1000, 1000, 640, 360), "distance": 4500.0, "noise": 2.0}
+        middle = (motion.num_frames - 40) // 2
+        tracks = motion.tracks(**film, generator=torch.Generator().manual_seed(1))
+        tracks = hidden(tracks, slice(middle, middle + 40))
+        seen, truth = tracks.seen.any(-1), motion.in_camera(yaw=yaw, pitch=10)
+        found = kt.reconstruct(tracks).points[seen, : truth.shape[1]]
+        assert (superpose(found, truth[seen], "similarity") - truth[seen]).norm(dim=-1).mean() < 40
