@@ -227,7 +227,7 @@ class PKC(Method):
             found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
         if polished and (body.turns(found) or not isinstance(self, _Followed)):
             rival = (yield from turned(body.is_odd(found))) if compared and body.turns(found) else None
-            found = yield from self._polished(body, found, rival)
+            found = yield from self._polished(body, found, cameras, rival)
             if self.rounds and self.viewpoint != "moving":
                 found, body = yield from self._filled(found, body, cameras, rival)
         made = self._from_hypotheses(found, body, cameras, notes, detections)
@@ -249,13 +249,18 @@ class PKC(Method):
                 found = yield from body.search(self._moves, self.steps)
                 if cameras is not None and _turns(cameras):
                     found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
-            found = yield from self._polished(body, found, rival)
+            found = yield from self._polished(body, found, cameras, rival)
         return found, body
 
-    def _polished(self, body: Body, found: Hypotheses, rival: Tensor | None) -> Search[Any, Any, Hypotheses]:
-        """Hypotheses, the best polished, and with other signs where the viewpoint's turn, depths (T, N), doubts it."""
+    def _polished(
+        self, body: Body, found: Hypotheses, cameras: Tensor | None, rival: Tensor | None
+    ) -> Search[Any, Any, Hypotheses]:
+        """Hypotheses, the best polished, and with other signs where the viewpoint's turn, depths (T, N), doubts it.
+
+        Cameras that are known tell signs by themselves, also against the template.
+        """
         found = yield from body.polished(found, self.steps, rival)
-        if rival is None or not self._moves or not body.turns(found):
+        if rival is None or not self._moves or _turns(cameras) or not body.turns(found):
             return found
         return (yield from turned_around(body, found, rival))
 
