@@ -47,9 +47,9 @@ PARTS = {
 SYNTHETIC = ("walk", "walk, 15 mm noise", "tree", "arm")
 YAWS = (0.0, 45.0, 90.0, 135.0)
 # import_module, as the package's functions have the names of these modules
-BODY, FIXED, FLIPS, MOVING, OBJECTIVE, DESCENT, DESCENTS = (
+BODY, FIXED, FLIPS, METHOD, MOVING, OBJECTIVE, DESCENT, DESCENTS = (
     import_module(f"kcs_torch.methods.pkc.{name}")
-    for name in ("body", "fixed_view", "flips", "moving_view", "objective", "descent", "descents")
+    for name in ("body", "fixed_view", "flips", "method", "moving_view", "objective", "descent", "descents")
 )
 LENGTHS = import_module("kcs_torch.nn.lengths")
 WRITTEN_OUT = {"posture": "_posture", "foreshortening": "_foreshortening", "proportions": "_sizes"}
@@ -176,7 +176,10 @@ FIXED_VARIANTS = {
     ),
     "no runs turned over": Variant(changes=(constant(FLIPS, "TIMES", 0),)),
     "no discrete moves": Variant({"rounds": 0}),
-    "not polished": Variant(changes=(constant(BODY.Body, "polished", as_found),)),
+    "no signs by aligned bones": Variant(changes=(constant(METHOD, "turned_around", as_found),)),
+    "not polished": Variant(
+        changes=(constant(BODY.Body, "polished", as_found), constant(METHOD, "turned_around", as_found))
+    ),
     "one hypothesis, no moves": Variant({"rounds": 0}, ((FIXED._Search, "start", first_alone),)),
 }
 MOVING_VARIANTS = {
