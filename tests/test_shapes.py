@@ -81,11 +81,11 @@ REFUSED = {
     "rotation_vector": ({"matrices": TURNS}, {"matrices": (5, 2, 3)}),
     "rows_to_cameras": ({"rows": ROWS}, {"rows": (5, 3, 3)}),
     "scatter_log_det": ({"values": WAY, "eps": 1.0}, {"values": (3,)}),
-    "similarity": ({"source": CLIP, "target": CLIP}, {"source": (4, 3), "target": (2, 1, 4, 3)}),
+    "similarity": ({"source": CLIP, "target": CLIP}, {"source": (3,), "target": (2, 5, 3, 3)}),
     "standing": ({"image": IMAGE, "weights": MASS}, {"image": (5, 4, 3), "weights": (2, 4, 4)}),
     "superpose": (
         {"source": CLIP, "target": CLIP, "how": "rigid", "weights": MASS},
-        {"source": (4, 3), "target": (2, 1, 4, 3), "weights": (2, 5, 1)},
+        {"source": (4, 2), "target": (2, 5, 3, 3), "weights": (2, 5, 1)},
     ),
     "svt": ({"matrix": WAY, "threshold": 1.0, "corner": torch.ones(2)}, {"threshold": (3,), "corner": (3,)}),
     "viewpoint_turn": ({"cameras": ROWS}, {"cameras": (2, 3)}),
@@ -103,6 +103,16 @@ def test_what_does_not_fit_is_told_by_its_name(name):
     if isinstance(arguments[what], torch.Tensor) and name not in ("jitter", "log_det", "psd_shrink", "svt"):
         with pytest.raises(ShapeError, match=f"{name}: {what}: expected a tensor, got list: use torch.as_tensor"):
             function(**{**arguments, what: [1.0]})
+
+
+@pytest.mark.parametrize("move", [F.similarity, lambda *pair, **_: F.superpose(*pair, "similarity")])
+def test_single_poses_are_moved_as_clips_are(move):
+    turned = CLIP @ TURNS[0].mT + 1
+    torch.testing.assert_close(move(CLIP[0, 0], turned[0, 0]), move(CLIP, turned)[0, 0])
+    with pytest.raises(ShapeError, match=r"similarity: source: expected shape \(\.\.\., T, N, D\), got \(4, 3\)"):
+        F.similarity(CLIP[0, 0], turned[0, 0], sequence=True)
+    with pytest.raises(ShapeError, match=r"superpose: source: expected shape \(\.\.\., T, N, 3\), got \(4, 3\)"):
+        F.superpose(CLIP[0, 0], turned[0, 0], "sequence")
 
 
 def test_cores_have_letters_for_any_size():

@@ -161,8 +161,8 @@ def similarity(
     """Return ``source`` moved onto ``target`` by rotation, translation and optionally scale.
 
     Args:
-        source: (..., T, N, D).
-        target: (..., T, N, D).
+        source: (..., T, N, D), or (..., N, D) unless ``sequence``.
+        target: as the source.
         sequence: True fits one rotation and scale to all frames together (frames are still centred one by one);
             False fits each frame.
         scale: False keeps the source's size.
@@ -174,8 +174,9 @@ def similarity(
     Raises:
         ShapeError: the shapes differ.
     """
-    check_core(source, "similarity: source", "T", "N", "D")
-    check_core(target, "similarity: target", *source.shape[-3:])
+    core = ("T", "N", "D") if sequence else ("N", "D")
+    check_core(source, "similarity: source", *core)
+    check_core(target, "similarity: target", *source.shape[-len(core) :])
     a, _ = centre(source)
     b, mean = centre(target)
     flat = (lambda x: x.flatten(-3, -2)) if sequence else (lambda x: x)
@@ -195,8 +196,8 @@ def superpose(
     rounding stays a point: neither size nor turn have a derivative there.
 
     Args:
-        source: (..., T, N, 3), finite.
-        target: (..., T, N, 3), finite.
+        source: (..., T, N, 3), finite; (..., N, 3) will do unless ``how`` is "sequence".
+        target: as the source.
         how: a name in :data:`ALIGNMENTS`.
         weights: (..., T, N), 0 where a joint does not count; all 1 if None.
         root: index of the root joint for ``root`` and ``scale``; the middle of all joints if None.
@@ -209,10 +210,11 @@ def superpose(
         ShapeError: they are not of these shapes.
     """
     check_alignment(how, root)
-    check_core(source, "superpose: source", "T", "N", 3)
-    check_core(target, "superpose: target", *source.shape[-3:])
+    core = ("T", "N", 3) if how == "sequence" else ("N", 3)
+    check_core(source, "superpose: source", *core)
+    check_core(target, "superpose: target", *source.shape[-len(core) :])
     if weights is not None:
-        check_core(weights, "superpose: weights", *source.shape[-3:-1])
+        check_core(weights, "superpose: weights", *source.shape[-len(core) : -1])
     if how == "none":
         return source
     mass = torch.ones_like(target[..., 0]) if weights is None else weights.to(target)

@@ -96,7 +96,7 @@ class UnrolledKCS(Unrolled):
         super().__init__(num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
         if not 0 < tau < math.inf or not scale_range >= 1 or arrangement not in ("stacked", "frames"):
             raise OptionError(
-                "UnrolledKCS: expected finite tau > 0, scale_range >= 1 and arrangement 'stacked' or 'frames', "
+                "UnrolledKCS: expected tau > 0 (finite), scale_range >= 1 and arrangement 'stacked' or 'frames', "
                 f"got {tau}, {scale_range} and {arrangement!r}"
             )
         self.skeleton = get_skeleton(skeleton)
