@@ -14,6 +14,7 @@ from kcs_torch.functional.chain import index_rows, safe_root
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.shapes import check_core
+from kcs_torch.functional.weights import known
 from kcs_torch.metrics.align import align as aligned
 from kcs_torch.skeleton import Skeleton, get_skeleton
 
@@ -99,7 +100,7 @@ def e3d(pred: Tensor, truth: Tensor, *, weights: Tensor | None = None) -> Tensor
     Raises:
         ShapeError: the shapes differ, or a number that counts is not finite.
     """
-    pred, truth = known(pred, weights), known(truth, weights)
+    pred, truth = _counted(pred, weights), _counted(truth, weights)
     pred = aligned(pred, truth, "none", weights=weights)  # checks the shapes; at least in single precision
     truth = truth.to(pred)
     mass = torch.ones_like(truth[..., 0]) if weights is None else weights.to(truth)
@@ -171,18 +172,17 @@ def distances(
     pred: Tensor, truth: Tensor, align: str, weights: Tensor | None, root: int | None
 ) -> tuple[Tensor, Tensor | None]:
     """Distances (..., T, N) after alignment, and how much each counts: nothing where the root is needed and unknown."""
-    pred, truth = known(pred, weights), known(truth, weights)
+    pred, truth = _counted(pred, weights), _counted(truth, weights)
     distance = (aligned(pred, truth, align, weights=weights, root=root) - truth).norm(dim=-1)
     if weights is not None and root is not None and align in ("root", "scale"):
         weights = weights * (weights[..., root, None] > 0)
     return distance, weights
 
 
-def known(points: Tensor, weights: Tensor | None) -> Tensor:
+def _counted(points: Tensor, weights: Tensor | None) -> Tensor:
     """Points, 0 where they do not count; what is no tensor or does not fit is told later."""
-    if not (isinstance(points, Tensor) and isinstance(weights, Tensor) and weights.shape == points.shape[:-1]):
-        return points
-    return torch.where(weights[..., None] > 0, points, torch.zeros((), dtype=points.dtype, device=points.device))
+    fit = isinstance(points, Tensor) and isinstance(weights, Tensor) and weights.shape == points.shape[:-1]
+    return known(points, weights) if fit else points
 
 
 def _mean(values: Tensor, weights: Tensor | None) -> Tensor:

@@ -16,6 +16,7 @@ from kcs_torch.functional.chain import bone_lengths, bone_vectors, pose_matrix
 from kcs_torch.functional.precision import full_precision, wide
 from kcs_torch.functional.shapes import check_core, fit_together
 from kcs_torch.functional.spectral import svt
+from kcs_torch.functional.weights import known
 from kcs_torch.skeleton import Skeleton, get_skeleton
 
 __all__ = ["SVT", "BoneLengths", "BoneVectors", "KCSMatrix"]
@@ -216,13 +217,6 @@ def narrow(value: Tensor, like: Tensor) -> Tensor:
     # In this order: beside a value that is far larger, its largest number would be lost to rounding. Infinity less
     # itself is NaN.
     return ((value - value.detach()).nan_to_num() + value.detach().clamp(-top, top)).to(like.dtype)
-
-
-def known(values: Tensor, weights: Tensor | None) -> Tensor:
-    """Values (..., D), 0 where the weights (...) are: what is not known is often NaN, and 0 times NaN is NaN."""
-    if weights is None:
-        return values
-    return torch.where(weights[..., None] > 0, values, torch.zeros((), dtype=values.dtype, device=values.device))
 
 
 def seen_weights(tracks: Tensor, weights: Tensor | None) -> Tensor:

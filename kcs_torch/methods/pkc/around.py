@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.chain import bone_lengths, bone_vectors
-from kcs_torch.functional.ranks import median
+from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.body import LONG, ONE, POLISH, Body, alike
 from kcs_torch.methods.pkc.flips import GAIN, flipped_runs, members, parts_of, signs_of
@@ -73,11 +72,10 @@ def turned_around(body: Body, found: Hypotheses, other: Tensor) -> Search[Any, A
     if now is first:
         return found
     depth, image, _ = yield from body.descended(now.depth, POLISH)
-    lengths = median(bone_lengths(body.joints(depth), body.objective.bones), 1)
     return replace(
         found,
         depth=torch.cat([depth, found.depth[1:]]),
-        lengths=torch.cat([lengths, found.lengths[1:]]),
+        lengths=torch.cat([body.lengths(depth), found.lengths[1:]]),
         image=None if image is None else image[0],
     )
 
@@ -86,7 +84,7 @@ def _settled(body: Body, depth: Tensor) -> Search[Any, Any, _Settled]:
     """Depths (K, T, N) after some steps, and what they cost."""
     objective = body.objective
     depth, _, value = yield from body.descended(depth, JUDGED)
-    lengths = median(bone_lengths(body.joints(depth), objective.bones), 1)
+    lengths = body.lengths(depth)
     return _Settled(depth, lengths, objective(depth, lengths) + objective.contact(depth) + value / ONE)
 
 

@@ -125,6 +125,10 @@ class Body:
         """Joints (H, T, N, 3) of depths (H, T, N), in the template's units."""
         return torch.cat([self.image.expand(*depth.shape, 2), depth[..., None]], -1)
 
+    def lengths(self, depth: Tensor) -> Tensor:
+        """Median lengths (H, B) of the bones of depths (H, T, N)."""
+        return median(bone_lengths(self.joints(depth), self.objective.bones), 1)
+
     def bodies(self, found: Hypotheses) -> Tensor:
         """Joints (H, T, N, 3) of hypotheses, in units of the image; bones keep their lengths as far as noise allows.
 
@@ -145,8 +149,7 @@ class Body:
 
     def rank(self, depth: Tensor, steps: int) -> Search[Any, Any, Hypotheses]:
         """Depths (H, T, N) from elsewhere, refined on the objective, best first."""
-        points = self.joints(depth)
-        lengths = median(bone_lengths(points, self.objective.bones), 1)
+        lengths = self.lengths(depth)
         usual = self.objective.posture.rest_lengths
         lengths = torch.where(lengths > 1e-3 * usual, lengths, usual)
         return (yield from refined(self.objective, Hypotheses(depth, lengths, depth.new_zeros(len(depth))), steps))
@@ -213,7 +216,6 @@ class Body:
         it which of close rivals is best; ``other`` depths (T, N), or their mirror image, are a rival then, too, if they
         come as near in ``steps`` on the objective. Energies stay those of the objective before, in their order.
         """
-        bones = self.objective.bones
         around = self.turns(found)
         close = (found.energy - found.energy[0] < CLOSE) & ((found.depth * found.depth[0]).sum((1, 2)) > 0)
         close[0] = True  # of mirror images, which cost the same here, only the objective tells the right one
@@ -228,8 +230,7 @@ class Body:
             elif bool(dearer[0] < CLOSE):
                 rivals = rivals.joined(replace(ranked, depth=other))
         depth, image, value = yield from self.descended(rivals.depth, (COARSE[-1], *POLISH) if around else POLISH)
-        points = self.joints(depth)
-        lengths = median(bone_lengths(points, bones), 1)
+        lengths = self.lengths(depth)
         best = (rivals.energy + value / ONE).argsort()[: len(pick)]
         return replace(
             found,

@@ -33,15 +33,15 @@ def shortened(tracks: Tracks) -> Tensor | None:
     shown = tracks.seen.sum(-1) >= min(SHOWN, tracks.num_joints)
     most = max(2, round(LONGEST * (tracks.fps or 30.0)))
     frames = shown.nonzero().flatten()
-    if not len(frames) or not bool((frames.diff() > most + 1).any()):
+    long = frames.diff() > most + 1
+    if not bool(long.any()):
         return None
-    keep = torch.ones_like(shown)
-    for before, after in zip(frames[:-1].tolist(), frames[1:].tolist(), strict=True):
-        missing = after - before - 1
-        if missing > most:
-            keep[before + 1 : after] = False
-            share = torch.arange(1, most + 1, device=frames.device) / (most + 1)
-            keep[before + (share * (missing + 1)).round().long()] = True
+    before, after = frames[:-1][long], frames[1:][long]
+    edges = torch.zeros_like(shown, dtype=torch.long)
+    edges[before + 1], edges[after] = 1, -1
+    keep = edges.cumsum(0) == 0
+    share = torch.arange(1, most + 1, device=frames.device) / (most + 1)
+    keep[before[:, None] + (share * (after - before)[:, None]).round().long()] = True
     return keep.nonzero().flatten()
 
 

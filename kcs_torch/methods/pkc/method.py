@@ -15,15 +15,15 @@ from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.lockstep import Search, run, together
-from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.around import turned_around
 from kcs_torch.methods.pkc.batch import Sized, serve
 from kcs_torch.methods.pkc.body import Body, Turned
 from kcs_torch.methods.pkc.cleaning import cleaned
+from kcs_torch.methods.pkc.fixed_answer import from_hypotheses
 from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of
 from kcs_torch.methods.pkc.gate import without_others
 from kcs_torch.methods.pkc.held import with_lengths_held
-from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
+from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.long_gaps import lengthened, shortened
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
@@ -50,9 +50,6 @@ what was found is polished further."""
 
 TELLING = 2.0
 """Degrees of the turn of known cameras from which on they tell the sign of depth."""
-
-OTHERS = 4
-"""Further solutions that tell how sure depths are, whether they are returned or not."""
 
 TRIED, AT_ONCE = 1.012, 1.04
 """Largest over smallest size in the image from which on a change of size is tried, and from which on by a new search at
@@ -230,7 +227,10 @@ class PKC(Method):
             found = yield from self._polished(body, found, cameras, rival)
             if self.rounds and self.viewpoint != "moving":
                 found, body = yield from self._filled(found, body, cameras, rival)
-        made = self._from_hypotheses(found, body, cameras, notes, detections)
+        made = from_hypotheses(
+            found, body, cameras, notes,
+            alternatives=self.alternatives, detections=detections, still=not _turns(cameras), told=self.steps >= 10,
+        )  # fmt: skip
         return _with_size(made, size) if changing else made
 
     def _filled(
@@ -330,32 +330,6 @@ class PKC(Method):
                 break
             ranked = yield from refined(body.objective, ranked, self.steps)
         return replace(ranked, steps=ranked.steps + MOVING_STEPS)
-
-    def _from_hypotheses(
-        self, found: Hypotheses, body: Body, cameras: Tensor | None, notes: tuple[str, ...], detections: bool
-    ) -> Estimate:
-        """Estimates of the distinct hypotheses, in the tracks' units."""
-        image = body.image if detections else None
-        found = distinct(found, max(self.alternatives, OTHERS) + 1, APART)
-        told = told_by_prior(found, body.skeleton)
-        if told:
-            doubtful = f"forward or backward is uncertain for {', '.join(told)}, decided by usual postures"
-            notes = (*notes, f"{doubtful}: see the alternatives")
-        made = []
-        wanted = found[: self.alternatives + 1]
-        for k, (depth, points) in enumerate(zip(wanted.depth, body.bodies(wanted), strict=True)):
-            one = torch.ones_like(points[:, 0, 0])
-            value = float(found.energy[k])
-            turned = body.frames(depth)[:, :2]
-            unsure = angle_doubt(body.objective, depth, found.lengths[k], float(viewpoint_turn(turned)))
-            spread = (
-                depth_deviation(found[k : k + OTHERS + 1], body.noise, body.skeleton, doubt=unsure, image=image)
-                / body.factor
-            )
-            settled = self.steps >= 10 and found.moved is not None and bool(found.moved[k] <= STILL)
-            path, said, still = turned if cameras is None else cameras, () if k else notes, not _turns(cameras)
-            made.append(Estimate(points, path, one, settled, found.steps, said, spread, value, still=still))
-        return replace(made[0], alternatives=tuple(made[1:]))
 
 
 class _Followed(PKC):

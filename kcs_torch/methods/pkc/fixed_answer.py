@@ -1,0 +1,63 @@
+"""Hypotheses of a body with a template as an answer: which differ, how sure depths are, and what the prior told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.camera import viewpoint_turn
+from kcs_torch.methods.finish import Estimate
+from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
+from kcs_torch.methods.pkc.body import Body
+from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct
+from kcs_torch.methods.pkc.moving_answer import STILL
+
+__all__ = ["from_hypotheses"]
+
+OTHERS = 4
+"""Further solutions that tell how sure depths are, whether they are returned or not."""
+
+
+def from_hypotheses(
+    found: Hypotheses,
+    body: Body,
+    cameras: Tensor | None,
+    notes: tuple[str, ...],
+    *,
+    alternatives: int,
+    detections: bool,
+    still: bool,
+    told: bool,
+) -> Estimate:
+    """Return the best estimate in the tracks' units, with so many distinct alternatives at most.
+
+    Args:
+        found: hypotheses, best first.
+        body: that they are of.
+        cameras: (T, 2, 3) that are known, or None: then the trunk's.
+        notes: on the clip so far.
+        alternatives: further solutions, at most.
+        detections: whether joints are a detector's.
+        still: whether the camera may be taken to stand still.
+        told: whether enough steps were made to tell from the last ones that a solution has settled.
+    """
+    image = body.image if detections else None
+    found = distinct(found, max(alternatives, OTHERS) + 1, APART)
+    doubtful = told_by_prior(found, body.skeleton)
+    if doubtful:
+        note = f"forward or backward is uncertain for {', '.join(doubtful)}, decided by usual postures"
+        notes = (*notes, f"{note}: see the alternatives")
+    made = []
+    wanted = found[: alternatives + 1]
+    for k, (depth, points) in enumerate(zip(wanted.depth, body.bodies(wanted), strict=True)):
+        one = torch.ones_like(points[:, 0, 0])
+        turned = body.frames(depth)[:, :2]
+        doubt = angle_doubt(body.objective, depth, found.lengths[k], float(viewpoint_turn(turned)))
+        spread = depth_deviation(found[k : k + OTHERS + 1], body.noise, body.skeleton, doubt=doubt, image=image)
+        settled = told and found.moved is not None and bool(found.moved[k] <= STILL)
+        path, said, value = turned if cameras is None else cameras, () if k else notes, float(found.energy[k])
+        spread = spread / body.factor
+        made.append(Estimate(points, path, one, settled, found.steps, said, spread, value, still=still))
+    return replace(made[0], alternatives=tuple(made[1:]))
