@@ -2,6 +2,7 @@
 
 import ast
 import json
+import pickle
 import re
 import subprocess
 import sys
@@ -215,6 +216,13 @@ def test_importing_a_submodule_does_not_hide_a_function():
         "assert callable(kt.reconstruct) and kt.reconstruct.__name__ == 'reconstruct'"
     )
     assert "torch" in loaded(code)
+
+
+def test_the_package_goes_to_other_processes_by_its_name():
+    """Launchers of jobs pickle what a script's functions use, and that is the package."""
+    import kcs_torch as kt
+
+    assert pickle.loads(pickle.dumps(kt)) is kt
 
 
 def test_version_is_that_of_the_project():
