@@ -111,7 +111,7 @@ class _Package(ModuleType):
         super().__setattr__(name, value)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """By name, as cloudpickle does with plain modules only: functions that use the package go to other processes."""
+        """By name, as cloudpickle does with plain modules only: functions that use it go to other processes."""
         return importlib.import_module, (self.__name__,)
 
 

@@ -7,8 +7,9 @@
     python scripts/benchmark.py paper.parts=all    # the tables of the two seed papers instead, see papers.py
 
 Writes SUITE/CASE.npz (the prediction) and results.csv (a row a case) to the run's folder under ``outputs/``, and
-prints the means of each suite. Inputs, truth and figures are the protocol's own. A case that fails is a row with its
-error, and makes the exit code 1.
+prints the means of each suite; a sweep has one results.csv more, of all its runs. Each row is written when its case is
+done: with keep=true a sweep that was stopped goes on in its folder. Inputs, truth and figures are the protocol's own. A
+case that fails is a row with its error, and makes the exit code 1.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from types import ModuleType
@@ -28,6 +29,7 @@ from typing import Any
 try:
     import hydra
     from hydra.core.hydra_config import HydraConfig
+    from hydra.errors import CompactHydraException
     from hydra.types import RunMode
     from omegaconf import DictConfig, OmegaConf
 except ModuleNotFoundError as error:
@@ -36,16 +38,32 @@ import numpy as np
 import torch
 
 import kcs_torch as kt
+from kcs_torch.errors import OptionError, counted, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.methods import METHODS
-from kcs_torch.training.configured import check_switch, check_threads, in_one_line, method_of
+from kcs_torch.training.configured import (
+    check_switch,
+    check_threads,
+    check_whole,
+    command_line,
+    in_one_line,
+    method_of,
+)
+from kcs_torch.types.hints import is_a
 
 MEASURED = ("suite", "case", "method", "options", "cameras", "intrinsics")
 FACTS = (
     *(*MEASURED, "frames", "joints"),
     *("seconds", "cpu_seconds", "ms_per_frame", "converged"),
 )
-failed = 0  # cases of all jobs; Hydra hands no exit code through
+COUNTS = {"clip": 10, "sequences": 1, "paths": 1, "seeds": 1, "walks": 1, "frames": 100}
+"""Numbers among the settings of the papers' tables, and the least that each may be."""
+
+failed = 0  # cases of all jobs run in this process; Hydra hands no exit code through
+
+
+class CasesFailed(CompactHydraException):
+    """Some cases of a run failed; the others are done. Hydra prints it without a traceback."""
 
 
 def load_protocol(shared: Path) -> ModuleType:
@@ -104,26 +122,22 @@ def run_case(
     case: dict[str, Any],
     method: kt.Method,
     target: Path,
-    cameras: bool,
-    intrinsics: bool | str | None = None,
+    cameras: torch.Tensor | None = None,
+    intrinsics: Any = None,
 ) -> dict[str, Any]:
     """Reconstruct one case, write the prediction, and return its figures and facts."""
     given, truth = protocol.build(data, case)
     tracks = load_input(given, protocol.case_name(case))
-    known = true_cameras(protocol, data, case) if cameras else None
-    lens = lens_of(protocol, data, case, intrinsics)
     start, begin = time.perf_counter(), time.process_time()
-    result = kt.reconstruct(tracks, method=method, cameras=known, intrinsics=lens)
+    result = kt.reconstruct(tracks, method=method, cameras=cameras, intrinsics=intrinsics)
     seconds, cpu = time.perf_counter() - start, time.process_time() - begin
     prediction = {"points3d": result.observed.numpy(), "cameras": result.cameras.numpy()}
-    target.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(target, **prediction)
+    with atomic_path(target) as temporary:
+        np.savez_compressed(temporary, **prediction)
     figures = protocol.score(
         prediction["points3d"], truth["points3d"], truth["edges"], prediction["cameras"], truth["world"]
     )
     return figures | {
-        "cameras": "estimated" if known is None else "true",
-        "intrinsics": "none" if lens is None else lens if isinstance(lens, str) else "true",
         "frames": tracks.num_frames,
         "joints": tracks.skeleton.num_observed,
         "seconds": round(seconds, 4),
@@ -134,18 +148,26 @@ def run_case(
 
 
 def table(rows: list[dict[str, Any]], figures: tuple[str, ...]) -> str:
-    """The means of each suite, over the cases that did not fail."""
-    names = [f for f in (*figures, "ms_per_frame") if any(f in row for row in rows)]
-    lines = [f"{'suite':<16}{'method':<12}{'cases':>9}" + "".join(f"{n:>14}" for n in names)]
-    for suite, method in dict.fromkeys((row["suite"], row["method"]) for row in rows):
-        group = [row for row in rows if (row["suite"], row["method"]) == (suite, method)]
-        good = [row for row in group if "error" not in row]
-        line = f"{suite:<16}{method:<12}{len(good):>5}/{len(group):<3}"
+    """The means of each suite and recipe, over the cases that did not fail."""
+    names = [f for f in (*figures, "ms_per_frame") if any(row.get(f) for row in rows)]
+    kinds = dict.fromkeys((row["suite"], recipe(row)) for row in rows)
+    width = max(12, *(len(kind) + 2 for _, kind in kinds))
+    lines = [f"{'suite':<16}{'method':<{width}}{'cases':>9}" + "".join(f"{n:>14}" for n in names)]
+    for suite, kind in kinds:
+        group = [row for row in rows if (row["suite"], recipe(row)) == (suite, kind)]
+        good = [row for row in group if not row.get("error")]
+        line = f"{suite:<16}{kind:<{width}}{len(good):>5}/{len(group):<3}"
         for name in names:
-            values = [row[name] for row in good if name in row]
+            values = [float(row[name]) for row in good if row.get(name)]
             line += f"{np.mean(values):>14.4f}" if values else f"{'-':>14}"
         lines.append(line)
     return "\n".join(lines)
+
+
+def recipe(row: dict[str, Any]) -> str:
+    """The method of a row, its fields, and what it was given."""
+    given = [f"{name}={row[name]}" for name in ("cameras", "intrinsics") if row[name] not in ("estimated", "none")]
+    return " ".join(filter(None, [row["method"], row["options"], *given]))
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
@@ -160,17 +182,21 @@ def write_rows(path: Path, rows: list[dict[str, Any]], columns: tuple[str, ...])
     """Write rows to a CSV file, whole or not at all; of those that measured the same only the last."""
     latest: dict[tuple[str, ...], dict[str, Any]] = {}
     for row in rows:
-        what = tuple(str(row[name]) for name in MEASURED)
-        latest.pop(what, None)
-        latest[what] = row
+        latest.pop(measured(row), None)
+        latest[measured(row)] = row
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows(latest.values())
 
 
-def tabulate(folder: Path, columns: tuple[str, ...]) -> None:
-    """Write the rows of all runs below a sweep's folder to one file.
+def measured(row: dict[str, Any]) -> tuple[str, ...]:
+    """What a row is of, as text, as it is in a file."""
+    return tuple(str(row[name]) for name in MEASURED)
+
+
+def tabulate(folder: Path, columns: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Write the rows of all runs below a sweep's folder to one file, and return what is in it.
 
     Every run does so at its end, and who writes looks again afterwards, so that nobody's rows are lost.
     """
@@ -178,6 +204,7 @@ def tabulate(folder: Path, columns: tuple[str, ...]) -> None:
     while len(found := sorted(folder.glob("*/**/results.csv"), key=lambda path: path.stat().st_mtime_ns)) > len(read):
         read = found
         write_rows(folder / "results.csv", [row for path in read for row in read_rows(path)], columns)
+    return read_rows(folder / "results.csv")
 
 
 def make_papers(paper: DictConfig, shared: Path, folder: Path) -> None:
@@ -187,6 +214,13 @@ def make_papers(paper: DictConfig, shared: Path, folder: Path) -> None:
 
     options = OmegaConf.to_container(paper)
     assert isinstance(options, dict)
+    for name, value in options.items():
+        if name not in (*COUNTS, "parts", "methods"):
+            raise unknown("setting of paper", name, (*COUNTS, "parts", "methods"))
+        if name in COUNTS:
+            check_whole(f"paper.{name}", value, COUNTS[name], 1_000_000)
+        elif not is_a(value, str | Sequence[str]):
+            raise OptionError(f"paper.{name}: expected all, a name or a list of names, got {value!r}")
     names, frames, sequences = options.pop("parts"), options.pop("clip"), options.pop("sequences")
     methods = options.pop("methods")
     chosen = tuple(METHODS) if methods == "all" else tuple([methods] if isinstance(methods, str) else methods)
@@ -198,62 +232,84 @@ def make_papers(paper: DictConfig, shared: Path, folder: Path) -> None:
 @hydra.main(version_base="1.3", config_path="../configs", config_name="benchmark")
 def main(config: DictConfig) -> None:
     """Run every chosen case and write results.csv."""
-    global failed
-    with in_one_line():
-        check_threads(config.threads)
-        check_switch("cameras", config.cameras)
-    torch.set_num_threads(config.threads)
     warnings.simplefilter("ignore", kt.KcsWarning)  # the column "converged" says it
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
-    shared = Path(config.shared)
-    if config.paper.parts:
-        make_papers(config.paper, shared, folder)
-        return
-    protocol = load_protocol(shared)
-    if config.intrinsics not in (None, False, True, "auto", "parallel"):
-        raise SystemExit(f"intrinsics={config.intrinsics}: expected null, true, auto or parallel")
     with in_one_line():
-        method = method_of(config.method)
-    options = {k: v for k, v in OmegaConf.to_container(config.method).items() if k != "_target_"}
+        check_threads(config.threads)
+        check_switch("cameras", config.cameras)
+        check_switch("keep", config.keep)
+        suites = OmegaConf.to_container(config, resolve=True)["suite"]
+        if not is_a(suites, str | Sequence[str]) or not suites:
+            raise OptionError(f"suite: expected all, a suite or a list of suites, got {suites!r}")
+        if config.intrinsics not in (None, False, True, "auto", "parallel"):
+            raise OptionError(f"intrinsics={config.intrinsics}: expected null, true, auto or parallel")
+        torch.set_num_threads(config.threads)
+        if config.paper.parts:
+            make_papers(config.paper, Path(str(config.shared)), folder)
+        else:
+            measure(config, suites, method_of(config.method), folder)
+
+
+def measure(config: DictConfig, suites: str | list[str], method: kt.Method, folder: Path) -> None:
+    """Run cases, write each row when it is there, and print the means; of a sweep, those of all its runs so far."""
+    global failed
+    job, shared = HydraConfig.get(), Path(str(config.shared))
+    protocol = load_protocol(shared)
+    data, own, columns = shared / "data", folder / "results.csv", (*FACTS, *protocol.FIGURES, "error")
+    options = OmegaConf.to_container(config.method, resolve=True)
+    text = " ".join(f"{name}={value}" for name, value in options.items() if name != "_target_")
     name = job.runtime.choices.method
-    text = " ".join(f"{k}={v}" for k, v in options.items())
-    asked = {
-        "cameras": "true" if config.cameras else "estimated",
-        "intrinsics": {None: "none", False: "none", True: "true"}.get(config.intrinsics, config.intrinsics),
-    }
+    if name in METHODS and type(method) is not METHODS[name]:  # another one was put in its place
+        name = method.name or type(method).__name__
+    kept = {measured(row): row for row in read_rows(own) if not row["error"]} if config.keep else {}
     rows: list[dict[str, Any]] = []
     stopped = False
-    suites = config.suite if isinstance(config.suite, str) else list(config.suite)
-    for suite, case in chosen(protocol, suites, str(config.case)):
-        label = protocol.case_name(case)
-        row: dict[str, Any] = {"suite": suite, "case": label, "method": name, "options": text} | asked
-        try:
-            given = protocol, shared / "data", case, method, folder / suite / f"{label}.npz"
-            row |= run_case(*given, config.cameras, config.intrinsics)
-            shown = "  ".join(f"{f} {row[f]:.4f}" for f in protocol.FIGURES if f in row)
-            print(f"{suite}/{label}  {shown}  {row['ms_per_frame']:.2f} ms a frame", flush=True)
-        except KeyboardInterrupt:
-            stopped = True
-            break
-        except (Exception, SystemExit) as error:  # the protocol leaves by SystemExit where a prediction is no good
-            row["error"] = f"{type(error).__name__}: {error}"
-            failed += 1
-            print(f"{suite}/{label}  {row['error']}", flush=True)
-        rows.append(row)
+    wrong = 0
+    try:
+        for suite, case in chosen(protocol, suites, str(config.case)):
+            label = protocol.case_name(case)
+            target = folder / suite / f"{label}.npz"
+            row: dict[str, Any] = {"suite": suite, "case": label, "method": name, "options": text}
+            row |= {"cameras": "estimated", "intrinsics": "none"}
+            try:
+                cameras = true_cameras(protocol, data, case) if config.cameras else None
+                lens = lens_of(protocol, data, case, config.intrinsics)
+                row["cameras"] = "estimated" if cameras is None else "true"
+                row["intrinsics"] = "none" if lens is None else lens if isinstance(lens, str) else "true"
+                if measured(row) in kept and target.is_file():
+                    rows.append(kept[measured(row)])
+                    print(f"{suite}/{label}  was done, and is kept", flush=True)
+                    continue
+                row |= run_case(protocol, data, case, method, target, cameras, lens)
+                shown = "  ".join(f"{f} {row[f]:.4f}" for f in protocol.FIGURES if f in row)
+                print(f"{suite}/{label}  {shown}  {row['ms_per_frame']:.2f} ms a frame", flush=True)
+            except (Exception, SystemExit) as error:  # the protocol leaves by SystemExit where a prediction is no good
+                row["error"] = f"{type(error).__name__}: {error}"
+                wrong += 1
+                print(f"{suite}/{label}  {row['error']}", flush=True)
+            rows.append(row)
+            write_rows(own, read_rows(own) + rows, columns)
+    except KeyboardInterrupt:
+        stopped = True
     if not rows and not stopped:
         raise SystemExit(f"case={config.case}: matches no case of suite={config.suite}")
-    columns = (*FACTS, *protocol.FIGURES, "error")
-    folder.mkdir(parents=True, exist_ok=True)
-    own = folder / "results.csv"
-    write_rows(own, read_rows(own) + rows, columns)
-    if job.mode == RunMode.MULTIRUN:
-        tabulate(Path(job.sweep.dir), columns)
-    print(f"\n{table(rows, protocol.FIGURES)}\n{folder / 'results.csv'}")
+    failed += wrong
+    multirun = job.mode == RunMode.MULTIRUN
+    shown = tabulate(Path(job.sweep.dir), columns) if multirun else rows
+    if shown:
+        print(f"\n{table(shown, protocol.FIGURES)}\n{(Path(job.sweep.dir) if multirun else folder) / 'results.csv'}")
     if stopped:
-        raise SystemExit("stopped: these are the cases that were done")
+        raise SystemExit("stopped: these are the cases that were done; keep=true goes on in the same folder")
+    if wrong and multirun:
+        raise CasesFailed(f"{counted(wrong, 'case')} failed")  # of another process only an error is heard
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        with command_line("benchmark"):
+            main()
+    except KeyboardInterrupt:  # while others work
+        print("stopped: rows of the cases that were done are in the runs' folders; keep=true goes on", file=sys.stderr)
+        sys.exit(130)
     sys.exit(1 if failed else 0)

@@ -52,9 +52,8 @@ def table2(settings: Settings) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as folder:
         for name in settings.methods:
             for label, case in cases.items():
-                figures = run_case(
-                    bench.protocol, bench.data, case, METHODS[name](), Path(folder) / "prediction.npz", False
-                )
+                target = Path(folder) / "prediction.npz"
+                figures = run_case(bench.protocol, bench.data, case, METHODS[name](), target)
                 yield {"setting": name, "at": label} | figures
 
 

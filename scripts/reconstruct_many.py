@@ -31,7 +31,7 @@ import torch
 
 from kcs_torch.errors import counted
 from kcs_torch.many import reconstruct_folder
-from kcs_torch.training.configured import check_threads, in_one_line, method_of
+from kcs_torch.training.configured import check_threads, command_line, in_one_line, method_of
 
 
 class ClipsFailed(CompactHydraException):
@@ -78,7 +78,8 @@ def main(config: DictConfig) -> None:
 
 if __name__ == "__main__":
     try:
-        main()
+        with command_line("reconstruct_many"):
+            main()
     except KeyboardInterrupt:
         print("stopped: run it again to go on", file=sys.stderr)
         sys.exit(130)

@@ -1,6 +1,7 @@
 """scripts/benchmark.py, on a small protocol made here and on a case of the real one."""
 
 import csv
+import os
 import subprocess
 import sys
 
@@ -39,9 +40,12 @@ def score(pred, truth, edges, cameras=None, world=None):
 """
 
 
-def benchmark(root, folder, *words):
+def benchmark(root, folder, *words, path=None):
     command = [sys.executable, str(root / "scripts" / "benchmark.py"), *words]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    looked = os.pathsep.join(filter(None, [path and str(path), os.environ.get("PYTHONPATH")]))
+    return subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": looked}
+    )
 
 
 def rows(path):
@@ -77,6 +81,68 @@ def test_what_is_measured_again_in_its_folder_replaces_what_was(root, folder):
     table = rows(folder / "again" / "results.csv")
     assert [(r["method"], r["case"]) for r in table] == [(m, c) for m in ("kcs", "rigid") for c in ("case_a", "case_b")]
     assert table[2:] == rows(folder / "again" / "0_rigid" / "results.csv") != rows(folder / "again/1_rigid/results.csv")
+
+
+@pytest.mark.parametrize("failing", [False, True])
+def test_runs_of_a_sweep_in_processes_of_their_own(root, folder, failing):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    suite = "broken" if failing else "turn"
+    done = benchmark(
+        root, folder, f"suite={suite}", "-m", "method=kcs,rigid", "hydra/launcher=joblib", "hydra.sweep.dir=out"
+    )
+    assert done.returncode == failing and "Traceback" not in done.stderr, done.stderr
+    assert ("1 case failed" in done.stderr) == failing
+    assert [bool(row["error"]) for row in rows(folder / "out" / "results.csv")] == [failing, False] * 2
+
+
+def test_a_stopped_run_keeps_what_it_has_and_goes_on(root, folder):
+    """The second case stops the first run as Ctrl-C does; nothing of it is left half written."""
+    stops = 'if case["src"] == "b" and not __import__("os").path.exists("went_on"): raise KeyboardInterrupt'
+    text = PROTOCOL.replace("    t = np.linspace", f"    {stops}\n    t = np.linspace", 1)
+    (folder.parent / "shared" / "protocol" / "protocol.py").write_text(text, encoding="utf-8")
+    words = ("method=rigid", "suite=turn", "hydra.run.dir=out")
+    stopped = benchmark(root, folder, *words)
+    assert stopped.returncode == 1 and "keep=true goes on" in stopped.stderr and "Traceback" not in stopped.stderr
+    first = rows(folder / "out" / "results.csv")
+    assert [row["case"] for row in first] == ["case_a"]
+    assert {path.name for path in (folder / "out" / "turn").iterdir()} == {"case_a.npz"}
+    (folder / "went_on").touch()
+    done = benchmark(root, folder, *words, "keep=true")
+    assert done.returncode == 0 and done.stdout.count("was done, and is kept") == 1, done.stderr
+    both = rows(folder / "out" / "results.csv")
+    assert [row["case"] for row in both] == ["case_a", "case_b"] and both[0] == first[0]
+    assert "2/2" in done.stdout
+    other = benchmark(root, folder, *words, "keep=true", "+method.num_steps=3")
+    assert other.returncode == 0 and "is kept" not in other.stdout
+
+
+def test_a_row_is_written_when_its_case_is_done(root, folder):
+    """Whatever ends the process then, as a cluster that kills it."""
+    text = PROTOCOL.replace(
+        "    t = np.linspace", '    case["src"] == "b" and __import__("os")._exit(9)\n    t = np.linspace', 1
+    )
+    (folder.parent / "shared" / "protocol" / "protocol.py").write_text(text, encoding="utf-8")
+    assert benchmark(root, folder, "method=rigid", "suite=turn", "hydra.run.dir=out").returncode == 9
+    assert [row["case"] for row in rows(folder / "out" / "results.csv")] == ["case_a"]
+
+
+def test_a_method_of_ones_own_has_its_own_name(root, folder):
+    text = "import kcs_torch as kt\n\nclass Mine(kt.methods.Rigid):\n    name = 'mine'\n"
+    (folder / "mine.py").write_text(text, encoding="utf-8")
+    target = "method._target_=mine.Mine"
+    alone = benchmark(root, folder, "suite=turn", target)
+    assert alone.returncode == 1 and f"{target}: cannot be imported: No module named 'mine'" in alone.stderr
+    assert "PYTHONPATH" in alone.stderr and "Traceback" not in alone.stderr
+    done = benchmark(root, folder, "suite=turn", target, "hydra.run.dir=out", path=folder)
+    assert done.returncode == 0, done.stderr
+    assert {row["method"] for row in rows(folder / "out" / "results.csv")} == {"mine"}
+
+
+def test_a_table_of_several_recipes(script):
+    shared = {"suite": "turn", "method": "sfam", "cameras": "estimated", "intrinsics": "none", "error": ""}
+    made = [shared | {"options": text, "rigid": value} for text, value in (("", "1"), ("", 3.0), ("beta=0", "7"))]
+    lines = script.table([*made, shared | {"options": "", "rigid": "", "error": "no"}], ("rigid",)).splitlines()
+    assert [line.split()[1:] for line in lines[1:]] == [["sfam", "2/3", "2.0000"], ["sfam", "beta=0", "1/1", "7.0000"]]
 
 
 def test_a_failing_case_is_a_row_and_an_exit_code(root, folder):
@@ -115,11 +181,28 @@ def test_wrong_choices(script, folder):
         (["method=sfam", "+method.foo=3"], "error: unknown option of method 'sfam' 'foo': choices are "),
         (["method=sfam", "cameras=no"], "error: cameras: expected true or false, got 'no'"),
         (["method=sfam", "+method.beta=much"], "error: sfam: beta: expected a finite number, got 'much'"),
+        (["suite=null"], "error: suite: expected all, a suite or a list of suites, got None"),
+        (
+            ["method._target_=kcs_torch.nn.SymmetryEnergy", "+method.skeleton=coco17"],
+            "expected a kcs_torch.Method, got",
+        ),
+        (["paper.parts=growth", "paper.frames=few"], "error: paper.frames: expected a whole number within 100.."),
+        (["paper.parts=growth", "+paper.frame=100"], "error: unknown setting of paper 'frame': did you mean 'frames'"),
     ],
 )
 def test_wrong_settings_are_a_line(root, folder, words, told):
     done = benchmark(root, folder, "suite=turn", *words)
     assert done.returncode == 1 and told in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("script", "word", "meant"), [("benchmark", "+suit=a", "suite"), ("reconstruct_many", "+batsch=1", "batch")]
+)
+def test_settings_that_nothing_reads_are_told(root, folder, script, word, meant):
+    """Of a name that it does not know Hydra says how to add it, and nothing would come of that."""
+    command = [sys.executable, str(root / "scripts" / f"{script}.py"), word]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and f"did you mean '{meant}'" in done.stderr and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("name", ["benchmark", "reconstruct_many"])

@@ -302,6 +302,7 @@ class TestCommandLine:
             ("model=transformer", "mlp\n\ttemporal"),
             ("--experiment=smoke", "--experiment=smoke: settings have no dashes: experiment=smoke"),
             ("modle=mlp", "unknown setting 'modle': did you mean .*choices: .*experiment, .*model, "),
+            ("+modul.lr=1", "unknown setting 'modul': did you mean 'module' or 'model'"),
             ("hydr/launcher=joblib", "unknown setting 'hydr': did you mean 'hydra'"),
             ("model.widht=3", "Could not override 'model.widht'"),
             ("+trainer.gradient_clip_val=1", r"gradient_clip_val: .*\+module\.clip"),
@@ -318,6 +319,10 @@ class TestCommandLine:
             ("data=cmu shared=/nowhere", "/nowhere/data/cmu, found none"),
             ("resume=/nowhere", "resume=/nowhere: expected a run's folder"),
             ("model._target_=kcs_torch.nn.Nothing", "kcs_torch.nn.Nothing"),
+            (
+                "model._target_=mine.Net",
+                "network._target_=mine.Net: cannot be imported: No module .*'mine'.* PYTHONPATH",
+            ),
             ("skeleton=dragon loss=bones", "unknown skeleton 'dragon'"),
         ],
     )

@@ -5,9 +5,11 @@ from __future__ import annotations
 import inspect
 import os
 import re
+import sys
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from hydra.errors import CompactHydraException, HydraException, InstantiationException
@@ -15,7 +17,7 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from kcs_torch.errors import KcsError, OptionError
+from kcs_torch.errors import KcsError, OptionError, unknown
 from kcs_torch.methods import Method
 from kcs_torch.types.hints import is_a, spoken
 
@@ -25,6 +27,8 @@ __all__ = [
     "check_threads",
     "check_values",
     "check_whole",
+    "command_line",
+    "configs",
     "in_one_line",
     "method_of",
 ]
@@ -32,6 +36,59 @@ __all__ = [
 
 class WrongConfiguration(CompactHydraException):
     """What is wrong with the configuration of a run; Hydra prints it without a traceback."""
+
+
+def configs() -> Path:
+    """The folder of the configurations: in a wheel it is a part of the package, in a clone it is beside it."""
+    package = Path(__file__).resolve().parents[1]
+    inside = package / "configs"
+    return inside if inside.is_dir() else package.parent / "configs"
+
+
+@contextmanager
+def command_line(program: str, arguments: Sequence[str] | None = None, start: str | None = None) -> Iterator[None]:
+    """Within this context Hydra finds a program's arguments, in an order that it takes; exit with 2 if one is unknown.
+
+    Args:
+        program: name of its configuration.
+        arguments: by default those of this process.
+        start: what is to start each further process; by default what has started this one.
+    """
+    before = sys.argv
+    given = list(before[1:] if arguments is None else arguments)
+    try:
+        _check_names(program, given)
+    except OptionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    # Hydra looks nowhere else, and takes flags before overrides only.
+    sys.argv = [start or before[0], *sorted(given, key=lambda one: re.match(r"~|[^-][^=]*=", one) is not None)]
+    try:
+        yield
+    finally:
+        sys.argv = before
+
+
+def _check_names(program: str, arguments: Sequence[str]) -> None:
+    """Look at the names of groups and settings: of one that it does not know Hydra says how to add it.
+
+    Raises:
+        OptionError: there is none of that name, and no other argument makes use of it.
+    """
+    if any(argument.startswith(("--config", "-cn", "-cp", "-cd")) for argument in arguments):
+        return  # another configuration has other names
+    own = OmegaConf.load(configs() / f"{program}.yaml")
+    groups = (next(iter(entry)) for entry in own.defaults if isinstance(entry, Mapping))
+    known = {str(name) for name in (*own, *groups)} - {"defaults"}
+    for argument in arguments:
+        bare = argument.lstrip("-")
+        if bare != argument and bare.partition("=")[0] in known:
+            raise OptionError(f"{argument}: settings have no dashes: {bare}")
+        named = re.match(r"(\+*)([A-Za-z_]\w*)[^=]*=", argument)
+        if named is None or named[2] in known:
+            continue
+        if not named[1] or not any(f"${{{named[2]}" in other for other in arguments):
+            raise unknown("setting", named[2], known)
 
 
 @contextmanager
@@ -100,13 +157,19 @@ def method_of(config: DictConfig) -> Method:
     """The method that the group ``method`` names, with its fields.
 
     Raises:
-        OptionError: a field is unknown, or its value is wrong.
+        OptionError: a field is unknown, or its value is wrong; what is named cannot be imported, or is no method.
     """
     options: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
-    kind = get_object(options.pop("_target_"))
+    target = options.pop("_target_")
+    try:
+        kind = get_object(target)
+    except Exception as error:  # whatever a module of the user's comes to
+        raise OptionError(_not_imported(f"method._target_={target}", error)) from None
     if isinstance(kind, type) and issubclass(kind, Method):
         return kind.from_options(**options)
-    found: Method = instantiate(config, _convert_="all")
+    found = instantiate(config, _convert_="all")
+    if not isinstance(found, Method):
+        raise OptionError(f"method._target_={target}: expected a kcs_torch.Method, got {type(found).__name__}")
     return found
 
 
@@ -119,6 +182,12 @@ def _hints(target: str) -> dict[str, Any]:
         return {}
 
 
+def _not_imported(what: str, error: BaseException) -> str:
+    """Why a target is not found, from what Hydra raises of it."""
+    cause = error.__cause__ or error
+    return f"{what}: cannot be imported: {cause}: a module of your own needs its folder in PYTHONPATH"
+
+
 def _told(error: Exception, also: tuple[type[Exception], ...]) -> str | None:
     """What is wrong with the configuration, or None if the program is wrong."""
     told: tuple[type[Exception], ...] = (KcsError, HydraException, OmegaConfBaseException, *also)
@@ -128,6 +197,8 @@ def _told(error: Exception, also: tuple[type[Exception], ...]) -> str | None:
         cause, place = error.__cause__, re.search(r"full_key: (\S+)", str(error))
         if isinstance(cause, (TypeError, ValueError, *told)):
             return str(cause) if isinstance(cause, KcsError) or place is None else f"{place.group(1)}: {cause}"
-        if cause is not None and "Error locating target" not in str(error):
-            return None
+        if cause is not None:
+            located = re.search(r"Error locating target '(\S+)'", str(error))
+            where = "" if place is None else f"{place.group(1)}."
+            return None if located is None else _not_imported(f"{where}_target_={located.group(1)}", cause)
     return str(error) if isinstance(error, told) else None

@@ -26,11 +26,19 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError, unknown
+from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.training.callbacks import Best, Diverged, Last, Watch
 from kcs_torch.training.checkpoint import describe, save_lifter
-from kcs_torch.training.configured import check_switch, check_threads, check_values, check_whole, in_one_line
+from kcs_torch.training.configured import (
+    check_switch,
+    check_threads,
+    check_values,
+    check_whole,
+    command_line,
+    configs,
+    in_one_line,
+)
 from kcs_torch.training.sweep import RESULT, tabulate
 
 __all__ = ["Outcome", "configs", "job", "main", "train"]
@@ -60,13 +68,6 @@ class Outcome:
     value: float
     metrics: Mapping[str, float]
     lifter: Path | None
-
-
-def configs() -> Path:
-    """The folder of the configurations: in a wheel it is a part of the package, in a clone it is beside it."""
-    package = Path(__file__).resolve().parents[1]
-    inside = package / "configs"
-    return inside if inside.is_dir() else package.parent / "configs"
 
 
 def train(config: DictConfig, folder: Path) -> Outcome:
@@ -269,47 +270,17 @@ def job(config: DictConfig) -> float:
     return outcome.value
 
 
-def _check_names(arguments: Sequence[str]) -> None:
-    """Look at the names of groups and settings: of one that it does not know Hydra says how to add it.
-
-    Raises:
-        OptionError: there is none of that name.
-    """
-    if any(argument.startswith(("--config", "-cn", "-cp", "-cd")) for argument in arguments):
-        return  # another configuration has other names
-    own = OmegaConf.load(configs() / "train.yaml")
-    groups = (next(iter(entry)) for entry in own.defaults if isinstance(entry, Mapping))
-    known = {str(name) for name in (*own, *groups)} - {"defaults"}
-    for argument in arguments:
-        bare = argument.lstrip("-")
-        if bare != argument and bare.partition("=")[0] in known:
-            raise OptionError(f"{argument}: settings have no dashes: {bare}")
-        named = re.match(r"([A-Za-z_]\w*)[^=]*=", argument)
-        if named is not None and named[1] not in known:
-            raise unknown("setting", named[1], known)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train as a command line says, by default that of this process; exit with 2 where it is wrong."""
-    try:
-        _check_names(sys.argv[1:] if arguments is None else arguments)
-    except OptionError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
     entry = hydra.main(version_base="1.3", config_path=str(configs()), config_name="train")(job)
-    before = sys.argv
-    if arguments is not None:
-        # Hydra looks nowhere else; and what stands first is what Lightning starts for each further device.
-        sys.argv = [__file__, *arguments]
-    flags = [a for a in sys.argv[1:] if a in ("-m", "--multirun")]  # which Hydra takes before overrides only
-    sys.argv = [sys.argv[0], *flags, *(a for a in sys.argv[1:] if a not in flags)]
-    try:
-        entry()
-    except SystemExit as end:  # Hydra leaves with 1 whatever it was; what it was is the context
-        wrong = isinstance(end.__context__, (HydraException, OmegaConfBaseException))
-        raise SystemExit(2 if wrong and not isinstance(end.__context__, InstantiationException) else end.code) from None
-    finally:
-        sys.argv = before
+    # What stands first is what Lightning starts for each further device.
+    with command_line("train", arguments, start=None if arguments is None else __file__):
+        try:
+            entry()
+        except SystemExit as end:  # Hydra leaves with 1 whatever it was; what it was is the context
+            wrong = isinstance(end.__context__, (HydraException, OmegaConfBaseException))
+            told = wrong and not isinstance(end.__context__, InstantiationException)
+            raise SystemExit(2 if told else end.code) from None
 
 
 if __name__ == "__main__":
