@@ -23,6 +23,7 @@ from numerics import (
 )
 from torch.testing import assert_close
 
+import kcs_torch as kt
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths, project
 from kcs_torch.nn import (
@@ -834,3 +835,20 @@ def test_parts_of_energies_check_what_they_are_given():
 def test_unknown_skeletons_are_named():
     with pytest.raises(SkeletonError, match="h36m17"):
         BoneLengthEnergy("h36m18")
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: kt.nn.ReprojectionEnergy(huber="a"), "positive huber length or None, got 'a'"),
+        (lambda: kt.nn.PerspectiveEnergy(huber="a"), "positive huber length or None, .* got 'a' and 0.15"),
+        (lambda: kt.nn.PerspectiveEnergy(nearest=None), "positive nearest depth, got None and None"),
+        (lambda: kt.nn.LowRankEnergy(eps="1e-3"), "eps > 0, got 'nuclear' and '1e-3'"),
+        (lambda: kt.nn.ProcrusteanEnergy("coco17", num_steps="3"), "num_steps >= 0, got .* and '3'"),
+        (lambda: kt.nn.AdductionEnergy("coco17", limit="a"), "limit: expected a sine within 0..1, got 'a'"),
+        (lambda: kt.nn.MLPLifter("coco17", dropout=None), "dropout: expected a share .*, got None"),
+    ],
+)
+def test_words_for_numbers_are_refused(make, told):
+    with pytest.raises(kt.OptionError, match=told):
+        make()

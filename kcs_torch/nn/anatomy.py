@@ -14,6 +14,7 @@ from kcs_torch.nn.energies import check_lengths
 from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
 from kcs_torch.nn.masks import known_points, some, weighs_joints
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.types.hints import is_a
 
 __all__ = ["AdductionEnergy", "HingeEnergy"]
 
@@ -150,8 +151,8 @@ class AdductionEnergy(_JointEnergy):
 
     def __init__(self, skeleton: str | Path | Skeleton, *, limit: float = 0.35) -> None:
         super().__init__(skeleton)
-        if not 0 <= limit <= 1:
-            raise OptionError(f"AdductionEnergy: limit: expected a sine within 0..1, got {limit}")
+        if not (is_a(limit, float) and 0 <= limit <= 1):
+            raise OptionError(f"AdductionEnergy: limit: expected a sine within 0..1, got {limit!r}")
         self.limit = limit
         where = _bone_places(self.skeleton)
         twins = {frozenset(pair) for pair in self.skeleton.mirror}

@@ -32,6 +32,7 @@ from kcs_torch.nn.layers import (
 from kcs_torch.nn.masks import bone_share, safe_root, some
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lm import fit_bones
+from kcs_torch.types.hints import is_a
 
 __all__ = ["BoneLengthEnergy", "LowRankEnergy", "ReprojectionEnergy", "SmoothnessEnergy", "SymmetryEnergy"]
 
@@ -123,8 +124,8 @@ class ReprojectionEnergy(nn.Module):
 
     def __init__(self, *, translation: bool = True, huber: float | None = None) -> None:
         super().__init__()
-        if huber is not None and not huber > 0:
-            raise OptionError(f"ReprojectionEnergy: expected a positive huber length or None, got {huber}")
+        if huber is not None and not (is_a(huber, float) and huber > 0):
+            raise OptionError(f"ReprojectionEnergy: expected a positive huber length or None, got {huber!r}")
         self.translation, self.huber = translation, huber
 
     def extra_repr(self) -> str:
@@ -199,9 +200,11 @@ class LowRankEnergy(nn.Module):
 
     def __init__(self, kind: str = "nuclear", *, eps: float = 1e-3) -> None:
         super().__init__()
-        if kind not in ("nuclear", "log_det") or not eps > 0:
+        if kind not in ("nuclear", "log_det") or not (is_a(eps, float) and eps > 0):
             shown = repr(kind) if isinstance(kind, str) else f"a {type(kind).__name__}"
-            raise OptionError(f"LowRankEnergy: expected kind 'nuclear' or 'log_det' and eps > 0, got {shown} and {eps}")
+            raise OptionError(
+                f"LowRankEnergy: expected kind 'nuclear' or 'log_det' and eps > 0, got {shown} and {eps!r}"
+            )
         self.kind, self.eps = kind, eps
 
     def extra_repr(self) -> str:

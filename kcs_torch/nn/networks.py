@@ -29,6 +29,7 @@ from kcs_torch.nn.layers import (
 )
 from kcs_torch.nn.normalise import NormalisedTracks, neighbours, normalise_tracks
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.types.hints import is_a
 
 __all__ = ["CameraHead", "MLPLifter", "TemporalLifter"]
 
@@ -69,8 +70,8 @@ class _Network(SkeletonModule):
         super().__init__(skeleton)
         kind = type(self).__name__
         check_whole(self, 1, width=width, window=window)
-        if not 0 <= dropout < 1:
-            raise OptionError(f"{kind}: dropout: expected a share within [0, 1), got {dropout:g}")
+        if not (is_a(dropout, float) and 0 <= dropout < 1):
+            raise OptionError(f"{kind}: dropout: expected a share within [0, 1), got {dropout!r}")
         if window % 2 == 0:
             raise OptionError(
                 f"{kind}: window: expected an odd number of frames, the middle one is lifted, got {window}"

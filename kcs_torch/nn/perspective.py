@@ -14,6 +14,7 @@ from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_clip, check_weights, huber_square
 from kcs_torch.nn.layers import check_tensor, full_precision, known, narrow, seen_weights, shown, wide
 from kcs_torch.nn.masks import safe_root, some
+from kcs_torch.types.hints import is_a
 from kcs_torch.types.intrinsics import Intrinsics
 
 __all__ = ["PerspectiveEnergy"]
@@ -46,10 +47,10 @@ class PerspectiveEnergy(nn.Module):
 
     def __init__(self, *, translation: bool = True, huber: float | None = None, nearest: float = 0.15) -> None:
         super().__init__()
-        if not nearest > 0 or (huber is not None and not huber > 0):
+        if not all(is_a(x, float) and x > 0 for x in (nearest, 1.0 if huber is None else huber)):
             raise OptionError(
                 "PerspectiveEnergy: expected a positive huber length or None, and a positive nearest depth, "
-                f"got {huber} and {nearest}"
+                f"got {huber!r} and {nearest!r}"
             )
         self.translation, self.huber, self.nearest = translation, huber, nearest
 

@@ -15,6 +15,7 @@ from kcs_torch.nn.energies import check_weights
 from kcs_torch.nn.layers import SkeletonModule, check_beside, full_precision, known, narrow, wide
 from kcs_torch.nn.masks import bone_share, safe_root, some
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.types.hints import is_a
 
 __all__ = ["ProcrusteanEnergy"]
 
@@ -43,10 +44,11 @@ class ProcrusteanEnergy(SkeletonModule):
         self, skeleton: str | Path | Skeleton, *, eps: float = 1e-3, order: int = 0, num_steps: int = 5
     ) -> None:
         super().__init__(skeleton)
-        if not eps > 0 or order not in (0, 1) or num_steps < 0:
+        numbers = is_a(eps, float) and is_a(num_steps, int)
+        if not numbers or not eps > 0 or order not in (0, 1) or num_steps < 0:
             raise OptionError(
                 "ProcrusteanEnergy: expected eps > 0, order 0 or 1 and num_steps >= 0, "
-                f"got {eps}, {order!r} and {num_steps}"
+                f"got {eps!r}, {order!r} and {num_steps!r}"
             )
         self.eps, self.order, self.num_steps = eps, order, num_steps
 
