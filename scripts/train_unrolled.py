@@ -24,7 +24,7 @@ from torch import Tensor
 
 import kcs_torch as kt
 from kcs_torch.functional import centre, orbit, project
-from kcs_torch.functional.chain import safe_norm
+from kcs_torch.functional.guarded import safe_norm
 from kcs_torch.nn.unrolled import Unrolled
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "cmu"

@@ -30,7 +30,7 @@ from kcs_torch.functional import (
     points_from_bones,
     pose_matrix,
 )
-from kcs_torch.functional.chain import safe_norm
+from kcs_torch.functional.guarded import safe_norm, safe_root
 
 BONES = BODY.bone_index()
 
@@ -139,6 +139,14 @@ def test_safe_norm_at_any_scale(one, two):
     scale = torch.tensor([10.0**one, 1.0, 10.0**two])
     assert_close(safe_norm(vectors * scale[:, None]), torch.tensor([5.0, 0.0, 3.0]) * scale)
     finite(safe_norm, vectors * scale[:, None])
+
+
+def test_safe_root_of_nothing_is_0_and_of_nan_nan():
+    squares = torch.tensor([-1e-12, 0.0, 0.25, 4.0, torch.nan], requires_grad=True)
+    root = safe_root(squares)
+    assert root[:4].tolist() == [0, 0, 0.5, 2] and root[4].isnan()
+    (grad,) = torch.autograd.grad(root[:4].sum(), squares)
+    assert grad[:4].tolist() == [0, 0, 1, 0.25]
 
 
 def test_kcs_matrix_is_free_of_rotation_reflection_and_translation():

@@ -27,7 +27,7 @@ from kcs_torch.nn import (
     StanceEnergy,
     SymmetryEnergy,
 )
-from kcs_torch.nn.masks import safe_root, weighs_joints
+from kcs_torch.nn.masks import weighs_joints
 from kcs_torch.skeleton import SKELETONS
 
 MAN = SKELETONS["h36m17"]
@@ -225,10 +225,3 @@ def test_weights_that_do_not_fit_are_refused():
         if not name.startswith("ContactEnergy"):
             with pytest.raises(ShapeError, match="weights"):
                 energy(WALK, torch.ones(FRAMES - 1, 17).double(), ALL)
-
-
-def test_root_of_a_weight():
-    weights = torch.tensor([0.0, 0.25, 4.0]).double().requires_grad_()
-    assert safe_root(weights).tolist() == [0, 0.5, 2]
-    (grad,) = torch.autograd.grad(safe_root(weights).sum(), weights)
-    assert grad.tolist() == [0, 1, 0.25]

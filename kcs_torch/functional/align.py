@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, unknown
-from kcs_torch.functional.chain import LOST, largest, unit_size
 from kcs_torch.functional.derivatives import applied, batch_first
+from kcs_torch.functional.guarded import LOST, largest, or_one, unit_size
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.shapes import check_core
 
@@ -53,7 +53,7 @@ def centre(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tenso
     else:
         check_core(weights, "centre: weights", points.shape[-2])
         total = weights.sum(-1)[..., None, None]
-        total = torch.where(total > 0, total, torch.ones_like(total))
+        total = or_one(total)
         mean = (points * weights[..., None]).sum(-2, keepdim=True) / total
     return points - mean, mean
 
@@ -152,7 +152,7 @@ def procrustes(
     rotation = nearest_rotation(left.mT @ target, reflect=reflect)
     size = (left * source).sum((-2, -1))
     overlap = ((left @ rotation) * target).sum((-2, -1))
-    return rotation, overlap / torch.where(size > 0, size, torch.ones_like(size))
+    return rotation, overlap / or_one(size)
 
 
 def similarity(
@@ -240,7 +240,7 @@ def superpose(
     heavy = unit * mass[..., None]
     size = whole(heavy * unit).sum((-2, -1))
     overlap = whole(heavy * target).sum((-2, -1))
-    factor = (overlap / torch.where(size > 0, size, torch.ones_like(size))).clamp_min(0)
+    factor = (overlap / or_one(size)).clamp_min(0)
     return unit * factor[..., None, None] + mean
 
 

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.chain import index_rows, safe_norm, unit_size
+from kcs_torch.functional.chain import index_rows
+from kcs_torch.functional.guarded import safe_norm, unit_size
 from kcs_torch.functional.shapes import check_core
 
 __all__ = ["angle_between", "flexion", "joint_angles"]

@@ -11,6 +11,7 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.angles import angle_between
 from kcs_torch.functional.eigen import eigh
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rotation import rotation_angle
@@ -90,7 +91,7 @@ def pinhole_translation(points: Tensor, rays: Tensor, weights: Tensor) -> Tensor
     check_core(weights, "pinhole_translation: weights", points.shape[-2])
     share = weights[..., None]
     total = share.sum(-2, keepdim=True)
-    total = torch.where(total > 0, total, torch.ones_like(total))
+    total = or_one(total)
     mean = lambda values: (share * values).sum(-2, keepdim=True) / total  # noqa: E731
     off = points[..., :2] - rays * points[..., 2:]  # + t_xy - ray t_z is to vanish
     middle, rest = mean(rays), mean(off)
@@ -101,7 +102,7 @@ def pinhole_translation(points: Tensor, rays: Tensor, weights: Tensor) -> Tensor
     heart = mean(points)
     with torch.no_grad():
         size = mean((points - heart).square()).sum(-1, keepdim=True).sqrt()
-    depth = torch.where(firm, found, 10 * torch.where(size > 0, size, torch.ones_like(size)) - heart[..., 2:])
+    depth = torch.where(firm, found, 10 * or_one(size) - heart[..., 2:])
     return torch.cat([middle * depth - rest, depth], -1).squeeze(-2)
 
 
@@ -198,7 +199,7 @@ def rows_to_cameras(rows: Tensor) -> tuple[Tensor, Tensor]:
     dtype, rows = rows.dtype, wide(rows)
     with torch.no_grad():
         size = rows.abs().amax((-2, -1), keepdim=True)
-        size = torch.where(size > 0, size, torch.ones_like(size))
+        size = or_one(size)
     a, b = (rows / size).unbind(-2)
     normal = torch.linalg.cross(a, b)
     with torch.no_grad():

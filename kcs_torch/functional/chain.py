@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional.guarded import or_one, safe_norm, unit_size
 from kcs_torch.functional.shapes import check_core
 
 __all__ = [
@@ -19,9 +20,6 @@ __all__ = [
     "points_from_bones",
     "pose_matrix",
 ]
-
-LOST = 16.0
-"""Distances and sizes below this, in rounding errors of the points, are none."""
 
 
 def incidence(bones: Tensor | Sequence[Sequence[int]], num_joints: int, *, dtype: torch.dtype | None = None) -> Tensor:
@@ -182,51 +180,8 @@ def pose_matrix(
         size = square.mean(-1)
     else:
         total = weights.sum(-1)
-        size = (weights * square).sum(-1) / torch.where(total > 0, total, torch.ones_like(total))
-    return matrix / torch.where(size > 0, size, torch.ones_like(size))[..., None, None]
-
-
-def unit_size(values: Tensor, dimensions: int, counts: Tensor | None = None, lost: Tensor | None = None) -> Tensor:
-    """Divide by the :func:`largest` magnitude over the last so many dimensions.
-
-    For what does not depend on scale: squares of the result neither under- nor overflow, nor do their inverses. What is
-    smaller than any unit would have it, or no larger than what is ``lost`` to rounding, counts as 0, so that its
-    derivative is bounded; NaN stays NaN.
-    """
-    top, least = largest(values, dimensions, counts), torch.finfo(values.dtype).tiny ** 0.25
-    tiny = top <= (least if lost is None else lost.clamp_min(least))
-    return torch.where(tiny, torch.zeros_like(values), values / torch.where(tiny, torch.ones_like(top), top))
-
-
-def largest(values: Tensor, dimensions: int, counts: Tensor | None = None) -> Tensor:
-    """The largest magnitude over the last so many dimensions, which are kept; a constant for autograd.
-
-    It is sought where ``counts``, which broadcasts against the values, is True; 0 where there is nothing.
-    """
-    over, size = tuple(range(-dimensions, 0)), values.detach().abs()
-    if counts is not None:
-        size = torch.where(counts, size, torch.zeros_like(size))
-    return size.amax(over, keepdim=True) if size.numel() else size.sum(over, keepdim=True)
-
-
-def safe_norm(vectors: Tensor) -> Tensor:
-    """Euclidean norm over the last dimension, with gradient 0 where it is 0.
-
-    Scaled by the largest component first, so that no square under- or overflows.
-    """
-    top = vectors.detach().abs().amax(-1, keepdim=True)
-    scale = torch.where(top > 0, top, torch.ones_like(top))
-    unit = vectors / scale
-    square = unit.square().sum(-1)
-    zero = top.squeeze(-1) == 0
-    root = torch.where(zero, torch.ones_like(square), square).sqrt()
-    return torch.where(zero, torch.zeros_like(square), root * scale.squeeze(-1))
-
-
-def safe_root(squares: Tensor) -> Tensor:
-    """Square roots, with derivative 0 where a square is 0; NaN stays."""
-    zero = squares == 0
-    return torch.where(zero, 0, torch.where(zero, 1, squares).sqrt())
+        size = (weights * square).sum(-1) / or_one(total)
+    return matrix / or_one(size)[..., None, None]
 
 
 def index_rows(

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kcs_torch.errors import NotFiniteError, ShapeError
 from kcs_torch.functional.eigen import eigh
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.precision import full_precision
 
 __all__ = ["LargestSum", "PSDShrink", "ShrinkSingularValues", "applied", "batch_first", "why_failed"]
@@ -127,7 +128,7 @@ class _ShrinkAdjoint(_Once):
         p = left.mT @ gv  # (..., n, n)
         share = ratio(s, level, k)
         total = s[..., :, None] + s[..., None, :]
-        odd = (f[..., :, None] + f[..., None, :]) / torch.where(total > 0, total, torch.ones_like(total))
+        odd = (f[..., :, None] + f[..., None, :]) / or_one(total)
         odd = torch.where(total > 0, odd, torch.maximum(share[..., :, None], share[..., None, :]))
         inner = divided(s, level, k) * (p + p.mT) / 2 + odd * (p - p.mT) / 2
         out = (left @ inner + (gv - left @ p) * share[..., None, :]) @ right.mT

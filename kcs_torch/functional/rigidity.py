@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.functional.chain import safe_root
+from kcs_torch.functional.guarded import or_one, safe_root
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.shapes import check_core
 
@@ -38,7 +38,7 @@ def distance_spread(points: Tensor, weights: Tensor | None = None) -> tuple[Tens
     check_core(weights, "distance_spread: weights", *points.shape[-3:-1])
     share = torch.minimum(weights[..., :, None], weights[..., None, :])
     total = share.sum(-3)
-    total = torch.where(total > 0, total, torch.ones_like(total))
+    total = or_one(total)
     mean = (share * distance).sum(-3) / total
     return mean, safe_root((share * (distance - mean[..., None, :, :]).square()).sum(-3) / total)
 

@@ -24,6 +24,7 @@ from kcs_torch.errors import (
     unknown,
     users_level,
 )
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.finish import HEADSTAND, WEAK_TURN, WHY_LOOSE, Estimate, finish, rms, what_is_wrong
 from kcs_torch.skeleton import Skeleton
@@ -161,7 +162,7 @@ class Method(ABC):
             filled = interpolate(filled, seen)[:, seen.any(0)]
         middle = filled.mean(1, keepdim=True) if filled.numel() else tracks.points[:, :1] * 0
         size = rms((tracks.points - middle) * tracks.seen[..., None], tracks.weights)
-        size = torch.where(size > 0, size, torch.ones_like(size))
+        size = or_one(size)
         if not self.centred:
             middle = middle.mean(0)
         centred = (tracks.points - middle) * tracks.seen[..., None]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.camera import complete_rotation, factorize, rows_to_cameras
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.solvers.ist import ist, metric_upgrade
 
 __all__ = ["orthographic_cameras"]
@@ -59,7 +60,7 @@ def orthographic_cameras(
     motion, _ = factorize(tracks - tracks.mean(-2, keepdim=True), 3 * ranks[-1])
     count = motion.new_full((windows,), frames) if counts is None else counts.to(motion)
     size = (motion[..., 0].square().sum((-2, -1)) / (2 * count)).sqrt()
-    motion = motion / torch.where(size > 0, size, torch.ones_like(size))[..., None, None, None]
+    motion = motion / or_one(size)[..., None, None, None]
     # Eigenvectors come with either sign: fix it, so that starts, and the mirror found, depend on no order of joints.
     flat = motion.flatten(-3, -2)
     peak = flat.gather(-2, flat.abs().argmax(-2, keepdim=True))[..., None, :]

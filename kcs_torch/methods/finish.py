@@ -13,6 +13,7 @@ from kcs_torch.errors import counted
 from kcs_torch.functional.align import centre
 from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.root import root_depth
@@ -314,6 +315,6 @@ def rms(vectors: Tensor, weights: Tensor) -> Tensor:
     """Weighted root mean square length of (..., D) vectors, scaled first, so that no square overflows."""
     vectors = torch.where(weights[..., None] > 0, vectors, torch.zeros_like(vectors))
     top = vectors.abs().amax()
-    top = torch.where(top > 0, top, torch.ones_like(top))
+    top = or_one(top)
     square = (vectors / top).square().sum(-1) * weights
     return top * (square.sum() / weights.sum()).sqrt()

@@ -15,6 +15,7 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import centre, nearest_rotation
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.chain import bone_lengths, chain_inverse, incidence
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.clips import Clips, in_batches, padded
@@ -226,7 +227,7 @@ class KCS(Method):
         With them come whether each clip settled at the last weight, and its steps: at a weight a clip that has settled
         rests, so that what is beside it in the batch makes no difference.
         """
-        image = clips.points / torch.where(scales > 0, scales, torch.ones_like(scales))[..., None, None]
+        image = clips.points / or_one(scales)[..., None, None]
         given = (deviation_goal(rest, image, cameras, clips.weights), cameras, clips.weights)
         top = deviation_scale(*given, matrix=matrix, arrangement=self.arrangement)
         state, made = start, torch.zeros(len(start), dtype=torch.long, device=start.device)

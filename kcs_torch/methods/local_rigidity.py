@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import back_project, complete_rotation, factorize, project, rows_to_cameras
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rigidity import distance_spread
 from kcs_torch.methods.factorised import SETTLED, Factorised
@@ -188,7 +189,7 @@ def rigid_pairs(points: Tensor, most: int, below: float) -> tuple[Tensor, Tensor
     mean, spread = distance_spread(points)
     row, column = torch.triu_indices(joints, joints, 1, device=points.device)
     size = mean[row, column]
-    ratio = spread[row, column] / torch.where(size > 0, size, torch.ones_like(size))
+    ratio = spread[row, column] / or_one(size)
     ratio = torch.where(size > 1e-6 * size.amax() if size.numel() else size > 0, ratio, math.inf)
     order = ratio.argsort(stable=True)[:most]
     order = order[ratio[order] < below]

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.clips import Clips, in_batches, padded
 from kcs_torch.skeleton import Skeleton
@@ -166,7 +167,7 @@ def _regress(value: Tensor, weight: Tensor, waves: Tensor, steps: int = 40) -> t
         off, slope, spread = stray()
         pull = weight * slope / off.abs().clamp_min(1e-3) / spread[:, None]
         each = pull.sum(1)
-        each = torch.where(each > 0, each, 1)  # of pairs that are never seen
+        each = or_one(each)  # of pairs that are never seen
         # the levels eliminated: each pair's waves and values less their weighted means
         level = (pull * value).sum(1) / each
         if len(ridge):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.pinhole import NEAREST
 from kcs_torch.methods.size import slow_waves, weak_perspective
@@ -84,7 +85,7 @@ def _onto(rays: Tensor) -> Tensor:
 def _line_of_sight(rays: Tensor, weights: Tensor, rate: float) -> Tensor:
     """Rotations (T, 3, 3) from the camera's frame to one that looks at the body, turning slowly."""
     count = weights.sum(-1, keepdim=True)
-    middle = (rays * weights[..., None]).sum(-2) / torch.where(count > 0, count, torch.ones_like(count))
+    middle = (rays * weights[..., None]).sum(-2) / or_one(count)
     middle = interpolate(middle[:, None], count > 0)[:, 0]
     smooth = slow_part(middle, rate, most=60)
     if not bool((count > 0).any()):

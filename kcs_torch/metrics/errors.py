@@ -10,7 +10,8 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import bone_lengths, centre, nearest_rotation
-from kcs_torch.functional.chain import index_rows, safe_root
+from kcs_torch.functional.chain import index_rows
+from kcs_torch.functional.guarded import or_one, safe_root
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.shapes import check_core
@@ -110,7 +111,7 @@ def e3d(pred: Tensor, truth: Tensor, *, weights: Tensor | None = None) -> Tensor
         turn = nearest_rotation(left.mT @ target.flatten(-3, -2), reflect=True)
         distance = (source @ turn[..., None, :, :] - target).norm(dim=-1)
     count = mass.sum(-1, keepdim=True)
-    count = torch.where(count > 0, count, torch.ones_like(count))
+    count = or_one(count)
     spread = safe_root((target.square() * mass[..., None]).sum(-2) / count)  # (..., T, 3)
     some = (mass.sum(-1) > 0).to(mass)
     return _mean(distance, weights) / ((spread.mean(-1) * some).sum(-1) / some.sum(-1))

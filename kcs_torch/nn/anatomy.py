@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.nn.energies import check_lengths
 from kcs_torch.nn.layers import SkeletonModule, known, narrow, wide
-from kcs_torch.nn.masks import known_points, some, weighs_joints
+from kcs_torch.nn.masks import known_points, weighs_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.hints import is_a
 
@@ -197,8 +198,8 @@ def _to_size(vectors: Tensor, weights: Tensor | None) -> Tensor:
         square = square.mean(-3, keepdim=True)
     else:
         share = weights.to(square)[..., None]
-        square = (share * square).sum(-3, keepdim=True) / some(share.sum(-3, keepdim=True))
-    return _divide(vectors, torch.where(square > 0, square, torch.ones_like(square)).sqrt())
+        square = (share * square).sum(-3, keepdim=True) / or_one(share.sum(-3, keepdim=True))
+    return _divide(vectors, or_one(square).sqrt())
 
 
 def _divide(vectors: Tensor, lengths: Tensor) -> Tensor:

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError, unknown
-from kcs_torch.functional.chain import pose_matrix, safe_norm
+from kcs_torch.functional.chain import pose_matrix
+from kcs_torch.functional.guarded import or_one, safe_norm
 from kcs_torch.nn.distances import check_pose_weights
 from kcs_torch.nn.layers import SkeletonModule, full_precision, known, wide
-from kcs_torch.nn.masks import bone_share, some
+from kcs_torch.nn.masks import bone_share
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.graph import find_parts
 
@@ -120,7 +121,7 @@ class KCSCritic(SkeletonModule):
             return each.mean(-1) if self.combined else each
         there = self._there(weights, each)
         each = each * there
-        return each.sum(-1) / some(there.sum(-1)) if self.combined else each
+        return each.sum(-1) / or_one(there.sum(-1)) if self.combined else each
 
     def gradient_penalty(
         self, real: Tensor, fake: Tensor, weights: Tensor | None = None, *, generator: torch.Generator | None = None
@@ -161,7 +162,7 @@ class KCSCritic(SkeletonModule):
         if weights is None:
             return excess.mean(-1)
         there = self._there(weights, excess)
-        return (excess * there).sum(-1) / some(there.sum(-1))
+        return (excess * there).sum(-1) / or_one(there.sum(-1))
 
     def _there(self, weights: Tensor, like: Tensor) -> Tensor:
         """1 where a bone of a part is seen, (..., P)."""

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from kcs_torch.functional.camera import project
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.spectral import spectral_norm, svt
-from kcs_torch.nn.masks import some
 
 __all__ = ["Arrangement", "deviation_goal", "deviation_scale", "deviation_step", "frame_scales", "template_scale"]
 
@@ -94,7 +94,7 @@ def frame_scales(rest: Tensor, tracks: Tensor, cameras: Tensor, weights: Tensor,
     flat = project(rest, cameras)
     match = (flat * tracks * weights[..., None]).sum((-2, -1))
     size = (flat.square() * weights[..., None]).sum((-2, -1))
-    free = match / torch.where(size > 0, size, torch.ones_like(size))
+    free = match / or_one(size)
     return torch.minimum(torch.maximum(free, low), high)
 
 
@@ -125,7 +125,7 @@ def template_scale(
         return fallback[..., None].expand(*fallback.shape, frames)
     length = bone_lengths(rest, bones)
     seen = (weights[..., bones[:, 0]] > 0) & (weights[..., bones[:, 1]] > 0) & (length > 0)
-    ratio = bone_vectors(tracks, bones).norm(dim=-1) / torch.where(length > 0, length, torch.ones_like(length))
+    ratio = bone_vectors(tracks, bones).norm(dim=-1) / or_one(length)
     ratio = torch.where(seen, ratio, torch.nan)
     count = max(1, round(frames / span))
     edges = [round(i * frames / count) for i in range(count + 1)]
@@ -156,7 +156,7 @@ def _quantile_of_known(values: Tensor, quantile: float) -> Tensor:
 
 def _centred(rows: Tensor, share: Tensor) -> Tensor:
     """Rows (..., 2, N) minus their weighted mean over joints: the translation at its optimum."""
-    return rows - (rows * share).sum(-1, keepdim=True) / some(share.sum(-1, keepdim=True))
+    return rows - (rows * share).sum(-1, keepdim=True) / or_one(share.sum(-1, keepdim=True))
 
 
 def _fold(deviation: Tensor, arrangement: Arrangement) -> Tensor:

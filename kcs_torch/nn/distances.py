@@ -9,11 +9,12 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.align import check_alignment, superpose
-from kcs_torch.functional.chain import pose_matrix, safe_norm
+from kcs_torch.functional.chain import pose_matrix
+from kcs_torch.functional.guarded import or_one, safe_norm
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_clip, check_weights
 from kcs_torch.nn.layers import SkeletonModule, check_tensor, full_precision, known, narrow, seen_weights, shown, wide
-from kcs_torch.nn.masks import bone_share, some
+from kcs_torch.nn.masks import bone_share
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["JointDistance", "KCSDistance"]
@@ -78,7 +79,7 @@ class JointDistance(nn.Module):
             distance = safe_norm(superpose(source, goal, self.align, share, root=self.root) - goal)
             if self.root is not None and self.align in ("root", "scale"):
                 share = share * (share[..., self.root, None] > 0)
-            return narrow((share * distance).sum(-1) / some(share.sum(-1)), points)
+            return narrow((share * distance).sum(-1) / or_one(share.sum(-1)), points)
 
 
 class KCSDistance(SkeletonModule):

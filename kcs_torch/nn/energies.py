@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.guarded import or_one, safe_root
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.spectral import log_det, nuclear_norm, svt
 from kcs_torch.nn.layers import (
@@ -29,7 +30,7 @@ from kcs_torch.nn.layers import (
     shown,
     wide,
 )
-from kcs_torch.nn.masks import bone_share, safe_root, some
+from kcs_torch.nn.masks import bone_share
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.types.hints import is_a
@@ -80,7 +81,7 @@ class BoneLengthEnergy(SkeletonModule):
         if weights is not None:
             share = share * bone_share(weights, self.bones)
         if lengths is None:
-            lengths = (size * share).sum(-2, keepdim=True) / some(share.sum(-2, keepdim=True))
+            lengths = (size * share).sum(-2, keepdim=True) / or_one(share.sum(-2, keepdim=True))
         else:
             lengths = lengths[..., None, :]
         return narrow(0.5 * (share * (size - lengths).square()).sum(-1), points)
@@ -246,12 +247,12 @@ class LowRankEnergy(nn.Module):
         else:
             share = share.to(matrix.dtype)
             frames, count = share.amax(-1).sum(-1), share.sum(-2, keepdim=True)
-            mean = (share * matrix).sum(-2, keepdim=True) / some(count)
-            centred = safe_root(share / some(count)) * (matrix - mean)
+            mean = (share * matrix).sum(-2, keepdim=True) / or_one(count)
+            centred = safe_root(share / or_one(count)) * (matrix - mean)
             covariance = centred.mT @ centred
             gone = (count <= 0).to(matrix.dtype).squeeze(-2)
-            variance = covariance.diagonal(dim1=-2, dim2=-1).sum(-1) / some((1 - gone).sum(-1))
-        level = self.eps * torch.where(variance > 0, variance, torch.ones_like(variance))
+            variance = covariance.diagonal(dim1=-2, dim2=-1).sum(-1) / or_one((1 - gone).sum(-1))
+        level = self.eps * or_one(variance)
         return frames / 2 * log_det(covariance + torch.diag_embed(gone * (1 - level[..., None])), level)
 
     def prox(self, points: Tensor, threshold: Tensor | float) -> Tensor:
@@ -372,4 +373,4 @@ def centred_residual(seen: Tensor, tracks: Tensor, weights: Tensor | None) -> Te
         return difference - difference.mean(-2, keepdim=True)
     share = weights[..., None]
     total = share.sum(-2, keepdim=True)
-    return difference - (difference * share).sum(-2, keepdim=True) / some(total)
+    return difference - (difference * share).sum(-2, keepdim=True) / or_one(total)

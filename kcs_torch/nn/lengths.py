@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.guarded import or_one, safe_root
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_lengths, check_weights
 from kcs_torch.nn.layers import (
@@ -22,7 +23,7 @@ from kcs_torch.nn.layers import (
     narrow,
     wide,
 )
-from kcs_torch.nn.masks import bone_share, safe_root, some
+from kcs_torch.nn.masks import bone_share
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["LEAST", "ForeshorteningEnergy", "ProportionEnergy", "foreshortening", "free_bones", "oddity", "usual_size"]
@@ -168,7 +169,7 @@ class ProportionEnergy(SkeletonModule):
         if weights is None:
             off = log - log.mean(-1, keepdim=True)
             return self._unusual(off).sum(-1) + apart.sum(-1) / 2
-        off = log - (weights * log).sum(-1, keepdim=True) / some(weights.sum(-1, keepdim=True))
+        off = log - (weights * log).sum(-1, keepdim=True) / or_one(weights.sum(-1, keepdim=True))
         both = torch.minimum(weights[..., self.pairs[:, 0]], weights[..., self.pairs[:, 1]])
         return (weights * self._unusual(off)).sum(-1) + (both * apart).sum(-1) / 2
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.nn.energies import centred_residual
 
 __all__ = ["majorise_step", "turn_onto_mean", "viewpoint_energy"]
@@ -100,7 +101,7 @@ def majorise_step(
     off = centred_residual(project(points, cameras), tracks, weights).square().sum(-1)
     share = weights / (noise**2 * (1 + off / (REACH * noise) ** 2))
     total = weights.sum(-1, keepdim=True)
-    part = weights / torch.where(total > 0, total, torch.ones_like(total))
+    part = weights / or_one(total)
     about = torch.eye(joints, dtype=points.dtype, device=points.device) - part[..., None, :]  # less the weighted mean
     held = about.mT @ (share[..., None] * about)
     seen = back_project(held @ tracks, cameras)

@@ -9,7 +9,7 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.layers import check_tensor, known, known_frames
 
-__all__ = ["bone_share", "known_points", "safe_root", "some", "weighs_joints"]
+__all__ = ["bone_share", "known_points", "weighs_joints"]
 
 
 def weighs_joints(weights: Tensor, points: Tensor, module: nn.Module) -> bool:
@@ -43,14 +43,3 @@ def known_points(points: Tensor, weights: Tensor | None, module: nn.Module) -> T
 def bone_share(weights: Tensor, bones: Tensor) -> Tensor:
     """Weights of the bones (..., B): each weighs as much as the lesser of its two ends (..., N)."""
     return torch.minimum(weights[..., bones[:, 0]], weights[..., bones[:, 1]])
-
-
-def safe_root(weights: Tensor) -> Tensor:
-    """Square roots, with derivative 0 where a weight is 0."""
-    some = weights > 0
-    return torch.where(some, torch.where(some, weights, torch.ones_like(weights)).sqrt(), torch.zeros_like(weights))
-
-
-def some(total: Tensor) -> Tensor:
-    """A total to divide by: 1 where nothing counts."""
-    return torch.where(total > 0, total, torch.ones_like(total))

@@ -8,10 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.chain import largest
+from kcs_torch.functional.guarded import largest, or_one, safe_root
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.nn.layers import seen_weights, wide
-from kcs_torch.nn.masks import safe_root, some
 
 __all__ = ["NormalisedTracks", "neighbours", "normalise_tracks"]
 
@@ -38,7 +37,7 @@ def normalise_tracks(tracks: Tensor, weights: Tensor | None, scale: Tensor | Non
     tracks = wide(tracks)
     mask = seen.to(tracks.dtype)
     tracks = torch.where(seen[..., None], tracks, torch.zeros_like(tracks))
-    top = some(largest(tracks, 3))  # divided out first, so that neither sums nor squares overflow
+    top = or_one(largest(tracks, 3))  # divided out first, so that neither sums nor squares overflow
     tracks = tracks / top
     count = mask.sum(-1)[..., None, None]  # (..., T, 1, 1)
     middle = tracks.sum(-2, keepdim=True) / count.clamp_min(1)
@@ -46,9 +45,9 @@ def normalise_tracks(tracks: Tensor, weights: Tensor | None, scale: Tensor | Non
     local = (tracks - middle) * mask[..., None]
     if scale is None:
         size = safe_root(local.square().sum((-3, -2, -1), keepdim=True) / count.sum(-3, keepdim=True).clamp_min(1))
-        return NormalisedTracks(local / some(size), mask, middle * top, size * top)
+        return NormalisedTracks(local / or_one(size), mask, middle * top, size * top)
     scale = wide(scale)
-    return NormalisedTracks(local / some(scale / top), mask, middle * top, scale)
+    return NormalisedTracks(local / or_one(scale / top), mask, middle * top, scale)
 
 
 def neighbours(frames: Tensor, steps: Sequence[int]) -> Tensor:

@@ -9,11 +9,10 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import perspective, pinhole_translation
-from kcs_torch.functional.chain import LOST
+from kcs_torch.functional.guarded import LOST, or_one, safe_root
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_clip, check_weights, huber_square
 from kcs_torch.nn.layers import check_tensor, full_precision, known, narrow, seen_weights, shown, wide
-from kcs_torch.nn.masks import safe_root, some
 from kcs_torch.types.hints import is_a
 from kcs_torch.types.intrinsics import Intrinsics
 
@@ -120,7 +119,7 @@ def _reach(points: Tensor, share: Tensor, rounding: Tensor) -> Tensor:
     Were the distance behind the camera to count like that before it, what lies behind would cost the same however far:
     nothing would push it ahead.
     """
-    total = some(share.sum(-1, keepdim=True))[..., None]
+    total = or_one(share.sum(-1, keepdim=True))[..., None]
     middle = (share[..., None] * points).sum(-2, keepdim=True) / total
     size = safe_root((share[..., None] * (points - middle).square() / total).sum((-2, -1)))
     far = middle[..., 0, 2]

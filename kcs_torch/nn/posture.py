@@ -10,10 +10,11 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.guarded import or_one, safe_root
 from kcs_torch.nn.energies import check_lengths
 from kcs_torch.nn.layers import SkeletonModule, check_beside, check_positive, full_precision, narrow, wide
 from kcs_torch.nn.lengths import LEAST, usual_size
-from kcs_torch.nn.masks import bone_share, known_points, safe_root, some, weighs_joints
+from kcs_torch.nn.masks import bone_share, known_points, weighs_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.graph import find_pieces
 
@@ -196,13 +197,13 @@ class PostureEnergy(SkeletonModule):
                 firm = torch.minimum(bone_share(weights, self.bones), weights[..., self.trunk].amin(-1, keepdim=True))
                 share = firm.to(local).repeat_interleave(3, -1) / self.correlation  # (..., T, 3B)
                 count, own = share.amax(-1).sum(-1), share.sum(-2, keepdim=True)
-                mean = (share * y).sum(-2, keepdim=True) / some(own)
+                mean = (share * y).sum(-2, keepdim=True) / or_one(own)
                 off = safe_root(share) * (y - mean)
                 mean = mean * safe_root(own * self.kappa / (own + self.kappa))
             else:
                 share = weights.to(local)[..., None] / (self.correlation if independent is None else 1)
                 count = share.sum((-2, -1))
-                mean = (share * y).sum(-2, keepdim=True) / torch.where(count > 0, count, 1)[..., None, None]
+                mean = (share * y).sum(-2, keepdim=True) / or_one(count)[..., None, None]
                 off, each = y - mean, share[..., None, :, :]
                 pull = (count * self.kappa / (count + self.kappa))[..., None, None, None]
             off, mean = (self.taken_apart(rows) for rows in (off, mean))  # (..., S, T or 1, K)

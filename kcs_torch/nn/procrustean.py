@@ -10,10 +10,11 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.guarded import or_one, safe_root
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.nn.energies import check_weights
 from kcs_torch.nn.layers import SkeletonModule, check_beside, full_precision, known, narrow, wide
-from kcs_torch.nn.masks import bone_share, safe_root, some
+from kcs_torch.nn.masks import bone_share
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.hints import is_a
 
@@ -88,19 +89,19 @@ class ProcrusteanEnergy(SkeletonModule):
         """Scaled deviations or changes (..., T, 3B) of aligned bones, and the share of the rows that counts."""
         if share is None:
             size = aligned.square().mean((-2, -1), keepdim=True)
-            aligned = aligned / some(size).sqrt()
+            aligned = aligned / or_one(size).sqrt()
             return (aligned.diff(dim=-2) if self.order else aligned - aligned.mean(-2, keepdim=True)), 1.0
         share = share.expand(*share.shape[:-1], 3).flatten(-2)  # (..., T, 3B)
-        size = (share * aligned.square()).sum((-2, -1), keepdim=True) / some(share.sum((-2, -1), keepdim=True))
-        aligned = aligned / some(size).sqrt()
+        size = (share * aligned.square()).sum((-2, -1), keepdim=True) / or_one(share.sum((-2, -1), keepdim=True))
+        aligned = aligned / or_one(size).sqrt()
         if self.order:
             rows, share = aligned.diff(dim=-2), torch.minimum(share[..., 1:, :], share[..., :-1, :])
             count = share.sum(-2, keepdim=True)
         else:
             count = share.sum(-2, keepdim=True)
-            rows = aligned - (share * aligned).sum(-2, keepdim=True) / some(count)
+            rows = aligned - (share * aligned).sum(-2, keepdim=True) / or_one(count)
         frames = max(rows.shape[-2], 1)
-        return rows * safe_root(share * frames / some(count)), share.amax(-1).sum(-1) / frames
+        return rows * safe_root(share * frames / or_one(count)), share.amax(-1).sum(-1) / frames
 
 
 def _align(vectors: Tensor, num_steps: int, share: Tensor | None = None) -> Tensor:
@@ -117,7 +118,7 @@ def _align(vectors: Tensor, num_steps: int, share: Tensor | None = None) -> Tens
         shown = (
             share.sum((-2, -1)).argmax(-1)[..., None, None, None].expand(*vectors.shape[:-3], 1, *vectors.shape[-2:])
         )
-        mean, heavy, count = vectors.gather(-3, shown), share * vectors, some(share.sum(-3, keepdim=True))
+        mean, heavy, count = vectors.gather(-3, shown), share * vectors, or_one(share.sum(-3, keepdim=True))
     for _ in range(num_steps):
         rotations = nearest_rotation(heavy.mT @ mean)
         turned = heavy @ rotations

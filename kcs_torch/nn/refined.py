@@ -9,9 +9,8 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import SkeletonError
 from kcs_torch.functional import centre
-from kcs_torch.functional.chain import largest
+from kcs_torch.functional.guarded import largest, or_one
 from kcs_torch.nn.layers import narrow, seen_weights, wide
-from kcs_torch.nn.masks import some
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["RefinedLifter"]
@@ -58,11 +57,11 @@ class RefinedLifter(nn.Module):
             ShapeError: the tracks are not of the network's skeleton.
         """
         points = wide(self.network(tracks, weights))
-        top = some(largest(points, 3))  # divided out first, so that neither sums nor squares overflow
+        top = or_one(largest(points, 3))  # divided out first, so that neither sums nor squares overflow
         points, middle = centre(points / top)
         weights = seen_weights(tracks, weights)
         image = torch.where(weights[..., None] > 0, wide(tracks) / top, points[..., :2] + middle[..., :2])
-        size = some(points[..., :2].square().mean((-3, -2, -1), keepdim=True).sqrt().detach())
+        size = or_one(points[..., :2].square().mean((-3, -2, -1), keepdim=True).sqrt().detach())
         cameras = torch.eye(3, dtype=image.dtype, device=image.device)[:2].expand(*image.shape[:-2], 2, 3)
         refined: Tensor = self.solver((image - middle[..., :2]) / size, cameras, weights=weights, start=points / size)
         return narrow((refined * size + middle) * top, tracks)

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.nn.layers import SkeletonModule, check_beside, check_positive, full_precision, narrow, wide
 from kcs_torch.nn.lengths import usual_size
-from kcs_torch.nn.masks import bone_share, known_points, some, weighs_joints
+from kcs_torch.nn.masks import bone_share, known_points, weighs_joints
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.skeleton import Skeleton
 
@@ -89,7 +90,7 @@ class StanceEnergy(SkeletonModule):
             mean = each.mean(-1) if each.shape[-1] else each.sum(-1)
         else:
             share = self._share(points, weights).to(each).clamp_min(0)
-            mean = (share * each).sum(-1) / some(share.sum(-1))
+            mean = (share * each).sum(-1) / or_one(share.sum(-1))
         return narrow(torch.log1p(mean / self.sway**2) / 2, points)
 
     def strayed(self, points: Tensor, size: Tensor | float | None = None, weights: Tensor | None = None) -> Tensor:
@@ -114,7 +115,7 @@ class StanceEnergy(SkeletonModule):
                 square = vectors.square().sum(-1)
                 known = square.new_ones(square.shape[-1]) if share is None else (share > 0).any(-2).to(square)
                 size = (known * usual_size(square, share)).sum(-1)
-                size = size / some((known * self.posture.rest_lengths.to(square)).sum(-1))
+                size = size / or_one((known * self.posture.rest_lengths.to(square)).sum(-1))
             size = torch.where(size > 0, size, torch.inf).to(vectors)[..., None, None]
             way = (self.line.to(vectors) @ vectors)[..., None, :] @ self.posture.frame(points)  # (..., T, 1, 3)
             off = way[..., 0, ::2] / size - self.usual.to(vectors)

@@ -10,6 +10,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median, nanmedian
 from kcs_torch.functional.spectral import spectral_norm, svt
 from kcs_torch.functional.temporal import interpolate
@@ -93,9 +94,9 @@ def estimate_lengths(
             off = off.mean(-2)
         else:
             off = (off * inside[..., None]).sum(-2) / inside.sum(-1, keepdim=True)
-        variation = off / torch.where(whole > 0, whole, torch.ones_like(whole))
+        variation = off / or_one(whole)
         steady = variation.quantile(0.25, -1, keepdim=True)
-        ratio = variation / torch.where(steady > 0, steady, torch.ones_like(steady))
+        ratio = variation / or_one(steady)
         return lengths, 1 / (1 + ratio.square()).square()
 
 

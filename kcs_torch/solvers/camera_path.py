@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError, unknown
 from kcs_torch.functional.align import nearest_rotation
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median, nanmedian
 from kcs_torch.functional.rotation import rotation_angle, rotation_matrix, rotation_vector
 from kcs_torch.functional.scatter import scatter_log_det
@@ -245,7 +246,7 @@ def _sum_unturned(rotations: Tensor, factors: Tensor, time: Tensor, turn: Tensor
     of some frames at a time.
     """
     size = turn.norm(dim=-1)[:, None]
-    axis = turn / torch.where(size > 0, size, torch.ones_like(size))
+    axis = turn / or_one(size)
     x, y, z = axis.unbind(-1)
     zero = torch.zeros_like(x)
     hat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 1, 3, 3)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.chain import bone_vectors, incidence, safe_norm
+from kcs_torch.functional.chain import bone_vectors, incidence
+from kcs_torch.functional.guarded import safe_norm
 from kcs_torch.functional.scatter import inverse_scatter
 
 __all__ = ["Curvature", "Levels", "block_roots", "frame_curvature", "shown", "whitening"]

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ConvergenceWarning, OptionError
+from kcs_torch.functional.guarded import or_one
 
 __all__ = ["Implicit", "fixed_point", "gmres"]
 
@@ -138,12 +139,12 @@ def gmres(
     flat = torch.where(lost, torch.zeros_like(flat), flat)
     # Divided by its largest number first: the square of a far cotangent would leave the range.
     top = flat.abs().amax(-1, keepdim=True)
-    flat = flat / torch.where(top > 0, top, torch.ones_like(top))
+    flat = flat / or_one(top)
     norm = torch.linalg.vector_norm(flat, dim=-1, keepdim=True)
     eps = torch.finfo(rhs.dtype).eps
     num_steps = min(num_steps, flat.shape[-1])
     basis = flat.new_zeros(*flat.shape[:-1], num_steps + 1, flat.shape[-1])
-    basis[..., 0, :] = flat / torch.where(norm > 0, norm, torch.ones_like(norm))
+    basis[..., 0, :] = flat / or_one(norm)
     image = flat.new_zeros(*flat.shape[:-1], num_steps + 1, num_steps)  # of the basis under A, in the basis
     target = flat.new_zeros(*flat.shape[:-1], num_steps + 1, 1)
     target[..., 0, :] = (norm > 0).to(flat.dtype)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import orthonormality_defect
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.functional.spectral import psd_shrink
 from kcs_torch.solvers.iterate import iterate
@@ -37,7 +38,7 @@ def ist(motion: Tensor, *, weight: float = 1e-3, num_steps: int = 60) -> Tensor:
     """
     _check(motion, "ist")
     unit = motion.abs().amax((-3, -2, -1), keepdim=True)  # first, so that no product overflows
-    unit = torch.where(unit > 0, unit, torch.ones_like(unit))
+    unit = or_one(unit)
     motion = motion / unit
     a, b = motion[..., 0, :], motion[..., 1, :]
     frames = motion.shape[-3]
@@ -59,7 +60,7 @@ def ist(motion: Tensor, *, weight: float = 1e-3, num_steps: int = 60) -> Tensor:
     probe = first  # power iteration for the step size
     for _ in range(8):
         size = torch.linalg.matrix_norm(probe, keepdim=True)
-        probe = adjoint(forward(probe / torch.where(size > 0, size, torch.ones_like(size))))
+        probe = adjoint(forward(probe / or_one(size)))
     bound = torch.linalg.matrix_norm(probe, keepdim=True).clamp_min(torch.finfo(motion.dtype).tiny) * 1.1
     level = weight * torch.linalg.matrix_norm(first) / bound[..., 0, 0]
 
@@ -145,7 +146,7 @@ def metric_upgrade(
 
     def normalise(rows: Tensor, gram: Tensor) -> Tensor:
         size = (rows * times(rows, gram)).sum((-2, -1))
-        return rows / torch.where(size > 0, size, torch.ones_like(size)).sqrt()[..., None, None]
+        return rows / or_one(size).sqrt()[..., None, None]
 
     def evaluate(rows: Tensor, forms: Tensor, bending: Tensor) -> tuple[Tensor, Tensor]:
         """Residuals (B, S, M) of the defect, and the cost (B, S)."""

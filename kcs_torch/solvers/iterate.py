@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ConvergenceWarning, OptionError
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.spectral import svt as shrink
 
 __all__ = ["Solution", "fpc", "iterate", "svt"]
@@ -204,4 +205,4 @@ def relative_change(old: Tensor, new: Tensor) -> Tensor:
     """How much a step changed matrices (..., M, N), as a share of the new value's size, (...)."""
     size = torch.linalg.vector_norm(new, dim=(-2, -1))
     moved = torch.linalg.vector_norm(new - old, dim=(-2, -1))
-    return moved / torch.where(size > 0, size, torch.ones_like(size))
+    return moved / or_one(size)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.solvers.iterate import Solution
 
 __all__ = ["History", "lbfgs"]
@@ -127,7 +128,7 @@ class _Rows:
         tiny = torch.finfo(x.dtype).tiny ** 0.5
         count = (gradient != 0).sum(-1, keepdim=True).clamp_min(1)  # what the energy does not depend on is padding
         size = (x.square().sum(-1, keepdim=True) / count).sqrt()
-        size = torch.where(size > 0, size, torch.ones_like(size))
+        size = or_one(size)
         self.index = torch.arange(len(x), device=x.device)
         self.x, self.value, self.gradient = x, value, gradient
         self.history = History(x, memory)

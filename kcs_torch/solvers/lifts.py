@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.align import nearest_rotation
-from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence, safe_norm
+from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.guarded import safe_norm
 from kcs_torch.functional.rotation import rotation_matrix
 
 __all__ = ["random_lifts", "rotations_over_time", "turning_cameras"]

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.spectral import psd_shrink
 from kcs_torch.solvers.iterate import iterate
 
@@ -51,7 +52,7 @@ def null_space_upgrade(motion: Tensor, *, softness: float = 1e-3, num_steps: int
         raise ShapeError(f"null_space_upgrade: expected motion (..., T, 2, R) with R >= 3, got {tuple(motion.shape)}")
     rank, frames = motion.shape[-1], motion.shape[-3]
     unit = motion.abs().amax((-3, -2, -1), keepdim=True)  # first, so that no product overflows
-    motion = motion / torch.where(unit > 0, unit, torch.ones_like(unit))
+    motion = motion / or_one(unit)
     size = torch.linalg.vector_norm(motion, dim=(-3, -2))  # (..., R) singular values
     split = size.clamp_min(1e-6 * size.amax(-1, keepdim=True).clamp_min(torch.finfo(size.dtype).tiny)).rsqrt()
     motion = motion * split[..., None, None, :]
@@ -81,7 +82,7 @@ def null_space_upgrade(motion: Tensor, *, softness: float = 1e-3, num_steps: int
 
     along = soften(scale)
     reach = (along * scale).sum(-1, keepdim=True)
-    along = along / torch.where(reach > 0, reach, torch.ones_like(reach))
+    along = along / or_one(reach)
 
     def near_null_space(vector: Tensor) -> Tensor:
         vector = soften(vector)
@@ -98,4 +99,4 @@ def null_space_upgrade(motion: Tensor, *, softness: float = 1e-3, num_steps: int
     inside, dual = iterate(step, (first, torch.zeros_like(first)), num_steps=num_steps).value
     length, axes = torch.linalg.eigh(psd_shrink(matrix(inside - dual), level))
     q = axes[..., -3:] * length[..., None, -3:].clamp_min(0).sqrt()
-    return q * split[..., None] / torch.where(unit > 0, unit, torch.ones_like(unit))[..., 0]
+    return q * split[..., None] / or_one(unit)[..., 0]

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.align import centre
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.rotation import rotation_matrix
 from kcs_torch.functional.temporal import best_path
 
@@ -117,7 +118,7 @@ def _fit(
     # In the image the body is as large as the scale tells or, where the scale is free, as the tracks are: a sphere's
     # shadow has 2/3 of its mean square.
     extent = torch.where(high.isinf(), (1.5 * seen).sqrt(), 0.5 * (low + high) * size)
-    reach = torch.where(extent > 0, extent, torch.ones_like(extent)) * (robust or 1.0)
+    reach = or_one(extent) * (robust or 1.0)
     share = weights.expand(len(rotations), *weights.shape)
     for _ in range(1 if robust is None else 4):
         rotations, scales, square = _refine(rotations, tracks, points, share, low, high, num_steps)
@@ -126,7 +127,7 @@ def _fit(
             share = weights / (1 + square).square()
     loss = square if robust is None else square / (1 + square)
     total = weights.sum(-1)
-    return rotations, scales, (loss * weights).sum(-1) / torch.where(total > 0, total, torch.ones_like(total))
+    return rotations, scales, (loss * weights).sum(-1) / or_one(total)
 
 
 def _refine(
@@ -137,7 +138,7 @@ def _refine(
     Entries of vectors and matrices come first, so that every operation runs over all frames and starts.
     """
     total = weights.sum(-1, keepdim=True)
-    unit = weights / torch.where(total > 0, total, torch.ones_like(total))
+    unit = weights / or_one(total)
     y, x = centre(tracks)[0], centre(points)[0]
     both = torch.cat([x, y], -1)
     # All moments of all starts by one product: (T, C, N) @ (T, N, 5 + 25).

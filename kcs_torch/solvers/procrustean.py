@@ -21,7 +21,8 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import nearest_rotation
-from kcs_torch.functional.chain import bone_vectors, safe_norm
+from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.guarded import safe_norm
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.solvers.curvature import Levels, shown, whitening
 from kcs_torch.solvers.lbfgs import lbfgs

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional import centre, orbit
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.nn.layers import wide
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.training.batch import Batch
@@ -60,6 +61,6 @@ def unit_size(batch: Batch) -> Batch:
     seen = (batch.weights > 0).to(tracks)
     about = centre(tracks, seen)[0] * seen[..., None]
     size = (about.square().sum((-3, -2, -1)) / seen.sum((-2, -1)).clamp_min(1)).sqrt()
-    size = torch.where(size > 0, size, torch.ones_like(size))[:, None, None, None]
+    size = or_one(size)[:, None, None, None]
     points = (wide(batch.points) / size).to(batch.points.dtype)
     return batch._replace(tracks=(tracks / size).to(batch.tracks.dtype), points=points)

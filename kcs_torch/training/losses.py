@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import centre, orbit
-from kcs_torch.functional.chain import safe_norm
+from kcs_torch.functional.guarded import safe_norm
 from kcs_torch.training.batch import Batch
 
 __all__ = ["CycleConsistency", "LossTerm"]

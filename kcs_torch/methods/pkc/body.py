@@ -12,6 +12,7 @@ from torch import Tensor
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.methods.lockstep import Search, together
@@ -109,7 +110,7 @@ class Body:
         rigid = torch.zeros(skeleton.num_bones, dtype=torch.bool, device=image.device)
         rigid[list(skeleton.rigid)] = True
         scale = image_scale(image, posture.rest_lengths, posture.bones, rigid, bone_noise(noise, posture.bones))
-        scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+        scale = or_one(scale)
         self.skeleton, self.rate, self.factor = skeleton, rate, 1 / scale
         self.image = image / scale
         self.noise = noise / scale

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.methods.pkc.objective import Objective
 
 __all__ = ["Flipped", "ParallelRays", "RunCosts", "Runs", "Turnable", "inside"]
@@ -182,9 +183,9 @@ class RunCosts:
         hinges, limbs = len(obj.hinges.joints), len(obj.adduction.joints)
         strayed, wrong, axes, sides, feet, short = total.split([len(self.lengths), hinges, hinges, limbs, 1, 1], -1)
         value = self.fixed + obj.length_value(strayed, self.lengths[None]) + short[:, 0]
-        value = value + w.hinge / w.sine**2 / 2 * (wrong / _known(axes / count)).sum(-1)
+        value = value + w.hinge / w.sine**2 / 2 * (wrong / or_one(axes / count)).sum(-1)
         reach = torch.where(inside(runs, count)[..., None], frames.reach[runs.part], base.reach)
-        over = (reach / _known(sides / count).sqrt()[:, None] - obj.adduction.limit).clamp_min(0).square()
+        over = (reach / or_one(sides / count).sqrt()[:, None] - obj.adduction.limit).clamp_min(0).square()
         value = value + w.adduction / w.sine**2 / 2 * (over * obj.adduction.firm.to(over)).sum((1, 2))
         value = value + w.stance / 2 * torch.log1p(feet[:, 0] / (count * obj.stance.sway**2))
         bends = _bends(base.dz, frames.dz, runs.part, runs.starts, runs.ends)
@@ -256,9 +257,4 @@ def _sized(sine: Tensor, points: Tensor, joints: Tensor) -> tuple[Tensor, Tensor
     """Sines (V, T, H) times the axes' size in the clip, which they were divided by, and its square in each frame."""
     axis = points[..., joints[:, -2], :] - points[..., joints[:, -1], :]
     square = axis.square().sum(-1)
-    return sine * _known(square.mean(-2, keepdim=True)).sqrt(), square
-
-
-def _known(square: Tensor) -> Tensor:
-    """Squares of sizes, 1 where they are 0."""
-    return torch.where(square > 0, square, 1)
+    return sine * or_one(square.mean(-2, keepdim=True)).sqrt(), square

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_lengths, bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.nn.deviation import (
     Arrangement,
@@ -136,7 +137,7 @@ class UnrolledKCS(Unrolled):
             return rest
         vectors = bone_vectors(rest, self.bones)
         own = vectors.norm(dim=-1)
-        factor = self._values("length", like) * own.mean() / torch.where(own > 0, own, torch.ones_like(own))
+        factor = self._values("length", like) * own.mean() / or_one(own)
         return self.inverse.to(like) @ (factor[:, None] * vectors)
 
     def find_cameras(

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.nn.energies import centred_residual
 from kcs_torch.nn.layers import full_precision, known, narrow
@@ -193,5 +194,4 @@ def _root_mean_square(values: Tensor, weights: Tensor) -> Tensor:
     """Of the seen joints' distance from the middle, (...); 1 where it is 0."""
     seen = (weights > 0).to(values.dtype)
     square = (values.square().sum(-1) * seen).sum((-2, -1)) / seen.sum((-2, -1)).clamp_min(1)
-    there = square > 0
-    return torch.where(there, torch.where(there, square, torch.ones_like(square)).sqrt(), torch.ones_like(square))
+    return or_one(square).sqrt()
