@@ -262,3 +262,10 @@ def test_slow_modes_tell_noise_only_where_they_may():
     tracks = 100 * torch.sin(2 * math.pi * (0.1 + 0.12 * own[0]) * time + 6 * own[1]) + 1000 * own[2]  # 6 to 14 periods
     told = [float(denoise_tracks(tracks, torch.ones(tracks.shape[:2]), quick=quick).noise.mean()) for quick in (12, 24)]
     assert told[0] > 10 and told[1] < 1
+
+
+@pytest.mark.parametrize("shape", [(0, 20, 4, 2), (0, 4, 2), (3, 0, 4, 2), (20, 0, 2)])
+def test_nothing_to_denoise(shape):
+    found = denoise_tracks(torch.zeros(shape), torch.ones(shape[:-1]))
+    assert found.points.shape == shape and found.weights.shape == found.outliers.shape == shape[:-1]
+    assert found.noise.shape == found.left.shape == (*shape[:-3], shape[-2])

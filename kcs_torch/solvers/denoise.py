@@ -91,7 +91,7 @@ def denoise_tracks(
         floor: of outliers, a share of the body's size (median distance of its joints from their centre).
 
     Returns:
-        :class:`Denoised`. Clips of fewer than 12 frames are only filled and cleared of outliers.
+        :class:`Denoised`. Clips of fewer than 12 frames are only filled and cleared of outliers; of none, none.
 
     >>> time = torch.linspace(0, 6, 100, dtype=torch.float64)[:, None, None]
     >>> truth = torch.sin(time + torch.arange(8).reshape(4, 2)) * 100
@@ -104,6 +104,9 @@ def denoise_tracks(
     Garcia 2010 smooths gappy data by one spectrum in the same way; here the joints' covariance is added.
     """
     shape = tracks.shape
+    if not tracks.numel():
+        none = tracks.new_zeros(*shape[:-3], shape[-2])
+        return Denoised(tracks, weights, none, torch.zeros_like(weights, dtype=torch.bool), none)
     values = tracks.detach().reshape(-1, *shape[-3:]).double()  # (K, T, N, 2): the spectra span more than float32
     given = weights.detach().reshape(values.shape[:-1]).double()
     size = body_size(values, given > 0)
