@@ -12,7 +12,7 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.angles import angle_between
 from kcs_torch.functional.eigen import eigh
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.functional.precision import wide
+from kcs_torch.functional.precision import wide, widened
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rotation import rotation_angle
 from kcs_torch.functional.shapes import check_core
@@ -133,6 +133,7 @@ def complete_rotation(cameras: Tensor) -> Tensor:
     return torch.cat([cameras, torch.linalg.cross(cameras[..., :1, :], cameras[..., 1:, :])], -2)
 
 
+@widened
 def factorize(tracks: Tensor, rank: int) -> tuple[Tensor, Tensor]:
     """Return motion M and shape S with ``stack(tracks) ~ M @ S``, the best of the given rank (Tomasi, Kanade 1992).
 

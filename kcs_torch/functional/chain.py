@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.guarded import or_one, safe_norm, unit_size
+from kcs_torch.functional.precision import widened
 from kcs_torch.functional.shapes import check_core
 
 __all__ = [
@@ -52,6 +53,7 @@ def incidence(bones: Tensor | Sequence[Sequence[int]], num_joints: int, *, dtype
     return (index[:, 1] == joint).to(kind) - (index[:, 0] == joint).to(kind)
 
 
+@widened
 def chain_inverse(matrix: Tensor) -> Tensor:
     """Return D = pinv(C).mT, the map back from bones to joints: ``D @ bones`` has joint mean zero.
 

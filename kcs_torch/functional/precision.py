@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
-__all__ = ["full_precision", "wide"]
+__all__ = ["full_precision", "wide", "widened"]
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
 
 
 def full_precision(tensor: Tensor) -> AbstractContextManager[Any]:
@@ -21,3 +26,32 @@ def full_precision(tensor: Tensor) -> AbstractContextManager[Any]:
 def wide(tensor: Tensor) -> Tensor:
     """At least in single precision: squares of millimetres or pixels leave the range of half precision."""
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+
+
+def widened(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Decorate a function that factorises matrices, which LAPACK does not do in half precision.
+
+    Where its first tensor is in half precision, or autocast is on, it computes at least in single precision without
+    autocast, and its results come back in the dtype of that tensor.
+    """
+
+    @wraps(function)
+    def run(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        first = next((x for x in (*args, *kwargs.values()) if isinstance(x, Tensor)), None)
+        if first is None or not first.is_floating_point():
+            return function(*args, **kwargs)
+        kind = torch.promote_types(first.dtype, torch.float32)
+        suspended = full_precision(first)
+        if kind == first.dtype and isinstance(suspended, nullcontext):
+            return function(*args, **kwargs)
+        given: Any = [_cast(x, kind) for x in args]
+        named: Any = {name: _cast(x, kind) for name, x in kwargs.items()}
+        with suspended:
+            out: Any = function(*given, **named)
+        return tuple(_cast(x, first.dtype) for x in out) if isinstance(out, tuple) else _cast(out, first.dtype)  # type: ignore[return-value]
+
+    return run
+
+
+def _cast(value: Any, dtype: torch.dtype) -> Any:
+    return value.to(dtype) if isinstance(value, Tensor) and value.is_floating_point() else value

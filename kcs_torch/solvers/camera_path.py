@@ -11,6 +11,7 @@ from torch import Tensor
 from kcs_torch.errors import ShapeError, unknown
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.guarded import or_one
+from kcs_torch.functional.precision import widened
 from kcs_torch.functional.ranks import median, nanmedian
 from kcs_torch.functional.rotation import rotation_angle, rotation_matrix, rotation_vector
 from kcs_torch.functional.scatter import scatter_log_det
@@ -35,6 +36,7 @@ RUN = 2000
 """Frames whose waves are summed together: more would only take memory."""
 
 
+@widened
 def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Fit R_t = exp(t w) R_0 to rotations: six numbers, robustly.
 
@@ -91,6 +93,7 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | No
     return path.view(*batch, frames, 3, 3), angle.view(*batch, frames)
 
 
+@widened
 def smooth_path(rotations: Tensor, *, waves: int = WAVES, num_steps: int = ROUNDS) -> tuple[Tensor, Tensor]:
     """Fit a path whose deviation from a constant angular velocity is a sum of ``waves`` slow cosines, robustly.
 
@@ -131,6 +134,7 @@ def _smoothed(rotations: Tensor, base: Tensor, angle: Tensor, waves: int, num_st
     return path, angle
 
 
+@widened
 def choose_path(rotations: Tensor, kind: CameraPath = "auto") -> tuple[Tensor, CameraPath, Tensor]:
     """Return the simplest camera path that explains the rotations: constant angular velocity, smooth, or free.
 

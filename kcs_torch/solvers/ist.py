@@ -10,6 +10,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import orthonormality_defect
 from kcs_torch.functional.guarded import or_one
+from kcs_torch.functional.precision import widened
 from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.functional.spectral import psd_shrink
 from kcs_torch.solvers.iterate import iterate
@@ -17,6 +18,7 @@ from kcs_torch.solvers.iterate import iterate
 __all__ = ["ist", "metric_upgrade"]
 
 
+@widened
 def ist(motion: Tensor, *, weight: float = 1e-3, num_steps: int = 60) -> Tensor:
     """Return Q of the convex relaxation: min_F 1/2 |A(F) - b|^2 + weight tr F over F = Q Q^T >= 0, cut to rank 3.
 
@@ -36,7 +38,7 @@ def ist(motion: Tensor, *, weight: float = 1e-3, num_steps: int = 60) -> Tensor:
 
     Kovalenko et al. 2019, eq. 4-7; Dai, Li, He 2012; Beck, Teboulle 2009.
     """
-    _check(motion, "ist")
+    check_motion(motion, "ist")
     unit = motion.abs().amax((-3, -2, -1), keepdim=True)  # first, so that no product overflows
     unit = or_one(unit)
     motion = motion / unit
@@ -74,6 +76,7 @@ def ist(motion: Tensor, *, weight: float = 1e-3, num_steps: int = 60) -> Tensor:
     return vector[..., -3:] * value[..., None, -3:].clamp_min(0).sqrt() / unit[..., 0]
 
 
+@widened
 def metric_upgrade(
     motion: Tensor,
     start: Tensor,
@@ -111,13 +114,9 @@ def metric_upgrade(
         ShapeError: R is below 3, or the shapes do not fit.
         OptionError: the batch is not made of so many neighbours.
     """
-    _check(motion, "metric_upgrade")
+    check_motion(motion, "metric_upgrade")
     if start.shape[-2:] != (motion.shape[-1], 3):
         raise ShapeError(f"metric_upgrade: expected start (..., {motion.shape[-1]}, 3), got {tuple(start.shape)}")
-    if motion.dtype in (torch.float16, torch.bfloat16):  # no factorisation takes these
-        options = {"smoothness": smoothness, "evenness": evenness, "num_steps": num_steps, "tolerance": tolerance}
-        wide = metric_upgrade(motion.float(), start.float(), together=together, counts=counts, **options)  # type: ignore
-        return wide[0].to(motion.dtype), wide[1].to(motion.dtype)
     total = motion.shape[:-3].numel()
     whole = type(together) is int and together >= 1
     if together is not None and (not whole or total % together):
@@ -254,6 +253,7 @@ def _triangle(matrix: Tensor) -> Tensor:
     return torch.linalg.cholesky(gram, upper=True).to(matrix.dtype)
 
 
-def _check(motion: Tensor, name: str) -> None:
+def check_motion(motion: Tensor, name: str) -> None:
+    """Raise a ShapeError unless ``motion`` is (..., T, 2, R) with R >= 3."""
     if motion.ndim < 3 or motion.shape[-2] != 2 or motion.shape[-1] < 3:
         raise ShapeError(f"{name}: expected motion (..., T, 2, R) with R >= 3, got {tuple(motion.shape)}")

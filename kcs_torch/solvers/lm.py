@@ -9,11 +9,13 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_vectors, incidence, index_rows, kcs_matrix
+from kcs_torch.functional.precision import widened
 from kcs_torch.functional.shapes import broadcast_shapes, check_core
 
 __all__ = ["fit_bones"]
 
 
+@widened
 def fit_bones(
     points: Tensor,
     lengths: Tensor,
@@ -75,10 +77,6 @@ def fit_bones(
         raise OptionError(
             f"fit_bones: expected num_steps, damping and stiffness >= 0, got {num_steps}, {damping} and {stiffness}"
         )
-    if points.dtype in (torch.float16, torch.bfloat16):  # no factorisation takes these
-        begin = None if start is None else start.float()
-        options = {"stiffness": stiffness, "num_steps": num_steps, "damping": damping, "start": begin}
-        return fit_bones(points.float(), lengths.float(), bones, **options).to(points.dtype)  # type: ignore[arg-type]
     limits = torch.finfo(points.dtype)
     matrix = incidence(bones, points.shape[-2], dtype=points.dtype)  # (N, B)
     overlap = matrix.mT @ matrix  # (B, B)

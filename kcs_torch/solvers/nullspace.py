@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError
 from kcs_torch.functional.guarded import or_one
+from kcs_torch.functional.precision import widened
 from kcs_torch.functional.spectral import psd_shrink
+from kcs_torch.solvers.ist import check_motion
 from kcs_torch.solvers.iterate import iterate
 
 __all__ = ["null_space_upgrade"]
@@ -16,6 +17,7 @@ PULL = 0.05
 """p, the trace's weight: a share of the largest eigenvalue of the first F."""
 
 
+@widened
 def null_space_upgrade(motion: Tensor, *, softness: float = 1e-3, num_steps: int = 100) -> Tensor:
     """Return Q of min tr F over F = Q Q^T >= 0 in the null space of the orthonormality constraints, cut to rank 3.
 
@@ -48,8 +50,7 @@ def null_space_upgrade(motion: Tensor, *, softness: float = 1e-3, num_steps: int
     >>> bool(orthonormality_defect(motion @ null_space_upgrade(motion)).max() < 1e-6)
     True
     """
-    if motion.ndim < 3 or motion.shape[-2] != 2 or motion.shape[-1] < 3:
-        raise ShapeError(f"null_space_upgrade: expected motion (..., T, 2, R) with R >= 3, got {tuple(motion.shape)}")
+    check_motion(motion, "null_space_upgrade")
     rank, frames = motion.shape[-1], motion.shape[-3]
     unit = motion.abs().amax((-3, -2, -1), keepdim=True)  # first, so that no product overflows
     motion = motion / or_one(unit)

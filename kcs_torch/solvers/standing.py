@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from kcs_torch.functional.precision import widened
 from kcs_torch.functional.tridiagonal import solve_tridiagonal
 
 __all__ = ["RIDGE", "root_velocity"]
@@ -13,6 +14,7 @@ RIDGE = 1e-3
 """Weight by which velocities that no foot tells are drawn to 0, over that of a foot that surely stands."""
 
 
+@widened
 def root_velocity(move: Tensor, weight: Tensor, slip: float, change: float, *, num_steps: int = 10) -> Tensor:
     """Return the body's velocity in depth at which standing feet stand still.
 
