@@ -13,6 +13,7 @@ from kcs_torch.anatomy import template_by_names
 from kcs_torch.data.gait import STRIDE_SECONDS, joint_segments, outer, rank, segment_rotations, walking_path
 from kcs_torch.errors import OptionError, SkeletonError
 from kcs_torch.functional import bone_lengths, bone_vectors, chain_inverse, incidence, orbit, points_from_bones
+from kcs_torch.functional.rotation import skew
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
 
@@ -172,7 +173,7 @@ def random_motion(
     time = torch.arange(num_frames, dtype=torch.float64)[:, None, None, None] / fps
     wave = torch.sin(2 * torch.pi * ((0.2 + 0.6 * uniform[0]) * time + uniform[1]))  # (T, 3, B, 3)
     axis = (strength * wave).sum(1)[:, _leaders(tree)]
-    points = _pose(tree, torch.linalg.matrix_exp(_skew(axis)), rest)
+    points = _pose(tree, torch.linalg.matrix_exp(skew(axis)), rest)
     return _film(points, body, fps, yaw, pitch, turn, noise, missing, generator, dtype, "random_motion")
 
 
@@ -252,10 +253,3 @@ def _film(
     tracks = Tracks.from_arrays(seen, skeleton=body, fps=fps, units="mm", source=source)
     tracks = replace(tracks, detector=False)
     return SyntheticClip(tracks=tracks, points=points, cameras=cameras[:, :2].to(dtype))
-
-
-def _skew(vectors: Tensor) -> Tensor:
-    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
-    x, y, z = vectors.unbind(-1)
-    o = torch.zeros_like(x)
-    return torch.stack([torch.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)

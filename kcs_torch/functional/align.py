@@ -11,6 +11,7 @@ from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.functional.derivatives import applied, batch_first
 from kcs_torch.functional.guarded import LOST, largest, or_one, unit_size
 from kcs_torch.functional.precision import wide
+from kcs_torch.functional.rotation import skew
 from kcs_torch.functional.shapes import check_core
 
 __all__ = ["ALIGNMENTS", "centre", "minimal_turn", "nearest_rotation", "procrustes", "similarity", "superpose"]
@@ -79,9 +80,7 @@ def minimal_turn(source: Tensor, target: Tensor) -> Tensor:
     a, b = torch.nn.functional.normalize(source, dim=-1), torch.nn.functional.normalize(target, dim=-1)
     a, b = torch.broadcast_tensors(a, b)
     still = (a.square().sum(-1) < 0.5) | (b.square().sum(-1) < 0.5)
-    x, y, z = torch.linalg.cross(a, b).unbind(-1)
-    o = torch.zeros_like(x)
-    spin = torch.stack([torch.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
+    spin = skew(torch.linalg.cross(a, b))
     cosine = (a * b).sum(-1)[..., None, None]
     back = cosine < 0
     eye = torch.eye(3, dtype=a.dtype, device=a.device)

@@ -164,3 +164,10 @@ def euler_angles(order: str, matrices: Tensor) -> Tensor:
     )
     third = torch.where(locked, torch.zeros_like(sine), torch.atan2(-sign * r[..., i, j], r[..., i, i]))
     return torch.stack([first, torch.atan2(sine, cosine), third], -1)
+
+
+def skew(vectors: Tensor) -> Tensor:
+    """The skew-symmetric matrices [v] (..., 3, 3) of vectors v (..., 3), with [v] w = v x w."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))

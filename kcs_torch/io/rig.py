@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OutputError
 from kcs_torch.functional import bone_lengths, minimal_turn, nearest_rotation
+from kcs_torch.functional.rotation import skew
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.axes import from_y_up, to_y_up
 
@@ -194,7 +195,4 @@ def _turn(arms: Tensor, seen: Tensor, firm: Sequence[int]) -> Tensor:
     little = 1e-4 * arms.square().sum()
     known = torch.hypot(sine, cosine) > little
     angle = torch.where(known, torch.atan2(sine, cosine), torch.zeros_like(sine))
-    x, y, z = (angle[:, None] * axis).unbind(-1)
-    o = torch.zeros_like(x)
-    spin = torch.stack([torch.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
-    return torch.linalg.matrix_exp(spin) @ turn
+    return torch.linalg.matrix_exp(skew(angle[:, None] * axis)) @ turn

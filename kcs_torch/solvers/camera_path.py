@@ -13,7 +13,7 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.precision import widened
 from kcs_torch.functional.ranks import median, nanmedian
-from kcs_torch.functional.rotation import rotation_angle, rotation_matrix, rotation_vector
+from kcs_torch.functional.rotation import rotation_angle, rotation_matrix, rotation_vector, skew
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.functional.spectral import dct_basis
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -251,9 +251,7 @@ def _sum_unturned(rotations: Tensor, factors: Tensor, time: Tensor, turn: Tensor
     """
     size = turn.norm(dim=-1)[:, None]
     axis = turn / or_one(size)
-    x, y, z = axis.unbind(-1)
-    zero = torch.zeros_like(x)
-    hat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 1, 3, 3)
+    hat = skew(axis)[:, None]
     along = (axis[:, :, None] * axis[:, None])[:, None]
     waves = rotations.new_zeros(2, len(rotations), len(factors), 9)
     for flat, angle in zip(rotations.flatten(-2).split(RUN, 1), (time * size).split(RUN, 1), strict=True):
@@ -270,7 +268,5 @@ def _left_jacobian(vectors: Tensor) -> Tensor:
     safe = torch.where(small, torch.ones_like(angle), angle)
     first = torch.where(small, 0.5 - angle.square() / 24, (1 - safe.cos()) / safe.square())
     second = torch.where(small, 1 / 6 - angle.square() / 120, (safe - safe.sin()) / safe**3)
-    x, y, z = vectors.unbind(-1)
-    zero = torch.zeros_like(x)
-    hat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    hat = skew(vectors)
     return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + first * hat + second * (hat @ hat)
