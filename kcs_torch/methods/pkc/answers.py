@@ -25,9 +25,10 @@ ANGLE = 0.15
 """Standard deviation, in radians, of a bone's angle to the image plane where it is nearest to it: what postures, hinges
 and proportions tell of a length that no crossing of the plane tells."""
 
-FRONT, ASIDE = 2.0, 0.25
-"""How much less sure angles are of a body that is seen exactly from the front or from behind, and the sine of the
-direction from which on this is over: a body that leans moves in the image only if it is seen from aside."""
+FRONT, SIDE, ASIDE = 2.4, 0.5, 0.1
+"""How uncertain angles are, in ``ANGLE``, of a body that is seen exactly from the front or from behind, what is left of
+that from the side, and the sine of the direction from which on it falls: a body that leans moves in the image only if
+it is seen from aside."""
 
 USUAL = 0.12
 """Standard deviation of a length of which the image tells nothing, as a share: bodies differ by so much."""
@@ -100,7 +101,8 @@ def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: floa
     odd = max(1.0, objective.oddity(lengths) / ODDITY)
     strange = max(strange, strange**STRANGE)
     aside = float(posture.frame(points)[..., 0, 2].square().mean())
-    told = (1 + aside / ASIDE**2) / FRONT**2 + (odd * turn / TURN) ** (2 * POWER)
+    view = FRONT**2 / (1 + aside / ASIDE**2) + SIDE**2
+    told = 1 / view + (odd * turn / TURN) ** (2 * POWER)
     return odd * strange / math.sqrt(told)
 
 
