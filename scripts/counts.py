@@ -26,6 +26,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import kcs_torch as kt
 from kcs_torch.data import walking_person
+from kcs_torch.io.atomic import atomic_path
 
 VIEWS = {"_reshape_alias", "_unsafe_view", "alias", "as_strided", "detach", "diagonal", "expand", "permute", "select"}
 VIEWS |= {"slice", "split", "split_with_sizes", "squeeze", "t", "transpose", "unbind", "unfold", "unsqueeze", "view"}
@@ -149,7 +150,7 @@ def main(words: list[str] | None = None) -> None:
     rows = [count(name, options.frames, turn, rates) for name in options.methods for turn in (0.0, 180.0)]
     print(table(rows))
     if options.csv:
-        with options.csv.open("w", newline="", encoding="utf-8") as file:
+        with atomic_path(options.csv) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(rows[0]))
             writer.writeheader()
             writer.writerows(rows)

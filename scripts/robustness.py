@@ -32,6 +32,7 @@ from torch import Tensor
 
 import kcs_torch as kt
 from kcs_torch.functional import bone_lengths, bone_vectors, chain_inverse, incidence, points_from_bones
+from kcs_torch.io.atomic import atomic_path
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 # Walks, a kick, dances and climbing, before a camera that orbits by half a turn; --sequences takes the first ones.
@@ -222,6 +223,9 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--sequences", type=int, default=len(ORBIT), help="of each part, at most")
     parser.add_argument("--csv", type=Path, help="also write every run here")
     options = parser.parse_args(words)
+    for name in ("seeds", "frames", "sequences"):
+        if getattr(options, name) < 1:
+            parser.error(f"argument --{name}: expected at least 1, got {getattr(options, name)}")
     if options.csv:
         options.csv.parent.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
@@ -237,7 +241,7 @@ def main(words: list[str] | None = None) -> None:
             bones = run.pop("bones", {})
             everything.append({"part": part} | run | {f"variation of {name}": value for name, value in bones.items()})
     if options.csv:
-        with options.csv.open("w", newline="", encoding="utf-8") as file:
+        with atomic_path(options.csv) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(dict.fromkeys(key for run in everything for key in run)))
             writer.writeheader()
             writer.writerows(everything)

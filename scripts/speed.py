@@ -36,6 +36,7 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.data import SyntheticClip, random_motion, walking_person
+from kcs_torch.io.atomic import atomic_path
 from kcs_torch.methods.cameras import orthographic_cameras
 
 TESTS = Path(__file__).resolve().parents[1] / "tests"
@@ -366,7 +367,7 @@ def main(words: list[str] | None = None) -> None:
             print(f"\n{part}\n{show(rows)}", flush=True)
             everything += [{"part": part} | row for row in rows]
     if options.csv:
-        with options.csv.open("w", newline="", encoding="utf-8") as file:
+        with atomic_path(options.csv) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(dict.fromkeys(key for row in everything for key in row)))
             writer.writeheader()
             writer.writerows(everything)

@@ -43,6 +43,13 @@ def test_without_the_data_it_says_what_it_needs(script, tmp_path):
         script.main(["--shared", str(tmp_path)])
 
 
+@pytest.mark.parametrize("name", ["seeds", "frames", "sequences"])
+def test_counts_are_at_least_one(script, name, capsys):
+    with pytest.raises(SystemExit):
+        script.main([f"--{name}", "0"])
+    assert f"argument --{name}: expected at least 1, got 0" in capsys.readouterr().err
+
+
 def test_true_lengths_and_cameras_are_those_of_the_case(script, shared):
     bench = script.Bench(shared, frames=30, sequences=1)
     ((label, tracks, truth),) = bench.orbits()
