@@ -30,7 +30,7 @@ from torch.testing import assert_close
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths, rows_to_cameras
 from kcs_torch.methods import SfAM
-from kcs_torch.nn import MLPLifter, RefinedLifter, UnrolledFPC, UnrolledPKC, UnrolledSfAM
+from kcs_torch.nn import MLPLifter, RefinedLifter, UnrolledFPC, UnrolledKCS, UnrolledPKC, UnrolledSfAM
 from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape
 
 BODIES = {"body": BODY, "chain": CHAIN, "ring": RING}
@@ -794,3 +794,31 @@ def test_a_lifter_is_refined_by_a_solver_of_its_skeleton():
     """Bones of another body of as many joints would link other joints, without a word."""
     with pytest.raises(SkeletonError, match="RefinedLifter: expected a solver of the network's skeleton, 'h36m17'"):
         RefinedLifter(MLPLifter("h36m17"), UnrolledSfAM("cmu17", num_steps=2))
+
+
+@pytest.mark.parametrize(
+    ("solver", "options"),
+    [
+        (UnrolledFPC, {"mu": "a"}),
+        (UnrolledFPC, {"tau": None}),
+        (UnrolledFPC, {"momentum": "0.5"}),
+        (UnrolledFPC, {"corner": "sharp"}),
+        (UnrolledSfAM, {"beta": "a"}),
+        (UnrolledSfAM, {"articulate_from": [0.5]}),
+        (UnrolledKCS, {"scale_range": "wide"}),
+        (UnrolledKCS, {"final": "1e-5"}),
+        (UnrolledPKC, {"slack": "a"}),
+        (UnrolledPKC, {"eps": True}),
+    ],
+)
+def test_what_is_no_number_is_refused_by_name(solver, options):
+    skeleton = () if solver is UnrolledFPC else ("h36m17",)
+    (name,) = options
+    with pytest.raises(OptionError, match=f"{solver.__name__}: {name}: expected a number, got"):
+        solver(*skeleton, **options)
+
+
+@pytest.mark.parametrize("lengths", [5, "ab", ["a"] * 16])
+def test_lengths_that_are_no_numbers_are_refused(lengths):
+    with pytest.raises(OptionError, match="lengths: expected 16 positive numbers"):
+        UnrolledSfAM("h36m17", lengths=lengths)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any, Literal
 
 import torch
@@ -41,17 +41,29 @@ class Unrolled(nn.Module):
         grad_steps: record only the last so many steps for autograd; None all.
         gradient: "unrolled" differentiates the recorded steps; "implicit" goes on with the last step until the shape
             stands still, and differentiates that fixed point; an :class:`kcs_torch.solvers.Implicit` says how exactly.
+        numbers: of the solver itself, looked at before it computes with them.
 
     Raises:
-        OptionError: a number is out of range, or ``grad_steps`` is given with the implicit gradient.
+        OptionError: a number is none, or is out of range, or ``grad_steps`` is given with the implicit gradient.
     """
 
     raw_corner: Tensor
 
     def __init__(
-        self, num_steps: int, *, momentum: float, learnable: bool, grad_steps: int | None, gradient: Gradient
+        self,
+        num_steps: int,
+        *,
+        momentum: float,
+        learnable: bool,
+        grad_steps: int | None,
+        gradient: Gradient,
+        **numbers: Any,
     ) -> None:
         super().__init__()
+        numbers["momentum"] = momentum
+        for name, value in numbers.items():
+            if isinstance(value, bool) or not isinstance(value, Real):
+                raise OptionError(f"{type(self).__name__}: {name}: expected a number, got {value!r}")
         whole = all(isinstance(x, Integral) for x in (num_steps, 0 if grad_steps is None else grad_steps))
         if not whole or num_steps < 1 or not 0 <= momentum < 1 or (grad_steps is not None and grad_steps < 0):
             raise OptionError(
@@ -181,12 +193,15 @@ class Unrolled(nn.Module):
                     "a template: expected lengths=..., one number per bone, to start from"
                 )
         else:
-            listed = [float(value) for value in lengths]
+            try:
+                listed = [float(value) for value in lengths]
+            except (TypeError, ValueError):  # no numbers
+                listed = []
             known = torch.tensor(listed, dtype=torch.float64)
             if len(listed) != skeleton.num_bones or not all(0 < value < math.inf for value in listed):
                 raise OptionError(
                     f"{type(self).__name__}: lengths: expected {skeleton.num_bones} positive numbers, one per bone of "
-                    f"skeleton '{skeleton.name}', got {list(lengths)}"
+                    f"skeleton '{skeleton.name}', got {lengths!r}"
                 )
         known = (known / known.mean()).clamp_min(1e-3)  # a bone without length in the template may grow
         self._positive("length", known, learnable=learnable)

@@ -58,7 +58,10 @@ class UnrolledFPC(Unrolled):
         grad_steps: int | None = None,
         gradient: Gradient = "unrolled",
     ) -> None:
-        super().__init__(num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
+        super().__init__(
+            num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient,
+            mu=mu, final=final, tau=tau, corner=corner,
+        )  # fmt: skip
         if not (0 < tau < math.inf and corner > 0):
             raise OptionError(f"{type(self).__name__}: expected finite tau > 0 and corner > 0, got {tau} and {corner}")
         self._hold_corner(corner)

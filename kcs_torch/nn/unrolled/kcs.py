@@ -94,7 +94,10 @@ class UnrolledKCS(Unrolled):
         grad_steps: int | None = None,
         gradient: Gradient = "unrolled",
     ) -> None:
-        super().__init__(num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
+        super().__init__(
+            num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient,
+            mu=mu, final=final, tau=tau, scale_range=scale_range,
+        )  # fmt: skip
         if not 0 < tau < math.inf or not scale_range >= 1 or arrangement not in ("stacked", "frames"):
             raise OptionError(
                 "UnrolledKCS: expected tau > 0 (finite), scale_range >= 1 and arrangement 'stacked' or 'frames', "

@@ -78,7 +78,10 @@ class UnrolledPKC(Unrolled):
         grad_steps: int | None = None,
         gradient: Gradient = "unrolled",
     ) -> None:
-        super().__init__(num_steps, momentum=0.0, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
+        super().__init__(
+            num_steps, momentum=0.0, learnable=learnable, grad_steps=grad_steps, gradient=gradient,
+            eps=eps, final=final, slack=slack, noise=noise, realign_from=realign_from,
+        )  # fmt: skip
         if not (slack > 0 and noise > 0) or not 0 <= realign_from <= 1:
             raise OptionError(
                 f"UnrolledPKC: expected slack and noise > 0 and realign_from in 0..1, got {slack}, {noise} and "

@@ -69,7 +69,10 @@ class UnrolledSfAM(Unrolled):
         grad_steps: int | None = None,
         gradient: Gradient = "unrolled",
     ) -> None:
-        super().__init__(num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient)
+        super().__init__(
+            num_steps, momentum=momentum, learnable=learnable, grad_steps=grad_steps, gradient=gradient,
+            mu=mu, final=final, tau=tau, corner=corner, beta=beta, articulate_from=articulate_from,
+        )  # fmt: skip
         if not (0 < tau < math.inf and beta > 0 and corner > 0) or not 0 <= articulate_from <= 1:
             raise OptionError(
                 f"UnrolledSfAM: expected tau (finite), beta and corner > 0 and articulate_from in 0..1, got {tau}, "
