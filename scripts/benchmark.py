@@ -245,6 +245,8 @@ def main(config: DictConfig) -> None:
         if config.intrinsics not in (None, False, True, "auto", "parallel"):
             raise OptionError(f"intrinsics={config.intrinsics}: expected null, true, auto or parallel")
         torch.set_num_threads(config.threads)
+        if not isinstance(config.paper, DictConfig):
+            raise OptionError(f"paper: expected its settings, such as paper.parts=all, got {config.paper!r}")
         if config.paper.parts:
             make_papers(config.paper, Path(str(config.shared)), folder)
         else:

@@ -182,6 +182,7 @@ def test_wrong_choices(script, folder):
         (["method=sfam", "cameras=no"], "error: cameras: expected true or false, got 'no'"),
         (["method=sfam", "+method.beta=much"], "error: sfam: beta: expected a finite number, got 'much'"),
         (["suite=null"], "error: suite: expected all, a suite or a list of suites, got None"),
+        (["paper=null"], "error: paper: expected its settings, such as paper.parts=all, got None"),
         (
             ["method._target_=kcs_torch.nn.SymmetryEnergy", "+method.skeleton=coco17"],
             "expected a kcs_torch.Method, got",
