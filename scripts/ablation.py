@@ -15,7 +15,6 @@ repository in ``../shared``, and --cases of each are taken, evenly spread. PyTor
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -34,7 +33,7 @@ from torch import Tensor
 import kcs_torch as kt
 from kcs_torch.data import SyntheticClip, random_motion, walking_person
 from kcs_torch.functional.align import similarity
-from kcs_torch.io.atomic import atomic_path
+from kcs_torch.io.atomic import write_table
 from kcs_torch.methods.pkc import Weights
 from kcs_torch.methods.pkc.limbs import SignCosts
 from kcs_torch.methods.pkc.trunk import mirror
@@ -326,10 +325,7 @@ def main(words: list[str] | None = None) -> None:
         if chosen:
             runs += measure(part, names, chosen, options)
     if options.csv:
-        with atomic_path(options.csv) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(runs[0]))
-            writer.writeheader()
-            writer.writerows(runs)
+        write_table(options.csv, runs)
 
 
 if __name__ == "__main__":

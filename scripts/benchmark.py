@@ -39,7 +39,7 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.errors import OptionError, counted, unknown
-from kcs_torch.io.atomic import atomic_path
+from kcs_torch.io.atomic import atomic_path, write_table
 from kcs_torch.methods import METHODS
 from kcs_torch.training.configured import (
     check_switch,
@@ -184,10 +184,7 @@ def write_rows(path: Path, rows: list[dict[str, Any]], columns: tuple[str, ...])
     for row in rows:
         latest.pop(measured(row), None)
         latest[measured(row)] = row
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(latest.values())
+    write_table(path, latest.values(), columns)
 
 
 def measured(row: dict[str, Any]) -> tuple[str, ...]:

@@ -13,7 +13,6 @@ measured time is Python, small matrices and short rows.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -26,7 +25,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import kcs_torch as kt
 from kcs_torch.data import walking_person
-from kcs_torch.io.atomic import atomic_path
+from kcs_torch.io.atomic import write_table
 
 VIEWS = {"_reshape_alias", "_unsafe_view", "alias", "as_strided", "detach", "diagonal", "expand", "permute", "select"}
 VIEWS |= {"slice", "split", "split_with_sizes", "squeeze", "t", "transpose", "unbind", "unfold", "unsqueeze", "view"}
@@ -150,10 +149,7 @@ def main(words: list[str] | None = None) -> None:
     rows = [count(name, options.frames, turn, rates) for name in options.methods for turn in (0.0, 180.0)]
     print(table(rows))
     if options.csv:
-        with atomic_path(options.csv) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+        write_table(options.csv, rows)
 
 
 if __name__ == "__main__":

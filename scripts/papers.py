@@ -8,7 +8,6 @@ tables.md. What the parts measure is in ``papers_sfam.py`` (Kovalenko et al. 201
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,6 +16,8 @@ from typing import Any
 
 import numpy as np
 from robustness import Bench
+
+from kcs_torch.io.atomic import write_table
 
 Row = dict[str, Any]
 
@@ -170,14 +171,6 @@ def plot(part: Part, rows: list[Row], path: Path) -> None:
     plt.close(shown)
 
 
-def write(path: Path, rows: list[Row]) -> None:
-    """Every row of a part, as CSV."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def make(names: str | list[str], settings: Settings, folder: Path) -> None:
     """Run parts and write their tables, rows and plots to a folder."""
     todo = chosen_parts(names)
@@ -185,7 +178,7 @@ def make(names: str | list[str], settings: Settings, folder: Path) -> None:
     tables = []
     for name, part in todo.items():
         rows = list(part.run(settings))
-        write(folder / f"{name}.csv", rows)
+        write_table(folder / f"{name}.csv", rows)
         tables.append(markdown(part, rows))
         print(tables[-1], flush=True)
         plot(part, rows, folder / f"{name}.png")

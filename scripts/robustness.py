@@ -17,7 +17,6 @@ is the mean over sequences and seeds, and the standard deviation of seeds' means
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import warnings
 from collections.abc import Iterator
@@ -32,7 +31,7 @@ from torch import Tensor
 
 import kcs_torch as kt
 from kcs_torch.functional import bone_lengths, bone_vectors, chain_inverse, incidence, points_from_bones
-from kcs_torch.io.atomic import atomic_path
+from kcs_torch.io.atomic import write_table
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 # Walks, a kick, dances and climbing, before a camera that orbits by half a turn; --sequences takes the first ones.
@@ -241,10 +240,7 @@ def main(words: list[str] | None = None) -> None:
             bones = run.pop("bones", {})
             everything.append({"part": part} | run | {f"variation of {name}": value for name, value in bones.items()})
     if options.csv:
-        with atomic_path(options.csv) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(dict.fromkeys(key for run in everything for key in run)))
-            writer.writeheader()
-            writer.writerows(everything)
+        write_table(options.csv, everything)
 
 
 if __name__ == "__main__":

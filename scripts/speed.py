@@ -16,7 +16,6 @@ second in batches of up to 4096, single precision on the GPU beside double on th
 from __future__ import annotations
 
 import argparse
-import csv
 import importlib.util
 import json
 import platform
@@ -36,7 +35,7 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.data import SyntheticClip, random_motion, walking_person
-from kcs_torch.io.atomic import atomic_path
+from kcs_torch.io.atomic import write_table
 from kcs_torch.methods.cameras import orthographic_cameras
 
 TESTS = Path(__file__).resolve().parents[1] / "tests"
@@ -367,10 +366,7 @@ def main(words: list[str] | None = None) -> None:
             print(f"\n{part}\n{show(rows)}", flush=True)
             everything += [{"part": part} | row for row in rows]
     if options.csv:
-        with atomic_path(options.csv) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(dict.fromkeys(key for row in everything for key in row)))
-            writer.writeheader()
-            writer.writerows(everything)
+        write_table(options.csv, everything)
 
 
 if __name__ == "__main__":

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import os
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from kcs_torch.errors import KcsError, OutputError
 
-__all__ = ["atomic_path"]
+__all__ = ["atomic_path", "write_table"]
 
 WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
@@ -56,6 +58,31 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             with contextlib.suppress(OSError):
                 for folder in reversed(made):
                     folder.rmdir()
+
+
+def write_table(path: str | Path, rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
+    """Write rows to a CSV file under a header, whole or not at all.
+
+    Args:
+        path: of the file.
+        rows: from columns to values; what a row lacks is left empty.
+        columns: in their order; by default all that rows have, as they come first.
+
+    Raises:
+        OutputError: as :func:`atomic_path`.
+
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "a.csv"
+    >>> write_table(path, [{"case": "walk"}, {"case": "run", "mm": 3}])
+    >>> path.read_text().split()
+    ['case,mm', 'walk,', 'run,3']
+    """
+    rows = list(rows)
+    names = list(dict.fromkeys(name for row in rows for name in row)) if columns is None else columns
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def _target(path: str | Path) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from kcs_torch.io.atomic import atomic_path
+from kcs_torch.io.atomic import write_table
 
 __all__ = ["Table", "tabulate"]
 
@@ -27,14 +26,7 @@ def tabulate(folder: Path) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     while len(found := sorted(folder.glob(f"**/{RESULT}"), key=_number)) > len(rows):
         rows = [_row(folder, path) for path in found]
-        columns = dict.fromkeys(name for row in rows for name in row)
-        with (
-            atomic_path(folder / "results.csv") as temporary,
-            temporary.open("w", newline="", encoding="utf-8") as file,
-        ):
-            writer = csv.DictWriter(file, list(columns))
-            writer.writeheader()
-            writer.writerows(rows)
+        write_table(folder / "results.csv", rows)
     return rows
 
 
