@@ -7,8 +7,9 @@
     python scripts/benchmark.py paper.parts=all    # the tables of the two seed papers instead, see papers.py
 
 Writes SUITE/CASE.npz (the prediction) and results.csv (a row a case) to the run's folder under ``outputs/``, and
-prints the means of each suite; a sweep has one results.csv more, of all its runs. Each row is written when its case is
-done: with keep=true a sweep that was stopped goes on in its folder. Inputs, truth and figures are the protocol's own. A
+prints the means of each suite; "covered" is the share of depths that are off by no more than the standard deviation
+that the method gives, after one scale for a clip. A sweep has one results.csv more, of all its runs. Each row is written
+when its case is done: with keep=true a sweep that was stopped goes on in its folder. Inputs, truth and figures are the protocol's own. A
 case that fails is a row with its error, and makes the exit code 1.
 """
 
@@ -41,6 +42,7 @@ import kcs_torch as kt
 from kcs_torch.errors import OptionError, counted, unknown
 from kcs_torch.io.atomic import atomic_path, write_table
 from kcs_torch.methods import METHODS
+from kcs_torch.metrics import coverage
 from kcs_torch.training.configured import (
     check_switch,
     check_threads,
@@ -54,7 +56,7 @@ from kcs_torch.types.hints import is_a
 MEASURED = ("suite", "case", "method", "options", "cameras", "intrinsics")
 FACTS = (
     *(*MEASURED, "frames", "joints"),
-    *("seconds", "cpu_seconds", "ms_per_frame", "converged"),
+    *("seconds", "cpu_seconds", "ms_per_frame", "converged", "covered"),
 )
 COUNTS = {"clip": 10, "sequences": 1, "paths": 1, "seeds": 1, "walks": 1, "frames": 100}
 """Numbers among the settings of the papers' tables, and the least that each may be."""
@@ -134,10 +136,7 @@ def run_case(
     prediction = {"points3d": result.observed.numpy(), "cameras": result.cameras.numpy()}
     with atomic_path(target) as temporary:
         np.savez_compressed(temporary, **prediction)
-    figures = protocol.score(
-        prediction["points3d"], truth["points3d"], truth["edges"], prediction["cameras"], truth["world"]
-    )
-    return figures | {
+    facts = {
         "frames": tracks.num_frames,
         "joints": tracks.skeleton.num_observed,
         "seconds": round(seconds, 4),
@@ -145,11 +144,24 @@ def run_case(
         "ms_per_frame": round(1000 * seconds / tracks.num_frames, 4),
         "converged": result.diagnostics.converged,
     }
+    if result.uncertainty is not None:
+        facts["covered"] = covered(result, torch.as_tensor(truth["points3d"]))
+    figures = protocol.score(
+        prediction["points3d"], truth["points3d"], truth["edges"], prediction["cameras"], truth["world"]
+    )
+    return figures | facts
+
+
+def covered(result: kt.Reconstruction, truth: torch.Tensor) -> float:
+    """Share of depths within one standard deviation, after one scale: the size of a detector's tracks is not known."""
+    known = truth.isfinite().all(-1)
+    deviation = result.uncertainty[:, : result.skeleton.num_observed]
+    return round(float(coverage(result.observed, deviation, truth, scale=True, weights=known.to(truth))), 4)
 
 
 def table(rows: list[dict[str, Any]], figures: tuple[str, ...]) -> str:
     """The means of each suite and recipe, over the cases that did not fail."""
-    names = [f for f in (*figures, "ms_per_frame") if any(row.get(f) for row in rows)]
+    names = [f for f in (*figures, "covered", "ms_per_frame") if any(row.get(f) for row in rows)]
     kinds = dict.fromkeys((row["suite"], recipe(row)) for row in rows)
     width = max(12, *(len(kind) + 2 for _, kind in kinds))
     lines = [f"{'suite':<16}{'method':<{width}}{'cases':>9}" + "".join(f"{n:>14}" for n in names)]
@@ -281,7 +293,7 @@ def measure(config: DictConfig, suites: str | list[str], method: kt.Method, fold
                     print(f"{suite}/{label}  was done, and is kept", flush=True)
                     continue
                 row |= run_case(protocol, data, case, method, target, cameras, lens)
-                shown = "  ".join(f"{f} {row[f]:.4f}" for f in protocol.FIGURES if f in row)
+                shown = "  ".join(f"{f} {row[f]:.4f}" for f in (*protocol.FIGURES, "covered") if f in row)
                 print(f"{suite}/{label}  {shown}  {row['ms_per_frame']:.2f} ms a frame", flush=True)
             except (Exception, SystemExit) as error:  # the protocol leaves by SystemExit where a prediction is no good
                 row["error"] = f"{type(error).__name__}: {error}"

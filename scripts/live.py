@@ -30,6 +30,7 @@ from torch import Tensor
 import kcs_torch as kt
 from kcs_torch.data import walking_person
 from kcs_torch.functional.align import similarity
+from kcs_torch.metrics import coverage
 
 WALKS = ((20.0, 0), (60.0, 1))
 
@@ -78,15 +79,8 @@ def measure(name: str, tracks: kt.Tracks, truth: Tensor, paced: bool) -> str:
     return (
         f"{name:<32}{len(poses):>7}{len(poses) / used:>7.0f}{len(poses) / whole:>8.0f}"
         f"{median:>8.1f}{most:>7.0f}{worst:>7.0f}{error(live, truth):>8.1f}{later}"
-        f"{100 * covered(live[ready], spread[ready], truth[ready]):>9.0f}"
+        f"{100 * float(coverage(live[ready], spread[ready], truth[ready])):>9.0f}"
     )
-
-
-def covered(points: Tensor, spread: Tensor, truth: Tensor) -> float:
-    """Share of depths within one deviation, of the better of the two mirror images."""
-    flips = (points, points * torch.tensor([1.0, 1.0, -1.0]).to(points))
-    off = [((p - truth)[..., 2] - (p - truth)[..., 2].mean(-1, keepdim=True)).abs() for p in flips]
-    return float((min(off, key=lambda x: float(x.square().sum())) <= spread).double().mean())
 
 
 def main() -> None:

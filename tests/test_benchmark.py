@@ -69,6 +69,7 @@ def test_multirun_writes_predictions_and_one_table(root, folder):
     for row in table:
         assert row["suite"] == "turn" and row["frames"] == "30" and row["joints"] == "5" and not row["error"]
         assert float(row["ms_per_frame"]) == pytest.approx(1000 * float(row["seconds"]) / 30, rel=0.05, abs=0.01)
+        assert not row["covered"]  # neither gives deviations
     for method in ("0_kcs", "1_sfam"):
         assert {p.name for p in (folder / "out" / method / "turn").iterdir()} == {"case_a.npz", "case_b.npz"}
         assert len(rows(folder / "out" / method / "results.csv")) == 2
@@ -238,5 +239,14 @@ def test_real_case_with_true_cameras(root, shared, tmp_path):
     done = benchmark(root, tmp_path, *words)
     assert done.returncode == 0, done.stdout + done.stderr
     (row,) = rows(tmp_path / "out" / "results.csv")
-    assert row["cameras"] == "true"
+    assert row["cameras"] == "true" and not row["covered"]
     assert float(row["e3d_world"]) == pytest.approx(float(row["e3d"]), rel=0.2)
+
+
+def test_how_many_errors_deviations_cover(root, shared, tmp_path):
+    words = ["method=pkc", "suite=real_openpose", "case=*camera1", f"shared={shared}", "hydra.run.dir=out"]
+    done = benchmark(root, tmp_path, *words)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (row,) = rows(tmp_path / "out" / "results.csv")
+    assert f"covered {float(row['covered']):.4f}" in done.stdout
+    assert 0.5 < float(row["covered"]) < 1  # of whatever size the tracks are

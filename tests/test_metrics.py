@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import similarity, superpose
-from kcs_torch.metrics import ALIGNMENTS, align, bone_deviation, e3d, mpjpe, pck
+from kcs_torch.metrics import ALIGNMENTS, align, bone_deviation, coverage, e3d, mpjpe, pck
 from kcs_torch.skeleton import SKELETONS
 
 BONES = [(0, 1), (1, 2), (2, 3), (0, 4)]
@@ -77,6 +77,7 @@ def test_batches_are_many_clips(batch):
             lambda p, t, w, how=how: pck(p, t, 1.0, align=how, weights=w),
             lambda p, t, w: e3d(p, t, weights=w),
             lambda p, t, w: bone_deviation(p, BONES, weights=w),
+            lambda p, t, w: coverage(p, w + 0.5, t, weights=w),
         ):
             together = figure(pred, truth, weights)
             assert together.shape == batch
@@ -146,6 +147,34 @@ def test_against_the_protocol(protocol):
     }
     for name, figure in ours.items():
         assert float(figure) == pytest.approx(theirs[name], rel=1e-6), name
+
+
+def test_coverage_of_true_deviations_is_that_of_the_normal_distribution():
+    generator = torch.Generator().manual_seed(0)
+    truth = clip(frames=500, joints=17)
+    deviation = (0.1 + torch.rand(500, 1, generator=generator, dtype=torch.float64)).expand(500, 17)
+    pred = truth.clone()
+    pred[..., 2] += deviation * torch.randn(500, 17, generator=generator, dtype=torch.float64)
+    assert float(coverage(pred, deviation, truth)) == pytest.approx(0.683, abs=0.03)
+    assert float(coverage(pred, 2 * deviation, truth)) == pytest.approx(0.954, abs=0.02)
+    mirrored, moved = pred * torch.tensor([1.0, 1.0, -1.0]), pred + 7
+    for other in (mirrored, moved):
+        assert torch.equal(coverage(other, deviation, truth), coverage(pred, deviation, truth))
+    assert coverage(9 * pred, 9 * deviation, truth, scale=True) == pytest.approx(0.683, abs=0.03)
+    assert coverage(9 * pred, 9 * deviation, truth) < 0.5
+
+
+def test_coverage_counts_what_is_known_of_the_truth():
+    truth, pred = clip(), clip(seed=1)
+    deviation = torch.ones(12, 6, dtype=torch.float64)
+    weights = deviation.clone()
+    weights[:, 5] = 0
+    spoilt = torch.where(weights[..., None] > 0, truth, torch.nan)
+    some = coverage(pred, deviation, spoilt, weights=weights)
+    assert torch.equal(some, coverage(pred[:, :5], deviation[:, :5], truth[:, :5])) and 0 < some < 1
+    assert coverage(pred, deviation, truth, weights=0 * weights).isnan()
+    with pytest.raises(ShapeError, match=r"coverage: deviation: expected shape \(\.\.\., 12, 6\), got \(6,\)"):
+        coverage(pred, torch.ones(6), truth)
 
 
 def test_bone_deviation_is_the_protocols_figure():

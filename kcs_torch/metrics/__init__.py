@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from kcs_torch.metrics.align import ALIGNMENTS, align
 from kcs_torch.metrics.compare import Comparison, compare
-from kcs_torch.metrics.errors import bone_deviation, e3d, mpjpe, pck
+from kcs_torch.metrics.errors import bone_deviation, coverage, e3d, mpjpe, pck
 from kcs_torch.metrics.solutions import Difference, difference
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ __all__ = [
     "align",
     "bone_deviation",
     "compare",
+    "coverage",
     "difference",
     "e3d",
     "mpjpe",

@@ -19,7 +19,7 @@ from kcs_torch.functional.weights import known
 from kcs_torch.metrics.align import align as aligned
 from kcs_torch.skeleton import Skeleton, get_skeleton
 
-__all__ = ["Bones", "bone_deviation", "bone_pairs", "distances", "e3d", "mpjpe", "pck"]
+__all__ = ["Bones", "bone_deviation", "bone_pairs", "coverage", "distances", "e3d", "mpjpe", "pck"]
 
 Bones = Tensor | Sequence[tuple[int, int]] | str | Path | Skeleton
 """What :func:`bone_pairs` takes."""
@@ -115,6 +115,52 @@ def e3d(pred: Tensor, truth: Tensor, *, weights: Tensor | None = None) -> Tensor
     spread = safe_root((target.square() * mass[..., None]).sum(-2) / count)  # (..., T, 3)
     some = (mass.sum(-1) > 0).to(mass)
     return _mean(distance, weights) / ((spread.mean(-1) * some).sum(-1) / some.sum(-1))
+
+
+def coverage(
+    pred: Tensor, deviation: Tensor, truth: Tensor, *, scale: bool = False, weights: Tensor | None = None
+) -> Tensor:
+    """Share of the depths that are off by no more than their standard deviation: about .68 where deviations are true.
+
+    Depths count from the middle of each frame's joints. Parallel rays do not tell the sign of depth: of a clip and its
+    mirror image, the nearer one counts.
+
+    Args:
+        pred: (..., T, N, 3), in the camera's frame, as a :class:`~kcs_torch.Reconstruction` has its ``points``.
+        deviation: (..., T, N) standard deviations of its depths, in its unit: the ``uncertainty``.
+        truth: (..., T, N, 3), in the same camera's frame.
+        scale: take the size from the truth first, one factor for a clip and its deviations; where both have one unit
+            there is no need.
+        weights: (..., T, N), 0 where a joint of the truth is unknown, whatever stands there; all 1 if None.
+
+    Returns:
+        (...), 0 to 1; NaN where nothing counts.
+
+    Raises:
+        ShapeError: the shapes differ, or a number that counts is not finite.
+
+    >>> truth = torch.tensor([[[0.0, 0, -1], [0, 1, 0], [0, 2, 1]]])
+    >>> coverage(1.2 * truth, torch.full((1, 3), 0.1), truth).item()
+    0.3333333432674408
+    """
+    check_core(pred, "coverage: pred", "T", "N", 3)
+    check_core(deviation, "coverage: deviation", *pred.shape[-3:-1])
+    pred, truth = _counted(pred, weights), _counted(truth, weights)
+    pred = aligned(pred, truth, "none", weights=weights)  # checks the rest; at least in single precision
+    mass = torch.ones_like(pred[..., 0]) if weights is None else weights.to(pred)
+    source, target = centre(pred, mass)[0], centre(truth.to(pred), mass)[0]
+    each, factor = mass[..., None], torch.ones_like(mass[..., 0, 0])
+
+    def summed(values: Tensor) -> Tensor:
+        return (values * each).sum((-3, -2, -1))
+
+    flip = pred.new_tensor([1.0, 1.0, -1.0])
+    turn = summed((source * target)[..., 2:]) < 0  # whose depths agree are nearer than their mirror image
+    source = torch.where(turn[..., None, None, None], source * flip, source)
+    if scale:
+        factor = summed(source * target) / or_one(summed(source.square()))
+    off = (factor[..., None, None] * source[..., 2] - target[..., 2]).abs()
+    return _mean((off <= factor[..., None, None] * deviation.to(off)).to(off), weights)
 
 
 def bone_deviation(points: Tensor, bones: Bones, *, weights: Tensor | None = None) -> Tensor:
