@@ -8,9 +8,9 @@
 
 Writes SUITE/CASE.npz (the prediction) and results.csv (a row a case) to the run's folder under ``outputs/``, and
 prints the means of each suite; "covered" is the share of depths that are off by no more than the standard deviation
-that the method gives, after one scale for a clip. A sweep has one results.csv more, of all its runs. Each row is written
-when its case is done: with keep=true a sweep that was stopped goes on in its folder. Inputs, truth and figures are the protocol's own. A
-case that fails is a row with its error, and makes the exit code 1.
+that the method gives, after one scale for a clip. A sweep has one results.csv more, of all its runs. Each row is
+written when its case is done: with keep=true a sweep that was stopped goes on in its folder. Inputs, truth and figures
+are the protocol's own. A case that fails is a row with its error, and makes the exit code 1.
 """
 
 from __future__ import annotations
