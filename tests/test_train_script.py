@@ -221,7 +221,7 @@ class TestWrongConfigurations:
             ("seed=one", "seed: expected a whole number"),
             ("threads=0", "threads: expected a whole number"),
             ("skeleton=dragon", "unknown skeleton 'dragon'"),
-            ("data.window=0", "window: expected at least 1"),
+            ("data.window=0", "window: expected a whole number, at least 1"),
             ("trainer.max_epochs=0", "at least one epoch with validation"),
             ("+trainer.default_root_dir=elsewhere", "trainer: default_root_dir: expected none"),
             ("+solver.num_steps=8", "solver: there is none to set num_steps of: choose one first, as solver=sfam does"),

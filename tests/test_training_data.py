@@ -1,5 +1,6 @@
 import itertools
 import math
+import re
 from pathlib import Path
 
 import lightning
@@ -474,6 +475,25 @@ def test_what_files_may_not_be(folder, tmp_path):
 def test_options_out_of_range(options):
     with pytest.raises(OptionError, match=next(iter(reversed(options)))):
         TracksDataModule(**options)
+
+
+@pytest.mark.parametrize("value", ["a", [1], math.nan, True, 1.5], ids=str)
+@pytest.mark.parametrize("name", ["window", "stride", "views", "batch_size", "steps_per_epoch", "clips", "seed"])
+def test_what_is_no_whole_number_is_told_by_its_name(name, value):
+    with pytest.raises(OptionError, match=rf"data: {name}: expected a whole number.*, got {re.escape(repr(value))}"):
+        TracksDataModule(**{name: value})
+
+
+@pytest.mark.parametrize("value", ["a", [1], math.nan, True], ids=str)
+@pytest.mark.parametrize("name", ["fps", "noise", "occlusion", "labelled", "labelled_per_batch", "pseudo_trust"])
+def test_what_is_no_number_is_told_by_its_name(name, value):
+    with pytest.raises(OptionError, match=rf"data: {name}: expected a .*, got {re.escape(repr(value))}"):
+        TracksDataModule(**{name: value})
+
+
+def test_what_is_no_method_makes_no_pseudo_labels():
+    with pytest.raises(OptionError, match="data: pseudo: expected a method, its name or None, got 5"):
+        TracksDataModule(pseudo=5)
 
 
 class Counting(lightning.LightningModule):

@@ -3,6 +3,7 @@
 import copy
 import json
 import math
+import re
 
 import lightning
 import pytest
@@ -125,6 +126,13 @@ def test_a_loss_over_nothing_is_0():
 def test_wrong_options(make, words):
     with pytest.raises(kt.OptionError, match=words):
         make()
+
+
+@pytest.mark.parametrize("name", ["critic_weight", "flip", "turn", "lr", "weight_decay", "clip", "seed"])
+@pytest.mark.parametrize("value", ["a", None, [1], math.nan, True])
+def test_what_is_no_number_is_told_by_its_name(name, value):
+    with pytest.raises(kt.OptionError, match=rf"LiftingModule: {name}: expected a .*, got {re.escape(repr(value))}"):
+        LiftingModule(kt.nn.MLPLifter(BODY), {"a": LossTerm(CycleConsistency())}, **{name: value})
 
 
 @pytest.mark.parametrize("shape", [(), (6, 5, 17), (5, 6)], ids=str)

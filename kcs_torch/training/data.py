@@ -16,14 +16,15 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.training.batch import Batch
 from kcs_torch.training.clips import SYNTHETIC, Clip, file_clips, find_files, synthetic_clips
 from kcs_torch.training.loader import BatchLoader, Deck
+from kcs_torch.training.options import AMOUNT, COUNT, COUNT_OR_NONE, POSITIVE, SHARE, WHOLE, check_options
 from kcs_torch.training.pseudo import pseudo_labels
 from kcs_torch.training.seeds import generator_of
 from kcs_torch.training.windows import FilmedWindows
-from kcs_torch.types.hints import is_a
 
 __all__ = ["TracksDataModule"]
 
 Patterns = str | Path | Sequence[str | Path]
+TILTS = "two angles within -90..90 degrees, the smaller one first"
 
 
 class TracksDataModule(lightning.LightningDataModule):
@@ -109,32 +110,24 @@ class TracksDataModule(lightning.LightningDataModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        rules = {
-            "fps": (fps is None or 0 < fps < math.inf, fps, "a positive number or None"),
-            "window": (window >= 1, window, "at least 1 frame"),
-            "stride": (stride is None or stride >= 1, stride, "at least 1 frame or None"),
-            "views": (views >= 1, views, "at least 1 camera"),
-            "pitch": (
-                is_a(pitch, tuple[float, float]) and -90 <= pitch[0] <= pitch[1] <= 90,
-                pitch,
-                "two angles within -90..90 degrees, the smaller one first",
-            ),
-            "noise": (0 <= noise < math.inf, noise, "a number not below 0"),
-            "occlusion": (0 <= occlusion < 1, occlusion, "a share of at least 0 and below 1"),
-            "batch_size": (batch_size >= 1, batch_size, "at least 1"),
-            "steps_per_epoch": (
-                steps_per_epoch is None or steps_per_epoch >= 1,
-                steps_per_epoch,
-                "at least 1, or None",
-            ),
-            "labelled": (0 <= labelled <= 1, labelled, "a share within 0..1"),
-            "labelled_per_batch": (0 <= labelled_per_batch <= 1, labelled_per_batch, "a share within 0..1"),
-            "pseudo_trust": (pseudo_trust > 0, pseudo_trust, "a positive number"),
-            "clips": (clips >= 1, clips, "at least 1"),
-        }
-        for name, (rule, value, expected) in rules.items():
-            if not rule:
-                raise OptionError(f"data: {name}: expected {expected}, got {value!r}")
+        check_options(
+            "data",
+            fps=(fps, (float | None, lambda x: x is None or 0 < x < math.inf, "a positive number or None")),
+            window=(window, COUNT),
+            stride=(stride, COUNT_OR_NONE),
+            views=(views, COUNT),
+            pitch=(pitch, (tuple[float, float], lambda x: -90 <= x[0] <= x[1] <= 90, TILTS)),
+            noise=(noise, AMOUNT),
+            occlusion=(occlusion, (float, lambda x: 0 <= x < 1, "a share of at least 0 and below 1")),
+            batch_size=(batch_size, COUNT),
+            steps_per_epoch=(steps_per_epoch, COUNT_OR_NONE),
+            labelled=(labelled, SHARE),
+            labelled_per_batch=(labelled_per_batch, SHARE),
+            pseudo=(pseudo, (str | Method | None, lambda _: True, "a method, its name or None")),
+            pseudo_trust=(pseudo_trust, POSITIVE),
+            clips=(clips, COUNT),
+            seed=(seed, WHOLE),
+        )
         if batch_size == 1 and 0 < labelled < 1 and 0 < labelled_per_batch < 1 and unlabelled:
             raise OptionError("data: batch_size: expected at least 2, so that a batch has windows of both kinds, got 1")
         if labelled == 0 and not unlabelled:
@@ -148,12 +141,8 @@ class TracksDataModule(lightning.LightningDataModule):
         self.files = {"train": train, "val": val, "test": test}
         self.folder, self.body, self.up, self.units, self.fps = folder, skeleton, up, units, fps
         self.file_units = file_units
-        self.window, self.stride, self.views, self.pitch = (
-            window,
-            stride or window,
-            views,
-            (float(pitch[0]), float(pitch[1])),
-        )
+        self.window, self.stride, self.views = window, stride or window, views
+        self.pitch = float(pitch[0]), float(pitch[1])
         self.noise, self.occlusion, self.fresh_cameras = noise, occlusion, fresh_cameras
         self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
         self.labelled, self.labelled_per_batch, self.unlabelled = labelled, labelled_per_batch, unlabelled

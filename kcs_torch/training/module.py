@@ -18,6 +18,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.training.augment import mirrored, turned, unit_size
 from kcs_torch.training.batch import Batch
 from kcs_torch.training.losses import LossTerm
+from kcs_torch.training.options import AMOUNT, POSITIVE, SHARE, WHOLE, check_options
 
 __all__ = ["LiftingModule"]
 
@@ -72,20 +73,23 @@ class LiftingModule(lightning.LightningModule):
         super().__init__()
         named = isinstance(losses, Mapping) and all(isinstance(term, LossTerm) for term in losses.values())
         names = list(losses) if named else []
-        fine = all(isinstance(name, str) and name and "." not in name and name not in RESERVED for name in names)
-        rules = {
-            "losses": (named and len(losses) > 0, losses, "a mapping of names to at least one LossTerm"),
-            "names of losses": (fine, names, f"words without dots, none of them of {', '.join(RESERVED)}"),
-            "critic_weight": (critic_weight >= 0, critic_weight, "a number not below 0"),
-            "flip": (0 <= flip <= 1, flip, "a share within 0..1"),
-            "turn": (0 <= turn <= 1, turn, "a share within 0..1"),
-            "lr": (lr > 0, lr, "a positive number"),
-            "weight_decay": (weight_decay >= 0, weight_decay, "a number not below 0"),
-            "clip": (clip > 0, clip, "a positive number"),
-        }
-        for name, (rule, value, expected) in rules.items():
-            if not rule:
-                raise OptionError(f"LiftingModule: {name}: expected {expected}, got {value!r}")
+        if not names:
+            raise OptionError(
+                f"LiftingModule: losses: expected a mapping of names to at least one LossTerm, got {losses!r}"
+            )
+        if not all(isinstance(name, str) and name and "." not in name and name not in RESERVED for name in names):
+            words = f"words without dots, none of them of {', '.join(RESERVED)}"
+            raise OptionError(f"LiftingModule: names of losses: expected {words}, got {names!r}")
+        check_options(
+            "LiftingModule",
+            critic_weight=(critic_weight, AMOUNT),
+            flip=(flip, SHARE),
+            turn=(turn, SHARE),
+            lr=(lr, POSITIVE),
+            weight_decay=(weight_decay, AMOUNT),
+            clip=(clip, POSITIVE),
+            seed=(seed, WHOLE),
+        )
         skeleton = getattr(network, "skeleton", None)
         if flip and not isinstance(skeleton, Skeleton):
             raise OptionError(
