@@ -12,7 +12,7 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.shapes import broadcast_shapes, check_core
 
-__all__ = ["best_path", "blend_windows", "interpolate", "jitter", "standing", "window_starts"]
+__all__ = ["best_path", "blend_windows", "fill_between", "interpolate", "jitter", "standing", "window_starts"]
 
 
 def interpolate(values: Tensor, seen: Tensor) -> Tensor:
@@ -44,6 +44,27 @@ def interpolate(values: Tensor, seen: Tensor) -> Tensor:
     known = (~never).to(values.dtype)[..., None]
     middle = (filled * known).sum(-2, keepdim=True) / known.sum(-2, keepdim=True).clamp_min(1)
     return torch.where(never[..., None], middle, filled)
+
+
+def fill_between(values: Tensor, pick: Tensor, length: int) -> Tensor:
+    """Fill in the frames between some, linearly, and those beyond the ends with the nearest.
+
+    Args:
+        values: (H, K, ...), of the frames that are known.
+        pick: (K,) which frames these are.
+        length: T.
+
+    Returns:
+        (H, T, ...).
+
+    >>> fill_between(torch.tensor([[0.0, 4]]), torch.tensor([0, 2]), 4)
+    tensor([[0., 2., 4., 4.]])
+    """
+    known = torch.zeros(length, 1, dtype=torch.bool, device=values.device)
+    known[pick] = True
+    full = values.new_zeros(len(values), length, 1, values[0, 0].numel())
+    full[:, pick] = values.reshape(*values.shape[:2], 1, -1)
+    return interpolate(full, known).reshape(len(values), length, *values.shape[2:])
 
 
 def jitter(values: Tensor, seen: Tensor, *, order: int = 4) -> Tensor:

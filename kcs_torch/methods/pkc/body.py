@@ -14,7 +14,7 @@ from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
-from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
+from kcs_torch.functional.temporal import blend_windows, fill_between, window_starts
 from kcs_torch.methods.lockstep import Search, together
 from kcs_torch.methods.pkc.assembly import TIGHT
 from kcs_torch.methods.pkc.descents import Descent
@@ -310,8 +310,10 @@ class Body:
                 off = (alike(other, depth) - depth).square().sum()
                 return bool(off <= AGREE**2 * depth.square().sum())
 
-            lifted = image[some], rate, noise, rounds, steps, anchor
-            return searching(self.skeleton, *lifted, standing=feet, confirmed=confirmed)
+            return searching(
+                self.skeleton, image[some], rate=rate, noise=noise, rounds=rounds, steps=steps, anchor=anchor,
+                standing=feet, confirmed=confirmed,
+            )  # fmt: skip
 
         if len(starts) == 1:
             found = yield from lift(slice(None))
@@ -336,12 +338,8 @@ class Body:
 
     def _on_all_frames(self, found: Hypotheses, stride: int, steps: int) -> Search[Any, Any, Hypotheses]:
         """Hypotheses of every ``stride``-th frame on all frames, refined."""
-        frames = len(self.image)
-        known = torch.zeros(frames, 1, dtype=torch.bool, device=self.image.device)
-        known[::stride] = True
-        full = found.depth.new_zeros(len(found.depth), frames, 1, found.depth.shape[-1])
-        full[:, ::stride] = found.depth[:, :, None]
-        depth = interpolate(full, known)[:, :, 0]
+        pick = torch.arange(0, len(self.image), stride, device=self.image.device)
+        depth = fill_between(found.depth, pick, len(self.image))
         return (yield from refined(self.objective, replace(found, depth=depth), steps))
 
 

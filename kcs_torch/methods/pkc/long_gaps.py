@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import complete_rotation
-from kcs_torch.functional.temporal import interpolate
+from kcs_torch.functional.temporal import fill_between
 from kcs_torch.methods.base import Estimate
 from kcs_torch.methods.pkc.cleaning import HELD
 from kcs_torch.methods.unseen import gap_deviation
@@ -50,14 +50,9 @@ def lengthened(found: Estimate, kept: Tensor, tracks: Tracks, cameras: Tensor | 
 
     How unsure places in a gap are goes by how long it really is. ``cameras`` (T, 2, 3) that are known stay as they are.
     """
-    frames = tracks.num_frames
-    known = torch.zeros(frames, 1, dtype=torch.bool, device=kept.device)
-    known[kept] = True
 
     def all_of(values: Tensor) -> Tensor:
-        out = values.new_zeros(frames, 1, values[0].numel())
-        out[kept] = values.reshape(len(kept), 1, -1)
-        return interpolate(out, known).reshape(frames, *values.shape[1:])
+        return fill_between(values[None], kept, tracks.num_frames)[0]
 
     points = all_of(found.points)
     unseen = gap_deviation(points[..., :2], tracks.seen, tracks.fps or 30.0, HELD)

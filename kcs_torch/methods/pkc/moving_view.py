@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from torch import Tensor
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
-from kcs_torch.functional.temporal import interpolate
+from kcs_torch.functional.temporal import fill_between
 from kcs_torch.methods.lockstep import Search, run
 from kcs_torch.methods.pkc.assembly import SLACK, TIGHT, WORTH, Assembly, followed
 from kcs_torch.methods.pkc.descents import Descent, descend_all
@@ -137,7 +138,15 @@ class MovingView:
         return own if self.noise is None else torch.hypot(own, FARTHER * self.noise)
 
 
-def moving_view(
+def moving_view(image: Tensor, skeleton: Skeleton, start: Tensor, rotations: Tensor, **options: Any) -> MovingView:
+    """Lift one clip by low-rank motion of aligned bones of constant length: :func:`searching` by itself.
+
+    Arguments are those of :func:`searching`.
+    """
+    return run(searching(image, skeleton, start, rotations, **options), descend_all)
+
+
+def searching(
     image: Tensor,
     skeleton: Skeleton,
     start: Tensor,
@@ -151,8 +160,8 @@ def moving_view(
     alternatives: int = 1,
     exact: bool = True,
     seed: int = 0,
-) -> MovingView:
-    """Lift one clip by low-rank motion of aligned bones of constant length.
+) -> Search[Descent, Pose, MovingView]:
+    """Search for the motion of one clip, beside others maybe.
 
     Args:
         image: (T, N, 2), complete, centred per frame, of root mean square 1.
@@ -172,31 +181,8 @@ def moving_view(
         seed: of the random starts.
 
     Returns:
-        The solutions, ranked.
+        A search that ends with the solutions, ranked.
     """
-    search = searching(
-        image, skeleton, start, rotations, weights=weights, noise=noise, turns=turns, lifts=lifts,
-        coarse_frames=coarse_frames, alternatives=alternatives, exact=exact, seed=seed,
-    )  # fmt: skip
-    return run(search, descend_all)
-
-
-def searching(
-    image: Tensor,
-    skeleton: Skeleton,
-    start: Tensor,
-    rotations: Tensor,
-    *,
-    weights: Tensor | None = None,
-    noise: float = 0.0,
-    turns: Sequence[float] = TURNS,
-    lifts: int = 6,
-    coarse_frames: int = 100,
-    alternatives: int = 1,
-    exact: bool = True,
-    seed: int = 0,
-) -> Search[Descent, Pose, MovingView]:
-    """:func:`moving_view` as a search, which may run beside others; arguments as there."""
     frames, joints, _ = image.shape
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
@@ -354,14 +340,6 @@ def _starts(
 
 def _spread_out(pose: Pose, image: Tensor, pick: Tensor) -> tuple[Tensor, Tensor]:
     """Points and rotations of all frames, linear between those in ``pick``."""
-    count, frames = len(pose.points), len(image)
-    known = torch.zeros(frames, 1, dtype=torch.bool, device=image.device)
-    known[pick] = True
-
-    def fill(values: Tensor) -> Tensor:
-        out = values.new_zeros(count, frames, 1, values[0, 0].numel())
-        out[:, pick] = values.flatten(2)[:, :, None]
-        return interpolate(out, known).reshape(count, frames, *values.shape[2:])
-
-    depth = fill(pose.points[..., 2:])
-    return torch.cat([image.expand(count, -1, -1, -1), depth], -1), nearest_rotation(fill(pose.rotations))
+    depth = fill_between(pose.points[..., 2:], pick, len(image))
+    turned = nearest_rotation(fill_between(pose.rotations, pick, len(image)))
+    return torch.cat([image.expand(len(depth), -1, -1, -1), depth], -1), turned
