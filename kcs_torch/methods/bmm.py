@@ -11,6 +11,7 @@ from torch import Tensor
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.spectral import spectral_norm, svt
 from kcs_torch.methods.factorised import SETTLED, Factorised, camera_rows
+from kcs_torch.nn.steps import continuation
 from kcs_torch.solvers.iterate import Solution, iterate, relative_change
 
 __all__ = ["BMM"]
@@ -60,13 +61,13 @@ class BMM(Factorised):
         share = weights[..., None]
         start = back_project(tracks, cameras)
         size = spectral_norm(start.flatten(-2))
-        fall = (self.final / self.mu) ** (1 / max(self.num_steps - 1, 1))
+        levels = continuation(self.num_steps, self.mu, self.final)
 
         def step(state: tuple[Tensor, Tensor], k: int) -> tuple[Tensor, Tensor]:
             shape, before = state
             ahead = shape + self.momentum * (shape - before)
             gradient = back_project(share * (project(ahead, cameras) - tracks), cameras)
-            shrunk = svt((ahead - gradient).flatten(-2), self.mu * fall**k * size)
+            shrunk = svt((ahead - gradient).flatten(-2), levels[k] * size)
             return shrunk.unflatten(-1, ahead.shape[-2:]), shape
 
         shape, before = iterate(step, (start, start), num_steps=self.num_steps).value

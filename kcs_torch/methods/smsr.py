@@ -12,6 +12,7 @@ from torch import Tensor
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.spectral import dct_basis, spectral_norm
 from kcs_torch.methods.factorised import SETTLED, Factorised, upgraded_rows
+from kcs_torch.nn.steps import continuation
 from kcs_torch.solvers.ist import ist, metric_upgrade
 from kcs_torch.solvers.iterate import Solution, fpc, relative_change
 
@@ -78,9 +79,8 @@ class SMSR(Factorised):
             return back_project(weights[..., None] * residual, cameras).flatten(-2)
 
         start = back_project(smooth, cameras).flatten(-2)
-        fall = (self.final / self.mu) ** (1 / max(self.num_steps - 1, 1))
         size = spectral_norm(start)
-        falling = torch.stack([self.mu * fall**k * size for k in range(self.num_steps)])
+        falling = torch.stack([mu * size for mu in continuation(self.num_steps, self.mu, self.final)])
         before = fpc(start, gradient, step=self.tau, weights=falling[:-1], steps_per_weight=1).value
         shape = fpc(before, gradient, step=self.tau, weights=falling[-1:], steps_per_weight=1).value
         change = relative_change(before, shape)
