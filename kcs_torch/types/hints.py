@@ -56,13 +56,6 @@ def spoken(hint: Any) -> str:
         return " or ".join(spoken(h) for h in inner)
     if origin is typing.Literal:
         return " or ".join(map(str, inner))
-    words = {
-        int: "a whole number",
-        float: "a finite number",
-        bool: "true or false",
-        str: "text",
-        types.NoneType: "none",
-    }
-    if hint in words:
-        return words[hint]
+    if hint in _WORDS:
+        return _WORDS[hint]
     return "a list such as [[left_wrist, right_wrist]]" if origin else getattr(hint, "__name__", str(hint))
