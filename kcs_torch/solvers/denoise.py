@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.solvers.completion import complete_tracks
-from kcs_torch.solvers.spectrum import temporal_modes, unshared, white_power
+from kcs_torch.solvers.spectrum import TINY, temporal_modes, unshared, white_power
 from kcs_torch.solvers.stray import FLOOR, STRAY, body_size, each_joint, far_off, stray_from_neighbours
 
 __all__ = ["Denoised", "denoise_tracks"]
@@ -25,7 +25,6 @@ _ROUNDS = ((2, 40), (1, 40), (1, 60))
 _CHUNK = 256  # windows solved at once: bounds memory
 # Of the body's size: below it nothing is gained, and gaps would converge more slowly.
 _LEAST_NOISE = 1e-3
-_TINY = 1e-30
 # Noise that lasts for several frames is told where joints do not share the first part of a band's deviation, and surely
 # where not the second.
 _LASTS = (0.08, 0.13)
@@ -110,7 +109,7 @@ def denoise_tracks(
     values = tracks.detach().reshape(-1, *shape[-3:]).double()  # (K, T, N, 2): the spectra span more than float32
     given = weights.detach().reshape(values.shape[:-1]).double()
     size = body_size(values, given > 0)
-    unit = torch.where(size > _TINY, size, torch.ones_like(size))[:, None, None, None]
+    unit = torch.where(size > TINY, size, torch.ones_like(size))[:, None, None, None]
     values = values / unit
     frames, joints = values.shape[1], values.shape[2]
     length = min(window, frames)
@@ -195,7 +194,7 @@ class _Model:
             variance = variance / variance.mean(-1, keepdim=True)
             self.axes.append(axes[:, None])
             variances.append(spectrum[:, a:b, None] * variance[:, None])
-        motion = torch.cat(variances, 1).clamp_min(_TINY)  # (K, L, M)
+        motion = torch.cat(variances, 1).clamp_min(TINY)  # (K, L, M)
         white, lasting = self.noise[:, None, None], self.lasting[..., None]
         self.ratio = (white / (motion + lasting))[:, None]  # (K, 1, L, M)
         self.moving = (motion / (motion + lasting))[:, None]
@@ -213,7 +212,7 @@ class _Model:
             if a >= self.quick:
                 part = z[:, :, a:b].flatten(1, 2)
                 own, surely = unshared(part)
-                among = (surely / part.square().mean((1, 2)).clamp_min(_TINY)).sqrt()
+                among = (surely / part.square().mean((1, 2)).clamp_min(TINY)).sqrt()
                 noisy = ((among - _LASTS[0]) / (_LASTS[1] - _LASTS[0])).clamp(0, 1)
                 known = torch.where(own.isfinite(), own, level)
                 level = torch.lerp(torch.minimum(known, level), known, noisy)
@@ -225,7 +224,7 @@ class _Model:
         dot = lambda a, b: (a * b).sum((-1, -2), keepdim=True)  # noqa: E731
         apply = lambda v: w * v + self._from_modes(self.ratio * self._to_modes(v))  # noqa: E731
         even = lambda r: self._from_modes(self._to_modes(r) / (self.share + self.ratio))  # noqa: E731
-        small = tolerance * dot(w * y, even(w * y)) + _TINY
+        small = tolerance * dot(w * y, even(w * y)) + TINY
         rest = w * y - apply(x)
         towards = step = even(rest)
         energy = dot(rest, towards)
@@ -234,11 +233,11 @@ class _Model:
                 break
             image = apply(step)
             # A window that has converged rests, so that what is beside it in the batch makes no difference.
-            far = torch.where(energy > small, energy / dot(step, image).clamp_min(_TINY**2), torch.zeros_like(energy))
+            far = torch.where(energy > small, energy / dot(step, image).clamp_min(TINY**2), torch.zeros_like(energy))
             x, rest = x + far * step, rest - far * image
             towards = even(rest)
             before, energy = energy, dot(rest, towards)
-            step = towards + energy / before.clamp_min(_TINY**2) * step
+            step = towards + energy / before.clamp_min(TINY**2) * step
         return x
 
     def still(self, x: Tensor) -> Tensor:

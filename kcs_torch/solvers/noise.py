@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.temporal import interpolate, window_starts
-from kcs_torch.solvers.spectrum import temporal_modes, unshared, white_power
+from kcs_torch.solvers.spectrum import TINY, temporal_modes, unshared, white_power
 from kcs_torch.solvers.stray import FLOOR, STRAY, body_size, each_joint, stray_from_neighbours
 
 __all__ = ["SHORT", "Noise", "measure_noise"]
@@ -22,8 +22,6 @@ SHORT = 12
 
 STEADY, SEEN = 4, 0.95
 """Joints that tell the kind of noise, at least, and the share of the frames that show each."""
-
-TINY = 1e-30
 
 
 class Noise(NamedTuple):

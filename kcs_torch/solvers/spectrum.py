@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.functional.ranks import median
 
-__all__ = ["spectrum_floor", "temporal_modes", "unshared", "white_power", "window_at"]
+__all__ = ["TINY", "spectrum_floor", "temporal_modes", "unshared", "white_power", "window_at"]
 
 ENOUGH = 20
 """Modes from which on noise can be told from motion."""
@@ -23,6 +23,7 @@ SHARED = (0.15, 0.35)
 the second on."""
 
 TINY = 1e-30
+"""Sizes and powers up to it are those of nothing."""
 
 
 def window_at(rate: float) -> int:
