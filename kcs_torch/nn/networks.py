@@ -57,6 +57,8 @@ class _Residual(nn.Module):
 class _Network(SkeletonModule):
     """Normalised frames and their neighbours, residual blocks, and ``outputs`` numbers a frame."""
 
+    _options: dict[str, Any]
+
     def __init__(
         self,
         skeleton: str | Path | Skeleton,
@@ -95,7 +97,7 @@ class _Network(SkeletonModule):
     @property
     def options(self) -> dict[str, Any]:
         """What the constructor takes besides the skeleton, as plain values."""
-        raise NotImplementedError
+        return dict(self._options)
 
     def extra_repr(self) -> str:
         return ", ".join([super().extra_repr(), *(f"{k}={v}" for k, v in self.options.items())])
@@ -177,11 +179,6 @@ class MLPLifter(_Lifter):
         super().__init__(skeleton, width=width, dropout=dropout, window=window, dilations=(0,) * num_blocks)
         self._options = {"width": width, "num_blocks": num_blocks, "dropout": dropout, "window": window}
 
-    @property
-    def options(self) -> dict[str, Any]:
-        """What the constructor takes besides the skeleton, as plain values."""
-        return dict(self._options)
-
 
 class TemporalLifter(_Lifter):
     """Residual temporal convolutions of three frames each, ever farther apart; for clips of any length.
@@ -217,11 +214,6 @@ class TemporalLifter(_Lifter):
         super().__init__(skeleton, width=channels, dropout=dropout, window=1, dilations=dilations)
         self._options = {"channels": channels, "dilations": list(dilations), "dropout": dropout}
 
-    @property
-    def options(self) -> dict[str, Any]:
-        """What the constructor takes besides the skeleton, as plain values."""
-        return dict(self._options)
-
 
 class CameraHead(_Network):
     """Weak-perspective camera of each frame from its tracks, as a network of its own.
@@ -255,11 +247,6 @@ class CameraHead(_Network):
         check_whole(self, 0, num_blocks=num_blocks)
         super().__init__(skeleton, width=width, dropout=dropout, window=window, dilations=(0,) * num_blocks, outputs=7)
         self._options = {"width": width, "num_blocks": num_blocks, "dropout": dropout, "window": window}
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """What the constructor takes besides the skeleton, as plain values."""
-        return dict(self._options)
 
     def forward(self, tracks: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Tell the cameras of tracks.
