@@ -12,8 +12,10 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.functional.chain import pose_matrix
 from kcs_torch.functional.guarded import or_one, safe_norm
+from kcs_torch.functional.precision import full_precision, wide
+from kcs_torch.functional.weights import known
 from kcs_torch.nn.distances import check_pose_weights
-from kcs_torch.nn.layers import SkeletonModule, full_precision, known, wide
+from kcs_torch.nn.layers import SkeletonModule
 from kcs_torch.nn.masks import bone_share
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.graph import find_parts

@@ -16,19 +16,18 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.guarded import or_one, safe_root
+from kcs_torch.functional.precision import full_precision, wide
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.spectral import log_det, nuclear_norm, svt
+from kcs_torch.functional.weights import known
 from kcs_torch.nn.layers import (
     SkeletonModule,
     check_coordinates,
     check_points,
     check_tensor,
-    full_precision,
-    known,
     narrow,
     seen_weights,
     shown,
-    wide,
 )
 from kcs_torch.nn.masks import bone_share
 from kcs_torch.skeleton import Skeleton

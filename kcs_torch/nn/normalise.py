@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.guarded import largest, or_one, safe_root
+from kcs_torch.functional.precision import wide
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.nn.layers import seen_weights, wide
+from kcs_torch.nn.layers import seen_weights
 
 __all__ = ["NormalisedTracks", "neighbours", "normalise_tracks"]
 

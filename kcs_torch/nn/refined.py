@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from kcs_torch.errors import SkeletonError
 from kcs_torch.functional import centre
 from kcs_torch.functional.guarded import largest, or_one
-from kcs_torch.nn.layers import narrow, seen_weights, wide
+from kcs_torch.functional.precision import wide
+from kcs_torch.nn.layers import narrow, seen_weights
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["RefinedLifter"]

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from kcs_torch.functional import centre, orbit
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.nn.layers import wide
+from kcs_torch.functional.precision import wide
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.training.batch import Batch
 

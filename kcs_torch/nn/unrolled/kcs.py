@@ -12,7 +12,9 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_lengths, bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.guarded import or_one
+from kcs_torch.functional.precision import full_precision, wide
 from kcs_torch.functional.shapes import broadcast_shapes
+from kcs_torch.functional.weights import known
 from kcs_torch.nn.deviation import (
     Arrangement,
     deviation_goal,
@@ -22,7 +24,7 @@ from kcs_torch.nn.deviation import (
     template_scale,
 )
 from kcs_torch.nn.energies import centred_residual
-from kcs_torch.nn.layers import full_precision, known, narrow, wide
+from kcs_torch.nn.layers import narrow
 from kcs_torch.nn.steps import continuation
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.skeleton import Skeleton, get_skeleton
