@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import difflib
 import sys
-from collections.abc import Iterable
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 __all__ = [
     "ConvergenceWarning",
@@ -23,6 +26,7 @@ __all__ = [
     "counted",
     "unknown",
     "users_level",
+    "warnings_told",
 ]
 
 
@@ -91,3 +95,20 @@ def users_level() -> int:
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "kcs_torch":
         level, frame = level + 1, frame.f_back
     return level
+
+
+@contextmanager
+def warnings_told(tell: Callable[[str], object]) -> Iterator[None]:
+    """Hand all warnings of this library to ``tell``, repeated ones too; others go where they usually do."""
+    usual = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
+        if issubclass(category, KcsWarning):
+            tell(str(message))
+        else:
+            usual(message, category, *rest)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", KcsWarning)
+        warnings.showwarning = show  # type: ignore[assignment]
+        yield

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import math
 import sys
-import warnings
 from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from kcs_torch.errors import KcsError, KcsWarning, counted
+from kcs_torch.errors import KcsError, counted, warnings_told
 
 if TYPE_CHECKING:
     from kcs_torch.types import Reconstruction
@@ -32,17 +31,7 @@ def answer(as_json: bool = False) -> Iterator[dict[str, Any]]:
     What the body puts into the dictionary that it gets is printed as JSON together with the error.
     """
     found: dict[str, Any] = {}
-    usual = warnings.showwarning
-
-    def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
-        if issubclass(category, KcsWarning):
-            typer.echo(f"warning: {one_line(message)}", err=True)
-        else:
-            usual(message, category, *rest)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", KcsWarning)
-        warnings.showwarning = show  # type: ignore[assignment]
+    with warnings_told(lambda text: typer.echo(f"warning: {one_line(text)}", err=True)):
         try:
             yield found
         except KcsError as error:

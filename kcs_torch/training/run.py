@@ -26,7 +26,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError
+from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError, warnings_told
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.training.callbacks import Best, Diverged, Last, Watch
 from kcs_torch.training.checkpoint import describe, save_lifter
@@ -225,21 +225,8 @@ def _quiet() -> Iterator[None]:
                 logging.getLogger(name).setLevel(level)
 
 
-@contextmanager
-def _said() -> Iterator[None]:
-    """Print warnings of this library as one line each, in every run of a sweep."""
-    usual = warnings.showwarning
-
-    def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
-        if issubclass(category, KcsWarning):
-            print(f"warning: {message}", file=sys.stderr)
-        else:
-            usual(message, category, *rest)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", KcsWarning)
-        warnings.showwarning = show  # type: ignore[assignment]
-        yield
+def _to_stderr(warning: str) -> None:
+    print(f"warning: {warning}", file=sys.stderr)
 
 
 def job(config: DictConfig) -> float:
@@ -258,7 +245,7 @@ def job(config: DictConfig) -> float:
     if config.keep and (folder / RESULT).is_file():
         print(f"{folder}: had ended with other settings, and is replaced: runs go by their number", file=sys.stderr)
     (folder / RESULT).unlink(missing_ok=True)  # of an earlier run, whose settings Hydra has replaced
-    with in_one_line(MisconfigurationException), _said():
+    with in_one_line(MisconfigurationException), warnings_told(_to_stderr):
         outcome = train(config, folder)
     figures = {config.optimise: outcome.value} | dict(outcome.metrics)
     result = {name: figure if math.isfinite(figure) else None for name, figure in figures.items()}
