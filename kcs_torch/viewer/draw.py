@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,7 +114,7 @@ def clearest_frame(people: Sequence[Tracks]) -> int:
     return first + int(np.argmax(near >= CLEAR * near.max()))
 
 
-def new_figure(width: float, height: float, dpi: int) -> Figure:
+def new_figure(width: float, height: float, dpi: int, layout: Literal["constrained"] | None = None) -> Figure:
     """An empty figure of no window, in inches.
 
     Raises:
@@ -125,9 +125,17 @@ def new_figure(width: float, height: float, dpi: int) -> Figure:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise OutputError(f"a picture needs the package matplotlib ({error}): pip install matplotlib") from None
-    figure = Figure(figsize=(width, height), dpi=dpi)
+    figure = Figure(figsize=(width, height), dpi=dpi, layout=layout)
     FigureCanvasAgg(figure)
     return figure
+
+
+def frame_alone(axis: Any) -> None:
+    """Leave of a picture's axes a pale frame, without ticks."""
+    axis.set_xticks([])
+    axis.set_yticks([])
+    for spine in axis.spines.values():
+        spine.set_color("#dddddd")
 
 
 def _panels(count: int, joints: int) -> tuple[Figure, list[Any]]:
@@ -136,10 +144,7 @@ def _panels(count: int, joints: int) -> tuple[Figure, list[Any]]:
     axes = figure.subplots(1, count, squeeze=False)[0]
     figure.subplots_adjust(left=0.01, right=0.99, bottom=0.45 / (side + 0.7), top=1 - 0.75 / (side + 0.7), wspace=0.02)
     for axis in axes:
-        axis.set_xticks([])
-        axis.set_yticks([])
-        for spine in axis.spines.values():
-            spine.set_color("#dddddd")
+        frame_alone(axis)
     return figure, list(axes)
 
 

@@ -11,7 +11,7 @@ from kcs_torch.errors import OutputError
 from kcs_torch.types import Reconstruction
 from kcs_torch.types.people import files_named
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
-from kcs_torch.viewer.draw import new_figure
+from kcs_torch.viewer.draw import frame_alone, new_figure
 from kcs_torch.viewer.names import person_names, printable
 from kcs_torch.viewer.together import points_together
 
@@ -195,7 +195,4 @@ def _limits(axis: Any, middle: Array, half: Array) -> None:
     half = np.array([box.width, box.height]) / scale
     axis.set_xlim(middle[0] - half[0], middle[0] + half[0])
     axis.set_ylim(middle[1] + half[1], middle[1] - half[1])
-    axis.set_xticks([])
-    axis.set_yticks([])
-    for spine in axis.spines.values():
-        spine.set_color("#dddddd")
+    frame_alone(axis)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.types import Reconstruction
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
+from kcs_torch.viewer.draw import frame_alone, new_figure
 from kcs_torch.viewer.names import printable
 from kcs_torch.viewer.summary import summarise
 
@@ -48,11 +49,6 @@ def sheet(result: Reconstruction, *, frames: int = 8, turn: float = TURN) -> Fig
     """
     if frames < 1:
         raise OptionError(f"frames: expected at least 1, got {frames}")
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise OutputError(f"a picture needs the package matplotlib ({error}): pip install matplotlib") from None
     points = result.points.detach().cpu().double().numpy()
     if not np.isfinite(points).all(-1).any():
         raise OutputError("a picture needs at least one joint at a finite place")
@@ -69,18 +65,17 @@ def sheet(result: Reconstruction, *, frames: int = 8, turn: float = TURN) -> Fig
         ("3D, from the camera", points[chosen][..., :2], points[chosen][..., 2]),
         (f"3D, turned {turn:g}°", np.stack([points @ right, points[..., 1]], -1)[chosen], (points @ away)[chosen]),
     ]
-    return _draw(result, chosen, kinds, Figure, FigureCanvasAgg)
+    return _draw(result, chosen, kinds)
 
 
-def _draw(result: Reconstruction, chosen: NDArray[Any], kinds: list[Any], figure_type: Any, canvas_type: Any) -> Figure:
+def _draw(result: Reconstruction, chosen: NDArray[Any], kinds: list[Any]) -> Figure:
     halves = [_half_width(places) for _, places, _ in kinds]
     shapes = [float(h[0] / h[1]) for h in halves]
     width = min(max(SIDE * max(shapes), SIDE / 2), WIDEST)
     heights = [min(SIDE, width / shape) for shape in shapes]
     columns, size = _arrange(len(chosen), width + 0.08, sum(heights) + 0.25)
     bands = math.ceil(len(chosen) / columns)
-    figure = figure_type(figsize=size, dpi=130, layout="constrained")
-    canvas_type(figure)
+    figure = new_figure(*size, 130, "constrained")
     axes = figure.subplots(bands * len(kinds), columns, squeeze=False, height_ratios=heights * bands)
     axes = axes.reshape(bands, len(kinds), columns).swapaxes(0, 1)  # by kind, band and column
     title = [f"{result.method}: {Path(result.tracks.source).name}", summarise(result)]
@@ -96,10 +91,7 @@ def _draw(result: Reconstruction, chosen: NDArray[Any], kinds: list[Any], figure
             axis.set_xlim(middle[0] - half[0], middle[0] + half[0])
             axis.set_ylim(middle[1] + half[1], middle[1] - half[1])  # y is down
             axis.set_aspect("equal")
-            axis.set_xticks([])
-            axis.set_yticks([])
-            for spine in axis.spines.values():
-                spine.set_color("#dddddd")
+            frame_alone(axis)
             if label == "tracks":
                 axis.set_title(_when(int(chosen[i]), result.fps), fontsize=8)
         for line in lines:
