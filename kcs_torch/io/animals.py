@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,10 +15,11 @@ from numpy.typing import NDArray
 from kcs_torch.errors import FormatError, counted
 from kcs_torch.io.build import build_tracks, nothing_seen
 from kcs_torch.io.folders import frame_numbers
-from kcs_torch.io.registry import Options, brief
+from kcs_torch.io.header import delimiter
+from kcs_torch.io.registry import Options, brief, read_error
 from kcs_torch.types import Tracks
 
-__all__ = ["LIMIT", "Animal", "bounded_lines", "build_animals", "frames_of", "refuse_3d"]
+__all__ = ["LIMIT", "Animal", "bounded_rows", "build_animals", "frames_of", "refuse_3d"]
 
 LIMIT = 2**28  # numbers of all animals in all frames
 LINES, LINE = 2**23, 2**23  # of a table of text, and letters of one
@@ -79,12 +82,23 @@ def frames_of(rows: Sequence[tuple[str | float, ...]], path: Path, notes: list[s
     return order, frames
 
 
-def bounded_lines(file: Iterable[str], path: Path) -> Iterator[str]:
-    """The lines of a table of text, within bounds on their length and number.
+@contextmanager
+def bounded_rows(path: Path) -> Iterator[Any]:
+    """Open a table of text: a csv reader of its rows.
 
     Raises:
-        FormatError: a line is longer, or there are more, than any table of tracks has.
+        FormatError: it cannot be read; a line is longer, or there are more, than any table of tracks has.
     """
+    try:
+        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+            between = delimiter(file.readline(LINE))
+            file.seek(0)
+            yield csv.reader(_bounded(file, path), delimiter=between)
+    except OSError as error:
+        raise read_error(path, error) from None
+
+
+def _bounded(file: Iterable[str], path: Path) -> Iterator[str]:
     for number, line in enumerate(file, 1):
         if len(line) > LINE or number > LINES:
             raise FormatError(f"{path}: line {number}: expected up to {LINES} lines of {LINE} letters: split the file")

@@ -18,11 +18,10 @@ import torch
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.animals import LIMIT, LINE, Animal, bounded_lines, build_animals, frames_of, refuse_3d
+from kcs_torch.io.animals import LIMIT, Animal, bounded_rows, build_animals, frames_of, refuse_3d
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5_pandas import Table, has_column, pandas_group, read_pandas
-from kcs_torch.io.header import delimiter
-from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief, read_error
+from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief
 from kcs_torch.io.wide import is_missing, not_a_number
 from kcs_torch.types import Motion, Tracks
 
@@ -141,10 +140,7 @@ def _read_csv(path: Path, coords: Sequence[str], notes: list[str]) -> Table:
     numbers, short = array("d"), 0
     rows: list[tuple[str, ...]] = []
     try:
-        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            between = delimiter(file.readline(LINE))
-            file.seek(0)
-            lines = csv.reader(bounded_lines(file, path), delimiter=between)
+        with bounded_rows(path) as lines:
             header = _header(lines, path)
             width, first = len(header[0]), _first_column(header)
             columns = list(zip(*header, strict=True))
@@ -168,8 +164,6 @@ def _read_csv(path: Path, coords: Sequence[str], notes: list[str]) -> Table:
                     names = [columns[i][1:] for i in take]
                     raise FormatError(f"{path}: line {lines.line_num}: {_wrong(names, values)}") from None
                 rows.append(tuple(line[:first]))
-    except OSError as error:
-        raise read_error(path, error) from None
     except (csv.Error, ValueError) as error:
         if isinstance(error, FormatError):
             raise

@@ -12,13 +12,13 @@ import torch
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.animals import LIMIT, LINE, Animal, bounded_lines, build_animals, frames_of, refuse_3d
+from kcs_torch.io.animals import LIMIT, Animal, bounded_rows, build_animals, frames_of, refuse_3d
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5 import Tree, read_tree
-from kcs_torch.io.header import Header, delimiter, first_line
+from kcs_torch.io.header import Header, first_line
 from kcs_torch.io.jsonfile import as_frame_number
 from kcs_torch.io.link import link_people
-from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief, read_error
+from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief
 from kcs_torch.io.wide import is_missing, not_a_number
 from kcs_torch.types import Motion, Tracks
 
@@ -174,11 +174,8 @@ def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
     """Read the table with one line for every animal in every frame."""
     instances: dict[str, dict[int, list[NDArray[np.float64]]]] = {}
     try:
-        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            between = delimiter(file.readline(LINE))
-            file.seek(0)
-            lines = csv.reader(bounded_lines(file, path), delimiter=between)
-            header = next(lines, [])
+        with bounded_rows(path) as lines:
+            header: list[str] = next(lines, [])
             names = list(dict.fromkeys(c.rpartition(".")[0] for c in header[3:]))
             places = [[_place(header, f"{n}.{c}") for c in ("x", "y", "score")] for n in names]
             if not names or any(None in p[:2] for p in places):
@@ -196,8 +193,6 @@ def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
                 if frame is None or not 0 <= frame < 10**15:
                     raise FormatError(f"{path}: line {lines.line_num}: expected a frame number, got {brief(line[1])}")
                 instances.setdefault(line[0], {}).setdefault(frame, []).append(np.array(values))
-    except OSError as error:
-        raise read_error(path, error) from None
     except csv.Error as error:
         raise FormatError(f"{path}: expected SLEAP's analysis CSV, got damaged text: {error}") from None
     if not instances:
