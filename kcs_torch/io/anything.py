@@ -64,15 +64,9 @@ def load_any(
     if up is not None or units is not None:
         raise OptionError(f"{path}: an axis that points up and units of length are for 3D motion, got 2D tracks")
     return load_tracks(
-        path,
-        format=format,
-        person=person,
-        skeleton=skeleton,
-        fps=fps,
-        threshold=threshold,
-        image_size=image_size,
+        path, format=format, person=person, skeleton=skeleton, fps=fps, threshold=threshold, image_size=image_size,
         trust=trust,
-    )
+    )  # fmt: skip
 
 
 def kind_of(path: str | Path, format: str | None = None) -> str:

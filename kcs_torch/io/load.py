@@ -115,13 +115,7 @@ def load_tracks(
     if person is not None and (isinstance(person, bool) or not isinstance(person, int) or person < 0):
         raise OptionError(f"person: expected None or a number from 0, got {person!r}")
     people = load_people(
-        path,
-        format=format,
-        skeleton=skeleton,
-        fps=fps,
-        threshold=threshold,
-        image_size=image_size,
-        trust=trust,
+        path, format=format, skeleton=skeleton, fps=fps, threshold=threshold, image_size=image_size, trust=trust
     )
     if person is not None:
         return people[check_person(path, person, len(people))]
