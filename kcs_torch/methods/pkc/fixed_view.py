@@ -49,15 +49,7 @@ SWITCH = 8.0
 """Largest cost of the trunk's change of sign from one frame to the next."""
 
 
-def fixed_view(skeleton: Skeleton, image: Tensor, **options: Any) -> Hypotheses:
-    """Lift one clip by lengths, signs and posture, without any turn of the viewpoint: :func:`searching` by itself.
-
-    Arguments are those of :func:`searching`.
-    """
-    return run(searching(skeleton, image, **options), serve)
-
-
-def searching(
+def fixed_view(
     skeleton: Skeleton,
     image: Tensor,
     *,
@@ -68,9 +60,8 @@ def searching(
     weights: Weights | None = None,
     anchor: Tensor | None = None,
     standing: Tensor | None = None,
-    confirmed: Callable[[Hypotheses], Search[Any, Any, bool]] | None = None,
-) -> Search[Any, Any, Hypotheses]:
-    """Search for the depths of one clip, beside others maybe.
+) -> Hypotheses:
+    """Lift one clip by lengths, signs and posture, without any turn of the viewpoint.
 
     1. The trunk, as a rigid template, gives a path of rotations and its mirror image; once with the template's lengths
        and once with central bones no longer than their longest image.
@@ -91,12 +82,31 @@ def searching(
         weights: of the objective.
         anchor: (B,) lengths known from elsewhere, or None.
         standing: (T, C) how surely the skeleton's contact points stand still, or None where nothing tells.
-        confirmed: whether hypotheses are confirmed from elsewhere, which ends the search early.
 
     Returns:
-        A search that ends with the hypotheses, best first.
+        The hypotheses, best first.
     """
     noise = torch.zeros_like(image[..., 0]) if noise is None else noise
+    search = searching(skeleton, image, rate, noise, rounds, steps, anchor, weights, standing)
+    return run(search, serve)
+
+
+def searching(
+    skeleton: Skeleton,
+    image: Tensor,
+    rate: float,
+    noise: Tensor,
+    rounds: int,
+    steps: int,
+    anchor: Tensor | None = None,
+    weights: Weights | None = None,
+    standing: Tensor | None = None,
+    confirmed: Callable[[Hypotheses], Search[Any, Any, bool]] | None = None,
+) -> Search[Any, Any, Hypotheses]:
+    """:func:`fixed_view` as a search, which may run beside others; arguments as there.
+
+    It ends early with hypotheses that are ``confirmed`` from elsewhere.
+    """
     slow = 30.0 / rate
     pace = pace_of(image, skeleton, rate)
     weights = at_pace(weights or Weights(), rate, pace)

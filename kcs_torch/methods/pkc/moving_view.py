@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -138,15 +137,7 @@ class MovingView:
         return own if self.noise is None else torch.hypot(own, FARTHER * self.noise)
 
 
-def moving_view(image: Tensor, skeleton: Skeleton, start: Tensor, rotations: Tensor, **options: Any) -> MovingView:
-    """Lift one clip by low-rank motion of aligned bones of constant length: :func:`searching` by itself.
-
-    Arguments are those of :func:`searching`.
-    """
-    return run(searching(image, skeleton, start, rotations, **options), descend_all)
-
-
-def searching(
+def moving_view(
     image: Tensor,
     skeleton: Skeleton,
     start: Tensor,
@@ -160,8 +151,8 @@ def searching(
     alternatives: int = 1,
     exact: bool = True,
     seed: int = 0,
-) -> Search[Descent, Pose, MovingView]:
-    """Search for the motion of one clip, beside others maybe.
+) -> MovingView:
+    """Lift one clip by low-rank motion of aligned bones of constant length.
 
     Args:
         image: (T, N, 2), complete, centred per frame, of root mean square 1.
@@ -181,8 +172,31 @@ def searching(
         seed: of the random starts.
 
     Returns:
-        A search that ends with the solutions, ranked.
+        The solutions, ranked.
     """
+    search = searching(
+        image, skeleton, start, rotations, weights=weights, noise=noise, turns=turns, lifts=lifts,
+        coarse_frames=coarse_frames, alternatives=alternatives, exact=exact, seed=seed,
+    )  # fmt: skip
+    return run(search, descend_all)
+
+
+def searching(
+    image: Tensor,
+    skeleton: Skeleton,
+    start: Tensor,
+    rotations: Tensor,
+    *,
+    weights: Tensor | None = None,
+    noise: float = 0.0,
+    turns: Sequence[float] = TURNS,
+    lifts: int = 6,
+    coarse_frames: int = 100,
+    alternatives: int = 1,
+    exact: bool = True,
+    seed: int = 0,
+) -> Search[Descent, Pose, MovingView]:
+    """:func:`moving_view` as a search, which may run beside others; arguments as there."""
     frames, joints, _ = image.shape
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
     is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
