@@ -247,6 +247,17 @@ def test_points_without_the_virtual_joints_are_told_how_to_get_them():
         KCSMatrix(body)(points.numpy())
 
 
+def test_swapped_axes_and_flat_points_are_told_how_to_put_right():
+    body = SKELETONS["coco17"]
+    layer, points = KCSMatrix(body), torch.randn(2, body.num_joints, 3)
+    with pytest.raises(ShapeError, match=r"got \(2, 3, 19\): their last two axes are swapped, \.mT puts"):
+        layer(points.mT)
+    with pytest.raises(ShapeError, match=r"got \(2, 57\): flat, unflatten\(-1, \(19, 3\)\) gives"):
+        layer(points.flatten(1))
+    with pytest.raises(ShapeError, match=r"got \(2, 51\): flat, unflatten\(-1, \(17, 3\)\) gives"):
+        layer(points[:, :17].flatten(1))
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16], ids=["half", "bfloat"])
 def test_the_kcs_matrix_of_millimetres_is_finite_in_half_precision(dtype):
     points = 500 * torch.randn(6, 17, 3, generator=torch.Generator().manual_seed(0))

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kcs_torch.anatomy import mirror_name, side_of
-from kcs_torch.errors import SkeletonError
+from kcs_torch.errors import ShapeError, SkeletonError
 from kcs_torch.skeleton import SKELETONS, Hinge, Skeleton, get_skeleton, guess_skeleton
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -481,3 +481,21 @@ def test_complete(batch):
     assert (seen[..., body.index("pelvis")] == 0).all()
     same = ARM.complete(points[..., :3, :], weights[..., :3])
     assert torch.equal(same[0], points[..., :3, :])
+
+
+def test_complete_names_what_it_cannot_take():
+    body = SKELETONS["coco17"]
+    points = torch.zeros(4, 17, 3)
+    for bad in (points.numpy(), points.tolist()):
+        with pytest.raises(ShapeError, match="complete: expected a tensor of points, got .*as_tensor"):
+            body.complete(bad)
+    with pytest.raises(ShapeError, match="complete: expected a tensor of weights, got ndarray"):
+        body.complete(points, np.ones((4, 17)))
+    with pytest.raises(ShapeError, match=r"\(\.\.\., 17, D\) for skeleton 'coco17', got \(4, 3, 17\): swap"):
+        body.complete(points.mT)
+    with pytest.raises(ShapeError, match=r"got \(4, 19, 3\), which have its virtual joints already"):
+        body.complete(body.complete(points)[0])
+    with pytest.raises(ShapeError, match=r"expected weights \(\.\.\., 17\) for points \(4, 17, 3\), got \(4, 19\)"):
+        body.complete(points, torch.ones(4, 19))
+    with pytest.raises(ShapeError, match=r"got \(17,\)"):
+        body.complete(points[0, :, 0])

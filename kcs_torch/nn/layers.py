@@ -72,6 +72,7 @@ def check_joints(module: nn.Module, skeleton: Skeleton, points: Tensor, form: st
     joints = skeleton.num_joints
     if points.ndim >= form.count(",") and points.shape[-2] == joints:
         return
+    dims = int(form.rstrip(")").rpartition(" ")[2])
     message = (
         f"{type(module).__name__}: expected {form.format(joints)} for skeleton '{skeleton.name}', "
         f"got {tuple(points.shape)}"
@@ -79,6 +80,10 @@ def check_joints(module: nn.Module, skeleton: Skeleton, points: Tensor, form: st
     if points.ndim >= 2 and points.shape[-2] == skeleton.num_observed < joints:
         virtual = ", ".join(skeleton.joints[skeleton.num_observed :])
         message += f": without its virtual joints {virtual}, which skeleton.complete(points, weights) appends to both"
+    elif points.ndim >= 2 and points.shape[-1] in (joints, skeleton.num_observed) and points.shape[-2] == dims:
+        message += ": their last two axes are swapped, .mT puts them right"
+    elif points.ndim and points.shape[-1] in (dims * joints, dims * skeleton.num_observed):
+        message += f": flat, unflatten(-1, ({points.shape[-1] // dims}, {dims})) gives joints their axis"
     raise ShapeError(message)
 
 
