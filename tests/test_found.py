@@ -73,6 +73,12 @@ def test_bones_of_a_body_at_rest_are_warned_of(frames):
         find_skeleton(swinging_body()[0])
 
 
+@pytest.mark.parametrize("source", [17, ["nose", "neck"], torch.zeros(5, 4, 3).numpy()])
+def test_what_is_no_tensor_is_told(source):
+    with pytest.raises(ShapeError, match="expected tracks, a result or a tensor of points, got .*SKELETONS"):
+        find_skeleton(source)
+
+
 def test_bad_input():
     with pytest.raises(ShapeError, match="at least 2 joints"):
         find_skeleton(torch.zeros(4, 1, 3))

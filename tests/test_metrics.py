@@ -206,7 +206,7 @@ def test_what_is_wrong_is_said():
         mpjpe(clip(), clip(), align="similarty")
     with pytest.raises(OptionError, match="root: expected a joint index below 6"):
         mpjpe(clip(), clip(), root=6)
-    with pytest.raises(ShapeError, match="two of shape"):
+    with pytest.raises(ShapeError, match="pred and truth of the same shape"):
         e3d(clip(), clip(joints=5))
     with pytest.raises(ShapeError, match="weights"):
         mpjpe(clip(), clip(), weights=torch.ones(12, 5))
@@ -214,6 +214,22 @@ def test_what_is_wrong_is_said():
         mpjpe(clip(), torch.full_like(clip(), torch.nan))
     with pytest.raises(ShapeError, match="pairs of joints"):
         bone_deviation(clip(), [])
+
+
+def test_where_points_do_not_fit_or_are_not_finite_is_said():
+    truth = clip()
+    with pytest.raises(ShapeError, match=r"got \(6, 3\) and \(6, 3\): of single poses pred\[None\]"):
+        mpjpe(truth[0], truth[0])
+    with pytest.raises(ShapeError, match=r"got \(12, 3, 6\) and .*: their last two axes are swapped"):
+        mpjpe(truth.mT, truth.mT)
+    with pytest.raises(ShapeError, match=r"got \(12, 5, 3\) and \(12, 6, 3\): take the joints that both have"):
+        mpjpe(truth[:, :5], truth)
+    holed = truth.clone()
+    holed[7, 2, 1] = torch.nan
+    with pytest.raises(ShapeError, match=r"^truth: expected finite points, got \[.*nan.*\] at frame 7, joint 2: where"):
+        mpjpe(truth, holed)
+    with pytest.raises(ShapeError, match=r"^pred: expected .* at frame 7, joint 2 of clip 1: where .* its weight$"):
+        mpjpe(torch.stack([truth, holed]), torch.stack([truth, truth]))
 
 
 def test_figures_have_gradients():
@@ -315,7 +331,7 @@ def test_arrays_and_lists_are_told_what_to_become():
         bone_deviation(points.numpy(), [(0, 1)])
 
 
-@pytest.mark.parametrize("threshold", [-1.0, float("nan")])
+@pytest.mark.parametrize("threshold", [-1.0, float("nan"), [50, 100, 150], "150", True, torch.ones(2)])
 def test_no_joint_is_within_less_than_nothing(threshold):
     with pytest.raises(OptionError, match="pck: expected a threshold of at least 0, got"):
         pck(torch.rand(5, 7, 3), torch.rand(5, 7, 3), threshold)

@@ -131,3 +131,9 @@ def test_lift_lists_the_solutions_and_writes_any(tmp_path):
     refused = lift("ninth.npz", "--solution", "9", code=2)
     assert f"expected a number from 1 to {count}, got 9" in refused.stderr
     assert not (tmp_path / "ninth.npz").exists()
+
+
+def test_points_are_no_solutions():
+    points = torch.zeros(5, 17, 3)
+    with pytest.raises(OptionError, match="difference: best: expected a Reconstruction, got Tensor: mpjpe compares"):
+        difference(points, points)

@@ -246,7 +246,7 @@ def test_what_is_wrong_is_said():
         kt.metrics.BoneDeviation([])
     with pytest.raises(ShapeError, match="weights"):
         kt.metrics.MPJPE().update(PRED, TRUTH, WEIGHTS[:2])
-    with pytest.raises(ShapeError, match="two of shape"):
+    with pytest.raises(ShapeError, match="pred and truth of the same shape"):
         kt.metrics.E3D().update(PRED, TRUTH[:, :3])
     with pytest.raises(ShapeError, match="expected finite points"):
         kt.metrics.MPJPE().update(torch.full_like(PRED, torch.nan), TRUTH)

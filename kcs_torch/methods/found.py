@@ -42,7 +42,7 @@ def find_skeleton(
         A skeleton named "found" with ``proportions``, the median lengths; its bones run away from the first joint.
 
     Raises:
-        ShapeError: there are no two joints, or points that are not finite (T, N, 3).
+        ShapeError: there are no two joints, points that are not finite (T, N, 3), or no tensor of them.
         OptionError: ``rigid_below`` is negative.
 
     Warns:
@@ -66,6 +66,12 @@ def find_skeleton(
         weights = source.tracks.weights if weights is None else weights
         joints = source.tracks.skeleton.joints if joints is None else joints
         source = source.points
+    given: object = source
+    if not isinstance(given, Tensor):
+        hint = "torch.as_tensor takes arrays; kcs_torch.SKELETONS holds the built-in ones"
+        raise ShapeError(
+            f"find_skeleton: expected tracks, a result or a tensor of points, got {type(given).__name__}: {hint}"
+        )
     if source.ndim != 3 or source.shape[-1] != 3 or source.shape[0] < 1 or source.shape[1] < 2:
         raise ShapeError(f"find_skeleton: expected points (T, N, 3) of at least 2 joints, got {tuple(source.shape)}")
     if not torch.isfinite(source).all():

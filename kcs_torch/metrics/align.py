@@ -37,12 +37,10 @@ def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = Non
     """
     check_alignment(how, root)
     check_tensors(pred=pred, truth=truth, weights=weights)
-    if pred.shape != truth.shape or pred.ndim < 3 or pred.shape[-1] != 3:
-        raise ShapeError(
-            f"align: expected two of shape (..., T, N, 3), got {tuple(pred.shape)} and {tuple(truth.shape)}"
-        )
-    if not bool(torch.isfinite(pred).all() and torch.isfinite(truth).all()):
-        raise ShapeError("align: expected finite points; write 0 where a joint is unknown, and 0 into its weight")
+    _check_points(pred, truth)
+    for name, points in (("pred", pred), ("truth", truth)):
+        if not bool(torch.isfinite(points).all()):
+            raise ShapeError(f"{name}: {_not_finite(points)}")
     if weights is not None and weights.shape != truth.shape[:-1]:
         raise ShapeError(f"weights: expected shape {tuple(truth.shape[:-1])}, got {tuple(weights.shape)}")
     if how in ("root", "scale") and root is not None and not -truth.shape[-2] <= root < truth.shape[-2]:
@@ -50,6 +48,30 @@ def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = Non
     wide = torch.promote_types(torch.promote_types(pred.dtype, truth.dtype), torch.float32)
     with torch.autocast(pred.device.type, enabled=False):  # rotations need more than three digits
         return superpose(pred.to(wide), truth.to(wide), how, None if weights is None else weights.to(wide), root=root)
+
+
+def _check_points(pred: Tensor, truth: Tensor) -> None:
+    """Raise a ShapeError unless both are (..., T, N, 3), alike."""
+    if pred.shape == truth.shape and pred.ndim >= 3 and pred.shape[-1] == 3:
+        return
+    message = (
+        f"expected pred and truth of the same shape (..., T, N, 3), got {tuple(pred.shape)} and {tuple(truth.shape)}"
+    )
+    if pred.ndim == truth.ndim == 2:
+        message += ": of single poses pred[None] and truth[None]"
+    elif pred.shape == truth.shape and pred.ndim >= 3 and pred.shape[-2] == 3:
+        message += ": their last two axes are swapped, .mT puts them right"
+    elif pred.ndim >= 2 and pred.ndim == truth.ndim and pred.shape[-2] != truth.shape[-2]:
+        message += ": take the joints that both have, in one order; skeleton.complete(points) appends virtual ones"
+    raise ShapeError(message)
+
+
+def _not_finite(points: Tensor) -> str:
+    """Where points (..., T, N, 3) are NaN or infinite first, and what to do about it, for the user."""
+    *batch, frame, joint = (~torch.isfinite(points)).any(-1).nonzero()[0].tolist()
+    where = f"frame {frame}, joint {joint}" + (f" of clip {', '.join(map(str, batch))}" if batch else "")
+    value = points[(*batch, frame, joint)].tolist()
+    return f"expected finite points, got {value} at {where}: where a joint is unknown, write 0, and 0 into its weight"
 
 
 def check_tensors(**given: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -76,12 +77,21 @@ def pck(
 
     Raises:
         ShapeError: the shapes differ.
-        OptionError: there is no such alignment, or the threshold is negative.
+        OptionError: there is no such alignment, or the threshold is no number or negative.
     """
-    if not threshold >= 0:
-        raise OptionError(f"pck: expected a threshold of at least 0, got {threshold}")
+    check_threshold(threshold, "pck")
     distance, mass = distances(pred, truth, align, weights, root)
     return _mean((distance <= threshold).to(distance), mass)
+
+
+def check_threshold(threshold: Any, what: str) -> None:
+    """Raise an OptionError unless a threshold is a number, at least 0."""
+    try:
+        fits = not isinstance(threshold, (bool, str)) and float(threshold) >= 0
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor of several
+        fits = False
+    if not fits:
+        raise OptionError(f"{what}: expected a threshold of at least 0, got {threshold!r}")
 
 
 def e3d(pred: Tensor, truth: Tensor, *, weights: Tensor | None = None) -> Tensor:

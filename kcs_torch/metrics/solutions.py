@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from kcs_torch.errors import ShapeError, counted
+from kcs_torch.errors import OptionError, ShapeError, counted
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.types import Reconstruction
 
@@ -63,6 +63,7 @@ def difference(best: Reconstruction, other: Reconstruction) -> Difference:
         other: the other, usually of ``best.alternatives``.
 
     Raises:
+        OptionError: one of them is no reconstruction.
         ShapeError: they are not of the same frames and joints.
 
     >>> import kcs_torch as kt
@@ -71,6 +72,11 @@ def difference(best: Reconstruction, other: Reconstruction) -> Difference:
     >>> print(difference(result, result.mirrored()))
     the mirror image in depth
     """
+    for name, one in (("best", best), ("other", other)):
+        if not isinstance(one, Reconstruction):
+            raise OptionError(
+                f"difference: {name}: expected a Reconstruction, got {type(one).__name__}: mpjpe compares points"
+            )
     if best.points.shape != other.points.shape:
         shapes = f"{tuple(best.points.shape)} and {tuple(other.points.shape)}"
         raise ShapeError(f"difference: expected solutions of the same frames and joints, got points {shapes}")

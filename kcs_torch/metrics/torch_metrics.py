@@ -8,9 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError
 from kcs_torch.functional.align import check_alignment
-from kcs_torch.metrics.errors import Bones, bone_deviation, bone_pairs, distances, e3d
+from kcs_torch.metrics.errors import Bones, bone_deviation, bone_pairs, check_threshold, distances, e3d
 from kcs_torch.skeleton import get_skeleton
 
 try:
@@ -110,7 +109,7 @@ class PCK(MPJPE):
         options: of ``torchmetrics.Metric``.
 
     Raises:
-        OptionError: there is no such alignment, or the threshold is negative.
+        OptionError: there is no such alignment, or the threshold is no number or negative.
     """
 
     higher_is_better = True
@@ -118,8 +117,7 @@ class PCK(MPJPE):
 
     def __init__(self, threshold: float, align: str = "root", *, root: int | None = None, **options: Any) -> None:
         super().__init__(align, root=root, **options)
-        if not threshold >= 0:
-            raise OptionError(f"PCK: expected a threshold of at least 0, got {threshold}")
+        check_threshold(threshold, "PCK")
         self.threshold = threshold
 
     def extra_repr(self) -> str:
