@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from samples import walk_result
 from torch.testing import assert_close
 
-from kcs_torch import KcsError, OptionError, ShapeError, SkeletonError, Tracks
+from kcs_torch import KcsError, Motion, OptionError, ShapeError, SkeletonError, Tracks
 from kcs_torch.data import walking_person
 from kcs_torch.errors import FormatError
 from kcs_torch.functional import bone_lengths
@@ -307,6 +307,29 @@ def test_joint_count_that_fits_another_skeleton_says_which():
     message = str(caught.value)
     assert "clip: expected the 25 joints of skeleton 'body25', got 17; 17 joints fit" in message
     assert all(name in message for name in ("h36m17", "coco17", "ap10k"))
+
+
+def test_virtual_joints_among_the_points_are_told():
+    whole = walking_person(5, skeleton="coco17").points
+    words = r"got 19: take off the virtual ones, pelvis, neck, points\[:, :17\], which are found anew"
+    with pytest.raises(SkeletonError, match=words):
+        Tracks.from_arrays(whole[..., :2], skeleton="coco17")
+    with pytest.raises(SkeletonError, match=words):
+        Motion.from_arrays(whole, skeleton="coco17")
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ((5, 2, 17), "the last two axes are swapped, points.swapaxes"),
+        ((5, 34), r"of flat rows points.reshape\(5, 17, 2\)"),
+        ((17, 2), r"of a single frame points\[None\]"),
+        ((3, 5, 17, 2), "one clip at a time, or reconstruct_all"),
+    ],
+)
+def test_shapes_that_are_nearly_right_are_told_how_to_put_right(shape, words):
+    with pytest.raises(ShapeError, match=words):
+        Tracks.from_arrays(np.zeros(shape), skeleton="coco17")
 
 
 def test_joint_count_that_fits_none():

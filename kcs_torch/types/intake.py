@@ -117,6 +117,9 @@ def choose_skeleton(
         if body.num_observed != num_joints:
             fits = fitting(num_joints)
             hint = f"; {num_joints} joints fit {', '.join(fits)}" if fits else ""
+            if num_joints == body.num_joints:
+                virtual = ", ".join(body.joints[body.num_observed :])
+                hint = f": take off the virtual ones, {virtual}, points[:, :{body.num_observed}], which are found anew"
             raise SkeletonError(
                 f"{source}: expected the {body.num_observed} joints of skeleton '{body.name}', got {num_joints}{hint}"
             )
@@ -221,6 +224,17 @@ class Intake(NamedTuple):
     notes: list[str]
 
 
+def _other_dimensions(shape: Sequence[int], dims: int) -> str:
+    """How to make points (frames, joints, dims) of an array of another number of dimensions, for the user."""
+    if len(shape) == 4 and shape[-1] == dims:
+        return ": give one clip at a time, or reconstruct_all a list of Tracks"
+    if len(shape) == 2 and shape[-1] == dims:
+        return ": of a single frame points[None]"
+    if len(shape) == 2 and shape[-1] % dims == 0:
+        return f": of flat rows points.reshape({shape[0]}, {shape[-1] // dims}, {dims})"
+    return ""
+
+
 def take_in(
     points: Any,
     confidence: Any,
@@ -236,11 +250,18 @@ def take_in(
 ) -> Intake:
     """Check arrays of one body's motion in ``dims`` dimensions; arguments and errors as of ``Tracks.from_arrays``."""
     remarks = list(notes)
-    xy = as_floats(points, f"{source}: points (frames, joints, {dims})", 3)
+    xy = as_floats(points, f"{source}: points (frames, joints, {dims})", None)
+    if xy.ndim != 3:
+        raise ShapeError(
+            f"{source}: points (frames, joints, {dims}): expected 3 dimensions, got shape {tuple(xy.shape)}"
+            f"{_other_dimensions(xy.shape, dims)}"
+        )
     if confidence is not None:
         confidence = as_floats(confidence, f"{source}: confidence (frames, joints)", 2)
     if xy.shape[-1] != dims:
         hint = "; confidences go into an array of their own" if xy.shape[-1] == dims + 1 else ""
+        if xy.shape[1] == dims:
+            hint = ": the last two axes are swapped, points.swapaxes(1, 2) puts them right"
         raise ShapeError(f"{source}: points: expected shape (frames, joints, {dims}), got {tuple(xy.shape)}{hint}")
     num_frames, num_joints = xy.shape[:2]
     if num_frames < 1:
