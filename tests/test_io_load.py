@@ -2,6 +2,7 @@
 
 import gzip
 import re
+import shutil
 import sys
 
 import pytest
@@ -100,6 +101,16 @@ def test_folders_of_folders_name_them(tmp_path):
     message = "expected a folder with tracks, got one that holds only folders (vid2, vid10): give one of them, such as "
     with pytest.raises(FormatError, match=re.escape(message + str(tmp_path / "sub" / "vid2"))):
         load_tracks(tmp_path / "sub")
+
+
+def test_folders_of_clips_name_them(tmp_path, samples):
+    clip = samples["npz"]
+    for name in ("walk.npz", "run.npz", "jump.npz"):
+        shutil.copy(clip, tmp_path / name)
+    (tmp_path / "notes.txt").write_text("hello")
+    words = r"each a clip of its own, such as jump\.npz \(npz\) and run\.npz \(npz\): give one of them"
+    with pytest.raises(FormatError, match=words):
+        load_tracks(tmp_path)
 
 
 @pytest.mark.parametrize("path", [None, 3, b"w.npz", ["w.npz"]])

@@ -5,7 +5,7 @@ import pytest
 import torch
 from samples import mmpose_frames, person, write_json
 
-from kcs_torch.errors import KcsError
+from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io import detect_format, load_people, load_tracks
 from kcs_torch.io.layout import names_of
 from kcs_torch.skeleton import SKELETONS
@@ -111,6 +111,14 @@ def test_a_folder_with_a_file_an_image(tmp_path):
     assert tracks.seen.any(1).nonzero().flatten().tolist() == [0, 1, 3, 7]
     assert np.allclose(numbers(tracks)[[0, 1, 3, 7]], person(4, 17))
     assert load_tracks(tmp_path / "predictions" / "clip_3.json").num_frames == 1
+
+
+@pytest.mark.parametrize("whole", [lambda frames: frames, lambda frames: {"meta_info": {}, "instance_info": frames}])
+def test_a_folder_with_the_file_of_a_video(tmp_path, whole):
+    file = write_json(tmp_path / "results_1.json", whole(mmpose_frames()))
+    with pytest.raises(FormatError, match=r"results_1\.json: expected the people of an image, got .* the file itself"):
+        load_tracks(tmp_path)
+    assert load_tracks(file).num_frames > 1
 
 
 def changed(**parts):

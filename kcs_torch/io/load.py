@@ -25,6 +25,9 @@ __all__ = [
 READERS, WRITERS = discover()
 """The formats that tracks come in, by name, and those that can be written, by suffix."""
 
+MANY_FILES = 20
+"""So many files of a folder that no reader knows as a whole are looked at one by one."""
+
 
 def detect_format(path: str | Path) -> str:
     """Tell the format of a file or folder from its content; a name in ``READERS``.
@@ -187,6 +190,21 @@ def _amount_seen(tracks: Tracks) -> float:
     return float(tracks.weights[:, : tracks.skeleton.num_observed].double().sum())
 
 
+def _clips(probe: Probe) -> str:
+    """Two of several files that readers know one by one, and their formats, for the user; empty where there is none."""
+    found: list[str] = []
+    for file in probe.files[:MANY_FILES]:
+        one = Probe(file)
+        try:
+            name = next((reader.name for reader in READERS.values() if reader.recognises(one)), None)
+        except FormatError:
+            continue
+        found += [f"{file.name} ({name})"] if name is not None else []
+        if len(found) == 2:
+            break
+    return " and ".join(found)
+
+
 def _describe(probe: Probe) -> str:
     """What a path that no reader recognises holds, in a few words."""
     motion = [reader.name for reader in MOTION_READERS.values() if reader.recognises(probe)]
@@ -198,6 +216,11 @@ def _describe(probe: Probe) -> str:
     if probe.files:
         suffixes = sorted({f.suffix or f.name for f in probe.files})
         shown = ", ".join(suffixes[:5]) + (", ..." if len(suffixes) > 5 else "")
+        if clips := _clips(probe):
+            return (
+                f"files that are each a clip of its own, such as {clips}: give one of them ("
+                "scripts/reconstruct_many.py reads all of a folder)"
+            )
         kind = "a folder without tracks" if probe.is_folder else "files without tracks"
         return f"{kind} ({len(probe.files)} files: {shown})"
     if probe.suffix == ".json":

@@ -83,8 +83,18 @@ def _folder(probe: Probe, options: Options, notes: list[str]) -> list[Tracks]:
     frames = frame_numbers([last_number(f.name) for f in files], notes)
     people: list[list[Sighting]] = [[] for _ in range(frames[-1] + 1)]
     for frame, file in zip(frames, files, strict=True):
-        people[frame] = _instances(read_json(file), str(file))
+        data = read_json(file)
+        if _begins_with_a_frame(data.get("instance_info") if isinstance(data, dict) else data):
+            raise FormatError(
+                f"{file}: expected the people of an image, got those of a whole video: give the file itself"
+            )
+        people[frame] = _instances(data, str(file))
     return _tracks(people, {}, probe.path, options, notes)
+
+
+def _begins_with_a_frame(data: Any) -> bool:
+    """Whether the first entry of a list is a frame with its people."""
+    return isinstance(data, list) and len(data) > 0 and isinstance(data[0], dict) and "instances" in data[0]
 
 
 def _instances(data: Any, where: str) -> list[Sighting]:
