@@ -628,6 +628,8 @@ def test_what_depth_rests_on_before_a_camera_that_stands_still(method, rests):
     assert any(f"depth rests on {rests}" in note for note in found.notes)
     told = [str(w.message) for w in caught if "has nothing else that tells depth" in str(w.message)]
     assert len(told) == (method == "sfam") and all("'pkc' and 'kcs' use the skeleton's template" in t for t in told)
+    assert bool(found.doubt) == bool(told) and all(t.endswith(found.doubt) for t in told)
+    assert found.brief_doubt == ("depth is little more than a guess" if told else "")  # in the titles of pictures
 
 
 def test_bones_that_nearly_keep_it_or_are_not_held_or_not_found_yet_are_not():

@@ -142,6 +142,17 @@ def test_every_method_projects_onto_the_image_and_gets_better(method):
     assert error(result.points, truth) < 0.8 * error(plain.points, truth)
 
 
+@pytest.mark.parametrize("turn", [0, 150])
+def test_the_turn_that_the_lens_shows_tells_whether_depth_is_a_guess(turn):
+    tracks, _ = filmed(frames=40, turn=turn)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = kt.reconstruct(tracks, method="sfam", intrinsics=LENS).diagnostics
+    told = [str(w.message) for w in caught if "nothing else that tells depth" in str(w.message)]
+    assert bool(found.doubt) == (found.viewpoint_turn < 30) == (turn == 0) and len(told) == (turn == 0)
+    assert f"by only {found.viewpoint_turn:.0f} degree" in found.doubt or turn
+
+
 def test_a_person_who_walks_towards_the_camera_comes_nearer_by_the_true_ratio():
     tracks, truth = filmed(yaw=20, frames=90)
     result = reconstruct(tracks, method="kcs", intrinsics=LENS)

@@ -26,13 +26,13 @@ from kcs_torch.errors import (
 )
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.finish import HEADSTAND, WEAK_TURN, WHY_LOOSE, Estimate, finish, rms, what_is_wrong
+from kcs_torch.methods.finish import HEADSTAND, WHY_LOOSE, Estimate, finish, rms, what_is_wrong
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
 from kcs_torch.types.hints import is_a, spoken
 from kcs_torch.types.tracks import never_seen
 
-__all__ = ["WEAK_TURN", "Estimate", "Method", "apart"]
+__all__ = ["Estimate", "Method", "apart"]
 
 
 @dataclass(frozen=True)
@@ -174,14 +174,6 @@ class Method(ABC):
         tracks, found = result.tracks, result.diagnostics
         if found.doubt:
             warnings.warn(f"{tracks.source}: {found.doubt}", KcsWarning, stacklevel=users_level())
-        elif not (self.learned or found.viewpoint_turn >= WEAK_TURN or self.knows_template(tracks.skeleton)):
-            told = tracks.skeleton.template is not None and self.name not in ("pkc", "kcs")
-            others = ", while 'pkc' and 'kcs' use the skeleton's template" if told else ""
-            message = (
-                f"{tracks.source}: the viewpoint turned by only {counted(round(found.viewpoint_turn), 'degree')}, and "
-                f"'{self.name}' has nothing else that tells depth: it is little more than a guess{others}"
-            )
-            warnings.warn(message, KcsWarning, stacklevel=users_level())
         if not found.converged:
             message = f"{tracks.source}: {self.unsettled(found.iterations)}"
             warnings.warn(message, ConvergenceWarning, stacklevel=users_level())

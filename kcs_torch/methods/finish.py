@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     *("HARDLY", "HEADSTAND", "WEAK_TURN", "WHY_LOOSE", "Estimate"),
-    *("finish", "little_turn", "loose_bones", "rms", "what_is_wrong"),
+    *("finish", "little_turn", "loose_bones", "nothing_else", "rms", "what_is_wrong"),
 ]
 
 WEAK_TURN = 30.0
@@ -140,6 +140,18 @@ def little_turn(method: Method, body: Skeleton, turn: float) -> str:
     if turn >= WEAK_TURN or method.learned:
         return ""
     return f"{HARDLY} {counted(round(turn), 'degree')}: depth rests on {_rest(method, body)}"
+
+
+def nothing_else(method: Method, body: Skeleton, turn: float) -> str:
+    """Why depth is little more than a guess where the viewpoint hardly turns, by so many degrees; else empty."""
+    if turn >= WEAK_TURN or method.learned or method.knows_template(body):
+        return ""
+    told = body.template is not None and method.name not in ("pkc", "kcs")
+    others = ", while 'pkc' and 'kcs' use the skeleton's template" if told else ""
+    return (
+        f"depth is little more than a guess: {HARDLY} {counted(round(turn), 'degree')}, and '{method.name}' has "
+        f"nothing else that tells depth{others}"
+    )
 
 
 def _rest(method: Method, body: Skeleton) -> str:
@@ -263,7 +275,7 @@ def _reconstruction(
         iterations=found.iterations,
         seconds=seconds,
         notes=tuple(notes),
-        doubt=found.doubt,
+        doubt=found.doubt or nothing_else(method, body, turn),
         largest_bone_variation=variation.largest,
         loosest_bone=variation.bone,
     )

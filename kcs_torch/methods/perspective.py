@@ -14,7 +14,7 @@ from kcs_torch.clean.detector import detected
 from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.methods.base import Method, apart, check_cameras
-from kcs_torch.methods.finish import HARDLY, WHY_LOOSE, little_turn, what_is_wrong
+from kcs_torch.methods.finish import HARDLY, WHY_LOOSE, little_turn, nothing_else, what_is_wrong
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
@@ -291,12 +291,16 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
     notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
     if scene.any_focal:
         notes.append(lens_note(intrinsics, tracks.units))
+    first = found.lifted[0].diagnostics
+    doubt = first.doubt
+    if doubt == nothing_else(method, body, first.viewpoint_turn):  # by the turn before the lens was known
+        doubt = nothing_else(method, body, turn)
     facts = replace(
         before,
         viewpoint_turn=turn,
         reprojection_rms=float(off.square().sum(-1).mean().sqrt()),
         notes=tuple(notes),
-        doubt="" if k else found.lifted[0].diagnostics.doubt,
+        doubt="" if k else doubt,
     )
     return replace(
         lifted,
