@@ -37,6 +37,15 @@ def test_figures_are_those_of_the_functions():
         }
 
 
+def test_a_wrong_unit_is_asked_about():
+    truth = walking_motion(20)
+    small = replace(truth, points=truth.points / 1000)
+    assert compare(small, truth).notes == ("the prediction is 0.001 times as large as the truth: is 'm' its unit?",)
+    assert "1e+03 times" in compare(truth, small).notes[0]
+    for unit in ("mm", ""):  # as it is, and where no size is known
+        assert compare(replace(truth, points=1000 * truth.points, units=unit), truth).notes == ()
+
+
 def test_joints_are_matched_by_name_and_not_by_order():
     truth = walking_motion(20, "h36m17")
     names = ["LKnee", "r_wrist", "Head Top", "leftElbow", "RAnkle", "tail"]

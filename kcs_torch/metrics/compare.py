@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError, unknown
+from kcs_torch.functional import centre
 from kcs_torch.metrics.align import ALIGNMENTS
 from kcs_torch.metrics.errors import bone_deviation, e3d, mpjpe, pck
 from kcs_torch.skeleton.mapping import map_joints
@@ -20,6 +21,8 @@ __all__ = ["Comparison", "compare"]
 
 _SIZED = ("scale", "similarity", "sequence")  # alignments that bring the unit along
 _USUAL_PCK = 0.15  # metres
+ODD_SIZE = 5.0
+"""Times the truth's size, or the inverse of it, from which on the user is asked about the unit."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +113,8 @@ def compare(
     weights = (truth.seen[:, theirs] & ~gone).to(target)
     if not bool((weights.sum(1) >= 3).any()):
         raise ShapeError("compare: expected a frame in which 3 joints of both are seen, got none")
+    if ratio is not None:
+        notes += _odd_size(points, target, weights, pred.units)
     at = _root(root, truth, names, theirs)
     flip = points * points.new_tensor([1.0, 1.0, -1.0])
     if mirror:
@@ -136,6 +141,17 @@ def compare(
         loosest_bone=variation.bone,
         notes=tuple(notes),
     )
+
+
+def _odd_size(points: Tensor, target: Tensor, weights: Tensor, units: str) -> list[str]:
+    """What to say of points (T, N, 3) far smaller or larger than the target's: metres taken for millimetres, say."""
+    ours, theirs = (
+        float((centre(torch.where(weights[..., None] > 0, p, 0), weights)[0] * weights[..., None]).norm())
+        for p in (points, target)
+    )
+    if theirs == 0 or 1 / ODD_SIZE < ours / theirs < ODD_SIZE:
+        return []
+    return [f"the prediction is {ours / theirs:.2g} times as large as the truth: is '{units}' its unit?"]
 
 
 def _joints(pred: Motion, truth: Motion, notes: list[str]) -> list[tuple[str, str]]:
