@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.functional.chain import bone_vectors, incidence, index_rows, kcs_matrix
+from kcs_torch.functional.chain import bone_vectors, incidence, index_rows
+from kcs_torch.functional.coupled import solve_coupled
 from kcs_torch.functional.precision import widened
 from kcs_torch.functional.shapes import broadcast_shapes, check_core
 
@@ -33,7 +34,8 @@ def fit_bones(
 
         (1/stiffness + J J^T) y = r + J (points - A),        J J^T = (C^T C) o Psi / (|b| |b|^T),
 
-    a B x B system per frame that the KCS matrix Psi fills, where the textbook step solves 3N x 3N.
+    a B x B system per frame of the KCS matrix Psi, where the textbook step solves 3N x 3N. It couples bones that meet,
+    so that a tree's takes a few operations a bone (:func:`kcs_torch.functional.coupled.solve_coupled`).
 
     Args:
         points: (..., N, D), what A stays near.
@@ -86,7 +88,6 @@ def fit_bones(
     root = root.expand(broadcast_shapes(root.shape, lengths.shape[-1:]))
     floor = 1e-4 * lengths.detach().abs().mean(-1, keepdim=True)
     tiny = limits.tiny**0.5
-    eye = torch.eye(len(bones), dtype=points.dtype, device=points.device)
     anchor_bones = bone_vectors(points, bones)
     current = points if start is None else start
     share = 1 / (1 + damping)
@@ -97,8 +98,7 @@ def fit_bones(
         goal = anchor_bones if damping == 0 else (anchor_bones + damping * vectors) * share
         residual = size - lengths + (unit * (goal - vectors)).sum(-1)
         weighted = root[..., None] * unit
-        factor, _ = torch.linalg.cholesky_ex(torch.addcmul(eye, share * overlap, kcs_matrix(weighted)))
-        pull = torch.cholesky_solve((root * residual)[..., None], factor)
+        pull = solve_coupled(weighted, root * residual, bones, overlap, share=share)[..., None]
         base = points if damping == 0 else (points + damping * current) * share
         current = base - share * (matrix @ (pull * weighted))
     return current
