@@ -217,6 +217,16 @@ def test_clips_that_tell_nothing(what):
     for method in ("pkc",) if what == "lying flat" else ("pkc", "kcs"):  # pkc looks for the lens of any
         found = kt.reconstruct(tracks, method=method, intrinsics="auto")
         assert found.points.isfinite().all() and found.lengths.isfinite().all()
+        if what in ("never seen", "a point"):
+            assert found.distance is None  # a point, at (300, 300) say, is as likely at any distance
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+@pytest.mark.parametrize("where", [1.0, 300.0, 700.0, 1e4])
+def test_a_point_has_no_lens(where):
+    tracks = replace(filmed(frames=12)[0], fps=None)
+    tracks = replace(tracks, points=torch.full_like(tracks.points, where))
+    assert likely_lens(kt.PKC()(tracks)) is None
 
 
 def test_what_it_needs_is_told():

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     *("HARDLY", "HEADSTAND", "WEAK_TURN", "WHY_LOOSE", "Estimate"),
-    *("finish", "little_turn", "loose_bones", "nothing_else", "rms", "what_is_wrong"),
+    *("extent", "finish", "little_turn", "loose_bones", "nothing_else", "rms", "what_is_wrong"),
 ]
 
 WEAK_TURN = 30.0
@@ -119,7 +119,7 @@ def finish(
     every = [found, *found.alternatives]
     placed = [_placed(tracks, one, size, known) for one in every]
     still, roots, remark = [i for i, one in enumerate(every) if one.still], None, ""
-    pointlike = not bool(_extent(tracks) > 0)
+    pointlike = not bool(extent(tracks) > 0)
     if still and not pointlike:
         roots, remark = root_depth(torch.stack([placed[i][0] for i in still]), tracks, found.standing)
     paths = {} if roots is None else dict(zip(still, roots, strict=True))
@@ -313,7 +313,7 @@ def _shift(residuals: Tensor, weights: Tensor) -> Tensor:
     return middle
 
 
-def _extent(tracks: Tracks) -> Tensor:
+def extent(tracks: Tracks) -> Tensor:
     """How far seen joints lie apart, at most, in a frame; 0 where it is rounding."""
     seen = tracks.seen[..., None]
     far = torch.full_like(tracks.points, math.inf)

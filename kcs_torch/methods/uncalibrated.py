@@ -12,6 +12,7 @@ from torch import Tensor
 from kcs_torch.clean.detector import detected
 from kcs_torch.errors import KcsWarning, OptionError
 from kcs_torch.methods.base import Method, apart, check_cameras
+from kcs_torch.methods.finish import extent
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.perspective import WIDE, feet_on_ground, reconstruct_perspective
 from kcs_torch.methods.pinhole import PinholeEnergy
@@ -117,6 +118,8 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
         well be parallel.
     """
     tracks, unit = lifted.tracks, body_unit(lifted)
+    if not bool(extent(tracks) > 0):  # a point is as likely at any distance
+        return None
     with apart([tracks]):
         if cameras is not None:
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
