@@ -89,3 +89,19 @@ def test_right_sides_may_be_more_than_systems(eliminates):
     got = solve_coupled(vectors, right, bones, overlap_of(bones))
     alone = [solve_coupled(vectors, one, bones, overlap_of(bones)) for one in right]
     assert eliminates and torch.equal(got, torch.stack(alone))
+
+
+def test_vmap_is_a_loop(eliminates):
+    """Over frames' values bones are read as ever; over several bodies' bones the solution is dense."""
+    bones, others = BODIES["hand"], BODIES["hand"].roll(3, 0)
+    vectors, right = normal(2, FRAMES, len(bones), 3), normal(2, FRAMES, len(bones), seed=1)
+    alone = [solve_coupled(v, r, bones, overlap_of(bones)) for v, r in zip(vectors, right, strict=True)]
+    got = torch.func.vmap(lambda v, r: solve_coupled(v, r, bones, overlap_of(bones)))(vectors, right)
+    assert_close(got, torch.stack(alone))
+    assert len(eliminates) == 3
+    alone[1] = solve_coupled(vectors[1], right[1], others, overlap_of(others))
+    overlaps = torch.stack([overlap_of(bones), overlap_of(others)])
+    assert_close(
+        torch.func.vmap(solve_coupled)(vectors, right, torch.stack([bones, others]), overlaps), torch.stack(alone)
+    )
+    assert len(eliminates) == 4

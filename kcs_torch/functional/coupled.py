@@ -59,8 +59,8 @@ def solve_coupled(vectors: Tensor, right: Tensor, bones: Tensor, overlap: Tensor
 
     C^T C couples bones that meet at a joint. There all are coupled with all, so that in a tree, eliminated from its
     leaves, zeros stay zeros: a few operations a bone, over all frames at once, where a dense factorisation takes some
-    B^3 / 3 in each frame. That is what is left where there are few frames or many cycles, on a GPU, and where
-    derivatives are wanted.
+    B^3 / 3 in each frame. That is what is left where there are few frames or many cycles, on a GPU, where derivatives
+    are wanted, and where torch.func.vmap maps over bones.
 
     Args:
         vectors: (..., B, D).
@@ -83,12 +83,21 @@ def solve_coupled(vectors: Tensor, right: Tensor, bones: Tensor, overlap: Tensor
     frames = vectors.shape[:-2].numel()
     dense = frames * (len(bones) ** 3 / 3 + FACTOR)
     if plain and here and dense > CALL:
-        order = _order(tuple(map(tuple, bones.tolist())))
-        if 0 < order.work * (CALL + EACH * frames) < dense:
+        order = _readable(bones)
+        if order and 0 < order.work * (CALL + EACH * frames) < dense:
             return _eliminated(vectors, right, order, share * overlap)
     eye = torch.eye(len(bones), dtype=vectors.dtype, device=vectors.device)
     factor, _ = torch.linalg.cholesky_ex(torch.addcmul(eye, share * overlap, kcs_matrix(vectors)))
     return torch.cholesky_solve(right[..., None], factor)[..., 0]
+
+
+def _readable(bones: Tensor) -> _Order | None:
+    """The order of elimination, or None if the bones cannot be read: several bodies' under torch.func.vmap."""
+    try:
+        pairs = bones.tolist()
+    except RuntimeError:
+        return None
+    return _order(tuple(map(tuple, pairs)))
 
 
 def _eliminated(vectors: Tensor, right: Tensor, order: _Order, weight: Tensor) -> Tensor:
