@@ -42,8 +42,8 @@ def viewpoint_energy(
     noise: Tensor | float,
 ) -> Tensor:
     """F (...) of points (..., T, N, 3); the arguments are those of :func:`majorise_step`."""
-    centred = _bones_about_mean(points, bones)[0]
-    scatter = _floor(centred.mT @ centred / centred.shape[-2], eps)
+    centred, _, frames = _bones_about_mean(points, bones)
+    scatter = _floor(centred.mT @ centred / frames, eps)
     far = (_sizes(bone_vectors(points, rigid), lengths) - lengths[..., None, :]) / slack
     off = centred_residual(project(points, cameras), tracks, weights).square().sum(-1) / noise**2
     charge = lambda square: REACH**2 / 2 * (square / REACH**2).log1p()  # noqa: E731
@@ -63,6 +63,7 @@ def majorise_step(
     eps: Tensor | float,
     slack: Tensor | float,
     noise: Tensor | float,
+    inside: Tensor | None = None,
 ) -> Tensor:
     """Minimise the quadratic that touches F at ``points`` and nowhere lies below it.
 
@@ -77,13 +78,14 @@ def majorise_step(
         eps: variance that the log-determinant does not look below.
         slack: standard deviation of a rigid bone's length.
         noise: standard deviation of the tracks.
+        inside: (..., T), False in frames that pad a shorter clip, whose weights are 0.
 
     Returns:
-        (..., T, N, 3), about the joints' mean.
+        (..., T, N, 3), about the joints' mean; 0 in padding.
     """
-    frames, joints = points.shape[-3:-1]
+    joints = points.shape[-2]
     eye = torch.eye(3 * joints, dtype=points.dtype, device=points.device)
-    centred, mean = _bones_about_mean(points, bones)
+    centred, mean, frames = _bones_about_mean(points, bones, inside)
     scatter = _floor(centred.mT @ centred / frames, eps)
     precision = torch.cholesky_inverse(torch.linalg.cholesky_ex(scatter)[0])  # (..., 3B, 3B)
     axes = torch.eye(3, dtype=points.dtype, device=points.device)
@@ -113,7 +115,8 @@ def majorise_step(
     factor, _ = torch.linalg.cholesky_ex(whole + ridge[..., None, None] * eye)
     right = goal + (aim + seen).flatten(-2)
     found = torch.cholesky_solve(right[..., None], factor).squeeze(-1).unflatten(-1, (joints, 3))
-    return found - found.mean(-2, keepdim=True)
+    found = found - found.mean(-2, keepdim=True)
+    return found if inside is None else torch.where(inside[..., None, None], found, found.new_zeros(()))
 
 
 def turn_onto_mean(points: Tensor, rotations: Tensor, bones: Tensor) -> tuple[Tensor, Tensor]:
@@ -133,11 +136,18 @@ def turn_onto_mean(points: Tensor, rotations: Tensor, bones: Tensor) -> tuple[Te
     return seen @ turned, turned
 
 
-def _bones_about_mean(points: Tensor, bones: Tensor) -> tuple[Tensor, Tensor]:
-    """Bones (..., T, 3B) about their mean (..., 3B) over time."""
+def _bones_about_mean(
+    points: Tensor, bones: Tensor, inside: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor | int]:
+    """Bones (..., T, 3B) about their mean (..., 3B) over time, and the number of frames; padding is 0."""
     flat = bone_vectors(points, bones).flatten(-2)
-    mean = flat.mean(-2)
-    return flat - mean[..., None, :], mean
+    if inside is None:
+        mean = flat.mean(-2)
+        return flat - mean[..., None, :], mean, flat.shape[-2]
+    real = inside[..., None].to(flat.dtype)
+    frames = real.sum(-2, keepdim=True).clamp_min(1)
+    mean = (flat * real).sum(-2) / frames.squeeze(-1)
+    return (flat - mean[..., None, :]) * real, mean, frames
 
 
 def _floor(scatter: Tensor, eps: Tensor | float) -> Tensor:

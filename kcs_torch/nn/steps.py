@@ -79,9 +79,10 @@ def estimate_lengths(
     size = bone_lengths(shape, bones)
     if weights is not None:
         seen = torch.minimum(weights[..., bones[:, 0]], weights[..., bones[:, 1]]) > 0
-        seen = seen | ~seen.any(-2, keepdim=True)
         if inside is not None:
             seen = seen & inside[..., None]
+            seen = seen | inside[..., None] & ~seen.any(-2, keepdim=True)
+        seen = seen | ~seen.any(-2, keepdim=True)
         lengths = nanmedian(torch.where(seen, size, torch.nan), -2)
     else:
         lengths = median(size, -2)
@@ -93,7 +94,7 @@ def estimate_lengths(
         if inside is None:
             off = off.mean(-2)
         else:
-            off = (off * inside[..., None]).sum(-2) / inside.sum(-1, keepdim=True)
+            off = (off * inside[..., None]).sum(-2) / inside.sum(-1, keepdim=True).clamp_min(1)
         variation = off / or_one(whole)
         steady = variation.quantile(0.25, -1, keepdim=True)
         ratio = variation / or_one(steady)

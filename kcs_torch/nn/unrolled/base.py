@@ -19,7 +19,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.implicit import Implicit, fixed_point
 from kcs_torch.solvers.iterate import Solution, iterate, relative_change
 
-__all__ = ["Gradient", "Unrolled"]
+__all__ = ["Gradient", "Unrolled", "clear_padding"]
 
 Gradient = Literal["unrolled", "implicit"] | Implicit
 """How an unrolled solver is differentiated."""
@@ -217,8 +217,9 @@ class Unrolled(nn.Module):
         seek: bool = False,
         lengths: Tensor | None = None,
         scales: Tensor | None = None,
+        inside: Tensor | None = None,
     ) -> Tensor:
-        """Return the weights (..., T, N) in the dtype of the tracks, 0 where these are not finite.
+        """Return the weights (..., T, N) in the dtype of the tracks, 0 where these are not finite, and in padding.
 
         Cameras have to be given unless they are what is sought.
 
@@ -250,6 +251,9 @@ class Unrolled(nn.Module):
             check_beside(lengths, "lengths", (skeleton.num_bones,), tracks, self, "tracks")
         check_beside(scales, "scales", tracks.shape[-3:-2], tracks, self, "tracks")
         check_weights(weights, tracks, self)
+        check_beside(inside, "inside", tracks.shape[-3:-2], tracks, self, "tracks")
+        if inside is not None and inside.dtype != torch.bool:
+            raise ShapeError(f"{name}: inside: expected True or False for each frame, got {inside.dtype}")
         if start is not None and start.shape[-3:] != (*tracks.shape[-3:-1], 3):
             expected = f"(..., {tracks.shape[-3]}, {tracks.shape[-2]}, 3)"
             raise ShapeError(f"{name}: expected start {expected}, got {tuple(start.shape)}")
@@ -257,4 +261,11 @@ class Unrolled(nn.Module):
             if value is not None and not fit_together(value.shape[:-3], tracks.shape[:-3]):
                 expected = f"a batch of {what} like that of tracks {tuple(tracks.shape)}"
                 raise ShapeError(f"{name}: expected {expected}, got {tuple(value.shape)}")
-        return seen_weights(tracks, weights).to(tracks.dtype)
+        return clear_padding(seen_weights(tracks, weights).to(tracks.dtype), inside, 1)
+
+
+def clear_padding(values: Tensor, inside: Tensor | None, trailing: int = 2) -> Tensor:
+    """Values (..., T, *), of so many dimensions beyond time, with 0 in frames that are not ``inside`` (..., T)."""
+    if inside is None:
+        return values
+    return torch.where(inside[(..., *[None] * trailing)], values, values.new_zeros(()))

@@ -12,7 +12,7 @@ from kcs_torch.functional.precision import full_precision, wide
 from kcs_torch.functional.weights import known
 from kcs_torch.nn.layers import narrow
 from kcs_torch.nn.steps import continuation, data_scale, shape_step, start_shape
-from kcs_torch.nn.unrolled.base import Gradient, Unrolled
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled, clear_padding
 from kcs_torch.solvers.iterate import Solution
 
 __all__ = ["UnrolledFPC"]
@@ -71,7 +71,13 @@ class UnrolledFPC(Unrolled):
         self._positive("step", [tau] * num_steps)
 
     def forward(
-        self, tracks: Tensor, cameras: Tensor, *, weights: Tensor | None = None, start: Tensor | None = None
+        self,
+        tracks: Tensor,
+        cameras: Tensor,
+        *,
+        weights: Tensor | None = None,
+        start: Tensor | None = None,
+        inside: Tensor | None = None,
     ) -> Tensor:
         """Return the shape in the world frame of the cameras.
 
@@ -80,6 +86,8 @@ class UnrolledFPC(Unrolled):
             cameras: (..., T, 2, 3).
             weights: (..., T, N), 0 where unseen.
             start: (..., T, N, 3), a network's output, say, in any precision; the back-projected tracks if None.
+            inside: (..., T), False in frames that pad a shorter clip; None where all are real. A clip is solved as if
+                it stood alone, and its padding is 0, whatever the other arguments have there.
 
         Returns:
             (..., T, N, 3).
@@ -90,7 +98,7 @@ class UnrolledFPC(Unrolled):
         Warns:
             ConvergenceWarning: with the implicit gradient, in the backward pass.
         """
-        return self.solve(tracks, cameras, weights=weights, start=start, measure=False).value
+        return self.solve(tracks, cameras, weights=weights, start=start, inside=inside, measure=False).value
 
     def solve(
         self,
@@ -99,15 +107,16 @@ class UnrolledFPC(Unrolled):
         *,
         weights: Tensor | None = None,
         start: Tensor | None = None,
+        inside: Tensor | None = None,
         measure: bool = True,
     ) -> Solution[Tensor]:
         """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution`.
 
         With ``measure`` it tells whether the last step stood still, which waits for the device.
         """
-        weights = self._check(tracks, cameras, weights, start)
+        weights = self._check(tracks, cameras, weights, start, inside=inside)
         given, tracks = tracks, wide(known(tracks, weights))
-        cameras, weights = wide(cameras), wide(weights)
+        cameras, weights = clear_padding(wide(cameras), inside), wide(weights)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
@@ -116,9 +125,10 @@ class UnrolledFPC(Unrolled):
             def advance(shape: Tensor, k: int) -> Tensor:
                 return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corners[k])
 
+            begin = start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype)
             solution = self._run(
                 advance,
-                start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype),
+                clear_padding(begin, inside),
                 measure=measure,
                 depends_on=(tracks, cameras, weights),
             )

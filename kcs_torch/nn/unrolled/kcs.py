@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,7 +28,7 @@ from kcs_torch.nn.deviation import (
 from kcs_torch.nn.energies import centred_residual
 from kcs_torch.nn.layers import narrow
 from kcs_torch.nn.steps import continuation
-from kcs_torch.nn.unrolled.base import Gradient, Unrolled
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled, clear_padding
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution
 from kcs_torch.solvers.pose import fit_cameras, steady_cameras
@@ -146,7 +148,13 @@ class UnrolledKCS(Unrolled):
         return self.inverse.to(like) @ (factor[:, None] * vectors)
 
     def find_cameras(
-        self, tracks: Tensor, *, weights: Tensor | None = None, continuity: float = 1.0, robust: float | None = 0.4
+        self,
+        tracks: Tensor,
+        *,
+        weights: Tensor | None = None,
+        continuity: float = 1.0,
+        robust: float | None = 0.4,
+        inside: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Fit cameras to the template seen in each frame, as :class:`kcs_torch.KCS` does in its first round.
 
@@ -155,30 +163,28 @@ class UnrolledKCS(Unrolled):
             weights: (..., T, N), 0 where unseen.
             continuity: weight of the turn between frames in choosing among a frame's cameras.
             robust: residuals of this share of the body's size count half; None is least squares.
+            inside: (..., T), False in padding, as of :meth:`UnrolledFPC.forward`.
 
         Returns:
-            Camera rows (..., T, 2, 3) and scales (..., T), constants for autograd.
+            Camera rows (..., T, 2, 3) and scales (..., T), constants for autograd; 0 in padding.
 
         Raises:
             ShapeError: the shapes do not fit.
         """
-        weights = self._check(tracks, None, weights, None, self.skeleton, seek=True)
+        weights = self._check(tracks, None, weights, None, self.skeleton, seek=True, inside=inside)
         with torch.no_grad(), full_precision(tracks):
             points, share = self._centred(wide(tracks), wide(weights))
             rest = self.template(points)
-            low, high = self._bounds(points, share, rest)
-            rows, sizes = [], []
-            clips = (x.reshape(-1, *x.shape[tracks.ndim - 3 :]) for x in (points, share, low, high))
-            for one, seen, least, most in zip(*clips, strict=True):
-                shape = rest.expand(len(one), -1, -1)
-                fit = fit_cameras(one, shape, seen, least, most, robust=robust)
-                rotations, scales = steady_cameras(fit, continuity)
-                rows.append(rotations[:, :2])
-                sizes.append(scales)
-            if not rows:  # an empty batch
-                return tracks.new_zeros(*tracks.shape[:-2], 2, 3), tracks.new_zeros(tracks.shape[:-2])
-            scales = torch.stack(sizes).reshape(tracks.shape[:-2])
-            return torch.stack(rows).reshape(*tracks.shape[:-2], 2, 3).to(tracks.dtype), narrow(scales, tracks)
+            rows, sizes = points.new_zeros(*share.shape[:-1], 2, 3), points.new_zeros(share.shape[:-1])
+            for at in _clips(share, inside):
+                one, seen = points[at], share[at]
+                if len(one):
+                    fit = fit_cameras(
+                        one, rest.expand(len(one), -1, -1), seen, *self._bounds(one, seen, rest), robust=robust
+                    )
+                    rotations, sizes[at] = steady_cameras(fit, continuity)
+                    rows[at] = rotations[:, :2]
+            return rows.to(tracks.dtype), narrow(sizes, tracks)
 
     def forward(
         self,
@@ -188,6 +194,7 @@ class UnrolledKCS(Unrolled):
         scales: Tensor | None = None,
         weights: Tensor | None = None,
         start: Tensor | None = None,
+        inside: Tensor | None = None,
     ) -> Tensor:
         """Return the shape in the world frame of the cameras, which is the template's.
 
@@ -197,6 +204,7 @@ class UnrolledKCS(Unrolled):
             scales: (..., T) image length of the template's unit; by least squares if None.
             weights: (..., T, N), 0 where unseen.
             start: (..., T, N, 3), in the unit of the tracks; the template if None.
+            inside: (..., T), False in padding, as of :meth:`UnrolledFPC.forward`.
 
         Returns:
             (..., T, N, 3), in the unit of the tracks at the clip's mean scale.
@@ -207,7 +215,9 @@ class UnrolledKCS(Unrolled):
         Warns:
             ConvergenceWarning: with the implicit gradient, in the backward pass.
         """
-        return self.solve(tracks, cameras, scales=scales, weights=weights, start=start, measure=False).value
+        return self.solve(
+            tracks, cameras, scales=scales, weights=weights, start=start, inside=inside, measure=False
+        ).value
 
     def solve(
         self,
@@ -217,31 +227,38 @@ class UnrolledKCS(Unrolled):
         scales: Tensor | None = None,
         weights: Tensor | None = None,
         start: Tensor | None = None,
+        inside: Tensor | None = None,
         measure: bool = True,
     ) -> Solution[Tensor]:
         """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution`.
 
         With ``measure`` it tells whether the last step stood still, which waits for the device.
         """
-        weights = self._check(tracks, cameras, weights, start, self.skeleton, scales=scales)
+        weights = self._check(tracks, cameras, weights, start, self.skeleton, scales=scales, inside=inside)
         with full_precision(tracks):
             points, share = self._centred(wide(tracks), wide(weights))
-            rows, rest = wide(cameras), self.template(points)
+            rows, rest = clear_padding(wide(cameras), inside), self.template(points)
             threshold, step = self._values("threshold", points), self._values("step", points)
             matrix, inverse = self.matrix.to(points), self.inverse.to(points)
             if scales is None:
                 with torch.no_grad():
-                    low, high = self._bounds(points, share, rest)
+                    low, high = self._bounds(points, share, rest, inside)
                 scales = frame_scales(rest, points, rows, share, low, high)
             scales = scales.to(points.dtype)
-            size = scales.mean(-1)[..., None, None, None]
-            given = (deviation_goal(rest, points / scales[..., None, None], rows, share), rows, share)
+            if inside is None:
+                size = scales.mean(-1)
+            else:
+                scales = clear_padding(scales, inside, 0)
+                size = scales.sum(-1) / inside.sum(-1).clamp_min(1)
+            size = size[..., None, None, None]
+            given = (deviation_goal(rest, points / or_one(scales)[..., None, None], rows, share), rows, share)
             top = deviation_scale(*given, matrix=matrix, arrangement=self.arrangement)
             if start is None:
-                batch = broadcast_shapes(points.shape[:-3], cameras.shape[:-3], scales.shape[:-1])
+                batch = broadcast_shapes(points.shape[:-3], rows.shape[:-3], scales.shape[:-1])
                 begin = points.new_zeros(*batch, points.shape[-3], 3, len(self.bones))
             else:
-                begin = bone_vectors(start.to(points.dtype) / size - rest, self.bones).mT
+                start = clear_padding(start, inside).to(points.dtype)
+                begin = clear_padding(bone_vectors(start / or_one(size) - rest, self.bones).mT, inside)
             solution = self._run(
                 lambda state, k: deviation_step(
                     state, *given, threshold[k] * top, step[k],
@@ -251,7 +268,7 @@ class UnrolledKCS(Unrolled):
                 measure=measure,
                 depends_on=(tracks, cameras, weights, scales),
             )  # fmt: skip
-            value = size * (rest + (solution.value @ inverse.mT).mT)
+            value = clear_padding(size * (rest + (solution.value @ inverse.mT).mT), inside)
         return Solution(narrow(value, tracks), solution.converged, solution.iterations)
 
     def _centred(self, tracks: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -260,9 +277,24 @@ class UnrolledKCS(Unrolled):
         points = known(-centred_residual(torch.zeros_like(points), points, weights), weights)
         return points, weights.expand(points.shape[:-1])
 
-    def _bounds(self, points: Tensor, weights: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+    def _bounds(
+        self, points: Tensor, weights: Tensor, rest: Tensor, inside: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Least and greatest scale (..., T)."""
-        scale = template_scale(points, weights, rest, self.rigid)
+        if inside is None:
+            scale = template_scale(points, weights, rest, self.rigid)
+        else:
+            scale = torch.ones_like(weights[..., 0])
+            for at in _clips(weights, inside):
+                if len(points[at]):
+                    scale[at] = template_scale(points[at], weights[at], rest, self.rigid)
         if self.scale_range == math.inf:
             return torch.zeros_like(scale), torch.full_like(scale, math.inf)
         return scale / self.scale_range, scale * self.scale_range
+
+
+def _clips(weights: Tensor, inside: Tensor | None) -> Iterator[tuple[Any, ...]]:
+    """What takes the frames of each clip from what has weights (..., T, N), one clip after another."""
+    real = None if inside is None else inside.expand(weights.shape[:-1])
+    for clip in itertools.product(*map(range, weights.shape[:-2])):
+        yield (*clip, slice(None) if real is None else real[clip])

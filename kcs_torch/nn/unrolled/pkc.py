@@ -18,7 +18,7 @@ from kcs_torch.nn.energies import centred_residual
 from kcs_torch.nn.layers import narrow
 from kcs_torch.nn.majorise import majorise_step, turn_onto_mean
 from kcs_torch.nn.steps import continuation, estimate_lengths, start_shape, to_scale
-from kcs_torch.nn.unrolled.base import Gradient, Unrolled
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled, clear_padding
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution
 
@@ -109,6 +109,7 @@ class UnrolledPKC(Unrolled):
         weights: Tensor | None = None,
         start: Tensor | None = None,
         lengths: Tensor | None = None,
+        inside: Tensor | None = None,
     ) -> Tensor:
         """Return the shape in the world frame of the cameras, which are held but for what :attr:`realign_from` says.
 
@@ -118,6 +119,7 @@ class UnrolledPKC(Unrolled):
             weights: (..., T, N), 0 where unseen.
             start: (..., T, N, 3), a network's output, say; the back-projected tracks if None.
             lengths: (..., B) bone lengths in the unit of the tracks, instead of the module's.
+            inside: (..., T), False in padding, as of :meth:`UnrolledFPC.forward`.
 
         Returns:
             (..., T, N, 3).
@@ -128,7 +130,9 @@ class UnrolledPKC(Unrolled):
         Warns:
             ConvergenceWarning: with the implicit gradient, in the backward pass.
         """
-        return self.solve(tracks, cameras, weights=weights, start=start, lengths=lengths, measure=False).value
+        return self.solve(
+            tracks, cameras, weights=weights, start=start, lengths=lengths, inside=inside, measure=False
+        ).value
 
     def solve(
         self,
@@ -138,6 +142,7 @@ class UnrolledPKC(Unrolled):
         weights: Tensor | None = None,
         start: Tensor | None = None,
         lengths: Tensor | None = None,
+        inside: Tensor | None = None,
         measure: bool = True,
     ) -> Solution[Tensor]:
         """As :meth:`forward`, as a :class:`kcs_torch.solvers.Solution`.
@@ -145,18 +150,20 @@ class UnrolledPKC(Unrolled):
         With ``measure`` it tells whether the last step stood still, which waits for the device.
         """
         joints = self.skeleton.num_joints
-        weights = self._check(tracks, cameras, weights, start, self.skeleton, lengths=lengths)
+        weights = self._check(tracks, cameras, weights, start, self.skeleton, lengths=lengths, inside=inside)
         depends_on = (tracks, cameras, weights, start, lengths)
         with full_precision(tracks):
             # Factorisations of covariances: in double precision, as for singular values.
             wide = torch.float32 if tracks.device.type == "mps" else torch.float64
             flat, rows = known(tracks, weights).to(wide), cameras.to(wide)
+            if inside is not None:  # any rotation will do
+                rows = torch.where(inside[..., None, None], rows, torch.eye(3, dtype=wide, device=rows.device)[:2])
             share = weights.to(wide).expand(flat.shape[:-1])
             flat = known(-centred_residual(torch.zeros_like(flat), flat, share), share)
             size = _root_mean_square(flat, share)[..., None, None, None]
             flat = flat / size
-            begin = start_shape(flat, rows, share) if start is None else start.to(wide) / size
-            begin = begin - begin.mean(-2, keepdim=True)
+            begin = start_shape(flat, rows, share) if start is None else clear_padding(start, inside).to(wide) / size
+            begin = clear_padding(begin - begin.mean(-2, keepdim=True), inside)
             fixed, relative = (None if lengths is None else lengths.to(wide) / size[..., 0, 0]), lengths is None
             if lengths is None and self.has_lengths:
                 fixed = self._values("length", flat)
@@ -176,13 +183,14 @@ class UnrolledPKC(Unrolled):
 
             def advance(state: Tensor, k: int) -> Tensor:
                 points, turned = split(state)
-                measured, rigidity = estimate_lengths(points, self.rigid, share, graded=graded)
+                measured, rigidity = estimate_lengths(points, self.rigid, share, graded=graded, inside=inside)
                 if fixed is not None:
                     part = fixed[..., self.indices]
                     measured = to_scale(part, measured) if relative else part
                 points = majorise_step(
                     points, flat, turned[..., :2, :], share, measured, bones=self.bones, rigid=self.rigid,
                     eps=eps[k], slack=slack[k] * rigidity.clamp_min(1e-4).rsqrt()[..., None, :], noise=noise[k],
+                    inside=inside,
                 )  # fmt: skip
                 if k >= self.first:
                     points, turned = turn_onto_mean(points, turned, self.bones)

@@ -14,7 +14,7 @@ from kcs_torch.functional.precision import full_precision, wide
 from kcs_torch.functional.weights import known
 from kcs_torch.nn.layers import narrow
 from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape, to_scale
-from kcs_torch.nn.unrolled.base import Gradient, Unrolled
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled, clear_padding
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution
 
@@ -98,6 +98,7 @@ class UnrolledSfAM(Unrolled):
         weights: Tensor | None = None,
         start: Tensor | None = None,
         lengths: Tensor | None = None,
+        inside: Tensor | None = None,
     ) -> Tensor:
         """Return the shape in the world frame of the cameras.
 
@@ -107,6 +108,7 @@ class UnrolledSfAM(Unrolled):
             weights: (..., T, N), 0 where unseen.
             start: (..., T, N, 3); the back-projected tracks if None.
             lengths: (..., B) bone lengths in the unit of the tracks, instead of the module's.
+            inside: (..., T), False in padding, as of :meth:`UnrolledFPC.forward`.
 
         Returns:
             (..., T, N, 3).
@@ -117,7 +119,9 @@ class UnrolledSfAM(Unrolled):
         Warns:
             ConvergenceWarning: with the implicit gradient, in the backward pass.
         """
-        return self.solve(tracks, cameras, weights=weights, start=start, lengths=lengths, measure=False).value
+        return self.solve(
+            tracks, cameras, weights=weights, start=start, lengths=lengths, inside=inside, measure=False
+        ).value
 
     def solve(
         self,
@@ -143,7 +147,7 @@ class UnrolledSfAM(Unrolled):
             lengths: as of :meth:`forward`.
             one_body: the batch (..., W, T, N, 2) are windows of one body, which share their bone lengths; ``lengths``
                 are then proportions (..., B), brought to the scale of the shape.
-            inside: (..., T), False in frames that pad a shorter clip at its end; their weights and cameras are 0.
+            inside: as of :meth:`forward`.
             held: an empty list is filled with the lengths and rigidity that each articulated step aimed at; a filled
                 one is what other windows of the same body aimed at, and is aimed at again.
             corner: (...) share of the scale, in all steps instead of the module's; may be infinite.
@@ -152,12 +156,14 @@ class UnrolledSfAM(Unrolled):
         Returns:
             The solution; ``change`` is that of the last step, (...).
         """
-        weights = self._check(tracks, cameras, weights, start, self.skeleton, lengths=None if one_body else lengths)
+        relative = one_body or lengths is None
+        weights = self._check(
+            tracks, cameras, weights, start, self.skeleton, lengths=None if relative else lengths, inside=inside
+        )
         given, tracks = tracks, wide(known(tracks, weights))
-        cameras, weights = wide(cameras), wide(weights)
+        cameras, weights = clear_padding(wide(cameras), inside), wide(weights)
         threshold, step = self._values("threshold", tracks), self._values("step", tracks)
         stiffness = self._values("stiffness", tracks)
-        relative = one_body or lengths is None
         if lengths is not None:
             lengths = lengths.to(tracks.dtype)
         elif self.has_lengths:
@@ -194,11 +200,9 @@ class UnrolledSfAM(Unrolled):
             scale = data_scale(tracks, cameras, weights)
             corners = self._corners(scale, corner)
             begin = start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype)
-            if inside is not None:
-                begin = begin * inside[..., None, None]
             solution = self._run(
                 advance,
-                begin,
+                clear_padding(begin, inside),
                 inner=begin.ndim if one_body else 3,
                 measure=measure,
                 depends_on=(tracks, cameras, weights, lengths),
