@@ -618,6 +618,26 @@ def test_joints_in_another_order_are_warned_of():
     assert any("hardly a body of skeleton 'h36m17'" in note for note in result.diagnostics.notes)
 
 
+@pytest.mark.parametrize(
+    ("body", "joints", "told"),
+    [
+        ("h36m17", {9: 7, 7: 9}, "away from their tracks in most frames, head by"),
+        ("coco17", {joint: (joint - 1) % 17 for joint in range(17)}, "hardly a body of skeleton 'coco17'"),
+    ],
+    ids=["two swapped", "one place on"],
+)
+def test_so_are_joints_that_other_joints_explain(body, joints, told):
+    """PKC keeps bones constant whatever is tracked: lengths that do not vary are no sign of a right order."""
+    points = walking_person(60, skeleton=body, yaw=40.0, noise=3.0).tracks.points[:, :17]
+    order = [joints.get(joint, joint) for joint in range(17)]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = METHODS["pkc"]()(Tracks.from_arrays(points[:, order], skeleton=body, fps=30))
+    heard = [str(w.message) for w in caught]
+    assert any(told in message and "in another order" in message for message in heard), heard
+    assert any(told in note for note in result.diagnostics.notes)
+
+
 @pytest.mark.parametrize(("method", "rests"), [("pkc", "the template and lengths"), ("sfam", "constant lengths alone")])
 def test_what_depth_rests_on_before_a_camera_that_stands_still(method, rests):
     """SfAM knows no template: the user is warned, and told of methods that do."""

@@ -26,7 +26,7 @@ from kcs_torch.errors import (
 )
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.finish import HEADSTAND, WHY_LOOSE, Estimate, finish, rms, what_is_wrong
+from kcs_torch.methods.finish import HEADSTAND, WHY_LOOSE, Estimate, finish, rms
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
 from kcs_torch.types.hints import is_a, spoken
@@ -181,9 +181,9 @@ class Method(ABC):
             warnings.warn(f"{tracks.source}: {gone}", KcsWarning, stacklevel=users_level())
         if HEADSTAND in found.notes:
             warnings.warn(f"{tracks.source}: {HEADSTAND}", KcsWarning, stacklevel=users_level())
-        wrong = [note for note in found.notes if note.endswith(WHY_LOOSE)]
-        for sentence in wrong if found.converged else what_is_wrong(self, result.points, tracks, False):
-            warnings.warn(f"{tracks.source}: {sentence}", KcsWarning, stacklevel=users_level())
+        for note in found.notes:
+            if note.endswith(WHY_LOOSE):
+                warnings.warn(f"{tracks.source}: {note}", KcsWarning, stacklevel=users_level())
 
     def unsettled(self, steps: int) -> str:
         """A sentence for those whose iteration stopped at its limit."""

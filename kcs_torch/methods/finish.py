@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -14,9 +15,10 @@ from kcs_torch.functional.align import centre
 from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.functional.ranks import median
+from kcs_torch.functional.ranks import median, nanmedian
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.root import root_depth
+from kcs_torch.methods.template import guessed
 from kcs_torch.nn.lengths import oddity
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Reconstruction, Tracks
@@ -43,6 +45,13 @@ PART = 2.0
 ODD, DEEP = 0.4, 1.0
 """Root mean square of the logarithms of lengths over the skeleton's, and depth over the size in the image, beyond which
 a body is another: people in odd postures, seen by detectors, come to .4 and .5."""
+
+OTHER = 0.6
+"""The former, beyond which it is another whatever its depth, unless a guess at an animal is all that is known of it."""
+
+AWAY, OFTEN = 0.25, 0.1
+"""Share of the body's size by which a joint is away from its tracks in most of the frames that show it, and the share
+of frames that have to show it, from which on it is another joint. Noise of 40 mm comes to .1 of the size."""
 
 POINT = 1e-6
 """Size in the image, over the depth, up to which a body is a point."""
@@ -162,9 +171,9 @@ def _rest(method: Method, body: Skeleton) -> str:
 
 
 def what_is_wrong(
-    method: Method, points: Tensor, tracks: Tracks, settled: bool = True, lengths: Tensor | None = None
+    method: Method, points: Tensor, images: Tensor, tracks: Tracks, settled: bool, lengths: Tensor | None = None
 ) -> list[str]:
-    """What about points (T, N, 3) tells that they are not the body's, for the user, and why that may be.
+    """What about points (T, N, 3) and their images (T, N, 2) tells that they are not the body's, and why that may be.
 
     Lengths that vary are no news of a solution that did not settle, and none of bones whose ends the tracks never show;
     a body unlike any is why it does not settle.
@@ -172,7 +181,30 @@ def what_is_wrong(
     body = tracks.skeleton
     told = [loose_bones(points, body, lengths, tracks.seen.any(0)) if method.keeps_lengths and settled else ""]
     told.append(odd_body(points, body, lengths) if method.knows_template(body) else "")
+    told.append(far_joints(images, tracks) if method.keeps_lengths else "")
     return [f"{sentence}: {WHY_LOOSE}" for sentence in told if sentence]
+
+
+def far_joints(images: Tensor, tracks: Tracks) -> str:
+    """Which joints' images (T, N, 2) are away from their tracks in most frames, for the user; empty where none is."""
+    seen = tracks.seen
+    joints = (seen.to(images.dtype).mean(0) >= OFTEN).nonzero().flatten().tolist() if len(seen) else []
+    size = float(rms(centre(tracks.points, tracks.weights)[0], seen.to(images.dtype))) if joints else 0.0
+    if not size > 0:
+        return ""
+    off = (images - tracks.points).norm(dim=-1) / size
+    off = nanmedian(torch.where(seen, off, torch.nan)[:, joints], 0)
+    found = (off > AWAY).nonzero().flatten().tolist()
+    named = [f"{tracks.skeleton.joints[joints[i]]} by {100 * float(off[i]):.0f} %" for i in found]
+    if not named:
+        return ""
+    return f"joints are away from their tracks in most frames, {the_worst(named, off[found])} of the body's size"
+
+
+def the_worst(named: Sequence[str], by: Tensor, kind: str = "joint", most: int = 3) -> str:
+    """The worst of what is ``named``, ``by`` (K,) so much, and how many more there are."""
+    shown = [named[i] for i in by.argsort(descending=True).tolist()]
+    return ", ".join(shown[:most]) + (f" and {counted(len(shown) - most, f'more {kind}')}" if len(shown) > most else "")
 
 
 def loose_bones(points: Tensor, body: Skeleton, lengths: Tensor | None = None, seen: Tensor | None = None) -> str:
@@ -194,10 +226,8 @@ def loose_bones(points: Tensor, body: Skeleton, lengths: Tensor | None = None, s
     found = ((share > LOOSE) & (100 * spread > PART * size)).nonzero().flatten().tolist()
     if not found:
         return ""
-    worst = sorted(found, key=lambda b: -float(share[b]))
-    named = [f"{body.bone_names[rigid[b]]} by {float(share[b]):.0f} %" for b in worst[:3]]
-    more = f" and {counted(len(worst) - 3, 'more bone')}" if len(worst) > 3 else ""
-    return f"lengths of rigid bones vary: {', '.join(named)}{more}"
+    named = [f"{body.bone_names[rigid[b]]} by {float(share[b]):.0f} %" for b in found]
+    return f"lengths of rigid bones vary: {the_worst(named, share[found], 'bone')}"
 
 
 def odd_body(points: Tensor, body: Skeleton, lengths: Tensor | None = None) -> str:
@@ -210,11 +240,13 @@ def odd_body(points: Tensor, body: Skeleton, lengths: Tensor | None = None) -> s
     odd = oddity(own[rigid], usual[rigid])
     middle = points - points.mean(1, keepdim=True)
     wide, far = float(middle[..., :2].norm()), float(middle[..., 2].norm())
-    if odd <= ODD or far <= DEEP * wide or wide <= POINT * far:  # a point in the image shows no body
-        return ""
+    deep = far > DEEP * wide
+    if odd <= ODD or not (deep or (odd > OTHER and not guessed(body))) or wide <= POINT * far:
+        return ""  # a point in the image shows no body
+    also = f", and it is {far / wide:.1f} times as deep as it is large in the image" if deep else ""
     return (
         f"this is hardly a body of skeleton '{body.name}': bones are {math.exp(odd):.1f} times as long or as short as "
-        f"usual, and it is {far / wide:.1f} times as deep as it is large in the image"
+        f"usual{also}"
     )
 
 
@@ -256,7 +288,7 @@ def _reconstruction(
         notes.append(f"bone lengths vary by {variation.median:.1f} %: '{method.name}' does not hold them constant")
     if upside_down(tracks.points[..., 1], tracks.seen, body, NEARLY_ALL):
         notes.append(HEADSTAND)
-    notes += what_is_wrong(method, points, tracks, lengths=bones)
+    notes += what_is_wrong(method, points, seen, tracks, found.converged, lengths=bones)
     if not body.rigid:
         kind = "no bones" if not body.num_bones else "no rigid bones"
         notes.append(f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown")

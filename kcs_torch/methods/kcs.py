@@ -10,7 +10,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from kcs_torch.anatomy import quadruped_places, template_by_names
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import centre, nearest_rotation
 from kcs_torch.functional.camera import complete_rotation
@@ -20,7 +19,7 @@ from kcs_torch.functional.ranks import median
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.clips import Clips, in_batches, padded
 from kcs_torch.methods.mirror import mirror_sign
-from kcs_torch.methods.template import clip_scale, rigid_shape
+from kcs_torch.methods.template import clip_scale, guessed, rigid_shape
 from kcs_torch.nn.deviation import Arrangement, deviation_goal, deviation_scale, deviation_step, frame_scales
 from kcs_torch.nn.steps import continuation
 from kcs_torch.skeleton import Skeleton
@@ -184,7 +183,7 @@ class KCS(Method):
         if rest is None:
             note = f"skeleton '{tracks.skeleton.name}' has no template: the tracks' best rigid shape serves"
             return centre(rigid_shape(tracks, cameras))[0], (note,)
-        if self.template is None and _is_guessed(tracks.skeleton):
+        if self.template is None and guessed(tracks.skeleton):
             own = centre(rigid_shape(tracks, cameras))[0]
             least, middle, _ = torch.linalg.eigvalsh(own.mT @ own).tolist()
             if least > DEEP**2 * middle:
@@ -260,9 +259,3 @@ def _same(clips: Clips, before: Tensor, after: Tensor) -> Tensor:
 
 CHECK = 5
 """Steps from one look at whether a clip has settled to the next."""
-
-
-def _is_guessed(body: Skeleton) -> bool:
-    """Whether the template is an animal's by the names of its joints, and not one that somebody gave."""
-    names = body.joints
-    return quadruped_places(names) is not None and body.template == template_by_names("quadruped", names)

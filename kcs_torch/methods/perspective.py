@@ -274,7 +274,8 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
     factor = intrinsics.focal / root.log().mean().exp()
     points, root = points * factor, root * factor
     n = body.num_observed  # virtual joints are means of others in the image, too, which no projection is
-    off = (intrinsics.project(points) - tracks.points)[:, :n][tracks.seen[:, :n]]
+    images = intrinsics.project(points)
+    off = (images - tracks.points)[:, :n][tracks.seen[:, :n]]
     points = torch.cat([points[..., :2], points[..., 2:] - root[:, None, None]], -1)
     told = () if k else found.notes  # the best solution's; "the mirror image", say, is true of none any more
     stale = (WHY_LOOSE, HARDLY, "weak perspective", "did not settle")  # true of what was lifted, perhaps not of this
@@ -287,7 +288,7 @@ def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconst
     if not k and (little := little_turn(method, body, turn)):
         notes.append(little)
     if not k:
-        notes.extend(what_is_wrong(method, points, tracks))
+        notes.extend(what_is_wrong(method, points, images, tracks, before.converged))
     notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
     if scene.any_focal:
         notes.append(lens_note(intrinsics, tracks.units))

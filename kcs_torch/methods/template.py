@@ -5,13 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from kcs_torch.anatomy import quadruped_places, template_by_names
 from kcs_torch.functional.camera import back_project
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.cameras import orthographic_cameras
 from kcs_torch.nn.deviation import template_scale
+from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
-__all__ = ["clip_scale", "rigid_shape"]
+__all__ = ["clip_scale", "guessed", "rigid_shape"]
 
 
 def clip_scale(tracks: Tracks, rest: Tensor, *, span: int = 60, quantile: float = 0.95) -> Tensor:
@@ -46,3 +48,9 @@ def rigid_shape(tracks: Tracks, cameras: Tensor | None = None) -> Tensor:
         cameras = orthographic_cameras(filled[None])[0]
     normal = (cameras.mT @ cameras).mean(0) + 1e-3 * torch.eye(3, dtype=filled.dtype, device=filled.device)
     return torch.linalg.solve(normal, back_project(filled, cameras).mean(0).mT).mT
+
+
+def guessed(body: Skeleton) -> bool:
+    """Whether a body's template is an animal's by the names of its joints, and not one that somebody gave."""
+    names = body.joints
+    return quadruped_places(names) is not None and body.template == template_by_names("quadruped", names)
