@@ -51,6 +51,16 @@ def test_track_ids_go_before_places():
     assert "people are followed by the file's own track ids" in first.notes
 
 
+def test_each_person_is_told_by_the_ids_of_the_file():
+    def called(ids):
+        return [[n for n in one.notes if "calls this one" in n] for one in read(two(ids=ids))]
+
+    left, right = ["the file calls this one 'left'"], ["the file calls this one 'right'"]
+    assert called([["left"] * 6, ["right"] * 6]) == [left, right]
+    assert called([["left"] * 6, ["left", *["right"] * 5]]) == [left, [right[0] + " in 5 of 6 frames"]]  # by places
+    assert called([[0] * 6, [0] * 6]) == [[], []]  # as some trackers number everybody
+
+
 @pytest.mark.parametrize(
     ("ids", "say"),
     [([[0] * 6, [0] * 6], "stands twice in frame 0"), ([[1, 1, 1, None, 1, 1], [2] * 6], "is missing in frame 3")],

@@ -13,7 +13,7 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.build import build_tracks, nothing_seen
 from kcs_torch.io.layout import choose_layout
 from kcs_torch.io.link import follow_people
-from kcs_torch.io.registry import Options
+from kcs_torch.io.registry import Options, brief
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 from kcs_torch.types.intake import at_the_corner
@@ -58,9 +58,9 @@ def people_tracks(
 ) -> list[Tracks]:
     """Follow the people of T frames and wrap each as :class:`Tracks`.
 
-    By the file's track ids where every person has one and no frame has one twice; by their places otherwise. Joints
-    are recognised by their number where neither names nor a skeleton are given. Joints whose x or y is exactly 0 are
-    unseen.
+    By the file's track ids where every person has one and no frame has one twice; by their places otherwise. Where ids
+    differ, a note says which one each person has. Joints are recognised by their number where neither names nor a
+    skeleton are given. Joints whose x or y is exactly 0 are unseen.
 
     Args:
         frames: the people of each frame.
@@ -95,6 +95,7 @@ def people_tracks(
         people = follow_people([np.array([s.joints for s in frame]) for frame in frames], max_gap=gap)
     elif len(people) > 1:
         remarks.append("people are followed by the file's own track ids")
+    several = len({s.track for frame in frames for s in frame} - {None}) > 1
     least = max(options.threshold, 1e-12)
     visible = [seen for seen in people if any((frames[t][i].joints[:, 2] >= least).any() for t, i in seen)]
     if not visible:
@@ -120,10 +121,20 @@ def people_tracks(
                 edges=edges,
                 skeleton=skeleton,
                 fps=fps,
-                notes=remarks,
+                notes=[*_called(frames, seen), *remarks] if several else remarks,
             )
         )
     return out
+
+
+def _called(frames: Sequence[Sequence[Sighting]], seen: Sequence[tuple[int, int]]) -> list[str]:
+    """What the file's track ids say of who this is, most of the time; nothing where there are none."""
+    ids = Counter(frames[t][i].track for t, i in seen if frames[t][i].track is not None)
+    if not ids:
+        return []
+    (name, count), *_ = ids.most_common(1)
+    often = "" if count == len(seen) else f" in {count} of {len(seen)} frames"
+    return [f"the file calls this one '{brief(name)}'{often}"]
 
 
 def _without_zeros(frames: Sequence[Sequence[Sighting]], measured: bool, notes: list[str]) -> list[list[Sighting]]:
