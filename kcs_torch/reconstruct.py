@@ -27,6 +27,9 @@ DEFAULT = "pkc"
 WITHOUT = ("auto", "parallel")
 """What may be asked for in place of intrinsics."""
 
+OF_TRACKS = ("joint_names", "edges", "threshold")
+"""What tracks are made with, no field of any method."""
+
 
 BESIDE = 1e8
 """Focal lengths off the optical axis from which on a joint's number is that of no image."""
@@ -66,19 +69,26 @@ def reconstruct(
         A :class:`Reconstruction`: points (T, N, 3) in the camera frame, cameras, lengths, diagnostics.
 
     Raises:
-        OptionError: the method or a field is unknown, or its value is out of range; or array options come with Tracks;
-            or a camera of these intrinsics would see nothing like the tracks.
+        OptionError: the method or a field is unknown, or its value is out of range; or array options come with Tracks,
+            or some that :meth:`Tracks.from_arrays` alone takes; or a camera of these intrinsics would see nothing like
+            the tracks, or they are in another unit.
         ShapeError: an array, or the intrinsics, has the wrong shape or values.
         SkeletonError: the skeleton is unknown or does not fit.
 
     Warns:
-        KcsWarning: no bones are given, and the method knows of bones; or as :meth:`Method.__call__`.
+        KcsWarning: no bones are given, and the method knows of bones; or many joints lie beside the image of which the
+            principal point is the middle; or as :meth:`Method.__call__`.
 
     >>> from kcs_torch.data.synthetic import walking_person
     >>> result = reconstruct(walking_person(60).tracks, method="sfam", beta=2.0)
     >>> result.points.shape, result.method
     (torch.Size([60, 17, 3]), 'sfam')
     """
+    if misplaced := [name for name in OF_TRACKS if name in fields]:
+        raise OptionError(
+            f"reconstruct: {misplaced[0]} belongs to the tracks: reconstruct(Tracks.from_arrays(points, skeleton=..., "
+            f"{misplaced[0]}=...))"
+        )
     lens = _lens(intrinsics)
     find = isinstance(skeleton, str) and skeleton == "auto"
     if find:
@@ -197,7 +207,11 @@ def _before(lens: Intrinsics | str | None, method: Method, tracks: Tracks, camer
     if lens is None:
         lens = "auto" if method.turns_over and cameras is None and may_be_near(tracks) else "parallel"
     if isinstance(lens, Intrinsics):
+        seen = tracks.points[tracks.seen].detach()
+        lens.check_unit(seen)
         off = (lens.rays(tracks.points)[..., :2].norm(dim=-1) * tracks.seen).amax(1)
+        if said := lens.beside(seen):
+            warnings.warn(f"{tracks.source}: {said}", KcsWarning, stacklevel=users_level())
         inside = bool((off < BESIDE).all())
         found = reconstruct_perspective(method, tracks, lens, cameras) if inside else None
         if found is None or not bool(found.points.isfinite().all()):

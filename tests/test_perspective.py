@@ -101,6 +101,8 @@ def test_rays_of_nothing_and_of_what_is_not_known():
     ("value", "kind", "says"),
     [
         ((1500, 1500, 960), kt.ShapeError, r"got shape \(3,\)"),
+        ((1500, 1500, 960, 540, -0.2, 0.1), kt.ShapeError, r"got shape \(6,\): a lens that distorts .* undistort the"),
+        ((np.eye(3), np.zeros(5)), kt.ShapeError, r"got two arrays: a lens that distorts .*undistortPoints"),
         (np.eye(4), kt.ShapeError, r"got shape \(4, 4\)"),
         ("1500", kt.ShapeError, "got '1500'"),
         ({"fx": 1}, kt.ShapeError, "fx, fy, cx, cy"),
@@ -461,6 +463,26 @@ def test_a_focal_length_in_another_unit_is_told():
         kt.reconstruct(filmed(frames=5)[0], method="kcs", intrinsics=(120, 120, 0, 0))
     with pytest.raises(kt.OptionError, match=r"in the unit of the tracks.*got Intrinsics\(fx=1.2"):
         kt.reconstruct(filmed(frames=5)[0], method="kcs", intrinsics=(1.2, 1.2, 0.5, 0.5))
+
+
+@pytest.mark.parametrize("by", [(1 / 1920, 1 / 1080), (1 / 1500, 1 / 1480)], ids=["image", "focal"])
+def test_shares_with_intrinsics_in_pixels_are_told(by):
+    """All rays would be one, and the body as large as a pixel."""
+    tracks, _ = filmed(frames=5)
+    points = (tracks.points - (0 if by[0] == 1 / 1920 else torch.tensor(LENS[2:]))) * torch.tensor(by)
+    with pytest.raises(kt.OptionError, match=r"in the unit of the focal lengths, got .*shares of the image"):
+        kt.reconstruct(replace(tracks, points=points), method="kcs", intrinsics=LENS)
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+def test_y_up_and_other_corners_are_told_with_intrinsics():
+    tracks, _ = filmed(frames=5)
+    up = tracks.points * torch.tensor([1.0, -1.0])
+    for points in (up, tracks.points - torch.tensor(LENS[2:])):
+        with pytest.warns(kt.KcsWarning, match=r"of the joints, .* lie beside an image whose middle is \(960, 540\)"):
+            kt.reconstruct(replace(tracks, points=points), method="kcs", intrinsics=LENS)
+    with pytest.warns(kt.KcsWarning, match=r"give -y instead \(with intrinsics the image's height - y\)"):
+        kt.reconstruct(replace(tracks, points=up + torch.tensor([0.0, 1080.0])), method="kcs", intrinsics=LENS)
 
 
 # ---------------------------------------------------------------------- files and the command line

@@ -156,6 +156,13 @@ def test_options_of_arrays_with_tracks():
         refused(OptionError, "belong to arrays; these tracks already have them", **option)
 
 
+@pytest.mark.parametrize("option", [{"joint_names": list("ab")}, {"edges": [(0, 1)]}, {"threshold": 0.5}])
+def test_what_tracks_are_made_with_is_no_field_of_a_method(option):
+    (name,) = option
+    with pytest.raises(OptionError, match=rf"{name} belongs to the tracks: reconstruct\(Tracks\.from_arrays\("):
+        kt.reconstruct(POINTS, **option)
+
+
 def test_fields_with_auto_are_the_defaults_own():
     refused(OptionError, "unknown option of method 'pkc' 'beta'", "rounds", beta=1.0)
     refused(OptionError, "pkc: steps: expected at least 1, got 0", steps=0)

@@ -63,8 +63,9 @@ NEARLY_ALL = 0.9
 """Share of the frames in which feet are above the rest of the body where y may well point up."""
 
 HEADSTAND = (
-    "the feet are above the rest of the body in nearly all frames. If y points up in these tracks, give -y instead: it "
-    "has to point down, as in images, or the body is upside down and mirrored"
+    "the feet are above the rest of the body in nearly all frames. If y points up in these tracks, give -y instead "
+    "(with intrinsics the image's height - y): it has to point down, as in images, or the body is upside down and "
+    "mirrored. If it does point down, joints may be in another order"
 )
 
 WHY_LOOSE = (

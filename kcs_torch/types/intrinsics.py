@@ -18,6 +18,20 @@ __all__ = ["Intrinsics"]
 WIDEST = 20.0
 """Tangent of the angle off the optical axis that no lens without distortion reaches for half of what it shows."""
 
+STRAIGHTEN = (
+    ": a lens that distorts is not modelled: undistort the tracks first, in OpenCV by undistortPoints(points, K, "
+    "distortion, P=K)"
+)
+
+UNIT = 2.0
+"""Coordinates up to this, half of them, are shares of an image or metres on its plane, no pixels."""
+
+COARSE = 50.0
+"""Focal lengths from this on are in pixels."""
+
+BESIDE = 0.25
+"""Share of the joints that lie beside the image from which on its corner is likely to be another."""
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -49,6 +63,8 @@ class Intrinsics:
         if isinstance(value, Intrinsics):
             return value
         what = "intrinsics: expected (fx, fy, cx, cy) or a matrix K (3, 3)"
+        if isinstance(value, (tuple, list)) and len(value) == 2:
+            raise ShapeError(f"{what}, got two arrays{STRAIGHTEN}")
         if isinstance(value, (tuple, list)) and len(value) == 4 and all(isinstance(x, (int, float)) for x in value):
             try:
                 return cls(*map(float, value))  # without tensors, so that torch.compile follows
@@ -58,7 +74,8 @@ class Intrinsics:
             raise ShapeError(f"{what}, got {value!r}")
         matrix = as_floats(value, what, None).double()
         if matrix.shape not in ((4,), (3, 3)):
-            raise ShapeError(f"{what}, got shape {tuple(matrix.shape)}")
+            hint = STRAIGHTEN if matrix.ndim == 1 and len(matrix) > 4 else ""
+            raise ShapeError(f"{what}, got shape {tuple(matrix.shape)}{hint}")
         if matrix.ndim == 1:
             return cls(*matrix.tolist())
         (fx, skew, cx), (tilt, fy, cy), last = matrix.tolist()
@@ -68,7 +85,7 @@ class Intrinsics:
         elif tilt != 0 or last != [0, 0, 1]:
             hint = "divide it by its last number, or transpose it, where it is written otherwise"
         elif abs(skew) > 1e-3 * abs(fx):
-            hint = "undistort the tracks first"
+            hint = "undistort the tracks first, which takes off the skew as well"
         if hint:
             raise OptionError(
                 "intrinsics: expected K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] without skew, got "
@@ -97,6 +114,35 @@ class Intrinsics:
                 f"are about {across:.3g}, got {self}: half of all points would lie beside the camera, not before it"
             )
         return torch.stack([x, y, torch.ones_like(x)], -1)
+
+    def check_unit(self, image: Tensor) -> None:
+        """Make sure that points (n, 2) of an image are in the unit of the focal lengths.
+
+        Raises:
+            OptionError: they are shares of the image, or of the focal length, where these are pixels.
+        """
+        off = image.abs().amax(-1)
+        if len(off) and self.focal > COARSE and 0 < float(off.median()) <= UNIT:
+            raise OptionError(
+                "intrinsics: expected tracks in the unit of the focal lengths, got coordinates of about "
+                f"{float(off.median()):.2g} and {self}: multiply shares of the image by its width and height; "
+                "undistorted points come in pixels with P=K, in OpenCV"
+            )
+
+    def beside(self, image: Tensor) -> str:
+        """What to say where many points (n, 2) lie beside the image whose middle is the principal point, else ""."""
+        if not (len(image) and self.cx > 0 and self.cy > 0):
+            return ""
+        middle = image.new_tensor([self.cx, self.cy])
+        share = float((((image - middle) / middle).abs() > 1.1).any(-1).to(image).mean())
+        if share <= BESIDE:
+            return ""
+        x, y = image.median(0).values.tolist()
+        return (
+            f"intrinsics: {100 * share:.0f} % of the joints, which are about ({x:.4g}, {y:.4g}), lie beside an image "
+            f"whose middle is ({self.cx:.4g}, {self.cy:.4g}): x and y count from its upper left corner, y down. Where "
+            "y points up give its height - y; after cropping take the corner off cx and cy"
+        )
 
     def project(self, points: Tensor) -> Tensor:
         """Images (..., 2) of points (..., 3) in the camera frame."""
