@@ -84,6 +84,9 @@ def unknown(what: str, name: object, choices: Iterable[str], error: type[KcsErro
     choices = sorted(choices)
     shown = repr(name) if len(repr(name)) <= 100 else f"{repr(name)[:96]} ..."  # it may come from a file
     close = difflib.get_close_matches(str(name)[:100], choices, n=2)
+    if not close:  # COCO17, say
+        small = {choice.lower(): choice for choice in choices}
+        close = [small[found] for found in difflib.get_close_matches(str(name)[:100].lower(), small, n=2)]
     hint = f": did you mean {' or '.join(repr(c) for c in close)}?" if close else ":"
     listing = f"(choices: {', '.join(choices)})" if close else f"choices are {', '.join(choices)}"
     return error(f"unknown {what} {shown}{hint} {listing}")

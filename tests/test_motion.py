@@ -298,6 +298,11 @@ def test_an_unknown_size_is_told(tmp_path):
     notes: list[str] = []
     save(motion, tmp_path / "m.bvh", notes=notes)
     assert any("--scale height=1.75m" in note for note in notes)
+    hand = replace(kt.Motion.from_arrays(torch.rand(3, 21, 3), skeleton="hand21", fps=30), units="px")
+    with pytest.warns(kt.KcsWarning, match="set it with .* or --scale wrist-thumb_cmc=...mm"):
+        save(hand, tmp_path / "hand.trc")
+    with pytest.raises(OptionError, match="'hand21' has none: give a bone, such as wrist-thumb_cmc"):
+        hand.scaled(units="m", height=0.18)
     with pytest.raises(OptionError, match="only lengths in px"):
         save(motion, tmp_path / "m.trc", units="mm")
 

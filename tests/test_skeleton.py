@@ -212,6 +212,7 @@ def test_graphs_are_admitted_when_asked_for():
         (lambda: Skeleton(("v", "a", "b"), ((0, 1), (1, 2)), virtual=((0, (1, 2)),)), "must follow the observed"),
         (lambda: Skeleton(("a", "b"), ((0, 1),), virtual=((1, ()),)), "needs sources"),
         (lambda: Skeleton.from_names(["a", "elbow"], [("a", "elbo")]), "did you mean 'elbow'"),
+        (lambda: Skeleton.from_names(["a", "b", "b"], [("a", "b"), ("b", "tail")]), "given twice: b"),
         (lambda: Skeleton.from_names(["a", "b"], ["ab"]), "expected pairs of joint names"),
         (lambda: Skeleton.from_names(["a", "b"], [("a", "b")], template={"a": (0, 0, 0)}), "none for b"),
         (lambda: Skeleton.from_names(["a", "b"], [("a", "b")], template={"c": (0, 0, 0)}), "unknown name in template"),

@@ -332,6 +332,19 @@ def test_shapes_that_are_nearly_right_are_told_how_to_put_right(shape, words):
         Tracks.from_arrays(np.zeros(shape), skeleton="coco17")
 
 
+def test_frames_that_are_none_are_told():
+    frames = [None, *np.ones((3, 17, 2))]
+    with pytest.raises(ShapeError, match="got list with None in it: a frame that shows nobody is one of NaN"):
+        Tracks.from_arrays(frames, skeleton="coco17")
+
+
+def test_joints_in_another_order_are_told_which_skeleton_they_fit():
+    names = [n.title().replace("_", "") for n in SKELETONS["coco17"].joints[:17][::-1]]
+    tracks = Tracks.from_arrays(grid(), joint_names=names)
+    assert any("17 joints fit coco17" in note for note in tracks.notes)
+    assert Tracks.from_arrays(grid(), joint_names=names, skeleton="coco17").skeleton.name == "coco17"
+
+
 def test_joint_count_that_fits_none():
     with pytest.raises(SkeletonError, match="got 3$"):
         Tracks.from_arrays(grid(joints=3), skeleton="body25")
@@ -340,6 +353,8 @@ def test_joint_count_that_fits_none():
 def test_unknown_skeletons():
     with pytest.raises(SkeletonError, match="unknown skeleton 'coco': did you mean 'coco1"):
         Tracks.from_arrays(grid(), skeleton="coco")
+    with pytest.raises(SkeletonError, match="unknown skeleton 'COCO17': did you mean 'coco17'"):
+        Tracks.from_arrays(grid(), skeleton="COCO17")
     with pytest.raises(SkeletonError, match="unknown skeleton 17"):
         Tracks.from_arrays(grid(), skeleton=17)
     with pytest.raises(FormatError, match="nowhere.yaml: cannot be read"):

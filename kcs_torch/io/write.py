@@ -14,7 +14,7 @@ from kcs_torch.io.load import WRITERS
 from kcs_torch.io.registry import Saving, Writer
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion, Reconstruction, Tracks
-from kcs_torch.types.size import METRES, unit_ratio
+from kcs_torch.types.size import METRES, size_hint, unit_ratio
 
 __all__ = ["check_skeleton", "ready_writer", "save", "save_people", "takes_up", "units_ratio", "writer_for"]
 
@@ -100,7 +100,7 @@ def save(
     elif wanted:
         saving.warnings.append(
             f"the true size is not known: lengths are in {motion.units or 'an unknown unit'}; set it with "
-            "scaled(units=..., height=1.75) or --scale height=1.75m"
+            f"{size_hint(motion.skeleton)}"
         )
     with atomic_path(path) as temporary:
         writer.write_motion(motion, temporary, saving)

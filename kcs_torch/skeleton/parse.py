@@ -77,6 +77,8 @@ def arguments(
         )
     names = (*(str(j) for j in joints), *virtual)
     position = {n: i for i, n in enumerate(names)}
+    if doubled := sorted({n for n in names if names.count(n) > 1}):  # else the joint that one replaced would be unknown
+        raise SkeletonError(f"skeleton '{name}': joint names must differ; given twice: {', '.join(doubled)}")
 
     def at(joint: object, what: str) -> int:
         if str(joint) not in position:

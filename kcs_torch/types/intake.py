@@ -57,6 +57,8 @@ def as_floats(value: Any, what: str, ndim: int | None) -> Tensor:
         except (TypeError, ValueError, OverflowError):
             kind = f"one of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
             hint = "; kcs_torch.load_tracks reads files" if isinstance(value, (str, Path)) else ""
+            if isinstance(value, (list, tuple)) and any(item is None for item in value):
+                hint = " with None in it: a frame that shows nobody is one of NaN"
             raise ShapeError(f"{what}: expected an array of numbers, got {kind}{hint}") from None
     if value.is_complex():
         raise ShapeError(f"{what}: expected real numbers, got {str(value.dtype).removeprefix('torch.')}")
@@ -100,6 +102,8 @@ def _may_be(names: Sequence[str], body: Skeleton) -> bool:
     if _numbered(names):
         return True
     found = map_joints(names, body.joints[: body.num_observed])
+    if None not in found:
+        return True  # whatever their order, as a skeleton matches joints by name
     return all(i in (None, j) for j, i in enumerate(found)) and MOST_LACKING * found.count(None) <= len(found)
 
 

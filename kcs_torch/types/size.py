@@ -14,7 +14,7 @@ from kcs_torch.errors import OptionError
 from kcs_torch.skeleton import Skeleton, map_joints, stature_weights
 from kcs_torch.types.intake import as_number
 
-__all__ = ["METRES", "check_size", "parse_size", "short_unit", "size_factor", "unit_ratio"]
+__all__ = ["METRES", "check_size", "parse_size", "short_unit", "size_factor", "size_hint", "unit_ratio"]
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Units of length in metres."""
@@ -130,10 +130,25 @@ def _stature(body: Skeleton, what: str) -> Tensor:
     """The weights of :func:`stature_weights`."""
     weights = stature_weights(body)
     if weights is None:
+        bone = f", such as {body.bone_names[0]}" if body.bones else ""
         raise OptionError(
             f"{what}: height needs a head and a foot among the joints; skeleton '{body.name}' has none: give a bone"
+            f"{bone}"
         )
     return weights
+
+
+def size_hint(body: Skeleton) -> str:
+    """How to set a body's size: by the stature where it has one, else by a bone.
+
+    >>> from kcs_torch.skeleton import get_skeleton
+    >>> size_hint(get_skeleton("hand21"))
+    'scaled(units="m", **{"wrist-thumb_cmc": ...}) or --scale wrist-thumb_cmc=...mm'
+    """
+    if stature_weights(body) is not None or not body.bones:
+        return "scaled(units=..., height=1.75) or --scale height=1.75m"
+    bone = body.bone_names[0]
+    return f'scaled(units="m", **{{"{bone}": ...}}) or --scale {bone}=...mm'
 
 
 def parse_size(text: str, what: str = "scale") -> dict[str, Any]:
