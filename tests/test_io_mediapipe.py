@@ -8,7 +8,7 @@ from samples import mediapipe_frames, person, write_json, write_mediapipe_csv, w
 
 from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io import detect_format, load_people, load_tracks
-from kcs_torch.skeleton import SKELETONS
+from kcs_torch.skeleton import SKELETONS, Skeleton
 
 SIZE = (1000, 1000)
 NAMES = SKELETONS["mediapipe33"].joints[:33]
@@ -160,6 +160,10 @@ def test_hands_are_left_out_beside_a_pose_and_read_alone(tmp_path):
     assert {h.skeleton.name for h in hands} == {"hand21"}
     assert any(same(h, HAND) for h in hands) and any(same(h, left) for h in hands)
     assert any("mirror the result of a left one" in n for n in hands[0].notes)
+    right = SKELETONS["hand21"]
+    own = Skeleton.from_edges(right.bones, [f"left_{joint}" for joint in right.joints])
+    told = [n for hand in read(tmp_path, frames, skeleton=own) for n in hand.notes]
+    assert not any("mirror the result" in n for n in told) and own.template != right.template
 
 
 def test_handedness_tells_hands_apart(tmp_path):

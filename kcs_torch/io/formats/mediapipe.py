@@ -43,8 +43,11 @@ def read(path: Path, options: Options) -> list[Tracks]:
     settle(found, path, options, shares=True)
     joints = next((len(s.joints) for people in found.frames.values() for s in people), 33)
     skeleton = BODIES.get(joints) if found.names is None else None
-    if joints == 21:
-        found.notes.append("a hand's template is that of a right one: mirror the result of a left one")
+    if joints == 21 and options.skeleton is None:
+        found.notes.append(
+            "a hand's template is that of a right one: mirror the result of a left one, or give a skeleton whose "
+            "joints are called left"
+        )
     return people_tracks(
         by_number(found.frames, found.notes),
         options,
