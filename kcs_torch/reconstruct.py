@@ -27,6 +27,12 @@ DEFAULT = "pkc"
 WITHOUT = ("auto", "parallel")
 """What may be asked for in place of intrinsics."""
 
+SHARED = (
+    "all coordinates lie within 0 and 1 and are taken as they are: if they are shares of the image, multiply x by its "
+    "width and y by its height, or the body is as distorted as the image is not square; else say units=..."
+)
+"""What is told of arrays that may be shares of an image."""
+
 OF_TRACKS = ("joint_names", "edges", "threshold")
 """What tracks are made with, no field of any method."""
 
@@ -76,7 +82,8 @@ def reconstruct(
         SkeletonError: the skeleton is unknown or does not fit.
 
     Warns:
-        KcsWarning: no bones are given, and the method knows of bones; or many joints lie beside the image of which the
+        KcsWarning: no bones are given, and the method knows of bones; or an array without units seems to hold shares of
+            an image; or many joints lie beside the image of which the
             principal point is the middle; or as :meth:`Method.__call__`.
 
     >>> from kcs_torch.data.synthetic import walking_person
@@ -101,6 +108,9 @@ def reconstruct(
             )
     else:
         tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units or "px")
+        low, high = float(tracks.points.min()), float(tracks.points.max())
+        if units is None and not isinstance(lens, Intrinsics) and low >= 0 and 0 < high <= 1:
+            warnings.warn(f"{tracks.source}: {SHARED}", KcsWarning, stacklevel=users_level())
     if find:
         tracks = with_found_bones(tracks)
     chosen = method_named(method, fields)

@@ -70,6 +70,13 @@ def test_arrays_without_a_skeleton():
     assert len(told) == 1 and told[0].filename == __file__
 
 
+def test_arrays_that_seem_to_be_shares_of_an_image_are_told():
+    shares = (POINTS - POINTS.min()) / (POINTS.max() - POINTS.min())
+    with pytest.warns(kt.KcsWarning, match="multiply x by its width and y by its height"):
+        reconstruct(shares, method="rigid", num_steps=1)
+    reconstruct(shares, method="rigid", num_steps=1, units="m")  # a warning would be an error here
+
+
 def test_methods_that_know_of_no_bones_do_not_ask_for_them():
     assert not reconstruct(POINTS, method="rigid", num_steps=1).skeleton.bones  # a warning would be an error here
 
