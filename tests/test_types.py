@@ -14,7 +14,7 @@ from torch.testing import assert_close
 
 from kcs_torch import KcsError, Motion, OptionError, ShapeError, SkeletonError, Tracks
 from kcs_torch.data import walking_person
-from kcs_torch.errors import FormatError
+from kcs_torch.errors import FormatError, KcsWarning
 from kcs_torch.functional import bone_lengths
 from kcs_torch.skeleton import SKELETONS, Skeleton
 from kcs_torch.types.size import check_size, size_factor
@@ -446,6 +446,14 @@ def test_scaled_by_a_bone():
     index = result.skeleton.bone_names.index(name)
     assert scaled.lengths[index].item() == pytest.approx(0.43)
     assert_close(scaled.points * (result.lengths[index] / 0.43), result.points)
+
+
+@pytest.mark.parametrize(("units", "height", "metres"), [("m", 175, "175"), ("mm", 1.75, "0.00175")])
+def test_a_stature_in_another_unit_is_told(units, height, metres):
+    with pytest.warns(KcsWarning, match=f"a height of {height} {units} is {metres} m: is the unit another") as told:
+        walk_result().scaled(units=units, height=height)
+    assert told[0].filename == __file__
+    walk_result().scaled(units="dragons", height=175)  # a warning would be an error here
 
 
 def test_scaled_by_height():

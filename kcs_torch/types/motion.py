@@ -179,7 +179,7 @@ class Motion(Trajectories):
 
     def scaled(self, *, units: str, factor: float | None = None, **sizes: float) -> Motion:
         """The same motion in another unit; arguments and errors as of :meth:`Reconstruction.scaled`."""
-        factor = size_factor(self.skeleton, self.lengths, factor, sizes)
+        factor = size_factor(self.skeleton, self.lengths, factor, sizes, units=units)
         return replace(self, points=self.points * factor, units=units)
 
     def angles(self, joints: Joints | None = None) -> JointAngles:

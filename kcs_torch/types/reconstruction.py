@@ -259,8 +259,11 @@ class Reconstruction:
         Raises:
             OptionError: not exactly one of ``factor`` and a size is given, it is no positive number, or the skeleton
                 has no head or no leg to tell a stature from.
+
+        Warns:
+            KcsWarning: nobody is so tall: 1.75 mm, or 175 m.
         """
-        factor = size_factor(self.skeleton, self.lengths, factor, sizes)
+        factor = size_factor(self.skeleton, self.lengths, factor, sizes, units=units)
         spread = None if self.uncertainty is None else self.uncertainty * factor
         return replace(
             self,

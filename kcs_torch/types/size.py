@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError
+from kcs_torch.errors import KcsWarning, OptionError, users_level
 from kcs_torch.skeleton import Skeleton, map_joints, stature_weights
 from kcs_torch.types.intake import as_number
 
@@ -46,8 +47,17 @@ def unit_ratio(old: str, new: str) -> float | None:
     return METRES[old] / METRES[new] if old in METRES and new in METRES else None
 
 
+STATURES = 0.1, 10.0
+"""Statures in metres, lowest and highest, that are hardly a slip in the unit: of a toy and of a giant."""
+
+
 def size_factor(
-    body: Skeleton, lengths: Tensor, factor: float | None, sizes: Mapping[str, float], what: str = "scaled"
+    body: Skeleton,
+    lengths: Tensor,
+    factor: float | None,
+    sizes: Mapping[str, float],
+    what: str = "scaled",
+    units: str = "",
 ) -> float:
     """The factor by which a body of bone ``lengths`` (B,) grows to the one size that is given, or ``factor`` itself.
 
@@ -57,9 +67,13 @@ def size_factor(
         factor: or None.
         sizes: one entry, ``height`` or the name of a bone, in the new unit; or none.
         what: who asks, for messages.
+        units: the new unit.
 
     Raises:
         OptionError: not exactly one of ``factor`` and a size is given, it is unknown, or it is not positive.
+
+    Warns:
+        KcsWarning: nobody is so tall in this unit.
     """
     if (factor is None) == (len(sizes) != 1):
         raise OptionError(f"{what}: expected either factor=... or exactly one size, such as height=1.75")
@@ -74,6 +88,10 @@ def size_factor(
             raise OptionError(f"{what}: {name} is zero or unknown in this motion")
         if not 0 < size < math.inf:
             raise OptionError(f"{what}: {name}: expected a positive number, got {size:g}")
+        metres = size * METRES[units] if units in METRES else 1.0
+        if name == "height" and not STATURES[0] <= metres <= STATURES[1]:
+            message = f"{what}: a height of {size:g} {units} is {metres:.4g} m: is the unit another?"
+            warnings.warn(message, KcsWarning, stacklevel=users_level())
         factor = size / own
     factor = _number(factor, f"{what}: factor")
     if not (factor > 0 and math.isfinite(factor)):
