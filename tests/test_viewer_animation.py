@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from samples import walk_result
 
-from kcs_torch.errors import OptionError, OutputError
+from kcs_torch.errors import KcsWarning, OptionError, OutputError
 from kcs_torch.io import save, save_people
 from kcs_torch.viewer import animation
 from kcs_torch.viewer.animation import GIF, MP4, Pace, pace
@@ -185,3 +185,8 @@ def test_without_rerun_the_package_is_named(result, tmp_path, monkeypatch):
 def test_files_of_one_person_are_told(result, tmp_path):
     with pytest.raises(OutputError, match=r"several people in one file go to \.gif, \.html, \.mp4, \.rrd"):
         save_people([result, result], tmp_path / "walk.npz")
+
+
+def test_people_of_clips_that_are_not_equally_long_are_told(result, tmp_path):
+    with pytest.warns(KcsWarning, match=r"people have 12, 5 frames: all are shown from their own first one on"):
+        save_people([result, walk_result(5)], tmp_path / "walk.html")

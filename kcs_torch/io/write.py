@@ -128,10 +128,21 @@ def save_people(results: Sequence[Reconstruction], path: str | Path) -> Path:
     Raises:
         OutputError: files of this suffix hold one person, or it is unknown, or the file cannot be written.
         OptionError: there is nobody, or the frame rates differ.
+
+    Warns:
+        KcsWarning: the clips are not equally long, so that they may begin at different frames.
     """
     writer = writer_for(path)
     if writer.write_people is None:
         raise OutputError(f"{path}: several people in one file go to {_suffixes('write_people')}")
+    frames = [len(result.points) for result in results]
+    if len(set(frames)) > 1:
+        warnings.warn(
+            f"{path}: people have {', '.join(map(str, frames))} frames: all are shown from their own first one on, "
+            "which is another time where each was trimmed (kcs-torch lift: --frames seen)",
+            KcsWarning,
+            stacklevel=users_level(),
+        )
     with atomic_path(path) as temporary:
         writer.write_people(results, temporary)
     return Path(path)
