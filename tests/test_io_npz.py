@@ -82,6 +82,18 @@ def test_options_go_before_the_file(tmp_path):
     assert "matched by name" in tracks.notes[0]
 
 
+def test_shares_of_the_image_become_pixels(tmp_path):
+    """--image-size went unheard."""
+    points = arrays()["points2d"] * 0 + [0.25, 0.5]
+    path = written(tmp_path / "a.npz", points2d=points, units="px")
+    tracks = load_tracks(path, image_size=(1280, 720))
+    assert tracks.points[tracks.seen].unique(dim=0).tolist() == [[320, 360]]
+    path = written(tmp_path / "b.npz", points2d=points * 1000, units="px")
+    tracks = load_tracks(path, image_size=(1280, 720))
+    assert tracks.points[tracks.seen].unique(dim=0).tolist() == [[250, 500]]
+    assert "the coordinates are pixels already" in tracks.notes
+
+
 def test_other_names_are_taken_in_their_order(tmp_path):
     body = Skeleton.from_names(["a", "b", "c"], [("a", "b"), ("b", "c")])
     tracks = load_tracks(written(tmp_path / "o.npz"), skeleton=body)

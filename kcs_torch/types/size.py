@@ -90,7 +90,8 @@ def size_factor(
             raise OptionError(f"{what}: {name}: expected a positive number, got {size:g}")
         metres = size * METRES[units] if units in METRES else 1.0
         if name == "height" and not STATURES[0] <= metres <= STATURES[1]:
-            message = f"{what}: a height of {size:g} {units} is {metres:.4g} m: is the unit another?"
+            said = "" if units == "m" else f" is {metres:.4g} m"
+            message = f"{what}: a height of {size:g} {units}{said}: is the unit another?"
             warnings.warn(message, KcsWarning, stacklevel=users_level())
         factor = size / own
     factor = _number(factor, f"{what}: factor")

@@ -32,6 +32,7 @@ from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io.archive import Archive, array_names
 from kcs_torch.io.build import build_tracks
 from kcs_torch.io.build_motion import build_motion
+from kcs_torch.io.people import SHARES
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, Saving, Writer
 from kcs_torch.skeleton import Skeleton
@@ -56,6 +57,14 @@ def read(path: Path, options: Options) -> list[Tracks]:
             "load_motion(path) reads it, and its .tracks() makes 2D tracks"
         )
     points = file.array("points2d", "fiu", 3)
+    units = file.text("units") if "units" in file else "px"
+    notes = _json(file, "notes", list) if "notes" in file else []
+    if options.image_size is not None and units == "px" and points.shape[-1] == 2:
+        there = np.abs(points[np.isfinite(points)])
+        if len(there) and float(np.median(there)) <= SHARES:
+            points = points * np.array(options.image_size)
+        else:
+            notes.append("the coordinates are pixels already")
     return [
         build_tracks(
             points,
@@ -66,8 +75,8 @@ def read(path: Path, options: Options) -> list[Tracks]:
             edges=file.array("edges", "iu") if "edges" in file else None,
             skeleton=_skeleton(file) if "skeleton" in file else None,
             fps=file.number("fps") if "fps" in file else None,
-            units=file.text("units") if "units" in file else "px",
-            notes=_json(file, "notes", list) if "notes" in file else (),
+            units=units,
+            notes=notes,
         )
     ]
 
