@@ -83,8 +83,8 @@ def reconstruct(
 
     Warns:
         KcsWarning: no bones are given, and the method knows of bones; or an array without units seems to hold shares of
-            an image; or many joints lie beside the image of which the
-            principal point is the middle; or as :meth:`Method.__call__`.
+            an image; or many joints lie beside the image of which the principal point is the middle; or as
+            :meth:`Method.__call__`.
 
     >>> from kcs_torch.data.synthetic import walking_person
     >>> result = reconstruct(walking_person(60).tracks, method="sfam", beta=2.0)
@@ -108,8 +108,8 @@ def reconstruct(
             )
     else:
         tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units or "px")
-        low, high = float(tracks.points.min()), float(tracks.points.max())
-        if units is None and not isinstance(lens, Intrinsics) and low >= 0 and 0 < high <= 1:
+        within = bool(((tracks.points >= 0) & (tracks.points <= 1)).all() & tracks.points.any())
+        if units is None and not isinstance(lens, Intrinsics) and within:
             warnings.warn(f"{tracks.source}: {SHARED}", KcsWarning, stacklevel=users_level())
     if find:
         tracks = with_found_bones(tracks)

@@ -493,6 +493,15 @@ def test_scaled_refuses(options, words):
     assert words in str(caught.value)
 
 
+def test_units_may_be_spelt_out():
+    result = walk_result()
+    assert result.scaled(units="Metres", height=1.75).units == "m"
+    assert Motion.of(result).scaled(units="centimeters", height=175).units == "cm"
+    assert Tracks.from_arrays(grid(12, 2), units="millimetres").units == "mm"
+    with pytest.raises(OptionError, match="units: expected a name such as 'm', got None"):
+        Tracks.from_arrays(grid(12, 2), units=None)
+
+
 def test_scaled_by_what_is_not_there():
     result = walk_result()
     with pytest.raises(OptionError, match="is zero or unknown in this motion"):

@@ -19,7 +19,7 @@ from kcs_torch.types.axes import from_y_up, to_y_up
 from kcs_torch.types.intake import as_floats, as_number, take_in
 from kcs_torch.types.intrinsics import Intrinsics
 from kcs_torch.types.reconstruction import Reconstruction
-from kcs_torch.types.size import size_factor
+from kcs_torch.types.size import short_unit, size_factor
 from kcs_torch.types.tracks import Tracks
 from kcs_torch.types.trajectories import Trajectories
 from kcs_torch.types.variation import BoneVariation, bone_variation
@@ -117,7 +117,9 @@ class Motion(Trajectories):
             at = [body.index(n) for n in given]
             xyz[:, at] = torch.where(seen[..., None], own, torch.zeros_like(own))
             weights[:, at] = seen.to(weights)
-        return cls(to_y_up(xyz, up), weights, body, taken.fps, units, source, tuple(dict.fromkeys(taken.notes)))
+        return cls(
+            to_y_up(xyz, up), weights, body, taken.fps, short_unit(units), source, tuple(dict.fromkeys(taken.notes))
+        )
 
     @classmethod
     def of(cls, result: Reconstruction) -> Motion:
@@ -179,6 +181,7 @@ class Motion(Trajectories):
 
     def scaled(self, *, units: str, factor: float | None = None, **sizes: float) -> Motion:
         """The same motion in another unit; arguments and errors as of :meth:`Reconstruction.scaled`."""
+        units = short_unit(units)
         factor = size_factor(self.skeleton, self.lengths, factor, sizes, units=units)
         return replace(self, points=self.points * factor, units=units)
 

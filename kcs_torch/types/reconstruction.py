@@ -16,7 +16,7 @@ from kcs_torch.functional.ranks import median
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.angles import JointAngles, Joints, angles_of
 from kcs_torch.types.intrinsics import Intrinsics
-from kcs_torch.types.size import size_factor
+from kcs_torch.types.size import short_unit, size_factor
 from kcs_torch.types.tracks import Tracks
 from kcs_torch.types.variation import BoneVariation, bone_variation
 
@@ -247,7 +247,7 @@ class Reconstruction:
         """The same motion in another unit.
 
         Args:
-            units: name of the new unit.
+            units: name of the new unit; lengths may be spelt out, "metres".
             factor: new units per old unit; or instead one size by name:
             **sizes: ``height=1.75``, the person's stature, or the length of a bone, given as
                 ``**{"left_knee-left_ankle": 0.43}``. The stature is that of the straightened body from the topmost
@@ -263,6 +263,7 @@ class Reconstruction:
         Warns:
             KcsWarning: nobody is so tall: 1.75 mm, or 175 m.
         """
+        units = short_unit(units)
         factor = size_factor(self.skeleton, self.lengths, factor, sizes, units=units)
         spread = None if self.uncertainty is None else self.uncertainty * factor
         return replace(

@@ -29,9 +29,14 @@ SPELT |= {"inch": "in", "inches": "in", "foot": "ft", "feet": "ft"}
 def short_unit(name: str) -> str:
     """A unit of length as it is written here, whatever a file calls it; other units in small letters.
 
+    Raises:
+        OptionError: it is no text.
+
     >>> short_unit("Millimeters"), short_unit("px")
     ('mm', 'px')
     """
+    if not isinstance(name, str):
+        raise OptionError(f"units: expected a name such as 'm', got {name!r}")
     name = name.strip().lower()
     return SPELT.get(name, name)
 

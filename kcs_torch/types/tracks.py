@@ -12,6 +12,7 @@ from torch import Tensor
 from kcs_torch.errors import counted
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.intake import no_bones, take_in
+from kcs_torch.types.size import short_unit
 from kcs_torch.types.trajectories import Trajectories
 
 __all__ = ["Tracks", "never_seen", "unseen_notes"]
@@ -91,7 +92,7 @@ class Tracks(Trajectories):
             remarks.append(no_bones(body))
         xy, weights = body.complete(taken.points, taken.weights)
         remarks += unseen_notes(weights, body)
-        return cls(xy, weights, body, taken.fps, units, source, tuple(remarks))
+        return cls(xy, weights, body, taken.fps, short_unit(units), source, tuple(remarks))
 
     def frames(self, start: int, stop: int, step: int = 1) -> Self:
         """A run of frames, with notes on what they do not show; with a step, every so many, at the slower rate."""
