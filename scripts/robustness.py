@@ -9,6 +9,7 @@ Parts, after figure 5 of Kovalenko et al. 2019:
 ``variation``  how much bones change their length over time, with and without the articulated term (5d)
 ``noise``      noise in the tracks (5a)
 ``template``   KCS with a template whose bones are too long or short, or point elsewhere; one fixed camera
+``missing``    PKC where joints are hidden, beside curves through the true places of all that are seen
 
 Motion, views and figures are those of the measuring protocol, which lies beside the repository in ``../shared``. A row
 is the mean over sequences and seeds, and the standard deviation of seeds' means; --csv has every single run.
@@ -19,7 +20,8 @@ from __future__ import annotations
 import argparse
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -27,6 +29,7 @@ from typing import Any
 import numpy as np
 import torch
 from benchmark import load_input, load_protocol
+from scipy.interpolate import CubicSpline, PchipInterpolator, make_interp_spline
 from torch import Tensor
 
 import kcs_torch as kt
@@ -41,6 +44,7 @@ WALKS = ("02_01", "05_01", "07_01", "08_01", "12_01", "16_15", "35_01", "39_01")
 LENGTHS = (0, 10, 30, 50, 70)  # mm
 NOISE = (0, 5, 10, 15, 20)  # mm
 TEMPLATE = ((0, 0), (10, 0), (20, 0), (30, 0), (0, 10), (0, 20))  # per cent of length, degrees
+CURVES = {"lines": partial(make_interp_spline, k=1), "monotone cubics": PchipInterpolator, "splines": CubicSpline}
 PITCH = 10
 FIGURES = ("rigid", "e3d", "bone_cv")
 
@@ -145,7 +149,35 @@ def template(bench: Bench, seeds: int) -> Iterator[Run]:
                 yield {"setting": setting, "case": label, "seed": seed} | figures
 
 
-PARTS = {"lengths": lengths, "variation": variation, "noise": noise, "template": template}
+def missing(bench: Bench, seeds: int) -> Iterator[Run]:
+    """The protocol's clips with hidden joints. Curves know the true places of the body and of its seen joints."""
+    cases = bench.protocol.suites()["missing"]
+    for case in [c for c in cases if c["src"] in list(dict.fromkeys(c["src"] for c in cases))[: bench.sequences]]:
+        for share in dict.fromkeys((0.0, case["missing"])):
+            given, truth = bench.protocol.build(bench.data, case | {"missing": share, "max_frames": bench.frames})
+            label, level = bench.protocol.case_name(case | {"missing": share}), f"{100 * share:.0f} % missing"
+            tracks = load_input(given, label)
+            run = {"case": label, "seed": 0}
+            if share or case["missing"] == cases[0]["missing"]:
+                yield {"setting": f"PKC, {level}"} | run | bench.score(kt.PKC()(tracks), truth)
+            true, seen = truth["points3d"], tracks.seen[:, : tracks.skeleton.num_observed].numpy()
+            about = true - true.mean(1, keepdims=True)
+            for name, curve in CURVES.items() if share else ():
+                points = torch.from_numpy(filled(about, seen, curve))
+                yield {"setting": f"truth, {name}, {level}"} | run | bench.score(points, truth)
+
+
+PARTS = {"lengths": lengths, "variation": variation, "noise": noise, "template": template, "missing": missing}
+
+
+def filled(points: np.ndarray, seen: np.ndarray, curve: Callable[..., Any]) -> np.ndarray:
+    """Points (T, N, 3) with curves in place of what is not seen (T, N); the ends are held."""
+    out = points.copy()
+    for joint, shown in enumerate(seen.T):
+        known = np.flatnonzero(shown)
+        time = np.clip(np.flatnonzero(~shown), known[0], known[-1])
+        out[~shown, joint] = curve(known, points[known, joint])(time)
+    return out
 
 
 def generator(seed: int) -> torch.Generator:

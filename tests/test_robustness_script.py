@@ -38,6 +38,15 @@ def test_tracks_at_other_places_keep_everything_else(script):
     assert_close(moved.points[tracks.seen], tracks.points[tracks.seen] + 3)
 
 
+@pytest.mark.parametrize("curve", ["lines", "monotone cubics", "splines"])
+def test_curves_go_through_what_is_seen_and_hold_the_ends(script, curve):
+    points = np.arange(7.0)[:, None, None] * np.ones((7, 2, 3))
+    seen = np.array([[0, 1], [1, 1], [1, 1], [0, 1], [0, 1], [1, 1], [0, 1]], dtype=bool)
+    got = script.filled(points, seen, script.CURVES[curve])
+    assert np.array_equal(got[seen], points[seen]) and np.array_equal(got[:, 1], points[:, 1])
+    assert np.allclose(got[:, 0, 0], [1, 1, 2, 3, 4, 5, 5])
+
+
 def test_without_the_data_it_says_what_it_needs(script, tmp_path):
     with pytest.raises(SystemExit, match="expected a folder with protocol"):
         script.main(["--shared", str(tmp_path)])
