@@ -83,7 +83,13 @@ def test_script(script, shared, tmp_path, capsys):
     assert list(dict.fromkeys(row["part"] for row in rows)) == list(script.PARTS)
     assert all(row["setting"] in shown and float(row["rigid"]) > 0 for row in rows)
     counts = {part: sum(row["part"] == part for row in rows) for part in script.PARTS}
-    assert counts == {"lengths": 2 + 4 * 2, "variation": 2, "noise": 4 * (1 + 4 * 2), "template": 4 * (2 + 5 * 2)}
+    assert counts == {
+        "lengths": 2 + 4 * 2,
+        "variation": 2,
+        "noise": 4 * (1 + 4 * 2),
+        "template": 4 * (2 + 5 * 2),
+        "missing": 1 + 3 * 4,
+    }
     own, free = (row for row in rows if row["part"] == "variation")
     bones = [key for key in own if key.startswith("variation of ")]
     middle = [np.median([float(row[bone]) for bone in bones]) for row in (own, free)]
