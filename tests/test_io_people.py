@@ -43,6 +43,27 @@ def test_people_are_followed_by_their_places():
     assert not any("track ids" in n for n in a.notes)
 
 
+def test_a_track_id_that_breaks_is_joined_by_place():
+    first, second = read(two(ids=([7, 7, 12, 12, 12, 3], [1] * 6)))
+    assert np.allclose(numbers(first), A) and np.allclose(numbers(second), B)
+    assert (
+        "track ids that break are joined by place: '12' begins where '7' ends, '3' begins where '12' ends"
+        in first.notes
+    )
+    assert "the file calls this one '12' in 3 of 6 frames" in first.notes
+    assert "the file calls this one '1'" in second.notes
+
+
+@pytest.mark.parametrize("away", [(900.0, 300.0), (300.0, 300.0)], ids=["elsewhere", "after more than a second"])
+def test_who_is_somebody_else_is_not_joined(away):
+    late = 40 if away == (300.0, 300.0) else 0
+    start, end = person(6, 17, at=(300.0, 300.0)), person(6, 17, at=away)
+    frames = [[Sighting(p, 7)] for p in start] + [[]] * late + [[Sighting(p, 8)] for p in end]
+    people = read(frames, Options(fps=30))
+    assert [int(one.seen.any(1).sum()) for one in people] == [6, 6]
+    assert not any("joined" in note for one in people for note in one.notes)
+
+
 def test_track_ids_go_before_places():
     swapped = [[1, 1, 1, 2, 2, 2], [2, 2, 2, 1, 1, 1]]
     first, second = read(two(ids=swapped))

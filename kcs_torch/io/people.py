@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,6 +33,10 @@ _MOST_NUMBERS = 5e7  # of all tracks together: each person has a place in every 
 _FPS = 30.0  # assumed for how long somebody may be out of sight, where nothing is known
 
 
+_Seen = list[tuple[int, int]]
+"""A person: frames, and the index among those seen there."""
+
+
 class Sighting(NamedTuple):
     """One person in one frame.
 
@@ -58,8 +63,9 @@ def people_tracks(
 ) -> list[Tracks]:
     """Follow the people of T frames and wrap each as :class:`Tracks`.
 
-    By the file's track ids where every person has one and no frame has one twice; by their places otherwise. Where ids
-    differ, a note says which one each person has. Joints are recognised by their number where neither names nor a
+    By the file's track ids where every person has one and no frame has one twice; by their places otherwise. Who
+    appears within a second where somebody else disappeared has got a new id, as trackers lose people. Where ids differ,
+    a note says which one each person has. Joints are recognised by their number where neither names nor a
     skeleton are given. Joints whose x or y is exactly 0 are unseen.
 
     Args:
@@ -90,11 +96,12 @@ def people_tracks(
     if names is None and skeleton is None:
         skeleton, names = choose_layout(everybody, options, source, remarks)
     people = _by_ids(frames, remarks)
-    if people is None:
+    if people is None or len(people) > 1:
         gap = max(round(min(options.fps or fps or _FPS, 1e6)), 1)
-        people = follow_people([np.array([s.joints for s in frame]) for frame in frames], max_gap=gap)
-    elif len(people) > 1:
-        remarks.append("people are followed by the file's own track ids")
+        places = follow_people([np.array([s.joints for s in frame]) for frame in frames], max_gap=gap)
+        if people is not None:
+            remarks.append("people are followed by the file's own track ids")
+        people = places if people is None else _without_breaks(people, places, frames, remarks)
     several = len({s.track for frame in frames for s in frame} - {None}) > 1
     least = max(options.threshold, 1e-12)
     visible = [seen for seen in people if any((frames[t][i].joints[:, 2] >= least).any() for t, i in seen)]
@@ -212,10 +219,9 @@ def _checked(
     return out
 
 
-def _by_ids(frames: Sequence[Sequence[Sighting]], notes: list[str]) -> list[list[tuple[int, int]]] | None:
+def _by_ids(frames: Sequence[Sequence[Sighting]], notes: list[str]) -> list[_Seen] | None:
     """(frame, index) of each person by track ids, the most seen first; None where they do not say who is who."""
-    people: dict[Hashable, list[tuple[int, int]]] = {}
-    amount: dict[Hashable, float] = {}
+    people: dict[Hashable, _Seen] = {}
     for t, frame in enumerate(frames):
         ids = [s.track for s in frame]
         if None in ids or len(set(ids)) < len(ids):
@@ -225,5 +231,37 @@ def _by_ids(frames: Sequence[Sequence[Sighting]], notes: list[str]) -> list[list
             return None
         for i, sighting in enumerate(frame):
             people.setdefault(sighting.track, []).append((t, i))
-            amount[sighting.track] = amount.get(sighting.track, 0.0) + float(sighting.joints[:, 2].sum())
-    return sorted(people.values(), key=lambda seen: -amount[frames[seen[0][0]][seen[0][1]].track])
+    return _best_seen_first(people.values(), frames)
+
+
+def _without_breaks(
+    people: Sequence[_Seen], places: Sequence[_Seen], frames: Sequence[Sequence[Sighting]], notes: list[str]
+) -> list[_Seen]:
+    """Join people by ids of whom one begins where another ends, by those who are followed by their places."""
+    begins, ends = ({seen[edge]: k for k, seen in enumerate(people)} for edge in (0, -1))
+    after = {
+        ends[old]: begins[new]
+        for person in places
+        for old, new in itertools.pairwise(person)
+        if old in ends and new in begins
+    }
+    if not after:
+        return list(people)
+    name = lambda k: f"'{brief(frames[people[k][0][0]][people[k][0][1]].track)}'"  # noqa: E731
+    breaks = sorted(after.items(), key=lambda ids: people[ids[1]][0])
+    first = [f"{name(new)} begins where {name(old)} ends" for old, new in breaks[:3]]
+    more = f" and {len(after) - 3} more" if len(after) > 3 else ""
+    notes.append(f"track ids that break are joined by place: {', '.join(first)}{more}")
+    joined = []
+    for k in sorted(set(range(len(people))) - set(after.values())):
+        whole = list(people[k])
+        while k in after:
+            k = after[k]
+            whole += people[k]
+        joined.append(whole)
+    return _best_seen_first(joined, frames)
+
+
+def _best_seen_first(people: Iterable[_Seen], frames: Sequence[Sequence[Sighting]]) -> list[_Seen]:
+    """By the sum of confidences."""
+    return sorted(people, key=lambda seen: -sum(float(frames[t][i].joints[:, 2].sum()) for t, i in seen))
