@@ -193,7 +193,7 @@ def far_joints(images: Tensor, tracks: Tracks) -> str:
     size = float(rms(centre(tracks.points, tracks.weights)[0], seen.to(images.dtype))) if joints else 0.0
     if not size > 0:
         return ""
-    off = (images - tracks.points).norm(dim=-1) / size
+    off = ((images - tracks.points) / size).norm(dim=-1)
     off = nanmedian(torch.where(seen, off, torch.nan)[:, joints], 0)
     found = (off > AWAY).nonzero().flatten().tolist()
     named = [f"{tracks.skeleton.joints[joints[i]]} by {100 * float(off[i]):.0f} %" for i in found]

@@ -21,6 +21,7 @@ from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.nn.energies import centred_residual
+from kcs_torch.nn.masks import clear_padding
 
 __all__ = ["majorise_step", "turn_onto_mean", "viewpoint_energy"]
 
@@ -115,8 +116,7 @@ def majorise_step(
     factor, _ = torch.linalg.cholesky_ex(whole + ridge[..., None, None] * eye)
     right = goal + (aim + seen).flatten(-2)
     found = torch.cholesky_solve(right[..., None], factor).squeeze(-1).unflatten(-1, (joints, 3))
-    found = found - found.mean(-2, keepdim=True)
-    return found if inside is None else torch.where(inside[..., None, None], found, found.new_zeros(()))
+    return clear_padding(found - found.mean(-2, keepdim=True), inside)
 
 
 def turn_onto_mean(points: Tensor, rotations: Tensor, bones: Tensor) -> tuple[Tensor, Tensor]:

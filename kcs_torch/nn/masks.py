@@ -10,7 +10,7 @@ from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.weights import known
 from kcs_torch.nn.layers import check_tensor, known_frames
 
-__all__ = ["bone_share", "known_points", "weighs_joints"]
+__all__ = ["bone_share", "clear_padding", "known_points", "weighs_joints"]
 
 
 def weighs_joints(weights: Tensor, points: Tensor, module: nn.Module) -> bool:
@@ -44,3 +44,10 @@ def known_points(points: Tensor, weights: Tensor | None, module: nn.Module) -> T
 def bone_share(weights: Tensor, bones: Tensor) -> Tensor:
     """Weights of the bones (..., B): each weighs as much as the lesser of its two ends (..., N)."""
     return torch.minimum(weights[..., bones[:, 0]], weights[..., bones[:, 1]])
+
+
+def clear_padding(values: Tensor, inside: Tensor | None, trailing: int = 2) -> Tensor:
+    """Values (..., T, *), of so many dimensions beyond time, with 0 in frames that are not ``inside`` (..., T)."""
+    if inside is None:
+        return values
+    return torch.where(inside[(..., *[None] * trailing)], values, values.new_zeros(()))

@@ -14,12 +14,13 @@ from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.nn.energies import check_weights
 from kcs_torch.nn.layers import check_beside, check_joints, check_points, check_tensor, inverse_softplus, seen_weights
+from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.steps import corner_of
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.implicit import Implicit, fixed_point
 from kcs_torch.solvers.iterate import Solution, iterate, relative_change
 
-__all__ = ["Gradient", "Unrolled", "clear_padding"]
+__all__ = ["Gradient", "Unrolled"]
 
 Gradient = Literal["unrolled", "implicit"] | Implicit
 """How an unrolled solver is differentiated."""
@@ -262,10 +263,3 @@ class Unrolled(nn.Module):
                 expected = f"a batch of {what} like that of tracks {tuple(tracks.shape)}"
                 raise ShapeError(f"{name}: expected {expected}, got {tuple(value.shape)}")
         return clear_padding(seen_weights(tracks, weights).to(tracks.dtype), inside, 1)
-
-
-def clear_padding(values: Tensor, inside: Tensor | None, trailing: int = 2) -> Tensor:
-    """Values (..., T, *), of so many dimensions beyond time, with 0 in frames that are not ``inside`` (..., T)."""
-    if inside is None:
-        return values
-    return torch.where(inside[(..., *[None] * trailing)], values, values.new_zeros(()))

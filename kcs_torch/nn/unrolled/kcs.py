@@ -27,8 +27,9 @@ from kcs_torch.nn.deviation import (
 )
 from kcs_torch.nn.energies import centred_residual
 from kcs_torch.nn.layers import narrow
+from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.steps import continuation
-from kcs_torch.nn.unrolled.base import Gradient, Unrolled, clear_padding
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution
 from kcs_torch.solvers.pose import fit_cameras, steady_cameras
