@@ -100,3 +100,14 @@ def test_what_is_inside_is_yes_or_no_for_each_frame():
         layer(tracks, cameras, inside=torch.ones(4, dtype=torch.bool))
     with pytest.raises(ShapeError, match="inside: expected True or False for each frame, got torch.float32"):
         layer(tracks, cameras, inside=torch.ones(5))
+
+
+@each_layer
+def test_vmap_follows(name):
+    if "implicit" in name:
+        pytest.skip("its number of steps depends on the data")
+    layer, (_, (tracks, cameras, weights), inside) = LAYERS[name](), clips()
+    scales = {"scales": torch.ones(3, 7, dtype=torch.float64)} if "kcs" in name else {}
+    run = lambda t, c, w, i, s: layer(t, c, weights=w, inside=i, **s)  # noqa: E731
+    got = torch.func.vmap(run)(tracks, cameras, weights, inside, scales)
+    assert_close(got, run(tracks, cameras, weights, inside, scales))

@@ -205,7 +205,8 @@ class UnrolledKCS(Unrolled):
             scales: (..., T) image length of the template's unit; by least squares if None.
             weights: (..., T, N), 0 where unseen.
             start: (..., T, N, 3), in the unit of the tracks; the template if None.
-            inside: (..., T), False in padding, as of :meth:`UnrolledFPC.forward`.
+            inside: (..., T), False in padding, as of :meth:`UnrolledFPC.forward`. Under ``torch.compile`` and
+                ``torch.func.vmap`` give ``scales`` with it.
 
         Returns:
             (..., T, N, 3), in the unit of the tracks at the clip's mean scale.
