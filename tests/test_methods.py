@@ -621,7 +621,7 @@ def test_joints_in_another_order_are_warned_of():
 @pytest.mark.parametrize(
     ("body", "joints", "told"),
     [
-        ("h36m17", {9: 7, 7: 9}, "away from their tracks in most frames, head by"),
+        ("h36m17", {9: 7, 7: 9}, "away from their tracks in most frames that show them, head by"),
         ("coco17", {joint: (joint - 1) % 17 for joint in range(17)}, "hardly a body of skeleton 'coco17'"),
     ],
     ids=["two swapped", "one place on"],

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_joints, as_text, entries, read_json
-from kcs_torch.io.people import SHARES, SIZE_HINT, Sighting
+from kcs_torch.io.people import SIZE_HINT, Sighting, are_shares
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import SKELETONS
 
@@ -216,10 +216,9 @@ def settle(found: Landmarks, path: Path, options: Options, *, shares: bool) -> N
     """
     people = [s.joints for frame in found.frames.values() for s in frame]
     everything = np.concatenate(people or [np.zeros((0, 3))])
-    places = np.abs(everything[:, :2][np.isfinite(everything[:, :2])])
-    if not len(places):
+    if not np.isfinite(everything[:, :2]).any():
         raise FormatError(f"{path}: expected landmarks in at least one of {len(found.frames)} frames, got none")
-    small = bool(np.median(places) <= SHARES)
+    small = are_shares(everything[:, :2])
     size = options.image_size or found.size
     if shares and not small:
         found.notes.append("the coordinates are pixels already")

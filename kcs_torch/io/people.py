@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from bisect import bisect
 from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
 from typing import Any, NamedTuple
@@ -19,12 +20,11 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 from kcs_torch.types.intake import at_the_corner
 
-__all__ = ["SHARES", "SIZE_HINT", "Sighting", "people_tracks"]
+__all__ = ["SIZE_HINT", "Sighting", "are_shares", "people_tracks"]
 
-SHARES = 2.0
-"""Coordinates whose median is above this are no shares of the image."""
 SIZE_HINT = "image_size=(width, height) (kcs-torch: --image-size 1920x1080)"
 
+_SHARES = 2.0  # coordinates whose median is above this are no shares of the image
 _OVERSHOOT = 1.5  # some networks' confidences pass 1 a little; above this they are on another scale
 _WELL_SEEN = 0.95  # quantile of the confidences that counts as certain where they are on another scale
 _PER_CENT = (50.0, 100.0)  # between these the largest confidence is per cent
@@ -95,13 +95,12 @@ def people_tracks(
         raise FormatError(f"{source}: expected people in at least one of {len(frames)} frames, got none{why}")
     if names is None and skeleton is None:
         skeleton, names = choose_layout(everybody, options, source, remarks)
-    people = _by_ids(frames, remarks)
-    if people is None or len(people) > 1:
-        gap = max(round(min(options.fps or fps or _FPS, 1e6)), 1)
-        places = follow_people([np.array([s.joints for s in frame]) for frame in frames], max_gap=gap)
-        if people is not None:
-            remarks.append("people are followed by the file's own track ids")
-        people = places if people is None else _without_breaks(people, places, frames, remarks)
+    people, gap = _by_ids(frames, remarks), max(round(min(options.fps or fps or _FPS, 1e6)), 1)
+    if people is None:
+        people = _by_places(frames, gap)
+    elif len(people) > 1:
+        remarks.append("people are followed by the file's own track ids")
+        people = _without_breaks(people, frames, gap, remarks)
     several = len({s.track for frame in frames for s in frame} - {None}) > 1
     least = max(options.threshold, 1e-12)
     visible = [seen for seen in people if any((frames[t][i].joints[:, 2] >= least).any() for t, i in seen)]
@@ -162,12 +161,18 @@ def _without_zeros(frames: Sequence[Sequence[Sighting]], measured: bool, notes: 
     return [[s._replace(joints=next(kept)) for s in frame] for frame in frames]
 
 
+def are_shares(places: NDArray[np.float64]) -> bool:
+    """Whether places (..., 2) in an image, some of which may be NaN, are shares of it rather than pixels."""
+    known = places[np.isfinite(places)]
+    return len(known) > 0 and bool(np.median(np.abs(known)) <= _SHARES)
+
+
 def _in_pixels(
     frames: Sequence[Sequence[Sighting]], size: tuple[int, int] | None, notes: list[str]
 ) -> Sequence[Sequence[Sighting]]:
     """With shares of an image of this size as pixels: some detectors write shares if they are told to."""
     seen = [s.joints[s.joints[:, 2] > 0, :2] for frame in frames for s in frame]
-    if not seen or np.median(np.abs(np.concatenate(seen))) > SHARES:
+    if not seen or not are_shares(np.concatenate(seen)):
         return frames
     if size is None:
         notes.append(f"coordinates are taken as they are: if they are shares of the image, give {SIZE_HINT}")
@@ -234,24 +239,32 @@ def _by_ids(frames: Sequence[Sequence[Sighting]], notes: list[str]) -> list[_See
     return _best_seen_first(people.values(), frames)
 
 
+def _by_places(frames: Sequence[Sequence[Sighting]], gap: int) -> list[_Seen]:
+    """(frame, index) of each person, who may be out of sight for ``gap`` frames, the most seen first."""
+    return follow_people([np.array([s.joints for s in frame]) for frame in frames], max_gap=gap)
+
+
 def _without_breaks(
-    people: Sequence[_Seen], places: Sequence[_Seen], frames: Sequence[Sequence[Sighting]], notes: list[str]
+    people: list[_Seen], frames: Sequence[Sequence[Sighting]], gap: int, notes: list[str]
 ) -> list[_Seen]:
-    """Join people by ids of whom one begins where another ends, by those who are followed by their places."""
+    """Join people by ids of whom one begins, within ``gap`` frames, where another ends."""
     begins, ends = ({seen[edge]: k for k, seen in enumerate(people)} for edge in (0, -1))
+    starts = sorted(t for t, _ in begins)
+    if not any(starts[i] - t <= gap for t, _ in ends if (i := bisect(starts, t)) < len(starts)):
+        return people
     after = {
         ends[old]: begins[new]
-        for person in places
+        for person in _by_places(frames, gap)
         for old, new in itertools.pairwise(person)
         if old in ends and new in begins
     }
     if not after:
-        return list(people)
+        return people
     name = lambda k: f"'{brief(frames[people[k][0][0]][people[k][0][1]].track)}'"  # noqa: E731
     breaks = sorted(after.items(), key=lambda ids: people[ids[1]][0])
-    first = [f"{name(new)} begins where {name(old)} ends" for old, new in breaks[:3]]
+    told = [f"{name(new)} begins where {name(old)} ends" for old, new in breaks[:3]]
     more = f" and {len(after) - 3} more" if len(after) > 3 else ""
-    notes.append(f"track ids that break are joined by place: {', '.join(first)}{more}")
+    notes.append(f"track ids that break are joined by place: {', '.join(told)}{more}")
     joined = []
     for k in sorted(set(range(len(people))) - set(after.values())):
         whole = list(people[k])

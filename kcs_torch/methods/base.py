@@ -26,7 +26,9 @@ from kcs_torch.errors import (
 )
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.finish import HEADSTAND, WHY_LOOSE, Estimate, finish, rms
+from kcs_torch.functional.weights import rms
+from kcs_torch.methods.finish import HEADSTAND, Estimate, finish
+from kcs_torch.methods.wrong import WHY_LOOSE
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
 from kcs_torch.types.hints import is_a, spoken

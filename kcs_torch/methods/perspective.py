@@ -14,13 +14,14 @@ from kcs_torch.clean.detector import detected
 from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.methods.base import Method, apart, check_cameras
-from kcs_torch.methods.finish import HARDLY, WHY_LOOSE, little_turn, nothing_else, what_is_wrong
+from kcs_torch.methods.finish import HARDLY, little_turn, nothing_else
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
 from kcs_torch.methods.scene import BLOCK, Bodies, Scene, ahead
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.view import View, lens_note, slow_part, zoomed
+from kcs_torch.methods.wrong import WHY_LOOSE, what_is_wrong
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 

@@ -32,7 +32,7 @@ from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io.archive import Archive, array_names
 from kcs_torch.io.build import build_tracks
 from kcs_torch.io.build_motion import build_motion
-from kcs_torch.io.people import SHARES
+from kcs_torch.io.people import are_shares
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, Saving, Writer
 from kcs_torch.skeleton import Skeleton
@@ -60,8 +60,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
     units = file.text("units") if "units" in file else "px"
     notes = _json(file, "notes", list) if "notes" in file else []
     if options.image_size is not None and units == "px" and points.shape[-1] == 2:
-        there = np.abs(points[np.isfinite(points)])
-        if len(there) and float(np.median(there)) <= SHARES:
+        if are_shares(points):
             points = points * np.array(options.image_size)
         else:
             notes.append("the coordinates are pixels already")
