@@ -59,11 +59,15 @@ class Descent:
         self.spread = spread * sides.share.to(like)  # (1 or H, 3, B)
         self.mean = (posture.mean.to(like).mT[:, sides.order] / self.spread).flatten(1)[..., None]  # (1 or H, 3B, 1)
         hinges, limbs = obj.hinges, obj.adduction
-        parent, joint, child, left, right = hinges.joints.unbind(1)
+        # Upper arms and thighs, which must not reach far across the body, are bones above hinges: these come first.
+        above = hinges.joints[:, [0, 1, 3, 4]].tolist()
+        first = [above.index(limb) for limb in limbs.joints.tolist()]
+        order = first + [k for k in range(len(above)) if k not in first]
+        self.outer = len(first)
+        parent, joint, child, left, right = hinges.joints[order].unbind(1)
         lines += [obj.tree[a] - obj.tree[b] for a, b in ((joint, parent), (child, joint), (left, right))]
-        self.firm, self.sign = hinges.firm.to(like), hinges.sign.to(like)
-        # Upper arms and thighs, which must not reach far across the body, are bones above hinges.
-        self.outer = [hinges.joints[:, [0, 1, 3, 4]].tolist().index(limb) for limb in limbs.joints.tolist()]
+        self.firm, self.sign = hinges.firm.to(like)[order], hinges.sign.to(like)[order]
+        self.hinged = hinges.limbs[order]
         self.side = limbs.side.to(like)
         self.lines = torch.cat(lines)  # (2 + 3 hinges, B)
         stance = obj.stance
@@ -268,7 +272,7 @@ class Descent:
             values.addcmul_(by, self.time, value=-1)
 
     def _hinges(self, lengths: Tensor, image: Image, depths: Tensor, out: Slopes) -> Tensor:
-        w, limbs = self.weights, self.objective.hinges.limbs
+        w, limbs = self.weights, self.hinged
         upper, lower, axis = depths.unflatten(1, (3, -1)).unbind(1)  # (H, hinges, T) each
         share = 1.0 if self.time is None else self.time
         total = ((axis.square() + image.across) * share).sum(-1)
@@ -294,7 +298,7 @@ class Descent:
         out.growth.index_add_(1, limbs.flatten(), -energy.repeat_interleave(2, 1))
         value, shrink = energy.sum(-1) / 2, energy
         if self.outer:  # the same for bones that reach across: -(u . a) / (|u| |a|) is at most the limit
-            some = slice(None) if len(self.outer) == energy.shape[1] else self.outer
+            some = slice(self.outer)
             bound = self.objective.adduction.limit
             scale = (self.side / (above * size)[:, some])[..., None]
             across = torch.addcmul(image.along, upper[:, some], axis[:, some]).mul_(-scale)

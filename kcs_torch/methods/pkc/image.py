@@ -36,21 +36,21 @@ class Image(NamedTuple):
     rays: Tensor | None
 
     @classmethod
-    def of(cls, bones: Tensor, lines: Tensor, order: Tensor, outer: list[int], rays: Tensor | None = None) -> Image:
+    def of(cls, bones: Tensor, lines: Tensor, order: Tensor, outer: int, rays: Tensor | None = None) -> Image:
         """That of bones (K, 2, B, T).
 
         Args:
             bones: in the skeleton's order.
             lines: (2 + 3 hinges, B) that make of bones the trunk's axes, and the bones and axes of hinges.
             order: (B,) of the bones.
-            outer: hinges below upper arms and thighs.
+            outer: how many hinges are below upper arms and thighs; they come first.
             rays: as of the image.
         """
         drawn = lines @ bones  # (K, 2, 2 + 3 hinges, T)
         edges = drawn[:, :, 2:].unflatten(2, (3, -1))
         (ux, uy), (vx, vy), (ax, ay) = (edge.unbind(1) for edge in edges.unbind(2))
         turns = ux * vy - uy * vx, ax * uy - ay * ux, ax * vy - ay * vx
-        along = (ux * ax + uy * ay)[:, outer]
+        along = (ux * ax + uy * ay)[:, :outer]
         x, y = bones.index_select(2, order).unbind(1)
         plane = drawn[:, :, :2].transpose(1, 2)
         across = ax.square() + ay.square()
