@@ -25,6 +25,7 @@ from kcs_torch.errors import (
     users_level,
 )
 from kcs_torch.functional.guarded import or_one
+from kcs_torch.functional.inference import plain
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.functional.weights import rms
 from kcs_torch.methods.finish import HEADSTAND, Estimate, finish
@@ -57,6 +58,8 @@ class Method(ABC):
     """Whether it looks for runs of depths with the wrong sign, so that they are looked for under perspective, too."""
     reckons_in_seconds: ClassVar[bool] = False
     """Whether the frame rate matters; 30 frames a second are assumed where it is unknown."""
+    differentiates: ClassVar[bool] = True
+    """Whether :meth:`solve` uses autograd; else it runs in inference mode, where every operation costs less."""
 
     def __post_init__(self) -> None:
         hints = typing.get_type_hints(type(self))
@@ -106,8 +109,7 @@ class Method(ABC):
         check_tracks(tracks, self.name)
         if cameras is not None:
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
-        # Solvers differentiate, which inference mode forbids.
-        with apart([tracks]):
+        with apart([tracks], self.differentiates):
             tracks = self.prepared(tracks)
             inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
@@ -130,7 +132,7 @@ class Method(ABC):
         begin = time.perf_counter()
         for i, one in enumerate(tracks):
             check_tracks(one, f"{self.name}: item {i}")
-        with apart(tracks):
+        with apart(tracks, self.differentiates):
             tracks = [self.prepared(one) for one in tracks]
             parts = [self._normalised(one) for one in tracks]
             found = self.solve_all([inner for inner, _, _ in parts])
@@ -146,15 +148,16 @@ class Method(ABC):
         """What :func:`finish` makes of an estimate, on the processor: its many small steps would hold up a GPU."""
         device = tracks.points.device
         if device.type == "cpu":
-            with apart([tracks]):
+            with apart([tracks], self.differentiates):
                 result = finish(self, tracks, found, size, known, seconds)
-            self._warn(result)
-            return result
-        here = tracks.to("cpu")
-        with apart([here]):
-            result = finish(self, here, found.to("cpu"), size.cpu(), known.cpu(), seconds)
+        else:
+            here = tracks.to("cpu")
+            with apart([here], self.differentiates):
+                result = finish(self, here, found.to("cpu"), size.cpu(), known.cpu(), seconds)
+                result = result.moved(lambda x: x.to(device), tracks)
+        result = plain(result)
         self._warn(result)
-        return result.moved(lambda x: x.to(device), tracks)
+        return result
 
     def _normalised(self, tracks: Tracks) -> tuple[Tracks, Tensor, Tensor]:
         """Tracks about their middle, of root mean square 1; that size; and the frames (T,) that show something."""
@@ -211,10 +214,13 @@ class Method(ABC):
 
 
 @contextlib.contextmanager
-def apart(tracks: Sequence[Tracks]) -> Iterator[None]:
-    """Leave the caller's autograd, inference mode and autocast alone; make on the tracks' device what is made anew."""
+def apart(tracks: Sequence[Tracks], differentiates: bool = True) -> Iterator[None]:
+    """Leave the caller's autograd, inference mode and autocast alone; make on the tracks' device what is made anew.
+
+    What is not differentiated in between runs in inference mode, see :func:`kcs_torch.functional.inference.plain`.
+    """
     devices = {one.points.device for one in tracks}
-    with torch.inference_mode(False), torch.no_grad(), contextlib.ExitStack() as precision:
+    with torch.inference_mode(not differentiates), torch.no_grad(), contextlib.ExitStack() as precision:
         for kind in {device.type for device in devices}:
             precision.enter_context(torch.autocast(kind, enabled=False))
         if len(devices) != 1 or devices == {torch.get_default_device()}:

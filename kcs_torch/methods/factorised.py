@@ -39,6 +39,7 @@ class Factorised(Method):
     """
 
     keeps_lengths: ClassVar[bool] = False
+    differentiates: ClassVar[bool] = False
     knows_bones: ClassVar[bool] = False
     together: ClassVar[bool] = False
     """Whether :meth:`find_shape` takes several clips (..., T, N, 2); else it is called for each."""

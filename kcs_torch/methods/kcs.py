@@ -67,6 +67,7 @@ class KCS(Method):
     """
 
     name: ClassVar[str] = "kcs"
+    differentiates: ClassVar[bool] = False
     keeps_lengths: ClassVar[bool] = False
     template: Sequence[Sequence[float]] | None = None
     links: tuple[tuple[str, str], ...] = ()

@@ -13,6 +13,7 @@ from torch import Tensor
 from kcs_torch.clean.detector import detected
 from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
+from kcs_torch.functional.inference import undifferentiated
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.finish import HARDLY, little_turn, nothing_else
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
@@ -169,7 +170,7 @@ def _reconstruct(
     assert best is not None
     exact = len(trunk_joints(tracks.skeleton)) >= 3 and not detected(tracks)
     if method.turns_over and exact and not best.flat:
-        best = replace(best, bodies=best.scene.polished(best.bodies, steps))
+        best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies, steps))
     return _assemble(method, tracks, best)
 
 
@@ -186,6 +187,7 @@ def _straighten(tracks: Tracks, rays: Tensor, distance: Tensor, depth: Tensor) -
     return replace(tracks, points=points, weights=weights, detector=detected(tracks))  # told once for all rounds
 
 
+@undifferentiated
 def _refine(
     lifted: Reconstruction,
     view: View,

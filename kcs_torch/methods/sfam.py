@@ -63,6 +63,7 @@ class SfAM(Method):
     """
 
     name: ClassVar[str] = "sfam"
+    differentiates: ClassVar[bool] = False
     beta: float = 1.5
     num_steps: int = 50
     mu: float = 0.5

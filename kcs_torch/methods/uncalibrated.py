@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcs_torch.clean.detector import detected
 from kcs_torch.errors import KcsWarning, OptionError
+from kcs_torch.functional.inference import undifferentiated
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.finish import extent
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
@@ -103,6 +104,7 @@ def reconstruct_uncalibrated(
     return replace(result, diagnostics=replace(result.diagnostics, seconds=before + time.perf_counter() - begin))
 
 
+@undifferentiated
 def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrinsics | None:
     """A lens through which a body looks more likely than under the parallel rays that it was solved for.
 
@@ -120,7 +122,7 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
     tracks, unit = lifted.tracks, body_unit(lifted)
     if not bool(extent(tracks) > 0):  # a point is as likely at any distance
         return None
-    with apart([tracks]):
+    with apart([tracks], differentiates=False):
         if cameras is not None:
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         every = max(1, round((tracks.fps or RATE) / RATE))

@@ -11,6 +11,7 @@ from torch import Tensor
 from kcs_torch.errors import ShapeError, unknown
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.guarded import or_one
+from kcs_torch.functional.inference import differentiating
 from kcs_torch.functional.precision import widened
 from kcs_torch.functional.ranks import median, nanmedian
 from kcs_torch.functional.rotation import rotation_angle, rotation_matrix, rotation_vector, skew
@@ -169,6 +170,7 @@ def _explains(path: Tensor, angle: Tensor) -> bool:
     return bool(angle.median() < (EVEN * length).clamp_max(NEAR))
 
 
+@differentiating
 def settle_path(
     vectors: Tensor, path: Tensor, *, waves: int = 0, eps: tuple[float, ...] = (1e-3, 1e-4, 1e-5), num_steps: int = 40
 ) -> Tensor:

@@ -96,6 +96,7 @@ class PKC(Method):
     """
 
     name: ClassVar[str] = "pkc"
+    differentiates: ClassVar[bool] = False
     turns_over: ClassVar[bool] = True
     reckons_in_seconds: ClassVar[bool] = True
     centred: ClassVar[bool] = False  # noise and outliers are told apart before the middle is taken

@@ -54,6 +54,7 @@ class PND(Method):
     """
 
     name: ClassVar[str] = "pnd"
+    differentiates: ClassVar[bool] = False
     keeps_lengths: ClassVar[bool] = False
     knows_bones: ClassVar[bool] = False
     num_steps: int = 50
