@@ -6,6 +6,7 @@ from collections.abc import Callable
 from copy import copy
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -89,18 +90,15 @@ def lbfgs(
     rows = _Rows(x, *evaluate(x), first_step, memory)
     found: list[tuple[Tensor, ...]] = []
     while num_steps > 0:
-        down, slope = rows.direction()
-        trial = torch.addcmul(rows.x, down, rows.length[:, None], value=-1)
-        del down  # of very long problems every vector tells
+        trial, slope = rows.trial()
         rows.judge(trial, *evaluate(trial), slope, max_trials)
         done = rows.settle(tolerance, num_steps)
-        count = int(done.sum())
-        if count == len(done) or (enough is not None and enough(rows.made, rows.x, rows.value)):
+        if done.all() or (enough is not None and enough(*rows.so_far())):
             break
-        if part is not None and count >= LEAVE * len(done):
-            found.append(rows[done.nonzero().flatten()].found())
-            rows = rows[(~done).nonzero().flatten()]
-            energy = part(rows.index)
+        if part is not None and done.sum() >= LEAVE * len(done):
+            found.append(rows[done].found())
+            rows = rows[~done]
+            energy = part(_tensor(rows.index, x))
     index, *last = rows.found()
     if found:
         index, *last = (torch.cat(column) for column in zip(*found, (index, *last), strict=True))
@@ -111,6 +109,9 @@ def lbfgs(
 
 class _Rows:
     """Problems that are under way, and how far each is.
+
+    What is a number of each problem is kept in NumPy arrays: on so few, an operation of PyTorch costs ten times as
+    much, and a GPU would be waited for wherever one decides what happens next.
 
     Attributes:
         index: (H,) which they are.
@@ -129,73 +130,94 @@ class _Rows:
         count = (gradient != 0).sum(-1, keepdim=True).clamp_min(1)  # what the energy does not depend on is padding
         size = (x.square().sum(-1, keepdim=True) / count).sqrt()
         size = or_one(size)
-        self.index = torch.arange(len(x), device=x.device)
-        self.x, self.value, self.gradient = x, value, gradient
+        self.x, self.gradient = x, gradient
         self.history = History(x, memory)
         self.steepest = first_step * size / (gradient.square().sum(-1, keepdim=True) / count).sqrt().clamp_min(tiny)
         self.scale = self.steepest
-        self.length, self.trials, self.made = torch.ones_like(value), torch.zeros_like(self.index), self.index * 0
-        self.failed = self.resting = torch.zeros_like(value, dtype=torch.bool)
-        self.past = value[:, None].repeat(1, PATIENCE + 1)
+        (self.value,) = _numbers(value)
+        self.index = np.arange(len(x))
+        self.length, self.trials, self.made = np.ones(len(x)), self.index * 0, self.index * 0
+        self.failed = self.resting = self.done = np.zeros(len(x), dtype=bool)
+        self.past = np.repeat(self.value[:, None], PATIENCE + 1, 1)
         # the least fall that counts, where the value itself falls to 0
-        self.least = torch.where(value.isfinite(), torch.finfo(x.dtype).eps * value.abs(), 0).clamp_min(tiny)
-        self.done = self.resting
+        rounding = torch.finfo(x.dtype).eps * np.abs(self.value)
+        self.least = np.where(np.isfinite(self.value), rounding, 0).clip(tiny)
 
-    def __getitem__(self, index: Tensor) -> _Rows:
-        """Some of the problems."""
-        some = copy(self)
+    def __getitem__(self, some: np.ndarray) -> _Rows:
+        """Some of the problems, (H,) bool."""
+        out, index = copy(self), _tensor(some.nonzero()[0], self.x)
         for name, value in vars(self).items():
-            setattr(some, name, value[index])
-        return some
+            setattr(out, name, value[some] if isinstance(value, np.ndarray) else value[index])
+        return out
 
-    def direction(self) -> tuple[Tensor, Tensor]:
-        """The step to be taken back (H, D), at full length, and its slope (H,)."""
+    def trial(self) -> tuple[Tensor, np.ndarray]:
+        """Where the next steps lead, (H, D), and the slopes (H,) along them."""
         down = self.history.turned(self.gradient, self.scale)
-        slope = (down * self.gradient).sum(-1, keepdim=True)
-        sound = (slope > 0) & ~self.failed[:, None]
-        if not bool(sound.all()):
-            down = torch.where(sound, down, self.steepest * self.gradient)
-            slope = (down * self.gradient).sum(-1, keepdim=True)
-        return down, slope[:, 0]
+        (slope,) = _numbers((down * self.gradient).sum(-1))
+        sound = (slope > 0) & ~self.failed
+        if not sound.all():
+            down = torch.where(_tensor(sound, down)[:, None], down, self.steepest * self.gradient)
+            (slope,) = _numbers((down * self.gradient).sum(-1))
+        if (self.length == 1).all():
+            return self.x - down, slope
+        return torch.addcmul(self.x, down, self.x.new_tensor(self.length)[:, None], value=-1), slope
 
-    def judge(self, trial: Tensor, value: Tensor, gradient: Tensor, slope: Tensor, max_trials: int) -> None:
+    def judge(self, trial: Tensor, value: Tensor, gradient: Tensor, slope: np.ndarray, max_trials: int) -> None:
         """Take the steps to trials (H, D) that lower the energy enough, and shorten the others."""
         length = self.length
-        most = torch.addcmul(self.value, length, slope, value=-1e-4)
-        good = (value <= most) & gradient.sum(-1).isfinite() & ~self.done
-        if bool(good.all()):
-            self.scale = self.history.add(trial - self.x, gradient - self.gradient, self.scale)
-            self.x, self.value, self.gradient = trial, value, gradient
-            self.length, self.trials, self.failed = torch.ones_like(length), self.trials * 0, ~good
-            self.made = self.made + 1
-            return
-        # the parabola through value, slope and trial, kept within a tenth and a half
-        bend = 2 * (value - self.value + length * slope)
-        guess = torch.where(torch.isfinite(value) & (bend > 0), slope * length.square() / bend, 0.1 * length)
-        less = torch.maximum(torch.minimum(guess, 0.5 * length), 0.1 * length)
+        now, whole = _numbers(value, gradient.sum(-1))
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            good = (now <= self.value - 1e-4 * length * slope) & np.isfinite(whole) & ~self.done
+            # the parabola through value, slope and trial, kept within a tenth and a half
+            bend = 2 * (now - self.value + length * slope)
+            guess = np.where(np.isfinite(now) & (bend > 0), slope * length**2 / bend, 0.1 * length)
         failed = (self.trials == max_trials - 1) & ~good & ~self.done
         moved = good | failed
-        x, change = torch.where(good[:, None], trial, self.x), torch.where(good[:, None], gradient, self.gradient)
-        self.scale = self.history.add(x - self.x, change - self.gradient, self.scale, moved)
-        self.x, self.value, self.gradient = x, torch.where(good, value, self.value), change
-        self.length, self.trials = torch.where(moved, 1, less), torch.where(moved, 0, self.trials + 1)
+        if good.all():
+            self.scale = self.history.add(trial - self.x, gradient - self.gradient, self.scale)
+            self.x, self.gradient = trial, gradient
+        else:
+            taken = _tensor(good, trial)[:, None]
+            x, change = torch.where(taken, trial, self.x), torch.where(taken, gradient, self.gradient)
+            self.scale = self.history.add(x - self.x, change - self.gradient, self.scale, _tensor(moved, trial))
+            self.x, self.gradient = x, change
+        self.value = np.where(good, now, self.value)
+        self.length = np.where(moved, 1, guess.clip(0.1 * length, 0.5 * length))
+        self.trials = np.where(moved, 0, self.trials + 1)
         self.resting = self.resting | (failed & self.failed)
-        self.failed = torch.where(moved, failed, self.failed)
+        self.failed = np.where(moved, failed, self.failed)
         self.made = self.made + moved
 
-    def settle(self, tolerance: float, num_steps: int) -> Tensor:
+    def settle(self, tolerance: float, num_steps: int) -> np.ndarray:
         """Which problems (H,) are done, as they rest or have made all their steps."""
-        now, ago = (((self.made + k) % (PATIENCE + 1))[:, None] for k in (0, 1))
-        self.past.scatter_(1, now, self.value[:, None])
-        fallen = self.past.gather(1, ago)[:, 0] - self.value
-        few = fallen <= (tolerance * self.value.abs()).maximum(self.least)
+        rows = np.arange(len(self.index))
+        self.past[rows, self.made % (PATIENCE + 1)] = self.value
+        with np.errstate(invalid="ignore"):
+            fallen = self.past[rows, (self.made + 1) % (PATIENCE + 1)] - self.value
+            few = fallen <= np.maximum(tolerance * np.abs(self.value), self.least)
         self.resting = self.resting | (few & (self.made >= PATIENCE))
         self.done = self.resting | (self.made >= num_steps)
         return self.done
 
+    def so_far(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Steps made (H,), where the problems are (H, D), and their values (H,)."""
+        return _tensor(self.made, self.x), self.x, self.x.new_tensor(self.value)
+
     def found(self) -> tuple[Tensor, ...]:
         """Which problems they are, where they are, where they were, values, steps made, and whether they rest."""
-        return self.index, self.x, self.x - self.history.travelled(), self.value, self.made, self.resting
+        made, x, value = self.so_far()
+        index, resting = _tensor(self.index, x), _tensor(self.resting, x)
+        return index, x, x - self.history.travelled(), value, made, resting
+
+
+def _numbers(*values: Tensor) -> np.ndarray:
+    """Tensors (H,) as rows of one array in double precision."""
+    return torch.stack(values).double().cpu().numpy()
+
+
+def _tensor(values: np.ndarray, like: Tensor) -> Tensor:
+    """An array of whole numbers or truths where another tensor is."""
+    return torch.from_numpy(values).to(like.device)
 
 
 class History:
@@ -218,14 +240,14 @@ class History:
         count, size = like.shape
         self.steps, self.changes = like.new_empty(2, count, memory, size)
         self.inverse, self.curves = like.new_zeros(count, memory, memory), like.new_zeros(count, memory)  # R^-1, D
-        self.made = torch.zeros(count, dtype=torch.long, device=like.device)
-        self.used, self.even = 0, True  # slots, at most; whether all problems have as many pairs
+        self.made, self.used = np.zeros(count, dtype=int), 0  # pairs of each problem so far; slots, at most
 
     def __getitem__(self, index: Tensor) -> History:
         """Those of some of the problems."""
         some = copy(self)
-        for name in ("steps", "changes", "inverse", "curves", "made"):
+        for name in ("steps", "changes", "inverse", "curves"):
             setattr(some, name, getattr(self, name)[index])
+        some.made = self.made[index.cpu().numpy()]
         return some
 
     def add(self, step: Tensor, change: Tensor, scale: Tensor, rows: Tensor | None = None) -> Tensor:
@@ -234,20 +256,24 @@ class History:
         Returns the new scales (H, 1). A pair that tells no curvature counts for nothing.
         """
         memory = self.steps.shape[1]
-        self.even &= rows is None
+        some = slice(None) if rows is None else rows.nonzero()[:, 0].cpu().numpy()
+        slots = self.made[some] % memory
+        self.made[some] += 1
+        alike = rows is None and len(slots) > 0 and bool((slots == slots[0]).all())
         if self.used < memory:
             self.used += 1
-            if not self.even:  # not all problems write there
+            if not (alike and slots[0] == self.used - 1):  # not all problems write there
                 self.steps[:, self.used - 1] = self.changes[:, self.used - 1] = 0
-        at = torch.arange(len(step), device=step.device) if rows is None else rows.nonzero().flatten()
-        slot = self.made[at] % memory
+        # Where each pair goes: a column of all problems, or of each one its own.
+        at: Any = slice(None) if alike else _tensor(np.arange(len(step))[some], step)
+        row: Any = slice(None) if alike else torch.arange(len(slots), device=step.device)
+        slot: Any = int(slots[0]) if alike else _tensor(slots, step)
         pick = lambda values: values if rows is None else values[at]  # noqa: E731
-        self.made[at] += 1
         self.steps[at, slot], self.changes[at, slot] = pick(step), pick(change)
         steps, _, known, _ = self._used()
         products = pick(change[:, None] @ steps.mT)  # (K, 1, used)
         square = pick(change.square().sum(-1, keepdim=True))
-        curve = products[:, 0].gather(1, slot[:, None])  # (K, 1)
+        curve = products[row, 0, slot][:, None]  # (K, 1)
         old = pick(scale)
         tiny = torch.finfo(scale.dtype).tiny ** 0.5
         kept = curve > 1e-10 * square * old.clamp_min(tiny)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, incidence
-from kcs_torch.methods.pkc.image import Image, Slopes, bend_cost
+from kcs_torch.methods.pkc.image import Image, Slopes, bend_cost, turned
 from kcs_torch.methods.pkc.sides import Sides
 from kcs_torch.nn.lengths import HIDDEN
 
@@ -46,6 +46,7 @@ class Descent:
         self.noise = _early(obj.noise).square() if obj.noisy else None
         self.rigid = obj.rigid[None, :, None] if obj.rigid.ndim == 1 else _early(obj.rigid)
         self.time = None if obj.time is None else obj.time[:, None]  # (H, 1, T)
+        w, share = obj.weights, 1.0 if self.time is None else self.time
         ends = incidence(obj.bones, body.num_joints, dtype=like.dtype).mT
         mix = ends @ obj.complete.mT @ obj.tree[: body.num_observed]  # virtual joints move bones with others
         eye = torch.eye(len(mix), dtype=like.dtype, device=like.device)
@@ -66,10 +67,12 @@ class Descent:
         self.outer = len(first)
         parent, joint, child, left, right = hinges.joints[order].unbind(1)
         lines += [obj.tree[a] - obj.tree[b] for a, b in ((joint, parent), (child, joint), (left, right))]
-        self.firm, self.sign = hinges.firm.to(like)[order], hinges.sign.to(like)[order]
-        self.hinged = hinges.limbs[order]
-        self.side = limbs.side.to(like)
         self.lines = torch.cat(lines)  # (2 + 3 hinges, B)
+        self.hinged, self.sign, self.side = hinges.limbs[order], hinges.sign.to(like)[order], -limbs.side.to(like)
+        self.firm = wide(w.hinge / w.sine**2, 2) * hinges.firm.to(like)[order, None] * share  # (1 or H, hinges, 1 or T)
+        self.reach = wide(w.adduction / w.sine**2, 2) * share
+        ends = torch.nn.functional.one_hot(self.hinged, body.num_bones).to(like)  # (hinges, 2, B)
+        self.bent, self.reached = -ends.sum(1), -ends[: self.outer, 0]  # whose lengths a hinge's cost depends on
         stance = obj.stance
         self.feet = stance.line.to(like)[sides.order]  # 0 where nothing stands on the ground
         self.beneath = stance.usual.to(like)[:, None]  # (2, 1)
@@ -79,8 +82,13 @@ class Descent:
         self.limbs = free.free.nonzero().flatten()
         clear = _early(obj.clear).index_select(1, self.limbs)
         self.clear = clear * (free.free.to(like)[self.limbs, None] / free.correlation)
+        self.held = self.clear.sum(-1)
         least = torch.finfo(like.dtype).tiny ** 0.25  # squares of it are not 0
         self.blur = HIDDEN * _early(obj.noise).index_select(1, self.limbs).clamp_min(least)
+        sizes = obj.proportions
+        self.usual = sizes.usual.to(like).clamp_min(torch.finfo(like.dtype).tiny).log()
+        twins = torch.nn.functional.one_hot(sizes.pairs, body.num_bones).to(like)
+        self.twins = (twins[:, 0] - twins[:, 1]) / sizes.twins  # (pairs, B)
 
     def imaged(self, bones: Tensor, rays: Tensor | None = None) -> Image:
         """What an image of the bones, (K, 2, B, T), decides, and the rays of their outer ends."""
@@ -144,7 +152,7 @@ class Descent:
     ) -> tuple[Tensor, Tensor, Tensor]:
         obj, size = self.objective, lengths[..., None]
         least = wide(self.weights.length, 2) ** 2
-        off = torch.addcmul(image.flat, dz, dz).sub_(size.square()).mul_(0.5 / size)
+        off = torch.addcmul(image.flat, dz, dz).div_(2 * size).sub_(size / 2)
         if self.noise is None:
             precision = self.rigid / least
         else:
@@ -154,7 +162,7 @@ class Descent:
             precision = self.rigid / total
         each = off.square().mul_(precision / HEAVY)
         count = wide(obj.count, 1)
-        spread = each.log1p().sum(-1) * HEAVY / count
+        spread = each.log1p().sum(-1) * (HEAVY / count)
         if self.noise is None:
             value, pull = spread, torch.ones_like(spread)
         else:
@@ -163,7 +171,7 @@ class Descent:
             root = (over.square() + (CORNER * noise).square() + 1e-12).sqrt()
             value, pull = (over + root) / 2, (1 + over / root) / 2
             push = -pull + CORNER**2 * noise / root / 2
-        outer = 1 / (2 + 2 * value)  # times count: d value / d spread
+        outer = 0.5 / (1 + value)  # times count: d value / d spread
         pull = pull * outer
         inverse = each.add_(1).reciprocal_()  # 1 / (1 + p off^2 / 4)
         bent = precision * off * inverse  # p off / (1 + p off^2 / 4)
@@ -214,11 +222,12 @@ class Descent:
         scatter = torch.bmm(halves.mT, halves) if few else torch.bmm(halves, halves.mT)
         scatter.diagonal(dim1=-2, dim2=-1).add_(1)
         factor, info = torch.linalg.cholesky_ex(scatter)
-        failed = info > 0  # a step so far that rounding or overflow leaves no scatter: it costs infinitely much
-        if bool(failed.any()):
-            factor = torch.where(failed[:, None, None], torch.ones_like(factor[0, 0]).diag(), factor)
         firm = amount + posture.strength
-        log_det = torch.where(failed, torch.inf, factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)).view(-1, count).sum(0)
+        log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        if bool(info.any()):  # a step so far that rounding or overflow leaves no scatter: it costs infinitely much
+            log_det = torch.where(info > 0, torch.inf, log_det)
+            factor = torch.where((info > 0)[:, None, None], torch.ones_like(factor[0, 0]).diag(), factor)
+        log_det = log_det.view(-1, count).sum(0)
         value = log_det * (firm[:, 0, 0] if isinstance(firm, Tensor) else firm)
         inverse = torch.cholesky_inverse(factor)
         pull = sides.joined(torch.bmm(halves, inverse) if few else torch.bmm(inverse, halves), count)  # (H, 3B, T)
@@ -272,52 +281,47 @@ class Descent:
             values.addcmul_(by, self.time, value=-1)
 
     def _hinges(self, lengths: Tensor, image: Image, depths: Tensor, out: Slopes) -> Tensor:
-        w, limbs = self.weights, self.hinged
-        upper, lower, axis = depths.unflatten(1, (3, -1)).unbind(1)  # (H, hinges, T) each
-        share = 1.0 if self.time is None else self.time
-        total = ((axis.square() + image.across) * share).sum(-1)
-        known = total > 0
-        counted = axis.shape[-1] if self.time is None else self.time.sum(-1).clamp_min(1e-9)
-        size = torch.where(known, total / counted, torch.ones_like(total)).sqrt()
-        above, below = lengths[:, limbs].unbind(-1)  # (H, hinges)
+        deep = depths.unflatten(1, (3, -1))  # (H, 3, hinges, T) of bones u above hinges, v below, and axes a
+        axis, upper = deep[:, 2], deep[:, 0, : self.outer]
+        square = axis.square() + image.across
+        total = (square if self.time is None else square * self.time).sum(-1)
+        total.masked_fill_(total == 0, torch.inf)  # an axis of no length has no hinge
+        size = (total / wide(self.objective.count, 1)).sqrt()
+        above, below = lengths[:, self.hinged].unbind(-1)  # (H, hinges)
         scale = (self.sign / (above * below * size))[..., None]
-        tilt, lean, rise = image.turns
-        wrong = (upper * rise).addcmul_(lower, lean, value=-1).addcmul_(axis, tilt, value=-1).mul_(scale).clamp_min_(0)
-        pull = wrong * (wide(w.hinge / w.sine**2, 2) * self.firm[:, None] * share)
+        wrong = (deep * image.turns).sum(1).mul_(scale).clamp_min_(0)
+        pull = wrong * self.firm
         energy = (pull * wrong).sum(-1)  # twice that of each hinge
-        pull = pull.mul_(scale)
-        back = out.lines[:, 2:].unflatten(1, (3, -1))  # of u, v and a
-        back[:] = torch.stack([pull * rise, -pull * lean, -pull * tilt], 1)
+        pull.mul_(scale)
+        back = out.lines[:, 2:].unflatten(1, (3, -1))
+        torch.mul(pull[:, None], image.turns, out=back)
         flat = None if out.image is None else out.flat_lines[:, :, 2:].unflatten(2, (3, -1))
         if flat is not None:
-            deep = depths.unflatten(1, (3, -1))
-            for k in range(3):  # -(v x a), -(a x u), -(u x v)
-                i, j = (k + 1) % 3, (k + 2) % 3
-                flat[:, 0, k] = pull * (deep[:, i] * image.edges[:, 1, j] - image.edges[:, 1, i] * deep[:, j])
-                flat[:, 1, k] = pull * (image.edges[:, 0, i] * deep[:, j] - deep[:, i] * image.edges[:, 0, j])
-        out.growth.index_add_(1, limbs.flatten(), -energy.repeat_interleave(2, 1))
+            torch.mul(pull[:, None, None], turned(torch.cat([image.edges, deep[:, None]], 1))[:, :2], out=flat)
+        out.growth.addmm_(energy, self.bent)
         value, shrink = energy.sum(-1) / 2, energy
         if self.outer:  # the same for bones that reach across: -(u . a) / (|u| |a|) is at most the limit
             some = slice(self.outer)
-            bound = self.objective.adduction.limit
             scale = (self.side / (above * size)[:, some])[..., None]
-            across = torch.addcmul(image.along, upper[:, some], axis[:, some]).mul_(-scale)
-            wrong = (across - bound).clamp_min_(0)
-            pull = wrong * (wide(w.adduction / w.sine**2, 2) * share)
+            across = torch.addcmul(image.along, upper, axis[:, some]).mul_(scale)
+            wrong = (across - self.objective.adduction.limit).clamp_min_(0)
+            pull = wrong * self.reach
             each = (pull * across).sum(-1)
             value = value + (pull * wrong).sum((1, 2)) / 2
-            pull = pull.mul_(scale)
-            back[:, 0, some] -= pull * axis[:, some]
-            back[:, 2, some] -= pull * upper[:, some]
+            pull.mul_(scale)
+            back[:, 0, some].addcmul_(pull, axis[:, some])
+            back[:, 2, some].addcmul_(pull, upper)
             if flat is not None:
-                flat[:, :, 0, some] -= pull[:, None] * image.edges[:, :, 2, some]
-                flat[:, :, 2, some] -= pull[:, None] * image.edges[:, :, 0, some]
-            out.growth.index_add_(1, limbs[some, 0], -each)
+                flat[:, :, 0, some].addcmul_(pull[:, None], image.edges[:, :, 2, some])
+                flat[:, :, 2, some].addcmul_(pull[:, None], image.edges[:, :, 0, some])
+            out.growth.addmm_(each, self.reached)
             shrink[:, some] += each
-        held = torch.where(known, shrink / total, 0)[..., None] * share
-        back[:, 2] -= held * axis
+        held = (shrink / total)[..., None]
+        if self.time is not None:
+            held = held * self.time
+        back[:, 2].addcmul_(held, axis, value=-1)
         if flat is not None:
-            flat[:, :, 2] -= held[:, None] * image.edges[:, :, 2]
+            flat[:, :, 2].addcmul_(held[:, None], image.edges[:, :, 2], value=-1)
         return value
 
     def _foreshortening(self, dz: Tensor, lengths: Tensor, image: Image, out: Slopes) -> Tensor:
@@ -335,9 +339,8 @@ class Descent:
             square = far
         square = square + least
         each = self.clear / square
-        held = self.clear.sum(-1)
-        value = held * size.log() + (self.clear * square.log()).sum(-1) / 2
-        out.growth.index_add_(1, self.limbs, held + (grown * each).sum(-1))
+        value = self.held * size.log() + (self.clear * square.log()).sum(-1) / 2
+        out.growth.index_add_(1, self.limbs, self.held + (grown * each).sum(-1))
         pull = each * depth
         out.depth.index_add_(1, self.limbs, pull)
         if rays is not None and out.image is not None:
@@ -347,18 +350,15 @@ class Descent:
 
     def _sizes(self, lengths: Tensor, growth: Tensor) -> Tensor:
         obj = self.objective
-        prior, tiny = obj.proportions, torch.finfo(lengths.dtype).tiny
-        log = (lengths.clamp_min(tiny) / prior.usual.to(lengths).clamp_min(tiny)).log()
+        prior = obj.proportions
+        log = lengths.clamp_min(torch.finfo(lengths.dtype).tiny).log() - self.usual
         off = log - log.mean(-1, keepdim=True)
-        half = 1 + (off / prior.spread).square() / 2
-        over = (off / prior.excess).clamp_min(0)
-        pull = off / (half * prior.spread**2) + over / prior.excess
-        growth += pull - pull.mean(-1, keepdim=True)
-        left, right = prior.pairs.unbind(1)
-        apart = (log[:, left] - log[:, right]) / prior.twins
-        growth.index_add_(1, left, apart / prior.twins)
-        growth.index_add_(1, right, apart / -prior.twins)
-        value = half.log().sum(-1) + (over.square().sum(-1) + apart.square().sum(-1)) / 2
+        half = (off / prior.spread).square_().mul_(0.5).add_(1)
+        over = off.clamp_min(0) / prior.excess
+        pull = torch.addcdiv(over / prior.excess, off, half, value=prior.spread**-2)
+        apart = log @ self.twins.mT
+        growth.add_(pull).sub_(pull.mean(-1, keepdim=True)).addmm_(apart, self.twins)
+        value = half.log().sum(-1) + torch.cat([over, apart], 1).square_().sum(-1) / 2
         if obj.anchor is not None:
             away = (lengths / obj.anchor).log() / ANCHOR
             growth += wide(obj.held, 1) * away / ANCHOR

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Image", "Slopes", "bend_cost"]
+__all__ = ["Image", "Slopes", "bend_cost", "turned"]
 
 
 class Image(NamedTuple):
@@ -19,7 +19,7 @@ class Image(NamedTuple):
         seen: x and y (K, B, T) in the order of :class:`kcs_torch.methods.pkc.sides.Sides`.
         plane: (K, 2, 2, T) of the trunk's two long axes.
         edges: (K, 2, 3, hinges, T) of the bones above and below hinges, and of their axes.
-        turns: (K, hinges, T) each: (u x v) . a = a_z turns_0 + v_z turns_1 - u_z turns_2.
+        turns: (K, 3, hinges, T), the slopes of -(u x v) . a in the depths of u, v and a.
         across: (K, hinges, T) squared lengths of the axes.
         along: (K, limbs, T) of upper arms and thighs along the axes.
         rays: (K or 1, 2, B, T) u and v of the rays (u, v, 1) of bones' outer ends; None where rays are parallel.
@@ -30,7 +30,7 @@ class Image(NamedTuple):
     seen: tuple[Tensor, Tensor]
     plane: Tensor
     edges: Tensor
-    turns: tuple[Tensor, Tensor, Tensor]
+    turns: Tensor
     across: Tensor
     along: Tensor
     rays: Tensor | None
@@ -48,12 +48,12 @@ class Image(NamedTuple):
         """
         drawn = lines @ bones  # (K, 2, 2 + 3 hinges, T)
         edges = drawn[:, :, 2:].unflatten(2, (3, -1))
-        (ux, uy), (vx, vy), (ax, ay) = (edge.unbind(1) for edge in edges.unbind(2))
-        turns = ux * vy - uy * vx, ax * uy - ay * ux, ax * vy - ay * vx
-        along = (ux * ax + uy * ay)[:, :outer]
+        (x, y), (u, a) = edges.unbind(1), edges[:, :, ::2].unbind(2)
+        turns = x.roll(-2, 1).mul_(y.roll(-1, 1)).sub_(y.roll(-2, 1).mul_(x.roll(-1, 1)))
+        along = (u[:, :, :outer] * a[:, :, :outer]).sum(1)
         x, y = bones.index_select(2, order).unbind(1)
         plane = drawn[:, :, :2].transpose(1, 2)
-        across = ax.square() + ay.square()
+        across = a.square().sum(1)
         return cls(bones, bones.square().sum(1), (x, y), plane, edges, turns, across, along, rays)
 
 
@@ -78,9 +78,14 @@ class Slopes(NamedTuple):
 
     @classmethod
     def of(cls, depth: Tensor, growth: Tensor, lines: Tensor, image: Tensor | None) -> Slopes:
-        """Those of a first term, and as yet none in lines such as (H, L, T)."""
-        shape = (len(lines), 0 if image is None else 2, *lines.shape[1:])
-        return cls(depth, growth, torch.zeros_like(lines), image, lines.new_zeros(shape), lines.new_zeros(len(lines)))
+        """Those of a first term; those in lines such as (H, L, T) are yet to be written."""
+        flat = lines.new_empty(len(lines), 0 if image is None else 2, *lines.shape[1:])
+        return cls(depth, growth, torch.empty_like(lines), image, flat, lines.new_zeros(len(lines)))
+
+
+def turned(edges: Tensor) -> Tensor:
+    """The slopes of -(u x v) . a in u, v and a, of vectors (H, 3 coordinates, 3 vectors, ...)."""
+    return torch.linalg.cross(edges.roll(-2, 2), edges.roll(-1, 2), dim=1)
 
 
 def bend_cost(values: Tensor, weight: Tensor | float, slope: Tensor, time: Tensor | None = None) -> Tensor:
