@@ -63,6 +63,14 @@ def test_a_near_camera_is_noticed():
     )
 
 
+def test_a_near_camera_takes_one_search(monkeypatch):
+    """What was found under parallel rays is refined, round by round, and not searched for anew."""
+    searched, solve = [], kt.PKC.solve
+    monkeypatch.setattr(kt.PKC, "solve", lambda *given: searched.append(0) or solve(*given))
+    assert quietly(filmed(frames=15)[0]).distance is not None
+    assert len(searched) == 1
+
+
 @pytest.mark.parametrize("turn", [0.0, 90.0])
 def test_parallel_rays_are_left_as_they_are(turn):
     tracks = kt.data.walking_person(30, turn=turn, yaw=60.0).tracks
@@ -158,7 +166,7 @@ def test_several_bodies_as_each_by_itself():
 
 def test_people_of_one_file_with_lenses_of_their_own_are_warned_of():
     """Of clips that have nothing to do with each other nothing is said, nor where all have one lens, or none."""
-    near, far = filmed(frames=30)[0], kt.data.walking_person(30, turn=0.0, yaw=60.0).tracks
+    near, far = filmed(frames=15)[0], kt.data.walking_person(15, turn=0.0, yaw=60.0).tracks
     together = [replace(one, source=f"shots/a, b.json, person {k}") for k, one in enumerate((near, far))]
 
     def told(people, **options):

@@ -28,6 +28,9 @@ from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
 __all__ = ["WIDE", "feet_on_ground", "reconstruct_perspective"]
 
+ROUNDS, FOCAL_ROUNDS = 3, 5
+"""Rounds, at most, of lifting and refining; and of refining alone, where the focal length is found."""
+
 SETTLED = 0.01
 """Root mean square change of depth, for a body of 1.75, below which no further round is made."""
 
@@ -75,8 +78,8 @@ def reconstruct_perspective(
     intrinsics: Intrinsics,
     cameras: Tensor | None = None,
     *,
-    any_focal: bool = False,
-    rounds: int = 3,
+    lifted: Reconstruction | None = None,
+    rounds: int | None = None,
     steps: int = 60,
 ) -> Reconstruction:
     """Reconstruct a body before a pinhole camera by a method made for parallel rays.
@@ -94,8 +97,10 @@ def reconstruct_perspective(
         tracks: in pixels, or in whatever unit the intrinsics have.
         intrinsics: of the camera.
         cameras: (T, 2, 3) known camera rows, world to camera.
-        any_focal: the focal length is to be found, from that of the intrinsics on; it makes a note of what it found.
-        rounds: of lifting and refining, at most.
+        lifted: what the method found in the tracks as if rays were parallel. The focal length is then to be found as
+            well, from that of the intrinsics on, and noted; nothing is lifted anew, but each round refines what the one
+            before found, as its focal length shows it.
+        rounds: at most; by default 3 of lifting and refining, or 5 of refining.
         steps: L-BFGS steps of each refinement.
 
     Returns:
@@ -108,7 +113,7 @@ def reconstruct_perspective(
     begin = time.perf_counter()
     with apart([tracks]):
         tracks = method.prepared(tracks)
-        result = _reconstruct(method, tracks, intrinsics, cameras, any_focal, rounds, steps)
+        result = _reconstruct(method, tracks, intrinsics, cameras, lifted, rounds, steps)
     result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
     method._warn(result)
     return result
@@ -119,8 +124,8 @@ def _reconstruct(
     tracks: Tracks,
     intrinsics: Intrinsics,
     cameras: Tensor | None,
-    any_focal: bool,
-    rounds: int,
+    lifted: Reconstruction | None,
+    rounds: int | None,
     steps: int,
 ) -> Reconstruction:
     """:func:`reconstruct_perspective` without autograd, on the tracks' device."""
@@ -141,16 +146,22 @@ def _reconstruct(
     feet = feet_on_ground(tracks, cameras)
     best: _Found | None = None
     unit: float | None = None
-    soft = SOFT if method.turns_over and len(trunk_joints(tracks.skeleton)) < 3 else 0
+    any_focal = lifted is not None
+    soft = SOFT if method.turns_over and not any_focal and len(trunk_joints(tracks.skeleton)) < 3 else 0
+    rounds = rounds or (ROUNDS if lifted is None else FOCAL_ROUNDS)
     while rounds > 0:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", KcsWarning)
-            known = None if cameras is None else (view.look @ complete_rotation(cameras))[:, :2]
-            step = SfAM() if soft else method.following(tracks.num_frames <= BLOCK)
-            lifted = step(_straighten(tracks, view.rays, distance, depth), known)
-        given = lifted, view, distance, depth, rate, feet, steps, unit
-        flips = method.turns_over and (best is not None or not any_focal)  # else a guess is confirmed
-        found = _refine(*given, mirror=cameras is None, flips=flips, any_focal=any_focal)
+        if best is not None and any_focal:
+            found = _once_more(best, view, feet, steps, method.turns_over)
+        else:
+            straight = _straighten(tracks, view.rays, distance, depth)
+            if lifted is not None:
+                made = _seen_along(view, lifted, distance, straight)
+            else:
+                step = SfAM() if soft else method.following(tracks.num_frames <= BLOCK)
+                made = _lift(step, straight, view, cameras)
+            given = made, view, distance, depth, rate, feet, steps, unit
+            flips = method.turns_over and not any_focal  # else a guess is confirmed
+            found = _refine(*given, mirror=cameras is None, flips=flips, any_focal=any_focal)
         bodies, unit = found.bodies, None if soft else found.scene.unit
         moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
         sound = bool(bodies.energy.isfinite().any())
@@ -163,7 +174,7 @@ def _reconstruct(
         better = best is None or bool(bodies.energy[0] < best.bodies.energy[0])
         if better:
             best = found
-        if moved < SETTLED or not sound or not better:
+        if moved < SETTLED or not sound or not better or found.flat:
             break
         if any_focal:
             view = View.of(tracks, zoomed(view.lens, float(bodies.focal[0])), rate)
@@ -185,6 +196,30 @@ def _straighten(tracks: Tracks, rays: Tensor, distance: Tensor, depth: Tensor) -
     own = torch.where(tracks.seen[..., None], rays * ahead(distance, depth)[..., None], torch.zeros_like(rays))
     points, weights = tracks.skeleton.complete(own[:, :n], tracks.weights[:, :n])
     return replace(tracks, points=points, weights=weights, detector=detected(tracks))  # told once for all rounds
+
+
+def _lift(method: Method, straight: Tracks, view: View, cameras: Tensor | None) -> Reconstruction:
+    """A method's solution of straightened tracks, about which nothing is warned of yet."""
+    known = None if cameras is None else (view.look @ complete_rotation(cameras))[:, :2]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", KcsWarning)
+        return method(straight, known)
+
+
+def _seen_along(view: View, lifted: Reconstruction, distance: Tensor, straight: Tracks) -> Reconstruction:
+    """A method's solution of tracks under parallel rays as one of the same tracks straightened, at distances (T,)."""
+    scales = lifted.scales * distance / view.lens.focal
+    flat = view.along(clean_image(lifted)) * distance[:, None, None]
+    middle = flat.mean(1, keepdim=True)
+    points = torch.cat([middle + (flat - middle) / scales[:, None, None], lifted.points[..., 2:]], -1)
+    others = tuple(_turned(one, view.look) for one in lifted.alternatives)
+    lifted = replace(_turned(lifted, view.look), points=points, scales=scales)
+    return replace(lifted, tracks=straight, alternatives=others)
+
+
+def _turned(lifted: Reconstruction, look: Tensor) -> Reconstruction:
+    """A solution whose cameras are those of a frame turned by (T, 3, 3)."""
+    return replace(lifted, cameras=(look @ complete_rotation(lifted.cameras))[:, :2])
 
 
 @undifferentiated
@@ -236,7 +271,28 @@ def _refine(
         return _Found(bodies, others, scene, view, True, lifted.diagnostics.notes)
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
-    bodies = scene.refined(distance / scales * (unit / own), start * (unit / own), steps)
+    distance, start = distance / scales * (unit / own), start * (unit / own)
+    scene, bodies = _settled(scene, distance, start, steps, flips, any_focal)
+    return _Found(bodies, others, scene, view, False, lifted.diagnostics.notes)
+
+
+@undifferentiated
+def _once_more(found: _Found, view: View, standing: Tensor | None, steps: int, flips: bool) -> _Found:
+    """Refine what was found with its focal length, from the view through such a lens."""
+    before = found.bodies[found.bodies.energy.isfinite()]
+    rays = view.seen_from(found.view, found.scene.rays)
+    scene = replace(found.scene, rays=rays, standing=standing, any_focal=False)
+    scene, bodies = _settled(scene, before.distance[0], before.depth, steps, flips, any_focal=True)
+    bodies = replace(bodies, origin=before.origin[bodies.origin])
+    lifted = tuple(_turned(one, view.look @ found.view.look.mT) for one in found.lifted)
+    return replace(found, bodies=bodies, lifted=lifted, scene=scene, view=view)
+
+
+def _settled(
+    scene: Scene, distance: Tensor, depth: Tensor, steps: int, flips: bool, any_focal: bool
+) -> tuple[Scene, Bodies]:
+    """Bodies refined from depths (H, T, N) at a distance (T,), best first; and the scene that they explain."""
+    bodies = scene.refined(distance, depth, steps)
     if flips:
         bodies = scene.turned_over(bodies, steps)
     if any_focal:
@@ -245,7 +301,7 @@ def _refine(
         best = scene.refined(bodies.distance[0], bodies.depth[:1], steps)
         rest = replace(bodies[1:], energy=bodies.energy[1:] + (best.energy - bodies.energy[:1]))
         bodies = replace(best, origin=bodies.origin[:1]).joined(rest)
-    return _Found(bodies, others, scene, view, False, lifted.diagnostics.notes)
+    return scene, bodies
 
 
 def _assemble(method: Method, tracks: Tracks, found: _Found) -> Reconstruction:

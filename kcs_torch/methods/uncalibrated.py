@@ -88,7 +88,7 @@ def reconstruct_uncalibrated(
         lens = likely_lens(result, cameras)
         near: Reconstruction | None = None
         if lens is not None:
-            near = reconstruct_perspective(judge, tracks, lens, cameras, any_focal=True)
+            near = reconstruct_perspective(judge, tracks, lens, cameras, lifted=result)
             if judge is not method:
                 assert near.distance is not None
                 focal = float(near.distance.log().mean().exp())  # the unit is a pixel there

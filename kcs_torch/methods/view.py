@@ -41,10 +41,14 @@ class View(NamedTuple):
         look = _line_of_sight(rays, tracks.weights, rate)
         return cls(lens, look, _onto(rays @ look.mT))
 
+    def along(self, image: Tensor) -> Tensor:
+        """Rays (T, N, 2) of points in the image (T, N, 2)."""
+        return _onto(self.lens.rays(image) @ self.look.mT)
+
     def seen_from(self, other: View, rays: Tensor) -> Tensor:
         """Another view's rays (T, N, 2) in this one, of the same points in the image."""
         image = other.lens.project(torch.cat([rays, torch.ones_like(rays[..., :1])], -1) @ other.look)
-        return _onto(self.lens.rays(image) @ self.look.mT)
+        return self.along(image)
 
     def first_distance(self, tracks: Tracks, rate: float) -> Tensor:
         """Distances (T,) that the body's size in the image tells, the focal length on average."""
