@@ -435,7 +435,7 @@ def test_a_frame_far_beside_the_camera_is_told(method, factor):
 
 
 def test_solutions_that_are_not_finite_are_dropped(monkeypatch):
-    real = perspective._refine
+    real = perspective.refine
 
     def refined(*given, **options):
         found = real(*given, **options)
@@ -445,7 +445,7 @@ def test_solutions_that_are_not_finite_are_dropped(monkeypatch):
     tracks, _ = filmed(frames=8)
     given = {"intrinsics": LENS, "method": "pkc", "steps": 3, "rounds": 0, "alternatives": 2}
     assert reconstruct(tracks, **given).alternatives
-    monkeypatch.setattr(perspective, "_refine", refined)
+    monkeypatch.setattr(perspective, "refine", refined)
     assert reconstruct(tracks, **given).alternatives == ()
 
 
@@ -537,7 +537,7 @@ class Noted(kt.KCS):
 @pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
 def test_what_was_done_to_the_tracks_is_told_whichever_solution_wins(monkeypatch):
     """The method's notes on the tracks are the best solution's, although it was an alternative; its own are of none."""
-    real = perspective._refine
+    real = perspective.refine
 
     def others_first(*arguments, **options):
         found = real(*arguments, **options)
@@ -548,7 +548,7 @@ def test_what_was_done_to_the_tracks_is_told_whichever_solution_wins(monkeypatch
     image = lens.project(clip.points + clip.points.new_tensor([0.0, 0.0, 3000.0]))
     tracks = kt.Tracks.from_arrays(image[:, :17], skeleton="coco17", fps=30.0)
     for order in (real, others_first):
-        monkeypatch.setattr(perspective, "_refine", order)
+        monkeypatch.setattr(perspective, "refine", order)
         found = kt.reconstruct(tracks, method=Noted(), intrinsics=lens)
         assert "tracks smoothed" in found.diagnostics.notes
         assert not any("mirror image" in note for one in (found, *found.alternatives) for note in one.diagnostics.notes)

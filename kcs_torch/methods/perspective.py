@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -16,12 +16,11 @@ from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.inference import undifferentiated
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.finish import HARDLY, little_turn, nothing_else
-from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
-from kcs_torch.methods.pkc.limbs import outward
+from kcs_torch.methods.refining import Found, refine, refine_again, seen_along
 from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
-from kcs_torch.methods.scene import BLOCK, Bodies, Scene, ahead
+from kcs_torch.methods.scene import BLOCK, ahead
 from kcs_torch.methods.sfam import SfAM
-from kcs_torch.methods.view import View, lens_note, slow_part, zoomed
+from kcs_torch.methods.view import View, lens_note, zoomed
 from kcs_torch.methods.wrong import WHY_LOOSE, what_is_wrong
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
@@ -33,9 +32,6 @@ ROUNDS, FOCAL_ROUNDS = 3, 5
 
 SETTLED = 0.01
 """Root mean square change of depth, for a body of 1.75, below which no further round is made."""
-
-FLAT = 0.0003
-"""Root mean square parallax, for a body of 1.75, below which there is no perspective to speak of."""
 
 APART = 0.04
 """Root mean square difference in depth, for a body of 1.75, from which on solutions count as two."""
@@ -49,27 +45,6 @@ bones of constant length, which PKC insists on."""
 
 WIDE = 3.0
 """Tangent of the angle off the optical axis from which on the focal length is hardly true."""
-
-
-@dataclass(frozen=True)
-class _Found:
-    """Solutions of one round, best first.
-
-    Attributes:
-        bodies: of the solutions.
-        lifted: the method's solutions that they came from, perhaps mirrored.
-        scene: that they explain.
-        view: whose rays are the scene's.
-        flat: whether there was no perspective to speak of, so that they are the method's own.
-        notes: of the method on the tracks, whichever of its solutions is best here.
-    """
-
-    bodies: Bodies
-    lifted: tuple[Reconstruction, ...]
-    scene: Scene
-    view: View
-    flat: bool
-    notes: tuple[str, ...] = ()
 
 
 def reconstruct_perspective(
@@ -144,24 +119,24 @@ def _reconstruct(
     if cameras is not None:
         cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
     feet = feet_on_ground(tracks, cameras)
-    best: _Found | None = None
+    best: Found | None = None
     unit: float | None = None
     any_focal = lifted is not None
     soft = SOFT if method.turns_over and not any_focal and len(trunk_joints(tracks.skeleton)) < 3 else 0
     rounds = rounds or (ROUNDS if lifted is None else FOCAL_ROUNDS)
     while rounds > 0:
         if best is not None and any_focal:
-            found = _once_more(best, view, feet, steps, method.turns_over)
+            found = refine_again(best, view, feet, steps, method.turns_over)
         else:
             straight = _straighten(tracks, view.rays, distance, depth)
             if lifted is not None:
-                made = _seen_along(view, lifted, distance, straight)
+                made = seen_along(view, lifted, distance, straight)
             else:
                 step = SfAM() if soft else method.following(tracks.num_frames <= BLOCK)
                 made = _lift(step, straight, view, cameras)
             given = made, view, distance, depth, rate, feet, steps, unit
             flips = method.turns_over and not any_focal  # else a guess is confirmed
-            found = _refine(*given, mirror=cameras is None, flips=flips, any_focal=any_focal)
+            found = refine(*given, mirror=cameras is None, flips=flips, any_focal=any_focal)
         bodies, unit = found.bodies, None if soft else found.scene.unit
         moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
         sound = bool(bodies.energy.isfinite().any())
@@ -206,105 +181,7 @@ def _lift(method: Method, straight: Tracks, view: View, cameras: Tensor | None) 
         return method(straight, known)
 
 
-def _seen_along(view: View, lifted: Reconstruction, distance: Tensor, straight: Tracks) -> Reconstruction:
-    """A method's solution of tracks under parallel rays as one of the same tracks straightened, at distances (T,)."""
-    scales = lifted.scales * distance / view.lens.focal
-    flat = view.along(clean_image(lifted)) * distance[:, None, None]
-    middle = flat.mean(1, keepdim=True)
-    points = torch.cat([middle + (flat - middle) / scales[:, None, None], lifted.points[..., 2:]], -1)
-    others = tuple(_turned(one, view.look) for one in lifted.alternatives)
-    lifted = replace(_turned(lifted, view.look), points=points, scales=scales)
-    return replace(lifted, tracks=straight, alternatives=others)
-
-
-def _turned(lifted: Reconstruction, look: Tensor) -> Reconstruction:
-    """A solution whose cameras are those of a frame turned by (T, 3, 3)."""
-    return replace(lifted, cameras=(look @ complete_rotation(lifted.cameras))[:, :2])
-
-
-@undifferentiated
-def _refine(
-    lifted: Reconstruction,
-    view: View,
-    distance: Tensor,
-    depth: Tensor,
-    rate: float,
-    standing: Tensor | None,
-    steps: int,
-    unit: float | None,
-    *,
-    mirror: bool,
-    flips: bool,
-    any_focal: bool,
-) -> _Found:
-    """Refine all solutions of the method under perspective, and the best one's mirror image.
-
-    Args:
-        lifted: the method's solutions, of straightened tracks.
-        view: of the tracks.
-        distance: (T,) by which they were straightened.
-        depth: (T, N) by which they were straightened.
-        rate: frames a second.
-        standing: (T, C) how surely contact points stand still, or None.
-        steps: of the refinement.
-        unit: of bodies found before, so that energies compare; that of the lifted one if None.
-        mirror: whether depth may have the other sign.
-        flips: whether runs of depths may have.
-        any_focal: whether the view's focal length is to be found.
-    """
-    others = (lifted, *lifted.alternatives)
-    flat = clean_image(lifted)
-    rays = flat / ahead(distance, depth)[..., None]
-    start = torch.stack([o.points[..., 2] for o in others])
-    start = start - start.mean(-1, keepdim=True)
-    own = body_unit(lifted)
-    unit = unit or own
-    scales = slow_part(lifted.scales.clamp_min(1e-9).log()[:, None], rate)[:, 0].exp()  # a method's own may jump
-    noise = image_noise(lifted, flat, own, rate)
-    scene = Scene(outward(lifted.skeleton), rays, noise, rate, unit, standing)
-    parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / own
-    if parallax < FLAT or not lifted.skeleton.num_bones:
-        energy = start.new_tensor([o.objective for o in others])
-        number = torch.arange(len(start), device=start.device)
-        far = (distance / lifted.scales).expand(len(start), -1)
-        bodies = Bodies(start, far, energy, number, torch.ones_like(energy))
-        return _Found(bodies, others, scene, view, True, lifted.diagnostics.notes)
-    if mirror:
-        others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
-    distance, start = distance / scales * (unit / own), start * (unit / own)
-    scene, bodies = _settled(scene, distance, start, steps, flips, any_focal)
-    return _Found(bodies, others, scene, view, False, lifted.diagnostics.notes)
-
-
-@undifferentiated
-def _once_more(found: _Found, view: View, standing: Tensor | None, steps: int, flips: bool) -> _Found:
-    """Refine what was found with its focal length, from the view through such a lens."""
-    before = found.bodies[found.bodies.energy.isfinite()]
-    rays = view.seen_from(found.view, found.scene.rays)
-    scene = replace(found.scene, rays=rays, standing=standing, any_focal=False)
-    scene, bodies = _settled(scene, before.distance[0], before.depth, steps, flips, any_focal=True)
-    bodies = replace(bodies, origin=before.origin[bodies.origin])
-    lifted = tuple(_turned(one, view.look @ found.view.look.mT) for one in found.lifted)
-    return replace(found, bodies=bodies, lifted=lifted, scene=scene, view=view)
-
-
-def _settled(
-    scene: Scene, distance: Tensor, depth: Tensor, steps: int, flips: bool, any_focal: bool
-) -> tuple[Scene, Bodies]:
-    """Bodies refined from depths (H, T, N) at a distance (T,), best first; and the scene that they explain."""
-    bodies = scene.refined(distance, depth, steps)
-    if flips:
-        bodies = scene.turned_over(bodies, steps)
-    if any_focal:
-        # A foot that comes along its ray seems to stand still, and would make the focal length too short.
-        scene = replace(scene, any_focal=True, standing=None)
-        best = scene.refined(bodies.distance[0], bodies.depth[:1], steps)
-        rest = replace(bodies[1:], energy=bodies.energy[1:] + (best.energy - bodies.energy[:1]))
-        bodies = replace(best, origin=bodies.origin[:1]).joined(rest)
-    return scene, bodies
-
-
-def _assemble(method: Method, tracks: Tracks, found: _Found) -> Reconstruction:
+def _assemble(method: Method, tracks: Tracks, found: Found) -> Reconstruction:
     """The best solution in the camera's frame, with those of the others that differ from it."""
     bodies, unit = found.bodies, found.scene.unit
     keep: list[int] = []
@@ -318,7 +195,7 @@ def _assemble(method: Method, tracks: Tracks, found: _Found) -> Reconstruction:
     return replace(made[0], alternatives=tuple(made[1:]))
 
 
-def _in_camera(method: Method, tracks: Tracks, found: _Found, k: int) -> Reconstruction:
+def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstruction:
     """Solution number ``k`` in the camera's frame."""
     bodies, body = found.bodies, tracks.skeleton
     lifted = found.lifted[int(bodies.origin[k])]

@@ -1,0 +1,140 @@
+"""A method's solutions under parallel rays, refined under perspective: one round of full perspective."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.inference import undifferentiated
+from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
+from kcs_torch.methods.pkc.limbs import outward
+from kcs_torch.methods.scene import Bodies, Scene, ahead
+from kcs_torch.methods.view import View, slow_part
+from kcs_torch.types import Reconstruction, Tracks
+
+__all__ = ["Found", "refine", "refine_again", "seen_along"]
+
+FLAT = 0.0003
+"""Root mean square parallax, for a body of 1.75, below which there is no perspective to speak of."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Solutions of one round, best first.
+
+    Attributes:
+        bodies: of the solutions.
+        lifted: the method's solutions that they came from, perhaps mirrored.
+        scene: that they explain.
+        view: whose rays are the scene's.
+        flat: whether there was no perspective to speak of, so that they are the method's own.
+        notes: of the method on the tracks, whichever of its solutions is best here.
+    """
+
+    bodies: Bodies
+    lifted: tuple[Reconstruction, ...]
+    scene: Scene
+    view: View
+    flat: bool
+    notes: tuple[str, ...] = ()
+
+
+def seen_along(view: View, lifted: Reconstruction, distance: Tensor, straight: Tracks) -> Reconstruction:
+    """A method's solution of tracks under parallel rays as one of the same tracks straightened, at distances (T,)."""
+    scales = lifted.scales * distance / view.lens.focal
+    flat = view.along(clean_image(lifted)) * distance[:, None, None]
+    middle = flat.mean(1, keepdim=True)
+    points = torch.cat([middle + (flat - middle) / scales[:, None, None], lifted.points[..., 2:]], -1)
+    others = tuple(_turned(one, view.look) for one in lifted.alternatives)
+    lifted = replace(_turned(lifted, view.look), points=points, scales=scales)
+    return replace(lifted, tracks=straight, alternatives=others)
+
+
+def _turned(lifted: Reconstruction, look: Tensor) -> Reconstruction:
+    """A solution whose cameras are those of a frame turned by (T, 3, 3)."""
+    return replace(lifted, cameras=(look @ complete_rotation(lifted.cameras))[:, :2])
+
+
+@undifferentiated
+def refine(
+    lifted: Reconstruction,
+    view: View,
+    distance: Tensor,
+    depth: Tensor,
+    rate: float,
+    standing: Tensor | None,
+    steps: int,
+    unit: float | None,
+    *,
+    mirror: bool,
+    flips: bool,
+    any_focal: bool,
+) -> Found:
+    """Refine all solutions of the method under perspective, and the best one's mirror image.
+
+    Args:
+        lifted: the method's solutions, of straightened tracks.
+        view: of the tracks.
+        distance: (T,) by which they were straightened.
+        depth: (T, N) by which they were straightened.
+        rate: frames a second.
+        standing: (T, C) how surely contact points stand still, or None.
+        steps: of the refinement.
+        unit: of bodies found before, so that energies compare; that of the lifted one if None.
+        mirror: whether depth may have the other sign.
+        flips: whether runs of depths may have.
+        any_focal: whether the view's focal length is to be found.
+    """
+    others = (lifted, *lifted.alternatives)
+    flat = clean_image(lifted)
+    rays = flat / ahead(distance, depth)[..., None]
+    start = torch.stack([o.points[..., 2] for o in others])
+    start = start - start.mean(-1, keepdim=True)
+    own = body_unit(lifted)
+    unit = unit or own
+    scales = slow_part(lifted.scales.clamp_min(1e-9).log()[:, None], rate)[:, 0].exp()  # a method's own may jump
+    noise = image_noise(lifted, flat, own, rate)
+    scene = Scene(outward(lifted.skeleton), rays, noise, rate, unit, standing)
+    parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / own
+    if parallax < FLAT or not lifted.skeleton.num_bones:
+        energy = start.new_tensor([o.objective for o in others])
+        number = torch.arange(len(start), device=start.device)
+        far = (distance / lifted.scales).expand(len(start), -1)
+        bodies = Bodies(start, far, energy, number, torch.ones_like(energy))
+        return Found(bodies, others, scene, view, True, lifted.diagnostics.notes)
+    if mirror:
+        others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
+    distance, start = distance / scales * (unit / own), start * (unit / own)
+    scene, bodies = _settled(scene, distance, start, steps, flips, any_focal)
+    return Found(bodies, others, scene, view, False, lifted.diagnostics.notes)
+
+
+@undifferentiated
+def refine_again(found: Found, view: View, standing: Tensor | None, steps: int, flips: bool) -> Found:
+    """Refine what was found with its focal length, from the view through such a lens."""
+    before = found.bodies[found.bodies.energy.isfinite()]
+    rays = view.seen_from(found.view, found.scene.rays)
+    scene = replace(found.scene, rays=rays, standing=standing, any_focal=False)
+    scene, bodies = _settled(scene, before.distance[0], before.depth, steps, flips, any_focal=True)
+    bodies = replace(bodies, origin=before.origin[bodies.origin])
+    lifted = tuple(_turned(one, view.look @ found.view.look.mT) for one in found.lifted)
+    return replace(found, bodies=bodies, lifted=lifted, scene=scene, view=view)
+
+
+def _settled(
+    scene: Scene, distance: Tensor, depth: Tensor, steps: int, flips: bool, any_focal: bool
+) -> tuple[Scene, Bodies]:
+    """Bodies refined from depths (H, T, N) at a distance (T,), best first; and the scene that they explain."""
+    bodies = scene.refined(distance, depth, steps)
+    if flips:
+        bodies = scene.turned_over(bodies, steps)
+    if any_focal:
+        # A foot that comes along its ray seems to stand still, and would make the focal length too short.
+        scene = replace(scene, any_focal=True, standing=None)
+        best = scene.refined(bodies.distance[0], bodies.depth[:1], steps)
+        rest = replace(bodies[1:], energy=bodies.energy[1:] + (best.energy - bodies.energy[:1]))
+        bodies = replace(best, origin=bodies.origin[:1]).joined(rest)
+    return scene, bodies
