@@ -212,7 +212,7 @@ class _Rows:
 
 def _numbers(*values: Tensor) -> np.ndarray:
     """Tensors (H,) as rows of one array in double precision."""
-    return torch.stack(values).double().cpu().numpy()
+    return torch.stack(values).cpu().double().numpy()
 
 
 def _tensor(values: np.ndarray, like: Tensor) -> Tensor:
