@@ -58,6 +58,14 @@ def test_plain_leaves_alone_what_is_plain():
     assert plain("text") == "text" and plain(None) is None and plain(Held) is Held
 
 
+def test_plain_keeps_what_is_the_callers():
+    with torch.inference_mode():
+        own, made = Held(torch.zeros(2) + 1), torch.zeros(1) + 1
+        value = Held(made, (own,))
+    found = plain(value, keep=own)
+    assert found.others[0] is own and not found.value.is_inference()
+
+
 def test_plain_within_inference_mode_gives_plain_tensors():
     with torch.inference_mode():
         assert not plain(torch.zeros(2)).is_inference()

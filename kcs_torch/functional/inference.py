@@ -17,23 +17,26 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
-def plain(value: Result) -> Result:
+def plain(value: Result, keep: object = None) -> Result:
     """The value with copies in place of tensors that inference mode made, which autograd refuses to keep.
 
-    Tensors are found in tuples, lists and dataclasses. Where there are none the value comes back as it is.
+    Tensors are found in tuples, lists and dataclasses. Where there are none the value comes back as it is. So does what
+    is to be kept: the caller's own, which inference mode of theirs may have made.
     """
     found: Any = value
+    if value is keep:
+        return value
     if isinstance(value, Tensor):
         if value.is_inference():
             with torch.inference_mode(False):
                 found = value.clone()
     elif isinstance(value, tuple | list):
-        parts = [plain(part) for part in value]
+        parts = [plain(part, keep) for part in value]
         if any(new is not old for new, old in zip(parts, value, strict=True)):
             found = type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
-        fresh = {name: plain(part) for name, part in fields.items()}
+        fresh = {name: plain(part, keep) for name, part in fields.items()}
         if any(fresh[name] is not part for name, part in fields.items()):
             found = copy(value)
             for name, part in fresh.items():

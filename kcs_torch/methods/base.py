@@ -110,7 +110,7 @@ class Method(ABC):
         if cameras is not None:
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         with apart([tracks], self.differentiates):
-            tracks = self.prepared(tracks)
+            tracks = self._mended(tracks)
             inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
         return self._finished(tracks, found, size, known, time.perf_counter() - begin)
@@ -133,7 +133,7 @@ class Method(ABC):
         for i, one in enumerate(tracks):
             check_tracks(one, f"{self.name}: item {i}")
         with apart(tracks, self.differentiates):
-            tracks = [self.prepared(one) for one in tracks]
+            tracks = [self._mended(one) for one in tracks]
             parts = [self._normalised(one) for one in tracks]
             found = self.solve_all([inner for inner, _, _ in parts])
         each = (time.perf_counter() - begin) / max(len(tracks), 1)
@@ -155,9 +155,13 @@ class Method(ABC):
             with apart([here], self.differentiates):
                 result = finish(self, here, found.to("cpu"), size.cpu(), known.cpu(), seconds)
                 result = result.moved(lambda x: x.to(device), tracks)
-        result = plain(result)
+        result = plain(result, keep=tracks)
         self._warn(result)
         return result
+
+    def _mended(self, tracks: Tracks) -> Tracks:
+        """:meth:`prepared`, plain if they are other tracks than those given."""
+        return plain(self.prepared(tracks), keep=tracks)
 
     def _normalised(self, tracks: Tracks) -> tuple[Tracks, Tensor, Tensor]:
         """Tracks about their middle, of root mean square 1; that size; and the frames (T,) that show something."""
