@@ -13,7 +13,7 @@ from kcs_torch.methods import METHODS
 from kcs_torch.methods.base import Method, check_tracks
 from kcs_torch.methods.found import find_skeleton
 from kcs_torch.methods.perspective import WIDE, reconstruct_perspective
-from kcs_torch.methods.uncalibrated import may_be_near, reconstruct_uncalibrated
+from kcs_torch.methods.uncalibrated import looking, may_be_near, reconstruct_uncalibrated
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.intake import no_bones
@@ -163,7 +163,7 @@ def reconstruct_all(
         return chosen.many(people)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
-        found = chosen.many(people)
+        found = looking(chosen).many(people)
     for i, (one, lifted) in enumerate(zip(people, found, strict=True)):
         if may_be_near(one):
             found[i] = reconstruct_uncalibrated(chosen, one, lifted=lifted)

@@ -12,7 +12,7 @@ from kcs_torch.methods.detector import detector_deviation
 from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.methods.unseen import gap_deviation
 from kcs_torch.nn.posture import trunk_joints
-from kcs_torch.types import Reconstruction
+from kcs_torch.types import Reconstruction, Tracks
 
 __all__ = ["body_unit", "clean_image", "image_noise"]
 
@@ -24,13 +24,13 @@ def clean_image(lifted: Reconstruction) -> Tensor:
     return middle + lifted.scales[:, None, None] * (flat - middle)
 
 
-def image_noise(lifted: Reconstruction, flat: Tensor, unit: float, rate: float) -> Tensor:
-    """Standard deviation (T, N) of joints in a clean image (T, N, 2), for a body of 1.75."""
-    tracks, off = lifted.tracks, flat - flat.mean(1, keepdim=True)
+def image_noise(tracks: Tracks, flat: Tensor, unit: float) -> Tensor:
+    """Standard deviation (T, N) of tracks' joints in their clean image (T, N, 2), for a body of 1.75."""
+    off = flat - flat.mean(1, keepdim=True)
     size = rms(off, torch.ones_like(off[..., 0])) / unit
     stray = (flat - tracks.points).square().sum(-1)[tracks.seen]
     level = math.sqrt(float(stray.median()) / 1.39) / unit / 2 if len(stray) else 0.0  # whatever outliers there are
-    share = gap_deviation(off / (size * unit), tracks.seen, rate)
+    share = gap_deviation(off / (size * unit), tracks.seen, tracks.fps or 30.0)
     return (size * share.maximum(detector_deviation(tracks))).clamp_min(level)
 
 

@@ -16,6 +16,7 @@ from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.inference import undifferentiated
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.finish import HARDLY, little_turn, nothing_else
+from kcs_torch.methods.pkc.near import SEEMS_NEAR
 from kcs_torch.methods.refining import Found, refine, refine_again, seen_along
 from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
 from kcs_torch.methods.scene import BLOCK, ahead
@@ -214,7 +215,8 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
     off = (images - tracks.points)[:, :n][tracks.seen[:, :n]]
     points = torch.cat([points[..., :2], points[..., 2:] - root[:, None, None]], -1)
     told = () if k else found.notes  # the best solution's; "the mirror image", say, is true of none any more
-    stale = (WHY_LOOSE, HARDLY, "weak perspective", "did not settle")  # true of what was lifted, perhaps not of this
+    # True of what was lifted, perhaps not of this.
+    stale = (WHY_LOOSE, HARDLY, SEEMS_NEAR, "weak perspective", "did not settle")
     notes = [n for n in told if not n.startswith((ABSENT, FOUND)) and not any(part in n for part in stale)]
     before = lifted.diagnostics
     if not (k or before.converged):

@@ -96,7 +96,7 @@ def refine(
     own = body_unit(lifted)
     unit = unit or own
     scales = slow_part(lifted.scales.clamp_min(1e-9).log()[:, None], rate)[:, 0].exp()  # a method's own may jump
-    noise = image_noise(lifted, flat, own, rate)
+    noise = image_noise(lifted.tracks, flat, own)
     scene = Scene(outward(lifted.skeleton), rays, noise, rate, unit, standing)
     parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / own
     if parallax < FLAT or not lifted.skeleton.num_bones:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 import warnings
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import torch
 from torch import Tensor
 
 from kcs_torch.clean.detector import detected
 from kcs_torch.errors import KcsWarning, OptionError
-from kcs_torch.functional.inference import undifferentiated
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.finish import extent
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
@@ -20,12 +19,13 @@ from kcs_torch.methods.pinhole import PinholeEnergy
 from kcs_torch.methods.pinhole_coordinates import USUAL, unusual
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
+from kcs_torch.methods.pkc.near import SEEMS_NEAR
 from kcs_torch.methods.view import View, lens_note
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
-__all__ = ["likely_lens", "may_be_near", "reconstruct_uncalibrated"]
+__all__ = ["likely_lens", "looking", "may_be_near", "reconstruct_uncalibrated"]
 
 FAR = 34.0
 """Distance, for a body of 1.75, of the far body that a near one is compared with."""
@@ -56,16 +56,17 @@ def reconstruct_uncalibrated(
     """Reconstruct a body before a camera of which nothing is known.
 
     The nearer a camera is, the more the size of a limb in the image changes with its depth: bones of constant length,
-    the template's posture and feet that stand still tell how much. PKC solves the tracks as if rays were parallel;
-    where :func:`likely_lens` finds the camera near, the focal length is found together with depths, lengths and
-    distances by :func:`kcs_torch.methods.perspective.reconstruct_perspective`. The principal point is taken to be the
-    tracks' middle.
+    the template's posture and feet that stand still tell how much. PKC solves the tracks as if rays were parallel, but
+    ends where it has found a body whose camera seems near (:func:`likely_lens`), before it turns runs of signs over.
+    The focal length is then found together with depths, lengths, distances and signs by
+    :func:`kcs_torch.methods.perspective.reconstruct_perspective`. The principal point is taken to be the tracks'
+    middle.
 
     Args:
         method: any.
         tracks: of a body with a template.
         cameras: as of :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
-        lifted: what PKC found under parallel rays, if it was asked before.
+        lifted: what PKC, :func:`looking` for a near camera, found under parallel rays, if it was asked before.
 
     Returns:
         As :func:`kcs_torch.methods.perspective.reconstruct_perspective`; a note tells the intrinsics. Where the tracks
@@ -84,7 +85,7 @@ def reconstruct_uncalibrated(
     before = 0.0 if lifted is None else lifted.diagnostics.seconds
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
-        result = judge(tracks, cameras) if lifted is None else lifted
+        result = looking(judge)(tracks, cameras) if lifted is None else lifted
         lens = likely_lens(result, cameras)
         near: Reconstruction | None = None
         if lens is not None:
@@ -98,13 +99,12 @@ def reconstruct_uncalibrated(
                 near = replace(near, diagnostics=replace(near.diagnostics, notes=notes))
         if near is not None and bool(near.points.isfinite().all()):
             result = near
-        elif judge is not method:
+        elif judge is not method or SEEMS_NEAR in result.diagnostics.notes:
             result = method(tracks, cameras)
     method._warn(result)
     return replace(result, diagnostics=replace(result.diagnostics, seconds=before + time.perf_counter() - begin))
 
 
-@undifferentiated
 def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrinsics | None:
     """A lens through which a body looks more likely than under the parallel rays that it was solved for.
 
@@ -119,54 +119,79 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
         A lens of usual distance whose principal point is the tracks' middle, to start from; or None where rays might as
         well be parallel.
     """
-    tracks, unit = lifted.tracks, body_unit(lifted)
-    if not bool(extent(tracks) > 0):  # a point is as likely at any distance
-        return None
+    tracks = lifted.tracks
     with apart([tracks], differentiates=False):
         if cameras is not None:
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
-        every = max(1, round((tracks.fps or RATE) / RATE))
-        flat = clean_image(lifted)
-        middle = flat.mean((0, 1))
-        aside = float((flat - middle).square().sum(-1).mean().sqrt())
-        some = _liveliest(flat[::every], round(SECONDS * RATE)) * every
-        rate = (tracks.fps or RATE) / every
-        noise, feet = image_noise(lifted, flat, unit, tracks.fps or RATE), feet_on_ground(tracks, cameras)
-        flat, depth = flat[some], lifted.points[some, :, 2] / unit
-        if not (aside < WIDE * USUAL * unit and bool(depth.isfinite().all()) and bool(depth.any())):
-            return None
-        x, y = middle.tolist()
-        ones = torch.ones_like(depth)
-        clean = replace(tracks, points=flat, weights=ones, fps=rate)
-        view = View.of(clean, Intrinsics(FAR * unit, FAR * unit, x, y), rate)
-        path = view.first_distance(clean, rate) / unit
-        lens = ones.new_tensor([1.0, USUAL / FAR]), torch.tensor([False, True], device=ones.device)
-        depth = (depth - depth.mean(-1, keepdim=True)).expand(2, -1, -1)
-        standing = None if feet is None else feet[some]
-        energy = PinholeEnergy(
-            outward(tracks.skeleton), view.rays, path, depth, rate, noise[some], standing=standing, focal=lens
-        )
-
-        def distance(state: Tensor) -> float:
-            return FAR * float(energy.unpack(state).focal[1])
-
-        def hopeless(state: Tensor, cost: Tensor) -> bool:
-            return float(cost[0] - cost[1]) < -HOPELESS and distance(state) > AWAY
-
-        def enough(made: Tensor, state: Tensor, cost: Tensor) -> bool:
-            return len(cost) > 1 and int(made.amin()) % EVERY == 0 and hopeless(state, cost)
-
-        state = energy.start
-        for _ in range(2):
-            found = lbfgs(energy, state, num_steps=STEPS, tolerance=1e-6, slopes=True, part=energy.rows, enough=enough)
-            state, cost = found.value, found.energy
-            assert cost is not None
-            gain = float(cost[0] - cost[1])
-            if gain > -unusual(FAR) or hopeless(state, cost):  # to be as far away costs no more than that
-                break
-        better = SEEN if detected(tracks) else BETTER
-        near = gain > better and distance(state) < NEAR
+        flat, unit = clean_image(lifted), body_unit(lifted)
+        x, y = flat.mean((0, 1)).tolist()
+        known = SEEMS_NEAR in lifted.diagnostics.notes
+        near = known or _looks_near(tracks, flat, lifted.points[..., 2] / unit, unit, cameras)
     return Intrinsics(USUAL * unit, USUAL * unit, x, y) if near else None
+
+
+class _Looking(PKC):
+    """PKC that looks for a near camera before it turns runs of signs over, which is then left to full perspective."""
+
+    def seems_near(self, tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> bool:
+        return _looks_near(tracks, flat, depth, unit, cameras)
+
+
+def looking(method: Method) -> Method:
+    """The method for tracks of a camera that may be near; only PKC itself is another one."""
+    return _Looking(**{f.name: getattr(method, f.name) for f in fields(method)}) if type(method) is PKC else method
+
+
+def _looks_near(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> bool:
+    """Whether a near camera explains a body better than a far one.
+
+    Args:
+        tracks: of the body.
+        flat: (T, N, 2) their image without noise.
+        depth: (T, N) under parallel rays, for a body of 1.75.
+        unit: of such a body, in the tracks' unit.
+        cameras: (T, 2, 3) that are known, or None.
+    """
+    middle = flat.mean((0, 1))
+    aside = float((flat - middle).square().sum(-1).mean().sqrt())
+    if not (bool(extent(tracks) > 0) and aside < WIDE * USUAL * unit):  # a point is as likely at any distance
+        return False
+    if not (bool(depth.isfinite().all()) and bool(depth.any())):
+        return False
+    every = max(1, round((tracks.fps or RATE) / RATE))
+    some = _liveliest(flat[::every], round(SECONDS * RATE)) * every
+    rate = (tracks.fps or RATE) / every
+    noise, feet = image_noise(tracks, flat, unit), feet_on_ground(tracks, cameras)
+    flat, depth = flat[some], depth[some]
+    ones = torch.ones_like(depth)
+    clean = replace(tracks, points=flat, weights=ones, fps=rate)
+    view = View.of(clean, Intrinsics(FAR * unit, FAR * unit, *middle.tolist()), rate)
+    path = view.first_distance(clean, rate) / unit
+    lens = ones.new_tensor([1.0, USUAL / FAR]), torch.tensor([False, True], device=ones.device)
+    depth = (depth - depth.mean(-1, keepdim=True)).expand(2, -1, -1)
+    standing = None if feet is None else feet[some]
+    energy = PinholeEnergy(
+        outward(tracks.skeleton), view.rays, path, depth, rate, noise[some], standing=standing, focal=lens
+    )
+
+    def distance(state: Tensor) -> float:
+        return FAR * float(energy.unpack(state).focal[1])
+
+    def hopeless(state: Tensor, cost: Tensor) -> bool:
+        return float(cost[0] - cost[1]) < -HOPELESS and distance(state) > AWAY
+
+    def enough(made: Tensor, state: Tensor, cost: Tensor) -> bool:
+        return len(cost) > 1 and int(made.amin()) % EVERY == 0 and hopeless(state, cost)
+
+    state = energy.start
+    for _ in range(2):
+        found = lbfgs(energy, state, num_steps=STEPS, tolerance=1e-6, slopes=True, part=energy.rows, enough=enough)
+        state, cost = found.value, found.energy
+        assert cost is not None
+        gain = float(cost[0] - cost[1])
+        if gain > -unusual(FAR) or hopeless(state, cost):  # to be as far away costs no more than that
+            break
+    return gain > (SEEN if detected(tracks) else BETTER) and distance(state) < NEAR
 
 
 def _liveliest(image: Tensor, count: int) -> Tensor:

@@ -30,10 +30,13 @@ from kcs_torch.solvers.camera_path import choose_path, view_energy
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.procrustean import COARSE, FINE, Stage, align_rotations
 
-__all__ = ["LONG", "ONE", "POLISH", "TOLD", "Body", "Turned", "alike"]
+__all__ = ["LONG", "ONE", "POLISH", "TOLD", "Body", "Near", "Turned", "alike"]
 
 Turned = Callable[[bool], Search[Any, Any, Tensor]]
 """Depths (T, N) that the viewpoint's turn tells, in the template's units; from many starts if so, else from one."""
+
+Near = Callable[[slice, Hypotheses], bool]
+"""Whether the camera seems near by hypotheses of some frames of the clip."""
 
 BLOCK, OVERLAP = 400, 40
 """Frames of a long clip that are searched together, and by how many blocks overlap."""
@@ -283,11 +286,13 @@ class Body:
             image = blend_windows(torch.stack(images), starts, frames).transpose(0, 1).unflatten(2, (-1, 2))
         return depth - depth.mean(-1, keepdim=True), image, value
 
-    def search(self, rounds: int, steps: int, turned: Turned | None = None) -> Search[Any, Any, Hypotheses]:
+    def search(
+        self, rounds: int, steps: int, turned: Turned | None = None, near: Near | None = None
+    ) -> Search[Any, Any, Hypotheses]:
         """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best.
 
         Where the viewpoint turns, those that agree with what it tells, depths (T, N) of ``turned``, are not looked
-        over.
+        over. Nor are any if the camera is ``near``, as hypotheses of the liveliest block tell.
         """
         stride = max(1, round(self.rate / 30)) if self.rate >= FAST else 1
         image = self.image[::stride]
@@ -301,6 +306,11 @@ class Body:
             noise, feet = self.noise[::stride][some], None if standing is None else standing[::stride][some]
 
             def confirmed(found: Hypotheses) -> Search[Any, Any, bool]:
+                nonlocal rounds
+                begin, end, _ = some.indices(frames)
+                if near is not None and anchor is None and near(slice(begin * stride, end * stride, stride), found):
+                    rounds = 0  # of the other blocks
+                    return True
                 if turned is None or self.is_odd(found):
                     return False
                 depth = found.depth[0]

@@ -29,6 +29,7 @@ from kcs_torch.methods.pkc.long_gaps import lengthened, shortened
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
 from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights, settled
 from kcs_torch.methods.pkc.moving_view import searching as turning
+from kcs_torch.methods.pkc.near import SEEMS_NEAR, Asked
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import Size
@@ -131,6 +132,20 @@ class PKC(Method):
             return replace(self, contacts=False)
         return _Followed(**{f.name: getattr(self, f.name) for f in fields(self)} | {"contacts": False})
 
+    def seems_near(self, tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> bool:
+        """Whether to look for a body's signs under perspective, rather than under parallel rays, as known so far.
+
+        Never: see :mod:`kcs_torch.methods.uncalibrated`.
+
+        Args:
+            tracks: of a body with a template.
+            flat: (T, N, 2) their image without noise.
+            depth: (T, N), for a body of 1.75.
+            unit: of such a body, in the tracks' unit.
+            cameras: (T, 2, 3) that are known, or None.
+        """
+        return False
+
     @property
     def _moves(self) -> int:
         """Rounds of discrete moves; under perspective they are made afterwards, along the rays."""
@@ -162,13 +177,14 @@ class PKC(Method):
         if float(image.abs().amax()) <= rounding:  # all joints lie at one point
             image = torch.zeros_like(image)
         (size,) = yield [Sized(replace(tracks, points=image))]
-        found = yield from self._solve(tracks, image, noise, standing, cameras, notes, size)
+        found = yield from self._solve(tracks, points, image, noise, standing, cameras, notes, size)
         every = [replace(one, standing=standing) for one in (found, *found.alternatives)]
         return replace(every[0], alternatives=tuple(every[1:]))
 
     def _solve(
         self,
         tracks: Tracks,
+        points: Tensor,
         image: Tensor,
         noise: Tensor,
         standing: Tensor | None,
@@ -176,7 +192,7 @@ class PKC(Method):
         notes: tuple[str, ...],
         size: Size,
     ) -> Search[Any, Any, Estimate]:
-        """Solve complete tracks (T, N, 2) of a body that may have a changing size in the image."""
+        """Solve complete points (T, N, 2) by their image about the middle, in which a body's size may change."""
         skeleton = tracks.skeleton
         has_trunk = len(trunk_joints(skeleton)) >= 3
         if self.viewpoint == "fixed" and not has_trunk:
@@ -188,16 +204,7 @@ class PKC(Method):
         if changing:
             image = resized
         if not has_trunk:
-            if enough:
-                moving, first = yield from self._in_space(tracks, image, noise)
-                made = from_moving(moving, first, skeleton, cameras, notes, alternatives=self.alternatives)
-            else:
-                seen = _complete(tracks, image)
-                (first,) = (yield [seen]) if cameras is None else [SfAM().solve(seen, cameras)]
-                said = (*notes, "so few frames or joints are solved by sfam", *first.notes)
-                made = replace(first, notes=said)
-                if tracks.num_joints < LEAST_JOINTS:
-                    made = replace(made, points=with_lengths_held(image, first.points, skeleton))
+            made = yield from self._without_template(tracks, image, noise, cameras, notes, enough)
             return _with_size(made, size) if changing else made
         still = self.contacts and not _turns(cameras) and self.viewpoint != "moving"
         feet = standing if still else None
@@ -205,17 +212,21 @@ class PKC(Method):
         detections = detected(tracks)  # their errors last, and would be taken for motion
         polished = enough and body.spanned and not detections
         compared = polished and self.viewpoint == "auto"
-        turned = self._turned(tracks, image, noise, body.factor)
+        turned, method = self._turned(tracks, image, noise, body.factor), self
         if enough and self.viewpoint == "moving":
             moving, _ = yield from self._moving(tracks, image, noise)
             found = yield from self._ranked(body, moving)
         else:
             resizing = enough and not changing and size.range >= TRIED  # what is compared must be searched alike
-            found = yield from body.search(self._moves, self.steps, turned if compared and not resizing else None)
+            compare = turned if compared and not resizing else None
+            near = Asked(self.seems_near, tracks, points, cameras, body)
+            found = yield from body.search(self._moves, self.steps, compare, near)
+            if near.told:  # the rest is as under perspective
+                method, notes = self.following(), (*notes, SEEMS_NEAR)
             led = compared and body.is_odd(found) and body.turns(found)  # by the viewpoint's turn, not by the template
             if resizing and not led:
                 other = Body(skeleton, resized, tracks.fps or 30.0, noise, feet)
-                better = yield from self._resized(found, body, other, size)
+                better = yield from method._resized(found, body, other, size)
                 if better is not None:
                     changing, body, found = True, other, better
                     turned = self._turned(tracks, resized, noise, body.factor)
@@ -223,16 +234,36 @@ class PKC(Method):
                 found = body.without_contacts(found)
         if cameras is not None and _turns(cameras):
             found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
-        if polished and (body.turns(found) or not isinstance(self, _Followed)):
+        if polished and (body.turns(found) or not isinstance(method, _Followed)):
             rival = (yield from turned(body.is_odd(found))) if compared and body.turns(found) else None
-            found = yield from self._polished(body, found, cameras, rival)
+            found = yield from method._polished(body, found, cameras, rival)
             if self.rounds and self.viewpoint != "moving":
-                found, body = yield from self._filled(found, body, cameras, rival)
+                found, body = yield from method._filled(found, body, cameras, rival)
         made = from_hypotheses(
             found, body, cameras, notes,
             alternatives=self.alternatives, detections=detections, still=not _turns(cameras), told=self.steps >= 10,
         )  # fmt: skip
         return _with_size(made, size) if changing else made
+
+    def _without_template(
+        self,
+        tracks: Tracks,
+        image: Tensor,
+        noise: Tensor,
+        cameras: Tensor | None,
+        notes: tuple[str, ...],
+        enough: bool,
+    ) -> Search[Any, Any, Estimate]:
+        """Solve a body of which nothing is known by the viewpoint's turn, if there is ``enough`` of it, or by SfAM."""
+        if enough:
+            moving, first = yield from self._in_space(tracks, image, noise)
+            return from_moving(moving, first, tracks.skeleton, cameras, notes, alternatives=self.alternatives)
+        seen = _complete(tracks, image)
+        (first,) = (yield [seen]) if cameras is None else [SfAM().solve(seen, cameras)]
+        made = replace(first, notes=(*notes, "so few frames or joints are solved by sfam", *first.notes))
+        if tracks.num_joints < LEAST_JOINTS:
+            made = replace(made, points=with_lengths_held(image, first.points, tracks.skeleton))
+        return made
 
     def _filled(
         self, found: Hypotheses, body: Body, cameras: Tensor | None, rival: Tensor | None
