@@ -187,6 +187,28 @@ def test_metrics_join_a_collection_and_are_saved():
     assert other["pa"].total == group["pa"].total
 
 
+def test_a_collection_takes_no_metric_for_another():
+    """Even if the first batch tells none from the others: all joints are near, or none counts."""
+    from torchmetrics import MetricCollection
+
+    def made():
+        shares = {f"pck{k}": kt.metrics.PCK(k / 100) for k in (5, 10, 20)}
+        return shares | {a: kt.metrics.MPJPE(a) for a in ("root", "none")} | {"mid": kt.metrics.MPJPE(root=0)}
+
+    for first in (torch.ones(7, 12, 6), torch.zeros(7, 12, 6)):
+        group, alone = MetricCollection(made()), made()
+        group.update(TRUTH, TRUTH, first)
+        group.update(PRED, TRUTH, torch.ones(7, 12, 6))
+        for name, metric in alone.items():
+            metric.update(TRUTH, TRUTH, first)
+            metric.update(PRED, TRUTH, torch.ones(7, 12, 6))
+            assert_close(group.compute()[name], metric.compute())
+        assert len(group.compute_groups) == len(alone)
+    same = MetricCollection({"a": kt.metrics.MPJPE(), "b": kt.metrics.MPJPE()})
+    same.update(PRED, TRUTH)
+    assert len(same.compute_groups) == 1
+
+
 TWO = """
     import sys, torch, kcs_torch as kt
     import torch.distributed as dist

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -27,25 +28,45 @@ __all__ = ["E3D", "MPJPE", "PCK", "BoneDeviation"]
 
 
 class _Mean(Metric):
-    """A weighted mean, whose sums are states."""
+    """A weighted mean, whose sums are states.
+
+    A ``MetricCollection`` takes metrics for the same whose states have the same names, and the same values after the
+    first batch, and updates only one of them from there on: the names tell what is measured.
+
+    Args:
+        measured: what else than the class tells metrics apart.
+        beside: more of it, of a class derived.
+        options: of ``torchmetrics.Metric``.
+    """
 
     is_differentiable = False
     full_state_update = False
     plot_lower_bound = 0.0
 
-    total: Tensor
-    count: Tensor
-
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, *measured: object, beside: object = None, **options: Any) -> None:
         super().__init__(**options)
-        for name in ("total", "count"):
+        key = hashlib.sha256(repr((type(self).__name__, *measured, beside)).encode()).hexdigest()[:16]
+        self._total, self._count = f"total_{key}", f"count_{key}"
+        for name in (self._total, self._count):
             self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+
+    @property
+    def total(self) -> Tensor:
+        """The sum of what has been added."""
+        return getattr(self, self._total)
+
+    @property
+    def count(self) -> Tensor:
+        """How much that was."""
+        return getattr(self, self._count)
 
     def _add(self, values: Tensor, mass: Tensor) -> None:
         mass = mass.to(values).expand(values.shape)
         values = torch.where(mass > 0, values, torch.zeros_like(values))  # NaN where nothing counts
-        self.total = self.total + (values.detach().double() * mass).sum()  # not in place: Lightning validates in
-        self.count = self.count + mass.double().sum()  # inference mode, whose tensors nothing may change later
+        total = self.total + (values.detach().double() * mass).sum()  # not in place: Lightning validates in inference
+        count = self.count + mass.double().sum()  # mode, whose tensors nothing may change later
+        setattr(self, self._total, total)
+        setattr(self, self._count, count)
 
     def compute(self) -> Tensor:
         """Return the mean over all that has been added; NaN where nothing counted."""
@@ -74,7 +95,7 @@ class MPJPE(_Mean):
     higher_is_better = False
 
     def __init__(self, align: str = "root", *, root: int | None = None, **options: Any) -> None:
-        super().__init__(**options)
+        super().__init__(align, root, **options)
         check_alignment(align, root)
         self.align, self.root = align, root
 
@@ -116,7 +137,7 @@ class PCK(MPJPE):
     plot_upper_bound = 1.0
 
     def __init__(self, threshold: float, align: str = "root", *, root: int | None = None, **options: Any) -> None:
-        super().__init__(align, root=root, **options)
+        super().__init__(align, root=root, beside=threshold, **options)
         check_threshold(threshold, "PCK")
         self.threshold = threshold
 
@@ -157,9 +178,9 @@ class BoneDeviation(_Mean):
     higher_is_better = False
 
     def __init__(self, bones: Bones, **options: Any) -> None:
-        super().__init__(**options)
-        self.bones = get_skeleton(bones) if isinstance(bones, (str, Path)) else bones
-        bone_pairs(self.bones)
+        bones = get_skeleton(bones) if isinstance(bones, (str, Path)) else bones
+        super().__init__(bone_pairs(bones).tolist(), **options)
+        self.bones = bones
 
     def update(self, points: Tensor, weights: Tensor | None = None) -> None:
         """Add a batch of clips (..., T, N, 3) with weights (..., T, N), 0 where a joint is unknown."""
