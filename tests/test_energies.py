@@ -141,6 +141,21 @@ def test_bone_length_prox_is_optimal():
     assert_close(spine, best, rtol=0, atol=1e-2)  # the flexible bone's length does not matter
 
 
+def test_prox_and_gradient_take_other_precisions_as_the_energy_does():
+    points, lengths = normal(5, 7, 3, dtype=torch.float32), normal(6).abs()
+    energy, fit = BoneLengthEnergy(BODY), ReprojectionEnergy()
+    assert_close(energy.prox(points, lengths), energy.prox(points, lengths.float()))
+    frames = torch.tensor([0.5, 1, 2, 4, 8])
+    each = torch.stack([energy.prox(x[None], lengths, float(k))[0] for x, k in zip(points, frames, strict=True)])
+    assert_close(energy.prox(points, lengths, frames[:, None]), each)
+    with pytest.raises(ShapeError, match=r"stiffness: expected a shape that broadcasts to \(5, 6\), got \(5,\)"):
+        energy.prox(points, lengths, frames)
+    tracks, cameras = normal(5, 7, 2), normal(5, 2, 3)
+    found = fit.grad(points, tracks, cameras)
+    assert_close(found, fit.grad(points.double(), tracks, cameras))
+    assert_close(fit.grad(points, tracks.float(), cameras), found.float(), rtol=1e-4, atol=1e-4)
+
+
 @pytest.mark.parametrize("dtype", FLOATS)
 def test_bone_length_prox_has_a_derivative_in_the_stiffness(dtype):
     """With a flexible bone, whose stiffness is 0, this was NaN."""

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from kcs_torch.errors import ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths
-from kcs_torch.nn import ForeshorteningEnergy, ProportionEnergy
+from kcs_torch.nn import ForeshorteningEnergy, PostureEnergy, ProportionEnergy
 from kcs_torch.nn.lengths import foreshortening, free_bones
 from kcs_torch.nn.posture import trunk_joints
 
@@ -84,6 +84,12 @@ def test_foreshortening_gradient(kind):
     assert gradcheck(energy, points, lengths, fast=True)
     finite(energy, points.float(), lengths.float())
     finite(energy, points.float(), torch.zeros(16))
+
+
+@pytest.mark.parametrize("energy", [ForeshorteningEnergy("h36m17"), PostureEnergy("h36m17")])
+def test_the_gradient_knows_that_lengths_are_the_points_own(energy):
+    noisy = WALK / 1000 + 0.02 * normal(*WALK.shape, seed=4)
+    assert gradcheck(energy.double(), noisy, fast=True, rtol=1e-6, atol=1e-7)
 
 
 def test_bones_of_no_weight_may_be_anything():

@@ -113,6 +113,13 @@ def test_weights_of_one_change_nothing(name):
     assert_close(energy(WALK, torch.ones(FRAMES, 17).double(), ALL), energy(WALK, None, ALL))
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@each
+def test_weights_in_half_precision_lose_no_digits_of_the_sums(name, dtype):
+    energy, own = WEIGHTED[name], torch.rand(FRAMES, 17, generator=torch.Generator().manual_seed(2)).to(dtype)
+    assert_close(energy(WALK, own, ALL), energy(WALK, own.double(), ALL), rtol=1e-5, atol=1e-6)
+
+
 @each
 def test_what_weighs_nothing_may_be_nan(name):
     energy, weights = WEIGHTED[name], gaps()

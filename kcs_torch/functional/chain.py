@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.guarded import or_one, safe_norm, unit_size
-from kcs_torch.functional.precision import widened
+from kcs_torch.functional.precision import wide, widened
 from kcs_torch.functional.shapes import check_core
 
 __all__ = [
@@ -181,8 +181,8 @@ def pose_matrix(
     if weights is None:
         size = square.mean(-1)
     else:
-        total = weights.sum(-1)
-        size = (weights * square).sum(-1) / or_one(total)
+        weights = wide(weights)
+        size = ((weights * square).sum(-1) / or_one(weights.sum(-1))).to(square.dtype)
     return matrix / or_one(size)[..., None, None]
 
 

@@ -149,7 +149,8 @@ def euler_angles(order: str, matrices: Tensor) -> Tensor:
         OptionError: the order is another one.
         ShapeError: the matrices are not (..., 3, 3).
     """
-    if sorted(order) != list(AXES):
+    if not isinstance(order, str) or sorted(order) != list(AXES):
+        order = order if isinstance(order, str) else f"a {type(order).__name__}"
         raise OptionError(f"euler_angles: expected X, Y and Z in some order, got {order!r}")
     check_core(matrices, "euler_angles: matrices", 3, 3)
     i, j, k = (AXES.index(axis) for axis in order)

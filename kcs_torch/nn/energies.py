@@ -91,7 +91,7 @@ class BoneLengthEnergy(SkeletonModule):
         Args:
             points: (..., T, N, 3).
             lengths: (..., B).
-            stiffness: the paper's beta.
+            stiffness: the paper's beta, not negative; a tensor broadcasts against (..., T, B).
             num_steps: Levenberg-Marquardt steps.
 
         Returns:
@@ -106,7 +106,12 @@ class BoneLengthEnergy(SkeletonModule):
         check_lengths(lengths, points, self)
         if not isinstance(stiffness, Tensor) and not stiffness >= 0:
             raise OptionError(f"BoneLengthEnergy: stiffness: expected a number that is not negative, got {stiffness}")
-        beta = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device) * self.rigid.to(points.dtype)
+        beta = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device)
+        full = (*points.shape[:-2], len(self.bones))
+        if beta.ndim > len(full) or not fit_together(beta.shape, full):
+            got = tuple(beta.shape)
+            raise ShapeError(f"BoneLengthEnergy: stiffness: expected a shape that broadcasts to {full}, got {got}")
+        beta, lengths = beta * self.rigid.to(points.dtype), lengths.to(points.dtype)
         with full_precision(points):
             return fit_bones(points, lengths[..., None, :], self.bones, stiffness=beta, num_steps=num_steps)
 
@@ -172,7 +177,7 @@ class ReprojectionEnergy(nn.Module):
                 got = f"{tuple(points.shape)} and {tuple(cameras.shape)}"
                 raise ShapeError(f"ReprojectionEnergy: expected {expected}, got {got}")
         check_weights(weights, points, self)
-        weights = seen_weights(tracks, weights)
+        weights = wide(seen_weights(tracks, weights))
         points, tracks = known(wide(points), weights), known(wide(tracks), weights)
         with full_precision(points):
             dtype = torch.promote_types(points.dtype, tracks.dtype)
@@ -183,7 +188,7 @@ class ReprojectionEnergy(nn.Module):
         """Gradient in ``points`` of the plain least-squares energy, R^T (w o residual): (..., T, N, 3)."""
         check_tensor(cameras, "cameras", self)
         residual = self.residual(points, tracks, cameras, weights)
-        return back_project(residual * seen_weights(tracks, weights)[..., None], cameras)
+        return back_project(residual * seen_weights(tracks, weights)[..., None].to(residual), cameras.to(residual))
 
 
 class LowRankEnergy(nn.Module):
@@ -233,7 +238,7 @@ class LowRankEnergy(nn.Module):
             matrix = wide(matrix)
             if self.kind == "log_det":
                 return narrow(self._log_det(matrix, share), points)
-            return narrow(nuclear_norm(matrix if share is None else matrix * safe_root(share).to(matrix.dtype)), points)
+            return narrow(nuclear_norm(matrix if share is None else matrix * safe_root(share.to(matrix.dtype))), points)
 
     def _log_det(self, matrix: Tensor, share: Tensor | None) -> Tensor:
         """T/2 log det(Sigma + eps I) of rows (..., T, D); what has no share in any frame adds nothing."""
@@ -272,7 +277,7 @@ class SmoothnessEnergy(nn.Module):
 
     def __init__(self, order: int = 2) -> None:
         super().__init__()
-        if not isinstance(order, int) or order < 1:
+        if not is_a(order, int) or order < 1:
             shown = order if isinstance(order, (int, float)) else f"a {type(order).__name__}"
             raise OptionError(f"SmoothnessEnergy: expected a whole order >= 1, got {shown}")
         self.order = order

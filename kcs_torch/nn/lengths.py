@@ -70,7 +70,8 @@ class ForeshorteningEnergy(SkeletonModule):
 
         Args:
             points: (..., T, N, 3).
-            lengths: (..., B); None takes each bone's root mean square over the frames in which it counts.
+            lengths: (..., B); None takes each bone's root mean square over the frames in which it counts, and
+                a hundredth of all bones', so that none is 0.
             weights: (..., T, N) of the joints: a bone weighs as much as the lesser of its two ends.
             bone_weights: (..., T, B) in place of ``weights``.
             bone_noise: (..., T, B) standard deviation of the bones' lengths in the image, in the points' unit.
@@ -199,7 +200,7 @@ def usual_size(square: Tensor, share: Tensor | None, least: float = 0.0) -> Tens
     else:
         seen = (share > 0).to(square)
         square = (square * seen).sum(-2) / seen.sum(-2).clamp_min(1)
-    return safe_root(square + least**2 * square.detach().mean(-1, keepdim=True))
+    return safe_root(square + least**2 * square.mean(-1, keepdim=True))
 
 
 def oddity(lengths: Tensor, usual: Tensor) -> float:

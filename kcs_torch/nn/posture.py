@@ -164,7 +164,8 @@ class PostureEnergy(SkeletonModule):
 
         Args:
             points: (..., T, N, 3).
-            lengths: (..., B); None takes each bone's root mean square over the frames that count.
+            lengths: (..., B); None takes each bone's root mean square over the frames that count, and a
+                hundredth of all bones', so that none is 0.
             weights: (..., T, N) of the joints: a bone weighs as much as the lesser of its ends, and no more than the
                 least joint of the trunk, which it is seen from; or (..., T) of the frames: 0 for one that pads a
                 shorter clip; all 1 if None.
