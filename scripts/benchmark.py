@@ -161,7 +161,7 @@ def covered(result: kt.Reconstruction, truth: torch.Tensor) -> float:
 
 def table(rows: list[dict[str, Any]], figures: tuple[str, ...]) -> str:
     """The means of each suite and recipe, over the cases that did not fail."""
-    names = [f for f in (*figures, "covered", "ms_per_frame") if any(row.get(f) for row in rows)]
+    names = [f for f in (*figures, "covered", "ms_per_frame") if any(has(row, f) for row in rows)]
     kinds = dict.fromkeys((row["suite"], recipe(row)) for row in rows)
     width = max(12, *(len(kind) + 2 for _, kind in kinds))
     lines = [f"{'suite':<16}{'method':<{width}}{'cases':>9}" + "".join(f"{n:>14}" for n in names)]
@@ -170,10 +170,15 @@ def table(rows: list[dict[str, Any]], figures: tuple[str, ...]) -> str:
         good = [row for row in group if not row.get("error")]
         line = f"{suite:<16}{kind:<{width}}{len(good):>5}/{len(group):<3}"
         for name in names:
-            values = [float(row[name]) for row in good if row.get(name)]
+            values = [float(row[name]) for row in good if has(row, name)]
             line += f"{np.mean(values):>14.4f}" if values else f"{'-':>14}"
         lines.append(line)
     return "\n".join(lines)
+
+
+def has(row: dict[str, Any], name: str) -> bool:
+    """Whether a row has a figure: 0 is one, but an empty cell is none."""
+    return row.get(name) not in (None, "")
 
 
 def recipe(row: dict[str, Any]) -> str:

@@ -141,9 +141,11 @@ def test_a_method_of_ones_own_has_its_own_name(root, folder):
 
 def test_a_table_of_several_recipes(script):
     shared = {"suite": "turn", "method": "sfam", "cameras": "estimated", "intrinsics": "none", "error": ""}
-    made = [shared | {"options": text, "rigid": value} for text, value in (("", "1"), ("", 3.0), ("beta=0", "7"))]
+    values = (("", "1"), ("", 3.0), ("", 0.0), ("beta=0", "7"), ("beta=1", 0.0))
+    made = [shared | {"options": text, "rigid": value} for text, value in values]
     lines = script.table([*made, shared | {"options": "", "rigid": "", "error": "no"}], ("rigid",)).splitlines()
-    assert [line.split()[1:] for line in lines[1:]] == [["sfam", "2/3", "2.0000"], ["sfam", "beta=0", "1/1", "7.0000"]]
+    expected = ["sfam 3/4 1.3333", "sfam beta=0 1/1 7.0000", "sfam beta=1 1/1 0.0000"]
+    assert [" ".join(line.split()[1:]) for line in lines[1:]] == expected
 
 
 def test_a_failing_case_is_a_row_and_an_exit_code(root, folder):

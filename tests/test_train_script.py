@@ -256,6 +256,11 @@ class TestWrongConfigurations:
             outcome = train(composed("+module.lr=1e30", f"solver={solver}"), tmp_path)
         assert outcome.value == float("inf") and outcome.lifter is None and not outcome.metrics
 
+    def test_a_network_whose_weights_are_numbers_may_still_have_diverged(self, tmp_path):
+        with pytest.warns(kt.KcsWarning, match="diverged"):
+            outcome = train(composed("+module.lr=1e30", "+module.clip=1e30", "data.steps_per_epoch=1"), tmp_path)
+        assert outcome.value == float("inf") and outcome.lifter is None
+
     def test_divergence_later_leaves_the_best_epoch(self, tmp_path, monkeypatch):
         step = LiftingModule.training_step
 

@@ -431,6 +431,22 @@ def test_network_and_critic_need_a_strategy_that_finds_unused_parameters():
         assert module.configure_callbacks() == []
 
 
+def test_what_a_loss_has_to_learn_is_trained():
+    class Sure(nn.Module):
+        """Distances over their own deviation."""
+
+        def __init__(self):
+            super().__init__()
+            self.log = nn.Parameter(torch.zeros(()))
+
+        def forward(self, points, target, weights):
+            return ((points - target).norm(dim=-1) * weights).mean(-1) / self.log.exp() + self.log
+
+    module = LiftingModule(kt.nn.MLPLifter(BODY, width=16), {"joints": LossTerm(Sure(), clips="labelled")})
+    fit(module, 1)
+    assert module.terms["joints"].log.item() != 0
+
+
 def test_training_brings_the_error_down():
     torch.manual_seed(0)
     network = kt.nn.TemporalLifter(BODY, channels=32, dilations=(1,), dropout=0.0)

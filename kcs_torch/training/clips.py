@@ -110,7 +110,9 @@ def file_clips(
             )
         if fps is not None:
             if motion.fps is None:
-                raise FormatError(f"{path}: its frame rate is unknown: give fps=None to take its frames as they are")
+                raise FormatError(
+                    f"{path}: its frame rate is unknown: give fps=None (data.fps=null) to take its frames as they are"
+                )
             points, known = resampled(motion.points, motion.seen, motion.fps, fps)
         else:
             points, known = motion.points, motion.seen

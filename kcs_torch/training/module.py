@@ -10,7 +10,7 @@ import lightning
 import torch
 from torch import Tensor, nn
 
-from kcs_torch.errors import OptionError, SkeletonError
+from kcs_torch.errors import NotFiniteError, OptionError, SkeletonError
 from kcs_torch.functional import centre
 from kcs_torch.metrics.torch_metrics import MPJPE, BoneDeviation
 from kcs_torch.nn import RefinedLifter, critic_loss, generator_loss
@@ -36,7 +36,8 @@ class LiftingModule(lightning.LightningModule):
     Args:
         network: (tracks (..., T, N, 2), weights (..., T, N)) to points (..., T, N, 3) in the camera frame, such as
             :class:`kcs_torch.nn.TemporalLifter`.
-        losses: by name; each is logged as ``train/NAME``.
+        losses: by name; each is logged as ``train/NAME``, and parameters that it has (its own uncertainty, say) are
+            trained with the network.
         refine: an unrolled solver at the end (:class:`kcs_torch.nn.RefinedLifter`), which is trained, too.
         critic: tells poses of labelled clips from the network's, such as :class:`kcs_torch.nn.KCSCritic`; the network
             learns to please it, and both take steps in turn.
@@ -235,6 +236,8 @@ class LiftingModule(lightning.LightningModule):
 
     def _measure(self, stage: str, batch: Batch) -> None:
         points = self(batch.tracks, batch.weights)
+        if not bool(points.isfinite().all()):
+            raise NotFiniteError(f"{type(self.network).__name__}: expected finite points, got NaN or infinity")
         metrics: Any = self.measured[stage]
         for name, metric in metrics.items():
             if name == "bone_deviation":
@@ -244,7 +247,7 @@ class LiftingModule(lightning.LightningModule):
             self.log(f"{stage}/{name}", metric, on_step=False, on_epoch=True, batch_size=len(points))
 
     def configure_optimizers(self) -> Any:
-        """AdamW for the network, another for the critic; :func:`step_share` says how far both go.
+        """AdamW for the network and what losses have to learn, another for the critic; :func:`step_share` says how far.
 
         Raises:
             OptionError: the trainer has neither a number of epochs nor of steps.
@@ -253,8 +256,10 @@ class LiftingModule(lightning.LightningModule):
         if not math.isfinite(total):
             raise OptionError("trainer: expected max_epochs or max_steps, which the size of a step depends on")
         self.total_steps = max(int(total), 1)
-        trained = [self.network] + ([] if self.critic is None else [self.critic])
-        return [torch.optim.AdamW(m.parameters(), lr=self.lr, weight_decay=self.weight_decay) for m in trained]
+        trained = [list(dict.fromkeys([*self.network.parameters(), *self.terms.parameters()]))]
+        if self.critic is not None:
+            trained.append(list(self.critic.parameters()))
+        return [torch.optim.AdamW(p, lr=self.lr, weight_decay=self.weight_decay) for p in trained]
 
 
 def step_share(step: int, total: int) -> float:
