@@ -92,6 +92,17 @@ def test_everybody_keeps_their_name(seed, scene):
         assert sum(n is not None for n in f) == sum(name in n for n in names)
 
 
+@pytest.mark.parametrize("gap", [1, 2, 5, 10])
+def test_a_duplicate_after_a_gap_takes_nobody_over(gap):
+    """One person, missed for some frames, and then found twice in a single one."""
+    frames, _ = crowd(3, num_people=1, noise=1)
+    frames[10 : 10 + gap] = [np.zeros((0, *frames[0].shape[1:]))] * gap
+    one = frames[10 + gap]
+    frames[10 + gap] = np.concatenate([one + np.array([4.0, 0, 0]), one])
+    found = [int((t[..., 2] > 0).any(1).sum()) for t in link_people(frames)]
+    assert found == [len(frames) - gap, 1]
+
+
 def test_nothing_is_lost_or_invented():
     frames, _ = crowd(1, num_people=4, lost=0.2, ghosts=0.3, hidden=40)
     tracks = link_people(frames)

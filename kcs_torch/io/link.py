@@ -23,6 +23,7 @@ _NOBODY = 0.4  # cost of leaving somebody without a detection
 _FARTHEST = 0.7  # a joint counts as no farther off: left and right confused do not make somebody else of a person
 _RANK = 0.5  # gain where somebody well seen so far gets a well seen detection: keeps ghosts from taking over
 _MEMORY = 0.95  # how slowly it fades how well somebody was seen
+_NEW = 0.2  # what share of its confidence a first sight counts for: a ghost's is less than theirs who went missing
 _SIZE = 0.2  # cost of a size that differs by a factor of e
 _VELOCITY = 0.4  # share of the newest displacement in the running velocity
 _SPEED_UP = 0.1  # sizes of the person by which the running velocity changes in a frame, at most
@@ -38,7 +39,7 @@ class _Person:
     size: float
     frame: int  # when last seen
     velocity: Array  # (2,) of the whole body, per frame
-    strength: float  # running mean of the confidence of all joints, 0 in frames without a sight
+    strength: float  # running mean of the confidence of all joints, 0 before the first sight and in frames without one
     seen: list[tuple[int, int]]  # (frame, index among its detections)
 
 
@@ -82,7 +83,7 @@ def follow_people(detections: Sequence[Array], *, max_gap: int = 30) -> list[lis
         for k, index in enumerate(visible):
             person = taken.get(k)
             if person is None:
-                size, strength = float(_sizes(found[index][None])[0]), float(found[index, :, 2].mean())
+                size, strength = float(_sizes(found[index][None])[0]), _NEW * float(found[index, :, 2].mean())
                 person = _Person(found[index], size, t, np.zeros(2), strength, [(t, int(index))])
                 people.append(person)
                 open_people.append(person)
@@ -135,10 +136,12 @@ def _update(person: _Person, found: Array, frame: int) -> None:
         most = _SPEED_UP * person.size  # so that one wrong detection does not send the prediction away
         person.velocity = person.velocity + np.clip(_VELOCITY * (step - person.velocity), -most, most)
     moved = person.pose[:, :2] + person.velocity * gap  # a joint that is unseen now moves with the body ...
-    faded = person.pose[:, 2] * 0.9**gap  # ... and counts less and less
-    person.pose = np.where(seen[:, None], found, np.column_stack([moved, faded]))
+    less = person.pose[:, 2] * 0.9**gap  # ... and counts less and less
+    person.pose = np.where(seen[:, None], found, np.column_stack([moved, less]))
     person.size = 0.8 * person.size + 0.2 * _sizes(found[None])[0] if seen.sum() > 1 else person.size
-    person.strength = _MEMORY**gap * person.strength + (1 - _MEMORY) * float(found[:, 2].mean())
+    faded = _MEMORY ** (gap - 1) * person.strength
+    rate = max(1 - _MEMORY, 1 / (len(person.seen) + 1))
+    person.strength = faded + rate * (float(found[:, 2].mean()) - faded)
     person.frame = frame
 
 
