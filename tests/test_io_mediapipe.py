@@ -134,6 +134,23 @@ def test_frames_by_number(tmp_path):
     assert one.num_frames == 1
 
 
+@pytest.mark.parametrize(
+    ("key", "second", "told"),
+    [("timestamp_ms", 1000, None), ("time", 1, None), ("timestamp", 1e6, "times are taken to count 1000000 a second")],
+)
+def test_times_place_frames_and_tell_the_rate(tmp_path, key, second, told):
+    frames = [{key: i / 25 * second, "pose_landmarks": marks(POSE[0])} for i in (0, 1, 2, 4, 5)]
+    (tracks,) = read(tmp_path, frames)
+    assert tracks.fps == 25 and tracks.seen.any(1).tolist() == [True, True, True, False, True, True]
+    assert told is None or told in tracks.notes
+    (numbered,) = read(tmp_path, [{**frame, "frame": i} for i, frame in enumerate(frames[:3])])
+    assert numbered.fps == 25 and numbered.num_frames == 3
+    (said,) = read(tmp_path, {"fps": 24, "frames": frames})
+    assert said.fps == 24 and said.num_frames == 6
+    (lost,) = read(tmp_path, [*frames[:3], {key: None, "pose_landmarks": marks(POSE[0])}])
+    assert lost.fps == 25 and lost.num_frames == 4
+
+
 @pytest.mark.parametrize("nobody", [{"pose_landmarks": None}, {"pose_landmarks": []}, {"pose_landmarks": [[]]}])
 def test_frames_without_anybody(tmp_path, nobody):
     (tracks,) = read(tmp_path, [nobody, *({"pose_landmarks": marks(p)} for p in POSE)])

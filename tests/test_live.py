@@ -152,9 +152,11 @@ def test_starts_anew_after_a_window_without_the_person(clip):
 def test_zeros_are_unseen_where_the_body_is_to_their_right_and_below(clip):
     lost = observed(clip)[:40] + 3000
     lost[:5], lost[20:25], lost[10:, 9] = torch.nan, torch.nan, torch.nan
-    zeros, nans = (follow(kt.Tracker("coco17", fps=30), xy) for xy in (lost.nan_to_num(0.0), lost))
-    assert all(torch.equal(p.seen, q.seen) for p, q in zip(zeros, nans, strict=True))
-    assert all(torch.allclose(p.points, q.points, equal_nan=True) for p, q in zip(zeros, nans, strict=True))
+    nans = follow(kt.Tracker("coco17", fps=30), lost)
+    for place in (0.0, -1.0):
+        found = follow(kt.Tracker("coco17", fps=30), lost.nan_to_num(place))
+        assert all(torch.equal(p.seen, q.seen) for p, q in zip(found, nans, strict=True))
+        assert all(torch.allclose(p.points, q.points, equal_nan=True) for p, q in zip(found, nans, strict=True))
     frame = lost[30].nan_to_num(0.0)
     assert bool(kt.Tracker("coco17").update(frame, torch.ones(17)).seen.all())  # confidences say what is unseen
     assert bool(kt.Tracker("coco17").update(frame - frame[0]).seen.all())  # the nose is the origin

@@ -540,6 +540,16 @@ def test_a_body_on_its_head_is_told():
 
 
 @quiet
+def test_a_body_on_its_side_is_told():
+    """x and y are easily swapped; one that gets up is not meant."""
+    told = "x and y are swapped in these tracks"
+    assert told in notes(tracks_of(WALK.flip(-1)), "kcs")
+    rises = torch.cat([WALK.flip(-1)[: len(WALK) // 2], WALK[len(WALK) // 2 :]])
+    for right in (WALK, rises):
+        assert told not in notes(tracks_of(right), "kcs")
+
+
+@quiet
 @pytest.mark.parametrize("method", METHODS)
 def test_a_body_without_rigid_bones_is_told(method):
     none = Tracks.from_arrays(WALK[:, :5])

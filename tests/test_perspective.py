@@ -481,6 +481,8 @@ def test_y_up_and_other_corners_are_told_with_intrinsics():
     for points in (up, tracks.points - torch.tensor(LENS[2:])):
         with pytest.warns(kt.KcsWarning, match=r"of the joints, .* lie beside an image whose middle is \(960, 540\)"):
             kt.reconstruct(replace(tracks, points=points), method="kcs", intrinsics=LENS)
+    with pytest.warns(kt.KcsWarning, match=r"a principal point at \(0, 0\) is the image's corner"):
+        kt.reconstruct(tracks, method="kcs", intrinsics=(*LENS[:2], 0, 0))
     with pytest.warns(kt.KcsWarning, match=r"give -y instead \(with intrinsics the image's height - y\)"):
         kt.reconstruct(replace(tracks, points=up + torch.tensor([0.0, 1080.0])), method="kcs", intrinsics=LENS)
 

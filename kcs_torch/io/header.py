@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES
+from kcs_torch.io.times import time_unit
 
 __all__ = ["WHO", "Columns", "Header", "Layout", "delimiter", "first_line", "plain_name"]
 
@@ -21,7 +22,6 @@ WHO = (
 _WHAT = "|".join(("x", "y", "z", *CONFIDENCES, *VISIBILITIES))
 _NAMED = re.compile(rf"(?P<name>.+)[_. ](?P<what>{_WHAT})(?: \[(?P<unit>[^\]]*)\])?\Z", re.IGNORECASE | re.DOTALL)
 _NUMBERED = re.compile(rf"(?P<what>{_WHAT})_?(?P<name>[0-9]{{1,4}})\Z", re.IGNORECASE)
-_TIME = re.compile(r"(?:time|timestamp|t)[ _]?[\[(]?(?P<unit>|s|sec|seconds|ms|msec|milliseconds)[\])]?\Z")
 _FRAME = re.compile(r"frame(?:[ _]?(?:#|no|nr|num|number|id|idx|index))?\.?|index\Z", re.IGNORECASE)
 _LINE = re.compile(r'(?:[^"\n]+|"[^"]*")*')
 
@@ -91,8 +91,8 @@ class Header:
     @cached_property
     def time(self) -> tuple[int, str] | None:
         """The column of times, and their unit where its name tells."""
-        matches = ((i, _TIME.match(cell.lower())) for i, cell in enumerate(self.cells))
-        return next(((i, match["unit"]) for i, match in matches if match), None)
+        units = ((i, time_unit(cell)) for i, cell in enumerate(self.cells))
+        return next(((i, unit) for i, unit in units if unit is not None), None)
 
     def column(self, names: Sequence[str]) -> int | None:
         """The column that has the first of these names that is there."""

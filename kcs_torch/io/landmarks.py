@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_joints, as_text, entries, read_json
 from kcs_torch.io.people import SIZE_HINT, Sighting, are_shares
 from kcs_torch.io.registry import Options
+from kcs_torch.io.times import frames_of_times, rate_of_times, time_unit
 from kcs_torch.skeleton import SKELETONS
 
 __all__ = [
@@ -79,7 +80,8 @@ def read_landmarks_json(path: Path) -> Landmarks:
         out.fps = _positive(data, "fps")
     poses: dict[int, list[Sighting]] = {}
     hands: dict[int, list[Sighting]] = {}
-    for number, frame, where in _frames(data, path):
+    listed = list(_frames(data, path))
+    for number, (frame, where) in zip(_numbers(listed, out), (rest for _, *rest in listed), strict=True):
         if number in poses:
             raise FormatError(f"{where}: expected every frame once, got frame {number} again")
         poses[number], hands[number] = _people(frame, where, out.seen)
@@ -91,8 +93,31 @@ def read_landmarks_json(path: Path) -> Landmarks:
     return out
 
 
-def _frames(data: Any, path: Path) -> Iterator[tuple[int, Any, str]]:
-    """The number, content and place of each frame."""
+def _numbers(listed: Sequence[tuple[int | None, Any, str]], out: Landmarks) -> list[int]:
+    """The number of each frame: as it says, else by its time, else in their order; ``out`` gets times and rate."""
+    frames = [frame if isinstance(frame, dict) else {} for _, frame, _ in listed]
+    key = next((k for frame in frames for k in frame if time_unit(k) is not None), "")
+    times = [_as_time(frame.get(key)) for frame in frames]
+    numbers = [i if number is None else number for i, (number, _, _) in enumerate(listed)]
+    by_time = len(set(times)) == len(times) > 1 and not any(map(math.isnan, times))
+    if by_time and all(number is None for number, _, _ in listed):
+        placed = frames_of_times(times, out.notes)
+        numbers = [placed[time] for time in times]
+    out.times = dict(zip(numbers, times, strict=True))
+    if out.fps is None:
+        out.fps = rate_of_times(out.times, time_unit(key) or "", out.notes)
+    return numbers
+
+
+def _as_time(value: Any) -> float:
+    """A time, NaN where it is none."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < FARTHEST:
+        return math.nan
+    return float(value)
+
+
+def _frames(data: Any, path: Path) -> Iterator[tuple[int | None, Any, str]]:
+    """The number, content and place of each frame; None where nothing numbers it."""
     if isinstance(data, dict):
         key = next((k for k in _LISTS if isinstance(data.get(k), list)), None)
         if key is not None:
@@ -100,21 +125,19 @@ def _frames(data: Any, path: Path) -> Iterator[tuple[int, Any, str]]:
         elif data and all(k.isdecimal() and len(k) < 16 for k in data):
             yield from ((int(k), frame, f"{path}: frame {int(k)}") for k, frame in data.items())
         else:
-            yield 0, data, str(path)
+            yield None, data, str(path)
         return
     if not isinstance(data, list):
         raise FormatError(f"{path}: expected a list of frames with landmarks, got other JSON")
     if _is_person(data):
-        yield 0, data, str(path)
+        yield None, data, str(path)
         return
     for i, frame in enumerate(data):
-        number: int | None = i
-        if isinstance(frame, dict):
-            key = next((k for k in FRAME_KEYS if k in frame), None)
-            number = i if key is None else as_frame_number(frame[key])
-            if number is None:
-                raise FormatError(f"{path}: entry {i}: '{key}': expected a whole number, got {as_text(frame[key])}")
-        yield number or 0, frame, f"{path}: frame {number}"
+        key = next((k for k in FRAME_KEYS if k in frame), None) if isinstance(frame, dict) else None
+        number = None if key is None else as_frame_number(frame[key])
+        if key is not None and number is None:
+            raise FormatError(f"{path}: entry {i}: '{key}': expected a whole number, got {as_text(frame[key])}")
+        yield number, frame, f"{path}: frame {i if number is None else number}"
 
 
 def _people(frame: Any, where: str, seen: set[str]) -> tuple[list[Sighting], list[Sighting]]:

@@ -66,7 +66,7 @@ def people_tracks(
     By the file's track ids where every person has one and no frame has one twice; by their places otherwise. Who
     appears within a second where somebody else disappeared has got a new id, as trackers lose people. Where ids differ,
     a note says which one each person has. Joints are recognised by their number where neither names nor a
-    skeleton are given. Joints whose x or y is exactly 0 are unseen.
+    skeleton are given. Joints whose x or y is exactly 0, or both -1, are unseen.
 
     Args:
         frames: the people of each frame.
@@ -77,7 +77,7 @@ def people_tracks(
         skeleton: the file's own skeleton.
         fps: the file's frames per second.
         notes: sentences for the user.
-        measured: no detector made them: only joints at (0, 0) with all others to the right and below are unseen.
+        measured: no detector made them: only joints at (0, 0) or (-1, -1) with all others beyond are unseen.
 
     Raises:
         FormatError: nobody is in any frame, or people have different numbers of joints.
@@ -153,10 +153,12 @@ def _without_zeros(frames: Sequence[Sequence[Sighting]], measured: bool, notes: 
     if measured:
         zero = at_the_corner(joints[..., :2], seen, notes) | ~seen
     else:
-        zero = (joints[..., :2] == 0).any(-1)
-        if halves := int((zero & seen).sum()):
-            are = "joint whose x or y is exactly 0 is" if halves == 1 else "joints whose x or y is exactly 0 are"
-            notes.append(f"{halves} {are} taken as unseen")
+        zero, minus = (joints[..., :2] == 0).any(-1), (joints[..., :2] == -1).all(-1)
+        for gone, how in ((zero, "whose x or y is exactly 0"), (minus, "that lies exactly at (-1, -1)")):
+            if count := int((gone & seen).sum()):
+                are = f"joint {how} is" if count == 1 else f"joints {how.replace('lies', 'lie')} are"
+                notes.append(f"{count} {are} taken as unseen")
+        zero |= minus
     kept = iter(np.where(zero[..., None], 0.0, joints))
     return [[s._replace(joints=next(kept)) for s in frame] for frame in frames]
 

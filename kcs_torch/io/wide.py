@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import math
 import re
-import statistics
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,21 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.frames import as_track_id
 from kcs_torch.io.header import Columns, Header, Layout, delimiter, first_line
 from kcs_torch.io.jsonfile import as_frame_number, as_text
 from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
 from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import brief, read_error
+from kcs_torch.io.times import frames_of_times, rate_of_times
 from kcs_torch.types.intake import FARTHEST
 
 __all__ = ["Row", "as_value", "is_missing", "not_a_number", "opened", "place_rows", "read_wide"]
 
 _LIMIT = 2**30  # bytes of a file
 _HEAD = 2**20  # characters of the first line, at most
-_UNEVEN = 0.3  # of a frame, by which times may be off
-_SKIPPED = 1.5  # frames from one row to the next from which on some are missing between
 _MISSING = ("", "na", "n/a", "#n/a", "<na>", "null", "none")
 _NAMELESS = re.compile(r"(?:Unnamed: [0-9]+)?\Z")
 
@@ -167,7 +163,7 @@ def place_rows(rows: Sequence[Row], unit: str, out: Landmarks) -> None:
             raise FormatError(f"{row.where}: expected every frame once, or a column 'person', got {again} again")
         people.append(Sighting(row.joints, row.who))
         out.times.setdefault(number, row.time)
-    out.fps = _rate(out.times, unit, out.notes)
+    out.fps = rate_of_times(out.times, unit, out.notes)
 
 
 def _triples(marks: Sequence[dict[str, int]], out: Landmarks, depth: bool) -> list[tuple[int, int, int]]:
@@ -220,28 +216,8 @@ def _numbers(rows: Sequence[Row], notes: list[str]) -> list[int]:
         return [row.number or 0 for row in rows]
     if any(math.isnan(row.time) for row in rows):
         return _counted(rows, notes)
-    times = sorted({row.time for row in rows})
-    frames = _even(times)
-    if frames is None:
-        notes.append("the times are uneven: frames are taken in their order, at the mean rate")
-        frames = list(range(len(times)))
-    frame = dict(zip(times, frames, strict=True))
+    frame = frames_of_times((row.time for row in rows), notes)
     return [frame[row.time] for row in rows]
-
-
-def _even(times: Sequence[float]) -> list[int] | None:
-    """The frame of each time, ascending and rounded, to milliseconds say; None where they lie at no even distances."""
-    steps = [b - a for a, b in itertools.pairwise(times)]
-    if not steps:
-        return [0] * len(times)
-    usual = statistics.median_low(steps)
-    step = statistics.fmean(one for one in steps if one < _SKIPPED * usual)
-    frames = list(itertools.accumulate((round(min(one / step, 1e300)) for one in steps), initial=0))
-    if len(set(frames)) < len(frames):
-        return None
-    step = (times[-1] - times[0]) / frames[-1]  # of all, as rounding adds up from gap to gap
-    off = (abs((time - times[0]) / step - frame) for time, frame in zip(times, frames, strict=True))
-    return frames if max(off) <= _UNEVEN else None
 
 
 def _counted(rows: Sequence[Row], notes: list[str]) -> list[int]:
@@ -255,20 +231,3 @@ def _counted(rows: Sequence[Row], notes: list[str]) -> list[int]:
         frames.append(so_far[row.who])
         so_far[row.who] += 1
     return frames
-
-
-def _rate(times: dict[int, float], unit: str, notes: list[str]) -> float | None:
-    """Frames per second by the times of numbered frames."""
-    numbers = sorted(times)
-    known = [(f, times[n]) for f, n in zip(frame_numbers(numbers, []), numbers, strict=True) if times[n] == times[n]]
-    if len(known) < 2 or not known[-1][1] > known[0][1]:
-        return None
-    rate = (known[-1][0] - known[0][0]) / (known[-1][1] - known[0][1])
-    if unit.startswith("m"):
-        rate *= 1e3
-    elif not unit:
-        scale = next((s for s in (1.0, 1e3, 1e6, 1e9) if s * rate >= 1), 1.0)
-        if scale > 1:
-            notes.append(f"times are taken to count {scale:.0f} a second")
-        rate *= scale
-    return round(rate, 3) or None

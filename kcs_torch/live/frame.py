@@ -26,8 +26,8 @@ def take_frame(
     Args:
         body: the skeleton.
         number: of the frame, for messages.
-        xy: (num_observed, 2); NaN where unseen. Without confidences, joints exactly at (0, 0) are unseen, too, if all
-            others lie to the right and below, or if there are none.
+        xy: (num_observed, 2); NaN where unseen. Without confidences, joints exactly at (0, 0) or (-1, -1) are unseen,
+            too, if all others lie to the right of (0, 0) and below it, or if there are none.
         confidence: (num_observed,) in 0..1; 1 where None.
         threshold: a joint with less confidence counts as unseen.
 
@@ -53,7 +53,7 @@ def take_frame(
         raise ShapeError(f"{where}: xy: {name(huge)} is beyond {LARGEST:g}; scale the tracks")
     seen = torch.isfinite(points).all(-1)
     if confidence is None:
-        corner = seen & (points == 0).all(-1)
+        corner = seen & ((points == 0).all(-1) | (points == -1).all(-1))
         away = bool((points[seen & ~corner] > 0).all())
         weights = (seen & ~corner if away else seen).double()
     else:

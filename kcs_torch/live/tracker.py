@@ -157,9 +157,9 @@ class Tracker:
         """Take the next frame and return its pose.
 
         Args:
-            xy: (num_observed, 2) array or tensor; NaN where unseen. Without confidences, joints exactly at (0, 0) are
-                unseen, too, if all others lie to the right and below. A frame of NaN, or of zeros, is one without the
-                person; after a whole window of them the tracker starts anew.
+            xy: (num_observed, 2) array or tensor; NaN where unseen. Without confidences, joints exactly at (0, 0)
+                or (-1, -1) are unseen, too, if all others lie to the right of (0, 0) and below it. A frame of NaN, or
+                of zeros, is one without the person; after a whole window of them the tracker starts anew.
             confidence: (num_observed,) in 0..1; 1 where None.
 
         Raises:

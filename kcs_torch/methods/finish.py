@@ -20,7 +20,7 @@ from kcs_torch.methods.root import root_depth
 from kcs_torch.methods.wrong import LOOSE, what_is_wrong
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Reconstruction, Tracks
-from kcs_torch.types.upright import upside_down
+from kcs_torch.types.upright import lies_down, upside_down
 from kcs_torch.types.variation import bone_variation
 
 if TYPE_CHECKING:
@@ -44,6 +44,11 @@ HEADSTAND = (
     "the feet are above the rest of the body in nearly all frames. If y points up in these tracks, give -y instead "
     "(with intrinsics the image's height - y): it has to point down, as in images, or the body is upside down and "
     "mirrored. If it does point down, joints may be in another order"
+)
+
+LYING = (
+    "the body lies on its side in nearly all frames. If it does not, x and y are swapped in these tracks (rows and "
+    "columns of an image are y and x), so that the body is mirrored, too; or the video is stored turned: turn them"
 )
 
 
@@ -182,6 +187,8 @@ def _reconstruction(
         notes.append(f"bone lengths vary by {variation.median:.1f} %: '{method.name}' does not hold them constant")
     if upside_down(tracks.points[..., 1], tracks.seen, body, NEARLY_ALL):
         notes.append(HEADSTAND)
+    elif lies_down(tracks.points, tracks.seen, body, NEARLY_ALL):
+        notes.append(LYING)
     notes += what_is_wrong(method, points, seen, tracks, found.converged, lengths=bones)
     if not body.rigid:
         kind = "no bones" if not body.num_bones else "no rigid bones"

@@ -204,17 +204,19 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
 
 
 def at_the_corner(points: np.ndarray, seen: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Which joints (..., N) of points (..., N, 2) lie exactly at (0, 0), and all others to the right of and below it.
+    """Which joints (..., N) of points (..., N, 2) lie exactly at (0, 0), or at (-1, -1), and all others beyond (0, 0).
 
     Detectors write unseen joints so. About a middle that is 0 the others lie all around.
     """
-    corner = seen & (points == 0).all(-1)
+    zero, minus = (seen & (points == place).all(-1) for place in (0, -1))
+    corner = zero | minus
     rest = points[seen & ~corner]
-    count = int(corner.sum())
-    if not (count and len(rest) and (rest > 0).all()):
+    if not (corner.any() and len(rest) and (rest > 0).all()):
         return np.zeros_like(corner)
-    are = "joint that lies exactly at (0, 0) is" if count == 1 else "joints that lie exactly at (0, 0) are"
-    notes.append(f"{count} {are} taken as unseen: NaN, or a confidence of 0, says so more clearly")
+    for count, place in ((int(zero.sum()), "(0, 0)"), (int(minus.sum()), "(-1, -1)")):
+        if count:
+            are = f"joint that lies exactly at {place} is" if count == 1 else f"joints that lie exactly at {place} are"
+            notes.append(f"{count} {are} taken as unseen: NaN, or a confidence of 0, says so more clearly")
     return corner
 
 

@@ -131,6 +131,11 @@ class Intrinsics:
 
     def beside(self, image: Tensor) -> str:
         """What to say where many points (n, 2) lie beside the image whose middle is the principal point, else ""."""
+        if len(image) and self.cx == self.cy == 0 and self.focal > COARSE and bool((image > 0).all()):
+            return (
+                "intrinsics: a principal point at (0, 0) is the image's corner, to the right of and below which all "
+                "joints lie: cx and cy are about half of the image's width and height"
+            )
         if not (len(image) and self.cx > 0 and self.cy > 0):
             return ""
         middle = image.new_tensor([self.cx, self.cy])
