@@ -115,6 +115,11 @@ def test_noise_that_cannot_be_measured():
     some = weights.clone()
     some[::3, 12:] = 0
     assert measure_noise(points, some) is not None
+    lost = weights.clone()
+    lost[::4] = 0  # nobody is seen
+    assert 0.005 < measure_noise(points, lost).white < measure_noise(points, weights).white
+    lost[1::4] = lost[2::4] = 0
+    assert measure_noise(points, lost) is None
 
 
 def parts(tracks: kt.Tracks) -> tuple[torch.Tensor, torch.Tensor]:

@@ -20,8 +20,9 @@ RESTLESS = (24, 48)
 SHORT = 12
 """Frames below which a clip does not tell its noise."""
 
-STEADY, SEEN = 4, 0.95
-"""Joints that tell the kind of noise, at least, and the share of the frames that show each."""
+STEADY, SEEN, SHOWN = 4, 0.95, 0.5
+"""Joints that tell the kind of noise, at least; the share of the frames with any joint that show each; and the share of
+such frames in all: others are filled, without noise."""
 
 
 class Noise(NamedTuple):
@@ -50,8 +51,9 @@ def measure_noise(tracks: Tensor, weights: Tensor, *, window: int = 64) -> Noise
         window: frames taken together, two seconds say.
 
     Returns:
-        The noise of the joints that are seen in nearly all frames, outliers apart, its slower part 0 in clips of fewer
-        than about 45 frames; or None where these joints are fewer than four, or frames fewer than twelve.
+        The noise of the joints that are seen in nearly all frames with any, outliers apart, its slower part 0 in clips
+        of fewer than about 45 frames; or None where these joints are fewer than four, frames fewer than twelve, or more
+        than half of them empty.
     """
     if len(tracks) < SHORT:
         return None
@@ -62,8 +64,9 @@ def measure_noise(tracks: Tensor, weights: Tensor, *, window: int = 64) -> Noise
         return None
     values = values / size
     seen = seen & ~each_joint(stray_from_neighbours, values, seen, STRAY, FLOOR)
-    steady = seen[0].double().mean(0) >= SEEN
-    if int(steady.sum()) < STEADY:
+    shown = seen[0].any(1)  # hands are lost as a whole now and then
+    steady = seen[0].double().sum(0) >= SEEN * float(shown.sum())
+    if int(steady.sum()) < STEADY or float(shown.double().mean()) < SHOWN:
         return None
     values, seen = values[:, :, steady], seen[:, :, steady]
     points = interpolate(values, seen)
