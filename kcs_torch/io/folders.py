@@ -84,7 +84,9 @@ def frame_numbers(
         )
         return list(range(len(numbers)))
     if step > 1:
-        notes.append(f"the {names} count in steps of {step}: each step is taken as one frame")
+        notes.append(
+            f"the {names} count in steps of {step}: each step is taken as one frame, at 1/{step} of the video's fps"
+        )
     gaps = sorted(set(range(frames[-1] + 1)) - set(frames))
     if gaps:
         shown = ", ".join(str(known[0] + g * step) for g in gaps[:5]) + (", ..." if len(gaps) > 5 else "")

@@ -105,7 +105,7 @@ class Probe:
                     raise FormatError(f"{path}: expected a file or a folder, got neither")
                 raise FormatError(f"{path}: there is no such file or folder")
             if self.is_file and not self.head:
-                raise FormatError(f"{path}: expected tracks, got an empty file")
+                raise FormatError(f"{path}: expected tracks or motion, got an empty file")
         except (OSError, ValueError) as error:
             if isinstance(error, KcsError):
                 raise

@@ -68,7 +68,7 @@ def find_skeleton(
         source = source.points
     given: object = source
     if not isinstance(given, Tensor):
-        hint = "torch.as_tensor takes arrays; kcs_torch.SKELETONS holds the built-in ones"
+        hint = "torch.as_tensor takes arrays, Skeleton.load a file; kcs_torch.SKELETONS holds the built-in ones"
         raise ShapeError(
             f"find_skeleton: expected tracks, a result or a tensor of points, got {type(given).__name__}: {hint}"
         )
