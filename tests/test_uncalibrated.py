@@ -14,7 +14,9 @@ import kcs_torch as kt
 from kcs_torch.cli import app
 from kcs_torch.io import load_reconstruction
 from kcs_torch.methods import uncalibrated
-from kcs_torch.methods.uncalibrated import likely_lens
+from kcs_torch.methods.pkc import body
+from kcs_torch.methods.pkc.near import SEEMS_NEAR
+from kcs_torch.methods.uncalibrated import likely_lens, looking
 from kcs_torch.types import Intrinsics
 
 LENS = Intrinsics(1500.0, 1500.0, 960.0, 540.0)
@@ -69,6 +71,38 @@ def test_a_near_camera_takes_one_search(monkeypatch):
     monkeypatch.setattr(kt.PKC, "solve", lambda *given: searched.append(0) or solve(*given))
     assert quietly(filmed(frames=15)[0]).distance is not None
     assert len(searched) == 1
+
+
+@pytest.mark.parametrize(("fps", "block"), [(30.0, 400), (60.0, 400), (30.0, 25)], ids=["one", "strides", "blocks"])
+def test_the_search_ends_where_the_camera_seems_near(monkeypatch, fps, block):
+    """Before runs of signs are turned over, asked once of the liveliest block; what is then found has no note of it."""
+    monkeypatch.setattr(body, "BLOCK", block)
+    asked, looks, turned = [], uncalibrated._looks_near, []
+    over = body.searching
+    monkeypatch.setattr(uncalibrated, "_looks_near", lambda *given: asked.append(len(given[1])) or looks(*given))
+    monkeypatch.setattr(body, "searching", lambda *given, **how: turned.append(how["rounds"]) or over(*given, **how))
+    tracks, _ = filmed(frames=60, fps=fps)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", kt.KcsWarning)
+        ended = looking(kt.PKC())(tracks)
+    assert SEEMS_NEAR in ended.diagnostics.notes and asked == [min(block, round(60 * 30 / fps))]
+    assert turned[0] == 1 and not any(turned[1:])
+    found = quietly(tracks)
+    assert found.distance is not None and not any(SEEMS_NEAR in note for note in found.diagnostics.notes)
+
+
+def test_only_pkc_itself_looks_for_a_near_camera():
+    assert looking(kt.KCS()) == kt.KCS() and looking(kt.PKC().following()) == kt.PKC().following()
+    assert looking(kt.PKC(seed=3)).seed == 3
+    far = kt.data.walking_person(30, turn=0.0, yaw=60.0).tracks
+    assert same(looking(kt.PKC())(far), kt.PKC()(far))
+
+
+def test_what_no_near_camera_explains_after_all_is_searched_to_the_end(monkeypatch):
+    tracks, _ = filmed(frames=30)
+    lost = replace(lifted_near(), points=lifted_near().points * torch.nan)
+    monkeypatch.setattr(uncalibrated, "reconstruct_perspective", lambda *given, **how: lost)
+    assert same(quietly(tracks), quietly(tracks, intrinsics="parallel"))
 
 
 @pytest.mark.parametrize("turn", [0.0, 90.0])

@@ -86,7 +86,9 @@ def reconstruct_uncalibrated(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
         result = looking(judge)(tracks, cameras) if lifted is None else lifted
-        lens = likely_lens(result, cameras)
+        asked = isinstance(looking(judge), _Looking) and judge.viewpoint != "moving"
+        ended = SEEMS_NEAR in result.diagnostics.notes
+        lens = likely_lens(result, cameras) if ended or not asked else None
         near: Reconstruction | None = None
         if lens is not None:
             near = reconstruct_perspective(judge, tracks, lens, cameras, lifted=result)
@@ -99,7 +101,7 @@ def reconstruct_uncalibrated(
                 near = replace(near, diagnostics=replace(near.diagnostics, notes=notes))
         if near is not None and bool(near.points.isfinite().all()):
             result = near
-        elif judge is not method or SEEMS_NEAR in result.diagnostics.notes:
+        elif judge is not method or ended:
             result = method(tracks, cameras)
     method._warn(result)
     return replace(result, diagnostics=replace(result.diagnostics, seconds=before + time.perf_counter() - begin))
