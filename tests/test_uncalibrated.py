@@ -91,6 +91,14 @@ def test_the_search_ends_where_the_camera_seems_near(monkeypatch, fps, block):
     assert found.distance is not None and not any(SEEMS_NEAR in note for note in found.diagnostics.notes)
 
 
+def test_clips_whose_signs_are_not_turned_over_under_perspective_are_searched_to_the_end(monkeypatch):
+    monkeypatch.setattr(uncalibrated, "BLOCK", 20)
+    tracks, _ = filmed(frames=30)
+    ended = looking(kt.PKC())(tracks)
+    assert same(ended, kt.PKC()(tracks)) and SEEMS_NEAR not in ended.diagnostics.notes
+    assert quietly(tracks).distance is not None  # asked about by what was found
+
+
 def test_only_pkc_itself_looks_for_a_near_camera():
     assert looking(kt.KCS()) == kt.KCS() and looking(kt.PKC().following()) == kt.PKC().following()
     assert looking(kt.PKC(seed=3)).seed == 3

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from dataclasses import fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +13,8 @@ from torch import Tensor
 from kcs_torch.clean.detector import detected
 from kcs_torch.errors import KcsWarning, OptionError
 from kcs_torch.methods.base import Method, apart, check_cameras
-from kcs_torch.methods.finish import extent
+from kcs_torch.methods.finish import Estimate, extent
+from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.perspective import WIDE, feet_on_ground, reconstruct_perspective
 from kcs_torch.methods.pinhole import PinholeEnergy
@@ -20,6 +22,7 @@ from kcs_torch.methods.pinhole_coordinates import USUAL, unusual
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.near import SEEMS_NEAR
+from kcs_torch.methods.scene import BLOCK
 from kcs_torch.methods.view import View, lens_note
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -86,9 +89,8 @@ def reconstruct_uncalibrated(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
         result = looking(judge)(tracks, cameras) if lifted is None else lifted
-        asked = isinstance(looking(judge), _Looking) and judge.viewpoint != "moving"
         ended = SEEMS_NEAR in result.diagnostics.notes
-        lens = likely_lens(result, cameras) if ended or not asked else None
+        lens = likely_lens(result, cameras) if ended or not _asks(judge, tracks) else None
         near: Reconstruction | None = None
         if lens is not None:
             near = reconstruct_perspective(judge, tracks, lens, cameras, lifted=result)
@@ -138,10 +140,23 @@ class _Looking(PKC):
     def seems_near(self, tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> bool:
         return _looks_near(tracks, flat, depth, unit, cameras)
 
+    def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
+        return super()._steps(tracks, cameras) if _asks(self, tracks) else _as(PKC, self)._steps(tracks, cameras)
+
 
 def looking(method: Method) -> Method:
     """The method for tracks of a camera that may be near; only PKC itself is another one."""
-    return _Looking(**{f.name: getattr(method, f.name) for f in fields(method)}) if type(method) is PKC else method
+    return _as(_Looking, method) if type(method) is PKC else method
+
+
+def _asks(method: PKC, tracks: Tracks) -> bool:
+    """Whether PKC, looking for a near camera, asks about these: not where perspective turns no signs over."""
+    return type(method) in (PKC, _Looking) and method.viewpoint != "moving" and tracks.num_frames <= BLOCK
+
+
+def _as(kind: type[PKC], method: Method) -> PKC:
+    """PKC of a kind with a method's fields."""
+    return kind(**{f.name: getattr(method, f.name) for f in fields(method)})
 
 
 def _looks_near(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> bool:
