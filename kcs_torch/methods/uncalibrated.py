@@ -137,7 +137,7 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
 class _Looking(PKC):
     """PKC that looks for a near camera before it turns runs of signs over, which is then left to full perspective."""
 
-    def seems_near(self, tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> bool:
+    def _seems_near(self, tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> bool:
         return _looks_near(tracks, flat, depth, unit, cameras)
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:

@@ -132,18 +132,8 @@ class PKC(Method):
             return replace(self, contacts=False)
         return _Followed(**{f.name: getattr(self, f.name) for f in fields(self)} | {"contacts": False})
 
-    def seems_near(self, tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> bool:
-        """Whether to look for a body's signs under perspective, rather than under parallel rays, as known so far.
-
-        Never: see :mod:`kcs_torch.methods.uncalibrated`.
-
-        Args:
-            tracks: of a body with a template.
-            flat: (T, N, 2) their image without noise.
-            depth: (T, N), for a body of 1.75.
-            unit: of such a body, in the tracks' unit.
-            cameras: (T, 2, 3) that are known, or None.
-        """
+    def _seems_near(self, tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> bool:
+        """Whether to leave signs to full perspective: never, but see :mod:`kcs_torch.methods.uncalibrated`."""
         return False
 
     @property
@@ -219,7 +209,7 @@ class PKC(Method):
         else:
             resizing = enough and not changing and size.range >= TRIED  # what is compared must be searched alike
             compare = turned if compared and not resizing else None
-            near = Asked(self.seems_near, tracks, points, cameras, body)
+            near = Asked(self._seems_near, tracks, points, cameras, body)
             found = yield from body.search(self._moves, self.steps, compare, near)
             if near.told:  # the rest is as under perspective
                 method, notes = self.following(), (*notes, SEEMS_NEAR)

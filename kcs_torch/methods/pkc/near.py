@@ -19,7 +19,8 @@ SEEMS_NEAR = "the camera seems near: runs of signs are left to full perspective"
 """What is noted of a search that ended early, as the camera seems near."""
 
 Question = Callable[[Tracks, Tensor, Tensor, float, Tensor | None], bool]
-"""Whether a camera seems near, see :meth:`kcs_torch.methods.PKC.seems_near`."""
+"""Whether a camera seems near, by tracks of a body with a template, their image (T, N, 2) without noise, depths (T, N)
+for a body of 1.75, the unit of such a body in the tracks, and cameras (T, 2, 3) that are known or None."""
 
 
 class Asked:
