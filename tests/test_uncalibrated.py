@@ -15,7 +15,7 @@ from kcs_torch.cli import app
 from kcs_torch.io import load_reconstruction
 from kcs_torch.methods import uncalibrated
 from kcs_torch.methods.pkc import body
-from kcs_torch.methods.pkc.near import SEEMS_NEAR
+from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
 from kcs_torch.methods.uncalibrated import likely_lens, looking
 from kcs_torch.types import Intrinsics
 
@@ -77,9 +77,9 @@ def test_a_near_camera_takes_one_search(monkeypatch):
 def test_the_search_ends_where_the_camera_seems_near(monkeypatch, fps, block):
     """Before runs of signs are turned over, asked once of the liveliest block; what is then found has no note of it."""
     monkeypatch.setattr(body, "BLOCK", block)
-    asked, looks, turned = [], uncalibrated._looks_near, []
+    asked, nearness, turned = [], uncalibrated._nearness, []
     over = body.searching
-    monkeypatch.setattr(uncalibrated, "_looks_near", lambda *given: asked.append(len(given[1])) or looks(*given))
+    monkeypatch.setattr(uncalibrated, "_nearness", lambda *given: asked.append(len(given[1])) or nearness(*given))
     monkeypatch.setattr(body, "searching", lambda *given, **how: turned.append(how["rounds"]) or over(*given, **how))
     tracks, _ = filmed(frames=60, fps=fps)
     with warnings.catch_warnings():
@@ -103,7 +103,9 @@ def test_only_pkc_itself_looks_for_a_near_camera():
     assert looking(kt.KCS()) == kt.KCS() and looking(kt.PKC().following()) == kt.PKC().following()
     assert looking(kt.PKC(seed=3)).seed == 3
     far = kt.data.walking_person(30, turn=0.0, yaw=60.0).tracks
-    assert same(looking(kt.PKC())(far), kt.PKC()(far))
+    found = looking(kt.PKC())(far)
+    assert same(found, kt.PKC()(far)) and SEEMS_FAR in found.diagnostics.notes
+    assert quietly(far).diagnostics.notes == kt.PKC()(far).diagnostics.notes
 
 
 def test_what_no_near_camera_explains_after_all_is_searched_to_the_end(monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from dataclasses import fields, replace
@@ -21,7 +22,7 @@ from kcs_torch.methods.pinhole import PinholeEnergy
 from kcs_torch.methods.pinhole_coordinates import USUAL, unusual
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
-from kcs_torch.methods.pkc.near import SEEMS_NEAR
+from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
 from kcs_torch.methods.scene import BLOCK
 from kcs_torch.methods.view import View, lens_note
 from kcs_torch.nn.posture import trunk_joints
@@ -35,6 +36,9 @@ FAR = 34.0
 
 NEAR = 10.0
 """Distance up to which a camera is near: from there on a wrong focal length does more harm than parallel rays."""
+
+CLOSE = 5.0
+"""Distance up to which the search under parallel rays ends: what is farther away it finds signs of better."""
 
 BETTER, SEEN = 2.5, -1.0
 """By how much the energy must be lower than of a far body for a near one to be believed; and in a detector's tracks,
@@ -90,7 +94,7 @@ def reconstruct_uncalibrated(
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
         result = looking(judge)(tracks, cameras) if lifted is None else lifted
         ended = SEEMS_NEAR in result.diagnostics.notes
-        lens = likely_lens(result, cameras) if ended or not _asks(judge, tracks) else None
+        lens = None if SEEMS_FAR in result.diagnostics.notes else likely_lens(result, cameras)
         near: Reconstruction | None = None
         if lens is not None:
             near = reconstruct_perspective(judge, tracks, lens, cameras, lifted=result)
@@ -106,7 +110,9 @@ def reconstruct_uncalibrated(
         elif judge is not method or ended:
             result = method(tracks, cameras)
     method._warn(result)
-    return replace(result, diagnostics=replace(result.diagnostics, seconds=before + time.perf_counter() - begin))
+    notes = tuple(note for note in result.diagnostics.notes if note != SEEMS_FAR)
+    spent = before + time.perf_counter() - begin
+    return replace(result, diagnostics=replace(result.diagnostics, seconds=spent, notes=notes))
 
 
 def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrinsics | None:
@@ -129,19 +135,25 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         flat, unit = clean_image(lifted), body_unit(lifted)
         x, y = flat.mean((0, 1)).tolist()
-        known = SEEMS_NEAR in lifted.diagnostics.notes
-        near = known or _looks_near(tracks, flat, lifted.points[..., 2] / unit, unit, cameras)
+        near = SEEMS_NEAR in lifted.diagnostics.notes
+        if not near:
+            distance = _nearness(tracks, flat, lifted.points[..., 2] / unit, unit, cameras)
+            near = distance is not None and distance < NEAR
     return Intrinsics(USUAL * unit, USUAL * unit, x, y) if near else None
 
 
 class _Looking(PKC):
     """PKC that looks for a near camera before it turns runs of signs over, which is then left to full perspective."""
 
-    def _seems_near(self, tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> bool:
-        return _looks_near(tracks, flat, depth, unit, cameras)
+    def _seems_near(self, tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> str:
+        distance = _nearness(tracks, flat, depth, unit, cameras)
+        if distance is None:
+            return ""
+        return SEEMS_NEAR if distance < CLOSE else SEEMS_FAR if distance == math.inf else ""
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
-        return super()._steps(tracks, cameras) if _asks(self, tracks) else _as(PKC, self)._steps(tracks, cameras)
+        turned = tracks.num_frames <= BLOCK  # else no signs are turned over under perspective
+        return super()._steps(tracks, cameras) if turned else _as(PKC, self)._steps(tracks, cameras)
 
 
 def looking(method: Method) -> Method:
@@ -149,18 +161,15 @@ def looking(method: Method) -> Method:
     return _as(_Looking, method) if type(method) is PKC else method
 
 
-def _asks(method: PKC, tracks: Tracks) -> bool:
-    """Whether PKC, looking for a near camera, asks about these: not where perspective turns no signs over."""
-    return type(method) in (PKC, _Looking) and method.viewpoint != "moving" and tracks.num_frames <= BLOCK
-
-
 def _as(kind: type[PKC], method: Method) -> PKC:
     """PKC of a kind with a method's fields."""
     return kind(**{f.name: getattr(method, f.name) for f in fields(method)})
 
 
-def _looks_near(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> bool:
-    """Whether a near camera explains a body better than a far one.
+def _nearness(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> float | None:
+    """How far the camera is that explains a body better than a far one, for a body of 1.75.
+
+    Infinity where the far one is better by far, None where it is not.
 
     Args:
         tracks: of the body.
@@ -172,9 +181,9 @@ def _looks_near(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, camera
     middle = flat.mean((0, 1))
     aside = float((flat - middle).square().sum(-1).mean().sqrt())
     if not (bool(extent(tracks) > 0) and aside < WIDE * USUAL * unit):  # a point is as likely at any distance
-        return False
+        return math.inf
     if not (bool(depth.isfinite().all()) and bool(depth.any())):
-        return False
+        return math.inf
     every = max(1, round((tracks.fps or RATE) / RATE))
     some = _liveliest(flat[::every], round(SECONDS * RATE)) * every
     rate = (tracks.fps or RATE) / every
@@ -203,12 +212,14 @@ def _looks_near(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, camera
     state = energy.start
     for _ in range(2):
         found = lbfgs(energy, state, num_steps=STEPS, tolerance=1e-6, slopes=True, part=energy.rows, enough=enough)
-        state, cost = found.value, found.energy
-        assert cost is not None
-        gain = float(cost[0] - cost[1])
-        if gain > -unusual(FAR) or hopeless(state, cost):  # to be as far away costs no more than that
+        assert found.energy is not None
+        state, gain = found.value, float(found.energy[0] - found.energy[1])
+        if hopeless(state, found.energy):
+            return math.inf
+        if gain > -unusual(FAR):  # to be as far away costs no more than that
             break
-    return gain > (SEEN if detected(tracks) else BETTER) and distance(state) < NEAR
+    found_at = distance(state)
+    return found_at if gain > (SEEN if detected(tracks) else BETTER) and found_at < NEAR else None
 
 
 def _liveliest(image: Tensor, count: int) -> Tensor:

@@ -29,7 +29,7 @@ from kcs_torch.methods.pkc.long_gaps import lengthened, shortened
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
 from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights, settled
 from kcs_torch.methods.pkc.moving_view import searching as turning
-from kcs_torch.methods.pkc.near import SEEMS_NEAR, Asked
+from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR, Asked
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import Size
@@ -132,9 +132,9 @@ class PKC(Method):
             return replace(self, contacts=False)
         return _Followed(**{f.name: getattr(self, f.name) for f in fields(self)} | {"contacts": False})
 
-    def _seems_near(self, tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> bool:
-        """Whether to leave signs to full perspective: never, but see :mod:`kcs_torch.methods.uncalibrated`."""
-        return False
+    def _seems_near(self, tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> str:
+        """How near the camera seems: nothing is said here, but see :mod:`kcs_torch.methods.uncalibrated`."""
+        return ""
 
     @property
     def _moves(self) -> int:
@@ -211,8 +211,10 @@ class PKC(Method):
             compare = turned if compared and not resizing else None
             near = Asked(self._seems_near, tracks, points, cameras, body)
             found = yield from body.search(self._moves, self.steps, compare, near)
-            if near.told:  # the rest is as under perspective
-                method, notes = self.following(), (*notes, SEEMS_NEAR)
+            if near.told == SEEMS_NEAR:  # the rest is as under perspective
+                method = self.following()
+            if near.told and (near.told != SEEMS_FAR or not body.turns(found)):  # of who turns much is learnt from here
+                notes = (*notes, near.told)
             led = compared and body.is_odd(found) and body.turns(found)  # by the viewpoint's turn, not by the template
             if resizing and not led:
                 other = Body(skeleton, resized, tracks.fps or 30.0, noise, feet)

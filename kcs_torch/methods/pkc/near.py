@@ -1,4 +1,4 @@
-"""Whether the camera of a body with a template seems near, asked while it is searched as under parallel rays."""
+"""How near the camera of a body with a template seems, asked while it is searched as under parallel rays."""
 
 from __future__ import annotations
 
@@ -13,14 +13,17 @@ from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.types import Tracks
 
-__all__ = ["SEEMS_NEAR", "Asked", "Question"]
+__all__ = ["SEEMS_FAR", "SEEMS_NEAR", "Asked", "Question"]
 
 SEEMS_NEAR = "the camera seems near: runs of signs are left to full perspective"
 """What is noted of a search that ended early, as the camera seems near."""
 
-Question = Callable[[Tracks, Tensor, Tensor, float, Tensor | None], bool]
-"""Whether a camera seems near, by tracks of a body with a template, their image (T, N, 2) without noise, depths (T, N)
-for a body of 1.75, the unit of such a body in the tracks, and cameras (T, 2, 3) that are known or None."""
+SEEMS_FAR = "the camera seems far"
+"""What is noted where nobody needs to look for a near camera any more."""
+
+Question = Callable[[Tracks, Tensor, Tensor, float, Tensor | None], str]
+"""What is to be noted of how near a camera seems, by tracks of a body with a template, their image (T, N, 2) without
+noise, depths (T, N) for a body of 1.75, the unit of such a body in the tracks, and known cameras (T, 2, 3) or None."""
 
 
 class Asked:
@@ -34,15 +37,15 @@ class Asked:
         body: in whose units hypotheses are.
 
     Attributes:
-        told: whether the camera seemed near.
+        told: the answer, "" so far.
     """
 
     def __init__(self, question: Question, tracks: Tracks, points: Tensor, cameras: Tensor | None, body: Body) -> None:
         self.question, self.points, self.cameras, self.body = question, points, cameras, body
-        self.tracks, self.told = replace(tracks, detector=detected(tracks)), False
+        self.tracks, self.told = replace(tracks, detector=detected(tracks)), ""
 
     def __call__(self, frames: slice, found: Hypotheses) -> bool:
-        """Whether it does by the best hypothesis of some frames."""
+        """Whether it seems near by the best hypothesis of some frames."""
         tracks, usual = self.tracks, self.body.objective.posture.rest_lengths
         size = float((found.lengths[0] / usual).median())
         if not 0 < size < math.inf:
@@ -52,4 +55,4 @@ class Asked:
         cameras = None if self.cameras is None else self.cameras[frames]
         unit = size / float(self.body.factor)
         self.told = self.question(some, self.points[frames], found.depth[0] / size, unit, cameras)
-        return self.told
+        return self.told == SEEMS_NEAR
