@@ -213,7 +213,7 @@ class PKC(Method):
             found = yield from body.search(self._moves, self.steps, compare, near)
             if near.told == SEEMS_NEAR:  # the rest is as under perspective
                 method = self.following()
-            if near.told and (near.told != SEEMS_FAR or not body.turns(found)):  # of who turns much is learnt from here
+            if near.told and (near.told != SEEMS_FAR or not body.turns(found)):  # else signs were poor: ask again later
                 notes = (*notes, near.told)
             led = compared and body.is_odd(found) and body.turns(found)  # by the viewpoint's turn, not by the template
             if resizing and not led:
