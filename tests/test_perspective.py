@@ -458,6 +458,7 @@ def test_no_angle_is_blamed_where_all_are_small(monkeypatch):
         kt.reconstruct(tracks, intrinsics=LENS)
 
 
+@pytest.mark.filterwarnings("ignore:.*a principal point at .* is the image's corner")
 def test_a_focal_length_in_another_unit_is_told():
     with pytest.warns(kt.KcsWarning, match=r"focal length 120 in the tracks' unit \(px\)"):
         kt.reconstruct(filmed(frames=5)[0], method="kcs", intrinsics=(120, 120, 0, 0))
