@@ -39,7 +39,7 @@ class ShapeError(KcsError):
 
 
 class NotFiniteError(ShapeError):
-    """A matrix to factorise holds NaN or infinite numbers."""
+    """A matrix to factorise, or what a network lifted, holds NaN or infinite numbers."""
 
 
 class SkeletonError(KcsError):

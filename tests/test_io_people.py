@@ -153,7 +153,7 @@ def test_negative_confidences_and_blank_joints_are_unseen():
     frames[3][0].joints[7, :2] = -1
     (tracks,) = read(frames)
     assert (~tracks.seen[:, :17]).nonzero().tolist() == [[1, 3], [2, 4], [2, 5], [3, 6], [3, 7]]
-    assert "1 joint that lies exactly at (-1, -1) is taken as unseen" in tracks.notes
+    assert "1 joint whose x and y are both -1 is taken as unseen" in tracks.notes
     assert "1 joint whose x or y is exactly 0 is taken as unseen" in tracks.notes
     assert "1 joints of negative confidence are taken as unseen" in tracks.notes
     assert frames[1][0].joints[3, 2] == -0.1  # left as it was

@@ -81,7 +81,7 @@ def read_landmarks_json(path: Path) -> Landmarks:
     poses: dict[int, list[Sighting]] = {}
     hands: dict[int, list[Sighting]] = {}
     listed = list(_frames(data, path))
-    for number, (frame, where) in zip(_numbers(listed, out), (rest for _, *rest in listed), strict=True):
+    for number, (_, frame, where) in zip(_numbers(listed, out), listed, strict=True):
         if number in poses:
             raise FormatError(f"{where}: expected every frame once, got frame {number} again")
         poses[number], hands[number] = _people(frame, where, out.seen)

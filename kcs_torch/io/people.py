@@ -154,9 +154,9 @@ def _without_zeros(frames: Sequence[Sequence[Sighting]], measured: bool, notes: 
         zero = at_the_corner(joints[..., :2], seen, notes) | ~seen
     else:
         zero, minus = (joints[..., :2] == 0).any(-1), (joints[..., :2] == -1).all(-1)
-        for gone, how in ((zero, "whose x or y is exactly 0"), (minus, "that lies exactly at (-1, -1)")):
+        for gone, how in ((zero, "whose x or y is exactly 0"), (minus, "whose x and y are both -1")):
             if count := int((gone & seen).sum()):
-                are = f"joint {how} is" if count == 1 else f"joints {how.replace('lies', 'lie')} are"
+                are = f"joint {how} is" if count == 1 else f"joints {how} are"
                 notes.append(f"{count} {are} taken as unseen")
         zero |= minus
     kept = iter(np.where(zero[..., None], 0.0, joints))

@@ -4,13 +4,7 @@ from kcs_torch.nn.anatomy import AdductionEnergy, HingeEnergy
 from kcs_torch.nn.contact import ContactEnergy
 from kcs_torch.nn.critic import KCSCritic, critic_loss, generator_loss
 from kcs_torch.nn.distances import JointDistance, KCSDistance
-from kcs_torch.nn.energies import (
-    BoneLengthEnergy,
-    LowRankEnergy,
-    ReprojectionEnergy,
-    SmoothnessEnergy,
-    SymmetryEnergy,
-)
+from kcs_torch.nn.energies import BoneLengthEnergy, LowRankEnergy, SmoothnessEnergy, SymmetryEnergy
 from kcs_torch.nn.layers import SVT, BoneLengths, BoneVectors, KCSMatrix
 from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy
 from kcs_torch.nn.networks import CameraHead, MLPLifter, TemporalLifter
@@ -18,6 +12,7 @@ from kcs_torch.nn.perspective import PerspectiveEnergy
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.nn.procrustean import ProcrusteanEnergy
 from kcs_torch.nn.refined import RefinedLifter
+from kcs_torch.nn.reprojection import ReprojectionEnergy
 from kcs_torch.nn.stance import StanceEnergy
 from kcs_torch.nn.unrolled import UnrolledFPC, UnrolledKCS, UnrolledPKC, UnrolledSfAM
 

@@ -20,8 +20,8 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.nn.energies import centred_residual
 from kcs_torch.nn.masks import clear_padding
+from kcs_torch.nn.reprojection import centred_residual
 
 __all__ = ["majorise_step", "turn_onto_mean", "viewpoint_energy"]
 

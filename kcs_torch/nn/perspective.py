@@ -13,8 +13,9 @@ from kcs_torch.functional.guarded import LOST, or_one, safe_root
 from kcs_torch.functional.precision import full_precision, wide
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.weights import known
-from kcs_torch.nn.energies import check_clip, check_weights, huber_square
+from kcs_torch.nn.energies import check_clip, check_weights
 from kcs_torch.nn.layers import check_tensor, narrow, seen_weights, shown
+from kcs_torch.nn.reprojection import huber_square
 from kcs_torch.types.hints import is_a
 from kcs_torch.types.intrinsics import Intrinsics
 

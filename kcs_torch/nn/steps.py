@@ -14,7 +14,7 @@ from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median, nanmedian
 from kcs_torch.functional.spectral import spectral_norm, svt
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.nn.energies import centred_residual
+from kcs_torch.nn.reprojection import centred_residual
 from kcs_torch.solvers.lm import fit_bones
 
 __all__ = ["continuation", "corner_of", "data_scale", "estimate_lengths", "shape_step", "start_shape", "to_scale"]

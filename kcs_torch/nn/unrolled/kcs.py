@@ -25,9 +25,9 @@ from kcs_torch.nn.deviation import (
     frame_scales,
     template_scale,
 )
-from kcs_torch.nn.energies import centred_residual
 from kcs_torch.nn.layers import narrow
 from kcs_torch.nn.masks import clear_padding
+from kcs_torch.nn.reprojection import centred_residual
 from kcs_torch.nn.steps import continuation
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.skeleton import Skeleton, get_skeleton

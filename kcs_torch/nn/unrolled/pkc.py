@@ -14,10 +14,10 @@ from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.precision import full_precision
 from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.functional.weights import known
-from kcs_torch.nn.energies import centred_residual
 from kcs_torch.nn.layers import narrow
 from kcs_torch.nn.majorise import majorise_step, turn_onto_mean
 from kcs_torch.nn.masks import clear_padding
+from kcs_torch.nn.reprojection import centred_residual
 from kcs_torch.nn.steps import continuation, estimate_lengths, start_shape, to_scale
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.skeleton import Skeleton, get_skeleton
