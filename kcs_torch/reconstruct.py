@@ -28,10 +28,13 @@ WITHOUT = ("auto", "parallel")
 """What may be asked for in place of intrinsics."""
 
 SHARED = (
-    "all coordinates lie within 0 and 1 and are taken as they are: if they are shares of the image, multiply x by its "
+    "coordinates lie within 0 and 1 and are taken as they are: if they are shares of the image, multiply x by its "
     "width and y by its height, or the body is as distorted as the image is not square; else say units=..."
 )
 """What is told of arrays that may be shares of an image."""
+
+INSIDE = 0.9
+"""Share of the coordinates within 0 and 1 from which on they may be."""
 
 OF_TRACKS = ("joint_names", "edges", "threshold")
 """What tracks are made with, no field of any method."""
@@ -108,8 +111,7 @@ def reconstruct(
             )
     else:
         tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units or "px")
-        within = bool(((tracks.points >= 0) & (tracks.points <= 1)).all() & tracks.points.any())
-        if units is None and not isinstance(lens, Intrinsics) and within:
+        if units is None and not isinstance(lens, Intrinsics) and _within_one(tracks):
             warnings.warn(f"{tracks.source}: {SHARED}", KcsWarning, stacklevel=users_level())
     if find:
         tracks = with_found_bones(tracks)
@@ -118,6 +120,12 @@ def reconstruct(
     if chosen.knows_bones and lacking in tracks.notes:
         warnings.warn(f"{tracks.source}: {lacking}", KcsWarning, stacklevel=users_level())
     return _before(lens, chosen, tracks, cameras)
+
+
+def _within_one(tracks: Tracks) -> bool:
+    """Whether hardly any coordinate that is seen lies outside of 0 to 1: a hand may leave the image."""
+    seen = tracks.points[tracks.seen]
+    return bool(seen.any()) and float(((seen >= 0) & (seen <= 1)).to(seen).mean()) >= INSIDE
 
 
 def reconstruct_all(

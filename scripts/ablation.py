@@ -245,7 +245,10 @@ def recorded(shared: Path, suite: str, cases: int, frames: int) -> Iterator[Clip
     """Some clips of one of the protocol's suites."""
     from benchmark import load_input, load_protocol
 
-    protocol = load_protocol(shared)
+    try:
+        protocol = load_protocol(shared)
+    except kt.OptionError as error:
+        raise SystemExit(f"error: {error}") from None
     every = protocol.suites()[suite]
     for i in sorted(set(np.linspace(0, len(every) - 1, min(cases, len(every))).round().astype(int))):
         given, truth = protocol.build(shared / "data", {"max_frames": frames} | every[i])

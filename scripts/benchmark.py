@@ -10,7 +10,8 @@ Writes SUITE/CASE.npz (the prediction) and results.csv (a row a case) to the run
 prints the means of each suite; "covered" is the share of depths that are off by no more than the standard deviation
 that the method gives, after one scale for a clip. A sweep has one results.csv more, of all its runs. Each row is
 written when its case is done: with keep=true a sweep that was stopped goes on in its folder. Inputs, truth and figures
-are the protocol's own. A case that fails is a row with its error, and makes the exit code 1.
+are the protocol's own. A case that fails is a row with its error, and makes the exit code 1; it
+is 2 where the call is wrong.
 """
 
 from __future__ import annotations
@@ -30,7 +31,6 @@ from typing import Any
 try:
     import hydra
     from hydra.core.hydra_config import HydraConfig
-    from hydra.errors import CompactHydraException
     from hydra.types import RunMode
     from omegaconf import DictConfig, OmegaConf
 except ModuleNotFoundError as error:
@@ -44,6 +44,7 @@ from kcs_torch.io.atomic import atomic_path, write_table
 from kcs_torch.methods import METHODS
 from kcs_torch.metrics import coverage
 from kcs_torch.training.configured import (
+    PartFailed,
     check_switch,
     check_threads,
     check_whole,
@@ -64,15 +65,11 @@ COUNTS = {"clip": 10, "sequences": 1, "paths": 1, "seeds": 1, "walks": 1, "frame
 failed = 0  # cases of all jobs run in this process; Hydra hands no exit code through
 
 
-class CasesFailed(CompactHydraException):
-    """Some cases of a run failed; the others are done. Hydra prints it without a traceback."""
-
-
 def load_protocol(shared: Path) -> ModuleType:
     """Import protocol.py by its path."""
     path = shared / "protocol" / "protocol.py"
     if not path.is_file():
-        raise SystemExit(
+        raise OptionError(
             f"shared={shared}: expected a folder with protocol/protocol.py and data/, found none: "
             "the sequences are not part of the project"
         )
@@ -86,10 +83,10 @@ def load_protocol(shared: Path) -> ModuleType:
 def chosen(protocol: ModuleType, suites: str | list[str], pattern: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the (suite, case) pairs to run."""
     known = protocol.suites()
-    names = list(known) if suites == "all" else [suites] if isinstance(suites, str) else list(suites)
+    names = list(known) if suites == "all" else [suites] if isinstance(suites, str) else list(dict.fromkeys(suites))
     for name in names:
         if name not in known:
-            raise SystemExit(f"suite={name}: expected all or some of {', '.join(known)}")
+            raise OptionError(f"suite={name}: expected all or some of {', '.join(known)}")
     for name in names:
         for case in known[name]:
             if fnmatch(protocol.case_name(case), pattern):
@@ -239,7 +236,7 @@ def make_papers(paper: DictConfig, shared: Path, folder: Path) -> None:
     methods = options.pop("methods")
     chosen = tuple(METHODS) if methods == "all" else tuple([methods] if isinstance(methods, str) else methods)
     if wrong := [name for name in chosen if name not in METHODS]:
-        raise SystemExit(f"paper.methods={','.join(wrong)}: expected all or some of {', '.join(METHODS)}")
+        raise OptionError(f"paper.methods={','.join(wrong)}: expected all or some of {', '.join(METHODS)}")
     make(names, Settings(Bench(shared, frames, sequences), chosen, **options), folder)
 
 
@@ -309,7 +306,7 @@ def measure(config: DictConfig, suites: str | list[str], method: kt.Method, fold
     except KeyboardInterrupt:
         stopped = True
     if not rows and not stopped:
-        raise SystemExit(f"case={config.case}: matches no case of suite={config.suite}")
+        raise OptionError(f"case={config.case}: matches no case of suite={config.suite}")
     failed += wrong
     multirun = job.mode == RunMode.MULTIRUN
     shown = tabulate(Path(job.sweep.dir), columns) if multirun else rows
@@ -318,7 +315,7 @@ def measure(config: DictConfig, suites: str | list[str], method: kt.Method, fold
     if stopped:
         raise SystemExit("stopped: these are the cases that were done; keep=true goes on in the same folder")
     if wrong and multirun:
-        raise CasesFailed(f"{counted(wrong, 'case')} failed")  # of another process only an error is heard
+        raise PartFailed(f"{counted(wrong, 'case')} failed")  # of another process only an error is heard
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from robustness import Bench
 
+from kcs_torch.errors import OptionError
 from kcs_torch.io.atomic import write_table
 
 Row = dict[str, Any]
@@ -76,7 +77,7 @@ def chosen_parts(names: str | list[str]) -> dict[str, Part]:
     wanted = list(known) if names == "all" else [names] if isinstance(names, str) else list(names)
     wrong = [name for name in wanted if name not in known]
     if wrong:
-        raise SystemExit(f"paper.parts={','.join(wrong)}: expected all or some of {', '.join(known)}")
+        raise OptionError(f"paper.parts={','.join(wrong)}: expected all or some of {', '.join(known)}")
     return {name: known[name] for name in wanted}
 
 

@@ -12,7 +12,7 @@ A folder holds results of one method; another one is refused there. Finished res
 and leave NAME.failed.txt beside the results, and no file is ever half written. The shards of a multirun share nothing
 but the two folders, so that they may run on any machines that see these: hydra/launcher is joblib (processes),
 submitit_slurm or submitit_local, or ray: pip install ".[launchers]".
-Exit code 1 where a clip failed.
+Exit code 1 where a clip failed, 2 where the call is wrong.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import sys
 try:
     import hydra
     from hydra.core.hydra_config import HydraConfig
-    from hydra.errors import CompactHydraException
     from hydra.types import RunMode
     from omegaconf import DictConfig, OmegaConf
 except ModuleNotFoundError as error:
@@ -31,12 +30,7 @@ import torch
 
 from kcs_torch.errors import counted
 from kcs_torch.many import reconstruct_folder
-from kcs_torch.training.configured import check_threads, command_line, in_one_line, method_of
-
-
-class ClipsFailed(CompactHydraException):
-    """Some clips of a shard failed; the others are done. Hydra prints it without a traceback."""
-
+from kcs_torch.training.configured import PartFailed, check_threads, command_line, in_one_line, method_of
 
 failed = 0  # clips of all jobs run in this process; Hydra hands no exit code through
 
@@ -73,7 +67,7 @@ def main(config: DictConfig) -> None:
     print(f"shard {config.shard} of {config.shards}: {counted(outcome.clips, 'clip')}, {made}; {rest}")
     failed += len(outcome.failed)
     if outcome.failed and HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise ClipsFailed(f"{counted(len(outcome.failed), 'clip')} failed")  # of another process only an error is heard
+        raise PartFailed(f"{counted(len(outcome.failed), 'clip')} failed")  # of another process only an error is heard
 
 
 if __name__ == "__main__":

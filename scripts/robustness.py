@@ -261,7 +261,10 @@ def main(words: list[str] | None = None) -> None:
         options.csv.parent.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", kt.KcsWarning)
-    bench = Bench(options.shared, options.frames, options.sequences)
+    try:
+        bench = Bench(options.shared, options.frames, options.sequences)
+    except kt.OptionError as error:
+        raise SystemExit(f"error: {error}") from None
     everything: list[Run] = []
     for part in options.parts:
         runs = list(PARTS[part](bench, options.seeds))

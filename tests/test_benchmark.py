@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from kcs_torch.errors import OptionError
+
 PROTOCOL = """
 import numpy as np
 FIGURES = ("rigid", "bone_cv")
@@ -132,7 +134,7 @@ def test_a_method_of_ones_own_has_its_own_name(root, folder):
     (folder / "mine.py").write_text(text, encoding="utf-8")
     target = "method._target_=mine.Mine"
     alone = benchmark(root, folder, "suite=turn", target)
-    assert alone.returncode == 1 and f"{target}: cannot be imported: No module named 'mine'" in alone.stderr
+    assert alone.returncode == 2 and f"{target}: cannot be imported: No module named 'mine'" in alone.stderr
     assert "PYTHONPATH" in alone.stderr and "Traceback" not in alone.stderr
     done = benchmark(root, folder, "suite=turn", target, "hydra.run.dir=out", path=folder)
     assert done.returncode == 0, done.stderr
@@ -166,15 +168,16 @@ def test_suites_and_cases_are_chosen_by_name_and_pattern(script, folder):
     protocol = script.load_protocol(folder.parent / "shared")
     names = lambda *choice: [(s, c["src"]) for s, c in script.chosen(protocol, *choice)]  # noqa: E731
     assert names("turn", "*") == [("turn", "a"), ("turn", "b")]
+    assert names(["turn", "turn"], "*_a") == [("turn", "a")]
     assert names(["broken", "turn"], "*_a") == [("broken", "a"), ("turn", "a")]
     assert len(names("all", "*")) == 4
 
 
 def test_wrong_choices(script, folder):
-    with pytest.raises(SystemExit, match="expected a folder with protocol"):
+    with pytest.raises(OptionError, match="expected a folder with protocol"):
         script.load_protocol(folder / "nowhere")
     protocol = script.load_protocol(folder.parent / "shared")
-    with pytest.raises(SystemExit, match="turn, broken"):
+    with pytest.raises(OptionError, match="turn, broken"):
         list(script.chosen(protocol, ["turn", "walks"], "*"))
 
 
@@ -196,7 +199,7 @@ def test_wrong_choices(script, folder):
 )
 def test_wrong_settings_are_a_line(root, folder, words, told):
     done = benchmark(root, folder, "suite=turn", *words)
-    assert done.returncode == 1 and told in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -221,7 +224,7 @@ def test_hydra_is_missed_in_one_line(root, folder, name):
 
 def test_no_case_is_an_error(root, folder):
     done = benchmark(root, folder, "suite=turn", "case=x*")
-    assert done.returncode == 1 and "matches no case" in done.stderr
+    assert done.returncode == 2 and "error: case=x*: matches no case" in done.stderr
 
 
 def test_real_case_with_its_lens(root, shared, tmp_path):
@@ -233,7 +236,7 @@ def test_real_case_with_its_lens(root, shared, tmp_path):
     assert (first["intrinsics"], second["intrinsics"]) == ("none", "true")
     assert float(second["pa"]) < float(first["pa"])
     wrong = benchmark(root, tmp_path, *words, "intrinsics=maybe")
-    assert wrong.returncode == 1 and "expected null, true, auto or parallel" in wrong.stdout + wrong.stderr
+    assert wrong.returncode == 2 and "expected null, true, auto or parallel" in wrong.stdout + wrong.stderr
 
 
 def test_real_case_with_true_cameras(root, shared, tmp_path):

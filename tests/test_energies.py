@@ -1,5 +1,6 @@
 """Energies: values by hand, gradients with degenerate inputs, and the prox and gradient that solvers use."""
 
+import math
 import warnings
 from copy import deepcopy
 
@@ -273,6 +274,18 @@ def test_nuclear_energy_gradient(kind):
 def test_log_det_energy_gradient(kind):
     """Also of the level, which is a share of the variance."""
     assert gradcheck(LowRankEnergy("log_det"), clip(kind))
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e-17, 1e15])
+def test_log_det_energy_of_any_size(size):
+    """Squares of small points underflow in single precision; only the level of the energy depends on their size."""
+    points = normal(12, 5, 3).float()
+    small = (size * points).requires_grad_()
+    value = LowRankEnergy("log_det")(small)
+    (slope,) = torch.autograd.grad(value, small)
+    expected = LowRankEnergy("log_det")(points.double()) + 12 * 15 * math.log(size)
+    assert_close(value.double(), expected, rtol=1e-5, atol=1e-5)
+    assert_close((slope.double() * size * points).sum(), torch.tensor(12 * 15.0).double(), rtol=1e-4, atol=0)
 
 
 def test_low_rank_prox_is_optimal():

@@ -701,3 +701,18 @@ def test_other_hdf5_is_described(tmp_path):
 
 def test_limit_is_shared():
     assert sleap.LIMIT == animals.LIMIT
+
+
+def test_shares_of_the_image(tmp_path):
+    """Somebody who divides by the size of the video is asked for it, and heard."""
+    columns = deeplabcut_columns(("one", "two"))
+    values = deeplabcut_values(columns)
+    places = [c[-1] != "likelihood" for c in columns]
+    values[:, places] /= 1000
+    path = write_deeplabcut_csv(tmp_path / "a.csv", columns, values)
+    assert all(any("image_size=" in note for note in tracks.notes) for tracks in load_people(path))
+    values[:, places] *= 1000
+    whole = load_people(write_deeplabcut_csv(tmp_path / "b.csv", columns, values), image_size=(1000, 1000))
+    for tracks, expected in zip(load_people(path, image_size=(1000, 1000)), whole, strict=True):
+        assert torch.allclose(tracks.points, expected.points)
+        assert not any("image_size=" in note for note in (*tracks.notes, *expected.notes))

@@ -94,6 +94,29 @@ def test_shares_of_the_image_become_pixels(tmp_path):
     assert "the coordinates are pixels already" in tracks.notes
 
 
+def test_letters_that_there_are_none_of(tmp_path):
+    """Python fails on such a text, in whatever it is asked first."""
+    for order in "<>":
+        units = np.array(["mm"], f"{order}U2")
+        units.view(f"{order}u4")[1] = 0x100006D if order == "<" else 0x110000
+        with pytest.raises(FormatError, match="'units' is damaged: it holds letters that there are none of"):
+            load_tracks(written(tmp_path / "a.npz", units=units))
+    assert load_tracks(written(tmp_path / "a.npz", units=np.array("\U0010ffff"))).units == "\U0010ffff"
+
+
+def test_what_may_be_shares_of_the_image_is_told(tmp_path):
+    points = arrays()["points2d"] * 0 + [0.25, 0.5]
+    notes = load_tracks(written(tmp_path / "a.npz", points2d=points, units="px")).notes
+    told = [note for note in notes if "image_size=" in note]
+    assert len(told) == 1
+    again = load_tracks(
+        written(tmp_path / "a.npz", points2d=points, units="px", notes=np.array(json.dumps(told)))
+    ).notes
+    assert [note for note in again if "image_size=" in note] == told  # once, in a file that was saved with it
+    metres = load_tracks(written(tmp_path / "b.npz", points2d=points, units="m")).notes
+    assert not any("image_size=" in note for note in metres)
+
+
 def test_other_names_are_taken_in_their_order(tmp_path):
     body = Skeleton.from_names(["a", "b", "c"], [("a", "b"), ("b", "c")])
     tracks = load_tracks(written(tmp_path / "o.npz"), skeleton=body)

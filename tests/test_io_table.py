@@ -238,6 +238,14 @@ def test_joints_of_no_name_have_no_columns(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_joints_of_one_name_but_for_blanks_have_no_columns_of_their_own(tmp_path):
+    """Such a table was written, and could not be read."""
+    motion = Motion.from_arrays(torch.randn(3, 2, 3), joint_names=["a", " a"])
+    with pytest.raises(kt.OutputError, match="two joints are 'a': rename one"):
+        kt.save(motion, tmp_path / "walk.csv")
+    assert not list(tmp_path.iterdir())
+
+
 def test_coordinates_as_large_as_tracks_may_have_are_read_back(tmp_path, result):
     back = load_motion(kt.save(Motion.of(result).scaled(units="", factor=1e24), tmp_path / "walk.csv"))
     assert torch.allclose(back.points / 1e24, Motion.of(result).points, rtol=1e-6, atol=1e-6)

@@ -249,7 +249,7 @@ def test_a_sweep_writes_a_folder_for_each_method(tmp_path, root):
     done = subprocess.run(
         [*command, f"output={tmp_path}/one"], cwd=tmp_path, capture_output=True, text=True, timeout=300
     )
-    assert done.returncode == 1 and "holds results of method=kcs, got method=sfam" in done.stderr
+    assert done.returncode == 2 and "holds results of method=kcs, got method=sfam" in done.stderr
     told = subprocess.run([*command[:2], "--help"], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert "-m input=tracks 'output=motion/${hydra:runtime.choices.method}' method=kcs,sfam\n" in told.stdout
     assert "Traceback" not in done.stderr
@@ -380,7 +380,7 @@ def test_a_wrong_call_of_the_script_is_a_line(tmp_path, root, words, told):
     (tmp_path / "in").mkdir()
     command = [sys.executable, str(root / "scripts" / "reconstruct_many.py"), *words]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 1 and told in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr
     assert {path.name for path in tmp_path.iterdir()} <= {"in", "out"}  # Hydra leaves nothing unasked
 
 

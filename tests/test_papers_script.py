@@ -11,6 +11,7 @@ import torch
 from omegaconf import OmegaConf
 from torch.testing import assert_close
 
+from kcs_torch.errors import OptionError
 from kcs_torch.functional.align import centre
 from kcs_torch.methods import METHODS
 
@@ -78,7 +79,7 @@ def test_growth_is_told_by_its_exponent(papers):
 def test_parts_are_chosen_by_name(papers):
     assert list(papers.chosen_parts("all")) == list(papers.parts())
     assert list(papers.chosen_parts(["walk35", "table2"])) == ["walk35", "table2"]
-    with pytest.raises(SystemExit, match=r"walk36: expected all or some of table2, .*walk35"):
+    with pytest.raises(OptionError, match=r"walk36: expected all or some of table2, .*walk35"):
         papers.chosen_parts(["table2", "walk36"])
 
 
@@ -174,5 +175,5 @@ def test_one_command_writes_rows_tables_and_plots(root, shared, tmp_path):
 
 def test_unknown_methods_are_named(import_script, tmp_path):
     paper = {"parts": "all", "methods": ["kcs", "sfm"], "clip": 30, "sequences": 1}
-    with pytest.raises(SystemExit, match=f"sfm: expected all or some of {', '.join(METHODS)}"):
+    with pytest.raises(OptionError, match=f"sfm: expected all or some of {', '.join(METHODS)}"):
         import_script("benchmark").make_papers(OmegaConf.create(paper), tmp_path, tmp_path)

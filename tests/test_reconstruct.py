@@ -75,6 +75,10 @@ def test_arrays_that_seem_to_be_shares_of_an_image_are_told():
     with pytest.warns(kt.KcsWarning, match="multiply x by its width and y by its height"):
         reconstruct(shares, method="rigid", num_steps=1)
     reconstruct(shares, method="rigid", num_steps=1, units="m")  # a warning would be an error here
+    shares[3, 4, 1] = 1.02  # a joint has left the image
+    with pytest.warns(kt.KcsWarning, match="lie within 0 and 1"):
+        reconstruct(shares, method="rigid", num_steps=1)
+    reconstruct(2 * shares - 1, method="rigid", num_steps=1)
 
 
 def test_methods_that_know_of_no_bones_do_not_ask_for_them():

@@ -428,6 +428,37 @@ class TestSweeps:
         assert err.count("had ended with other settings, and is replaced") == 2
 
     @pytest.mark.filterwarnings("ignore:Experiment logs directory")
+    def test_figures_of_other_settings_are_not_kept(self, tmp_path, capsys):
+        """A debugging run leaves the checkpoints of the run before, but the figures are its own."""
+        words = [*SMALL, "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}"]
+        assert called(capsys, *words)[0] == 0
+        before = json.loads((tmp_path / RESULT).read_text())
+        assert called(capsys, *words, "+trainer.fast_dev_run=true")[0] == 0
+        assert json.loads((tmp_path / RESULT).read_text()) != before
+        code, out, err = called(capsys, *words, "keep=true")
+        assert code == 0 and "is kept" not in out and "is replaced" in err
+        assert json.loads((tmp_path / RESULT).read_text()) == before
+        code, out, err = called(capsys, *words, "keep=true")
+        assert code == 0 and "had ended, and is kept" in out, err
+
+    @pytest.mark.filterwarnings("ignore:Experiment logs directory")
+    def test_a_run_that_diverges_leaves_no_network(self, tmp_path, capsys):
+        words = [*SMALL, "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}"]
+        assert called(capsys, *words)[0] == 0 and (tmp_path / "lifter.safetensors").is_file()
+        code, out, err = called(capsys, *words, "+module.lr=1e30")
+        assert code == 0 and "inf" in out and "diverged" in err
+        assert not list(tmp_path.rglob("*.ckpt")) and not (tmp_path / "lifter.safetensors").exists()
+        code, out, err = called(capsys, *words, "+module.lr=1e30", "keep=true")
+        assert code == 0 and "had ended, and is kept" in out, err
+
+    def test_a_folder_that_cannot_be_made(self, tmp_path, capsys):
+        (tmp_path / "file").write_text("")
+        for name in ("hydra.run.dir", "hydra.sweep.dir"):
+            code, out, err = called(capsys, *SMALL, f"{name}={tmp_path}/file/run")
+            assert code == 2 and not out and err.startswith(f"error: {name}={tmp_path}/file/run: cannot be written to")
+            assert len(err.splitlines()) == 1
+
+    @pytest.mark.filterwarnings("ignore:Experiment logs directory")
     def test_figures_of_an_earlier_sweep_are_not_those_of_a_run_that_fails(self, tmp_path, monkeypatch, capsys):
         monkeypatch.chdir(tmp_path)
         assert called(capsys, *SWEEP, "+module.lr=1e-3,1e-4")[0] == 0

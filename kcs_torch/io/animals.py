@@ -17,6 +17,7 @@ from kcs_torch.io.build import build_tracks, nothing_seen
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.header import delimiter
 from kcs_torch.io.registry import Options, brief, read_error
+from kcs_torch.io.shares import are_shares, in_pixels
 from kcs_torch.types import Tracks
 
 __all__ = ["LIMIT", "Animal", "bounded_rows", "build_animals", "frames_of", "refuse_3d"]
@@ -140,6 +141,8 @@ def build_animals(
         shared.append(f"left out, as one joint alone is no body: {alone}")
     for animal in whole:
         _check(animal, path)
+    if are_shares(np.concatenate([a.points.ravel() for a in whole])):
+        whole = [a._replace(points=in_pixels(a.points, options.image_size, shared)) for a in whole]
     seen = [a for a in whole if _seen(a, options.threshold).any()]
     if not seen:
         faint = [a.confidence[_seen(a, 0.0)] for a in whole if a.confidence is not None]

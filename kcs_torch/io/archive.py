@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -91,6 +92,8 @@ class Archive:
             raise FormatError(f"{self.path}: '{key}' is damaged or truncated: {as_text(error)}") from None
         if array.dtype.kind not in kinds:
             raise FormatError(f"{self.path}: '{key}': expected {_say(kinds)}, got an array of {array.dtype}")
+        if array.dtype.kind == "U" and _beyond_unicode(array):
+            raise FormatError(f"{self.path}: '{key}' is damaged: it holds letters that there are none of")
         if ndim is not None and array.ndim != ndim:
             raise FormatError(f"{self.path}: '{key}': expected {ndim} dimensions, got shape {array.shape}")
         return array
@@ -160,6 +163,12 @@ def _header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
     header = np.lib.format.read_array_header_2_0 if new else np.lib.format.read_array_header_1_0
     shape, _, dtype = header(file)
     return shape, dtype
+
+
+def _beyond_unicode(texts: NDArray[Any]) -> bool:
+    """Whether numbers of letters are too large: Python would fail on such a text, or show what is beside it."""
+    letters = np.frombuffer(texts.tobytes(), np.dtype("u4").newbyteorder(texts.dtype.byteorder))
+    return bool((letters > sys.maxunicode).any())
 
 
 def _decode(value: Any) -> str:

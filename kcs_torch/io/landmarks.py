@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_joints, as_text, entries, read_json
-from kcs_torch.io.people import SIZE_HINT, Sighting, are_shares
+from kcs_torch.io.people import Sighting
 from kcs_torch.io.registry import Options
+from kcs_torch.io.shares import ASK, SIZE_HINT, are_shares
 from kcs_torch.io.times import frames_of_times, rate_of_times, time_unit
 from kcs_torch.skeleton import SKELETONS
 
@@ -251,7 +252,7 @@ def settle(found: Landmarks, path: Path, options: Options, *, shares: bool) -> N
             "are metres, say, in a table, name its format: csv"
         )
     elif small and size is None:
-        found.notes.append(f"coordinates are taken as they are: if they are shares of the image, give {SIZE_HINT}")
+        found.notes.append(ASK)
     small = small and size is not None
     visible = not found.seen & set(CONFIDENCES)
     seen = everything[:, 2]

@@ -16,15 +16,13 @@ from kcs_torch.io.build import build_tracks, nothing_seen
 from kcs_torch.io.layout import choose_layout
 from kcs_torch.io.link import follow_people
 from kcs_torch.io.registry import Options, brief
+from kcs_torch.io.shares import ASK, are_shares
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 from kcs_torch.types.intake import at_the_corner
 
-__all__ = ["SIZE_HINT", "Sighting", "are_shares", "people_tracks"]
+__all__ = ["Sighting", "people_tracks"]
 
-SIZE_HINT = "image_size=(width, height) (kcs-torch: --image-size 1920x1080)"
-
-_SHARES = 2.0  # coordinates whose median is above this are no shares of the image
 _OVERSHOOT = 1.5  # some networks' confidences pass 1 a little; above this they are on another scale
 _WELL_SEEN = 0.95  # quantile of the confidences that counts as certain where they are on another scale
 _PER_CENT = (50.0, 100.0)  # between these the largest confidence is per cent
@@ -163,12 +161,6 @@ def _without_zeros(frames: Sequence[Sequence[Sighting]], measured: bool, notes: 
     return [[s._replace(joints=next(kept)) for s in frame] for frame in frames]
 
 
-def are_shares(places: NDArray[np.float64]) -> bool:
-    """Whether places (..., 2) in an image, some of which may be NaN, are shares of it rather than pixels."""
-    known = places[np.isfinite(places)]
-    return len(known) > 0 and bool(np.median(np.abs(known)) <= _SHARES)
-
-
 def _in_pixels(
     frames: Sequence[Sequence[Sighting]], size: tuple[int, int] | None, notes: list[str]
 ) -> Sequence[Sequence[Sighting]]:
@@ -177,7 +169,7 @@ def _in_pixels(
     if not seen or not are_shares(np.concatenate(seen)):
         return frames
     if size is None:
-        notes.append(f"coordinates are taken as they are: if they are shares of the image, give {SIZE_HINT}")
+        notes.append(ASK)
         return frames
     return [[s._replace(joints=s.joints * [*size, 1]) for s in frame] for frame in frames]
 

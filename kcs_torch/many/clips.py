@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import zlib
+import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
@@ -59,7 +59,8 @@ class Clip:
 
     def share_of(self, shards: int) -> int:
         """Which of so many parts of the work it belongs to: told by its name alone, the same on every machine."""
-        return zlib.crc32(self.name.encode("utf-8", "surrogateescape")) % shards
+        digest = hashlib.blake2b(self.name.encode("utf-8", "surrogateescape"), digest_size=8).digest()
+        return int.from_bytes(digest, "big") % shards
 
 
 def clips_of(source: str | Path, output: str | Path, pattern: str = "*") -> list[Clip]:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_lengths
-from kcs_torch.functional.guarded import or_one, safe_root
+from kcs_torch.functional.guarded import largest, or_one, safe_root
 from kcs_torch.functional.precision import full_precision, wide
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.spectral import log_det, nuclear_norm, svt
@@ -167,20 +167,21 @@ class LowRankEnergy(nn.Module):
         """T/2 log det(Sigma + eps I) of rows (..., T, D); what has no share in any frame adds nothing."""
         if share is None:
             frames: Tensor | int = matrix.shape[-2]
-            centred = matrix - matrix.sum(-2, keepdim=True) / max(frames, 1)
-            covariance = centred.mT @ centred / max(frames, 1)
-            gone = torch.zeros_like(covariance[..., 0])
-            variance = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
+            centred = (matrix - matrix.sum(-2, keepdim=True) / max(frames, 1)) / max(frames, 1) ** 0.5
+            gone = torch.zeros_like(matrix.sum(-2))
         else:
             share = share.to(matrix.dtype)
             frames, count = share.amax(-1).sum(-1), share.sum(-2, keepdim=True)
             mean = (share * matrix).sum(-2, keepdim=True) / or_one(count)
             centred = safe_root(share / or_one(count)) * (matrix - mean)
-            covariance = centred.mT @ centred
             gone = (count <= 0).to(matrix.dtype).squeeze(-2)
-            variance = covariance.diagonal(dim1=-2, dim2=-1).sum(-1) / or_one((1 - gone).sum(-1))
-        level = self.eps * or_one(variance)
-        return frames / 2 * log_det(covariance + torch.diag_embed(gone * (1 - level[..., None])), level)
+        real = (1 - gone).sum(-1)
+        unit = or_one(largest(centred, 2))  # squares of what is small would underflow
+        centred = centred / unit
+        covariance = centred.mT @ centred
+        level = self.eps * or_one(covariance.diagonal(dim1=-2, dim2=-1).sum(-1) / or_one(real))
+        low = log_det(covariance + torch.diag_embed(gone * (1 - level[..., None])), level)
+        return frames / 2 * (low + 2 * real * unit[..., 0, 0].log())
 
     def prox(self, points: Tensor, threshold: Tensor | float) -> Tensor:
         """Singular value shrinkage of S#, the nuclear norm's proximal map: (..., T, N, D)."""

@@ -71,7 +71,7 @@ class _Network(SkeletonModule):
     ) -> None:
         super().__init__(skeleton)
         kind = type(self).__name__
-        check_whole(self, 1, width=width, window=window)
+        check_whole(self, 1, window=window)
         if not (is_a(dropout, float) and 0 <= dropout < 1):
             raise OptionError(f"{kind}: dropout: expected a share within [0, 1), got {dropout!r}")
         if window % 2 == 0:
@@ -176,6 +176,7 @@ class MLPLifter(_Lifter):
         window: int = 1,
     ) -> None:
         check_whole(self, 0, num_blocks=num_blocks)
+        check_whole(self, 1, width=width)
         super().__init__(skeleton, width=width, dropout=dropout, window=window, dilations=(0,) * num_blocks)
         self._options = {"width": width, "num_blocks": num_blocks, "dropout": dropout, "window": window}
 
@@ -211,6 +212,7 @@ class TemporalLifter(_Lifter):
         if not isinstance(given, Iterable) or not all(isinstance(d, Integral) and int(d) >= 1 for d in given):
             raise OptionError(f"TemporalLifter: dilations: expected whole numbers from 1, got {dilations!r}")
         dilations = tuple(int(d) for d in dilations)
+        check_whole(self, 1, channels=channels)
         super().__init__(skeleton, width=channels, dropout=dropout, window=1, dilations=dilations)
         self._options = {"channels": channels, "dilations": list(dilations), "dropout": dropout}
 
@@ -245,6 +247,7 @@ class CameraHead(_Network):
         window: int = 1,
     ) -> None:
         check_whole(self, 0, num_blocks=num_blocks)
+        check_whole(self, 1, width=width)
         super().__init__(skeleton, width=width, dropout=dropout, window=window, dilations=(0,) * num_blocks, outputs=7)
         self._options = {"width": width, "num_blocks": num_blocks, "dropout": dropout, "window": window}
 

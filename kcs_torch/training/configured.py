@@ -10,6 +10,7 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from hydra.errors import CompactHydraException, HydraException, InstantiationException
@@ -22,6 +23,7 @@ from kcs_torch.methods import Method
 from kcs_torch.types.hints import is_a, spoken
 
 __all__ = [
+    "PartFailed",
     "WrongConfiguration",
     "check_switch",
     "check_threads",
@@ -38,6 +40,10 @@ class WrongConfiguration(CompactHydraException):
     """What is wrong with the configuration of a run; Hydra prints it without a traceback."""
 
 
+class PartFailed(CompactHydraException):
+    """Some of a run's work failed, and the rest is done; Hydra prints it without a traceback."""
+
+
 def configs() -> Path:
     """The folder of the configurations: in a wheel it is a part of the package, in a clone it is beside it."""
     package = Path(__file__).resolve().parents[1]
@@ -47,7 +53,7 @@ def configs() -> Path:
 
 @contextmanager
 def command_line(program: str, arguments: Sequence[str] | None = None, start: str | None = None) -> Iterator[None]:
-    """Within this context Hydra finds a program's arguments, in an order that it takes; exit with 2 if one is unknown.
+    """Within this context Hydra finds a program's arguments, in an order that it takes; exit with 2 if one is wrong.
 
     Args:
         program: name of its configuration.
@@ -58,6 +64,7 @@ def command_line(program: str, arguments: Sequence[str] | None = None, start: st
     given = list(before[1:] if arguments is None else arguments)
     try:
         _check_names(program, given)
+        _check_folders(given)
     except OptionError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
@@ -65,8 +72,32 @@ def command_line(program: str, arguments: Sequence[str] | None = None, start: st
     sys.argv = [start or before[0], *sorted(given, key=lambda one: re.match(r"~|[^-][^=]*=", one) is not None)]
     try:
         yield
+    except SystemExit as end:  # Hydra leaves with 1 whatever it was; what it was is the context
+        cause = end.__context__
+        wrong = isinstance(cause, (HydraException, OmegaConfBaseException))
+        told = wrong and not isinstance(cause, (InstantiationException, PartFailed))
+        raise SystemExit(2 if told else end.code) from None
     finally:
         sys.argv = before
+
+
+def _check_folders(arguments: Sequence[str]) -> None:
+    """Look at the folders of runs, which Hydra makes before it asks anybody.
+
+    Raises:
+        OptionError: one cannot be made, or cannot be written to.
+    """
+    for argument in arguments:
+        name, _, value = argument.partition("=")
+        if name not in ("hydra.run.dir", "hydra.sweep.dir") or not value or set(value) & set("$'\"\\"):
+            continue  # of what Hydra has yet to resolve it tells itself
+        folder = Path(value)
+        there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        try:
+            with TemporaryDirectory(dir=there):
+                pass
+        except OSError as error:
+            raise OptionError(f"{argument}: cannot be written to: {there}: {error.strerror}") from None
 
 
 def _check_names(program: str, arguments: Sequence[str]) -> None:
@@ -78,8 +109,8 @@ def _check_names(program: str, arguments: Sequence[str]) -> None:
     if any(argument.startswith(("--config", "-cn", "-cp", "-cd")) for argument in arguments):
         return  # another configuration has other names
     own = OmegaConf.load(configs() / f"{program}.yaml")
-    groups = (next(iter(entry)) for entry in own.defaults if isinstance(entry, Mapping))
-    known = {str(name) for name in (*own, *groups)} - {"defaults"}
+    groups = (str(next(iter(entry))) for entry in own.defaults if isinstance(entry, Mapping))
+    known = {*map(str, own), *(name for name in groups if not name.startswith("override "))} - {"defaults"}
     for argument in arguments:
         bare = argument.lstrip("-")
         if bare != argument and bare.partition("=")[0] in known:
@@ -103,6 +134,8 @@ def in_one_line(*also: type[Exception]) -> Iterator[None]:
     """
     try:
         yield
+    except PartFailed:
+        raise
     except Exception as error:
         if (text := _told(error, also)) is None or os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise

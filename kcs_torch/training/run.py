@@ -18,13 +18,11 @@ import hydra
 import lightning
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError, warnings_told
 from kcs_torch.io.atomic import atomic_path
@@ -42,6 +40,12 @@ from kcs_torch.training.configured import (
 from kcs_torch.training.sweep import RESULT, tabulate
 
 __all__ = ["Outcome", "configs", "job", "main", "train"]
+
+LIFTER = "lifter.safetensors"
+"""The file of a run's network."""
+
+SETTINGS = "settings.json"
+"""The file of the settings that gave a run's figures: Hydra's own are of whatever was called last."""
 
 QUIET = (
     r".*does not have many workers.*",  # batches are made faster than they are used
@@ -108,6 +112,8 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         if "enable_progress_bar" not in config.trainer:
             made["enable_progress_bar"] = sys.stderr.isatty()
         trainer = instantiate(own, **made, _convert_="all")
+        if resumed is None:
+            _clear(folder)
         try:
             trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
         except (Diverged, NotFiniteError):  # a loss or a solver was given NaN
@@ -130,10 +136,16 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         tested = trainer.test(module, datamodule=data, ckpt_path=best.best_model_path, verbose=False, weights_only=True)
     metrics = {name: float(figure) for figures in tested for name, figure in figures.items()}
     notes = {"config": _for_json(plain), "metrics": {name: f for name, f in metrics.items() if math.isfinite(f)}}
-    lifter = folder / "lifter.safetensors"
+    lifter = folder / LIFTER
     if savable:
         save_lifter(lifter, module.network, fps=data.fps, notes=notes)
     return Outcome(float(best.best_model_score), metrics, lifter if savable else None)
+
+
+def _clear(folder: Path) -> None:
+    """Remove an earlier run's networks: should this one diverge, they would pass for its own."""
+    for name in (LIFTER, *(f"checkpoints/{kind}.ckpt" for kind in ("best", "last"))):
+        (folder / name).unlink(missing_ok=True)
 
 
 def _savable(network: Any) -> bool:
@@ -178,7 +190,10 @@ def _checkpoint(path: Path, config: Mapping[str, Any]) -> Path:
 
 def _differing(checkpoint: Path, config: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
     """The settings that a checkpoint's run had otherwise, as they were and as they are."""
-    then = torch.load(checkpoint, map_location="cpu", weights_only=True)["config"]
+    return _changes(torch.load(checkpoint, map_location="cpu", weights_only=True)["config"], config)
+
+
+def _changes(then: Any, config: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
     before, now = _flat(then), _flat(config)
     keys = sorted({*before, *now} - {"resume", "keep"})
     return [(key, before.get(key), now.get(key)) for key in keys if before.get(key) != now.get(key)]
@@ -187,9 +202,9 @@ def _differing(checkpoint: Path, config: Mapping[str, Any]) -> list[tuple[str, A
 def _ended(config: DictConfig, folder: Path) -> dict[str, float | None] | None:
     """The figures of a run of the same settings that ended in this folder before; None where there is none."""
     with suppress(Exception):  # whatever is wrong with its files, it did not end
-        plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
-        if not _differing(folder / "checkpoints" / "last.ckpt", plain):
-            return dict(json.loads((folder / RESULT).read_text(encoding="utf-8")))
+        result, then = (json.loads((folder / name).read_text(encoding="utf-8")) for name in (RESULT, SETTINGS))
+        if not _changes(then, _for_json(OmegaConf.to_container(config, resolve=True))):
+            return dict(result)
     return None
 
 
@@ -249,8 +264,10 @@ def job(config: DictConfig) -> float:
         outcome = train(config, folder)
     figures = {config.optimise: outcome.value} | dict(outcome.metrics)
     result = {name: figure if math.isfinite(figure) else None for name, figure in figures.items()}
-    with atomic_path(folder / RESULT) as temporary:
-        temporary.write_text(json.dumps(result, indent=2), encoding="utf-8")
+    plain = _for_json(OmegaConf.to_container(config, resolve=True))
+    for name, content in ((SETTINGS, plain), (RESULT, result)):  # who finds a result finds the settings of it
+        with atomic_path(folder / name) as temporary:
+            temporary.write_text(json.dumps(content, indent=2), encoding="utf-8")
     print("  ".join(f"{name} {value:.4g}" for name, value in figures.items()), outcome.lifter or folder, sep="\n")
     if settings.mode == RunMode.MULTIRUN:
         tabulate(Path(settings.sweep.dir))
@@ -262,12 +279,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     entry = hydra.main(version_base="1.3", config_path=str(configs()), config_name="train")(job)
     # What stands first is what Lightning starts for each further device.
     with command_line("train", arguments, start=None if arguments is None else __file__):
-        try:
-            entry()
-        except SystemExit as end:  # Hydra leaves with 1 whatever it was; what it was is the context
-            wrong = isinstance(end.__context__, (HydraException, OmegaConfBaseException))
-            told = wrong and not isinstance(end.__context__, InstantiationException)
-            raise SystemExit(2 if told else end.code) from None
+        entry()
 
 
 if __name__ == "__main__":

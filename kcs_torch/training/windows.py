@@ -91,8 +91,8 @@ class FilmedWindows:
             frames = len(clip.points)
             if frames < window:
                 raise ShapeError(
-                    f"{clip.source}: expected at least a window of {window} frames, got {frames}: leave it out by a "
-                    f"pattern !{clip.source} or choose a smaller window"
+                    f"{clip.source}: expected at least a window of {window} frames, got {frames}: choose a smaller "
+                    "window, or leave this clip out (a file by a pattern that begins with !)"
                 )
             own = list(range(0, frames - window + 1, stride))
             if to_the_end and own[-1] < frames - window:

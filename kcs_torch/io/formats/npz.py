@@ -32,9 +32,9 @@ from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io.archive import Archive, array_names
 from kcs_torch.io.build import build_tracks
 from kcs_torch.io.build_motion import build_motion
-from kcs_torch.io.people import are_shares
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, Saving, Writer
+from kcs_torch.io.shares import are_shares, in_pixels
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Intrinsics, Motion, Reconstruction, Tracks
 from kcs_torch.types.axes import AXES, from_y_up
@@ -59,10 +59,10 @@ def read(path: Path, options: Options) -> list[Tracks]:
     points = file.array("points2d", "fiu", 3)
     units = file.text("units") if "units" in file else "px"
     notes = _json(file, "notes", list) if "notes" in file else []
-    if options.image_size is not None and units == "px" and points.shape[-1] == 2:
+    if units == "px" and points.shape[-1] == 2:
         if are_shares(points):
-            points = points * np.array(options.image_size)
-        else:
+            points = in_pixels(points, options.image_size, notes)
+        elif options.image_size is not None:
             notes.append("the coordinates are pixels already")
     return [
         build_tracks(

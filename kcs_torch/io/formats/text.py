@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -42,9 +43,11 @@ def write_motion_csv(motion: Motion, path: Path, saving: Saving) -> None:
 def _write_rows(
     points: NDArray[Any], moved: Reconstruction | Motion, more: dict[str, NDArray[Any]], path: Path
 ) -> None:
-    blank = [i for i, joint in enumerate(moved.skeleton.joints) if not joint.strip()]
-    if blank:
-        raise OutputError(f"a table's columns need joint names, and that of joint {blank[0]} is blank: name it")
+    names = [joint.strip() for joint in moved.skeleton.joints]  # who reads the table leaves blanks out
+    if "" in names:
+        raise OutputError(f"a table's columns need joint names, and that of joint {names.index('')} is blank: name it")
+    if twice := [joint for joint, count in Counter(names).items() if count > 1]:
+        raise OutputError(f"a table's columns need different names, and two joints are '{twice[0]}': rename one")
     unit = f" [{moved.units}]" if moved.units else ""
     header = [f"{cell(joint)}_{axis}{unit}" for joint in moved.skeleton.joints for axis in "xyz"]
     header += [f"{name}{unit}" for name in more]
