@@ -105,6 +105,11 @@ def test_joints_on_their_parents_are_left_out(tmp_path):
     assert "left out because they lie on their parent: Extra" in motion.notes
 
 
+def test_a_frame_that_takes_no_time_is_told(tmp_path):
+    motion = load_motion(write(tmp_path, TEXT.replace("Frame Time: 0.04", "Frame Time: 0")))
+    assert motion.fps is None and "Frame Time is 0 seconds: the frame rate is unknown" in motion.notes
+
+
 def test_names_are_made_to_differ(tmp_path):
     assert load_motion(write(tmp_path, TEXT.replace("Leg", "Hips"))).skeleton.joints == ("Hips", "Hips_2", "Hips_end")
 

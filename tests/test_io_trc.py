@@ -48,6 +48,20 @@ def test_cells_by_hand(tmp_path):
     assert load_motion(tmp_path / "x.trc", up="z").points[0, 0].tolist() == [1, 3, -2]
 
 
+def test_times_of_the_rows(tmp_path):
+    """The header is believed, but told; where it has no rate, times tell it."""
+    rows = "".join(f"{i + 1}\t{i / 30:.3f}\t1\t2\t3\t4\t5\t6\n" for i in range(9))
+    head = HEAD.replace("\t2\t2\tmm", "\t9\t2\tmm")
+    told = "the header tells 60 frames a second, the rows' times 29.963: the header is believed"
+    motion = load_motion(write(tmp_path, head + rows))
+    assert motion.fps == 60 and told in motion.notes
+    motion = load_motion(write(tmp_path, head.replace("60\t60", "30\t30") + rows))
+    assert motion.fps == 30 and not any("header" in note for note in motion.notes)
+    assert load_motion(write(tmp_path, head.replace("60\t60", "0\t0") + rows)).fps == 29.963
+    assert load_motion(write(tmp_path, head.replace("60\t60", "0\t0") + rows.replace("0.033", "?"))).fps is None
+    assert load_motion(write(tmp_path, HEAD + "1\n" + ROWS[ROWS.index("2\t0.016") :])).fps == 60  # a row without a time
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -67,6 +67,8 @@ def read(path: Path, options: MotionOptions) -> Motion:
     if left:
         shown = ", ".join(left[:5]) + (", ..." if len(left) > 5 else "")
         notes.append(f"left out because they lie on their parent: {shown}")
+    if not seconds > 0:
+        notes.append(f"Frame Time is {seconds:g} seconds: the frame rate is unknown")
     at = {i: k for k, i in enumerate(stay)}
     return build_motion(
         points[:, stay],

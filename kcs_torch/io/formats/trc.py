@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from array import array
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +20,14 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.build_motion import build_motion, distinct, numbers, read_lines
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer
+from kcs_torch.io.times import rate_of_times
 from kcs_torch.types import Motion
 from kcs_torch.types.axes import from_y_up
 from kcs_torch.types.size import short_unit
 
 __all__ = ["MOTION_READERS", "WRITERS"]
 
+_OFF, _ROUNDED = 0.02, 0.002  # by which a rate and times are apart at most: a share, and seconds, as times are rounded
 _UNSEEN = ("", "nan", "NaN", "NAN", "-nan", "nan(ind)")
 
 
@@ -49,6 +52,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
     if not names:
         raise FormatError(f"{path}: line {at + 1}: expected names of markers, got none")
     frames: list[array[float]] = []
+    times: dict[int, float] = {}
     for number, line in enumerate(lines[at + 1 :], at + 2):
         row = cells_of(line)
         if not any(row) or not row[0]:  # the line below the names holds X1, Y1, Z1, ...; an empty one may follow
@@ -60,6 +64,8 @@ def read(path: Path, options: MotionOptions) -> Motion:
             )
         cells = cells[: 3 * len(names)] + [""] * (3 * len(names) - len(cells))
         filled = iter(numbers([c for c in cells if c not in _UNSEEN], f"{path}: line {number}"))
+        with suppress(ValueError, IndexError):
+            times[len(frames)] = float(row[1])
         frames.append(array("d", [math.nan if c in _UNSEEN else next(filled) for c in cells]))
     if not frames:
         raise FormatError(f"{path}: expected a line a frame below the names of the markers, got none")
@@ -67,13 +73,16 @@ def read(path: Path, options: MotionOptions) -> Motion:
     told = header.get("NumFrames", "")
     if told.isdigit() and int(told) != len(frames):
         notes.append(f"the header tells {told} frames, the file has {len(frames)}")
-    rate = header.get("DataRate", "")
+    rate, real = header.get("DataRate", ""), rate_of_times(times, "s", []) if len(times) == len(frames) else None
+    fps = (_rate(rate, path) if rate else None) or real
+    if fps and real and abs(1 / real - 1 / fps) > _OFF / fps + _ROUNDED / len(frames):
+        notes.append(f"the header tells {fps:g} frames a second, the rows' times {real:g}: the header is believed")
     return build_motion(
         torch.from_numpy(np.array(frames, np.float64)).reshape(len(frames), len(names), 3),
         options,
         source=str(path),
         names=distinct(names),
-        fps=_rate(rate, path) if rate else None,
+        fps=fps,
         units=short_unit(header.get("Units", "")),
         notes=notes,
     )
