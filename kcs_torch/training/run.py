@@ -112,7 +112,7 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         if "enable_progress_bar" not in config.trainer:
             made["enable_progress_bar"] = sys.stderr.isatty()
         trainer = instantiate(own, **made, _convert_="all")
-        if resumed is None:
+        if resumed is None or folder.resolve() not in resumed.parents:
             _clear(folder)
         try:
             trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
