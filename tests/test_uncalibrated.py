@@ -1,6 +1,7 @@
 """A camera of which nothing is known: near ones are noticed and their focal length found, far ones change nothing."""
 
 import functools
+import math
 import warnings
 from dataclasses import replace
 
@@ -13,7 +14,7 @@ from typer.testing import CliRunner
 import kcs_torch as kt
 from kcs_torch.cli import app
 from kcs_torch.io import load_reconstruction
-from kcs_torch.methods import uncalibrated
+from kcs_torch.methods import perspective, refining, scene, uncalibrated
 from kcs_torch.methods.pkc import body
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
 from kcs_torch.methods.uncalibrated import likely_lens, looking
@@ -71,6 +72,23 @@ def test_a_near_camera_takes_one_search(monkeypatch):
     monkeypatch.setattr(kt.PKC, "solve", lambda *given: searched.append(0) or solve(*given))
     assert quietly(filmed(frames=15)[0]).distance is not None
     assert len(searched) == 1
+
+
+def test_runs_are_turned_over_once_through_one_lens(monkeypatch):
+    """A round whose focal length hardly differs from that of the last flips would find what they found."""
+    focals, flips = [], []
+    again, over = perspective.refine_again, scene.Scene.turned_over
+    monkeypatch.setattr(perspective, "refine_again", lambda *given: focals.append(given[1].lens.focal) or again(*given))
+    monkeypatch.setattr(scene.Scene, "turned_over", lambda *given: flips.append(focals[-1]) or over(*given))
+    assert quietly(filmed(3000.0, frames=30)[0]).distance is not None
+    assert len(focals) > len(flips) >= 1 and flips[0] == focals[0]
+    last = flips[0]
+    for focal in focals[1:]:
+        if abs(math.log(focal / last)) > refining.SAME:
+            last = focal
+            assert last in flips
+        else:
+            assert focal not in flips
 
 
 @pytest.mark.parametrize(("fps", "block"), [(30.0, 400), (60.0, 400), (30.0, 25)], ids=["one", "strides", "blocks"])

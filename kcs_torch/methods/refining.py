@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -20,6 +21,9 @@ __all__ = ["Found", "refine", "refine_again", "seen_along"]
 FLAT = 0.0003
 """Root mean square parallax, for a body of 1.75, below which there is no perspective to speak of."""
 
+SAME = 0.1
+"""Change of the focal length's logarithm up to which a lens shows what another one did."""
+
 
 @dataclass(frozen=True)
 class Found:
@@ -32,6 +36,7 @@ class Found:
         view: whose rays are the scene's.
         flat: whether there was no perspective to speak of, so that they are the method's own.
         notes: of the method on the tracks, whichever of its solutions is best here.
+        through: focal length through which flips of runs of signs were last looked for, or None.
     """
 
     bodies: Bodies
@@ -40,6 +45,7 @@ class Found:
     view: View
     flat: bool
     notes: tuple[str, ...] = ()
+    through: float | None = None
 
 
 def seen_along(view: View, lifted: Reconstruction, distance: Tensor, straight: Tracks) -> Reconstruction:
@@ -114,14 +120,21 @@ def refine(
 
 @undifferentiated
 def refine_again(found: Found, view: View, standing: Tensor | None, steps: int, flips: bool) -> Found:
-    """Refine what was found with its focal length, from the view through such a lens."""
-    before = found.bodies[found.bodies.energy.isfinite()]
+    """Refine what was found with its focal length, from the view through such a lens.
+
+    Runs of signs that nothing bettered through nearly the same lens are not looked over again.
+    """
+    focal, before = view.lens.focal, found.through
+    flips = flips and (before is None or abs(math.log(focal / before)) > SAME)
+    bodies = found.bodies[found.bodies.energy.isfinite()]
     rays = view.seen_from(found.view, found.scene.rays)
     scene = replace(found.scene, rays=rays, standing=standing, any_focal=False)
-    scene, bodies = _settled(scene, before.distance[0], before.depth, steps, flips, any_focal=True)
-    bodies = replace(bodies, origin=before.origin[bodies.origin])
+    origin = bodies.origin
+    scene, bodies = _settled(scene, bodies.distance[0], bodies.depth, steps, flips, any_focal=True)
+    bodies = replace(bodies, origin=origin[bodies.origin])
     lifted = tuple(_turned(one, view.look @ found.view.look.mT) for one in found.lifted)
-    return replace(found, bodies=bodies, lifted=lifted, scene=scene, view=view)
+    through = focal if flips else before
+    return replace(found, bodies=bodies, lifted=lifted, scene=scene, view=view, through=through)
 
 
 def _settled(
