@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.functional import centre, nearest_rotation, procrustes, similarity
+from kcs_torch.functional import centre, minimal_turn, nearest_rotation, procrustes, similarity, superpose
+from kcs_torch.metrics import ALIGNMENTS
 
 MIRROR = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
 
@@ -167,3 +168,25 @@ def test_random_rotations_are_rotations():
     turn = rotations(10)
     assert_close(turn @ turn.mT, torch.eye(3).double().expand(10, 3, 3))
     assert_close(torch.linalg.det(turn), torch.ones(10).double())
+
+
+@pytest.mark.parametrize("kind", HALVES)
+def test_half_precision_of_large_points(kind):
+    """Sums of pixels or millimetres leave the range of half precision, and so do their squares."""
+    points, weights = (torch.full((1, 17, 3), 4000.0)).to(kind), torch.ones(1, 17).to(kind)
+    assert centre(points, weights)[1].unique().tolist() == [4000.0]
+    body = (300 * normal(5, 17, 3)).to(kind)
+    turned = (body.double() @ rotations(5)).to(kind)
+    for how in ALIGNMENTS:
+        moved = superpose(body, turned, how)
+        assert moved.dtype == kind and moved.isfinite().all()
+    for moved in (similarity(body, turned), superpose(body, turned, "similarity")):
+        assert (moved.double() - turned.double()).norm(dim=-1).mean() < 8 * torch.finfo(kind).eps * 300
+    rotation, scale = procrustes(centre(body)[0], centre(turned)[0])
+    assert rotation.dtype == scale.dtype == kind and (scale - 1).abs().max() < 8 * torch.finfo(kind).eps
+
+
+def test_minimal_turn_of_short_vectors():
+    quarter = minimal_turn(torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]))
+    for size in (1e-13, 1e-30, 1e20):
+        assert_close(minimal_turn(torch.tensor([size, 0, 0]), torch.tensor([0.0, size, 0])), quarter)

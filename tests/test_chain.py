@@ -217,3 +217,8 @@ def test_bones_of_a_list_are_pairs_of_the_points_joints(call):
         ):
             call(points, wrong)
     assert torch.equal(call(points, np.array([[0, 4]])), call(points, [(0, 4)]))
+
+
+def test_points_from_bones_that_do_not_fit():
+    with pytest.raises(ShapeError, match="points_from_bones: inverse: expected shape"):
+        points_from_bones(torch.randn(4, 3), torch.randn(5, 6))

@@ -322,3 +322,13 @@ def test_bodies_of_any_size_keep_their_joints(tmp_path, factor):
     back = load_motion(save(motion, tmp_path / "w.bvh", notes=[]))
     assert back.skeleton.joints == motion.skeleton.joints
     assert torch.allclose(back.points / factor, motion.points / factor, atol=1e-6)
+
+
+@pytest.mark.parametrize("fps", [1 / 30, 1 / 3600, 29.97, 120.0])
+def test_slow_rates_come_back(tmp_path, fps):
+    """Three decimals of one frame an hour are none."""
+    points = torch.rand(1, 17, 3).double().expand(5, 17, 3)
+    motion = kt.Motion.from_arrays(points, skeleton="h36m17", units="m", fps=fps)
+    for suffix in (".bvh", ".csv"):
+        kt.save(motion, tmp_path / f"slow{suffix}")
+        assert load_motion(tmp_path / f"slow{suffix}").fps == pytest.approx(fps, rel=1e-5)

@@ -229,6 +229,16 @@ def test_svt_of_no_data():
     assert solution.converged and torch.equal(solution.value, torch.zeros(4, 3))
 
 
+def test_svt_settles_each_problem_of_a_batch():
+    """The residual was measured over the batch, in which a small problem counts for nothing."""
+    target, mask = completion()
+    both = torch.stack([1000 * target, target])
+    solution = svt(mask, mask, mask(both), threshold=1.0, num_steps=2000)
+    assert solution.converged
+    off = torch.linalg.matrix_norm(mask(solution.value - both)) / torch.linalg.matrix_norm(mask(both))
+    assert off.max() < 2e-4
+
+
 def test_svt_gradient_and_batches():
     _, mask = completion()
     run = lambda t, level: svt(mask, mask, mask(t), threshold=level, num_steps=4, tolerance=0.0).value  # noqa: E731

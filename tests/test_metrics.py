@@ -249,6 +249,16 @@ def test_e3d_of_any_precision(given, known):
         assert torch.allclose(e3d(pred, truth).double(), exact, rtol=1e-5)
 
 
+@pytest.mark.parametrize("value", [0.0, 3.0, 1 / 3])
+def test_e3d_of_a_truth_that_is_a_point(value):
+    """Its size is 0, or rounding."""
+    pred, point = torch.randn(4, 7, 3), torch.full((4, 7, 3), value)
+    assert e3d(pred, point).isnan() and e3d(point, point).isnan()
+    clips = e3d(torch.stack([pred, pred]), torch.stack([point, 2 * pred]))
+    assert clips.isnan().tolist() == [True, False]
+    assert e3d(torch.zeros(0, 7, 3), torch.zeros(0, 7, 3)).isnan()
+
+
 def test_weights_of_e3d_are_shares():
     truth, pred = clip(), clip(seed=1)
     weights = torch.rand(12, 6, generator=torch.Generator().manual_seed(2), dtype=torch.float64)

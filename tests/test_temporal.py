@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numerics import DEVICES, FLOATS, finite, gradcheck, leaves_arguments_alone, normal, same_as_loop
 from torch.testing import assert_close
 
-from kcs_torch.errors import OptionError
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import best_path, blend_windows, interpolate, standing, window_starts
 
 # ---------------------------------------------------------------------- gaps
@@ -207,3 +207,15 @@ def test_results_follow_dtype_and_device(dtype, device):
     ]
     assert {(v.dtype, v.device.type) for v in results} == {(dtype, device)}
     assert best_path(values[:, :, 0], values.new_zeros(5, 4, 4)).device.type == device
+
+
+def test_what_does_not_fit_is_told():
+    points = normal(9, 5, 2)
+    for seen in (torch.ones(7, 5).bool(), torch.ones(9, 5), None):
+        with pytest.raises(ShapeError, match="interpolate: seen: expected"):
+            interpolate(points, seen)
+    with pytest.raises(ShapeError, match="blend_windows: expected parts"):
+        blend_windows(torch.zeros(0, 3, 2), [], 5)
+    with pytest.raises(ShapeError, match="blend_windows: expected parts"):
+        blend_windows(torch.zeros(2, 3, 2), [0], 5)
+    assert best_path(torch.zeros(2, 0, 3), torch.zeros(2, 0, 3, 3)).shape == (2, 0)

@@ -143,3 +143,9 @@ def test_wrong_frames_are_told():
         draw_tracks(tracks(), frame=5)
     with pytest.raises(OptionError, match="at least one person"):
         draw_tracks([])
+
+
+def test_what_is_no_frame_and_a_skeleton_by_its_name():
+    with pytest.raises(OptionError, match="expected a frame from 0 to 0, got 0.5"):
+        draw_tracks(Tracks.from_arrays(torch.rand(1, 17, 2), skeleton="h36m17"), frame=0.5)
+    assert draw_skeleton("coco17").axes

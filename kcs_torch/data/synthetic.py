@@ -16,6 +16,7 @@ from kcs_torch.functional import bone_lengths, bone_vectors, chain_inverse, inci
 from kcs_torch.functional.rotation import skew
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
+from kcs_torch.types.hints import is_a
 
 __all__ = ["SyntheticClip", "random_motion", "walking_person"]
 
@@ -28,6 +29,7 @@ _RANGES = {
     "size": (1e-6, math.inf, "a positive number"),
     "noise": (0, math.inf, "a number not below 0"),
     "missing": (0, 1, "a share, at least 0 and below 1"),
+    **dict.fromkeys(("yaw", "pitch", "turn", "swing"), (-math.inf, math.inf, "a finite number of degrees")),
 }
 
 
@@ -92,6 +94,7 @@ def walking_person(
     (torch.Size([40, 19, 3]), 40, 'mm')
     """
     _check(num_frames=num_frames, fps=fps, noise=noise, missing=missing, height=height)
+    _check(yaw=yaw, pitch=pitch, turn=turn)
     body = get_skeleton(skeleton)
     body.validate()
     rest, segments = _rest_pose(body)
@@ -150,6 +153,7 @@ def random_motion(
     torch.Size([20, 3, 3])
     """
     _check(num_frames=num_frames, fps=fps, noise=noise, missing=missing, size=size)
+    _check(yaw=yaw, pitch=pitch, turn=turn, swing=swing)
     body = get_skeleton(skeleton)
     if not body.bones:
         raise SkeletonError(f"random_motion: skeleton '{body.name}' has no bones")
@@ -181,9 +185,8 @@ def _check(**numbers: float) -> None:
     """OptionError where a number is out of its range."""
     for name, value in numbers.items():
         least, most, words = _RANGES[name]
-        whole = name != "num_frames" or isinstance(value, int)
-        if not (whole and math.isfinite(value) and least <= value < most):
-            raise OptionError(f"{name}: expected {words}, got {value}")
+        if not (is_a(value, int if name == "num_frames" else float) and math.isfinite(value) and least <= value < most):
+            raise OptionError(f"{name}: expected {words}, got {value!r}")
 
 
 def _rest_pose(body: Skeleton) -> tuple[Tensor, list[str]]:

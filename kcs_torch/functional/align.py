@@ -10,7 +10,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.functional.derivatives import applied, batch_first
 from kcs_torch.functional.guarded import LOST, largest, or_one, unit_size
-from kcs_torch.functional.precision import wide
+from kcs_torch.functional.precision import full_precision, wide
 from kcs_torch.functional.rotation import skew
 from kcs_torch.functional.shapes import check_core
 
@@ -53,9 +53,9 @@ def centre(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tenso
         mean = points.mean(-2, keepdim=True)
     else:
         check_core(weights, "centre: weights", points.shape[-2])
-        total = weights.sum(-1)[..., None, None]
-        total = or_one(total)
-        mean = (points * weights[..., None]).sum(-2, keepdim=True) / total
+        total = or_one(wide(weights).sum(-1)[..., None, None])
+        mean = (wide(points) * weights[..., None]).sum(-2, keepdim=True) / total
+        mean = mean.to(torch.promote_types(points.dtype, weights.dtype))
     return points - mean, mean
 
 
@@ -77,7 +77,7 @@ def minimal_turn(source: Tensor, target: Tensor) -> Tensor:
     """
     check_core(source, "minimal_turn: source", 3)
     check_core(target, "minimal_turn: target", 3)
-    a, b = torch.nn.functional.normalize(source, dim=-1), torch.nn.functional.normalize(target, dim=-1)
+    a, b = (torch.nn.functional.normalize(x / or_one(largest(x, 1)), dim=-1) for x in (source, target))
     a, b = torch.broadcast_tensors(a, b)
     still = (a.square().sum(-1) < 0.5) | (b.square().sum(-1) < 0.5)
     spin = skew(torch.linalg.cross(a, b))
@@ -147,11 +147,14 @@ def procrustes(
         raise ShapeError(f"procrustes: source and target: expected equal shapes, got {got}")
     if weights is not None:
         check_core(weights, "procrustes: weights", source.shape[-2])
+    dtype = torch.promote_types(source.dtype, target.dtype)
+    source, target = wide(source), wide(target)
     left = source if weights is None else source * weights[..., None]
-    rotation = nearest_rotation(left.mT @ target, reflect=reflect)
-    size = (left * source).sum((-2, -1))
-    overlap = ((left @ rotation) * target).sum((-2, -1))
-    return rotation, overlap / or_one(size)
+    with full_precision(left):
+        rotation = nearest_rotation(left.mT @ target, reflect=reflect)
+        size = (left * source).sum((-2, -1))
+        overlap = ((left @ rotation) * target).sum((-2, -1))
+    return rotation.to(dtype), (overlap / or_one(size)).to(dtype)
 
 
 def similarity(
@@ -176,14 +179,16 @@ def similarity(
     core = ("T", "N", "D") if sequence else ("N", "D")
     check_core(source, "similarity: source", *core)
     check_core(target, "similarity: target", *source.shape[-len(core) :])
-    a, _ = centre(source)
-    b, mean = centre(target)
+    dtype = torch.promote_types(source.dtype, target.dtype)
+    a, _ = centre(wide(source))
+    b, mean = centre(wide(target))
     flat = (lambda x: x.flatten(-3, -2)) if sequence else (lambda x: x)
     rotation, factor = procrustes(flat(a), flat(b), reflect=reflect)
     if sequence:
         rotation, factor = rotation[..., None, :, :], factor[..., None]
-    moved = a @ rotation
-    return (moved * factor[..., None, None] if scale else moved) + mean
+    with full_precision(a):
+        moved = a @ rotation
+    return ((moved * factor[..., None, None] if scale else moved) + mean).to(dtype)
 
 
 def superpose(
@@ -216,6 +221,13 @@ def superpose(
         check_core(weights, "superpose: weights", *source.shape[-len(core) : -1])
     if how == "none":
         return source
+    dtype = torch.promote_types(source.dtype, target.dtype)
+    source, target = wide(source), wide(target)
+    with full_precision(source):
+        return _superposed(source, target, how, weights, root).to(dtype)
+
+
+def _superposed(source: Tensor, target: Tensor, how: str, weights: Tensor | None, root: int | None) -> Tensor:
     mass = torch.ones_like(target[..., 0]) if weights is None else weights.to(target)
     sequence = how == "sequence"
     over, counts = 3 if sequence else 2, mass[..., None] > 0

@@ -84,7 +84,7 @@ def joint_angles(points: Tensor, joints: Tensor | Sequence[Sequence[int]]) -> Te
         (..., J) in radians: 0 straight, pi folded; 0 with the derivative 0 where two joints coincide.
 
     Raises:
-        ShapeError: ``joints`` is not (J, 3), or lists joints that the points have not.
+        ShapeError: ``joints`` is not (J, 3), or a list of joints that the points have not.
 
     >>> arm = torch.tensor([[0.0, 0, 0], [0, 3, 0], [2, 3, 0]])
     >>> joint_angles(arm, [(0, 1, 2)]).rad2deg().tolist()

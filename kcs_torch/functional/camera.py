@@ -143,7 +143,8 @@ def factorize(tracks: Tensor, rank: int) -> tuple[Tensor, Tensor]:
 
     Returns:
         M (..., T, 2, rank) whose columns carry the singular values, in falling order, and S (..., rank, N) with
-        orthonormal rows.
+        orthonormal rows. Derivatives are those of singular vectors: none, NaN that is, where singular values coincide
+        or are 0, as those of tracks that do not move.
 
     Raises:
         ShapeError: the tracks are not (..., T, N, 2), or the rank is out of range.

@@ -82,7 +82,12 @@ def points_from_bones(vectors: Tensor, inverse: Tensor) -> Tensor:
 
     Returns:
         (..., N, D) points.
+
+    Raises:
+        ShapeError: they are not of these shapes.
     """
+    check_core(vectors, "points_from_bones: vectors", "B", "D")
+    check_core(inverse, "points_from_bones: inverse", "N", vectors.shape[-2])
     return inverse @ vectors
 
 

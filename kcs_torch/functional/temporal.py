@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.precision import wide
-from kcs_torch.functional.shapes import broadcast_shapes, check_core
+from kcs_torch.functional.shapes import broadcast_shapes, check_core, fit_together
 
 __all__ = ["best_path", "blend_windows", "fill_between", "interpolate", "jitter", "standing", "window_starts"]
 
@@ -26,10 +26,15 @@ def interpolate(values: Tensor, seen: Tensor) -> Tensor:
         (..., T, N, D). A joint never seen takes the mean of the seen joints of each frame (0 where there is none).
 
     Raises:
-        ShapeError: the values are not (..., T, N, D).
+        ShapeError: the values are not (..., T, N, D), or ``seen`` is not of truth values that fit them.
     """
     check_core(values, "interpolate: values", "T", "N", "D")
     frames = values.shape[-3]
+    if not isinstance(seen, Tensor) or seen.dtype != torch.bool or not fit_together(seen.shape, values.shape[:-1]):
+        got = f"{tuple(seen.shape)} of {seen.dtype}" if isinstance(seen, Tensor) else type(seen).__name__
+        raise ShapeError(
+            f"interpolate: seen: expected (..., T, N) = {tuple(values.shape[:-1])} of torch.bool, got {got}"
+        )
     seen = seen.expand(values.shape[:-1])
     time = torch.arange(frames, device=values.device)[:, None].expand(seen.shape)
     before = torch.where(seen, time, -1).cummax(-2).values
@@ -161,7 +166,15 @@ def blend_windows(parts: Tensor, starts: list[int], length: int) -> Tensor:
 
     Returns:
         (T, ...).
+
+    Raises:
+        ShapeError: there are no windows, or not one for each start.
     """
+    if parts.ndim < 2 or not len(parts) or len(parts) != len(starts):
+        raise ShapeError(
+            f"blend_windows: expected parts (W, T_w, ...) of as many windows as starts, at least one, got "
+            f"{tuple(parts.shape)} and {len(starts)} starts"
+        )
     window = parts.shape[1]
     ramp = torch.arange(1, window + 1, dtype=parts.dtype, device=parts.device)
     ramp = torch.minimum(ramp, ramp.flip(0))
@@ -198,7 +211,7 @@ def best_path(cost: Tensor, transition: Tensor) -> Tensor:
     check_core(cost, "best_path: cost", "T", "S")
     frames, states = cost.shape[-2:]
     check_core(transition, "best_path: transition", max(frames - 1, 0), states, states)
-    if frames == 1:
+    if frames <= 1:
         return cost.argmin(-1)
     batch = broadcast_shapes(cost.shape[:-2], transition.shape[:-3])
     problems, count = 2 * math.prod(batch), frames - 1

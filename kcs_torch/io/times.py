@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from kcs_torch.io.folders import frame_numbers
 
-__all__ = ["frames_of_times", "rate_of_times", "time_unit"]
+__all__ = ["frames_of_times", "plain_rate", "rate_of_times", "time_unit"]
 
 _TIME = re.compile(r"(?:time|timestamp|t)[ _]?[\[(]?(?P<unit>|s|sec|seconds|ms|msec|milliseconds)[\])]?\Z")
 _UNEVEN = 0.3  # of a frame, by which times may be off
@@ -60,7 +60,16 @@ def rate_of_times(times: Mapping[int, float], unit: str, notes: list[str]) -> fl
         if scale > 1:
             notes.append(f"times are taken to count {scale:.0f} a second")
         rate *= scale
-    return round(rate, 3) or None
+    return plain_rate(rate) or None
+
+
+def plain_rate(rate: float) -> float:
+    """A rate without what rounded times make of it: to three decimals, or six digits below 10 a second.
+
+    >>> plain_rate(1 / 0.033333), plain_rate(1 / 30)
+    (30.0, 0.0333333)
+    """
+    return round(rate, 3) if rate >= 10 else float(f"{rate:.6g}")
 
 
 def _even(times: Sequence[float]) -> list[int] | None:

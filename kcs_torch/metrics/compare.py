@@ -15,6 +15,7 @@ from kcs_torch.metrics.align import ALIGNMENTS
 from kcs_torch.metrics.errors import bone_deviation, e3d, mpjpe, pck
 from kcs_torch.skeleton.mapping import map_joints
 from kcs_torch.types import Motion
+from kcs_torch.types.hints import is_a
 from kcs_torch.types.size import METRES, unit_ratio
 
 __all__ = ["Comparison", "compare"]
@@ -95,8 +96,8 @@ def compare(
         if not isinstance(one, Motion):
             hint = "Motion.of(result) makes it of a result"
             raise OptionError(f"compare: {name}: expected Motion, got {type(one).__name__}; {hint}")
-    if within is not None and not 0 < within < math.inf:
-        raise OptionError(f"within (--within): expected a positive distance, got {within}")
+    if within is not None and not (is_a(within, float) and 0 < within < math.inf):
+        raise OptionError(f"within (--within): expected a positive distance, got {within!r}")
     notes: list[str] = []
     names = _joints(pred, truth, notes)
     pred, truth = _same_frames(pred, truth, notes)

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import bone_lengths, centre, nearest_rotation
 from kcs_torch.functional.chain import index_rows
-from kcs_torch.functional.guarded import or_one, safe_root
+from kcs_torch.functional.guarded import LOST, largest, or_one, safe_root
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.shapes import check_core
@@ -124,7 +124,9 @@ def e3d(pred: Tensor, truth: Tensor, *, weights: Tensor | None = None) -> Tensor
     count = or_one(count)
     spread = safe_root((target.square() * mass[..., None]).sum(-2) / count)  # (..., T, 3)
     some = (mass.sum(-1) > 0).to(mass)
-    return _mean(distance, weights) / ((spread.mean(-1) * some).sum(-1) / some.sum(-1))
+    size = (spread.mean(-1) * some).sum(-1) / some.sum(-1)
+    lost = LOST * torch.finfo(truth.dtype).eps * largest(truth, 3, mass[..., None] > 0)[..., 0, 0, 0]
+    return _mean(distance, weights) / torch.where(size > lost, size, torch.nan)
 
 
 def coverage(
@@ -175,6 +177,8 @@ def coverage(
 
 def bone_deviation(points: Tensor, bones: Bones, *, weights: Tensor | None = None) -> Tensor:
     """Median over the bones of their length's standard deviation over the mean: how far they are from rigid.
+
+    Of an even number of bones it is the lower of the two in the middle.
 
     Args:
         points: (..., T, N, 3).

@@ -152,7 +152,8 @@ class PCK(MPJPE):
 class E3D(_Mean):
     """Mean over the clips of the normalised error of non-rigid structure from motion, :func:`kcs_torch.metrics.e3d`.
 
-    One orthogonal matrix for a clip, which may mirror, as papers have it. Clips without any known joint do not count.
+    One orthogonal matrix for a clip, which may mirror, as papers have it. Clips without any known joint, or whose truth
+    is a point, do not count.
     """
 
     higher_is_better = False
@@ -160,8 +161,7 @@ class E3D(_Mean):
     def update(self, pred: Tensor, truth: Tensor, weights: Tensor | None = None) -> None:
         """Add a batch of clips, as :meth:`MPJPE.update`."""
         value = e3d(pred, truth, weights=weights)
-        some = torch.ones_like(value) if weights is None else (weights > 0).flatten(-2).any(-1)
-        self._add(value, some)
+        self._add(value, ~torch.isnan(value))
 
 
 class BoneDeviation(_Mean):

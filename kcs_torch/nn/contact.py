@@ -66,16 +66,22 @@ class ContactEnergy(SkeletonModule):
             ShapeError: the shapes do not fit.
         """
         self._check(points, velocity, standing)
+        inside = torch.ones_like(points[..., 0, 0], dtype=torch.bool)
         if weights is not None:
-            seen = weights[..., self.contacts] if weighs_joints(weights, points, self) else weights[..., None]
-            standing = torch.minimum(standing, seen)
+            of_joints = weighs_joints(weights, points, self)
+            seen = weights[..., self.contacts] if of_joints else weights[..., None]
+            standing = torch.where(seen > 0, torch.minimum(standing, seen), torch.zeros_like(standing))
+            some = (weights.amax(-1) if of_joints else weights) > 0
+            inside = some.flip(-1).cumsum(-1).flip(-1) > 0  # what follows the last frame of any weight pads a clip
         depth = wide(points)[..., self.contacts, 2]
         both = torch.minimum(standing[..., 1:, :], standing[..., :-1, :])
         step = known((depth[..., 1:, :] - depth[..., :-1, :])[..., None], both)[..., 0]
-        velocity = self._best(step, both) if velocity is None else wide(velocity)
+        velocity = self._best(step, both, inside) if velocity is None else wide(velocity)
+        velocity = known(velocity[..., None], inside)[..., 0]
         move = step + velocity[..., 1:, None]
         slip = (both * torch.log1p((move / self.slip).square())).sum((-2, -1)) / 2
-        steady = ((velocity[..., 2:] - velocity[..., 1:-1]) / self.change).square().sum(-1) / 2
+        change = (velocity[..., 2:] - velocity[..., 1:-1]) * inside[..., 2:]
+        steady = (change / self.change).square().sum(-1) / 2
         return narrow(slip + steady + RIDGE / 2 * (velocity[..., 1:] / self.slip).square().sum(-1), points)
 
     def _check(self, points: Tensor, velocity: Tensor | None, standing: Tensor) -> None:
@@ -96,9 +102,10 @@ class ContactEnergy(SkeletonModule):
                 raise ShapeError(f"ContactEnergy: {name}: expected {expected}, got {got}")
 
     @torch.no_grad()
-    def _best(self, step: Tensor, standing: Tensor) -> Tensor:
+    def _best(self, step: Tensor, standing: Tensor, inside: Tensor) -> Tensor:
         """The velocity (..., T) that costs least."""
         if not self.contacts.numel() or not step.shape[-2]:
             return step.new_zeros(*step.shape[:-2], step.shape[-2] + 1)
-        best = root_velocity(step, standing.to(step), self.slip, self.change, num_steps=self.num_steps)
+        own = standing.to(step), self.slip, self.change
+        best = root_velocity(step, *own, num_steps=self.num_steps, inside=inside[..., 1:])
         return torch.nn.functional.pad(best, (1, 0))

@@ -171,7 +171,8 @@ def svt(
         threshold: the larger, the nearer the solution is to that of the nuclear norm alone.
         step: below 2 over the squared norm of ``forward``.
         num_steps: at most so many steps.
-        tolerance: stop where the residual is this share of the target.
+        tolerance: stop where the residual is this share of the target, in each problem of a batch: over the last two
+            dimensions of the target (the last one, if it has no other).
         grad_steps: as in :func:`iterate`.
 
     Returns:
@@ -183,7 +184,8 @@ def svt(
     >>> svt(lambda X: X, lambda Y: Y, Y, threshold=0.5).value.round(decimals=2).tolist()
     [[3.0, 0.0], [0.0, 1.0]]
     """
-    goal = torch.linalg.vector_norm(target.detach()) * tolerance
+    norm = lambda x: torch.linalg.vector_norm(x, dim=tuple(range(-min(x.ndim, 2), 0)))  # noqa: E731
+    goal = norm(target.detach()) * tolerance
 
     def ascend(state: tuple[Tensor, Tensor], _: int) -> tuple[Tensor, Tensor]:
         dual = state[0]
@@ -194,7 +196,7 @@ def svt(
         ascend,
         (step * target, adjoint(torch.zeros_like(target))),
         num_steps=num_steps,
-        change=lambda old, new: torch.linalg.vector_norm(new[0] - old[0]) / step - goal,
+        change=lambda old, new: norm(new[0] - old[0]) / step - goal,
         tolerance=0.0,
         grad_steps=grad_steps,
     )

@@ -15,7 +15,9 @@ RIDGE = 1e-3
 
 
 @widened
-def root_velocity(move: Tensor, weight: Tensor, slip: float, change: float, *, num_steps: int = 10) -> Tensor:
+def root_velocity(
+    move: Tensor, weight: Tensor, slip: float, change: float, *, num_steps: int = 10, inside: Tensor | None = None
+) -> Tensor:
     """Return the body's velocity in depth at which standing feet stand still.
 
     min over v of 1/2 sum_tc w_tc log(1 + ((m_tc + v_t)/s)^2) + 1/2 sum_t ((v_t - v_t-1)/a)^2 + RIDGE/2 sum_t (v_t/s)^2,
@@ -27,6 +29,7 @@ def root_velocity(move: Tensor, weight: Tensor, slip: float, change: float, *, n
         slip: s, standard deviation of a standing foot's velocity.
         change: a, standard deviation of the change of the body's velocity.
         num_steps: reweightings.
+        inside: (..., T), False in changes to frames that pad a shorter clip; their velocity is 0.
 
     Returns:
         v (..., T), the body's change of depth from a frame to the next.
@@ -37,6 +40,8 @@ def root_velocity(move: Tensor, weight: Tensor, slip: float, change: float, *, n
     """
     velocity = torch.zeros_like(move[..., 0])
     tie = torch.full_like(velocity[..., 1:], -1 / change**2)  # of each to the next
+    if inside is not None:
+        tie = tie * inside[..., 1:]
     own = RIDGE / slip**2 + torch.nn.functional.pad(-tie, (0, 1)) + torch.nn.functional.pad(-tie, (1, 0))
     for _ in range(num_steps):
         pull = weight / (1 + ((move + velocity[..., None]) / slip).square()) / slip**2

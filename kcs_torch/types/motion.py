@@ -16,6 +16,7 @@ from kcs_torch.functional import interpolate, orbit
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
 from kcs_torch.types.angles import JointAngles, Joints, angles_of
 from kcs_torch.types.axes import from_y_up, to_y_up
+from kcs_torch.types.hints import is_a
 from kcs_torch.types.intake import as_floats, as_number, take_in
 from kcs_torch.types.intrinsics import Intrinsics
 from kcs_torch.types.reconstruction import Reconstruction
@@ -252,8 +253,8 @@ class Motion(Trajectories):
         >>> walk.tracks(yaw=45, intrinsics=(1000, 1000, 640, 360)).units
         'px'
         """
-        if not (math.isfinite(noise) and noise >= 0):
-            raise OptionError(f"noise: expected a number not below 0, got {noise}")
+        if not (is_a(noise, float) and math.isfinite(noise) and noise >= 0):
+            raise OptionError(f"noise: expected a number not below 0, got {noise!r}")
         points = self.in_camera(yaw=yaw, pitch=pitch, turn=turn)
         if intrinsics is None:
             image, units = points[..., :2].clone(), self.units or "px"

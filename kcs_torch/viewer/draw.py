@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import OptionError, OutputError
-from kcs_torch.skeleton import Skeleton
+from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
+from kcs_torch.types.hints import is_a
 from kcs_torch.types.people import files_named
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.labels import write_labels
@@ -52,8 +54,8 @@ def draw_tracks(people: Tracks | Sequence[Tracks], *, frame: int | None = None) 
         raise OptionError("draw_tracks: expected tracks of at least one person, got none")
     frames = max(p.num_frames for p in people)
     chosen = clearest_frame(people) if frame is None else frame
-    if not 0 <= chosen < frames:
-        raise OptionError(f"draw_tracks: expected a frame from 0 to {frames - 1}, got {frame}")
+    if not (is_a(chosen, int) and 0 <= chosen < frames):
+        raise OptionError(f"draw_tracks: expected a frame from 0 to {frames - 1}, got {frame!r}")
     poses = [_pose(p, chosen) for p in people]
     counts = [int(np.isfinite(x[: p.skeleton.num_observed]).all(-1).sum()) for p, x in zip(people, poses, strict=True)]
     there = [k for k in range(len(people)) if counts[k]] or [0]
@@ -77,7 +79,7 @@ def draw_tracks(people: Tracks | Sequence[Tracks], *, frame: int | None = None) 
     return figure
 
 
-def draw_skeleton(skeleton: Skeleton) -> Figure:
+def draw_skeleton(skeleton: str | Path | Skeleton) -> Figure:
     """Draw a skeleton with the joints' numbers and names: mirror pairs in their colours, virtual joints hollow.
 
     It shows the template pose from where its joints are best told apart. Of a skeleton without one it shows which
@@ -88,7 +90,9 @@ def draw_skeleton(skeleton: Skeleton) -> Figure:
 
     Raises:
         OutputError: matplotlib is not installed.
+        SkeletonError: there is no skeleton of that name.
     """
+    skeleton = get_skeleton(skeleton)
     figure, (axis,) = _panels(1, skeleton.num_joints)
     virtual = skeleton.num_joints - skeleton.num_observed
     facts = [f"{skeleton.num_observed} joints", *([f"{virtual} virtual (hollow)"] if virtual else [])]

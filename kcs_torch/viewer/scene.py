@@ -42,6 +42,8 @@ def scene_of(results: Sequence[Reconstruction], names: Sequence[str] | None = No
     """
     if not results:
         raise OptionError("player: expected at least one result, got none")
+    if wrong := [r for r in results if not isinstance(r, Reconstruction)]:
+        raise OptionError(f"player: expected results of reconstruct(), got {type(wrong[0]).__name__}")
     rate = clip_rate(results, "player")
     names = person_names(results) if names is None else list(names)
     if len(names) != len(results):

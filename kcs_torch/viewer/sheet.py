@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.types import Reconstruction
+from kcs_torch.types.hints import is_a
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.draw import frame_alone, new_figure
 from kcs_torch.viewer.names import printable
@@ -47,8 +48,8 @@ def sheet(result: Reconstruction, *, frames: int = 8, turn: float = TURN) -> Fig
         OptionError: ``frames`` is below 1.
         OutputError: matplotlib is not installed, or no joint is at a finite place.
     """
-    if frames < 1:
-        raise OptionError(f"frames: expected at least 1, got {frames}")
+    if not (is_a(frames, int) and frames >= 1):
+        raise OptionError(f"frames: expected a whole number, at least 1, got {frames!r}")
     points = result.points.detach().cpu().double().numpy()
     if not np.isfinite(points).all(-1).any():
         raise OutputError("a picture needs at least one joint at a finite place")

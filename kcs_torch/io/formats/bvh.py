@@ -27,6 +27,7 @@ from kcs_torch.io.build_motion import build_motion, distinct, numbers, read_line
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer
 from kcs_torch.io.rig import Rig, check_tree, fit_rig
+from kcs_torch.io.times import plain_rate
 from kcs_torch.types import Motion
 from kcs_torch.types.axes import from_y_up
 from kcs_torch.types.size import METRES
@@ -76,7 +77,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
         source=str(path),
         names=distinct([nodes[i].name for i in stay]),
         edges=[(at[stands[nodes[i].parent]], at[i]) for i in stay if nodes[i].parent >= 0],
-        fps=round(1 / seconds, 3) if seconds > 0 else None,
+        fps=plain_rate(1 / seconds) if seconds > 0 else None,
         notes=notes,
     )
 
