@@ -228,6 +228,7 @@ def superpose(
 
 
 def _superposed(source: Tensor, target: Tensor, how: str, weights: Tensor | None, root: int | None) -> Tensor:
+    """:func:`superpose` of arguments that fit, at least in single precision."""
     mass = torch.ones_like(target[..., 0]) if weights is None else weights.to(target)
     sequence = how == "sequence"
     over, counts = 3 if sequence else 2, mass[..., None] > 0

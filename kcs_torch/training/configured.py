@@ -92,12 +92,12 @@ def _check_folders(arguments: Sequence[str]) -> None:
         if name not in ("hydra.run.dir", "hydra.sweep.dir") or not value or set(value) & set("$'\"\\"):
             continue  # of what Hydra has yet to resolve it tells itself
         folder = Path(value)
-        there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
         try:
+            there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
             with TemporaryDirectory(dir=there):
                 pass
         except OSError as error:
-            raise OptionError(f"{argument}: cannot be written to: {there}: {error.strerror}") from None
+            raise OptionError(f"{argument}: cannot be written to: {error.strerror}") from None
 
 
 def _check_names(program: str, arguments: Sequence[str]) -> None:
