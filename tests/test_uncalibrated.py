@@ -160,6 +160,21 @@ def test_a_hopeless_search_ends_early(monkeypatch):
     assert likely_lens(near) is not None and made[0].iterations == uncalibrated.STEPS
 
 
+def test_what_is_surely_far_is_asked_about_once(monkeypatch):
+    """A near body that is dearer in the end tells it as well as one that is hopeless on the way."""
+    monkeypatch.setattr(uncalibrated, "HOPELESS", 1e9)
+    tracks = kt.data.walking_person(45, turn=0.0, yaw=200.0).tracks
+    asked, nearness = [], uncalibrated._nearness
+    monkeypatch.setattr(uncalibrated, "_nearness", lambda *given: asked.append(0) or nearness(*given))
+    found = {}
+    for dearer, times in ((1e9, 2), (-1e9, 1)):
+        monkeypatch.setattr(uncalibrated, "DEARER", dearer)
+        asked.clear()
+        found[times] = quietly(tracks)
+        assert len(asked) == times
+    assert same(found[1], found[2]) and found[1].distance is None
+
+
 def test_who_looks_for_a_near_camera():
     """PKC, unless cameras are known; other methods where they are asked to, by PKC's focal length."""
     tracks, _ = filmed(frames=30)

@@ -48,6 +48,10 @@ SECONDS, RATE, STEPS = 5.0, 30.0, 60
 """How much of a clip tells whether a camera is near, at how many frames a second at most, and in how many steps; as
 many again where these do not find back to a far body."""
 
+DEARER = 6.0
+"""By how much a near body must be dearer in the end for the camera to be far: what seemed nearer than that may yet be
+near, once signs are right."""
+
 EVERY, HOPELESS, AWAY = 20, 10.0, 6.5
 """Every so many steps it may be hopeless: if a near body is dearer by so much, and has gone as far away."""
 
@@ -219,6 +223,8 @@ def _nearness(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras:
         if gain > -unusual(FAR):  # to be as far away costs no more than that
             break
     found_at = distance(state)
+    if gain < -DEARER:
+        return math.inf
     return found_at if gain > (SEEN if detected(tracks) else BETTER) and found_at < NEAR else None
 
 
