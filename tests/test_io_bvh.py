@@ -106,8 +106,9 @@ def test_joints_on_their_parents_are_left_out(tmp_path):
 
 
 def test_a_frame_that_takes_no_time_is_told(tmp_path):
-    motion = load_motion(write(tmp_path, TEXT.replace("Frame Time: 0.04", "Frame Time: 0")))
-    assert motion.fps is None and "Frame Time is 0 seconds: the frame rate is unknown" in motion.notes
+    for seconds in ("0", "-1", "1e+30"):
+        motion = load_motion(write(tmp_path, TEXT.replace("Frame Time: 0.04", f"Frame Time: {seconds}")))
+        assert motion.fps is None and f"Frame Time is {seconds} seconds: the frame rate is unknown" in motion.notes
 
 
 def test_names_are_made_to_differ(tmp_path):

@@ -444,7 +444,7 @@ def test_sheet_opens_no_window_and_keeps_no_state(result):
 
 
 def test_too_few_frames_are_told(result):
-    with pytest.raises(OptionError, match="frames: expected at least 1, got 0"):
+    with pytest.raises(OptionError, match="frames: expected a whole number, at least 1, got 0"):
         sheet(result, frames=0)
 
 

@@ -60,16 +60,19 @@ def rate_of_times(times: Mapping[int, float], unit: str, notes: list[str]) -> fl
         if scale > 1:
             notes.append(f"times are taken to count {scale:.0f} a second")
         rate *= scale
-    return plain_rate(rate) or None
+    return plain_rate(rate)
 
 
-def plain_rate(rate: float) -> float:
+def plain_rate(rate: float) -> float | None:
     """A rate without what rounded times make of it: to three decimals, or six digits below 10 a second.
+
+    None below a frame in eleven days, which no times mean.
 
     >>> plain_rate(1 / 0.033333), plain_rate(1 / 30)
     (30.0, 0.0333333)
     """
-    return round(rate, 3) if rate >= 10 else float(f"{rate:.6g}")
+    plain = round(rate, 3) if rate >= 10 else float(f"{rate:.6g}")
+    return plain if plain >= 1e-6 else None
 
 
 def _even(times: Sequence[float]) -> list[int] | None:

@@ -68,7 +68,8 @@ def read(path: Path, options: MotionOptions) -> Motion:
     if left:
         shown = ", ".join(left[:5]) + (", ..." if len(left) > 5 else "")
         notes.append(f"left out because they lie on their parent: {shown}")
-    if not seconds > 0:
+    fps = plain_rate(1 / seconds) if seconds > 0 else None
+    if fps is None:
         notes.append(f"Frame Time is {seconds:g} seconds: the frame rate is unknown")
     at = {i: k for k, i in enumerate(stay)}
     return build_motion(
@@ -77,7 +78,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
         source=str(path),
         names=distinct([nodes[i].name for i in stay]),
         edges=[(at[stands[nodes[i].parent]], at[i]) for i in stay if nodes[i].parent >= 0],
-        fps=plain_rate(1 / seconds) if seconds > 0 else None,
+        fps=fps,
         notes=notes,
     )
 
