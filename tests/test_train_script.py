@@ -435,6 +435,7 @@ class TestSweeps:
         before = json.loads((tmp_path / RESULT).read_text())
         assert called(capsys, *words, "+trainer.fast_dev_run=true")[0] == 0
         assert json.loads((tmp_path / RESULT).read_text()) != before
+        assert (tmp_path / "lifter.safetensors").is_file() and len(list(tmp_path.rglob("*.ckpt"))) == 2
         code, out, err = called(capsys, *words, "keep=true")
         assert code == 0 and "is kept" not in out and "is replaced" in err
         assert json.loads((tmp_path / RESULT).read_text()) == before

@@ -112,14 +112,13 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         if "enable_progress_bar" not in config.trainer:
             made["enable_progress_bar"] = sys.stderr.isatty()
         trainer = instantiate(own, **made, _convert_="all")
-        if resumed is None or folder.resolve() not in resumed.parents:
-            _clear(folder)
         try:
             trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
         except (Diverged, NotFiniteError):  # a loss or a solver was given NaN
             text = "training diverged: what was best before that counts; try a smaller module.lr"
             warnings.warn(text, KcsWarning, stacklevel=2)
             if best.best_model_score is None:
+                _clear(folder)
                 return Outcome(math.inf if config.mode == "min" else -math.inf, {}, None)
         except (RuntimeError, ValueError) as error:  # of a module's state, of an optimiser's
             if resumed is None or not re.search("state.dict", str(error)):
@@ -139,11 +138,13 @@ def train(config: DictConfig, folder: Path) -> Outcome:
     lifter = folder / LIFTER
     if savable:
         save_lifter(lifter, module.network, fps=data.fps, notes=notes)
+    else:
+        lifter.unlink(missing_ok=True)
     return Outcome(float(best.best_model_score), metrics, lifter if savable else None)
 
 
 def _clear(folder: Path) -> None:
-    """Remove an earlier run's networks: should this one diverge, they would pass for its own."""
+    """Remove an earlier run's networks, which would pass for those of one that has none."""
     for name in (LIFTER, *(f"checkpoints/{kind}.ckpt" for kind in ("best", "last"))):
         (folder / name).unlink(missing_ok=True)
 
