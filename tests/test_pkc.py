@@ -31,6 +31,7 @@ from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.gaps import gaps_of
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.root import standing_feet
+from kcs_torch.metrics import e3d
 
 # Many tests take few steps, after which nothing has settled.
 pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")
@@ -103,6 +104,28 @@ def test_short_clips_and_single_images_of_other_bodies():
             covered.append((off.abs() < found.uncertainty).double().mean())
     assert torch.stack(wrong).mean() < 0.5  # of what guessing a flat body is wrong by
     assert torch.stack(covered).mean() > 0.42
+
+
+@pytest.mark.parametrize("frames", [3, 5, 8, 11])
+def test_a_few_frames_from_several_sides(frames):
+    """They tell depth of a body of which nothing is known; a template is believed until the viewpoint turns far."""
+    clip = random_motion("cmu17", frames, turn=150.0, fps=100.0, generator=torch.Generator().manual_seed(1))
+    plain = Skeleton(tuple(f"point {i}" for i in range(17)), clip.skeleton.bones)
+    flat = torch.cat([clip.points[..., :2], torch.zeros_like(clip.points[..., 2:])], -1)
+    for body in (plain, clip.skeleton):
+        found = PKC()(replace(clip.tracks, skeleton=body))
+        wrong = min(float(e3d(found.points * sign, clip.points)) for sign in (1.0, FLIP))
+        assert wrong < 0.06 < 0.3 < float(e3d(flat, clip.points))
+        assert found.uncertainty.isfinite().all()
+
+
+@pytest.mark.filterwarnings("ignore:.*lengths of rigid bones vary")
+def test_two_frames_are_too_few_for_the_viewpoint_to_tell():
+    clip = random_motion("cmu17", 2, turn=150.0, generator=torch.Generator().manual_seed(1))
+    plain = Skeleton(tuple(f"point {i}" for i in range(17)), clip.skeleton.bones)
+    with pytest.warns(KcsWarning, match="two frames fit bodies of any depth"):
+        found = PKC()(replace(clip.tracks, skeleton=plain))
+    assert any("so few frames or joints are solved by sfam" in note for note in found.diagnostics.notes)
 
 
 @pytest.mark.parametrize(("frames", "yaw"), [(50, 70.0), (40, 70.0)])

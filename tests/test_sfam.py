@@ -1,6 +1,7 @@
 """SfAM: the printed iteration written out, cameras, windows and their seams, options, and motion capture."""
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_lengths, complete_rotation, window_starts
 from kcs_torch.methods import sfam
 from kcs_torch.methods.windows import spread_first
+from kcs_torch.metrics import e3d
 from kcs_torch.nn import UnrolledSfAM
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.solvers import fit_bones
@@ -349,6 +351,57 @@ def test_several_clips_at_once():
 
 
 # ---------------------------------------------------------------------- very long clips
+
+
+# ---------------------------------------------------------------------- few frames
+
+
+@pytest.mark.parametrize("frames", [3, 4, 6, 10])
+@pytest.mark.parametrize("body", ["cmu17", "hand21"])
+def test_a_few_frames_from_several_sides_are_enough(frames, body):
+    """Cameras of several shapes explain any few frames; those whose bones keep their length are taken."""
+    clip = random_motion(body, frames, turn=150.0, fps=300.0, generator=torch.Generator().manual_seed(1))
+    flat = torch.cat([clip.points[..., :2], torch.zeros_like(clip.points[..., 2:])], -1)
+    assert e3d(flat, clip.points) > 0.3
+    assert e3d(SfAM()(clip.tracks).points, clip.points) < 0.06
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")  # cameras of a wrong rank may hardly turn
+def test_cameras_of_short_clips_are_those_of_the_steadiest_bones():
+    """Of all ranks' cameras those are taken of which the nuclear norm times the bones' variation is least."""
+    clip = random_motion("cmu17", 24, turn=120.0, fps=60.0, generator=torch.Generator().manual_seed(2))
+    bones = clip.skeleton.bone_index()
+
+    def cost(made):
+        centre = made.points.mean(1, keepdim=True)
+        world = (made.points - centre) @ complete_rotation(made.cameras)
+        lengths = bone_lengths(made.points, bones)
+        spread = (lengths.std(0, correction=0) / lengths.mean(0)).square().mean().sqrt() + sfam.GRANTED
+        return float(torch.linalg.svdvals(world.flatten(1)).sum() * spread)
+
+    each = [cost(SfAM(rank=k, camera_path="free")(clip.tracks)) for k in range(1, 6)]
+    assert cost(SfAM(camera_path="free")(clip.tracks)) == pytest.approx(min(each), rel=1e-6)
+    assert max(each) > 1.2 * min(each)
+
+
+def test_short_clips_of_many_lengths_are_what_they_are_alone():
+    """Few frames allow few ranks, and each clip has its own cameras chosen, whatever else is in its batch."""
+    frames = (2, 4, 6, 7, 11, 14, 17, 19, 24, 24)
+    clips = [random_motion("cmu17", n, turn=140.0, generator=torch.Generator().manual_seed(n)).tracks for n in frames]
+    method = SfAM(camera_path="free")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", KcsWarning)  # of two frames no depth is known
+        together, alone = method.many(clips), [method(one) for one in clips]
+    for one, own in zip(together, alone, strict=True):
+        assert_close(one.points, own.points, rtol=0, atol=1e-4 * float(own.points.std()))
+        assert_close(one.cameras, own.cameras, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("frames", [5, 30])
+def test_points_without_bones_have_cameras_of_least_nuclear_norm(frames):
+    clip = random_motion("cmu17", frames, turn=150.0, fps=300.0, generator=torch.Generator().manual_seed(3))
+    found = SfAM()(Tracks.from_arrays(clip.tracks.points))
+    assert e3d(found.points, clip.points) < 0.1
 
 
 def test_windows_of_very_long_clips_share_the_lengths_of_some(monkeypatch):

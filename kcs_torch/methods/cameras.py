@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -11,11 +12,15 @@ from kcs_torch.functional.camera import complete_rotation, factorize, rows_to_ca
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.solvers.ist import ist, metric_upgrade
 
-__all__ = ["orthographic_cameras"]
+__all__ = ["camera_choices", "orthographic_cameras"]
 
 
 RUN, MANY = 8, 1024
 """Clips whose starts are tried together: more would leave a processor's cache, or take a GPU's memory."""
+
+MOST, EACH = 5, 8
+"""Shapes K that are tried at most, and frames that there must be for each: fewer leave the upgrade so free that nearly
+any cameras look orthonormal."""
 
 
 def orthographic_cameras(
@@ -37,14 +42,14 @@ def orthographic_cameras(
 
     Args:
         tracks: (W, T, N, 2), complete.
-        rank: K, or "auto" to try 2..5 (1 where there are too few joints or frames for more).
+        rank: K, or "auto" to try 2..5 (fewer where there are few joints, or less than 8 frames for each).
         num_starts: random starts beside the relaxation's.
         smoothness: weight of the rows' second differences.
         seed: of the random starts.
         together: the batch is of different clips with so many windows each, which are refined as far as a clip is
             alone; of a single one if None.
         counts: (W,) frames of each clip, where shorter ones are padded with zeros at their end; they have no fewer
-            frames than joints, or are all of one length.
+            frames than joints, and as many as 5 shapes need, or are all of one length.
 
     Returns:
         (W, T, 2, 3) orthonormal rows; each window has a world frame and a mirror of its own. Windows too short or with
@@ -52,11 +57,53 @@ def orthographic_cameras(
 
     Kovalenko et al. 2019, section 3.2.
     """
-    windows, frames, joints, _ = tracks.shape
-    most = min(2 * frames, joints - 1) // 3  # the largest K that the factorisation can hold
+    windows, frames, *_ = tracks.shape
+    held = _most(tracks)
+    if held < 1:
+        return _identity(tracks)
+    most = min(held, MOST, max(1, frames // EACH))
+    ranks = range(min(2, most), most + 1) if rank == "auto" else [min(rank, held)]
+    candidates, fault = _candidates(tracks, ranks, num_starts, smoothness, seed, together, counts)
+    return candidates[fault.argmin(0), torch.arange(windows, device=tracks.device)]
+
+
+def camera_choices(tracks: Tensor, *, together: int | None = None, counts: Tensor | None = None) -> Tensor:
+    """The best cameras of each rank K = 1..5, for those who can tell by more than the rows: (C, W, T, 2, 3).
+
+    Fewer where there are few joints, or less than three frames for each shape. Arguments, and the fault by which the
+    best ones are chosen, as of :func:`orthographic_cameras`.
+    """
+    windows, frames, *_ = tracks.shape
+    most = min(_most(tracks), MOST, max(1, frames // 3))
     if most < 1:
-        return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(windows, frames, 2, 3)
-    ranks = range(min(2, most), min(5, most) + 1) if rank == "auto" else [min(rank, most)]
+        return _identity(tracks)[None]
+    candidates, fault = _candidates(tracks, range(1, most + 1), together=together, counts=counts)
+    candidates, fault = candidates.unflatten(0, (most, -1)), fault.unflatten(0, (most, -1))
+    best = fault.argmin(1)  # (C, W)
+    return candidates[torch.arange(most, device=best.device)[:, None], best, torch.arange(windows, device=best.device)]
+
+
+def _most(tracks: Tensor) -> int:
+    """The largest K that the factorisation can hold."""
+    return min(2 * tracks.shape[1], tracks.shape[2] - 1) // 3
+
+
+def _identity(tracks: Tensor) -> Tensor:
+    """Cameras that do not turn."""
+    return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(*tracks.shape[:2], 2, 3)
+
+
+def _candidates(
+    tracks: Tensor,
+    ranks: Sequence[int],
+    num_starts: int = 7,
+    smoothness: float = 0.1,
+    seed: int = 0,
+    together: int | None = None,
+    counts: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Two cameras (C, W, T, 2, 3) of each rank, rank by rank, and their faults (C, W)."""
+    windows, frames, *_ = tracks.shape
     motion, _ = factorize(tracks - tracks.mean(-2, keepdim=True), 3 * ranks[-1])
     count = motion.new_full((windows,), frames) if counts is None else counts.to(motion)
     size = (motion[..., 0].square().sum((-2, -1)) / (2 * count)).sqrt()
@@ -91,4 +138,4 @@ def orthographic_cameras(
     if frames > 2:
         inside = torch.arange(2, frames, device=tracks.device) < count[:, None]
         uneven = (torch.linalg.matrix_norm(turn.diff(dim=2)) * inside).sum(-1) / (count - 2)
-    return candidates[(uneven * defect).argmin(0), window]
+    return candidates, uneven * defect

@@ -13,11 +13,13 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
+from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import nanmedian
-from kcs_torch.functional.spectral import dct_basis
+from kcs_torch.functional.spectral import dct_basis, nuclear_norm
 from kcs_torch.functional.temporal import interpolate, window_starts
 from kcs_torch.methods.base import Estimate, Method
-from kcs_torch.methods.cameras import orthographic_cameras
+from kcs_torch.methods.cameras import camera_choices, orthographic_cameras
 from kcs_torch.methods.clips import Clips, in_batches, padded
 from kcs_torch.methods.mirror import mirror_sign
 from kcs_torch.methods.unseen import place_unseen
@@ -106,9 +108,10 @@ class SfAM(Method):
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
         """Solve clips of one skeleton and equally many windows as one batch, padded to one length."""
 
-        def kind(one: Tracks) -> tuple[int, int]:
+        def kind(one: Tracks) -> tuple[int, bool, int]:
             # Where frames are fewer than joints their number decides how many shapes there may be.
-            return len(self._starts(one.num_frames)), min(one.num_frames, max(one.num_joints, SHORT))
+            frames = one.num_frames
+            return len(self._starts(frames)), frames < CHOSEN, min(frames, max(one.num_joints, SHORT))
 
         return in_batches(tracks, lambda clips: self._solve(clips, None), kind)
 
@@ -166,10 +169,9 @@ class SfAM(Method):
             smooth = [self._smooth(x[:n]) for x, n in zip(filled.flatten(0, 1), lengths, strict=True)]
             filled = padded(smooth).view_as(filled)
             points = filled * (weights > 0)[..., None]
-        if cameras is not None:
-            rows = cameras[at]
-        else:
-            rows = self._cameras(filled, counts)
+        if cameras is None and self.rank == "auto" and first.shape[1] == 1 and window < CHOSEN:
+            return self._chosen(points, filled, weights, skeleton, inside)
+        rows = self._cameras(filled, counts) if cameras is None else cameras[at]
         if inside is not None:
             rows = rows * inside[..., None, None]
         points, weights = points.squeeze(0), weights.squeeze(0)
@@ -177,6 +179,28 @@ class SfAM(Method):
         local = solution.value.view(*filled.shape[:-1], 3) @ complete_rotation(rows).mT
         assert solution.change is not None
         return local, rows, solution.change.view(first.shape)
+
+    def _chosen(
+        self, points: Tensor, filled: Tensor, weights: Tensor, skeleton: Skeleton, inside: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """As :meth:`_windows`, of short clips (K, 1, T, N, ...), by the best of the cameras of each rank.
+
+        Cameras of a high rank explain any few frames. So what tells is what the method wants of the shapes that come of
+        them: their nuclear norm, times how much their bones vary in length.
+        """
+        counts = None if inside is None else inside.sum((1, 2))
+        rows = camera_choices(filled[:, 0], together=1, counts=counts)[:, :, None]  # (C, K, 1, T, 2, 3)
+        if inside is not None:
+            rows = rows * inside[..., None, None]
+        number = len(rows)
+        points, weights = (x.expand(number, *x.shape).flatten(0, 1) for x in (points, weights))
+        real = None if inside is None else inside.expand(number, *inside.shape).flatten(0, 1)
+        solution = self.shape(points, rows.flatten(0, 1), weights, skeleton, inside=real)
+        cost = nuclear_norm(solution.value.flatten(-2)) * _variation(solution.value, skeleton, real)
+        best = cost.view(number, -1).argmin(0), torch.arange(len(filled), device=cost.device)
+        assert solution.change is not None
+        shapes, change = (x.unflatten(0, (number, -1))[best] for x in (solution.value, solution.change))
+        return shapes @ complete_rotation(rows[best]).mT, rows[best], change.view(len(filled), 1)
 
     def _cameras(self, tracks: Tensor, counts: Tensor | None) -> Tensor:
         """Cameras (K, V, T, 2, 3) of windows, some of a long clip at a time: the search tries several starts."""
@@ -279,6 +303,12 @@ more would only take memory."""
 LEAD = 40
 """Windows of a clip that are solved first, together: they tell the lengths of its bones, which the others take."""
 
+CHOSEN = 60
+"""Frames of a clip below which cameras are chosen by the shapes that come of them."""
+
+GRANTED = 0.005
+"""Variation of bones, a share of their lengths, that all cameras are granted where they are chosen."""
+
 TURNS = 45.0, 90.0
 """Degrees that a window's viewpoint turns: up to the first the nuclear norm is the plain one, from the second on the
 reweighted."""
@@ -307,6 +337,19 @@ def _join(
     back = sorted(range(len(order)), key=order.__getitem__)
     joined, rows = (padded([parts[i][end] for i in back]) for end in (0, 1))
     return joined, rows
+
+
+def _variation(points: Tensor, skeleton: Skeleton, inside: Tensor | None) -> Tensor:
+    """How much rigid bones of points (..., T, N, 3) vary in length, (...,), a share; 1 where there are none."""
+    rigid = list(skeleton.rigid)
+    if not rigid:
+        return torch.ones_like(points[..., 0, 0, 0])
+    lengths = bone_lengths(points, skeleton.bone_index(device=points.device)[rigid])  # (..., T, B)
+    real = torch.ones_like(lengths[..., :1]) if inside is None else inside[..., None].to(lengths)
+    count = real.sum(-2)
+    mean = (lengths * real).sum(-2) / count
+    off = ((lengths - mean[..., None, :]) * real).square().sum(-2) / count
+    return (off / or_one(mean).square()).mean(-1).sqrt() + GRANTED
 
 
 def _fill_blank_frames(clips: Clips) -> Clips:

@@ -189,9 +189,12 @@ class Body:
         skeleton = self.skeleton
         return skeleton.is_tree and skeleton.num_bones == skeleton.num_joints - 1 and bool(self.image.any())
 
-    def turns(self, found: Hypotheses) -> bool:
-        """Whether the trunk of the best hypothesis turns far enough to tell depth better than the template does."""
-        return self._turn(found) >= (LITTLE if self.is_odd(found) else TURNING)
+    def turns(self, found: Hypotheses, least: float = 0.0) -> bool:
+        """Whether the trunk of the best hypothesis turns far enough to tell depth better than the template does.
+
+        That is by 60 degrees, or 30 of a body unlike its template, and by no less than ``least``.
+        """
+        return self._turn(found) >= max(LITTLE if self.is_odd(found) else TURNING, least)
 
     def sways(self, found: Hypotheses) -> bool:
         """Whether it turns far enough for aligned bones to tell depth as well as the template does, not better."""

@@ -60,8 +60,13 @@ BETTER, HOPEFUL, FEW = 5.0, 2.5, 2
 """By how much the objective must fall for a change of size to be believed; by how much, if hypotheses are refined with
 it, for a new search to be made; and how many are."""
 
-LEAST_FRAMES, LEAST_JOINTS = 12, 4
+LEAST_FRAMES, LEAST_JOINTS = 3, 4
 """Frames and joints from which on the viewpoint's turn may tell depth."""
+
+MANY_FRAMES, FAR = 12, 90.0
+"""In clips of fewer frames than these it tells more than a template does only where it turns by so many degrees."""
+
+TWO_FRAMES = "depth is little more than a guess: two frames fit bodies of any depth, and three that differ are needed"
 
 
 @dataclass(frozen=True)
@@ -190,6 +195,7 @@ class PKC(Method):
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
         enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= LEAST_JOINTS
+        many = enough and tracks.num_frames >= MANY_FRAMES
         changing, resized = size.sure, image / size.path[:, None, None]
         if changing:
             image = resized
@@ -207,8 +213,8 @@ class PKC(Method):
             moving, _ = yield from self._moving(tracks, image, noise)
             found = yield from self._ranked(body, moving)
         else:
-            resizing = enough and not changing and size.range >= TRIED  # what is compared must be searched alike
-            compare = turned if compared and not resizing else None
+            resizing = many and not changing and size.range >= TRIED  # what is compared must be searched alike
+            compare = turned if compared and many and not resizing else None
             near = Asked(self._seems_near, tracks, points, cameras, body)
             found = yield from body.search(self._moves, self.steps, compare, near)
             if near.told == SEEMS_NEAR:  # the rest is as under perspective
@@ -226,8 +232,9 @@ class PKC(Method):
                 found = body.without_contacts(found)
         if cameras is not None and _turns(cameras):
             found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
-        if polished and (body.turns(found) or not isinstance(method, _Followed)):
-            rival = (yield from turned(body.is_odd(found))) if compared and body.turns(found) else None
+        around = polished and body.turns(found, 0.0 if many else FAR)
+        if around or (polished and many and not isinstance(method, _Followed)):
+            rival = (yield from turned(body.is_odd(found))) if compared and around else None
             found = yield from method._polished(body, found, cameras, rival)
             if self.rounds and self.viewpoint != "moving":
                 found, body = yield from method._filled(found, body, cameras, rival)
@@ -253,6 +260,8 @@ class PKC(Method):
         seen = _complete(tracks, image)
         (first,) = (yield [seen]) if cameras is None else [SfAM().solve(seen, cameras)]
         made = replace(first, notes=(*notes, "so few frames or joints are solved by sfam", *first.notes))
+        if cameras is None and tracks.num_frames == 2:
+            made = replace(made, doubt=TWO_FRAMES)
         if tracks.num_joints < LEAST_JOINTS:
             made = replace(made, points=with_lengths_held(image, first.points, tracks.skeleton))
         return made
