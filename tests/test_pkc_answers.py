@@ -106,13 +106,13 @@ def test_angles_are_surer_where_the_viewpoint_turns_and_postures_are_usual():
     skeleton = SKELETONS["h36m17"]
     rest = skeleton.template_points(dtype=torch.float64)
     rest = rest - rest.mean(0)
-    usual = rest.expand(30, -1, -1)
+    usual = rest.expand(60, -1, -1)
     odd = usual.clone()
     hand = skeleton.joints.index("left_wrist")
     odd[:, hand, :2] = odd[:, hand, :2] * 1.2 - 0.3
     found = {}
     for name, body in (("usual", usual), ("odd", odd)):
-        goal = Objective(skeleton, body[..., :2], Weights(), torch.zeros(30, 17).double())
+        goal = Objective(skeleton, body[..., :2], Weights(), torch.zeros(60, 17).double())
         lengths = bone_lengths(body, goal.bones).mean(0)
         found[name] = [angle_doubt(goal, body[..., 2], lengths, turn) for turn in (0.0, 22.0, 180.0)]
     still, little, much = found["usual"]
@@ -120,6 +120,30 @@ def test_angles_are_surer_where_the_viewpoint_turns_and_postures_are_usual():
     told = [(still / one) ** 2 - 1 for one in (little, much)]  # by the turn, over what a view from the front tells
     assert told[1] / told[0] == pytest.approx((180 / 22.0) ** (2 * answers.POWER))
     assert found["odd"][0] > still
+
+
+@pytest.mark.parametrize(
+    ("frames", "turn", "factor"),
+    [
+        (11, 0.0, 1.0),
+        (12, 0.0, 3.0),
+        (30, 0.0, 2.0),
+        (30, 120.0, 1.5),
+        (30, 240.0, 1.0),
+        (60, 0.0, 1.0),
+        (90, 0.0, 1.0),
+    ],
+)
+def test_angles_are_less_sure_in_short_clips_that_do_not_turn(frames, turn, factor, monkeypatch):
+    """Up to three times; those of fewer than twelve frames are taken to be noisy instead."""
+    skeleton = SKELETONS["h36m17"]
+    rest = skeleton.template_points(dtype=torch.float64)
+    body = (rest - rest.mean(0)).expand(frames, -1, -1)
+    goal = Objective(skeleton, body[..., :2], Weights(), torch.zeros(frames, 17).double())
+    lengths = bone_lengths(body, goal.bones).mean(0)
+    found = angle_doubt(goal, body[..., 2], lengths, turn)
+    monkeypatch.setattr(answers, "SHORT", 0.0)
+    assert found == pytest.approx(factor * angle_doubt(goal, body[..., 2], lengths, turn))
 
 
 @pytest.mark.parametrize("degrees", [10.0, 30.0, 90.0])

@@ -61,6 +61,10 @@ TURN, POWER = 26.0, 1.2
 """Degrees of the viewpoint's turn that tell as much as the template, and the power of the turn that deviations fall
 with, as those of the moving viewpoint do."""
 
+SHORT, LEAST_FRAMES, AROUND = 10.0, 12, 240.0
+"""Independent frames up to which the fewer there are the less sure angles are, to a third at most; frames from which on:
+shorter clips are taken to be noisy, which says as much; and degrees of a turn that make good for it."""
+
 RIVAL, COLD = 0.15, 6.0
 """Odds of another solution that is no worse, and objective by which they fall to a third."""
 
@@ -91,8 +95,8 @@ def told_by_prior(found: Hypotheses, skeleton: Skeleton) -> list[str]:
 def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: float) -> float:
     """How uncertain angles of a solution (T, N), (B,) are, over those of usual postures before a camera at rest.
 
-    More where postures stray from the template, or the body is seen from the front, and less where it is seen from
-    aside or the viewpoint turned by ``turn`` degrees.
+    More where postures stray from the template, the body is seen from the front or in a short clip, and less where it
+    is seen from aside or the viewpoint turned by ``turn`` degrees.
     """
     posture = objective.posture
     points = torch.cat([objective.image, depth[..., None]], -1)
@@ -103,7 +107,10 @@ def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: floa
     aside = float(posture.frame(points)[..., 0, 2].square().mean())
     view = FRONT**2 / (1 + aside / ASIDE**2) + SIDE**2
     told = 1 / view + (odd * turn / TURN) ** (2 * POWER)
-    return odd * strange / math.sqrt(told)
+    frames = len(depth)
+    few = SHORT * posture.correlation / frames if frames >= LEAST_FRAMES else 1.0
+    short = 1 + (min(max(few, 1.0), 3.0) - 1) * max(0.0, 1 - turn / AROUND)
+    return short * odd * strange / math.sqrt(told)
 
 
 def depth_deviation(
