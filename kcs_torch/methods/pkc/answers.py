@@ -62,8 +62,8 @@ TURN, POWER = 26.0, 1.2
 with, as those of the moving viewpoint do."""
 
 SHORT, LEAST_FRAMES, AROUND = 10.0, 12, 240.0
-"""Independent frames up to which the fewer there are the less sure angles are, to a third at most; frames from which on:
-shorter clips are taken to be noisy, which says as much; and degrees of a turn that make good for it."""
+"""Independent frames up to which angles are the less sure the fewer there are, up to three times; frames from which on,
+as shorter clips are taken to be noisy, which says as much; and degrees of a turn that make good for it."""
 
 RIVAL, COLD = 0.15, 6.0
 """Odds of another solution that is no worse, and objective by which they fall to a third."""
