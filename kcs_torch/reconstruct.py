@@ -116,8 +116,7 @@ def reconstruct(
     if find:
         tracks = with_found_bones(tracks)
     chosen = method_named(method, fields)
-    lacking = no_bones(tracks.skeleton)
-    if chosen.knows_bones and lacking in tracks.notes:
+    if chosen.knows_bones and not tracks.skeleton.bones and (lacking := no_bones(tracks.skeleton)) in tracks.notes:
         warnings.warn(f"{tracks.source}: {lacking}", KcsWarning, stacklevel=users_level())
     return _before(lens, chosen, tracks, cameras)
 
