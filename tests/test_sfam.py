@@ -387,6 +387,20 @@ def test_cameras_of_short_clips_are_those_of_the_steadiest_bones():
     assert max(each) > 1.2 * min(each)
 
 
+def test_bones_that_no_frame_shows_choose_no_cameras():
+    """What is made up for a joint keeps its length or not as it likes."""
+    clip = random_motion("cmu17", 8, turn=150.0, fps=300.0, generator=torch.Generator().manual_seed(4))
+    points, weights = clip.points, torch.ones(8, 17)
+    longer = points.clone()
+    longer[3, 16] = 50 * points[3, 16]  # a hand, the end of one bone
+    weights[:, 16] = 0
+    skeleton = clip.skeleton
+    assert sfam._variation(points, torch.ones_like(weights), skeleton, None) == pytest.approx(sfam.GRANTED)
+    assert sfam._variation(longer, weights, skeleton, None) == pytest.approx(sfam.GRANTED)
+    assert sfam._variation(longer, torch.ones_like(weights), skeleton, None) > 10 * sfam.GRANTED
+    assert sfam._variation(points, 0 * weights, skeleton, None) == 1
+
+
 def test_short_clips_of_many_lengths_are_what_they_are_alone():
     """Few frames allow few ranks, and each clip has its own cameras chosen, whatever else is in its batch."""
     frames = (2, 4, 6, 7, 11, 14, 17, 19, 24, 24)

@@ -196,7 +196,7 @@ class SfAM(Method):
         points, weights = (x.expand(number, *x.shape).flatten(0, 1) for x in (points, weights))
         real = None if inside is None else inside.expand(number, *inside.shape).flatten(0, 1)
         solution = self.shape(points, rows.flatten(0, 1), weights, skeleton, inside=real)
-        cost = nuclear_norm(solution.value.flatten(-2)) * _variation(solution.value, skeleton, real)
+        cost = nuclear_norm(solution.value.flatten(-2)) * _variation(solution.value, weights, skeleton, real)
         best = cost.view(number, -1).argmin(0), torch.arange(len(filled), device=cost.device)
         assert solution.change is not None
         shapes, change = (x.unflatten(0, (number, -1))[best] for x in (solution.value, solution.change))
@@ -339,17 +339,20 @@ def _join(
     return joined, rows
 
 
-def _variation(points: Tensor, skeleton: Skeleton, inside: Tensor | None) -> Tensor:
-    """How much rigid bones of points (..., T, N, 3) vary in length, (...,), a share; 1 where there are none."""
-    rigid = list(skeleton.rigid)
-    if not rigid:
-        return torch.ones_like(points[..., 0, 0, 0])
-    lengths = bone_lengths(points, skeleton.bone_index(device=points.device)[rigid])  # (..., T, B)
+def _variation(points: Tensor, weights: Tensor, skeleton: Skeleton, inside: Tensor | None) -> Tensor:
+    """How much rigid bones of points (..., T, N, 3) vary in length, (...,), a share; 1 where there are none.
+
+    Bones of joints that no frame shows, by weights (..., T, N), do not count.
+    """
+    bones = skeleton.bone_index(device=points.device)[list(skeleton.rigid)]
+    lengths = bone_lengths(points, bones)  # (..., T, B)
     real = torch.ones_like(lengths[..., :1]) if inside is None else inside[..., None].to(lengths)
     count = real.sum(-2)
     mean = (lengths * real).sum(-2) / count
-    off = ((lengths - mean[..., None, :]) * real).square().sum(-2) / count
-    return (off / or_one(mean).square()).mean(-1).sqrt() + GRANTED
+    off = ((lengths - mean[..., None, :]) * real).square().sum(-2) / count / or_one(mean).square()
+    shown = (weights > 0).any(-2)[..., bones].all(-1).to(lengths)  # (..., B)
+    told = shown.sum(-1)
+    return torch.where(told > 0, ((off * shown).sum(-1) / or_one(told)).sqrt() + GRANTED, 1)
 
 
 def _fill_blank_frames(clips: Clips) -> Clips:
