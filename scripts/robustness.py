@@ -10,6 +10,7 @@ Parts, after figure 5 of Kovalenko et al. 2019:
 ``noise``      noise in the tracks (5a)
 ``template``   KCS with a template whose bones are too long or short, or point elsewhere; one fixed camera
 ``missing``    PKC where joints are hidden, beside curves through the true places of all that are seen
+``short``      SfAM and PKC in clips of a few frames, of bodies without a template, before a camera that goes round
 
 Motion, views and figures are those of the measuring protocol, which lies beside the repository in ``../shared``. A row
 is the mean over sequences and seeds, and the standard deviation of seeds' means; --csv has every single run.
@@ -22,6 +23,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import product
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -41,6 +43,15 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 ORBIT = ("02_01", "07_01", "16_15", "35_01", "39_01", "10_04", "49_18", "charleston1", "zombie", "01_01")
 # Eight people who walk before a fixed camera, each seen from four sides.
 WALKS = ("02_01", "05_01", "07_01", "08_01", "12_01", "16_15", "35_01", "39_01")
+# Animals, hands, robots, people and markers; a few frames of each, from two of its places on and in three views.
+MOTIONS = (
+    *("dog/dog_walk01", "hand/manipnet_mug1_rightHand", "cmu/cmu_35_01", "robot/franka_panda_fk"),
+    *("akhter/akhter_stretch", "dog/dog_run00", "hand/manipnet_cup1_bothhands", "cmu/cmu_49_18", "robot/ur5e_fk"),
+    *("akhter/akhter_yoga", "cmu_cs2s/train_jumping_1", "cmu/cmu_05_01", "cmu/cmu_16_15", "fly/df3d_fly"),
+    "cmu_cs2s/train_soccer_2",
+)
+PLACES, ROUND = (0.2, 0.7), ((60, 0), (120, 70), (180, 30))  # share of the frames before; degrees of orbit, and yaw
+FEW = (4, 6, 10, 16, 26, 40, 58)
 LENGTHS = (0, 10, 30, 50, 70)  # mm
 NOISE = (0, 5, 10, 15, 20)  # mm
 TEMPLATE = ((0, 0), (10, 0), (20, 0), (30, 0), (0, 10), (0, 20))  # per cent of length, degrees
@@ -77,11 +88,26 @@ class Bench:
         yaw = np.linspace(45, 45 + 180, frames)
         return torch.from_numpy(self.protocol.rotation(yaw, PITCH)[:, :2])
 
+    def few(self, name: str, frames: int, place: float, orbit: float, yaw: float) -> Case | None:
+        """So many frames of a motion before a camera that goes round meanwhile; None if it has fewer."""
+        source = self.protocol.load(self.data, name)
+        points, edges = source["points3d"].astype(float), source["edges"] if "edges" in source.files else None
+        if name.startswith("cmu/"):
+            points, edges = points[:, self.protocol.CMU17], np.array(self.protocol.CMU17_EDGES)
+        points = points[:: 4 if float(source["fps"]) >= 100 else 1]
+        if len(points) < frames:
+            return None
+        first = int(place * (len(points) - frames))
+        turned = self.protocol.rotation(yaw + orbit * np.linspace(0, 1, frames), PITCH)
+        points = np.einsum("tij,tnj->tni", turned, points[first : first + frames])
+        tracks = kt.Tracks.from_arrays(points[..., :2], edges=edges, source=name)
+        return f"{name} from {place:g}, orbit {orbit:g}", tracks, {"points3d": points, "edges": edges}
+
     def score(self, result: kt.Reconstruction | Tensor, truth: dict[str, Any]) -> Run:
         """The protocol's figures of a result, or of points."""
         points = result if isinstance(result, Tensor) else result.observed
         figures = self.protocol.score(points.numpy(), truth["points3d"], truth["edges"])
-        return {name: figures[name] for name in FIGURES}
+        return {name: figures.get(name, math.nan) for name in FIGURES}  # no edges, no bones
 
 
 def lengths(bench: Bench, seeds: int) -> Iterator[Run]:
@@ -167,7 +193,22 @@ def missing(bench: Bench, seeds: int) -> Iterator[Run]:
                 yield {"setting": f"truth, {name}, {level}"} | run | bench.score(points, truth)
 
 
-PARTS = {"lengths": lengths, "variation": variation, "noise": noise, "template": template, "missing": missing}
+def short(bench: Bench, seeds: int) -> Iterator[Run]:
+    """Clips of a few frames, of bodies of which nothing is known, before a camera that goes round meanwhile."""
+    methods: dict[str, kt.Method] = {"SfAM": kt.SfAM(), "PKC": kt.PKC()}
+    for frames in (count for count in FEW if count <= bench.frames):
+        for name, place, view in product(MOTIONS[: bench.sequences], PLACES, ROUND):
+            if (case := bench.few(name, frames, place, *view)) is None:
+                continue
+            label, tracks, truth = case
+            run = {"case": label, "seed": 0}
+            flat = torch.nn.functional.pad(tracks.points, (0, 1))
+            yield {"setting": f"flat guess, {frames} frames"} | run | bench.score(flat, truth)
+            for kind, method in methods.items():
+                yield {"setting": f"{kind}, {frames} frames"} | run | bench.score(method(tracks), truth)
+
+
+PARTS = {f.__name__: f for f in (lengths, variation, noise, template, missing, short)}
 
 
 def filled(points: np.ndarray, seen: np.ndarray, curve: Callable[..., Any]) -> np.ndarray:
@@ -251,7 +292,7 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--shared", type=Path, default=SHARED, help="folder with protocol/protocol.py and data/")
     parser.add_argument("--seeds", type=int, default=3, help="random draws of each disturbance")
     parser.add_argument("--frames", type=int, default=300, help="of each sequence, at most")
-    parser.add_argument("--sequences", type=int, default=len(ORBIT), help="of each part, at most")
+    parser.add_argument("--sequences", type=int, default=len(MOTIONS), help="of each part, at most")
     parser.add_argument("--csv", type=Path, help="also write every run here")
     options = parser.parse_args(words)
     for name in ("seeds", "frames", "sequences"):

@@ -74,9 +74,24 @@ def test_true_lengths_and_cameras_are_those_of_the_case(script, shared):
     assert_close(centre(seen)[0], centre(tracks.points)[0], rtol=0, atol=1e-3)
 
 
-def test_script(script, shared, tmp_path, capsys):
+def test_a_few_frames_are_those_of_the_motion(script, shared):
+    bench = script.Bench(shared, frames=30, sequences=1)
+    assert bench.few("fly/df3d_fly", 16, 0.2, 60, 0) is None  # it has 15
+    label, tracks, truth = bench.few("cmu/cmu_35_01", 10, 0.5, 90, 0)
+    assert label == "cmu/cmu_35_01 from 0.5, orbit 90" and tracks.num_frames == 10 and not tracks.skeleton.template
+    source = bench.protocol.load(bench.data, "cmu/cmu_35_01")["points3d"].astype(float)[::4]
+    first = int(0.5 * (len(source) - 10))
+    world = torch.from_numpy(source[first : first + 10, bench.protocol.CMU17])
+    size = bone_lengths(world, tracks.skeleton.bone_index())
+    assert_close(bone_lengths(torch.from_numpy(truth["points3d"]), tracks.skeleton.bone_index()), size)
+    assert_close(tracks.points, torch.from_numpy(truth["points3d"][..., :2]))
+
+
+def test_script(script, shared, tmp_path, capsys, monkeypatch):
     table = tmp_path / "made" / "runs.csv"
-    script.main(["--sequences", "1", "--frames", "40", "--seeds", "2", "--shared", str(shared), "--csv", str(table)])
+    usual = ["--sequences", "1", "--seeds", "2", "--shared", str(shared), "--csv", str(table)]
+    monkeypatch.setattr(script, "FEW", (6,))
+    script.main([*usual, "--frames", "40"])
     shown = capsys.readouterr().out
     with table.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -89,7 +104,10 @@ def test_script(script, shared, tmp_path, capsys):
         "noise": 4 * (1 + 4 * 2),
         "template": 4 * (2 + 5 * 2),
         "missing": 1 + 3 * 4,
+        "short": 2 * 3 * 3,
     }
+    short = lambda kind: [float(row["e3d"]) for row in rows if row["setting"] == f"{kind}, 6 frames"]  # noqa: E731
+    assert max(short("PKC")) < 0.4 * min(short("flat guess"))
     own, free = (row for row in rows if row["part"] == "variation")
     bones = [key for key in own if key.startswith("variation of ")]
     middle = [np.median([float(row[bone]) for bone in bones]) for row in (own, free)]
