@@ -9,6 +9,6 @@ from kcs_torch.clean.gaps import fill
 from kcs_torch.clean.gating import gate
 from kcs_torch.clean.sides import unswap
 from kcs_torch.clean.smoothing import SMOOTHERS, smooth
-from kcs_torch.clean.timing import resample, trim
+from kcs_torch.clean.timing import resample, split, trim
 
-__all__ = ["SMOOTHERS", "fill", "gate", "resample", "smooth", "trim", "unswap"]
+__all__ = ["SMOOTHERS", "fill", "gate", "resample", "smooth", "split", "trim", "unswap"]

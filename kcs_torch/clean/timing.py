@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import torch
 
 from kcs_torch.clean.common import check_tracks, frame_rate, number, rebuilt, runs
 from kcs_torch.errors import OptionError, ShapeError, unknown
+from kcs_torch.solvers.cuts import find_cuts
 from kcs_torch.types import Tracks
 
-__all__ = ["resample", "trim"]
+__all__ = ["cuts_of", "resample", "split", "trim"]
 
 _KINDS = {"linear": 1, "cubic": 3}
 _EPS = 1e-6  # of a frame: rounding of times must not make a seen frame unseen
@@ -48,6 +50,36 @@ def trim(tracks: Tracks, start: int | None = None, stop: int | None = None) -> T
         raise ShapeError(f"{tracks.source}: no joint is seen in frames {first} to {end - 1}")
     note = f"trim: frames {first} to {end - 1} of {frames}"
     return replace(cut, notes=(*cut.notes, note))
+
+
+def split(tracks: Tracks) -> list[Tracks]:
+    """Divide a clip at the cuts of its film, where the body is suddenly seen from another side.
+
+    Args:
+        tracks: what to divide.
+
+    Returns:
+        The shots, each with a note; the clip itself alone where there is no cut.
+
+    >>> from kcs_torch.data.synthetic import walking_person
+    >>> front, side = (walking_person(30, yaw=yaw, turn=0).tracks for yaw in (0, 90))
+    >>> both = replace(front, points=torch.cat([front.points, side.points]), weights=torch.ones(60, 17).double())
+    >>> [one.num_frames for one in split(both)]
+    [30, 30]
+    """
+    check_tracks(tracks, "split")
+    cuts = cuts_of(tracks)
+    if not cuts:
+        return [tracks]
+    return [trim(tracks, *ends) for ends in pairwise([0, *cuts, tracks.num_frames])]
+
+
+def cuts_of(tracks: Tracks) -> list[int]:
+    """The first frames of the shots of a clip but the first, see :func:`kcs_torch.solvers.cuts.find_cuts`."""
+    body, points = tracks.skeleton, tracks.points
+    count = body.num_observed
+    pairs = torch.tensor([pair for pair in body.mirror if max(pair) < count], dtype=torch.long, device=points.device)
+    return find_cuts(points[:, :count], tracks.seen[:, :count], pairs.view(-1, 2))
 
 
 def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: float | None = None) -> Tracks:

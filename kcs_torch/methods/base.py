@@ -28,7 +28,7 @@ from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.inference import plain
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.functional.weights import rms
-from kcs_torch.methods.finish import HEADSTAND, Estimate, finish
+from kcs_torch.methods.finish import BY_SHOTS, HEADSTAND, Estimate, finish
 from kcs_torch.methods.wrong import WHY_LOOSE
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
@@ -191,7 +191,7 @@ class Method(ABC):
         if HEADSTAND in found.notes:
             warnings.warn(f"{tracks.source}: {HEADSTAND}", KcsWarning, stacklevel=users_level())
         for note in found.notes:
-            if note.endswith(WHY_LOOSE):
+            if note.endswith((WHY_LOOSE, BY_SHOTS)):
                 warnings.warn(f"{tracks.source}: {note}", KcsWarning, stacklevel=users_level())
 
     def unsettled(self, steps: int) -> str:

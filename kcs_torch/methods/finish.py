@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from kcs_torch.clean.timing import cuts_of
 from kcs_torch.errors import counted
 from kcs_torch.functional.align import centre
 from kcs_torch.functional.camera import viewpoint_turn
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from kcs_torch.methods.base import Method
 
 __all__ = [
-    *("HARDLY", "HEADSTAND", "WEAK_TURN", "Estimate"),
+    *("BY_SHOTS", "HARDLY", "HEADSTAND", "WEAK_TURN", "Estimate"),
     *("extent", "finish", "little_turn", "nothing_else"),
 ]
 
@@ -37,6 +38,9 @@ WEAK_TURN = 30.0
 FAR_STEPS = 2
 """How often joints are weighed anew by their distance, when the body is put in its place."""
 
+SHOWN = 5
+"""Cuts that are named at most."""
+
 NEARLY_ALL = 0.9
 """Share of the frames in which feet are above the rest of the body where y may well point up."""
 
@@ -44,6 +48,11 @@ HEADSTAND = (
     "the feet are above the rest of the body in nearly all frames. If y points up in these tracks, give -y instead "
     "(with intrinsics the image's height - y): it has to point down, as in images, or the body is upside down and "
     "mirrored. If it does point down, joints may be in another order"
+)
+
+BY_SHOTS = (
+    "as at a cut of a film, which is no motion: solve the shots by themselves, "
+    "kt.reconstruct_all(kt.clean.split(tracks)), or part by part with --frames"
 )
 
 LYING = (
@@ -189,6 +198,9 @@ def _reconstruction(
         notes.append(HEADSTAND)
     elif lies_down(tracks.points, tracks.seen, body, NEARLY_ALL):
         notes.append(LYING)
+    if cuts := cuts_of(tracks):
+        places = ", ".join(map(str, cuts[:SHOWN])) + (f" and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else "")
+        notes.append(f"the view jumps at frame {places}, {BY_SHOTS}")
     notes += what_is_wrong(method, points, seen, tracks, found.converged, lengths=bones)
     if not body.rigid:
         kind = "no bones" if not body.num_bones else "no rigid bones"

@@ -1,0 +1,62 @@
+"""Cuts of a film: frames from which on the body is seen from another side."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcs_torch.functional.ranks import nanmedian
+
+__all__ = ["find_cuts"]
+
+AWAY = 0.12
+"""From the frame before to that after a cut half of the joints move, against the body's middle, by more than this share
+of its size, the median distance of joints from there."""
+
+SUDDEN, BESIDE = 5.0, 8
+"""And by more than so many times what they move between any two of so many frames before and after."""
+
+LEAST, JOINTS = 4, 6
+"""Frames that there must be on either side, and joints."""
+
+
+def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
+    """Find the first frame of each shot but the first: there the pose jumps as it does nowhere near.
+
+    Frames in which half of the joints are seen are compared with the next such one, if that follows at once. Sides that
+    a detector takes for each other are no cut, nor is a single wrong frame, which jumps back.
+
+    Args:
+        points: (T, N, 2).
+        seen: (T, N) bool.
+        pairs: (P, 2) joints that are each other's twins.
+
+    >>> time = torch.arange(30.0)[:, None, None] / 30
+    >>> pose = torch.randn(8, 2, generator=torch.Generator().manual_seed(0)) + time
+    >>> pose[18:] = pose[18:] * torch.tensor([-1.0, 1.0])  # from behind
+    >>> find_cuts(pose, torch.ones(30, 8, dtype=torch.bool), torch.zeros(0, 2, dtype=torch.long))
+    [18]
+    """
+    joints = points.shape[1]
+    shown = (2 * seen.sum(-1) >= joints).nonzero().flatten()
+    if joints < JOINTS or len(shown) < 2 * LEAST:
+        return []
+    known = torch.where(seen[..., None], points, torch.nan)[shown]  # (K, N, 2)
+    known = known - nanmedian(known, 1, keepdim=True)
+    twins = torch.arange(joints, device=points.device)
+    twins[pairs[:, 0]], twins[pairs[:, 1]] = pairs[:, 1], pairs[:, 0]
+    before, after = known[:-1], known[1:]
+    step = torch.fmin(_moved(before, after), _moved(before, after[:, twins]))
+    size = nanmedian(known.norm(dim=-1), 1)
+    step = (step / torch.minimum(size[1:], size[:-1])).nan_to_num(0.0, 0.0)  # a body at one point has no pose
+    beside = torch.nn.functional.pad(step, (BESIDE, BESIDE)).unfold(0, 2 * BESIDE + 1, 1).clone()
+    beside[:, BESIDE] = 0
+    leaps = (step > AWAY) & (step > SUDDEN * beside.amax(1)) & (shown.diff() == 1)
+    leaps[: LEAST - 1] = leaps[len(leaps) - LEAST + 1 :] = False
+    return (shown[1:][leaps]).tolist()
+
+
+def _moved(before: Tensor, after: Tensor) -> Tensor:
+    """How far the middle one of the joints moves against all, (K,), by poses (K, N, 2); NaN where none is in both."""
+    way = after - before
+    return nanmedian((way - nanmedian(way, 1, keepdim=True)).norm(dim=-1), 1)

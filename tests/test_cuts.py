@@ -1,0 +1,97 @@
+"""Cuts of a film: found, told, and what lies between them solved by itself."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import kcs_torch as kt
+from kcs_torch.clean import split
+from kcs_torch.clean.timing import cuts_of
+from kcs_torch.data import walking_person
+from kcs_torch.solvers.cuts import find_cuts
+
+NONE = torch.zeros(0, 2, dtype=torch.long)
+
+
+def film(*yaws, frames=24):
+    """Shots of one walk from several sides, one after another; the truth of each."""
+    clips = [walking_person(frames, yaw=yaw, turn=0.0) for yaw in yaws]
+    points, weights = (torch.cat([getattr(c.tracks, name) for c in clips]) for name in ("points", "weights"))
+    return replace(clips[0].tracks, points=points, weights=weights), clips
+
+
+@pytest.mark.parametrize("yaws", [(0.0, 90.0), (0.0, 110.0, 40.0), (45.0, 135.0), (0.0, 0.0)])
+def test_shots_from_other_sides_are_found(yaws):
+    tracks, _ = film(*yaws)
+    cuts = [24 * k for k in range(1, len(yaws)) if yaws[k] != yaws[k - 1]]
+    assert cuts_of(tracks) == cuts
+    assert [one.num_frames for one in split(tracks)] == [24] * len(yaws) if cuts else [48]
+
+
+def test_a_clip_without_a_cut_is_left_as_it_is():
+    tracks = walking_person(60, turn=360.0).tracks
+    assert split(tracks) == [tracks]
+
+
+@pytest.mark.parametrize("fps", [1.5, 3.0, 10.0])
+def test_few_frames_a_second_are_no_cuts(fps):
+    assert cuts_of(walking_person(40, fps=fps, turn=180.0).tracks) == []
+
+
+def test_noise_gaps_and_wrong_frames_are_no_cuts():
+    draw = torch.Generator().manual_seed(0)
+    clip = walking_person(60, turn=0.0, noise=30.0, missing=0.4, generator=draw).tracks
+    assert cuts_of(clip) == []
+    points = clip.points.clone()
+    points[30] = points[30] * torch.tensor([-1.0, 1.0]) + 300 * torch.randn(17, 2, generator=draw)
+    assert cuts_of(replace(clip, points=points)) == []
+    assert find_cuts(torch.zeros(30, 8, 2), torch.ones(30, 8, dtype=torch.bool), NONE) == []
+
+
+def test_sides_that_a_detector_takes_for_each_other_are_no_cut():
+    tracks = walking_person(40, yaw=0.0, turn=0.0).tracks
+    points = tracks.points.clone()
+    left, right = torch.tensor(tracks.skeleton.mirror).unbind(1)
+    points[20:, left], points[20:, right] = tracks.points[20:, right], tracks.points[20:, left]
+    seen = torch.ones(40, 17, dtype=torch.bool)
+    assert find_cuts(points, seen, torch.tensor(tracks.skeleton.mirror)) == []
+    assert find_cuts(points, seen, NONE) == [20]
+
+
+@pytest.mark.parametrize("frames", [0, 1, 3, 7])
+def test_too_few_frames_tell_no_cut(frames):
+    assert find_cuts(torch.randn(frames, 8, 2), torch.ones(frames, 8, dtype=torch.bool), NONE) == []
+
+
+def test_a_cut_near_an_end_may_be_a_wrong_frame():
+    tracks, _ = film(0.0, 90.0)
+    assert cuts_of(tracks.frames(21, 40)) == []
+    assert cuts_of(tracks.frames(20, 40)) == [4]
+    assert cuts_of(tracks.frames(0, 28)) == [24]
+    assert cuts_of(tracks.frames(0, 27)) == []
+
+
+def test_a_gap_between_shots_is_left_to_it():
+    """Nobody knows how far a body moves while it is not seen."""
+    tracks, _ = film(0.0, 90.0)
+    weights = tracks.weights.clone()
+    weights[24] = 0
+    assert cuts_of(replace(tracks, weights=weights)) == []
+
+
+def test_a_cut_is_told_and_shots_are_solved_by_themselves():
+    tracks, clips = film(0.0, 100.0, frames=30)
+    with pytest.warns(kt.KcsWarning, match=r"the view jumps at frame 30, as at a cut of a film.*kt\.clean\.split"):
+        both = kt.reconstruct(tracks)
+    shots = kt.reconstruct_all(split(tracks))
+    parts = (both.points[:30], both.points[30:], *(shot.points for shot in shots))
+    wrong = [float(kt.metrics.e3d(part, clip.points)) for part, clip in zip(parts, clips * 2, strict=True)]
+    assert wrong[0] + wrong[1] > 2 * (wrong[2] + wrong[3])
+
+
+def test_a_cut_is_told_under_perspective_too():
+    tracks, _ = film(0.0, 100.0, frames=20)
+    moved = replace(tracks, points=tracks.points / 4 + 500, units="px")
+    with pytest.warns(kt.KcsWarning, match="the view jumps at frame 20"):
+        kt.reconstruct(moved, method="kcs", intrinsics=(1000, 1000, 500, 500))
