@@ -22,7 +22,7 @@ def clips(script):
     """Walks, with noise, in slow motion, before a camera that goes round and with arms spread; a tree in motion."""
     noisy = walking_person(18, yaw=0, turn=0, noise=15, generator=torch.Generator().manual_seed(0)).tracks
     slow = replace(walking_person(20, fps=150, yaw=0, turn=0).tracks, fps=30)
-    round_ = walking_person(24, yaw=0, turn=200).tracks
+    round_ = walking_person(24, yaw=0, turn=270).tracks
     spread = arms_spread(20)
     tree = next(iter(script.synthetic("tree", 24)))[1]
     return {"fixed": [noisy, slow, round_, spread], "moving": [tree]}

@@ -61,7 +61,7 @@ def test_after_the_context_the_fast_parts_are_back():
 def test_script(root, tmp_path, capsys, part):
     script = runpy.run_path(str(root / "scripts" / "speed.py"))
     table = tmp_path / "made" / "speed.csv"
-    sizes = ["--frames", "12", "--growth", "12", "--memory", "12", "--joints", "5", "--runs", "1"]
+    sizes = ["--frames", "26", "--growth", "12", "--memory", "12", "--joints", "5", "--runs", "1"]
     sizes += [
         "--which",
         "kcs",

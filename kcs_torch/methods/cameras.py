@@ -18,9 +18,8 @@ __all__ = ["camera_choices", "orthographic_cameras"]
 RUN, MANY = 8, 1024
 """Clips whose starts are tried together: more would leave a processor's cache, or take a GPU's memory."""
 
-MOST, EACH = 5, 8
-"""Shapes K that are tried at most, and frames that there must be for each: fewer leave the upgrade so free that nearly
-any cameras look orthonormal."""
+MOST = 5
+"""Shapes K that are tried at most."""
 
 
 def orthographic_cameras(
@@ -42,14 +41,14 @@ def orthographic_cameras(
 
     Args:
         tracks: (W, T, N, 2), complete.
-        rank: K, or "auto" to try 2..5 (fewer where there are few joints, or less than 8 frames for each).
+        rank: K, or "auto" to try 2..5 (1 where there are too few joints or frames for more).
         num_starts: random starts beside the relaxation's.
         smoothness: weight of the rows' second differences.
         seed: of the random starts.
         together: the batch is of different clips with so many windows each, which are refined as far as a clip is
             alone; of a single one if None.
         counts: (W,) frames of each clip, where shorter ones are padded with zeros at their end; they have no fewer
-            frames than joints, and as many as 5 shapes need, or are all of one length.
+            frames than joints, or are all of one length.
 
     Returns:
         (W, T, 2, 3) orthonormal rows; each window has a world frame and a mirror of its own. Windows too short or with
@@ -57,14 +56,13 @@ def orthographic_cameras(
 
     Kovalenko et al. 2019, section 3.2.
     """
-    windows, frames, *_ = tracks.shape
     held = _most(tracks)
     if held < 1:
         return _identity(tracks)
-    most = min(held, MOST, max(1, frames // EACH))
+    most = min(held, MOST)
     ranks = range(min(2, most), most + 1) if rank == "auto" else [min(rank, held)]
     candidates, fault = _candidates(tracks, ranks, num_starts, smoothness, seed, together, counts)
-    return candidates[fault.argmin(0), torch.arange(windows, device=tracks.device)]
+    return candidates[fault.argmin(0), torch.arange(len(tracks), device=tracks.device)]
 
 
 def camera_choices(tracks: Tensor, *, together: int | None = None, counts: Tensor | None = None) -> Tensor:

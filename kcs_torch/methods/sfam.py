@@ -303,7 +303,7 @@ more would only take memory."""
 LEAD = 40
 """Windows of a clip that are solved first, together: they tell the lengths of its bones, which the others take."""
 
-CHOSEN = 60
+CHOSEN = 24
 """Frames of a clip below which cameras are chosen by the shapes that come of them."""
 
 GRANTED = 0.005

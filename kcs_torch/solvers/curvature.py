@@ -87,7 +87,8 @@ def whitening(
     hypotheses, frames, joints, _ = points.shape
     inverse = points.new_zeros(hypotheses, 3 * len(bones), 3 * len(bones))
     for weight, rows, eps, linked in levels:
-        inverse = inverse + linked * weight * inverse_scatter(rows, eps)
+        # Where rounding leaves nothing of eps the value is NaN, so that no step is taken: any root does.
+        inverse = inverse + linked * weight * inverse_scatter(rows, eps).nan_to_num(0.0)
     length = safe_norm(bone_vectors(points, rigid))
     if counts is None:
         spread = (length - length.mean(-2, keepdim=True)).square().mean(-2)  # var() warns where no pair is rigid

@@ -64,7 +64,8 @@ LEAST_FRAMES, LEAST_JOINTS = 3, 4
 """Frames and joints from which on the viewpoint's turn may tell depth."""
 
 MANY_FRAMES, FAR = 12, 90.0
-"""In clips of fewer frames than these it tells more than a template does only where it turns by so many degrees."""
+"""In clips of fewer frames than these it does so only if bones link all joints and all are seen, and tells more than a
+template does only where it turns by so many degrees."""
 
 TWO_FRAMES = "depth is little more than a guess: two frames fit bodies of any depth, and three that differ are needed"
 
@@ -194,7 +195,9 @@ class PKC(Method):
             raise OptionError(
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
-        enough = tracks.num_frames >= LEAST_FRAMES and tracks.num_joints >= LEAST_JOINTS
+        enough = tracks.num_joints >= LEAST_JOINTS and (
+            tracks.num_frames >= MANY_FRAMES or (tracks.num_frames >= LEAST_FRAMES and _is_whole(tracks))
+        )
         many = enough and tracks.num_frames >= MANY_FRAMES
         changing, resized = size.sure, image / size.path[:, None, None]
         if changing:
@@ -388,3 +391,9 @@ def _with_size(found: Estimate, size: Size) -> Estimate:
 
 def _scaled(found: Estimate, size: Tensor) -> Estimate:
     return replace(found, scales=found.scales * size)
+
+
+def _is_whole(tracks: Tracks) -> bool:
+    """Whether the bones are a tree of all joints, and these are seen in all frames."""
+    body = tracks.skeleton
+    return body.is_tree and body.num_bones == body.num_joints - 1 and bool(tracks.seen.all())
