@@ -473,7 +473,7 @@ MISTAKES = {
     "fill weight": (lambda t: kt.clean.fill(t, 2, weight=1.5), "at most 1"),
     "resample": (lambda t: kt.clean.resample(t, 0), "resample: fps"),
     "resample kind": (lambda t: kt.clean.resample(t, 25, kind="sinc"), "choices are cubic, linear"),
-    "resample too much": (lambda t: kt.clean.resample(t, 1e9), "a rate near the 50"),
+    "resample too much": (lambda t: kt.clean.resample(t, 1e6), "a rate near the 50"),
     "trim": (lambda t: kt.clean.trim(t, 10, 10), "within 0:400"),
     "trim beyond": (lambda t: kt.clean.trim(t, 400), "within 0:400"),
     "trim negative": (lambda t: kt.clean.trim(t, -5), "got -5"),
@@ -541,3 +541,17 @@ def test_wild_tracks_stay_tracks(tracks, method, cutoff, longest, factor):
         if name == "fill":
             assert not bool((tracks.seen & ~cleaned.seen).any())
             torch.testing.assert_close(cleaned.points[tracks.seen], tracks.points[tracks.seen], rtol=0, atol=0)
+
+
+def test_a_trimmed_clip_is_a_copy():
+    tracks = walking_person(30).tracks
+    part = kt.clean.trim(tracks, 10, 20)
+    part.points[0] = 12345.0
+    assert float(tracks.points[10].max()) != 12345.0
+
+
+def test_one_euro_goes_by_the_size_of_the_body():
+    """Not by how far it walks: the same motion filtered as part of a longer walk hardly differs."""
+    tracks = walking_person(150, yaw=90, turn=0, noise=5.0, generator=torch.Generator().manual_seed(0)).tracks
+    long, short = (kt.clean.smooth(one, "one-euro", 2.0).points[:30] for one in (tracks, tracks.frames(0, 30)))
+    assert float((long - short).norm(dim=-1).max()) < 5

@@ -95,3 +95,12 @@ def test_a_cut_is_told_under_perspective_too():
     moved = replace(tracks, points=tracks.points / 4 + 500, units="px")
     with pytest.warns(kt.KcsWarning, match="the view jumps at frame 20"):
         kt.reconstruct(moved, method="kcs", intrinsics=(1000, 1000, 500, 500))
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_cut_is_found_where_one_side_is_hidden(side):
+    """Compared with its own mirror image hardly any joint is left there."""
+    clip, _ = film(90.0, 30.0)
+    weights = clip.weights.clone()
+    weights[:, [i for i, name in enumerate(clip.skeleton.joints) if name.startswith(side)]] = 0
+    assert cuts_of(replace(clip, weights=weights)) == [24]

@@ -880,3 +880,11 @@ def test_unknown_skeletons_are_named():
 def test_words_for_numbers_are_refused(make, told):
     with pytest.raises(kt.OptionError, match=told):
         make()
+
+
+def test_lengths_of_each_frame_are_told_apart_from_those_of_clips():
+    body = kt.SKELETONS["h36m17"]
+    points = torch.randn(10, 17, 3)
+    with pytest.raises(ShapeError, match="the same in all frames"):
+        kt.nn.BoneLengthEnergy(body)(points, bone_lengths(points, body.bone_index()))
+    assert kt.nn.BoneLengthEnergy(body)(points[None], torch.ones(10, 16)).shape == (10, 10)

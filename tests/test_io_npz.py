@@ -423,3 +423,26 @@ def test_every_file_of_the_data_folder_loads_or_says_why(shared):
         else:
             with pytest.raises(FormatError, match="3D motion only"):
                 load_tracks(path)
+
+
+def test_tracks_come_back_as_sure_as_they_were(tmp_path):
+    """Also joints that cleaning filled, whose confidence is low, and what is known of a detector."""
+    tracks = walk_result().tracks
+    for detector in (None, False, True):
+        weights = tracks.weights.clone()
+        weights[3, 4] = 0.1
+        mine = replace(tracks, weights=weights, detector=detector)
+        back = load_tracks(save(mine, tmp_path / "t.npz"))
+        assert back.detector is detector
+        assert float(back.weights[3, 4]) == pytest.approx(0.1)
+        assert not load_tracks(tmp_path / "t.npz", threshold=0.3).seen[3, 4]
+        whole = save(replace(walk_result(), tracks=mine), tmp_path / "r.npz")
+        assert load_reconstruction(whole).tracks.detector is detector
+
+
+def test_files_of_others_go_through_a_threshold(tmp_path):
+    faint = np.ones((5, 3))
+    faint[2, 1] = 0.2
+    path = written(tmp_path / "raw.npz", confidence=faint)
+    assert not load_tracks(path).seen[2, 1]
+    assert load_tracks(path, threshold=0.1).seen[2, 1]

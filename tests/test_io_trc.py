@@ -132,3 +132,32 @@ def test_mutated_files_end_in_our_errors(tmp_path):
         except kt.KcsError as error:
             assert "m.trc" in str(error)
     assert 0 < read < 150
+
+
+def rows(path, order, first=1, cells=None):
+    """A file of ten frames of two markers, its rows in another order, or some of them."""
+    head = "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\n"
+    head += "10\t10\t10\t2\tmm\nFrame#\tTime\tA\t\t\tB\n\t\tX1\tY1\tZ1\tX2\tY2\tZ2\n\n"
+    lines = [[first + k, k / 10, k, 0, 0, k, 1, 1][:cells] for k in order]
+    path.write_text(head + "".join("\t".join(map(str, line)) + "\n" for line in lines), encoding="utf-8")
+    return load_motion(path)
+
+
+def test_rows_are_frames_by_their_numbers(tmp_path):
+    path = tmp_path / "a.trc"
+    whole = rows(path, range(10))
+    shuffled = rows(path, [*range(5, 10), *range(5)])
+    assert torch.equal(shuffled.points, whole.points)
+    assert any("the order of their numbers" in note for note in shuffled.notes)
+    gapped = rows(path, [0, 1, 2, 6, 7, 8, 9])
+    assert gapped.num_frames == 10 and gapped.fps == 10 and not gapped.seen[3:6].any()
+    assert torch.equal(gapped.points[6:], whole.points[6:])
+    assert any("frame 0 is the file's frame 21" in note for note in rows(path, range(10), first=21).notes)
+    with pytest.raises(FormatError, match="expected every frame once, got frame 3 again"):
+        rows(path, [0, 1, 2, 2, 3])
+
+
+def test_rows_that_end_early_are_told(tmp_path):
+    motion = rows(tmp_path / "a.trc", range(10), cells=5)
+    assert any("10 rows end before the last marker" in note for note in motion.notes)
+    assert not any("end before" in note for note in rows(tmp_path / "b.trc", range(10)).notes)

@@ -260,7 +260,7 @@ def test_finds_the_body_again_after_it_turned_unseen(clip):
         (lambda x: x[:16], r"frame 1: xy: expected shape \(17, 2\).*got \(16, 2\)"),
         (lambda x: x[None], "frame 1: xy: expected 2 dimensions"),
         (lambda x: x.index_fill(0, torch.tensor([7]), torch.inf), "frame 1: xy: joint 'left_elbow' is infinite"),
-        (lambda x: 1e200 * x, "frame 1: xy: joint 'nose' is beyond"),
+        (lambda x: 1e200 * x, "frame 1: xy: joint 'nose': expected coordinates up to 1e"),
         (lambda x: "a camera", "frame 1: xy: expected an array of numbers"),
     ],
 )
@@ -343,3 +343,14 @@ def test_bad_options():
         kt.Tracker("auto")
     with pytest.raises(kt.ShapeError, match="nothing to reconstruct"):
         kt.Tracker("coco17").result()
+
+
+@pytest.mark.parametrize("option", [{"units": 5}, {"wait": "no"}])
+def test_odd_options_are_told(option):
+    with pytest.raises(kt.OptionError, match=next(iter(option))):
+        kt.Tracker("coco17", **option)
+
+
+def test_units_are_spelt_as_elsewhere():
+    with kt.Tracker("coco17", units="Millimetres") as tracker:
+        assert tracker.units == "mm"

@@ -440,3 +440,17 @@ def test_what_was_changed_since_is_told(tmp_path):
     os.utime(source / "clip1.npz", (later, later))
     again = run(source, tmp_path / "out")
     assert (again.skipped, again.outdated) == (2, (source / "clip1.npz",))
+
+
+def test_a_number_is_the_same_however_it_is_written(clips, tmp_path):
+    run(clips, tmp_path, fps=30)
+    assert run(clips, tmp_path, fps=30.0).failed == ()
+    assert run(clips, tmp_path, fps=np.float64(30)).failed == ()
+
+
+def test_a_size_that_no_body_has_is_told_before_anything_is_solved(clips, tmp_path, monkeypatch):
+    monkeypatch.setattr(folder._Work, "_lift", lambda _, people: [pytest.fail("solved in vain") for one in people])
+    failed = run(clips, tmp_path, scale="hieght=1.75m").failed
+    assert failed and all("unknown size 'hieght'" in why for _, why in failed)
+    with pytest.raises(kt.OptionError, match="scale: expected height"):
+        run(clips, tmp_path / "other", scale="units=3m")

@@ -232,3 +232,13 @@ def test_weights_that_do_not_fit_are_refused():
         if not name.startswith("ContactEnergy"):
             with pytest.raises(ShapeError, match="weights"):
                 energy(WALK, torch.ones(FRAMES - 1, 17).double(), ALL)
+
+
+def test_weights_of_joints_that_clips_share_where_frames_are_as_many():
+    """Of a square all that fits is taken; of weights that fit as both, those for each frame of each clip."""
+    points = torch.zeros(8, 17, 17, 3)
+    module = modules.PostureEnergy(MAN)
+    assert weighs_joints(torch.ones(17, 17), points, module)
+    assert weighs_joints(torch.ones(17, 17), points[:1], module)
+    assert not weighs_joints(torch.ones(8, 17), points, module)
+    assert not weighs_joints(torch.ones(17, 17), torch.zeros(17, 17, 17, 3), module)

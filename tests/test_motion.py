@@ -383,3 +383,29 @@ def test_every_real_file_is_of_one_format(shared):
         if path.name in found:
             with pytest.raises(FormatError, match="3D|motion|three"):
                 kt.load_tracks(path)
+
+
+def test_confidences_come_back(tmp_path):
+    motion = walk(8)
+    weights = torch.full_like(motion.weights, 0.4)
+    weights[2, 3] = 0
+    back = load_motion(save(replace(motion, weights=weights), tmp_path / "m.npz"))
+    assert torch.allclose(back.weights, weights)
+
+
+def test_own_virtual_joints_are_as_sure_as_they_are_told():
+    body = kt.SKELETONS["coco17"]
+    points, sure = torch.rand(4, 19, 3, generator=torch.Generator().manual_seed(0)).double(), torch.ones(4, 19)
+    sure[:, -1], sure[:, -2] = 0, 0.3
+    made = Motion.from_arrays(points, sure, joint_names=body.joints, skeleton="coco17")
+    assert made.weights[:, -1].tolist() == [0] * 4 and made.weights[0, -2] == pytest.approx(0.3)
+    assert torch.equal(made.points[:, -2], points[:, -2])
+    points[0, -1] = math.inf
+    with pytest.raises(ShapeError, match=f"joint '{body.joints[-1]}' is infinite"):
+        Motion.from_arrays(points, joint_names=body.joints, skeleton="coco17")
+
+
+@pytest.mark.parametrize(("lens", "distance"), [((1000, 1000, 0, 0), None), ((1000, 1000, 960, 540), "far")])
+def test_a_distance_is_a_number_that_something_tells(lens, distance):
+    with pytest.raises(OptionError, match="distance: expected a number"):
+        walk(8).tracks(intrinsics=lens, distance=distance)

@@ -250,3 +250,37 @@ def test_what_does_not_fit_is_said():
             PerspectiveEnergy()(points, wrong, LENS)
     with pytest.raises(ShapeError, match="intrinsics"):
         PerspectiveEnergy()(points, tracks, (1.0, 2.0))
+
+
+def matrix(lens):
+    fx, fy, cx, cy = lens.unbind(-1)
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], -1).unflatten(-1, (3, 3))
+
+
+def test_a_matrix_has_a_derivative_and_is_mapped():
+    points, _, tracks = scene(noise=1.0)
+    energy = PerspectiveEnergy()
+    (own,) = torch.autograd.grad(energy(points, tracks, lens := K.clone().requires_grad_()).sum(), lens)
+    (found,) = torch.autograd.grad(energy(points, tracks, full := matrix(K).requires_grad_()).sum(), full)
+    assert_close(torch.stack([found[0, 0], found[1, 1], found[0, 2], found[1, 2]]), own)
+    several = torch.func.vmap(lambda k: energy(points, tracks, k))(torch.stack([matrix(K), matrix(2 * K)]))
+    assert_close(several[0], energy(points, tracks, LENS))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        torch.zeros(4),
+        torch.tensor([-1500.0, 1500, 640, 360]),
+        torch.full((2, 4), torch.nan),
+        matrix(K).mT[None],
+        2 * matrix(K)[None],
+        matrix(K)[None] + torch.tensor([[0.0, 50, 0], [0, 0, 0], [0, 0, 0]]),
+    ],
+    ids=["zero", "negative", "nan", "transposed", "doubled", "skewed"],
+)
+def test_tensors_of_intrinsics_are_looked_at(wrong):
+    points, _, tracks = scene()
+    with pytest.raises(OptionError, match="intrinsics: expected"):
+        PerspectiveEnergy()(points, tracks, wrong)

@@ -314,3 +314,11 @@ def plain(align, root):
 def test_a_root_is_an_index(kind):
     with pytest.raises(kt.OptionError, match="root: expected the index of a joint"):
         kind("root", root="pelvis")
+
+
+def test_metrics_in_one_collection():
+    from torchmetrics import MetricCollection
+
+    both = MetricCollection({"error": kt.metrics.MPJPE(), "bones": kt.metrics.BoneDeviation(BONES)})
+    both.update(pred=PRED, truth=TRUTH)
+    assert both.compute()["bones"] == pytest.approx(float(fed(kt.metrics.BoneDeviation(BONES), PRED).compute()))

@@ -570,3 +570,15 @@ def test_a_network_of_ones_own_trains_and_is_told_that_it_has_no_file(tmp_path):
     with pytest.warns(kt.KcsWarning, match="no lifter.safetensors: unknown solver to save"):
         outcome = train(config, tmp_path)
     assert outcome.lifter is None and outcome.metrics["test/mpjpe"] > 0
+
+
+def test_losses_that_are_compiled_or_take_anything():
+    class Anything(nn.Module):
+        def forward(self, points, *more, **options):
+            return points.square().mean((-3, -2, -1))
+
+    batch, points = batch_of(), torch.randn(6, 5, 17, 3)
+    energy = kt.nn.BoneLengthEnergy(BODY)
+    compiled = LossTerm(torch.compile(energy, backend="eager")).value(points, batch, nn.Identity())
+    assert compiled == pytest.approx(LossTerm(energy).value(points, batch, nn.Identity()))
+    assert LossTerm(Anything()).value(points, batch, nn.Identity()) == pytest.approx(points.square().mean().item())

@@ -644,3 +644,21 @@ def test_joints_of_another_body_are_those_in_common():
     few = [n for n in names if "Knee" in n or "Hip" in n or "Ankle" in n]
     with pytest.raises(SkeletonError, match="none of them named"):
         Tracks.from_arrays(walk.points[:, [names.index(n) for n in few]], joint_names=few, skeleton="h36m17")
+
+
+def test_whole_numbers_of_any_kind():
+    tracks = walking_person(20).tracks
+    assert tracks.frames(np.int64(0), 20, np.int64(2)).num_frames == 10
+    for part in ((1.5, 3), (0, "3"), (0, 3, 0), (0, 3, True)):
+        with pytest.raises(OptionError, match="expected a whole number"):
+            tracks.frames(*part)
+
+
+def test_a_mirror_image_has_the_mirrored_alternatives():
+    """Of which no objective is known."""
+    result = walk_result()
+    other = replace(result, points=result.points + 1.0, objective=3.0)
+    turned = replace(result, objective=2.0, alternatives=(other,)).mirrored()
+    assert math.isnan(turned.objective) and math.isnan(turned.alternatives[0].objective)
+    assert_close(turned.alternatives[0].points, other.mirrored().points)
+    assert replace(result, alternatives=(other,)).solution(np.int64(2)) is not None

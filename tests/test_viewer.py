@@ -97,7 +97,7 @@ def test_page_holds_the_motion(result):
     assert np.allclose(shown(data), points - middle, atol=1e-4 * np.ptp(points))
     assert (data["total"], data["step"], data["fps"]) == (12, 1, 25.0)
     assert data["people"][0]["joints"] == list(result.skeleton.joints)
-    spread = unpack(data["people"][0]["spread"]).reshape(12, -1)
+    spread = unpack(data["people"][0]["solutions"][0]["spread"]).reshape(12, -1)
     assert np.allclose(spread, result.uncertainty, atol=1e-4 * float(result.uncertainty.max()))
 
 
@@ -141,7 +141,7 @@ def test_the_projection_lies_on_the_tracks(result):
     """Scale and shift of each frame take the points onto the tracks, as far as those of the result do."""
     data = scene(player(result))
     one = data["people"][0]
-    fit = unpack(one["fit"]).reshape(-1, 1, 3)
+    fit = unpack(one["solutions"][0]["fit"]).reshape(-1, 1, 3)
     drawn = fit[..., :1] * shown(data)[..., :2] + fit[..., 1:]
     seen = result.tracks.seen.numpy()
     tracks = unpack(one["tracks"]).reshape(*seen.shape, 2)
@@ -157,8 +157,9 @@ def test_before_a_known_lens_the_projection_is_a_pinholes(result):
     near = replace(result, distance=distance, tracks=replace(result.tracks, points=image))
     data = scene(player(near))
     middle = np.median(image.numpy()[result.tracks.seen.numpy()], axis=0)
-    assert np.allclose(data["people"][0]["lens"], [900, 1100, 320 - middle[0], 240 - middle[1]], rtol=1e-6, atol=1e-3)
-    assert np.allclose(unpack(data["people"][0]["path"]), distance)
+    best = data["people"][0]["solutions"][0]
+    assert np.allclose(best["lens"], [900, 1100, 320 - middle[0], 240 - middle[1]], rtol=1e-6, atol=1e-3)
+    assert np.allclose(unpack(best["path"]), distance)
 
 
 def test_people_before_lenses_of_their_own_stand_as_in_the_image(result):
@@ -242,7 +243,7 @@ def test_several_people_share_a_scene(result):
     assert [p["frames"] for p in data["people"]] == [12, 6]
     apart = shown(data, person=1) - shown(data)[:6]
     assert np.allclose(apart, 1, atol=1e-4 * np.ptp(result.points.numpy()))
-    assert data["people"][1]["spread"] is None
+    assert data["people"][1]["solutions"][0]["spread"] is None
     assert any("behind each other is not known" in e["text"] for e in Page(text).all("li"))
     methods = scene(player([result, replace(result, method="other")]))
     assert [p["name"] for p in methods["people"]] == ["SfAM", "other"]
@@ -506,3 +507,10 @@ def test_pages_are_bounded():
         text = player(replace(long, alternatives=(long, long)))
         assert 4e6 < len(text) < 9e6
         assert "frame shown" in text
+
+
+def test_each_solution_is_drawn_along_its_own_path(result):
+    other = replace(result, root_depth=torch.linspace(0, 5, 12).double())
+    best = replace(result, root_depth=torch.linspace(0, 1, 12).double(), alternatives=(other,))
+    solutions = scene(player(best))["people"][0]["solutions"]
+    assert [unpack(one["path"])[-1] for one in solutions] == pytest.approx([1, 5])

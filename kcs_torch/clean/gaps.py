@@ -8,6 +8,7 @@ import torch
 from kcs_torch.clean.common import check_tracks, number, rebuilt, runs, share
 from kcs_torch.errors import OptionError, unknown
 from kcs_torch.types import Tracks
+from kcs_torch.types.hints import is_a
 
 __all__ = ["fill"]
 
@@ -38,7 +39,7 @@ def fill(tracks: Tracks, longest: int, *, kind: str = "cubic", weight: float = 0
     'fill: 3 of 3 (100 %) unseen detections filled (cubic): gaps of up to 5 frames, 1 of them'
     """
     check_tracks(tracks, "fill")
-    if isinstance(longest, bool) or not isinstance(longest, (int, np.integer)) or longest < 1:
+    if not is_a(longest, int) or longest < 1:
         raise OptionError(f"fill: longest: expected a whole number of frames from 1, got {longest!r}")
     if kind not in _KINDS:
         raise unknown("kind of fill", kind, _KINDS)

@@ -9,8 +9,9 @@ from typing import overload
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from kcs_torch.clean.common import Array, check_tracks, frame_rate, number, rebuilt, runs, share
+from kcs_torch.clean.common import Array, body_size, check_tracks, frame_rate, number, rebuilt, runs, share
 from kcs_torch.clean.detector import found_by_detector
 from kcs_torch.clean.filters import FILTERS, Filter
 from kcs_torch.clean.sides import unswap
@@ -42,7 +43,7 @@ def smooth(
         motion: tracks, or a result: then its 3D points and the depth of its root, not its tracks. Bones of a smoothed
             result keep their length less exactly; its lengths and ``bone_variation`` are told anew.
         method: "butterworth" (order 4, no lag, -3 dB at the cut-off), "savgol" (Savitzky-Golay, cubic, no lag) or
-            "one-euro" (causal; follows fast motion).
+            "one-euro" (causal, but for the body's size, the whole clip's; follows fast motion).
         cutoff: in Hz.
         fps: frames a second; as the motion says if None.
 
@@ -73,7 +74,7 @@ def smooth(
     points = tracks.points[:, :count].detach().double().cpu().numpy()
     weights = tracks.weights[:, :count].detach().double().cpu().numpy()
     seen = weights > 0
-    chosen = FILTERS[method](cutoff, rate, _size(points[seen]))
+    chosen = FILTERS[method](cutoff, rate, _size(points, seen))
     moved, short = _smooth_runs(points, weights, chosen)
     change = math.sqrt(float(np.square(moved - points).sum(-1)[seen].mean()))
     note = f"smooth ({chosen.words}): joints moved by {change:.2g} {tracks.units} (root mean square)"
@@ -107,7 +108,7 @@ def _smooth_runs(points: Array, weights: Array, chosen: Filter) -> tuple[Array, 
 def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: float) -> Reconstruction:
     """A result with smoothed points and root; the other solutions are smoothed like it."""
     points = result.points.detach().double().cpu().numpy()
-    chosen = FILTERS[method](cutoff, rate, _size(points.reshape(-1, 3)))
+    chosen = FILTERS[method](cutoff, rate, _size(points, np.ones(points.shape[:2], dtype=bool)))
     words = chosen.words
     if len(points) < chosen.least:
         note = f"smooth 3D ({words}): left as it is: {len(points)} frames are fewer than {chosen.least}"
@@ -133,7 +134,6 @@ def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: flo
     ).remeasured()
 
 
-def _size(points: Array) -> float:
-    """Root mean square distance of points (..., D) from their middle, never 0: what one-euro measures speeds in."""
-    size = math.sqrt(float(np.square(points - points.mean(0)).sum(-1).mean()))
-    return size if size > 0 else 1.0
+def _size(points: Array, seen: NDArray[np.bool_]) -> float:
+    """The body's size, never 0: what one-euro measures speeds in."""
+    return float(body_size(torch.from_numpy(points), torch.from_numpy(seen))) or 1.0

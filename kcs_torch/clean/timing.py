@@ -9,10 +9,11 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from kcs_torch.clean.common import check_tracks, frame_rate, number, rebuilt, runs
+from kcs_torch.clean.common import check_rate, check_tracks, frame_rate, rebuilt, runs
 from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.solvers.cuts import find_cuts
 from kcs_torch.types import Tracks
+from kcs_torch.types.hints import is_a
 
 __all__ = ["cuts_of", "resample", "split", "trim"]
 
@@ -39,7 +40,7 @@ def trim(tracks: Tracks, start: int | None = None, stop: int | None = None) -> T
     check_tracks(tracks, "trim")
     frames = tracks.num_frames
     for name, value in (("start", start), ("stop", stop)):
-        if value is not None and (isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0):
+        if value is not None and (not is_a(value, int) or value < 0):
             raise OptionError(f"trim: {name}: expected a frame counted from 0, or None, got {value!r}")
     first, end = start or 0, frames if stop is None else min(stop, frames)
     if not first < end:
@@ -49,7 +50,7 @@ def trim(tracks: Tracks, start: int | None = None, stop: int | None = None) -> T
     if not bool(cut.seen.any()):
         raise ShapeError(f"{tracks.source}: no joint is seen in frames {first} to {end - 1}")
     note = f"trim: frames {first} to {end - 1} of {frames}"
-    return replace(cut, notes=(*cut.notes, note))
+    return replace(cut, points=cut.points.clone(), weights=cut.weights.clone(), notes=(*cut.notes, note))
 
 
 def split(tracks: Tracks) -> list[Tracks]:
@@ -108,7 +109,7 @@ def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: flo
     check_tracks(tracks, "resample")
     if kind not in _KINDS:
         raise unknown("kind of resample", kind, _KINDS)
-    number(fps, "resample: fps", "a positive number of frames a second")
+    check_rate(fps, "resample: fps")
     rate = frame_rate(tracks.fps, source_fps, "resample", tracks.source)
     from scipy.interpolate import make_interp_spline
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kcs_torch.cli.options import AsJson, InFormat, Rate
-from kcs_torch.cli.report import answer, print_json, progress
+from kcs_torch.cli.report import answer, one_line, print_json, progress
 from kcs_torch.errors import counted
 
 if TYPE_CHECKING:
@@ -82,10 +82,13 @@ def angles(
             with progress(f"writing {output}"):
                 found.save(output)
         facts = _facts(found)
+        notes = list(data.diagnostics.notes if isinstance(data, Reconstruction) else data.notes)
         if as_json:
-            print_json({"source": source, "fps": found.fps, "angles": facts})
+            print_json({"source": source, "fps": found.fps, "angles": facts, "notes": notes})
             return
         typer.echo(_spoken(found, facts, source))
+        for note in notes:
+            typer.echo(f"  note: {one_line(note)}")
         if output is not None:
             typer.echo(f"wrote {output}")
 

@@ -62,7 +62,7 @@ def convert(
         str | None,
         typer.Option(metavar="NUMBER", help="Which person's 2D tracks, counted from 0; the most visible if not given."),
     ] = None,
-    threshold: Threshold = 0.3,
+    threshold: Threshold = None,
     size: ImageSize = None,
     trust: Trust = False,
     overwrite: Annotated[

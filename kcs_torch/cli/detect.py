@@ -65,7 +65,7 @@ def detect(
     fps: Annotated[
         float | None, typer.Option(metavar="NUMBER", help="Frames a second; those of VIDEO if not given.")
     ] = None,
-    threshold: Threshold = 0.3,
+    threshold: Threshold = None,
     as_json: AsJson = False,
 ) -> None:
     """Find the joints of people in a video; this needs a detector (see `kcs-torch doctor`)."""
@@ -110,7 +110,7 @@ def people_of(
     frames: str | None,
     skeleton: str | None,
     fps: float | None,
-    threshold: float,
+    threshold: float | None,
 ) -> list[tuple[int, Tracks]]:
     """The chosen people of a video, each with their number.
 

@@ -36,7 +36,7 @@ def info(
     tracks: TracksPath,
     format: FormatName = None,
     skeleton: UseSkeleton = None,
-    threshold: Threshold = 0.3,
+    threshold: Threshold = None,
     size: ImageSize = None,
     trust: Trust = False,
     output: Annotated[

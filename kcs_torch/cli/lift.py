@@ -111,7 +111,7 @@ def lift(
     fps: Annotated[
         float | None, typer.Option(metavar="NUMBER", help="Frames a second; those of TRACKS if not given.")
     ] = None,
-    threshold: Threshold = 0.3,
+    threshold: Threshold = None,
     size: ImageSize = None,
     trust: Trust = False,
     intrinsics: Annotated[

@@ -55,7 +55,13 @@ UseSkeleton = Annotated[
     ),
 ]
 Threshold = Annotated[
-    float, typer.Option("--threshold", metavar="0..1", help="A joint with less confidence counts as unseen.")
+    float | None,
+    typer.Option(
+        "--threshold",
+        metavar="0..1",
+        help="A joint with less confidence counts as unseen: .3 if not given, or 0 for tracks that kcs-torch wrote.",
+        show_default=False,
+    ),
 ]
 ImageSize = Annotated[
     str | None,

@@ -71,7 +71,7 @@ def score(
     from_units: FromUnits = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare a motion with ground truth; joints are matched by name, frames by number or time."""
+    """Compare a motion with ground truth; joints are matched by name, frames by number."""
     with answer(as_json):
         from kcs_torch.io import load_motion
         from kcs_torch.metrics import compare
@@ -147,7 +147,8 @@ def _spoken(found: Comparison, pred: str, truth: str, mirror: bool) -> str:
     lines += [f"{name:<16}{text}" for name, text in rows.items()]
     lines += [f"note: {one_line(note)}" for note in found.notes]
     better = [how for how in found.mpjpe if found.mirrored[how] < 0.98 * found.mpjpe[how]]
-    if better:
+    turned = min(found.mirrored.values()) < 0.98 * min(found.mpjpe.values())  # else the axes are to blame
+    if better and turned:
         shown = ", ".join(f"{how} {found.mirrored[how]:.4g}{unit}" for how in better)
         how = "without" if mirror else "with"
         lines.append(f"note: the mirror image in depth is closer ({shown}): score it {how} --mirror")

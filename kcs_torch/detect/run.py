@@ -40,7 +40,7 @@ def detect_video(
     stop: int | None = None,
     skeleton: str | Path | Skeleton | None = None,
     fps: float | None = None,
-    threshold: float = 0.3,
+    threshold: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Tracks]:
     """Find the joints of the people in a video, the most seen first.
@@ -56,7 +56,7 @@ def detect_video(
         stop: frame after the last; the end if None.
         skeleton: another skeleton, whose joints are taken by name; the detector's if None.
         fps: frames a second; as the video says if None.
-        threshold: a joint with less confidence counts as unseen.
+        threshold: a joint with less confidence counts as unseen; .3 if None.
         progress: called with frames done and frames in all (0: unknown).
 
     Returns:

@@ -143,17 +143,17 @@ def build_animals(
         _check(animal, path)
     if are_shares(np.concatenate([a.points.ravel() for a in whole])):
         whole = [a._replace(points=in_pixels(a.points, options.image_size, shared)) for a in whole]
-    seen = [a for a in whole if _seen(a, options.threshold).any()]
+    seen = [a for a in whole if _seen(a, options.least).any()]
     if not seen:
         faint = [a.confidence[_seen(a, 0.0)] for a in whole if a.confidence is not None]
-        raise nothing_seen(str(path), options.threshold, max((float(c.max()) for c in faint if len(c)), default=0.0))
+        raise nothing_seen(str(path), options.least, max((float(c.max()) for c in faint if len(c)), default=0.0))
     if len(seen) < len(whole):
         missing = [a.name for a in whole if not any(a is s for s in seen)]
         shown = ", ".join(map(brief, missing[:5])) + (", ..." if len(missing) > 5 else "")
         shared.append(
             f"{len(missing)} of {len(whole)} animals never reach the confidence threshold ({shown}): left out"
         )
-    shares = [float(_seen(a, options.threshold).any(1).mean()) for a in seen]
+    shares = [float(_seen(a, options.least).any(1).mean()) for a in seen]
     if len(seen) > 2 and float(np.median(shares)) < _FRAGMENT:
         shared.append(f"most of the {len(seen)} animals are seen in few frames: pieces of tracks, which are not joined")
     people = []

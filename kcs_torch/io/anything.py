@@ -26,7 +26,7 @@ def load_any(
     up: str | None = None,
     units: str | None = None,
     person: int | None = None,
-    threshold: float = 0.3,
+    threshold: float | None = None,
     image_size: tuple[int, int] | None = None,
     trust: bool = False,
 ) -> Reconstruction | Motion | Tracks:

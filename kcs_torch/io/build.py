@@ -28,6 +28,7 @@ def build_tracks(
     fps: float | None = None,
     units: str = "px",
     notes: Sequence[str] = (),
+    detector: bool | None = None,
 ) -> Tracks:
     """Wrap what a reader found in a file, as the caller's ``options`` want it.
 
@@ -42,6 +43,7 @@ def build_tracks(
         fps: the file's frames per second.
         units: the file's units.
         notes: sentences for the user.
+        detector: whether the file says that a detector made them.
 
     Raises:
         ShapeError: the numbers are no tracks.
@@ -65,11 +67,12 @@ def build_tracks(
         edges=edges,
         fps=options.fps if options.fps is not None else fps,
         units=units,
-        threshold=options.threshold,
+        threshold=options.least,
         source=source,
         notes=remarks,
     )
-    return replace(tracks, notes=tuple(dict.fromkeys(tracks.notes)))  # a result read again already has some
+    notes = tuple(dict.fromkeys(tracks.notes))  # a result read again already has some
+    return replace(tracks, notes=notes, detector=detector)
 
 
 def nothing_seen(source: str, threshold: float, highest: float) -> ShapeError:

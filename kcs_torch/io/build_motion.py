@@ -33,6 +33,7 @@ def build_motion(
     units: str = "",
     up: str | None = None,
     notes: Sequence[str] = (),
+    confidence: Tensor | None = None,
 ) -> Motion:
     """Wrap what a reader found in a file, as the caller's ``options`` want it.
 
@@ -47,6 +48,7 @@ def build_motion(
         units: the file's units.
         up: the file's axis that points up, where it says.
         notes: sentences for the user.
+        confidence: (T, N), or None.
 
     Raises:
         ShapeError: the numbers are no motion.
@@ -69,6 +71,7 @@ def build_motion(
             )
     return Motion.from_arrays(
         points,
+        confidence,
         up=axis,
         skeleton=options.skeleton or skeleton,
         joint_names=names,

@@ -50,7 +50,7 @@ def load_people(
     format: str | None = None,
     skeleton: str | Path | Skeleton | None = None,
     fps: float | None = None,
-    threshold: float = 0.3,
+    threshold: float | None = None,
     image_size: tuple[int, int] | None = None,
     trust: bool = False,
 ) -> list[Tracks]:
@@ -62,7 +62,8 @@ def load_people(
         skeleton: a :class:`Skeleton`, a built-in name or a YAML/JSON file; as the file says if None. Joints are
             matched by name where the file names them, by their order otherwise.
         fps: frames per second; as the file says if None.
-        threshold: a joint with less confidence counts as unseen, 0..1.
+        threshold: a joint with less confidence counts as unseen, 0..1. None: .3, or 0 for tracks that this library
+            wrote, whose joints have been through one.
         image_size: width and height of the video in pixels, where coordinates are shares of it (as MediaPipe's are).
         trust: read a file although it is a pickle (VideoPose3D's .npz): arrays and numbers are taken from it, no code.
 
@@ -90,7 +91,7 @@ def load_tracks(
     person: int | None = None,
     skeleton: str | Path | Skeleton | None = None,
     fps: float | None = None,
-    threshold: float = 0.3,
+    threshold: float | None = None,
     image_size: tuple[int, int] | None = None,
     trust: bool = False,
 ) -> Tracks:
@@ -102,7 +103,8 @@ def load_tracks(
         person: which one, counted from 0 in the order of :func:`load_people`; the most seen if None.
         skeleton: a :class:`Skeleton`, a built-in name or a YAML/JSON file; as the file says if None.
         fps: frames per second; as the file says if None.
-        threshold: a joint with less confidence counts as unseen, 0..1.
+        threshold: a joint with less confidence counts as unseen, 0..1. None: .3, or 0 for tracks that this library
+            wrote, whose joints have been through one.
         image_size: width and height of the video in pixels, where coordinates are shares of it (as MediaPipe's are).
         trust: read a file although it is a pickle (VideoPose3D's .npz): arrays and numbers are taken from it, no code.
 
@@ -137,7 +139,7 @@ def check_reading(
     format: str | None = None,
     skeleton: str | Path | Skeleton | None = None,
     fps: float | None = None,
-    threshold: float = 0.3,
+    threshold: float | None = None,
     image_size: tuple[int, int] | None = None,
     trust: bool = False,
     **unknown_options: object,
@@ -153,7 +155,7 @@ def check_reading(
         raise unknown("reading option", name, ["format", *(field.name for field in fields(Options))])
     if format is not None and format not in READERS:
         raise unknown("format", format, READERS)
-    least = as_number(threshold)
+    least = 0.0 if threshold is None else as_number(threshold)
     if least is None or not 0 <= least <= 1:
         raise OptionError(f"threshold: expected a number from 0 to 1, got {threshold!r}")
     check_fps(fps)

@@ -100,10 +100,10 @@ def people_tracks(
         remarks.append("people are followed by the file's own track ids")
         people = _without_breaks(people, frames, gap, remarks)
     several = len({s.track for frame in frames for s in frame} - {None}) > 1
-    least = max(options.threshold, 1e-12)
+    least = max(options.least, 1e-12)
     visible = [seen for seen in people if any((frames[t][i].joints[:, 2] >= least).any() for t, i in seen)]
     if not visible:
-        raise nothing_seen(source, options.threshold, max(float(joints[:, 2].max()) for joints in everybody))
+        raise nothing_seen(source, options.least, max(float(joints[:, 2].max()) for joints in everybody))
     if len(visible) < len(people):
         remarks.append(f"{len(people) - len(visible)} people never reach the confidence threshold: left out")
     most = max(int(_MOST_NUMBERS / (len(frames) * everybody[0].size)), 1)

@@ -44,6 +44,7 @@ __all__ = [
 ]
 
 RATE = 30.0  # frames per second of files that need a number where none is known
+THRESHOLD = 0.3  # confidence from which on a joint counts as seen
 HEAD = 65536  # bytes of a file that a reader may look at to recognise it
 
 
@@ -54,16 +55,21 @@ class Options:
     Attributes:
         skeleton: a :class:`Skeleton`, a built-in name, or a YAML/JSON file; None: as the file says.
         fps: frames per second; None: as the file says.
-        threshold: a joint with less confidence counts as unseen.
+        threshold: a joint with less confidence counts as unseen; None: as the file says.
         image_size: width and height of the video in pixels, where coordinates are shares of it.
         trust: whether a pickle (VideoPose3D's .npz) may be read; arrays, lists and numbers are taken from it, no code.
     """
 
     skeleton: str | Path | Skeleton | None = None
     fps: float | None = None
-    threshold: float = 0.3
+    threshold: float | None = None
     image_size: tuple[int, int] | None = None
     trust: bool = False
+
+    @property
+    def least(self) -> float:
+        """The threshold of files that say nothing of it."""
+        return THRESHOLD if self.threshold is None else self.threshold
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,9 @@ from torch import Tensor
 from kcs_torch.errors import ShapeError
 from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types import as_floats
+from kcs_torch.types.intake import as_floats, as_weights, check_places
 
 __all__ = ["Sight", "take_frame"]
-
-LARGEST = 1e100
-"""Largest coordinate: its square is finite."""
 
 
 def take_frame(
@@ -40,31 +37,19 @@ def take_frame(
     where = f"frame {number}"
     given = as_floats(xy, f"{where}: xy", 2)
     count = body.num_observed
-    name = lambda bad: f"joint '{body.joints[int(bad.nonzero()[0, 0])]}'"  # noqa: E731
     if given.shape != (count, 2):
         expected = f"({count}, 2) for skeleton '{body.name}'"
         raise ShapeError(f"{where}: xy: expected shape {expected}, got {tuple(given.shape)}")
     points = given.detach().to("cpu", torch.float64)
-    infinite = torch.isinf(points).any(-1)
-    huge = (points.abs() > LARGEST).any(-1)
-    if bool(infinite.any()):
-        raise ShapeError(f"{where}: xy: {name(infinite)} is infinite; write NaN where a joint is unseen")
-    if bool(huge.any()):
-        raise ShapeError(f"{where}: xy: {name(huge)} is beyond {LARGEST:g}; scale the tracks")
+    check_places(points, f"{where}: xy", body.joints)
     seen = torch.isfinite(points).all(-1)
     if confidence is None:
         corner = seen & ((points == 0).all(-1) | (points == -1).all(-1))
         away = bool((points[seen & ~corner] > 0).all())
         weights = (seen & ~corner if away else seen).double()
     else:
-        weights = as_floats(confidence, f"{where}: confidence", 1).detach().to("cpu", torch.float64)
-        if weights.shape != (count,):
-            raise ShapeError(f"{where}: confidence: expected shape ({count},), got {tuple(weights.shape)}")
-        weights = torch.nan_to_num(weights, nan=0.0, posinf=torch.inf, neginf=-torch.inf)
-        wrong = (weights < 0) | (weights > 1)
-        if bool(wrong.any()):
-            raise ShapeError(f"{where}: confidence: {name(wrong)} has {float(weights[wrong][0]):g}; expected 0..1")
-        weights = torch.where(seen & (weights >= threshold), weights, 0.0)
+        told = as_floats(confidence, f"{where}: confidence", 1).detach().to("cpu", torch.float64)
+        weights = as_weights(told, seen, threshold, f"{where}: confidence", body.joints)
     points = torch.where(weights[:, None] > 0, points, 0.0)
     return *body.complete(points, weights), given
 

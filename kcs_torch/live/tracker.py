@@ -23,6 +23,7 @@ from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Reconstruction, Tracks
 from kcs_torch.types.hints import is_a
 from kcs_torch.types.intake import RATES, as_number
+from kcs_torch.types.size import short_unit
 
 __all__ = ["Tracker"]
 
@@ -115,6 +116,8 @@ class Tracker:
             )
         if least is None or not 0 <= least <= 1:
             raise OptionError(f"Tracker: threshold: expected a confidence within 0..1, got {threshold!r}")
+        if not is_a(wait, bool):
+            raise OptionError(f"Tracker: wait: expected true or false, got {wait!r}")
         if method is not None and not isinstance(method, PKC):
             raise OptionError(f"Tracker: method: expected a kcs_torch.PKC, or None for its defaults, got {method!r}")
         window = max(2 * LEAST, round(LENGTH * rate)) if window is None else window
@@ -123,7 +126,7 @@ class Tracker:
             if not is_a(value, int) or value < LEAST:
                 raise OptionError(f"Tracker: {name}: expected at least {LEAST} frames, a whole number, got {value!r}")
         self.skeleton, self.fps, self.window, self.period = body, rate, int(window), int(period)
-        self.units, self.threshold, self.wait = units, least, bool(wait)
+        self.units, self.threshold, self.wait = short_unit(units), least, wait
         self.method = PKC() if method is None else method
         self._filter: BodyFilter | ChainFilter
         self._body, early = outward(body), EARLY

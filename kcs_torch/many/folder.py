@@ -24,7 +24,7 @@ from kcs_torch.methods.base import Method
 from kcs_torch.reconstruct import method_named, reconstruct_all, with_found_bones
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.hints import is_a, spoken
-from kcs_torch.types.size import METRES, parse_size
+from kcs_torch.types.size import METRES, check_size, parse_size
 
 __all__ = ["Outcome", "reconstruct_folder"]
 
@@ -221,7 +221,11 @@ class _Work:
     def _people(self, clip: Clip) -> list[Tracks]:
         people = load_people(clip.source, **self.reading)  # type: ignore[arg-type]
         people = people if self.everybody else [most_seen(people)]
-        return [with_found_bones(one) for one in people] if self.find else people
+        people = [with_found_bones(one) for one in people] if self.find else people
+        if self.size is not None:  # before they are solved in vain
+            for one, name in itertools.product(people, set(self.size) - {"units"}):
+                check_size(one.skeleton, name, "scale")
+        return people
 
     def _lift(self, people: list[Tracks]) -> list[Reconstruction]:
         return reconstruct_all(people, method=self.method, intrinsics=self.intrinsics)

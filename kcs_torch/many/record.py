@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from kcs_torch.errors import FormatError, OptionError, OutputError
@@ -38,6 +39,8 @@ def as_text(value: object) -> str:
     if isinstance(value, torch.nn.Module):
         weights = [t.detach().cpu().contiguous().reshape(-1).view(torch.uint8) for t in value.state_dict().values()]
         return f"{type(value).__name__} {zlib.crc32(b''.join(w.numpy().tobytes() for w in weights)):08x}"
+    if isinstance(value, np.generic):
+        value = value.item()
     return value if isinstance(value, str) else re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
 
@@ -47,6 +50,15 @@ def _skeleton(value: object) -> str:
         with suppress(OSError):
             return f"{Path(value).name} {zlib.crc32(Path(value).read_bytes()):08x}"
     return as_text(value)
+
+
+def _alike(one: str | None, other: str | None) -> bool:
+    """Whether two settings are the same text, or the same number: 30 and 30.0."""
+    if one is None or other is None:
+        return one is other
+    with suppress(ValueError):
+        return one == other or float(one) == float(other)
+    return False
 
 
 def claim(output: Path, settings: dict[str, str], retry: bool) -> None:
@@ -77,7 +89,7 @@ def claim(output: Path, settings: dict[str, str], retry: bool) -> None:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-    other = [name for name in {**own, **settings} if own.get(name) != settings.get(name)]
+    other = [name for name in {**own, **settings} if not _alike(own.get(name), settings.get(name))]
     if own.get("method") != settings["method"]:
         other = ["method"]
     elif retry:

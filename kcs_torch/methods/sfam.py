@@ -53,7 +53,8 @@ class SfAM(Method):
             is large the shapes are shrunk, and lengths taken from them would be too short.
         lengths: where the bone lengths come from: "shape" (re-estimated at each step), or "skeleton" (its
             proportions, at the scale of the shape), or one relative length per bone (fixed, as printed).
-        rank: K shapes of the camera factorisation, or "auto": chosen by how evenly and how orthonormal the rows come.
+        rank: K shapes of the camera factorisation, or "auto": chosen by how evenly and how orthonormal the rows come;
+            in clips of fewer than 24 frames by the shapes that come of them.
         camera_path: "free" cameras; "constant" angular velocity; "auto" takes the latter where it explains the former.
             It concerns the cameras that are reported, not the shape.
         trajectories: number of cosines that the tracks' paths are smoothed to within a window, or None.

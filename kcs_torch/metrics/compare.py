@@ -108,7 +108,7 @@ def compare(
     theirs = [truth.skeleton.index(name) for _, name in names]
     points = (ratio or 1.0) * pred.points[:, [pred.skeleton.index(name) for name, _ in names]].to(truth.points)
     target = truth.points[:, theirs]
-    gone = ~pred.seen[:, [pred.skeleton.index(name) for name, _ in names]]
+    gone = ~pred.seen[:, [pred.skeleton.index(name) for name, _ in names]].to(target.device)
     if bool(gone.any()):
         notes.append(f"{100 * float(gone.double().mean()):.1f} % of the prediction's joints are missing: not compared")
     weights = (truth.seen[:, theirs] & ~gone).to(target)
@@ -193,7 +193,8 @@ def _same_frames(pred: Motion, truth: Motion, notes: list[str]) -> tuple[Motion,
         thinned = fast.frames(0, fast.num_frames, step)
         if abs(fast.fps / slow.fps - step) < 0.01 * step and abs(thinned.num_frames - slow.num_frames) <= 1:
             count = min(thinned.num_frames, slow.num_frames)
-            notes.append(f"every {step} frames of {fast.source} are compared with {slow.source}, {count} in all")
+            which = "frames" if step == 1 else f"every {step} frames"
+            notes.append(f"{which} of {fast.source} are compared with {slow.source}, the first {count}")
             thinned, slow = thinned.frames(0, count), slow.frames(0, count)
             return (thinned, slow) if fast is pred else (slow, thinned)
     if pred.fps and truth.fps and abs(pred.fps / truth.fps - 1) < 0.01:

@@ -182,7 +182,10 @@ class BoneDeviation(_Mean):
         super().__init__(bone_pairs(bones).tolist(), **options)
         self.bones = bones
 
-    def update(self, points: Tensor, weights: Tensor | None = None) -> None:
-        """Add a batch of clips (..., T, N, 3) with weights (..., T, N), 0 where a joint is unknown."""
-        value = bone_deviation(points, self.bones, weights=weights)
+    def update(self, pred: Tensor, weights: Tensor | None = None) -> None:
+        """Add a batch of clips (..., T, N, 3) with weights (..., T, N), 0 where a joint is unknown.
+
+        In a ``MetricCollection`` with others name the arguments: ``update(pred=..., truth=...)``.
+        """
+        value = bone_deviation(pred, self.bones, weights=weights)
         self._add(value, ~torch.isnan(value))

@@ -28,8 +28,9 @@ class ContactEnergy(SkeletonModule):
 
     Args:
         skeleton: with contacts; without them only a velocity that is given costs anything.
-        slip: s, in units of the points per frame.
-        change: a, of the root's velocity from frame to frame.
+        slip: s, in units of the points per frame; what is usual is for a body of 1.75 units, metres say, at 30 frames a
+            second: of a body in millimetres give a thousand times as much.
+        change: a, of the root's velocity from frame to frame, in the same unit.
         num_steps: reweightings that find the best velocity where none is given.
 
     Raises:

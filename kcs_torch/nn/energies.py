@@ -278,3 +278,9 @@ def check_lengths(lengths: Tensor | None, points: Tensor, module: SkeletonModule
     if lengths.shape[-1:] != (count,) or not fit_together(lengths.shape[:-1], points.shape[:-3]):
         expected = f"(..., {count}), the same in all frames, for points {tuple(points.shape)}"
         raise ShapeError(f"{type(module).__name__}: expected lengths {expected}, got {tuple(lengths.shape)}")
+    if points.ndim == 3 and lengths.shape[:-1] == points.shape[:1] and len(points) > 1:
+        raise ShapeError(
+            f"{type(module).__name__}: expected lengths ({count},) that are the same in all frames of a clip "
+            f"{tuple(points.shape)}, got {tuple(lengths.shape)}: take their median over the frames; if they are of as "
+            "many bodies, give points[None]"
+        )

@@ -16,17 +16,18 @@ __all__ = ["bone_share", "clear_padding", "known_points", "weighs_joints"]
 def weighs_joints(weights: Tensor, points: Tensor, module: nn.Module) -> bool:
     """Whether weights are those of the joints (..., T, N) of points (..., T, N, D), or of the frames (..., T).
 
-    Where there are as many frames as joints, weights of joints have all dimensions of the points but the last.
+    Where there are as many frames as joints, weights may be both: then they are those of the frames if there is one for
+    each frame of each clip.
 
     Raises:
         ShapeError: they are neither.
     """
     check_tensor(weights, "weights", module)
     frames, joints = points.shape[-3:-1]
-    if weights.shape[-2:] == (frames, joints) and (frames != joints or weights.ndim >= points.ndim - 1):
-        if fit_together(weights.shape[:-2], points.shape[:-3]):
-            return True
-    elif weights.shape[-1:] == (frames,) and fit_together(weights.shape[:-1], points.shape[:-3]):
+    of_frames = weights.shape[-1:] == (frames,) and fit_together(weights.shape[:-1], points.shape[:-3])
+    if weights.shape[-2:] == (frames, joints) and fit_together(weights.shape[:-2], points.shape[:-3]):
+        return not (of_frames and weights.shape[:-1] == points.shape[:-3])
+    if of_frames:
         return False
     raise ShapeError(
         f"{type(module).__name__}: expected weights (..., {frames}, {joints}) of joints or (..., {frames}) of frames "

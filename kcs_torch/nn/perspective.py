@@ -17,7 +17,7 @@ from kcs_torch.nn.energies import check_clip, check_weights
 from kcs_torch.nn.layers import check_tensor, narrow, seen_weights, shown
 from kcs_torch.nn.reprojection import huber_square
 from kcs_torch.types.hints import is_a
-from kcs_torch.types.intrinsics import Intrinsics
+from kcs_torch.types.intrinsics import SKEW, Intrinsics
 
 __all__ = ["PerspectiveEnergy"]
 
@@ -105,13 +105,36 @@ class PerspectiveEnergy(nn.Module):
 
 
 def lens_tensor(intrinsics: Any, like: Tensor) -> Tensor:
-    """Intrinsics as a tensor (..., 4) of fx, fy, cx, cy."""
-    if isinstance(intrinsics, Tensor) and intrinsics.shape[-1:] == (4,):
-        return intrinsics.to(like)
-    if isinstance(intrinsics, Tensor) and intrinsics.ndim > 2 and intrinsics.shape[-2:] == (3, 3):
+    """Intrinsics as a tensor (..., 4) of fx, fy, cx, cy, of which tensors have a derivative.
+
+    Raises:
+        OptionError: some make no sense; numbers that are being traced or mapped are not looked at.
+    """
+    if not isinstance(intrinsics, Tensor):
+        return Intrinsics.of(intrinsics).tensor(like)
+    matrices = intrinsics.shape[-2:] == (3, 3)
+    if not matrices and intrinsics.shape[-1:] != (4,):
+        return Intrinsics.of(intrinsics).tensor(like)  # which tells what is wrong
+    lens = intrinsics
+    if matrices:
         each = [intrinsics[..., row, column] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))]
-        return torch.stack(each, -1).to(like)
-    return Intrinsics.of(intrinsics).tensor(like)
+        lens = torch.stack(each, -1)
+    wrong = ~(lens.isfinite().all(-1) & (lens[..., :2] > 0).all(-1))
+    if matrices:
+        rest = intrinsics[..., [1, 2, 2], [0, 0, 1]].abs().sum(-1) + (intrinsics[..., 2, 2] - 1).abs()
+        wrong = wrong | (rest != 0) | (intrinsics[..., 0, 1].abs() > SKEW * intrinsics[..., 0, 0].abs())
+    if not (torch.compiler.is_compiling() or wrong.is_meta) and _any(wrong):
+        at = tuple(wrong.nonzero()[0].tolist())
+        Intrinsics.of(intrinsics[at].detach())  # tells it
+    return lens.to(like)
+
+
+def _any(flags: Tensor) -> bool:
+    """Whether any is true; False under ``torch.func.vmap``, where no number can be looked at."""
+    try:
+        return bool(flags.any())
+    except RuntimeError:
+        return False
 
 
 def _reach(points: Tensor, share: Tensor, rounding: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ SUDDEN, BESIDE = 5.0, 8
 """And by more than so many times what they move between any two of so many frames before and after."""
 
 LEAST, JOINTS = 4, 6
-"""Frames that there must be on either side, and joints."""
+"""Frames that there must be on either side, and joints that both frames of a jump show."""
 
 
 def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
@@ -57,6 +57,7 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
 
 
 def _moved(before: Tensor, after: Tensor) -> Tensor:
-    """How far the middle one of the joints moves against all, (K,), by poses (K, N, 2); NaN where none is in both."""
+    """How far the middle one of the joints moves against all, (K,), by poses (K, N, 2); NaN where few are in both."""
     way = after - before
-    return nanmedian((way - nanmedian(way, 1, keepdim=True)).norm(dim=-1), 1)
+    enough = (~way.isnan().any(-1)).sum(1) >= JOINTS
+    return torch.where(enough, nanmedian((way - nanmedian(way, 1, keepdim=True)).norm(dim=-1), 1), torch.nan)

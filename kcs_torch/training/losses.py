@@ -56,7 +56,9 @@ class LossTerm:
             )
 
     def _wanted(self) -> dict[str, inspect.Parameter]:
-        return dict(inspect.signature(self.loss.forward).parameters)
+        loss = getattr(self.loss, "_orig_mod", self.loss)  # of torch.compile, which takes anything
+        some = inspect.signature(loss.forward).parameters
+        return {name: p for name, p in some.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
 
     def share(self, batch: Batch) -> Tensor:
         """How much each frame counts, (B, T)."""

@@ -23,7 +23,9 @@ __all__ = [
     "Intake",
     "as_floats",
     "as_number",
+    "as_weights",
     "at_the_corner",
+    "check_places",
     "choose_skeleton",
     "joint_order",
     "no_bones",
@@ -230,6 +232,49 @@ class Intake(NamedTuple):
     notes: list[str]
 
 
+def check_places(points: Tensor, what: str, joints: Sequence[str]) -> None:
+    """Make sure that points (..., N, D) of joints are NaN or a number that can be reckoned with.
+
+    Raises:
+        ShapeError: one is infinite or too large.
+    """
+    infinite = torch.isinf(points).any(-1)
+    if infinite.any():
+        raise ShapeError(f"{what}: {_label(infinite, joints)} is infinite; write NaN where a joint is unseen")
+    large = (points.abs() > FARTHEST).any(-1)
+    if large.any():
+        most = float(points[large].abs().nan_to_num().max())
+        raise ShapeError(f"{what}: {_label(large, joints)}: expected coordinates up to {FARTHEST:g}, got {most:.3g}")
+
+
+def as_weights(confidence: Tensor, seen: Tensor, threshold: float, what: str, joints: Sequence[str]) -> Tensor:
+    """Weights (..., N) by confidences: 0 where joints are not ``seen``, or with less confidence than the threshold.
+
+    Raises:
+        ShapeError: the shape is another, or a confidence is out of range.
+    """
+    if confidence.shape != seen.shape:
+        raise ShapeError(f"{what}: expected shape {tuple(seen.shape)}, got {tuple(confidence.shape)}")
+    infinite = torch.isinf(confidence)
+    if infinite.any():
+        raise ShapeError(f"{what}: {_label(infinite, joints)} is infinite; expected 0..1")
+    weights = torch.nan_to_num(confidence, nan=0.0)
+    if (weights < 0).any():
+        raise ShapeError(f"{what}: {_label(weights < 0, joints)} is negative; expected 0..1")
+    if (weights > 1).any():
+        most = float(weights.max())
+        raise ShapeError(
+            f"{what}: {_label(weights > 1, joints)} is {most:g} at most; expected 0..1: divide by the largest"
+        )
+    return torch.where(seen & (weights >= threshold), weights, torch.zeros_like(weights))
+
+
+def _label(bad: Tensor, joints: Sequence[str]) -> str:
+    """The first of the joints (N,) of one frame, or (T, N) of several, that are bad."""
+    *frame, joint = bad.nonzero()[0].tolist()
+    return f"{f'frame {frame[0]}, ' if frame else ''}joint '{joints[joint]}'"
+
+
 def _other_dimensions(shape: Sequence[int], dims: int) -> str:
     """How to make points (frames, joints, dims) of an array of another number of dimensions, for the user."""
     if len(shape) == 4 and shape[-1] == dims:
@@ -298,16 +343,7 @@ def take_in(
             xy = torch.nn.functional.pad(xy, (0, 0, 0, 1), value=math.nan)[:, order]
             confidence = confidence if confidence is None else torch.nn.functional.pad(confidence, (0, 1))[:, order]
     body = choose_skeleton(skeleton, names, edges, xy.shape[1], source, remarks)
-    label = lambda t, n: f"frame {int(t)}, joint '{body.joints[int(n)]}'"  # noqa: E731
-    infinite = torch.isinf(xy).any(-1)
-    if infinite.any():
-        raise ShapeError(
-            f"{source}: points: {label(*infinite.nonzero()[0])} is infinite; write NaN where a joint is unseen"
-        )
-    large = (xy.abs() > FARTHEST).any(-1)
-    if large.any():
-        where, most = label(*large.nonzero()[0]), float(xy[large].abs().nan_to_num().max())
-        raise ShapeError(f"{source}: points: {where}: expected coordinates up to {FARTHEST:g}, got {most:.3g}")
+    check_places(xy, f"{source}: points", body.joints)
     seen = torch.isfinite(xy).all(-1)
     if confidence is None and dims == 2:
         corner = at_the_corner(xy.numpy(force=True), seen.numpy(force=True), remarks)
@@ -315,23 +351,7 @@ def take_in(
     if confidence is None:
         weights = seen.to(xy.dtype)
     else:
-        weights = confidence.to(xy)
-        if weights.shape != seen.shape:
-            raise ShapeError(f"{source}: confidence: expected shape {tuple(seen.shape)}, got {tuple(weights.shape)}")
-        if torch.isinf(weights).any():
-            raise ShapeError(
-                f"{source}: confidence: {label(*torch.isinf(weights).nonzero()[0])} is infinite; expected 0..1"
-            )
-        weights = torch.nan_to_num(weights, nan=0.0)
-        if (weights < 0).any():
-            raise ShapeError(f"{source}: confidence: {label(*(weights < 0).nonzero()[0])} is negative; expected 0..1")
-        if (weights > 1).any():
-            where = label(*(weights > 1).nonzero()[0])
-            raise ShapeError(
-                f"{source}: confidence: {where} is {float(weights.max()):g} at most; expected 0..1: "
-                "divide by the largest"
-            )
-        weights = torch.where(seen & (weights >= threshold), weights, torch.zeros_like(weights))
+        weights = as_weights(confidence.to(xy), seen, threshold, f"{source}: confidence", body.joints)
     seen = weights > 0
     if not seen.any():
         raise ShapeError(
@@ -341,7 +361,7 @@ def take_in(
     usual = float(off[seen].median())
     stray = seen & (off > STRAY * max(usual, 1.0))
     if stray.any():
-        where, most = label(*stray.nonzero()[0]), float(off[stray].max())
+        where, most = _label(stray, body.joints), float(off[stray].max())
         raise ShapeError(
             f"{source}: points: {where} lies {most:.3g} off the clip's middle, half of all joints within {usual:.3g}: "
             "write NaN where a joint is unseen"

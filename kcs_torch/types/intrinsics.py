@@ -13,7 +13,7 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import perspective
 from kcs_torch.types.intake import as_floats
 
-__all__ = ["Intrinsics"]
+__all__ = ["SKEW", "Intrinsics"]
 
 WIDEST = 20.0
 """Tangent of the angle off the optical axis that no lens without distortion reaches for half of what it shows."""
@@ -25,6 +25,9 @@ STRAIGHTEN = (
 
 UNIT = 2.0
 """Coordinates up to this, half of them, are shares of an image or metres on its plane, no pixels."""
+
+SKEW = 1e-3
+"""Skew, over the focal length, up to which it is rounding."""
 
 COARSE = 50.0
 """Focal lengths from this on are in pixels."""
@@ -84,7 +87,7 @@ class Intrinsics:
             hint = "give finite numbers"
         elif tilt != 0 or last != [0, 0, 1]:
             hint = "divide it by its last number, or transpose it, where it is written otherwise"
-        elif abs(skew) > 1e-3 * abs(fx):
+        elif abs(skew) > SKEW * abs(fx):
             hint = "undistort the tracks first, which takes off the skew as well"
         if hint:
             raise OptionError(

@@ -11,13 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import interpolate, orbit
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
 from kcs_torch.types.angles import JointAngles, Joints, angles_of
 from kcs_torch.types.axes import from_y_up, to_y_up
 from kcs_torch.types.hints import is_a
-from kcs_torch.types.intake import as_floats, as_number, take_in
+from kcs_torch.types.intake import as_floats, as_number, as_weights, check_places, take_in
 from kcs_torch.types.intrinsics import Intrinsics
 from kcs_torch.types.reconstruction import Reconstruction
 from kcs_torch.types.size import short_unit, size_factor
@@ -90,13 +90,21 @@ class Motion(Trajectories):
         if skeleton is None and names is not None:
             skeleton = _same(names, edges)
             edges = None if skeleton is not None else edges
-        whole, order = points, names
-        if names is not None and skeleton is not None and confidence is None:
+        own: list[tuple[str, Tensor, Tensor]] = []  # the file's own virtual joints go before the means
+        if names is not None and skeleton is not None:
             body = get_skeleton(skeleton)
             extra = set(body.joints[body.num_observed :])
             if extra & set(names) and set(body.joints[: body.num_observed]) <= set(names):
+                points = as_floats(points, f"{source}: points", 3)
+                sure = points.new_ones(points.shape[:2]) if confidence is None else confidence
+                sure = as_floats(sure, f"{source}: confidence (frames, joints)", 2)
+                if points.shape[1] != len(names):
+                    raise ShapeError(f"{source}: joint_names: expected {points.shape[1]} names, got {len(names)}")
+                check_places(points, f"{source}: points", names)
+                sure = as_weights(sure.to(points), torch.isfinite(points).all(-1), 0.0, f"{source}: confidence", names)
                 keep = [i for i, n in enumerate(names) if n not in extra]
-                points, names = as_floats(points, f"{source}: points", 3)[:, keep], [names[i] for i in keep]
+                own = [(n, points[:, i], sure[:, i]) for i, n in enumerate(names) if n in extra]
+                points, names, confidence = points[:, keep], [names[i] for i in keep], sure[:, keep]
         taken = take_in(
             points,
             confidence,
@@ -111,13 +119,10 @@ class Motion(Trajectories):
         )
         body = taken.skeleton
         xyz, weights = body.complete(taken.points, taken.weights)
-        given = [n for n in body.joints[body.num_observed :] if n in (order or ())]
-        if given and order is not None:  # the file's own virtual joints go before the means
-            own = torch.as_tensor(whole).to(xyz)[:, [order.index(n) for n in given]]
-            seen = torch.isfinite(own).all(-1)
-            at = [body.index(n) for n in given]
-            xyz[:, at] = torch.where(seen[..., None], own, torch.zeros_like(own))
-            weights[:, at] = seen.to(weights)
+        for name, place, weight in own:
+            at = body.index(name)
+            xyz[:, at] = torch.where((weight > 0)[:, None], place, 0.0).to(xyz)
+            weights[:, at] = weight.to(weights)
         return cls(
             to_y_up(xyz, up), weights, body, taken.fps, short_unit(units), source, tuple(dict.fromkeys(taken.notes))
         )
@@ -189,7 +194,8 @@ class Motion(Trajectories):
     def angles(self, joints: Joints | None = None) -> JointAngles:
         """How joints bend over time; arguments and errors as of :meth:`Reconstruction.angles`, without deviations.
 
-        An angle is NaN where one of its joints is unseen. Where an end of a hinge's axis is, it has no sign.
+        An angle is NaN where one of its joints is unseen. Where an end of a hinge's axis is, the axis lies between
+        those before and after; if it never is seen, the angle has no sign.
 
         >>> walk = Motion.from_arrays(torch.rand(10, 17, 3), skeleton="h36m17", units="m")
         >>> walk.angles(["left_knee", ("thorax", "neck", "head")])
@@ -261,7 +267,15 @@ class Motion(Trajectories):
         else:
             lens = Intrinsics.of(intrinsics)
             if distance is None:  # of a ball around it all that fits into the nearer half of the image
-                distance = float(points.norm(dim=-1).max()) * (1 + lens.focal / max(min(lens.cx, lens.cy), 1.0))
+                half = min(lens.cx, lens.cy)
+                if not half > 0:
+                    raise OptionError(
+                        "distance: expected a number, as a principal point at the image's edge does not tell how large "
+                        f"the image is, got {distance!r}"
+                    )
+                distance = float(points.norm(dim=-1).max()) * (1 + lens.focal / half)
+            if not is_a(distance, float):
+                raise OptionError(f"distance: expected a number, got {distance!r}")
             if not (math.isfinite(distance) and distance > 0 and float(points[..., 2].min()) + distance > 0):
                 least = -float(points[..., 2].min())
                 raise OptionError(f"distance: expected more than {least:g}, before all joints, got {distance}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from kcs_torch.functional import bone_lengths
 from kcs_torch.functional.ranks import median
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.angles import JointAngles, Joints, angles_of
+from kcs_torch.types.hints import is_a
 from kcs_torch.types.intrinsics import Intrinsics
 from kcs_torch.types.size import short_unit, size_factor
 from kcs_torch.types.tracks import Tracks
@@ -146,17 +148,19 @@ class Reconstruction:
         """The other solution that parallel rays admit: depth with the opposite sign.
 
         Before a camera of known intrinsics each joint moves along its ray: the mirror image has the same image, but its
-        bones do not keep their length.
+        bones do not keep their length. The alternatives are turned over as well, and no objective is known.
         """
         flip = torch.tensor([1.0, 1.0, -1.0]).to(self.points)
+        others = tuple(other.mirrored() for other in self.alternatives)
+        turned = replace(self, cameras=self.cameras * flip, objective=math.nan, alternatives=others)
         if self.distance is not None:
             far, depth = self.distance[:, None], self.points[..., 2]
             near = torch.maximum(far - depth, 0.01 * far)
             points = self.points * (near / (far + depth))[..., None]
             points = torch.cat([points[..., :2], (near - far)[..., None]], -1)
-            return replace(self, points=points, cameras=self.cameras * flip).remeasured()
+            return replace(turned, points=points).remeasured()
         root = None if self.root_depth is None else -self.root_depth
-        return replace(self, points=self.points * flip, cameras=self.cameras * flip, root_depth=root)
+        return replace(turned, points=self.points * flip, root_depth=root)
 
     def remeasured(self) -> Reconstruction:
         """The same with the lengths that the bones of its points have, and with how much these vary."""
@@ -178,7 +182,7 @@ class Reconstruction:
         Raises:
             OptionError: there is none.
         """
-        if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= 1 + len(self.alternatives):
+        if not is_a(number, int) or not 1 <= number <= 1 + len(self.alternatives):
             count = len(self.alternatives) + 1
             raise OptionError(
                 f"{self.tracks.source}: solution: expected a number from 1 to {count}, got {number!r}"

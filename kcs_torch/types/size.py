@@ -186,7 +186,8 @@ def parse_size(text: str, what: str = "scale") -> dict[str, Any]:
     """
     text = str(text)
     found = re.fullmatch(r"(.+)=\s*([0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*([a-z]+)", text.strip())
-    if found is None or found[3] not in METRES or not 0 < float(found[2]) < float("inf"):
+    known = found is not None and found[3] in METRES and found[1].strip() not in ("units", "self")
+    if found is None or not known or not 0 < float(found[2]) < float("inf"):
         raise OptionError(
             f"{what}: expected height=1.75m, a bone such as left_knee-left_ankle=430mm, or factor=2mm, with one of the "
             f"units {', '.join(METRES)}; got {text!r}"

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.types.hints import is_a
 
 __all__ = ["Trajectories"]
 
@@ -70,9 +71,11 @@ class Trajectories:
         """A run of frames, as a slice takes them; with a step, every so many, at the slower rate.
 
         Raises:
-            OptionError: the step is below 1, or no whole number.
+            OptionError: one is no whole number, or the step is below 1.
         """
-        if isinstance(step, bool) or not isinstance(step, int) or step < 1:
-            raise OptionError(f"{self.source}: frames: step: expected a whole number from 1, got {step!r}")
+        for name, value in (("start", start), ("stop", stop), ("step", step)):
+            if not is_a(value, int) or (name == "step" and value < 1):
+                least = " from 1" if name == "step" else ""
+                raise OptionError(f"{self.source}: frames: {name}: expected a whole number{least}, got {value!r}")
         rate = None if self.fps is None else self.fps / step
         return replace(self, points=self.points[start:stop:step], weights=self.weights[start:stop:step], fps=rate)

@@ -142,6 +142,24 @@ def save_mp4(results: Reconstruction | Sequence[Reconstruction], path: Path) -> 
             said.seek(0)
             words = said.read().decode("utf-8", "replace").strip().splitlines() or [f"exit code {process.returncode}"]
             raise OutputError(f"ffmpeg could not make an MP4: {words[-1]}")
+    if not _is_whole(path):  # ffmpeg does not always say so
+        raise OutputError(f"{path}: cannot be written: ffmpeg left half of an MP4 (is the disk full?)")
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether the boxes of an MP4 fill it and its table of contents is among them."""
+    left, kinds = path.stat().st_size, set()
+    with path.open("rb") as file:
+        while left >= 8:
+            head = file.read(16)
+            size, kind = int.from_bytes(head[:4], "big"), head[4:8]
+            size = int.from_bytes(head[8:], "big") if size == 1 else size or left
+            if size < 8:
+                return False
+            kinds.add(kind)
+            left -= size
+            file.seek(size - len(head), 1)
+    return left == 0 and b"moov" in kinds
 
 
 def find_ffmpeg() -> str:

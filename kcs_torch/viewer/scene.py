@@ -83,7 +83,7 @@ def _numbers(result: Reconstruction) -> int:
     """How many 16-bit numbers a result takes."""
     frames, joints = result.points.shape[:2]
     solutions = 1 + len(result.alternatives)
-    return frames * (joints * (3 * solutions + 4) + 6 * solutions + 8)
+    return frames * (joints * (4 * solutions + 3) + 14 * solutions)
 
 
 def _person(
@@ -93,8 +93,6 @@ def _person(
     body, tracks, middle = result.skeleton, result.tracks, middle - shift
     weights = tracks.weights.detach().cpu().double().numpy()[frames]
     places = tracks.points.detach().cpu().double().numpy()[frames] - middle2d
-    path = result.root_depth if result.distance is None else result.distance
-    solutions = [result, *result.alternatives]
     return {
         "name": name,
         "summary": summarise(result),
@@ -106,14 +104,22 @@ def _person(
         "bones": [[*bone, key] for bone, key in zip(body.bones, bone_keys(body), strict=True)],
         "rigid": list(body.rigid),
         "solutions": [
-            {"label": _label(result, other, k), **_motion(_points(other)[frames] - middle)}
-            for k, other in enumerate(solutions)
+            {"label": _label(result, other, k), **_solution(other, frames, middle, middle2d)}
+            for k, other in enumerate((result, *result.alternatives))
         ],
+        "tracks": _whole(np.where(weights[..., None] > 0, places, np.nan)),
+        "weights": _encode((255 * np.clip(weights, 0, 1)).round().astype("u1"), "u1"),
+    }
+
+
+def _solution(result: Reconstruction, frames: slice, middle: Array, middle2d: Array) -> dict[str, Any]:
+    """What solutions of the same tracks do not share."""
+    path = result.root_depth if result.distance is None else result.distance
+    return {
+        **_motion(_points(result)[frames] - middle),
         "path": None if path is None else _floats(path[frames].detach().cpu().double().numpy()),
         "lens": None if result.distance is None else _lens(result, middle2d),
         "fit": None if result.distance is not None else _floats(_fit(result, middle, middle2d)[frames]),
-        "tracks": _whole(np.where(weights[..., None] > 0, places, np.nan)),
-        "weights": _encode((255 * np.clip(weights, 0, 1)).round().astype("u1"), "u1"),
         "spread": None if result.uncertainty is None else _whole(result.uncertainty[frames].double().numpy(force=True)),
     }
 

@@ -110,6 +110,8 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
     file["data"]["meta_points"]["residuals"] = np.where(seen, 0.0, -1.0).T[None]
     file["data"]["meta_points"]["camera_masks"] = np.zeros((7, count, frames), bool)
     file.write(str(path))
+    if path.stat().st_size < 16 * frames * count:  # ezc3d does not say so
+        raise OutputError(f"{path}: cannot be written: it came out shorter than the motion (is the disk full?)")
 
 
 MOTION_READERS = (MotionReader("c3d", "C3D of motion capture: markers (needs ezc3d)", recognises, read),)

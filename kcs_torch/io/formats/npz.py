@@ -1,14 +1,16 @@
 """The native .npz: tracks in, everything out. Plain arrays, no pickle.
 
 Tracks are ``points2d`` (T, N, 2) with NaN where unseen, ``confidence`` (T, N), ``edges`` (B, 2), ``joint_names``
-(N,), ``fps`` (NaN: unknown) and ``units``; all but the first may be absent. A result adds, for the same N joints,
+(N,), ``fps`` (NaN: unknown) and ``units``; all but the first may be absent. What this library writes has ``skeleton``
+and ``notes`` as JSON text, too, and ``detector``, whether a detector made the tracks, where that is known; confidences
+have then been through a threshold and count as they are. A result adds, for the same N joints,
 ``points3d`` (T, N, 3), and
 
 - ``points3d_all`` (T, M, 3) and ``joint_names_all`` (M,): with the virtual joints, which come last; ``bones`` (B, 2)
   are (parent, child) indices into them and ``lengths`` (B,) their lengths;
 - ``cameras`` (T, 2, 3), ``scales`` (T,), ``units3d``, ``method``, ``objective``, and where they are known
   ``uncertainty`` (T, M), ``root_depth`` (T,), ``distance`` (T,) and ``intrinsics`` (fx, fy, cx, cy);
-- ``skeleton``, ``diagnostics`` and ``notes`` as JSON text;
+- ``diagnostics`` as JSON text;
 - ``alternatives``, how many other solutions there are, best first: what belongs to number 1 begins with
   ``alternative1_`` (``alternative1_points3d_all``, ...). Tracks and skeleton are those of the result.
 
@@ -64,18 +66,20 @@ def read(path: Path, options: Options) -> list[Tracks]:
             points = in_pixels(points, options.image_size, notes)
         elif options.image_size is not None:
             notes.append("the coordinates are pixels already")
+    written = "skeleton" in file  # by this library
     return [
         build_tracks(
             points,
             file.array("confidence", "fiub", 2) if "confidence" in file else None,
-            options,
+            dataclasses.replace(options, threshold=0.0) if written and options.threshold is None else options,
             source=str(path),
             names=file.texts("joint_names") if "joint_names" in file else None,
             edges=file.array("edges", "iu") if "edges" in file else None,
-            skeleton=_skeleton(file) if "skeleton" in file else None,
+            skeleton=_skeleton(file) if written else None,
             fps=file.number("fps") if "fps" in file else None,
             units=units,
             notes=notes,
+            detector=_detector_in(file),
         )
     ]
 
@@ -121,9 +125,16 @@ def _tracks_out(tracks: Tracks) -> dict[str, Any]:
         "skeleton": np.array(json.dumps(body.to_dict())),
         "notes": np.array(json.dumps(tracks.notes)),
     }
+    if tracks.detector is not None:
+        arrays["detector"] = np.bool_(tracks.detector)
     if body.virtual:
         arrays |= {"points2d_virtual": points[:, n:], "confidence_virtual": weights[:, n:]}
     return arrays
+
+
+def _detector_in(file: Archive) -> bool | None:
+    """Whether a detector made the tracks, where the file says so."""
+    return bool(file.array("detector", "b", 0)) if "detector" in file else None
 
 
 def _save(arrays: dict[str, Any], path: Path) -> None:
@@ -227,6 +238,7 @@ def _tracks_in(file: Archive) -> Tracks:
         file.text("units") if "units" in file else "px",
         file.text("source") if "source" in file else str(file.path),
         tuple(map(str, _json(file, "notes", list))) if "notes" in file else (),
+        _detector_in(file),
     )
 
 
@@ -277,8 +289,8 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         raise FormatError(f"{path}: expected 3D motion under 'points3d', got {', '.join(file.keys) or 'nothing'}")
     points = torch.from_numpy(file.array("points3d", "fiu", 3).astype(np.float64))
     confidence = file.array("confidence", "fiub", 2).astype(np.float64) if "confidence" in file else None
-    if confidence is not None and "points2d" not in file and confidence.shape == points.shape[:2]:
-        points[torch.from_numpy(confidence) <= 0] = math.nan
+    if "points2d" in file:  # these are the tracks' confidences
+        confidence = None
     if points.shape[2] != 3:
         raise FormatError(f"{path}: 'points3d': expected shape (frames, joints, 3), got {tuple(points.shape)}")
     notes = _json(file, "notes", list) if "notes" in file else []
@@ -303,6 +315,7 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         units=file.text("units3d" if "units3d" in file else "units") if "units" in file else "",
         up=axis,
         notes=[str(note) for note in notes],
+        confidence=None if confidence is None else torch.from_numpy(confidence),
     )
 
 

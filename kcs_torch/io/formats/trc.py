@@ -7,6 +7,7 @@ which axis points up.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from array import array
@@ -16,8 +17,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kcs_torch.errors import FormatError
+from kcs_torch.errors import FormatError, counted
 from kcs_torch.io.build_motion import build_motion, distinct, numbers, read_lines
+from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer
 from kcs_torch.io.times import rate_of_times
@@ -52,7 +54,9 @@ def read(path: Path, options: MotionOptions) -> Motion:
     if not names:
         raise FormatError(f"{path}: line {at + 1}: expected names of markers, got none")
     frames: list[array[float]] = []
-    times: dict[int, float] = {}
+    numbered: list[str] = []
+    told_at: dict[int, float] = {}
+    short = 0
     for number, line in enumerate(lines[at + 1 :], at + 2):
         row = cells_of(line)
         if not any(row) or not row[0]:  # the line below the names holds X1, Y1, Z1, ...; an empty one may follow
@@ -62,14 +66,22 @@ def read(path: Path, options: MotionOptions) -> Motion:
             raise FormatError(
                 f"{path}: line {number}: expected {3 * len(names)} numbers of {len(names)} markers, got {len(cells)}"
             )
+        short += len(cells) < 3 * len(names) - 2  # of an unseen last marker there may be but one cell
         cells = cells[: 3 * len(names)] + [""] * (3 * len(names) - len(cells))
         filled = iter(numbers([c for c in cells if c not in _UNSEEN], f"{path}: line {number}"))
         with suppress(ValueError, IndexError):
-            times[len(frames)] = float(row[1])
+            told_at[len(frames)] = float(row[1])
+        numbered.append(row[0])
         frames.append(array("d", [math.nan if c in _UNSEEN else next(filled) for c in cells]))
     if not frames:
         raise FormatError(f"{path}: expected a line a frame below the names of the markers, got none")
-    notes = []
+    notes: list[str] = []
+    if short:
+        notes.append(
+            f"{counted(short, 'row')} end{'' if short > 1 else 's'} before the last marker: the rest is unseen"
+        )
+    places = _places(numbered, path, notes)
+    times = {places[i]: time for i, time in told_at.items()}
     told = header.get("NumFrames", "")
     if told.isdigit() and int(told) != len(frames):
         notes.append(f"the header tells {told} frames, the file has {len(frames)}")
@@ -77,8 +89,10 @@ def read(path: Path, options: MotionOptions) -> Motion:
     fps = (_rate(rate, path) if rate else None) or real
     if fps and real and abs(1 / real - 1 / fps) > _OFF / fps + _ROUNDED / len(frames):
         notes.append(f"the header tells {fps:g} frames a second, the rows' times {real:g}: the header is believed")
+    points = np.full((max(places) + 1, 3 * len(names)), np.nan)
+    points[places] = np.array(frames, np.float64)
     return build_motion(
-        torch.from_numpy(np.array(frames, np.float64)).reshape(len(frames), len(names), 3),
+        torch.from_numpy(points).reshape(len(points), len(names), 3),
         options,
         source=str(path),
         names=distinct(names),
@@ -86,6 +100,24 @@ def read(path: Path, options: MotionOptions) -> Motion:
         units=short_unit(header.get("Units", "")),
         notes=notes,
     )
+
+
+def _places(numbered: list[str], path: Path, notes: list[str]) -> list[int]:
+    """Which frame each row is, by its number; rows that hold no whole numbers are taken in their order."""
+    if not all(text.isdigit() for text in numbered):
+        return list(range(len(numbered)))
+    numbers = [int(text) for text in numbered]
+    order = sorted(range(len(numbers)), key=numbers.__getitem__)
+    again = next((numbers[b] for a, b in itertools.pairwise(order) if numbers[a] == numbers[b]), None)
+    if again is not None:
+        raise FormatError(f"{path}: Frame#: expected every frame once, got frame {again} again")
+    if order != sorted(order):
+        notes.append("the rows are put in the order of their numbers, Frame#")
+    first = numbers[order[0]]
+    if first > 1:
+        notes.append(f"frame 0 is the file's frame {first}")
+    frames = frame_numbers([numbers[i] for i in order], notes, names="rows", whole="row")
+    return [frame for _, frame in sorted(zip(order, frames, strict=True))]
 
 
 def _rate(text: str, path: Path) -> float | None:

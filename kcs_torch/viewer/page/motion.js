@@ -24,9 +24,13 @@ people.forEach((person, k) => {
   person.middle = data.middle.map((m, a) => m - person.shift[a]);  // where its own origin is
   person.count = person.joints.length;
   person.colours = { ...data.colours, centre: TRUNKS[k % TRUNKS.length] };
-  for (const key of ["path", "fit", "tracks", "weights", "spread"]) if (person[key]) person[key] = unpack(person[key]);
-  for (const s of person.solutions) { s.points = unpack(s.points); s.centres = unpack(s.centres); }
-  person.home = person.path ? person.path.reduce((a, b) => a + b, 0) / person.path.length : 0;
+  for (const key of ["tracks", "weights"]) person[key] = unpack(person[key]);
+  for (const s of person.solutions) {
+    for (const key of ["points", "centres", "path", "fit", "spread"]) if (s[key]) s[key] = unpack(s[key]);
+    s.home = s.path ? s.path.reduce((a, b) => a + b, 0) / s.path.length : 0;
+  }
+  for (const key of ["path", "lens", "fit", "spread", "home"])  // those of the solution that is shown
+    Object.defineProperty(person, key, { get: () => person.solutions[person.chosen][key] });
   person.blank = Array.from({ length: person.frames }, (_, t) =>
     !person.weights.subarray(t * person.count, (t + 1) * person.count).some(w => w > 0));
 });
