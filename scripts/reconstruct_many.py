@@ -18,6 +18,7 @@ Exit code 1 where a clip failed, 2 where the call is wrong.
 from __future__ import annotations
 
 import sys
+from collections import Counter
 
 try:
     import hydra
@@ -63,6 +64,9 @@ def main(config: DictConfig) -> None:
         print("options of reading, such as skeleton=..., go in as +reading.skeleton=...; retry=true tries them again")
     rate = outcome.done / outcome.seconds if outcome.seconds else 0.0
     made = f"{outcome.done} made ({counted(outcome.frames, 'frame')}) in {outcome.seconds:.1f} s, {rate:.1f} a second"
+    for why, number in Counter(why for _, why in outcome.doubted).items():
+        first = next(path for path, other in outcome.doubted if other == why)
+        print(f"doubted: {counted(number, 'clip')}: {why} ({first} is the first)")
     rest = f"{outcome.skipped} were there, {len(outcome.failed)} failed"
     print(f"shard {config.shard} of {config.shards}: {counted(outcome.clips, 'clip')}, {made}; {rest}")
     failed += len(outcome.failed)

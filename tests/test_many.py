@@ -454,3 +454,14 @@ def test_a_size_that_no_body_has_is_told_before_anything_is_solved(clips, tmp_pa
     assert failed and all("unknown size 'hieght'" in why for _, why in failed)
     with pytest.raises(kt.OptionError, match="scale: expected height"):
         run(clips, tmp_path / "other", scale="units=3m")
+
+
+def test_doubted_clips_are_told(clips, tmp_path):
+    outcome = run(clips, tmp_path / "told", method="pkc", pattern="*0.npz")
+    assert outcome.doubted == ()
+    source = tmp_path / "in"
+    source.mkdir()
+    chain = kt.Skeleton.from_names([f"j{k}" for k in range(6)], [(f"j{k}", f"j{k + 1}") for k in range(5)])
+    kt.save(random_motion(chain, 30, turn=0).tracks, source / "still.npz")
+    ((path, why),) = run(source, tmp_path / "out", method="pkc").doubted
+    assert path.name == "still.npz" and "guess" in why

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise, starmap
+
 import torch
 
 from kcs_torch.clean.common import body_size, check_tracks, rebuilt, share
+from kcs_torch.clean.timing import cuts_of
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.graph import find_pieces
@@ -48,12 +51,16 @@ def unswap(tracks: Tracks) -> Tracks:
         return tracks
     points, weights = tracks.points[:, :count].clone(), tracks.weights[:, :count].clone()
     size = float(body_size(points, weights > 0))
-    counts = {}
+    counts, cuts = {}, cuts_of(tracks)  # a view from another side is no swap
     for name, some in (("", pairs), *_limbs(body, pairs)):
         left, right = torch.tensor(some, device=points.device).T
         seen = (weights[:, left] > 0) & (weights[:, right] > 0)
         penalty = _LIMB if name else _BODY
-        frames = swapped_frames(points[:, left], points[:, right], seen, size, penalty).nonzero()  # (F, 1)
+        swapped = [
+            swapped_frames(points[shot, left], points[shot, right], seen[shot], size, penalty)
+            for shot in starmap(slice, pairwise([0, *cuts, tracks.num_frames]))
+        ]
+        frames = torch.cat(swapped).nonzero()  # (F, 1)
         for values in (points, weights):
             values[frames, left], values[frames, right] = values[frames, right], values[frames, left]
         counts[name] = len(frames)

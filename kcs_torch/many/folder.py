@@ -41,6 +41,7 @@ class Outcome:
         done: made now.
         skipped: made before.
         outdated: of these, clips whose file was changed since: remove their results to have them made anew.
+        doubted: clips made now of whose depth a result warns (:class:`kcs_torch.types.Diagnostics`), and why.
         failed: each clip that failed, now or before, and why.
         frames: of the clips made now.
         seconds: that it took.
@@ -50,6 +51,7 @@ class Outcome:
     done: int
     skipped: int
     outdated: tuple[Path, ...]
+    doubted: tuple[tuple[Path, str], ...]
     failed: tuple[tuple[Path, str], ...]
     frames: int
     seconds: float
@@ -141,7 +143,8 @@ def reconstruct_folder(
     claim(Path(output), settings_of(method, options, reading) | {"everybody": str(everybody)}, retry)
     workplace = Path(output) / f".part_{shard}_of_{shards}"
     _sweep(Path(output), workplace)
-    work = _Work(method, suffixes, everybody, workplace, size, up, units, intrinsics, find, how)
+    doubted: list[tuple[Path, str]] = []
+    work = _Work(method, suffixes, everybody, workplace, size, up, units, intrinsics, find, how, doubted)
     todo: list[Clip] = []
     outdated: list[Path] = []
     failed: list[tuple[Path, str]] = []
@@ -168,7 +171,8 @@ def reconstruct_folder(
                 f"{rate:.1f} clips a second, {(len(todo) - tried) / rate / 60:.1f} minutes left"
             )
     _sweep(Path(output), workplace)
-    return Outcome(len(clips), done, skipped, tuple(outdated), tuple(failed), frames, time.monotonic() - begin)
+    told_of = tuple(outdated), tuple(doubted), tuple(failed)
+    return Outcome(len(clips), done, skipped, *told_of, frames, time.monotonic() - begin)
 
 
 @dataclass(frozen=True)
@@ -185,6 +189,7 @@ class _Work:
     intrinsics: Any
     find: bool
     reading: dict[str, object]
+    doubted: list[tuple[Path, str]]
 
     def results(self, clip: Clip) -> list[Path]:
         """The clip's results if all are there, else none; of everybody's the last written says so."""
@@ -214,7 +219,10 @@ class _Work:
             for clip, people in read:
                 own = None if found is None else list(itertools.islice(found, len(people)))
                 with _listing(clip, failed):
-                    self._write(clip, self._lift(people) if own is None else own)
+                    results = self._lift(people) if own is None else own
+                    self._write(clip, results)
+                    doubts = [one.diagnostics.brief_doubt for one in results if one.diagnostics.doubt]
+                    self.doubted.extend((clip.source, doubt) for doubt in doubts[:1])
                     made, frames = made + 1, frames + people[0].num_frames
         return made, frames, failed
 

@@ -107,6 +107,16 @@ class Pose:
         """Some of the hypotheses."""
         return Pose(self.points[index], self.rotations[index], self.objective[index], self.moved[index])
 
+    def exchanged(self, other: Pose, some: Tensor) -> Pose:
+        """The hypotheses, but those of another where ``some`` (H,) is true."""
+        every = some[:, None, None, None]
+        return Pose(
+            torch.where(every, other.points, self.points),
+            torch.where(every, other.rotations, self.rotations),
+            torch.where(some, other.objective, self.objective),
+            torch.where(some, other.moved, self.moved),
+        )
+
 
 def procrustean(
     tracks: Tensor,

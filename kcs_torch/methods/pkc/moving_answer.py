@@ -11,6 +11,7 @@ from torch import Tensor
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.methods.finish import Estimate
 from kcs_torch.methods.pkc.body import TOLD
+from kcs_torch.methods.pkc.leaps import leaps_of
 from kcs_torch.methods.pkc.moving_view import MovingView
 from kcs_torch.methods.wrong import loose_bones
 from kcs_torch.skeleton import Skeleton
@@ -47,6 +48,9 @@ TURN = 60.0
 """Degrees by which the viewpoint should turn about a body: of a solution that turns by less, depth may be drawn out as
 far as its turn is too small, and other methods follow it there."""
 
+NEEDED = f"The viewpoint should turn about the body by {TURN:g} degrees or more, or the skeleton have a template"
+"""What would tell depth."""
+
 
 def from_moving(
     moving: MovingView,
@@ -72,23 +76,23 @@ def from_moving(
     agree = _agreement(depth, first.points[..., 2])
     sure = witnessed = max(agree / SURE, moving.lead / LEAD)
     rivalled = 0 < moving.lead < CLOSE
-    if loose_bones(best.points, skeleton) or shown < TURN or rivalled:  # another warning tells of the first
+    leaps = leaps_of(depth[None])[0].nonzero().flatten().tolist()
+    if loose_bones(best.points, skeleton) or shown < TURN or rivalled or leaps:  # another warning tells of the first
         sure = min(sure, BROKEN)
     lack = depth.square().mean().sqrt() * max(0.0, 1 - sure)
-    needed = f"The viewpoint should turn about the body by {TURN:g} degrees or more, or the skeleton have a template"
+    needed = NEEDED if shown < TURN else "More joints, a longer clip or a skeleton with a template would decide"
     doubt = ""
     if witnessed < DOUBT / SURE:
         doubt = (
             "depth is little more than a guess: two methods find depths that hardly agree "
             f"(correlation {agree:.2f}). {needed}"
         )
+    elif leaps:
+        doubt = f"depth is uncertain: from frame {leaps[0]} on all joints lie on the other side in depth. {needed}"
     elif shown < TURN:
         doubt = f"depth may be drawn out or pressed flat: the viewpoint turned by only {shown:.0f} degrees. {needed}"
     elif rivalled:
-        doubt = (
-            "depth is uncertain: bodies that differ fit the tracks nearly as well (see the alternatives). "
-            "More joints, a longer clip or a skeleton with a template would decide"
-        )
+        doubt = f"depth is uncertain: bodies that differ fit the tracks nearly as well (see the alternatives). {needed}"
 
     best, *rivals = (_unsurer(one, lack) for one in (best, *rivals))
     best = replace(best, notes=notes, doubt=doubt)

@@ -15,6 +15,7 @@ from kcs_torch.functional.temporal import fill_between
 from kcs_torch.methods.lockstep import Search, run
 from kcs_torch.methods.pkc.assembly import SLACK, TIGHT, WORTH, Assembly, followed
 from kcs_torch.methods.pkc.descents import Descent, descend_all
+from kcs_torch.methods.pkc.leaps import leaps_of, without_leaps
 from kcs_torch.nn.unrolled import UnrolledFPC
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.bone_paths import bone_paths, path_energy
@@ -69,6 +70,10 @@ OTHER = 0.1
 NEAR = 6.0
 """How much dearer than the best, for each frame compared, another solution may be to be given beside it: what leads by
 more has so far been right."""
+
+LEAP = 1.0
+"""How much dearer, for each frame, a solution may be that does not leap to its mirror image: the energy knows nothing
+of a camera's leap."""
 
 LONG = 2000
 """Frames of a clip up to which paths of bones are put together: of longer ones the frames that are compared are too far
@@ -280,6 +285,12 @@ def searching(
             bones = spread(pose.points[0])
         pose = yield from descend(image, pose, FINER[loose], fine, weights)
     ranks = value(pose)
+    if (even := without_leaps(pose)) is not None:
+        even = yield from descend(image, even, FINER[loose], fine, weights)
+        other = value(even)
+        left = leaps_of(pose.points[..., 2]).sum(1) - leaps_of(even.points[..., 2]).sum(1)
+        pick = (left > 0) & (other < ranks + LEAP * frames)
+        pose, ranks = pose.exchanged(even, pick), torch.where(pick, other, ranks)
     best = _distinct(pose, ranks, alternatives)
     return MovingView(pose[best], ranks[best], bones, rigid, loose, lead)
 
