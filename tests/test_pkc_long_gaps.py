@@ -69,3 +69,23 @@ def test_frames_beside_a_long_gap_are_not_led_astray(shared):
         seen, truth = tracks.seen.any(-1), motion.in_camera(yaw=yaw, pitch=10)
         found = kt.reconstruct(tracks).points[seen, : truth.shape[1]]
         assert (superpose(found, truth[seen], "similarity") - truth[seen]).norm(dim=-1).mean() < 40
+
+
+@pytest.mark.parametrize("cameras", [None, torch.eye(3)[None, :2].double()])
+def test_a_single_image_is_solved_as_two_of_the_same(cameras):
+    clip = kt.data.walking_person(40, yaw=40.0, noise=8.0, generator=torch.Generator().manual_seed(0)).tracks
+    one = clip.frames(20, 21)
+    two = replace(one, points=one.points.repeat(2, 1, 1), weights=one.weights.repeat(2, 1))
+    ours, theirs = (
+        kt.reconstruct(
+            t,
+            method="pkc",
+            intrinsics="parallel",
+            cameras=None if cameras is None else cameras.repeat(t.num_frames, 1, 1),
+        )
+        for t in (one, two)
+    )
+    torch.testing.assert_close(ours.points, theirs.points[:1])
+    torch.testing.assert_close(ours.uncertainty, theirs.uncertainty[:1])
+    assert len(ours.alternatives) == len(theirs.alternatives) > 0
+    assert all(other.points.shape == (1, 17, 3) and other.cameras.shape == (1, 2, 3) for other in ours.alternatives)

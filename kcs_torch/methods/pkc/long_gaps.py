@@ -15,7 +15,7 @@ from kcs_torch.methods.pkc.cleaning import HELD
 from kcs_torch.methods.unseen import gap_deviation
 from kcs_torch.types import Tracks
 
-__all__ = ["lengthened", "shortened"]
+__all__ = ["first_frame", "lengthened", "shortened"]
 
 LONGEST = 0.25
 """Seconds that a gap may last; of longer ones only so many frames are solved. What fills a gap bends as little as it
@@ -64,4 +64,17 @@ def lengthened(found: Estimate, kept: Tensor, tracks: Tracks, cameras: Tensor | 
         deviation=None if found.deviation is None else all_of(found.deviation).maximum(unseen),
         standing=None if found.standing is None else all_of(found.standing),
         alternatives=tuple(lengthened(other, kept, tracks, cameras) for other in found.alternatives),
+    )
+
+
+def first_frame(found: Estimate) -> Estimate:
+    """An estimate of several frames as one of the first."""
+    return replace(
+        found,
+        points=found.points[:1],
+        cameras=found.cameras[:1],
+        scales=found.scales[:1],
+        deviation=None if found.deviation is None else found.deviation[:1],
+        standing=None if found.standing is None else found.standing[:1],
+        alternatives=tuple(first_frame(other) for other in found.alternatives),
     )

@@ -25,7 +25,7 @@ from kcs_torch.methods.pkc.gate import without_others
 from kcs_torch.methods.pkc.held import with_lengths_held
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.limbs import outward
-from kcs_torch.methods.pkc.long_gaps import lengthened, shortened
+from kcs_torch.methods.pkc.long_gaps import first_frame, lengthened, shortened
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
 from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights, settled
 from kcs_torch.methods.pkc.moving_view import searching as turning
@@ -156,12 +156,21 @@ class PKC(Method):
         return run(together([self._steps(one, None) for one in tracks]), serve)
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
+        if tracks.num_frames == 1 and self.knows_template(tracks.skeleton):
+            return (yield from self._image(tracks, cameras))
         kept = shortened(tracks)
         if kept is None:
             return (yield from self._whole(tracks, cameras))
         some = replace(tracks, points=tracks.points[kept], weights=tracks.weights[kept])
         found = yield from self._whole(some, None if cameras is None else cameras[kept])
         return lengthened(found, kept, tracks, cameras)
+
+    def _image(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
+        """Solve a single image as two of the same: as one its bones would rather be of usual lengths than as seen."""
+        points, weights = (x.expand(2, *x.shape[1:]) for x in (tracks.points, tracks.weights))
+        both = replace(tracks, points=points, weights=weights)
+        found = yield from self._whole(both, None if cameras is None else cameras.expand(2, 2, 3))
+        return first_frame(found)
 
     def _whole(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
         """Solve tracks without long gaps."""
