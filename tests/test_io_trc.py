@@ -153,6 +153,9 @@ def test_rows_are_frames_by_their_numbers(tmp_path):
     assert gapped.num_frames == 10 and gapped.fps == 10 and not gapped.seen[3:6].any()
     assert torch.equal(gapped.points[6:], whole.points[6:])
     assert any("frame 0 is the file's frame 21" in note for note in rows(path, range(10), first=21).notes)
+    odd = rows(path, range(10)).num_frames
+    path.write_text(path.read_text(encoding="utf-8").replace("\n1\t", "\n²\t"), encoding="utf-8")
+    assert load_motion(path).num_frames == odd
     with pytest.raises(FormatError, match="expected every frame once, got frame 3 again"):
         rows(path, [0, 1, 2, 2, 3])
 

@@ -212,7 +212,7 @@ def _describe(probe: Probe) -> str:
     motion = [reader.name for reader in MOTION_READERS.values() if reader.recognises(probe)]
     if motion:
         return (
-            f"3D motion ({motion[0]}): `kcs-torch convert` and `kcs-torch score` take it; in Python "
+            f"3D motion ({motion[0]}): `kcs-torch convert`, `angles` and `score` take it; in Python "
             "load_motion(path) reads it, and its .tracks() makes 2D tracks"
         )
     if probe.files:

@@ -30,6 +30,7 @@ from kcs_torch.types.size import short_unit
 __all__ = ["MOTION_READERS", "WRITERS"]
 
 _OFF, _ROUNDED = 0.02, 0.002  # by which a rate and times are apart at most: a share, and seconds, as times are rounded
+_DIGITS = 16  # from which on a number is none of a frame
 _UNSEEN = ("", "nan", "NaN", "NAN", "-nan", "nan(ind)")
 
 
@@ -104,7 +105,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
 
 def _places(numbered: list[str], path: Path, notes: list[str]) -> list[int]:
     """Which frame each row is, by its number; rows that hold no whole numbers are taken in their order."""
-    if not all(text.isdigit() for text in numbered):
+    if not all(text.isdecimal() and len(text) < _DIGITS for text in numbered):
         return list(range(len(numbered)))
     numbers = [int(text) for text in numbered]
     order = sorted(range(len(numbers)), key=numbers.__getitem__)
