@@ -109,3 +109,16 @@ def test_a_cut_is_found_where_one_side_is_hidden(side):
 def test_a_cut_is_no_swap_of_sides():
     tracks, _ = film(20.0, 120.0, -60.0)
     assert kt.clean.unswap(tracks) is tracks
+
+
+def test_shots_of_other_sizes_are_solved_together():
+    tracks, clips = film(0.0, 100.0, frames=30)
+    points = tracks.points.clone()
+    points[30:] *= 1.5
+    with pytest.warns(kt.KcsWarning, match="the view jumps at frame 30"):
+        both = kt.reconstruct(replace(tracks, points=points))
+    ratio = float(both.scales[30:].mean() / both.scales[:30].mean())
+    assert 1.44 < ratio < 1.56
+    assert both.distance is None
+    for part, clip in zip((both.points[:30], both.points[30:]), clips, strict=True):
+        assert float(kt.metrics.mpjpe(part, clip.points, align="similarity")) < 40

@@ -56,7 +56,7 @@ def trim(tracks: Tracks, start: int | None = None, stop: int | None = None) -> T
 def split(tracks: Tracks) -> list[Tracks]:
     """Divide a clip at the cuts of its film, where the body is suddenly seen from another side.
 
-    Shots of one body at one size in the image are better solved together, as they tell each other's depth.
+    Shots of one body are better solved together by PKC, as they tell each other's depth.
 
     Args:
         tracks: what to divide.

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcs_torch.clean.timing import cuts_of
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.temporal import interpolate
@@ -96,13 +97,23 @@ def weak_perspectives(tracks: Sequence[Tracks]) -> list[Size]:
 
     def solve(some: list[Tracks]) -> list[Size]:
         clips = Clips.of(some)
-        waves = [slow_waves(one.num_frames, one.fps or 30.0, one.points) for one in some]
+        waves = [_waves(one) for one in some]
         most = max(each.shape[1] for each in waves)
         wide = [torch.nn.functional.pad(each, (0, most - each.shape[1])) for each in waves]
         paths, gains = _paths(clips.points, clips.weights > 0, some[0].skeleton, padded(wide), clips.counts)
         return [_judged(path, gain) for path, gain in zip(clips.cut(paths), gains, strict=True)]
 
     return in_batches(tracks, solve)
+
+
+def _waves(tracks: Tracks) -> Tensor:
+    """What the log of the size may be a sum of, (T, W): slow waves, and steps at the cuts of the film."""
+    waves, cuts = slow_waves(tracks.num_frames, tracks.fps or 30.0, tracks.points), cuts_of(tracks)
+    if not cuts:
+        return waves
+    time = torch.arange(tracks.num_frames, device=waves.device)[:, None]
+    later = (time >= torch.tensor(cuts, device=waves.device)).to(waves)
+    return torch.cat([waves, later - later.mean(0)], 1)
 
 
 def _judged(path: Tensor, gain: Tensor) -> Size:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.clean.detector import detected
+from kcs_torch.clean.timing import cuts_of
 from kcs_torch.errors import KcsWarning, OptionError
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.finish import Estimate, extent
@@ -57,8 +58,8 @@ EVERY, HOPELESS, AWAY = 20, 10.0, 6.5
 
 
 def may_be_near(tracks: Tracks) -> bool:
-    """Whether perspective can be told: from a body with a template and a trunk."""
-    return len(trunk_joints(tracks.skeleton)) >= 3
+    """Whether perspective can be told: from a body with a template and a trunk, in one shot of one camera."""
+    return len(trunk_joints(tracks.skeleton)) >= 3 and not cuts_of(tracks)
 
 
 def reconstruct_uncalibrated(
@@ -86,7 +87,7 @@ def reconstruct_uncalibrated(
     Raises:
         OptionError: the skeleton has no template with a trunk.
     """
-    if not may_be_near(tracks):
+    if len(trunk_joints(tracks.skeleton)) < 3:
         raise OptionError(
             f"intrinsics: 'auto' needs a skeleton with a template and a trunk, '{tracks.skeleton.name}' has none: "
             "expected (fx, fy, cx, cy) or a matrix K (3, 3)"
@@ -156,8 +157,9 @@ class _Looking(PKC):
         return SEEMS_NEAR if distance < CLOSE else SEEMS_FAR if distance == math.inf else ""
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
-        turned = tracks.num_frames <= BLOCK  # else no signs are turned over under perspective
-        return super()._steps(tracks, cameras) if turned else _as(PKC, self)._steps(tracks, cameras)
+        # in longer clips no signs are turned over under perspective
+        asked = tracks.num_frames <= BLOCK and may_be_near(tracks)
+        return super()._steps(tracks, cameras) if asked else _as(PKC, self)._steps(tracks, cameras)
 
 
 def looking(method: Method) -> Method:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from kcs_torch.clean.detector import detected
+from kcs_torch.clean.timing import cuts_of
 from kcs_torch.errors import counted
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.detector import detector_deviation
@@ -16,6 +18,7 @@ from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.batch import Noisy
 from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.unseen import gap_deviation, place_unseen, within_reach
+from kcs_torch.solvers.denoise import Denoised
 from kcs_torch.solvers.noise import SHORT
 from kcs_torch.solvers.spectrum import window_at
 from kcs_torch.types import Tracks
@@ -44,7 +47,7 @@ last seen, and the largest in gaps."""
 def cleaned(
     tracks: Tracks, denoise: bool, template: bool = True
 ) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
-    """Smooth noisy tracks, reject outliers and fill gaps.
+    """Smooth noisy tracks, reject outliers and fill gaps; each shot by itself where a film has cuts.
 
     Args:
         tracks: of root mean square 1.
@@ -54,31 +57,49 @@ def cleaned(
     Returns:
         Complete tracks (T, N, 2), the standard deviation (T, N) of the noise that is left in them, and what was done.
     """
-    level, left, keep = 0.0, 0.0, tracks.seen
-    points, notes = tracks.points, []
-    if denoise:
-        keep = plausible(points, keep, tracks.skeleton)
+    ends = [0, *cuts_of(tracks), tracks.num_frames]
+    shots = [tracks.frames(*some) for some in pairwise(ends)]
+    if not denoise:
+        parts = [_complete(shot, interpolate(shot.points, shot.seen), shot.seen, 0.0) for shot in shots]
+    else:
         rate = tracks.fps or 30.0
         window = window_at(rate)
         quick = math.ceil(2 * QUICK * window / rate)
-        (found,) = yield [Noisy(points, torch.where(keep, tracks.weights, 0), window, quick)]
-        level, left = float(found.noise.median()), float(found.left.median())
-        wrong = int((found.outliers & keep).sum()) + int((tracks.seen & ~keep).sum())
-        if wrong:
-            share = wrong / int(tracks.seen.sum())
-            notes.append(f"{counted(wrong, 'detection')} ({100 * share:.1f} %) rejected as outliers")
-        keep = keep & ~found.outliers
-        exact = keep
-        if level <= (CLEAN * min(1.0, 30 / rate) if template else PLAIN):
-            left = 0.0
-        else:
-            exact = torch.zeros_like(keep)
-            smoothed = f"tracks smoothed: noise of {100 * level:.1f} % of the body's size"
-            untold = tracks.detector is None and not detected(tracks)
-            notes.append(f"{smoothed}. {HINT}" if template and untold else smoothed)
-        points = torch.where(exact[..., None], points, found.points)
-    else:
-        points = interpolate(points, tracks.seen)
+        kept = [plausible(shot.points, shot.seen, shot.skeleton) for shot in shots]
+        asked = [torch.where(keep, shot.weights, 0) for shot, keep in zip(shots, kept, strict=True)]
+        found = yield [Noisy(shot.points, w, window, quick) for shot, w in zip(shots, asked, strict=True)]
+        levels = [one.noise.median().expand(shot.num_frames) for one, shot in zip(found, shots, strict=True)]
+        level = float(torch.cat(levels).median())  # one for all shots, or the sharper ones would fill the others
+        clean = level <= (CLEAN * min(1.0, 30 / rate) if template else PLAIN)
+        parts = [_smoothed(*one, None if clean else level, template) for one in zip(shots, kept, found, strict=True)]
+    points, noise, notes = zip(*parts, strict=True)
+    return torch.cat(points), torch.cat(noise), tuple(dict.fromkeys(note for some in notes for note in some))
+
+
+def _smoothed(
+    tracks: Tracks, keep: Tensor, found: Denoised, level: float | None, template: bool
+) -> tuple[Tensor, Tensor, list[str]]:
+    """A shot whose outliers are rejected, and smoothed unless it is exact: then there is no level of noise."""
+    notes = []
+    wrong = int((found.outliers & keep).sum()) + int((tracks.seen & ~keep).sum())
+    if wrong:
+        share = wrong / int(tracks.seen.sum())
+        notes.append(f"{counted(wrong, 'detection')} ({100 * share:.1f} %) rejected as outliers")
+    keep = keep & ~found.outliers
+    exact = keep
+    if level is not None:
+        exact = torch.zeros_like(keep)
+        smoothed = f"tracks smoothed: noise of {100 * level:.1f} % of the body's size"
+        untold = tracks.detector is None and not detected(tracks)
+        notes.append(f"{smoothed}. {HINT}" if template and untold else smoothed)
+    points = torch.where(exact[..., None], tracks.points, found.points)
+    points, noise, more = _complete(tracks, points, keep, 0.0 if level is None else float(found.left.median()))
+    return points, noise, [*notes, *more]
+
+
+def _complete(tracks: Tracks, points: Tensor, keep: Tensor, left: float) -> tuple[Tensor, Tensor, list[str]]:
+    """A shot of points (T, N, 2), of which those to keep (T, N) have so much noise left; all others are placed."""
+    notes = []
     known = keep.any(0)
     if not bool(known.all()):
         flat = torch.nn.functional.pad(points, (0, 1))
@@ -97,7 +118,7 @@ def cleaned(
         count = int(away.sum())
         show = "shows" if count == 1 else "show"
         notes.append(f"{counted(count, 'frame')} at the clip's ends {show} nobody: nearest pose held")
-    return points, noise, tuple(notes)
+    return points, noise, notes
 
 
 def _nearest_shown(seen: Tensor) -> Tensor:
