@@ -1,5 +1,6 @@
 """C3D files: a real one, our own read back, and damaged ones, which must not take this process down."""
 
+import os
 import random
 from dataclasses import replace
 
@@ -103,3 +104,21 @@ def test_a_crash_of_the_library_is_an_error_of_the_file(tmp_path, monkeypatch):
     monkeypatch.setattr(worker, "PATIENCE", 0.3)
     with pytest.raises(FormatError, match="gave no answer"):
         load_motion(path)
+
+
+def test_a_file_that_comes_out_short_is_told_and_the_old_one_stays(tmp_path, monkeypatch):
+    """ezc3d does not say that a disk is full."""
+    path = tmp_path / "a.c3d"
+    save(walk(8), path)
+    before = path.read_bytes()
+
+    whole = ezc3d.c3d.write
+
+    def short(file, name):
+        whole(file, name)
+        os.truncate(name, 700)
+
+    monkeypatch.setattr(ezc3d.c3d, "write", short)
+    with pytest.raises(OutputError, match=r"a\.c3d: cannot be written: it came out shorter"):
+        save(walk(8), path)
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["a.c3d"]

@@ -16,7 +16,7 @@ from samples import walk_result
 from kcs_torch.errors import KcsWarning, OptionError, OutputError
 from kcs_torch.io import save, save_people
 from kcs_torch.viewer import animation
-from kcs_torch.viewer.animation import GIF, MP4, Pace, pace
+from kcs_torch.viewer.animation import GIF, MP4, Pace, _is_whole, pace
 from kcs_torch.viewer.film import Film
 
 needs_ffmpeg = pytest.mark.skipif(not shutil.which("ffmpeg"), reason="needs ffmpeg (Debian: apt-get install ffmpeg)")
@@ -190,3 +190,23 @@ def test_files_of_one_person_are_told(result, tmp_path):
 def test_people_of_clips_that_are_not_equally_long_are_told(result, tmp_path):
     with pytest.warns(KcsWarning, match=r"people have 12, 5 frames: all are shown from their own first one on"):
         save_people([result, walk_result(5)], tmp_path / "walk.html")
+
+
+def test_half_an_mp4_is_told_from_a_whole_one(tmp_path):
+    """ffmpeg does not always say that a disk is full."""
+    box = lambda kind, size: (8 + size).to_bytes(4, "big") + kind + bytes(size)  # noqa: E731
+    whole = box(b"ftyp", 24) + box(b"moov", 100) + box(b"mdat", 500)
+    path = tmp_path / "a.mp4"
+    large = (1).to_bytes(4, "big") + b"mdat" + (516).to_bytes(8, "big") + bytes(500)
+    for made, good in (
+        (whole, True),
+        (box(b"moov", 9) + large, True),
+        (box(b"moov", 9) + bytes(4) + b"mdat" + bytes(50), True),  # to the end of the file
+        (whole[:-1], False),
+        (whole[:300], False),
+        (box(b"ftyp", 24) + box(b"mdat", 500), False),
+        (b"", False),
+        (whole + bytes(3), False),
+    ):
+        path.write_bytes(made)
+        assert _is_whole(path) is good

@@ -51,8 +51,8 @@ HEADSTAND = (
 )
 
 BY_SHOTS = (
-    "as at a cut of a film. Shots of one body are best solved together, as here; others by themselves: "
-    "kt.reconstruct_all(kt.clean.split(tracks)), or part by part with --frames"
+    "as at a cut of a film. Shots of one body tell 'pkc' each other's depth; those of others, or for other methods, "
+    "should be solved by themselves: kt.reconstruct_all(kt.clean.split(tracks)), or part by part with --frames"
 )
 
 LYING = (
