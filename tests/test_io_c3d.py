@@ -43,6 +43,19 @@ def test_what_is_written_is_read_back(tmp_path, up):
     assert np.nanmax(raw[..., "xyz".index(up)]) == pytest.approx(1000 * float(motion.points[..., 1].max()), rel=1e-5)
 
 
+def test_what_is_left_out_is_told(tmp_path):
+    path = save(walk(4), tmp_path / "w.c3d")
+    file = ezc3d.c3d(str(path))
+    file["parameters"]["ANALOG"]["RATE"]["value"] = [250.0]
+    file["parameters"]["ANALOG"]["LABELS"]["value"] = ["Fz1", "Fz2"]
+    file["data"]["analogs"] = np.zeros((1, 2, 40))
+    file["header"]["points"]["first_frame"] = 99
+    file.write(str(path))
+    notes = load_motion(path).notes
+    assert "2 analog channels (of force plates, muscles, ...) are left out" in notes
+    assert any("number 100;" in note for note in notes)
+
+
 @pytest.mark.parametrize("fps", [23.976, 29.97, 59.94, 1000.0])
 def test_rates_that_single_precision_rounds_come_back(tmp_path, fps):
     assert load_motion(save(replace(walk(3), fps=fps), tmp_path / "w.c3d")).fps == fps

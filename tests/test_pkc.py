@@ -867,8 +867,8 @@ def test_bodies_of_two_or_three_joints_keep_their_lengths(joints, frames):
 @pytest.mark.parametrize("width", [1.0, 3.0])
 def test_a_body_unlike_its_template_is_not_searched_again_for_a_change_of_size(width, monkeypatch):
     """Where the viewpoint turns its template hardly counts, and no other search asks for such small changes."""
-    tried, real = [], PKC._resized
-    monkeypatch.setattr(PKC, "_resized", lambda self, *given: tried.append(given) or real(self, *given))
+    tried, real = [], module.resized
+    monkeypatch.setattr(module, "resized", lambda *given: tried.append(given) or real(*given))
     body = SKELETONS["coco17"]
     body = replace(body, template=tuple((width * x, y, z) for x, y, z in body.template))
     tracks = random_motion(body, 40, turn=120.0, generator=torch.Generator().manual_seed(0)).tracks

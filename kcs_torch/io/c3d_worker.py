@@ -1,8 +1,8 @@
 """Read the points of a C3D file with ezc3d in a process of its own; see ``formats/c3d.py``.
 
 Run by its path, so that only numpy and ezc3d are loaded. It writes one line of JSON to its standard output, ``{"error":
-text}`` or ``{"shape": (T, N), "labels", "units", "rate", "x_screen", "y_screen"}``, and then the points (T, N, 3) as
-little-endian doubles, NaN where a point is unseen.
+text}`` or ``{"shape": (T, N), "labels", "units", "rate", "x_screen", "y_screen", "analogs"}``, and then the points
+(T, N, 3) as little-endian doubles, NaN where a point is unseen.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ def main(path: str) -> None:
             "rate": float(next(iter(value(facts, "RATE")), 0)),
             "x_screen": "".join(map(str, value(facts, "X_SCREEN")[:1])),
             "y_screen": "".join(map(str, value(facts, "Y_SCREEN")[:1])),
+            "analogs": int(np.shape(file["data"]["analogs"])[1]),
         }
     except Exception as error:  # ezc3d raises many kinds on damaged files
         answer = {"error": f"damaged or truncated, or no C3D file: {error}"}

@@ -55,6 +55,10 @@ def read(path: Path, options: MotionOptions) -> Motion:
     first, last = (int.from_bytes(Probe(path).head[at : at + 2], "little") for at in (6, 8))
     if len(points) < last - first + 1 < 0xFFFF:
         notes.append(f"the header tells {last - first + 1} frames, the file has {len(points)}: it is cut short")
+    if first > 1:
+        notes.append(f"the first frame is the recording's number {first}; it becomes frame 0")
+    if answer["analogs"]:
+        notes.append(f"{answer['analogs']} analog channels (of force plates, muscles, ...) are left out")
     return build_motion(
         torch.from_numpy(points[:, there].copy()),
         options,

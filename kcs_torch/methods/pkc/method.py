@@ -30,6 +30,7 @@ from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
 from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights, settled
 from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR, Asked
+from kcs_torch.methods.pkc.sizing import TRIED, resized, with_size
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import Size
@@ -51,14 +52,6 @@ what was found is polished further."""
 
 TELLING = 2.0
 """Degrees of the turn of known cameras from which on they tell the sign of depth."""
-
-TRIED, AT_ONCE = 1.012, 1.04
-"""Largest over smallest size in the image from which on a change of size is tried, and from which on by a new search at
-once."""
-
-BETTER, HOPEFUL, FEW = 5.0, 2.5, 2
-"""By how much the objective must fall for a change of size to be believed; by how much, if hypotheses are refined with
-it, for a new search to be made; and how many are."""
 
 LEAST_FRAMES, LEAST_JOINTS = 3, 4
 """Frames and joints from which on the viewpoint's turn may tell depth."""
@@ -208,12 +201,12 @@ class PKC(Method):
             tracks.num_frames >= MANY_FRAMES or (tracks.num_frames >= LEAST_FRAMES and _is_whole(tracks))
         )
         many = enough and tracks.num_frames >= MANY_FRAMES
-        changing, resized = size.sure, image / size.path[:, None, None]
+        changing, even = size.sure, image / size.path[:, None, None]
         if changing:
-            image = resized
+            image = even
         if not has_trunk:
             made = yield from self._without_template(tracks, image, noise, cameras, notes, enough)
-            return _with_size(made, size) if changing else made
+            return with_size(made, size) if changing else made
         still = self.contacts and not _turns(cameras) and self.viewpoint != "moving"
         feet = standing if still else None
         body = Body(skeleton, image, tracks.fps or 30.0, noise, feet)
@@ -235,11 +228,11 @@ class PKC(Method):
                 notes = (*notes, near.told)
             led = compared and body.is_odd(found) and body.turns(found)  # by the viewpoint's turn, not by the template
             if resizing and not led:
-                other = Body(skeleton, resized, tracks.fps or 30.0, noise, feet)
-                better = yield from method._resized(found, body, other, size)
+                other = Body(skeleton, even, tracks.fps or 30.0, noise, feet)
+                better = yield from resized(found, body, other, size, method._moves, self.steps)
                 if better is not None:
                     changing, body, found = True, other, better
-                    turned = self._turned(tracks, resized, noise, body.factor)
+                    turned = self._turned(tracks, even, noise, body.factor)
             if cameras is None and body.seen_from_around(found):
                 found = body.without_contacts(found)
         if cameras is not None and _turns(cameras):
@@ -254,7 +247,7 @@ class PKC(Method):
             found, body, cameras, notes,
             alternatives=self.alternatives, detections=detections, still=not _turns(cameras), told=self.steps >= 10,
         )  # fmt: skip
-        return _with_size(made, size) if changing else made
+        return with_size(made, size) if changing else made
 
     def _without_template(
         self,
@@ -308,22 +301,6 @@ class PKC(Method):
         if rival is None or not self._moves or _turns(cameras) or not body.turns(found):
             return found
         return (yield from turned_around(body, found, rival))
-
-    def _resized(self, found: Hypotheses, body: Body, other: Body, size: Size) -> Search[Any, Any, Hypotheses | None]:
-        """Hypotheses of a body whose size in the image changes, if they explain the tracks better; else None.
-
-        A small change is tried on what was found without it first.
-        """
-        before = found.energy[0]
-        if size.range < AT_ONCE:
-            ratio = other.factor / body.factor
-            few = found[:FEW]
-            start = replace(few, depth=few.depth * ratio / size.path[:, None], lengths=few.lengths * ratio)
-            tried = yield from refined(other.objective, start, self.steps)
-            if not bool(tried.energy[0] < before - HOPEFUL):
-                return None
-        new = yield from other.search(self._moves, self.steps)
-        return new if bool(new.energy[0] < before - BETTER) else None
 
     def _moving(
         self, tracks: Tracks, image: Tensor, noise: Tensor, count: int = 1
@@ -389,17 +366,6 @@ def _complete(tracks: Tracks, image: Tensor) -> Tracks:
 def _turns(cameras: Tensor | None) -> bool:
     """Whether known cameras turn far enough to tell the sign of depth."""
     return cameras is not None and float(viewpoint_turn(cameras)) >= TELLING
-
-
-def _with_size(found: Estimate, size: Size) -> Estimate:
-    """An estimate of tracks that were divided by the size over time."""
-    others = tuple(_scaled(other, size.path) for other in found.alternatives)
-    note = f"weak perspective: the body's size in the image varies by a factor of {size.range:.2f}"
-    return replace(_scaled(found, size.path), alternatives=others, notes=(*found.notes, note))
-
-
-def _scaled(found: Estimate, size: Tensor) -> Estimate:
-    return replace(found, scales=found.scales * size)
 
 
 def _is_whole(tracks: Tracks) -> bool:
