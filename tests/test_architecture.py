@@ -29,7 +29,7 @@ ALLOWED = {
     "clean": {"functional", "solvers", "nn"} | BASE,
     "data": {"functional"} | BASE,
     "detect": {"io"} | BASE,
-    "viewer": {"functional"} | BASE,
+    "viewer": {"functional", "metrics"} | BASE,
     "io": {"functional", "viewer"} | BASE,
     "reconstruct": {"functional", "solvers", "nn", "methods"} | BASE,
     "live": {"functional", "solvers", "nn", "methods"} | BASE,

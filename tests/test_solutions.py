@@ -58,6 +58,10 @@ def test_the_mirror_image_is_told():
     assert found.mirrored and str(found) == "the mirror image in depth"
     depth = result.points[..., 2] - result.points[..., 2].mean(1, keepdim=True)
     assert found.rms == pytest.approx(2 * float(depth.square().mean().sqrt()), rel=1e-3)
+    points = result.points.clone()
+    points[2, 3] = torch.nan  # says nothing of the others
+    gap = replace(result, points=points)
+    assert str(difference(gap, gap.mirrored())) == "the mirror image in depth"
 
 
 def test_what_is_nearly_the_mirror_image_is_not_called_it():

@@ -82,10 +82,10 @@ def difference(best: Reconstruction, other: Reconstruction) -> Difference:
         raise ShapeError(f"difference: expected solutions of the same frames and joints, got points {shapes}")
     ours, theirs = best.points.detach().double(), other.points.detach().double()
     both = torch.stack([ours, theirs.to(ours.device)])
-    depth = both[..., 2] - both[..., 2].mean(-1, keepdim=True)
+    depth = both[..., 2] - both[..., 2].nanmean(-1, keepdim=True)
     apart = torch.cat([(both[1] - both[0])[..., :2], (depth[1] - depth[0])[..., None]], -1)
-    rms = float(apart.square().sum(-1).mean().sqrt())
-    add, subtract = (float(z.square().mean().sqrt()) for z in (depth.sum(0), depth[1] - depth[0]))
+    rms = float(apart.square().sum(-1).nanmean().sqrt())
+    add, subtract = (float(z.square().nanmean().sqrt()) for z in (depth.sum(0), depth[1] - depth[0]))
     body = best.skeleton
     flipped: dict[str, float] = {}
     if body.num_bones:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import OptionError, OutputError
+from kcs_torch.metrics import difference
 from kcs_torch.types import Reconstruction
 from kcs_torch.types.intake import FARTHEST
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
@@ -24,7 +25,6 @@ MOST_NUMBERS = 3_000_000
 """A page holds no more numbers than this, of two bytes each: about 8 MB as text. Longer clips show every n-th frame."""
 
 LOST = 4.0  # points this many times farther from the body's middle than 99.5 % of them are drawn at that distance
-MIRRORED, EXACT = 0.3, 1e-3  # as of kcs_torch.metrics.difference
 WHOLE = 32767  # of 16-bit integers; -32768 stands for NaN
 Array = NDArray[np.float64]
 
@@ -167,11 +167,11 @@ def _label(best: Reconstruction, other: Reconstruction, number: int) -> str:
 
 
 def _difference(best: Reconstruction, other: Reconstruction) -> str:
+    found = difference(best, other)
+    if found.mirrored:
+        return "nearly the mirror image" if found.beside_mirror else "mirror image"
     ours, theirs = ((z - np.nanmean(z, 1, keepdims=True)) for z in (_points(r)[..., 2] for r in (best, other)))
     apart = np.sqrt(np.nanmean((ours - theirs) ** 2, 0))
-    add, subtract = np.sqrt(np.nanmean((ours + theirs) ** 2)), np.sqrt(np.nanmean(apart**2))
-    if add < MIRRORED * subtract:
-        return "mirror image" if add <= EXACT * subtract else "nearly the mirror image"
     most = np.argsort(-np.nan_to_num(apart))
     worst = [best.skeleton.joints[j] for j in most if apart[j] > 0.6 * apart[most[0]]]
     more = f" and {len(worst) - 2} more" if len(worst) > 2 else ""
