@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError, counted
-from kcs_torch.io.build import build_tracks, nothing_seen
+from kcs_torch.io.build import OVERSHOOT, build_tracks, nothing_seen
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.header import delimiter
+from kcs_torch.io.jsonfile import FARTHEST
 from kcs_torch.io.registry import Options, brief, read_error
 from kcs_torch.io.shares import are_shares, in_pixels
 from kcs_torch.types import Tracks
@@ -24,8 +25,6 @@ __all__ = ["LIMIT", "Animal", "bounded_rows", "build_animals", "frames_of", "ref
 
 LIMIT = 2**28  # numbers of all animals in all frames
 LINES, LINE = 2**23, 2**23  # of a table of text, and letters of one
-_OVERSHOOT = 1.5  # some networks' confidences pass 1 a little; above this they are on another scale
-_FARTHEST = 1e9  # pixels
 _FRAGMENT = 0.1  # share of the frames, below which an animal that is seen is a piece of somebody's track
 _SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]*\Z")
 _NUMBER = re.compile(r"([0-9]+)\Z")
@@ -199,7 +198,7 @@ def _seen(animal: Animal, threshold: float) -> NDArray[np.bool_]:
 def _check(animal: Animal, path: Path) -> None:
     """Refuse coordinates that are no pixels."""
     with np.errstate(invalid="ignore"):
-        far = np.argwhere(np.abs(animal.points) > _FARTHEST)
+        far = np.argwhere(np.abs(animal.points) > FARTHEST)
     if len(far):
         t, n, axis = far[0].tolist()
         whose = f" of '{brief(animal.name)}'" if animal.name else ""
@@ -210,7 +209,7 @@ def _check(animal: Animal, path: Path) -> None:
 def _within_one(confidence: NDArray[np.float64], notes: list[str]) -> NDArray[np.float64]:
     """Confidences a little above 1 are 1."""
     largest = float(np.nanmax(confidence, initial=0))
-    if 1 < largest <= _OVERSHOOT:
+    if 1 < largest <= OVERSHOOT:
         notes.append(f"confidences above 1 (up to {largest:.3g}) are taken as 1")
         return confidence.clip(max=1)
     return confidence

@@ -13,7 +13,9 @@ from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
 
-__all__ = ["build_tracks", "nothing_seen"]
+__all__ = ["OVERSHOOT", "build_tracks", "nothing_seen"]
+
+OVERSHOOT = 1.5  # some networks' confidences pass 1 a little; above this they are on another scale
 
 
 def build_tracks(

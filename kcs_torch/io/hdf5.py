@@ -20,7 +20,9 @@ from kcs_torch.io.archive import LARGE, RATIO
 from kcs_torch.io.registry import need
 from kcs_torch.io.worker import ask_worker
 
-__all__ = ["Tree", "read_hdf5", "read_tree"]
+__all__ = ["LIMIT", "Tree", "read_hdf5", "read_tree"]
+
+LIMIT = 2**28  # numbers in one dataset
 
 
 class Tree(NamedTuple):
@@ -39,19 +41,18 @@ class Tree(NamedTuple):
     arrays: dict[str, NDArray[np.float64]]
 
 
-def read_tree(path: Path, wanted: Collection[str], limit: int) -> Tree:
+def read_tree(path: Path, wanted: Collection[str]) -> Tree:
     """Read what a file holds, and the datasets that are wanted: real numbers, text, or tables of both.
 
     Args:
         path: the file.
         wanted: names of datasets, with ``*`` and ``?`` as in file names.
-        limit: how many numbers each of them may have.
 
     Raises:
         FormatError: the file cannot be read or is damaged, a wanted dataset is neither numbers nor text or too large,
             or h5py is not installed.
     """
-    return _ask(path, "HDF5", wanted=list(wanted), limit=limit, depth=2, texts=True)
+    return _ask(path, "HDF5", wanted=list(wanted), limit=LIMIT, depth=2, texts=True)
 
 
 def read_hdf5(

@@ -17,7 +17,6 @@ from kcs_torch.io.pickles import load_arrays
 
 __all__ = ["Table", "has_column", "pandas_group", "read_pandas"]
 
-LIMIT = 2**28  # numbers in a table
 _WANTED = ("*/table", "*/axis1", "*/axis1_*", "*/block*_items_*", "*/block*_values")
 
 
@@ -48,7 +47,7 @@ def pandas_group(tree: Tree) -> str | None:
 def has_column(path: Path, coord: str) -> bool:
     """Whether a table has a column of this innermost name; False of files that cannot be read."""
     try:
-        tree = read_tree(path, ("*/block0_items_*",), LIMIT)
+        tree = read_tree(path, ("*/block0_items_*",))
         group = pandas_group(tree)
         if group is None:
             return False
@@ -67,7 +66,7 @@ def read_pandas(path: Path) -> Table:
     Raises:
         FormatError: the file cannot be read, is damaged, or holds no such table.
     """
-    tree = read_tree(path, _WANTED, LIMIT)
+    tree = read_tree(path, _WANTED)
     group = pandas_group(tree)
     if group is None:
         held = ", ".join(sorted(tree.shapes)[:8]) or "nothing"

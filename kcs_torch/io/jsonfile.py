@@ -20,7 +20,7 @@ __all__ = ["as_frame_number", "as_joints", "as_text", "entries", "kind", "outlin
 
 LIMIT = 2**30  # bytes of one file; Python needs several times as much
 FARTHEST = 1e9  # pixels
-_MOST_JOINTS = 2000
+MOST_JOINTS = 2000
 _BLANK = b"\xef\xbb\xbf \t\r\n"  # what may stand before the JSON, a byte order mark included
 _TOKEN = re.compile(rb'"(?:[^"\\]|\\.)*"|[{}\[\],:]|"|[^\s{}\[\],:"]+', re.DOTALL)
 _DEEPEST = 16  # levels that an outline goes down
@@ -139,8 +139,8 @@ def as_joints(values: Any, where: str, scores: Any = None) -> NDArray[np.float64
             width = 2
     if width < 2 or len(flat) % width:
         raise FormatError(f"{where}: expected 3 numbers a joint, got {len(flat)} numbers")
-    if len(flat) > width * _MOST_JOINTS:
-        raise FormatError(f"{where}: expected at most {_MOST_JOINTS} joints, got {len(flat) // width}")
+    if len(flat) > width * MOST_JOINTS:
+        raise FormatError(f"{where}: expected at most {MOST_JOINTS} joints, got {len(flat) // width}")
     rows = np.array(_numbers(flat, where)).reshape(-1, width)
     joints = np.ones((len(rows), 3))
     joints[:, : min(width, 3)] = rows[:, :3]

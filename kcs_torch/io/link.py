@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["follow_people", "link_people"]
+__all__ = ["follow_people", "link_people", "longest_gap"]
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,11 @@ _VELOCITY = 0.4  # share of the newest displacement in the running velocity
 _SPEED_UP = 0.1  # sizes of the person by which the running velocity changes in a frame, at most
 _COAST = 0.9  # the velocity fades by this factor with each frame of a gap
 _MOST_OPEN = 200  # people who may be out of sight at a time; of more, those seen last
+
+
+def longest_gap(fps: float | None) -> int:
+    """Frames for which somebody may be out of sight: a second's, or 30 where the rate is not known."""
+    return max(round(min(fps or 30.0, 1e6)), 1)
 
 
 @dataclass

@@ -237,7 +237,7 @@ def _describe(probe: Probe) -> str:
         return "a video: find the joints in it first, with `kcs-torch detect VIDEO -o tracks.npz`"
     if probe.head.startswith(b"\x89HDF"):
         try:
-            held = sorted(read_tree(probe.path, (), 0).shapes)
+            held = sorted(read_tree(probe.path, ()).shapes)
         except FormatError as error:
             return f"an HDF5 file that cannot be read ({str(error).removeprefix(f'{probe.path}: ')})"
         return f"an HDF5 file with other content ({', '.join(held[:8]) or 'nothing'}{', ...' if len(held) > 8 else ''})"

@@ -14,15 +14,14 @@ from numpy.typing import NDArray
 from kcs_torch.errors import FormatError
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.header import Header, plain_name
-from kcs_torch.io.jsonfile import as_frame_number, as_text
+from kcs_torch.io.jsonfile import MOST_JOINTS, as_frame_number, as_text
 from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
 from kcs_torch.io.wide import Row, as_value, opened, place_rows
 from kcs_torch.types.intake import FARTHEST
 
-__all__ = ["LongHeader", "read_long"]
+__all__ = ["MOST", "LongHeader", "read_long"]
 
-_MOST = 5e7  # coordinates of all frames, those between the file's included
-_MOST_JOINTS = 2000
+MOST = 5e7  # coordinates of all frames, those between the file's included
 _PARTS = ("joint", "joint_name", "keypoint", "bodypart", "body_part", "part", "landmark", "node", "marker", "name")
 _SLEAP = ["track", "frame_idx", "instance.score"]
 _UNIT = re.compile(r" \[(?P<unit>[^\]]*)\]\Z")
@@ -148,9 +147,9 @@ class _Table:
             self.lines.append(i)
             self.joints.append(names.setdefault(name, len(names)))
             self.people.append(0 if header.who is None else called.setdefault(cells[header.who].strip(), len(called)))
-        if len(names) > _MOST_JOINTS:
+        if len(names) > MOST_JOINTS:
             column = header.cells[header.joint]
-            raise FormatError(f"{self.path}: '{column}': expected {_MOST_JOINTS} joints at most, got {len(names)}")
+            raise FormatError(f"{self.path}: '{column}': expected {MOST_JOINTS} joints at most, got {len(names)}")
 
     def _value(self, line: int, k: int, text: str) -> float:
         column = self.columns[k]
@@ -210,7 +209,7 @@ class _Table:
         if self.header.number is not None:
             count = frame_numbers([as_frame_number(place) for place in places.tolist()], [])[-1] + 1
         count, joints = max(count, groups), len(self.names)
-        if count * joints * 3 > _MOST:
+        if count * joints * 3 > MOST:
             raise FormatError(f"{self.path}: {count} frames of {joints} joints are more than fits: split the file")
 
     def _check_once(self, flat: NDArray[np.int64], values: NDArray[np.float64]) -> None:

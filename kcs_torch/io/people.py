@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.build import build_tracks, nothing_seen
+from kcs_torch.io.build import OVERSHOOT, build_tracks, nothing_seen
 from kcs_torch.io.layout import choose_layout
-from kcs_torch.io.link import follow_people
+from kcs_torch.io.link import follow_people, longest_gap
 from kcs_torch.io.registry import Options, brief
 from kcs_torch.io.shares import ASK, are_shares
 from kcs_torch.skeleton import Skeleton
@@ -23,13 +23,10 @@ from kcs_torch.types.intake import at_the_corner
 
 __all__ = ["Sighting", "people_tracks"]
 
-_OVERSHOOT = 1.5  # some networks' confidences pass 1 a little; above this they are on another scale
 _WELL_SEEN = 0.95  # quantile of the confidences that counts as certain where they are on another scale
 _PER_CENT = (50.0, 100.0)  # between these the largest confidence is per cent
 _MOST_IN_FRAME = 100  # people of one frame
 _MOST_NUMBERS = 5e7  # of all tracks together: each person has a place in every frame
-_FPS = 30.0  # assumed for how long somebody may be out of sight, where nothing is known
-
 
 _Seen = list[tuple[int, int]]
 """A person: frames, and the index among those seen there."""
@@ -93,7 +90,7 @@ def people_tracks(
         raise FormatError(f"{source}: expected people in at least one of {len(frames)} frames, got none{why}")
     if names is None and skeleton is None:
         skeleton, names = choose_layout(everybody, options, source, remarks)
-    people, gap = _by_ids(frames, remarks), max(round(min(options.fps or fps or _FPS, 1e6)), 1)
+    people, gap = _by_ids(frames, remarks), longest_gap(options.fps or fps)
     if people is None:
         people = _by_places(frames, gap)
     elif len(people) > 1:
@@ -189,7 +186,7 @@ def _checked(
     if _PER_CENT[0] < largest <= _PER_CENT[1]:
         scale = _PER_CENT[1]
         notes.append(f"confidences up to {largest:.4g} are taken as per cent")
-    elif largest > _OVERSHOOT:
+    elif largest > OVERSHOOT:
         scale = float(np.quantile(scores, _WELL_SEEN))
         notes.append(f"confidences up to {largest:.4g}: divided by {scale:.4g}, their 95th percentile, and cut at 1")
     elif largest > 1:

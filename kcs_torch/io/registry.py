@@ -148,7 +148,7 @@ class Probe:
         from kcs_torch.io.hdf5 import read_tree
 
         try:
-            return read_tree(self.path, (), 0)
+            return read_tree(self.path, ())
         except FormatError:
             return None
 

@@ -20,11 +20,9 @@ from kcs_torch.nn.networks import MLPLifter, TemporalLifter
 from kcs_torch.nn.normalise import normalise_tracks
 from kcs_torch.skeleton import Skeleton, map_joints
 from kcs_torch.types import Tracks
+from kcs_torch.types.intake import MOST_LACKING
 
 __all__ = ["Lifter"]
-
-MOST_LACKING = 3
-"""One of the network's joints in so many may be missing from the tracks, which it then places."""
 
 OTHER_RATE = 1.25
 """Ratio of frame rates from which on a network that looks at several frames was trained on another tempo."""

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.build import build_tracks
-from kcs_torch.io.hdf5 import read_hdf5
+from kcs_torch.io.hdf5 import LIMIT, read_hdf5
 from kcs_torch.io.matlab import read_matlab
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.types import Tracks
 
 __all__ = ["READERS"]
 
-LIMIT = 2**28  # numbers in one variable
 _SHAPES = "W (2 x frames, joints), rows x1, y1, x2, y2, ..., or points2d (frames, joints, 2)"
 _WANTED = ("W", "points2d", "confidence", "edges", "fps")
 

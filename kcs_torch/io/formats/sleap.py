@@ -17,7 +17,7 @@ from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5 import Tree, read_tree
 from kcs_torch.io.header import Header, first_line
 from kcs_torch.io.jsonfile import as_frame_number
-from kcs_torch.io.link import link_people
+from kcs_torch.io.link import link_people, longest_gap
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief
 from kcs_torch.io.wide import is_missing, not_a_number
 from kcs_torch.types import Motion, Tracks
@@ -25,7 +25,6 @@ from kcs_torch.types import Motion, Tracks
 __all__ = ["MOTION_READERS", "READERS"]
 
 _FIRST = ["track", "frame_idx", "instance.score"]
-_FPS = 30.0  # assumed for how long somebody may be out of sight, where nothing is known
 _ORDERS = (("track", "xy", "node", "frame"), ("frame", "track", "node", "xy"))
 """Of the dimensions of ``tracks``: SLEAP's own, which MATLAB sees reversed, and that of sleap-io's "standard" files."""
 _WANTED = ("tracks", "point_scores", "node_names", "track_names", "edge_inds")
@@ -65,7 +64,7 @@ def _is_3d(tree: Tree) -> bool:
 
 def read_motion(path: Path, options: MotionOptions) -> Motion:
     """Read the 3D motion of the animal that is seen most: ``tracks`` (frames, tracks, nodes, 3)."""
-    tree = read_tree(path, _WANTED, LIMIT)
+    tree = read_tree(path, _WANTED)
     points = tree.arrays.get("tracks", np.zeros(0))
     if points.ndim != 4 or points.shape[3] != 3 or 0 in points.shape:
         raise FormatError(f"{path}: expected 3D motion 'tracks' (frames, tracks, nodes, 3), got {points.shape}")
@@ -86,7 +85,7 @@ def _is_project(tree: Tree) -> bool:
 
 
 def _read_hdf5(path: Path, notes: list[str]) -> tuple[list[Animal], NDArray[np.int64] | None]:
-    tree = read_tree(path, _WANTED, LIMIT)
+    tree = read_tree(path, _WANTED)
     if _is_project(tree):
         raise FormatError(
             f"{path}: expected SLEAP's analysis file, got a project: write one with "
@@ -244,7 +243,7 @@ def _linked(
         poses[..., 2] = np.where(np.isnan(poses[..., 2]), 1.0, poses[..., 2])
         poses[~np.isfinite(poses).all(-1)] = 0
         detections[places[frame]] = poses
-    linked = link_people(detections, max_gap=max(round(options.fps or _FPS), 1))
+    linked = link_people(detections, max_gap=longest_gap(options.fps))
     notes.append("animals without a track are followed over the frames by where they are")
     return {f"untracked {i}": np.where(t[..., 2:] > 0, t, np.nan) for i, t in enumerate(linked)}
 

@@ -21,7 +21,7 @@ from kcs_torch.io.frames import by_number
 from kcs_torch.io.header import Columns, Header, Layout, first_line
 from kcs_torch.io.landmark_tables import some_joints, table_kind
 from kcs_torch.io.landmarks import settle
-from kcs_torch.io.long import LongHeader, read_long
+from kcs_torch.io.long import MOST, LongHeader, read_long
 from kcs_torch.io.people import people_tracks
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader
 from kcs_torch.io.wide import read_wide
@@ -32,7 +32,6 @@ __all__ = ["MOTION_READERS", "READERS"]
 
 _UPPER = ("headtop", "head", "nose", "eye", "ear", "upperneck", "neck", "thorax", "shoulder")
 _LOWER = ("ankle", "heel", "bigtoe", "smalltoe", "knee")
-_MOST = 5e7  # coordinates of all frames, those between the file's included
 
 
 def recognises(probe: Probe) -> bool:
@@ -81,7 +80,7 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         )
     names = found.names or ()
     frames = by_number(found.frames, found.notes)
-    if len(frames) * len(names) * 3 > _MOST:
+    if len(frames) * len(names) * 3 > MOST:
         raise FormatError(f"{path}: {len(frames)} frames of {len(names)} joints are more than fits: split the file")
     if not frames:
         raise FormatError(f"{path}: expected a row a frame below the columns' names, got none")
