@@ -13,12 +13,12 @@ from kcs_torch.errors import SkeletonError
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton, map_joints
 
-__all__ = ["choose_layout", "mean_bone", "named_layout", "names_of"]
+__all__ = ["BY_COUNT", "choose_layout", "likeliest", "named_layout", "names_of"]
 
 _CLEARLY = 0.7  # bones this much shorter, by another layout's order of joints, tell that it is the right one
 _ENOUGH = 2000  # people, of whom the bones are measured
 
-_BY_COUNT: dict[int, tuple[str, ...]] = {
+BY_COUNT: dict[int, tuple[str, ...]] = {
     15: ("mpi15",),
     16: ("mpii16",),
     17: ("coco17", "h36m17", "ap10k"),
@@ -76,26 +76,30 @@ def choose_layout(
     count = len(people[0])
     if options.skeleton is not None and get_skeleton(options.skeleton).num_observed == count:
         return None, None
-    if count not in _BY_COUNT:
-        known = ", ".join(f"{n} ({' or '.join(names)})" for n, names in _BY_COUNT.items())
+    if count not in BY_COUNT:
+        known = ", ".join(f"{n} ({' or '.join(names)})" for n, names in BY_COUNT.items())
         fits = [s.name for s in SKELETONS.values() if s.num_observed == count]
         hint = " or ".join(map(repr, fits)) if fits else "a YAML file that names them and their bones"
         raise SkeletonError(
             f"{where}: expected a known number of joints, {known}, got {count}, which the file does not name: "
             f"give skeleton={hint} (--skeleton)"
         )
-    usual, *others = _BY_COUNT[count]
+    usual, *others = BY_COUNT[count]
     if not others:
         return usual, names_of(usual, count)
-    sample = np.stack(people[:: max(len(people) // _ENOUGH, 1)])
-    length = {name: mean_bone(SKELETONS[name], sample) for name in (usual, *others)}
-    best = min(length, key=lambda name: length[name])
-    best = best if length[best] < _CLEARLY * length[usual] else usual
+    best, length = likeliest((usual, *others), np.stack(people[:: max(len(people) // _ENOUGH, 1)]))
     if best != usual or any(_CLEARLY * length[name] < length[best] for name in others):
         why = f"the joints' places say {best}, not {usual}" if best != usual else f"taken as {best}"
         rest = " or ".join(name for name in (usual, *others) if name != best)
         notes.append(f"{count} joints without names: {why}; if they are {rest}, give --skeleton")
     return best, names_of(best, count)
+
+
+def likeliest(layouts: Sequence[str], people: NDArray[np.float64]) -> tuple[str, dict[str, float]]:
+    """The layout by whose bones detections (P, N, 3) are clearly smallest, else the first; and their sizes by each."""
+    length = {name: _mean_bone(SKELETONS[name], people) for name in layouts}
+    best, usual = min(layouts, key=lambda name: length[name]), layouts[0]
+    return best if length[best] < _CLEARLY * length[usual] else usual, length
 
 
 def named_layout(names: Sequence[str], notes: list[str]) -> str | None:
@@ -122,7 +126,7 @@ def named_layout(names: Sequence[str], notes: list[str]) -> str | None:
     return best
 
 
-def mean_bone(skeleton: Skeleton, people: NDArray[np.float64]) -> float:
+def _mean_bone(skeleton: Skeleton, people: NDArray[np.float64]) -> float:
     """Mean length of the bones that all detections (P, N, 3) have by a skeleton: small if it is the right one."""
     data = torch.from_numpy(np.nan_to_num(people))
     points, weights = skeleton.complete(data[..., :2], data[..., 2])

@@ -6,7 +6,7 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from kcs_torch.io.registry import brief, read_error
 from kcs_torch.io.times import frames_of_times, rate_of_times
 from kcs_torch.types.intake import FARTHEST
 
-__all__ = ["Row", "as_value", "is_missing", "not_a_number", "opened", "place_rows", "read_wide"]
+__all__ = ["Row", "as_float", "as_value", "no_numbers", "opened", "place_rows", "read_wide"]
 
 _LIMIT = 2**30  # bytes of a file
 _HEAD = 2**20  # characters of the first line, at most
@@ -50,21 +50,31 @@ class Row(NamedTuple):
     joints: NDArray[np.float64]
 
 
-def is_missing(cell: str) -> bool:
-    """Whether a cell says that a number is missing, otherwise than by NaN: R writes NA, SQL NULL.
+def as_float(cell: str) -> float:
+    """The number in a cell, NaN if it is missing: R writes NA, SQL NULL. A ValueError if it is none.
 
-    >>> is_missing(" N/A "), is_missing("nan"), is_missing("0")
-    (True, False, False)
+    >>> as_float("0"), as_float(" N/A ")
+    (0.0, nan)
     """
-    return cell.strip().lower() in _MISSING
+    return math.nan if cell.strip().lower() in _MISSING else float(cell)
 
 
-def not_a_number(cell: str) -> str:
-    """What a cell says that should hold a number, for messages, with a hint where decimals have a comma.
+def no_numbers(columns: Iterable[str], cells: Iterable[str]) -> str:
+    """Which of these columns' cells is the first that holds no number, for messages.
 
-    >>> print(not_a_number("1,5"))
-    got '1,5' (write decimals with a point)
+    >>> print(no_numbers(["'x'", "'y'"], ["0", "1,5"]))
+    expected numbers, got '1,5' (write decimals with a point) for 'y'
     """
+    for column, cell in zip(columns, cells, strict=True):
+        try:
+            as_float(cell)
+        except ValueError:
+            return f"expected numbers, {_not_a_number(cell)} for {column}"
+    return "expected numbers"
+
+
+def _not_a_number(cell: str) -> str:
+    """What a cell says that should hold a number, for messages, with a hint where decimals have a comma."""
     hint = " (write decimals with a point)" if re.fullmatch(r"-?[0-9]+,[0-9]+", cell.strip()) else ""
     return f"got '{as_text(cell)}'{hint}"
 
@@ -202,9 +212,9 @@ def _row(
 def as_value(cell: str, where: str, name: str) -> float:
     """The number in a cell, NaN if it is missing; an error with file, row and column if it is none, or too large."""
     try:
-        value = math.nan if is_missing(cell) else float(cell)
+        value = as_float(cell)
     except ValueError:
-        raise FormatError(f"{where}: '{name}': expected a number, {not_a_number(cell)}") from None
+        raise FormatError(f"{where}: '{name}': expected a number, {_not_a_number(cell)}") from None
     if not (math.isnan(value) or abs(value) <= FARTHEST):
         raise FormatError(f"{where}: '{name}': expected a coordinate or a visibility, got {value:.3g}")
     return value

@@ -6,7 +6,6 @@ Columns are named by scorer, individuals (where there are several), bodyparts an
 from __future__ import annotations
 
 import csv
-import math
 import re
 from array import array
 from collections.abc import Iterator, Sequence
@@ -22,7 +21,7 @@ from kcs_torch.io.animals import LIMIT, Animal, bounded_rows, build_animals, fra
 from kcs_torch.io.build_motion import build_motion
 from kcs_torch.io.hdf5_pandas import Table, has_column, pandas_group, read_pandas
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief
-from kcs_torch.io.wide import is_missing, not_a_number
+from kcs_torch.io.wide import as_float, no_numbers
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]
@@ -159,10 +158,10 @@ def _read_csv(path: Path, coords: Sequence[str], notes: list[str]) -> Table:
                 if not rows and not any(values) and not any(c.isdigit() for c in "".join(line[:first])):
                     continue  # pandas may write the name of the index in a line of its own
                 try:
-                    numbers.extend([_number(v) for v in values])
+                    numbers.extend([as_float(v) for v in values])
                 except ValueError:
-                    names = [columns[i][1:] for i in take]
-                    raise FormatError(f"{path}: line {lines.line_num}: {_wrong(names, values)}") from None
+                    wrong = no_numbers([_said(columns[i]) for i in take], values)
+                    raise FormatError(f"{path}: line {lines.line_num}: {wrong}") from None
                 rows.append(tuple(line[:first]))
     except (csv.Error, ValueError) as error:
         if isinstance(error, FormatError):
@@ -177,19 +176,10 @@ def _read_csv(path: Path, coords: Sequence[str], notes: list[str]) -> Table:
     return Table([columns[i] for i in take], np.frombuffer(numbers).reshape(-1, len(take)), rows)
 
 
-def _number(cell: str) -> float:
-    return math.nan if is_missing(cell) else float(cell)
-
-
-def _wrong(names: Sequence[tuple[str, ...]], cells: Sequence[str]) -> str:
-    """Which of these columns' cells is the first that holds no number, for messages."""
-    for (*whose, part, coord), cell in zip(names, cells, strict=True):
-        try:
-            _number(cell)
-        except ValueError:
-            animal = f" of '{brief(whose[0])}'" if whose else ""
-            return f"expected numbers, {not_a_number(cell)} for {coord} of '{brief(part)}'{animal}"
-    return "expected numbers"
+def _said(column: tuple[str, ...]) -> str:
+    """A column's name in words, for messages."""
+    _, *whose, part, coord = column
+    return f"{coord} of '{brief(part)}'" + (f" of '{brief(whose[0])}'" if whose else "")
 
 
 def _header(lines: Iterator[list[str]], path: Path) -> list[list[str]]:

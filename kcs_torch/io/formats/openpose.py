@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kcs_torch.errors import FormatError, counted
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.jsonfile import FARTHEST, kind, outline, read_json, short
-from kcs_torch.io.layout import mean_bone
+from kcs_torch.io.layout import BY_COUNT, likeliest
 from kcs_torch.io.people import Sighting, people_tracks
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.skeleton import SKELETONS, get_skeleton
@@ -21,12 +21,11 @@ from kcs_torch.types import Tracks
 
 __all__ = ["READERS"]
 
-LAYOUTS = {25: ("body25", "body25b"), 18: ("coco18",), 15: ("mpi15",), 21: ("hand21",)}
+LAYOUTS = {count: BY_COUNT[count] for count in (25, 18, 15, 21)}
 """Skeletons by the number of joints that a person has; the usual one first."""
 _BODY = "pose_keypoints_2d"
 _OTHERS = ("face_keypoints_2d", "hand_left_keypoints_2d", "hand_right_keypoints_2d")
 _NAME = re.compile(r"(?P<prefix>.*?)(?P<number>[0-9]+)?(?:_keypoints)?\Z", re.DOTALL)
-_CLEARLY = 0.7  # bones this much shorter, by another layout's order of joints, tell that it is the right one
 
 Person = NDArray[np.float64]  # (..., N, 3): x, y, confidence
 
@@ -142,13 +141,11 @@ def _numbers(values: Any, file: Path) -> list[float]:
 def _layout(joints: int, detections: list[Person], options: Options, path: Path, notes: list[str]) -> str | None:
     """The built-in skeleton that a number of joints means; None where the caller's own fits."""
     if joints in LAYOUTS:
-        usual, *others = LAYOUTS[joints]
-        spread = {name: mean_bone(SKELETONS[name], np.concatenate(detections)) for name in (usual, *others)}
-        best = min(spread, key=lambda name: spread[name])
-        if spread[best] < _CLEARLY * spread[usual]:
+        usual = LAYOUTS[joints][0]
+        best, _ = likeliest(LAYOUTS[joints], np.concatenate(detections))
+        if best != usual:
             notes.append(f"{3 * joints} numbers per person usually mean {usual}, but the joints lie as those of {best}")
-            return best
-        return usual
+        return best
     if options.skeleton is not None and get_skeleton(options.skeleton).num_observed == joints:
         return None
     known = ", ".join(f"{3 * n} ({' or '.join(names)})" for n, names in LAYOUTS.items())

@@ -19,7 +19,7 @@ from kcs_torch.io.header import Header, first_line
 from kcs_torch.io.jsonfile import as_frame_number
 from kcs_torch.io.link import link_people, longest_gap
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief
-from kcs_torch.io.wide import is_missing, not_a_number
+from kcs_torch.io.wide import as_float, no_numbers
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]
@@ -186,9 +186,10 @@ def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
                     raise FormatError(f"{path}: line {lines.line_num}: expected {len(header)} cells, got {len(line)}")
                 try:
                     frame = as_frame_number(float(line[1]))  # tables that pandas wrote again may say 7.0
-                    values = [[_number(line[i]) if i is not None else math.nan for i in p] for p in places]
+                    values = [[as_float(line[i]) if i is not None else math.nan for i in p] for p in places]
                 except ValueError:
-                    raise FormatError(f"{path}: line {lines.line_num}: {_wrong(header, line)}") from None
+                    wrong = no_numbers([f"'{brief(column)}'" for column in header[1:]], line[1:])
+                    raise FormatError(f"{path}: line {lines.line_num}: {wrong}") from None
                 if frame is None or not 0 <= frame < 10**15:
                     raise FormatError(f"{path}: line {lines.line_num}: expected a frame number, got {brief(line[1])}")
                 instances.setdefault(line[0], {}).setdefault(frame, []).append(np.array(values))
@@ -250,20 +251,6 @@ def _linked(
 
 def _place(header: list[str], column: str) -> int | None:
     return header.index(column) if column in header else None
-
-
-def _number(cell: str) -> float:
-    return math.nan if is_missing(cell) else float(cell)
-
-
-def _wrong(header: list[str], line: list[str]) -> str:
-    """Which column is the first that holds no number, for messages."""
-    for column, cell in list(zip(header, line, strict=True))[1:]:
-        try:
-            _number(cell)
-        except ValueError:
-            return f"expected numbers, {not_a_number(cell)} for '{brief(column)}'"
-    return "expected numbers"
 
 
 MOTION_READERS = (
