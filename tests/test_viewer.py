@@ -452,16 +452,6 @@ def test_too_few_frames_are_told(result):
 # ---------------------------------------------------------------------- both
 
 
-@pytest.mark.parametrize(
-    ("view", "module", "package"),
-    [(sheet, "matplotlib.figure", "matplotlib")],
-)
-def test_a_missing_package_is_told(result, monkeypatch, view, module, package):
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(OutputError, match=f"pip install {package}"):
-        view(result)
-
-
 def test_summary_leaves_out_what_is_unknown(result):
     words = summarise(result)
     assert words.startswith("12 frames at 25 a second · skeleton coco17 · viewpoint turn 12°")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -39,7 +38,7 @@ def write_picture(draw: Callable[[], Any], path: Path) -> None:
         OutputError: the place cannot be written to.
     """
     from kcs_torch.io.atomic import atomic_path
+    from kcs_torch.viewer.draw import any_letters
 
-    with atomic_path(path) as temporary, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph")  # names of joints may hold letters that the font has not
+    with atomic_path(path) as temporary, any_letters():
         draw().savefig(temporary, format=path.suffix[1:].lower())

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.types import Reconstruction
+from kcs_torch.viewer.draw import any_letters
 from kcs_torch.viewer.film import Film
 from kcs_torch.viewer.names import clip_rate
 
@@ -74,7 +75,7 @@ def animation(
 
     Raises:
         OptionError: there is no result, or the frame rates differ.
-        OutputError: matplotlib is not installed, or no joint is at a finite place.
+        OutputError: no joint is at a finite place.
     """
     people = [results] if isinstance(results, Reconstruction) else list(results)
     if not people:
@@ -87,16 +88,15 @@ def animation(
     return (film.picture(frame, turn) for frame, turn in zip(frames, turns, strict=False)), len(frames), rate
 
 
+@any_letters()
 def save_gif(results: Reconstruction | Sequence[Reconstruction], path: Path) -> None:
     """Write a GIF of at most 200 frames and 20 frames a second.
 
     Raises:
-        OutputError: pillow, which comes with matplotlib, is not installed; or nothing can be drawn.
+        OutputError: nothing can be drawn.
     """
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise OutputError(f"a GIF needs the package pillow ({error}): pip install pillow") from None
+    from PIL import Image
+
     pictures, _, rate = animation(results, GIF)
     palette: Any = None
     frames = []
@@ -109,6 +109,7 @@ def save_gif(results: Reconstruction | Sequence[Reconstruction], path: Path) -> 
     frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], duration=hold, loop=0, optimize=False)
 
 
+@any_letters()
 def save_mp4(results: Reconstruction | Sequence[Reconstruction], path: Path) -> None:
     """Write an MP4 (H.264) of at most 900 frames and 30 frames a second.
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kcs_torch.errors import OptionError, OutputError
+from kcs_torch.errors import OptionError
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
 from kcs_torch.types.hints import is_a
@@ -23,7 +25,7 @@ from kcs_torch.viewer.names import printable
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["clearest_frame", "draw_skeleton", "draw_tracks", "new_figure"]
+__all__ = ["any_letters", "clearest_frame", "draw_skeleton", "draw_tracks", "new_figure"]
 
 LOOK = 100  # frames from the first in which anybody is seen, among which a clear one is looked for
 CLEAR = 0.9  # share of the most joints seen in any of these frames, from which on a frame is clear
@@ -47,7 +49,6 @@ def draw_tracks(people: Tracks | Sequence[Tracks], *, frame: int | None = None) 
 
     Raises:
         OptionError: there is nobody, or no such frame.
-        OutputError: matplotlib is not installed.
     """
     people = [people] if isinstance(people, Tracks) else list(people)
     if not people:
@@ -89,7 +90,6 @@ def draw_skeleton(skeleton: str | Path | Skeleton) -> Figure:
         A matplotlib figure, of no window; ``figure.savefig(path)`` writes it.
 
     Raises:
-        OutputError: matplotlib is not installed.
         SkeletonError: there is no skeleton of that name.
     """
     skeleton = get_skeleton(skeleton)
@@ -119,19 +119,21 @@ def clearest_frame(people: Sequence[Tracks]) -> int:
 
 
 def new_figure(width: float, height: float, dpi: int, layout: Literal["constrained"] | None = None) -> Figure:
-    """An empty figure of no window, in inches.
+    """An empty figure of no window, in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-    Raises:
-        OutputError: matplotlib is not installed.
-    """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise OutputError(f"a picture needs the package matplotlib ({error}): pip install matplotlib") from None
     figure = Figure(figsize=(width, height), dpi=dpi, layout=layout)
     FigureCanvasAgg(figure)
     return figure
+
+
+@contextmanager
+def any_letters() -> Iterator[None]:
+    """Write whatever a file's or a joint's name holds, without a warning of letters that the font has not."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph")
+        yield
 
 
 def frame_alone(axis: Any) -> None:

@@ -46,7 +46,7 @@ def sheet(result: Reconstruction, *, frames: int = 8, turn: float = TURN) -> Fig
 
     Raises:
         OptionError: ``frames`` is below 1.
-        OutputError: matplotlib is not installed, or no joint is at a finite place.
+        OutputError: no joint is at a finite place.
     """
     if not (is_a(frames, int) and frames >= 1):
         raise OptionError(f"frames: expected a whole number, at least 1, got {frames!r}")

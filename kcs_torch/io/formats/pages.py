@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,9 +28,9 @@ def write_html(results: Results, path: Path) -> None:
 def write_png(result: Reconstruction, path: Path) -> None:
     """Write the figure of :func:`kcs_torch.viewer.sheet`."""
     from kcs_torch.viewer import sheet
+    from kcs_torch.viewer.draw import any_letters
 
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph")  # a file's name may hold letters that the font has not
+    with any_letters():
         sheet(result).savefig(path, format="png")
 
 
@@ -39,18 +38,14 @@ def write_gif(results: Results, path: Path) -> None:
     """Write the film of :func:`kcs_torch.viewer.animation` as a GIF."""
     from kcs_torch.viewer.animation import save_gif
 
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph")
-        save_gif(results, path)
+    save_gif(results, path)
 
 
 def write_mp4(results: Results, path: Path) -> None:
     """Write the film of :func:`kcs_torch.viewer.animation` as an MP4."""
     from kcs_torch.viewer.animation import save_mp4
 
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph")
-        save_mp4(results, path)
+    save_mp4(results, path)
 
 
 def write_rrd(results: Results, path: Path) -> None:
