@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kcs_torch.errors import OptionError, OutputError
+from kcs_torch.errors import OutputError
 from kcs_torch.types import Reconstruction
 from kcs_torch.viewer.draw import any_letters
 from kcs_torch.viewer.film import Film
-from kcs_torch.viewer.names import clip_rate
+from kcs_torch.viewer.names import as_people, clip_rate
 
 __all__ = ["GIF", "MP4", "Pace", "animation", "pace", "save_gif", "save_mp4"]
 
@@ -77,9 +77,7 @@ def animation(
         OptionError: there is no result, or the frame rates differ.
         OutputError: no joint is at a finite place.
     """
-    people = [results] if isinstance(results, Reconstruction) else list(results)
-    if not people:
-        raise OptionError("animation: expected at least one result, got none")
+    people = as_people(results, "animation")
     total = max(len(r.points) for r in people)
     step, rate, faster = pace(total, clip_rate(people, "animation"), limits)
     film = Film(people, faster)

@@ -12,6 +12,7 @@ from kcs_torch.types import Reconstruction
 from kcs_torch.types.people import files_named
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.draw import frame_alone, new_figure
+from kcs_torch.viewer.layout import turned
 from kcs_torch.viewer.names import person_names, printable
 from kcs_torch.viewer.together import points_together
 
@@ -171,10 +172,7 @@ class Room:
 
     def seen(self, points: Array, yaw: float) -> Array:
         """(..., 3) to the right, down and away on the picture; the angle is in degrees, negative from the left."""
-        a, b = np.radians([yaw, PITCH])
-        x, y, z = np.moveaxis(points - self.centre, -1, 0)
-        right, away = x * np.cos(a) + z * np.sin(a), z * np.cos(a) - x * np.sin(a)
-        return np.stack([right, y * np.cos(b) - away * np.sin(b), away * np.cos(b) + y * np.sin(b)], -1)
+        return turned(points - self.centre, yaw, PITCH)
 
     def fallen(self, points: Array, yaw: float) -> Array:
         """Points let down on the floor, on the picture."""

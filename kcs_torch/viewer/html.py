@@ -10,6 +10,7 @@ from typing import Any
 
 from kcs_torch.types import Reconstruction
 from kcs_torch.types.people import files_named, shared
+from kcs_torch.viewer.names import as_people
 from kcs_torch.viewer.scene import scene_of
 from kcs_torch.viewer.summary import doubts, summarise
 
@@ -48,7 +49,7 @@ def player(
         OptionError: there is no result, the frame rates differ, or the number of names does.
         OutputError: a result has no joint at a finite place.
     """
-    people = [results] if isinstance(results, Reconstruction) else list(results)
+    people = as_people(results, "player")
     data = scene_of(people, names)
     if title is None:
         title = f"{', '.join(dict.fromkeys(r.method for r in people))}: {files_named(r.tracks for r in people)}"

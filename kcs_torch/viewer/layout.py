@@ -1,4 +1,4 @@
-"""Where to draw the joints of a skeleton on paper: (N, 2), x right, y down, so that no two hide each other."""
+"""Where to draw joints on paper: turned, and a skeleton's, (N, 2), so that no two hide each other."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["flat_layout"]
+__all__ = ["flat_layout", "turned"]
 
 YAWS, PITCHES = (0.0, 25.0, 50.0, 75.0), (0.0, 15.0, 30.0)
 ROUNDS = 300
@@ -29,15 +29,17 @@ def flat_layout(skeleton: Skeleton) -> Array:
     if skeleton.template is None:
         return _spread(skeleton)
     rest = np.array(skeleton.template)
-    views = [_seen_from(rest, yaw, pitch) for pitch in PITCHES for yaw in YAWS]
+    views = [turned(rest, -yaw, pitch)[:, :2] for pitch in PITCHES for yaw in YAWS]
     return max(views, key=_clarity)  # of equally clear ones the first, from the front
 
 
-def _seen_from(points: Array, yaw: float, pitch: float) -> Array:
+def turned(points: Array, yaw: float, pitch: float = 0.0) -> Array:
+    """Points (..., 3) right, down and away as seen from the right by ``yaw`` degrees and from above by ``pitch``."""
     a, b = np.radians([yaw, pitch])
-    x, y, z = points.T
-    x, z = x * np.cos(a) - z * np.sin(a), x * np.sin(a) + z * np.cos(a)
-    return np.stack([x, y * np.cos(b) - z * np.sin(b)], -1)
+    x, y, z = np.moveaxis(points, -1, 0)
+    with np.errstate(invalid="ignore"):  # infinite ones
+        right, away = x * np.cos(a) + z * np.sin(a), z * np.cos(a) - x * np.sin(a)
+        return np.stack([right, y * np.cos(b) - away * np.sin(b), away * np.cos(b) + y * np.sin(b)], -1)
 
 
 def _clarity(places: Array) -> float:

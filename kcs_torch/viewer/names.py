@@ -9,7 +9,19 @@ from kcs_torch.errors import OptionError
 from kcs_torch.types import Reconstruction
 from kcs_torch.types.people import file_and_person
 
-__all__ = ["clip_rate", "person_names", "printable"]
+__all__ = ["as_people", "clip_rate", "person_names", "printable"]
+
+
+def as_people(results: Reconstruction | Sequence[Reconstruction], what: str) -> list[Reconstruction]:
+    """One or several results as a list.
+
+    Raises:
+        OptionError: there is none; ``what`` is to be made of them.
+    """
+    people = [results] if isinstance(results, Reconstruction) else list(results)
+    if not people:
+        raise OptionError(f"{what}: expected at least one result, got none")
+    return people
 
 
 def clip_rate(results: Sequence[Reconstruction], what: str) -> float | None:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kcs_torch.errors import OptionError, OutputError
+from kcs_torch.errors import OutputError
 from kcs_torch.types import Reconstruction
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
-from kcs_torch.viewer.names import clip_rate, person_names, printable
+from kcs_torch.viewer.names import as_people, clip_rate, person_names, printable
 from kcs_torch.viewer.together import points_together
 
 __all__ = ["need_rerun", "save_recording"]
@@ -28,9 +28,7 @@ def save_recording(results: Reconstruction | Sequence[Reconstruction], path: str
         OptionError: there is no result, or the frame rates differ.
         OutputError: rerun is not installed, or it cannot write the file.
     """
-    people = [results] if isinstance(results, Reconstruction) else list(results)
-    if not people:
-        raise OptionError("save_recording: expected at least one result, got none")
+    people = as_people(results, "save_recording")
     clip_rate(people, "save_recording")
     rr, rrb = need_rerun()
     layout = rrb.Horizontal(

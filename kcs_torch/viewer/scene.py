@@ -37,11 +37,9 @@ def scene_of(results: Sequence[Reconstruction], names: Sequence[str] | None = No
         names: what to call them; found from their sources if None.
 
     Raises:
-        OptionError: there is nobody, or the frame rates differ.
+        OptionError: one is none of reconstruct(), the frame rates differ, or the number of names does.
         OutputError: a result has no joint at a finite place.
     """
-    if not results:
-        raise OptionError("player: expected at least one result, got none")
     if wrong := [r for r in results if not isinstance(r, Reconstruction)]:
         raise OptionError(f"player: expected results of reconstruct(), got {type(wrong[0]).__name__}")
     rate = clip_rate(results, "player")

@@ -15,6 +15,7 @@ from kcs_torch.types import Reconstruction
 from kcs_torch.types.hints import is_a
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.draw import frame_alone, new_figure
+from kcs_torch.viewer.layout import turned
 from kcs_torch.viewer.names import printable
 from kcs_torch.viewer.summary import summarise
 
@@ -58,13 +59,12 @@ def sheet(result: Reconstruction, *, frames: int = 8, turn: float = TURN) -> Fig
     tracks = np.where(seen[..., None], tracks, np.nan)
     shown = np.flatnonzero(seen.any(1)) if seen.any() else np.arange(len(points))
     chosen = shown[np.unique(np.linspace(0, len(shown) - 1, frames).round().astype(int))]
-    angle = np.radians(turn)
-    right = np.array([np.cos(angle), 0, np.sin(angle)])  # the camera's x axis, turned about the vertical
-    away = np.array([-np.sin(angle), 0, np.cos(angle)])
+    points = points[chosen]
+    aside = turned(points, turn)
     kinds = [
         ("tracks", tracks[chosen], None),
-        ("3D, from the camera", points[chosen][..., :2], points[chosen][..., 2]),
-        (f"3D, turned {turn:g}°", np.stack([points @ right, points[..., 1]], -1)[chosen], (points @ away)[chosen]),
+        ("3D, from the camera", points[..., :2], points[..., 2]),
+        (f"3D, turned {turn:g}°", aside[..., :2], aside[..., 2]),
     ]
     return _draw(result, chosen, kinds)
 
