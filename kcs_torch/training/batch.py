@@ -1,12 +1,13 @@
-"""What a training step is given: :class:`Batch`."""
+"""What a training step is given: :class:`Batch`, and how its depth is told."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
-__all__ = ["Batch"]
+__all__ = ["Batch", "from_mean_depth"]
 
 
 class Batch(NamedTuple):
@@ -26,3 +27,9 @@ class Batch(NamedTuple):
     points: Tensor
     labelled: Tensor
     pseudo: Tensor
+
+
+def from_mean_depth(points: Tensor) -> Tensor:
+    """Points (..., N, 3) with their depth from the mean of each frame's joints."""
+    depth = points[..., 2:]
+    return torch.cat([points[..., :2], depth - depth.mean(-2, keepdim=True)], -1)

@@ -19,6 +19,7 @@ from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.nn.networks import MLPLifter, TemporalLifter
 from kcs_torch.nn.normalise import normalise_tracks
 from kcs_torch.skeleton import Skeleton, map_joints
+from kcs_torch.training.batch import from_mean_depth
 from kcs_torch.types import Tracks
 from kcs_torch.types.intake import MOST_LACKING
 
@@ -110,9 +111,7 @@ class Lifter(Method):
             share = float(size.amax() / size.amin())
             if share > 1:
                 notes.append(f"weak perspective: the body's size in the image varies by a factor of {share:.2f}")
-            body = match.give(answer, image, one)
-            depth = body[..., 2:]
-            body = torch.cat([body[..., :2], depth - depth.mean(-2, keepdim=True)], -1)
+            body = from_mean_depth(match.give(answer, image, one))
             out.append(
                 Estimate(body, eye if cameras is None else cameras, size, True, 1, tuple(notes), still=self.still)
             )

@@ -19,6 +19,7 @@ from torch import Tensor
 from kcs_torch.errors import KcsError, KcsWarning
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.methods import Method
+from kcs_torch.training.batch import from_mean_depth
 from kcs_torch.training.windows import FilmedWindows
 from kcs_torch.types import Reconstruction, Tracks
 
@@ -115,8 +116,7 @@ def _lift(clips: list[Tracks], method: Method, failed: list[str]) -> list[Recons
 
 def _label(tracks: Tracks, points: Tensor, spread: Tensor | None, trust: float) -> tuple[Tensor, Tensor]:
     """Points with their depth from the mean of each frame, and weights 1 / (1 + (spread / (trust size))^2)."""
-    depth = points[..., 2:]
-    points = torch.cat([points[..., :2], depth - depth.mean(-2, keepdim=True)], -1)
+    points = from_mean_depth(points)
     sound = torch.isfinite(points).all(-1)
     if spread is None:
         weights = torch.ones_like(points[..., 0])

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import FormatError, ShapeError
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.training.batch import Batch
+from kcs_torch.training.batch import Batch, from_mean_depth
 from kcs_torch.training.clips import Clip
 from kcs_torch.training.film import film, random_cameras
 from kcs_torch.training.seeds import generator_of
@@ -190,9 +190,7 @@ class FilmedWindows:
         else:
             cameras = self.cameras[self.clip_of[window], view]
             tracks, weights = self.tracks[view[:, None], frames], self.weights[view[:, None], frames]
-        points = points @ cameras[:, None].mT
-        depth = points[..., 2:]
-        points = torch.cat([points[..., :2], depth - depth.mean(-2, keepdim=True)], -1)
+        points = from_mean_depth(points @ cameras[:, None].mT)
         mark = labelled.to(points.dtype)
         shown = labelled[:, None, None, None]
         pseudo = torch.zeros_like(weights)
