@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kcs_torch.cli.options import AsJson, InFormat, Rate
+from kcs_torch.cli.options import AsJson, InFormat, Rate, check_other
 from kcs_torch.cli.report import answer, one_line, print_json, progress
 from kcs_torch.errors import counted
 
@@ -62,10 +62,12 @@ def angles(
     with answer(as_json):
         from kcs_torch.errors import FormatError, OptionError
         from kcs_torch.io import load_any
+        from kcs_torch.io.angles import check_table
         from kcs_torch.types import Reconstruction, Tracks
 
         if output is not None:
-            _check(output, source)
+            check_table(output)
+            check_other(output, source, "motion")
         with progress(f"reading {source}"):
             data = load_any(source, format=format, skeleton=skeleton, fps=fps)
         if isinstance(data, Tracks):
@@ -91,16 +93,6 @@ def angles(
             typer.echo(f"  note: {one_line(note)}")
         if output is not None:
             typer.echo(f"wrote {output}")
-
-
-def _check(output: Path, source: str) -> None:
-    """Make sure that the table can be written, and not over what is read."""
-    from kcs_torch.errors import OutputError
-    from kcs_torch.io.angles import check_table
-
-    check_table(output)
-    if output.exists() and output.resolve() == Path(source).resolve():
-        raise OutputError(f"{output}: expected another file than the motion, which it would replace")
 
 
 def _named(words: str) -> str | list[str]:

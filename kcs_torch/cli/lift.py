@@ -258,14 +258,9 @@ def method_fields(method: str, settings: list[str]) -> dict[str, Any]:
         OptionError: the method, a field or a value is wrong.
     """
     from kcs_torch.cli.fields import parse_settings
-    from kcs_torch.errors import unknown
-    from kcs_torch.methods import METHODS
-    from kcs_torch.reconstruct import DEFAULT
+    from kcs_torch.reconstruct import method_named
 
-    method = DEFAULT if method == "auto" else method
-    if method not in METHODS:
-        raise unknown("method", method, ["auto", *METHODS])
-    return parse_settings(settings, [METHODS[method]])
+    return parse_settings(settings, [type(method_named(method, {}))])
 
 
 def _learned(path: str, settings: list[str]) -> Method:

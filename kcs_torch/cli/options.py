@@ -21,6 +21,7 @@ __all__ = [
     "TracksPath",
     "Trust",
     "UseSkeleton",
+    "check_other",
     "check_outputs",
     "image_size",
     "new_folders",
@@ -91,7 +92,6 @@ def check_outputs(outputs: Sequence[Path], source: str | None = None, skeleton: 
         OutputError: a suffix is unknown, a package is missing that it needs, a file does not take the skeleton, a place
             cannot be written to, or an output would replace the input.
     """
-    from kcs_torch.errors import OutputError
     from kcs_torch.io.atomic import atomic_path
     from kcs_torch.io.write import check_skeleton, ready_writer
 
@@ -101,14 +101,26 @@ def check_outputs(outputs: Sequence[Path], source: str | None = None, skeleton: 
         if skeleton is not None:
             check_skeleton(path, skeleton)
         once.setdefault(path.resolve(), path)
-        if source is not None and path.exists() and path.resolve() == Path(source).resolve():
-            raise OutputError(f"{path}: expected another file than the tracks, which it would replace")
+        if source is not None:
+            check_other(path, source, "tracks")
         try:
             with atomic_path(path):
                 raise _NothingWritten
         except _NothingWritten:
             pass
     return list(once.values())
+
+
+def check_other(path: Path, source: str, what: str) -> None:
+    """Make sure that a file is not the one that ``what`` is read from.
+
+    Raises:
+        OutputError: it is.
+    """
+    from kcs_torch.errors import OutputError
+
+    if path.exists() and path.resolve() == Path(source).resolve():
+        raise OutputError(f"{path}: expected another file than the {what}, which it would replace")
 
 
 def new_folders(outputs: Sequence[Path]) -> list[Path]:

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from kcs_torch.cli.options import check_other
+
 __all__ = ["PICTURES", "check_picture", "is_picture", "write_picture"]
 
 PICTURES = (".png", ".svg", ".pdf")
@@ -27,8 +29,7 @@ def check_picture(path: Path, *, source: str) -> None:
     if not is_picture(path):
         got = f"'{path.suffix}'" if path.suffix else "none"
         raise OutputError(f"{path}: expected a picture with one of the suffixes {', '.join(PICTURES)}, got {got}")
-    if path.exists() and path.resolve() == Path(source).resolve():
-        raise OutputError(f"{path}: expected another file than the tracks, which it would replace")
+    check_other(path, source, "tracks")
 
 
 def write_picture(draw: Callable[[], Any], path: Path) -> None:
