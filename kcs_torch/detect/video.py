@@ -23,14 +23,12 @@ class Video:
     """An opened video.
 
     Attributes:
-        path: of the file.
         width: of the frames, in pixels, as they are shown: turned as the file says.
         height: of the frames, in pixels.
         fps: frames a second, or None where the file does not say.
         num_frames: as the file claims, 0 where it does not say.
     """
 
-    path: Path
     width: int
     height: int
     fps: float | None
@@ -77,6 +75,6 @@ def open_video(path: str | Path, detector: str) -> Iterator[Video]:
         fps = float(source.get(cv2.CAP_PROP_FPS))
         count = source.get(cv2.CAP_PROP_FRAME_COUNT)
         rate = fps if math.isfinite(fps) and 0 < fps < _FASTEST else None
-        yield Video(path, width, height, rate, max(0, int(count)) if math.isfinite(count) else 0, source)
+        yield Video(width, height, rate, max(0, int(count)) if math.isfinite(count) else 0, source)
     finally:
         source.release()

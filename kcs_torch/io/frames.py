@@ -37,17 +37,15 @@ def by_image(images: Mapping[str, Sequence[Sighting]], notes: list[str]) -> list
     return _spread([images[names[i]] for i in order], [numbers[i] for i in order], notes, as_text(names[order[0]]))
 
 
-def by_number(numbered: Mapping[int, Sequence[Sighting]], notes: list[str], *, first: int = 0) -> list[list[Sighting]]:
+def by_number(numbered: Mapping[int, Sequence[Sighting]], notes: list[str]) -> list[list[Sighting]]:
     """Put the people of each numbered frame in order, frames without any between them. As :func:`by_image`.
 
     Args:
         numbered: the people of each frame by its number.
         notes: sentences for the user on what was assumed; added to.
-        first: with what the numbers usually begin; only another beginning is noted.
     """
     numbers = sorted(numbered)
-    shown = "" if not numbers or numbers[0] in (first, 0, 1) else str(numbers[0])
-    return _spread([numbered[n] for n in numbers], numbers, notes, shown)
+    return _spread([numbered[n] for n in numbers], numbers, notes, str(numbers[0]) if numbers else "")
 
 
 def _spread(
@@ -57,7 +55,7 @@ def _spread(
     out: list[list[Sighting]] = [[] for _ in range(frames[-1] + 1)] if frames else []
     for frame, found in zip(frames, people, strict=True):
         out[frame] = list(found)
-    if numbers and numbers[0] not in (None, 0, 1) and first:
+    if numbers and numbers[0] not in (None, 0, 1):
         notes.append(f"frame 0 is image {first}")
     return out
 
