@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from typing import Any
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "ShapeError",
     "SkeletonError",
     "counted",
+    "listed",
     "unknown",
     "users_level",
     "warnings_told",
@@ -73,6 +75,16 @@ def counted(number: int, what: str) -> str:
     ('1 frame', '2 frames')
     """
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def listed(things: Iterable[object], most: int) -> str:
+    """Things in a row, no more than ``most``.
+
+    >>> listed("abc", 3), listed(range(9), 2)
+    ('a, b, c', '0, 1, ...')
+    """
+    words = list(map(str, islice(things, most + 1)))
+    return ", ".join([*words[:most], *(["..."] if len(words) > most else [])])
 
 
 def unknown(what: str, name: object, choices: Iterable[str], error: type[KcsError] = OptionError) -> KcsError:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.clean.common import body_size, check_tracks, frame_rate, number, rebuilt, share
+from kcs_torch.errors import listed
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.types import Tracks
 
@@ -76,7 +77,7 @@ def gate(tracks: Tracks, *, threshold: float = 6.0, floor: float = 0.2, reach: f
     total = int(dropped.sum())
     which = [f"{tracks.skeleton.joints[n]} {int(dropped[n])}" for n in dropped.argsort(descending=True).tolist()]
     which = which[: int((dropped > 0).sum())]
-    names = f": {', '.join(which[:6])}{', ...' if len(which) > 6 else ''}" if which else ""
+    names = f": {listed(which, 6)}" if which else ""
     note = f"gate: {share(total, int(seen.sum()))} detections dropped as outliers{names}"
     return rebuilt(tracks, tracks.points[:, :count], tracks.weights[:, :count] * kept, note)
 

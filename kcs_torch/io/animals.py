@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kcs_torch.errors import FormatError, counted
+from kcs_torch.errors import FormatError, counted, listed
 from kcs_torch.io.build import OVERSHOOT, build_tracks, nothing_seen
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.header import delimiter
@@ -71,7 +71,7 @@ def frames_of(rows: Sequence[tuple[str | float, ...]], path: Path, notes: list[s
         found = _NUMBER.search(_SUFFIX.sub("", name))
         numbers.append(int(found[1][-18:]) if found else None)
     if len(videos) > 1:
-        shown = ", ".join(brief(v) for v in list(videos)[:4]) + (", ..." if len(videos) > 4 else "")
+        shown = listed(map(brief, videos), 4)
         raise FormatError(f"{path}: expected the frames of one video, got rows of {len(videos)} ({shown}): split it")
     if videos:
         notes.append("rows are placed by the numbers in the images' names")
@@ -121,7 +121,6 @@ def build_animals(
     notes: Sequence[str],
     *,
     edges: Any = None,
-    fps: float | None = None,
 ) -> list[Tracks]:
     """Wrap the animals of a file; those that say nothing are left out, which the notes tell.
 
@@ -148,7 +147,7 @@ def build_animals(
         raise nothing_seen(str(path), options.least, max((float(c.max()) for c in faint if len(c)), default=0.0))
     if len(seen) < len(whole):
         missing = [a.name for a in whole if not any(a is s for s in seen)]
-        shown = ", ".join(map(brief, missing[:5])) + (", ..." if len(missing) > 5 else "")
+        shown = listed(map(brief, missing), 5)
         shared.append(
             f"{len(missing)} of {len(whole)} animals never reach the confidence threshold ({shown}): left out"
         )
@@ -166,7 +165,6 @@ def build_animals(
             source=str(path),
             names=animal.joints,
             edges=edges,
-            fps=fps,
             notes=[*shared, *own],
         )
         people.append(tracks)

@@ -8,6 +8,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from kcs_torch.errors import listed
+
 __all__ = ["frame_numbers", "natural_key", "sibling_files"]
 
 _SPARSE = 20  # frames per file, above which numbers in file names are no frame numbers (time stamps, say)
@@ -69,10 +71,10 @@ def frame_numbers(
         return list(range(len(numbers)))
     if 0 in steps:
         again = sorted({n for n, step in zip(known, steps, strict=False) if not step})
-        shown = ", ".join(map(str, again[:5])) + (", ..." if len(again) > 5 else "")
         verb, plural = ("stands", "") if len(again) == 1 else ("stand", "s")
         notes.append(
-            f"number{plural} {shown} {verb} for several of the {names}: each of these is taken as a frame of its own"
+            f"number{plural} {listed(again, 5)} {verb} for several of the {names}: each of these is taken as a frame "
+            "of its own"
         )
         return list(range(len(numbers)))
     step = math.gcd(*steps)
@@ -89,7 +91,7 @@ def frame_numbers(
         )
     gaps = sorted(set(range(frames[-1] + 1)) - set(frames))
     if gaps:
-        shown = ", ".join(str(known[0] + g * step) for g in gaps[:5]) + (", ..." if len(gaps) > 5 else "")
+        shown = listed((known[0] + g * step for g in gaps), 5)
         verb, plural = ("has", "") if len(gaps) == 1 else ("have", "s")
         notes.append(f"{len(gaps)} of {frames[-1] + 1} frames {verb} no {whole} (number{plural} {shown}): unseen")
     return frames

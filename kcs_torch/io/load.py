@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
-from kcs_torch.errors import FormatError, OptionError, unknown
+from kcs_torch.errors import FormatError, OptionError, listed, unknown
 from kcs_torch.io.hdf5 import read_tree
 from kcs_torch.io.motion import MOTION_READERS
 from kcs_torch.io.registry import Options, Probe, Reader, brief, check_fps, discover
@@ -217,14 +217,13 @@ def _describe(probe: Probe) -> str:
         )
     if probe.files:
         suffixes = sorted({f.suffix or f.name for f in probe.files})
-        shown = ", ".join(suffixes[:5]) + (", ..." if len(suffixes) > 5 else "")
         if clips := _clips(probe):
             return (
                 f"files that are each a clip of its own, such as {clips}: give one of them ("
                 "scripts/reconstruct_many.py reads all of a folder)"
             )
         kind = "a folder without tracks" if probe.is_folder else "files without tracks"
-        return f"{kind} ({len(probe.files)} files: {shown})"
+        return f"{kind} ({len(probe.files)} files: {listed(suffixes, 5)})"
     if probe.suffix == ".json":
         try:
             json.loads(probe.path.read_bytes())
@@ -240,7 +239,7 @@ def _describe(probe: Probe) -> str:
             held = sorted(read_tree(probe.path, ()).shapes)
         except FormatError as error:
             return f"an HDF5 file that cannot be read ({str(error).removeprefix(f'{probe.path}: ')})"
-        return f"an HDF5 file with other content ({', '.join(held[:8]) or 'nothing'}{', ...' if len(held) > 8 else ''})"
+        return f"an HDF5 file with other content ({listed(held, 8) or 'nothing'})"
     if probe.head.startswith((b"PK\x03\x04", b"\x80")):
         return "a binary file with other content"
     if probe.head.startswith(b"\x1f\x8b"):

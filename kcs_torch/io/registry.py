@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from kcs_torch.errors import FormatError, KcsError, OptionError
+from kcs_torch.errors import FormatError, KcsError, OptionError, listed
 from kcs_torch.io.folders import natural_key, sibling_files
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
@@ -295,14 +295,13 @@ def _folders(path: Path) -> str:
     names = sorted((f.name for f in path.iterdir() if f.is_dir() and not f.name.startswith(".")), key=natural_key)
     if not names:
         return "an empty one"
-    listed = f"{', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"
-    return f"one that holds only folders ({listed}): give one of them, such as {path / names[0]}"
+    return f"one that holds only folders ({listed(names, 5)}): give one of them, such as {path / names[0]}"
 
 
-def brief(value: Any, most: int = 100) -> str:
+def brief(value: Any) -> str:
     """A text from a file as a message shows it, cut where it is long."""
     text = str(value)
-    return text if len(text) <= most else f"{text[: most - 4]} ..."
+    return text if len(text) <= 100 else f"{text[:96]} ..."
 
 
 def check_fps(fps: float | None) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError, SkeletonError, unknown
+from kcs_torch.errors import OptionError, ShapeError, SkeletonError, listed, unknown
 from kcs_torch.functional import centre
 from kcs_torch.metrics.align import ALIGNMENTS
 from kcs_torch.metrics.errors import bone_deviation, e3d, mpjpe, pck
@@ -163,8 +163,7 @@ def _joints(pred: Motion, truth: Motion, notes: list[str]) -> list[tuple[str, st
     if len(names) < 3:
         raise SkeletonError(
             f"expected at least 3 joints that mean the same by their names, got {len(names)}: {pred.source} has "
-            f"{', '.join(ours[:12])}{', ...' if len(ours) > 12 else ''}; {truth.source} has {', '.join(theirs[:12])}"
-            f"{', ...' if len(theirs) > 12 else ''}"
+            f"{listed(ours, 12)}; {truth.source} has {listed(theirs, 12)}"
         )
     for motion, used in ((pred, {a for a, _ in names}), (truth, {b for _, b in names})):
         spare = [joint for joint in motion.skeleton.joints if joint not in used]

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kcs_torch.errors import OptionError, SkeletonError
+from kcs_torch.errors import OptionError, SkeletonError, listed
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods import Method
 from kcs_torch.methods.base import Estimate
@@ -208,10 +208,9 @@ def _match(own: Skeleton, body: Skeleton, source: str) -> _Match:
     found = map_joints(own.joints, wanted)
     missing = [name for name, i in zip(wanted, found, strict=True) if i is None]
     if MOST_LACKING * len(missing) > len(wanted):
-        listed = f"{', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''}"
         raise SkeletonError(
             f"{source}: expected the {len(wanted)} joints that the network was trained on ({', '.join(wanted)}), got "
-            f"skeleton '{own.name}', none of whose joints is {listed}"
+            f"skeleton '{own.name}', none of whose joints is {listed(missing, 6)}"
         )
     back = [-1 if i is None else i for i in map_joints(body.joints, own.joints)]
     for place, i in enumerate(found):

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import FormatError
+from kcs_torch.errors import FormatError, listed
 from kcs_torch.functional import euler_angles, euler_rotation
 from kcs_torch.io.build_motion import build_motion, distinct, numbers, read_lines
 from kcs_torch.io.plain import plain
@@ -66,8 +66,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
         stands.setdefault(i, stands.get(node.parent, node.parent))
     left = [n.name for i, n in enumerate(nodes) if i not in set(stay) and n.channels]
     if left:
-        shown = ", ".join(left[:5]) + (", ..." if len(left) > 5 else "")
-        notes.append(f"left out because they lie on their parent: {shown}")
+        notes.append(f"left out because they lie on their parent: {listed(left, 5)}")
     fps = plain_rate(1 / seconds) if seconds > 0 else None
     if fps is None:
         notes.append(f"Frame Time is {seconds:g} seconds: the frame rate is unknown")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kcs_torch.errors import FormatError, OutputError
+from kcs_torch.errors import FormatError, OutputError, listed
 from kcs_torch.io.build_motion import build_motion, distinct
 from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer, need
@@ -50,7 +50,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
         raise FormatError(f"{path}: expected markers, got none that is seen in any frame")
     if not there.all():
         gone = [name for name, seen in zip(names, there, strict=True) if not seen]
-        notes.append(f"never seen, left out: {', '.join(gone[:8])}{', ...' if len(gone) > 8 else ''}")
+        notes.append(f"never seen, left out: {listed(gone, 8)}")
     rate = float(f"{float(answer['rate']):.7g}")  # of single precision
     first, last = (int.from_bytes(Probe(path).head[at : at + 2], "little") for at in (6, 8))
     if len(points) < last - first + 1 < 0xFFFF:
