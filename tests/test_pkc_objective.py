@@ -356,6 +356,31 @@ def test_contacts_rank_solutions():
     assert shaken.contact(depth)[1] < 0.8 * slides
 
 
+def test_noise_leaves_more_room_to_bones_near_the_image_plane():
+    """A leg that swings through the image plane, and a longer one that nods on one side of it, look the same."""
+    points = walk(yaw=0.0)
+    plain = objective(points)
+    lengths = lengths_of(plain, points)
+    thigh = plain.skeleton.bone_names.index("left_hip-left_knee")
+    dz = points[:, plain.bones[:, 1], 2] - points[:, plain.bones[:, 0], 2]
+    nods, longer = dz.clone(), lengths.clone()
+    nods[:, thigh] = (dz[:, thigh].square() + 0.1**2).sqrt()
+    longer[thigh] = (lengths[thigh].square() + 0.1**2).sqrt()
+    both = plain.joints(torch.stack([dz, nods])), torch.stack([lengths, longer])
+    assert not plain.volume(*both).any()  # exact images leave none
+
+    def noisy(level):
+        return Objective(plain.skeleton, points[..., :2], Weights(), torch.full((40, 17), level).double())
+
+    swings, leans = noisy(0.005).volume(*both)
+    assert leans > swings + 2
+    assert noisy(1e-5).volume(*both).abs().max() < 1e-2  # and little noise leaves little
+    assert_close(noisy(0.005).volume(-both[0], both[1]), torch.stack([swings, leans]))
+    found = noisy(0.005)
+    ranked = found.minimise(*both, 3)
+    assert_close(ranked.energy, found(ranked.depth, ranked.lengths) + found.volume(ranked.depth, ranked.lengths))
+
+
 def test_frame_rates_count_alike():
     """Twice the frames a second: each tells half as much, so that the terms stay about the same."""
     slow, fast = walk(60), walk(120, fps=60.0)

@@ -220,7 +220,7 @@ class Scene:
         lengths = median(bone_lengths(points, objective.bones), 1)
         parts = parts_of(self.skeleton, limbs_of(self.skeleton, objective.posture.trunk.tolist()))
         body = AlongRays(objective, self.rays / float(best.focal), best.distance[0] / self.unit, depth[0])
-        energy = RunCosts(objective, body, lengths[0]).unchanged + objective.contact(depth)
+        energy = RunCosts(objective, body, lengths[0]).unchanged + objective.ranking(depth, lengths)
         now = Hypotheses(depth, lengths, energy)
         tried = flipped(objective, parts, now, body)
         return tried.depth[promising(tried, now)] * self.unit

@@ -85,7 +85,7 @@ def _settled(body: Body, depth: Tensor) -> Search[Any, Any, _Settled]:
     objective = body.objective
     depth, _, value = yield from body.descended(depth, JUDGED)
     lengths = body.lengths(depth)
-    return _Settled(depth, lengths, objective(depth, lengths) + objective.contact(depth) + value / ONE)
+    return _Settled(depth, lengths, objective(depth, lengths) + objective.ranking(depth, lengths) + value / ONE)
 
 
 def _flips(body: Body, now: _Settled) -> Tensor:

@@ -143,6 +143,7 @@ def flipped(
         near = (walks & (energy < best.energy + FIRST[0][0])).nonzero().flatten()
         for some in near.split(max(1, ROWS // len(own))):  # all of them would for long blocks take much memory
             energy[some] += objective.contact(depths(some))
+    energy += objective.volume(best.depth, best.lengths)  # turning over changes no depth's size
     order = energy.argsort()
     owner = runs.part[order].tolist()
     order = order[[k for k, part in enumerate(owner) if part not in owner[:k]]]
@@ -163,7 +164,8 @@ def _strides(objective: Objective, body: Turnable, member: Tensor, runs: Runs, b
     image = None if turned.image is objective.image else turned.image
     terms = objective.terms(made.depth, made.lengths, image)
     terms["foreshortening"] = turned.foreshortened(objective, best.lengths[0]).sum(1)
-    made = replace(made, energy=torch.stack(list(terms.values())).sum(0) + objective.contact(made.depth))
+    energy = torch.stack(list(terms.values())).sum(0) + objective.ranking(made.depth, made.lengths)
+    made = replace(made, energy=energy)
     made = made[_change(made, best) > SLIGHT]
     return made[made.energy.argsort()[:STRIDES]]
 

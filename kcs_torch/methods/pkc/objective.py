@@ -40,6 +40,10 @@ NEVER = 3.5
 STEADY = 5
 """Reweightings by which the body's velocity is found; more change what contacts cost by .02 on average."""
 
+VOLUME = 4.0
+"""How much more, in noise, foreshortening counts among hypotheses than within one: noise lasts for less time than
+poses."""
+
 SHORT = 0.001
 """Bones are no shorter than this, a standing person being about 1.75 tall."""
 
@@ -152,9 +156,8 @@ class Objective:
         Another image (H, T, N, 2) than the objective's own may go with them; its noise and gaps are taken to be those.
         """
         w = self.weights
-        own = self.image if image is None else image
         flat = self.flat if image is None else bone_vectors(image, self.bones).square().sum(-1)
-        points = torch.cat([own.expand(*depth.shape, 2), depth[..., None]], -1)
+        points = self._points(depth, image)
         dz = depth[..., self.bones[:, 1]] - depth[..., self.bones[:, 0]]  # (H, T, B)
         bend = dz.diff(n=2, dim=1).square()
         if self.time is not None:
@@ -166,7 +169,7 @@ class Objective:
             "stance": w.stance * self.stance(points, 1.0, self.time),
             "hinges": w.hinge / w.sine**2 * self.hinges(points, lengths, self.time).sum(-1),
             "adduction": w.adduction / w.sine**2 * self.adduction(points, lengths, self.time).sum(-1),
-            "foreshortening": self.foreshortening(points, lengths, bone_weights=self.clear, bone_noise=self.noise),
+            "foreshortening": self.foreshortened(points, lengths, self.clear),
         }
         return out | self.length_terms(lengths)
 
@@ -201,6 +204,34 @@ class Objective:
         pad = torch.nn.functional.pad
         parts = (pad(part[..., None], (2, 0)) for part in depth.split(few))
         return torch.cat([self.weights.contact * self.feet(part, None, self.standing) for part in parts])
+
+    def volume(self, depth: Tensor, lengths: Tensor) -> Tensor:
+        """What a hypothesis gains by the room that the image's noise leaves its depths, (H,); arguments as of ranking.
+
+        A hypothesis is as likely as all depths near it are together, not as its best ones: noise n of a bone's image w
+        lets its depth vary by n |w| / |dz|. The determinant of the curvature is, but for constants, what the
+        foreshortening adds up. Bones that lean away from the image plane all the time would else win, as
+        they can explain any noise.
+        """
+        if not self.noisy:
+            return depth.new_zeros(len(depth))
+        square = self.noise.square()
+        share = VOLUME * self.clear * square / (square + self.weights.length**2)  # of exact images there is no room
+        few = max(1, MOST // depth.shape[1])
+        parts = zip(depth.split(few), lengths.split(few), strict=True)
+        return torch.cat([self.foreshortened(self._points(one), length, share) for one, length in parts])
+
+    def ranking(self, depth: Tensor, lengths: Tensor) -> Tensor:
+        """What ranks solutions and does not pull on them, (H,), of depths (H, T, N) and lengths (H, B)."""
+        return self.contact(depth) + self.volume(depth, lengths)
+
+    def foreshortened(self, points: Tensor, lengths: Tensor, share: Tensor) -> Tensor:
+        """The foreshortening (H,) of joints (H, T, N, 3) and lengths (H, B), of which images have shares (T, B)."""
+        return self.foreshortening(points, lengths, bone_weights=share, bone_noise=self.noise)
+
+    def _points(self, depth: Tensor, image: Tensor | None = None) -> Tensor:
+        """Joints (H, T, N, 3) of depths (H, T, N)."""
+        return torch.cat([(self.image if image is None else image).expand(*depth.shape, 2), depth[..., None]], -1)
 
     def oddity(self, lengths: Tensor) -> float:
         """How far lengths (B,) of rigid bones stray from the template's: root mean square of the logarithm."""
@@ -247,7 +278,7 @@ class Objective:
         return self.rigid / (least + share * self.noise.square())
 
     def __call__(self, depth: Tensor, lengths: Tensor) -> Tensor:
-        """The energy (H,) of depths (H, T, N) and lengths (H, B), less that of contacts."""
+        """The energy (H,) of depths (H, T, N) and lengths (H, B), less what :meth:`ranking` adds."""
         return torch.stack(list(self.terms(depth, lengths).values())).sum(0)
 
     def minimise(self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0) -> Refined:
@@ -263,11 +294,11 @@ class Objective:
         return self.ranked(Refined(torch.cat(z), torch.cat(size), torch.cat(energy), torch.cat(moved), max(steps)))
 
     def ranked(self, found: Refined) -> Refined:
-        """Refined hypotheses, best first, with what contacts cost."""
-        return found._replace(energy=found.energy + self.contact(found.depth)).sorted()
+        """Refined hypotheses, best first, with what :meth:`ranking` adds."""
+        return found._replace(energy=found.energy + self.ranking(found.depth, found.lengths)).sorted()
 
     def refined(self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0) -> Refined:
-        """As :meth:`minimise`, in the order of the hypotheses, and less what contacts cost."""
+        """As :meth:`minimise`, in the order of the hypotheses, and less what :meth:`ranking` adds."""
         give_back(depth.shape[1])
         goal = copy(self)
         goal.weights = replace(self.weights, length=loose * self.weights.length)
