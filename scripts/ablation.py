@@ -140,6 +140,7 @@ FIXED_VARIANTS = {
     "images as likely as clear ones": Variant(
         changes=tuple(constant(owner, "HIDDEN", 1e-9) for owner in (LENGTHS, DESCENT))
     ),
+    "hypotheses ranked without their room": Variant(changes=(constant(OBJECTIVE, "VOLUME", 0.0),)),
     "no posture": Variant(changes=(*without("posture", posture=INF).changes, *weighted(stance=0.0))),
     "mirror images of a motion not as likely": Variant(
         changes=(

@@ -85,7 +85,7 @@ class Objective:
     T/2 sum_b log(1 + v_b)        bones keep their length,
     + sum_tb |second difference of dz|^2 / (2 a^2)        move smoothly,
     + PostureEnergy + StanceEnergy + HingeEnergy + AdductionEnergy + ForeshorteningEnergy + ProportionEnergy
-    + ContactEnergy.
+    + ContactEnergy + volume; the last two rank hypotheses and do not pull on them.
 
     v_b is the robust mean over time of ((|b|^2 - L^2) / 2L)^2 / s^2: how well a bone keeps its length is for the data
     to say. Perspective and a detector's habits change lengths by much more than s, all clip long.
