@@ -498,5 +498,7 @@ def test_complete_names_what_it_cannot_take():
         body.complete(body.complete(points)[0])
     with pytest.raises(ShapeError, match=r"expected weights \(\.\.\., 17\) for points \(4, 17, 3\), got \(4, 19\)"):
         body.complete(points, torch.ones(4, 19))
+    with pytest.raises(ShapeError, match=r"complete: points: expected floating point, got torch.int64"):
+        body.complete(points.long())
     with pytest.raises(ShapeError, match=r"got \(17,\)"):
         body.complete(points[0, :, 0])

@@ -127,11 +127,12 @@ class PostureEnergy(SkeletonModule):
         self._check(points)
         part = points.index_select(-2, self.trunk)
         part = part - part.mean(-2, keepdim=True)
-        first, second = (self.affine.to(part) @ part).unbind(-2)  # images of the trunk's two long axes
-        first = _unit(first)
-        second = _unit(second - (second * first).sum(-1, keepdim=True) * first)
-        turned = torch.stack([first, second, torch.linalg.cross(first, second)], -1)
-        return turned @ self.axes.to(part).mT
+        with full_precision(part):
+            first, second = (self.affine.to(part) @ part).unbind(-2)  # images of the trunk's two long axes
+            first = _unit(first)
+            second = _unit(second - (second * first).sum(-1, keepdim=True) * first)
+            turned = torch.stack([first, second, torch.linalg.cross(first, second)], -1)
+            return turned @ self.axes.to(part).mT
 
     def directions(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """Bones seen from the trunk over their lengths, (..., T, B, 3), 0 where a length is 0; as in :meth:`forward`.

@@ -333,7 +333,8 @@ class Skeleton:
             points (..., N, D) and weights (..., N). A virtual joint is seen where all its sources are.
 
         Raises:
-            ShapeError: they are not tensors of these shapes; points that have the virtual joints already are not.
+            ShapeError: they are not tensors of these shapes; points that have the virtual joints already are not. Nor
+                are points that are not in floating point.
         """
         given: dict[str, Any] = {"points": points, "weights": weights}
         for name, value in given.items():
@@ -349,6 +350,8 @@ class Skeleton:
             elif points.ndim >= 2 and points.shape[-1] == self.num_observed:
                 message += ": swap their last two axes, points.mT"
             raise ShapeError(message)
+        if not points.is_floating_point():
+            raise ShapeError(f"complete: points: expected floating point, got {points.dtype}: use points.float()")
         if weights is not None and weights.shape[-1:] != (self.num_observed,):
             raise ShapeError(
                 f"complete: expected weights (..., {self.num_observed}) for points {tuple(points.shape)}, "
