@@ -7,7 +7,16 @@ from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.functional import centre, minimal_turn, nearest_rotation, procrustes, similarity, superpose
+from kcs_torch.functional import (
+    centre,
+    distance_spread,
+    minimal_turn,
+    nearest_rotation,
+    pinhole_translation,
+    procrustes,
+    similarity,
+    superpose,
+)
 from kcs_torch.metrics import ALIGNMENTS
 
 MIRROR = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
@@ -33,6 +42,19 @@ def test_centre_ignores_what_has_no_weight():
     assert_close(centre(other, weights)[1], centre(points, weights)[1])
     moved, mean = centre(points, torch.zeros(6).double())
     assert torch.equal(moved, points) and torch.equal(mean, torch.zeros(1, 2))
+
+
+def test_weights_below_zero_count_as_zero():
+    points, other, weights = normal(4, 6, 3), normal(4, 6, 3, seed=1), torch.tensor([1.0, 2, 0, 1, 1, 0]).double()
+    less = weights - (weights == 0).double()
+    for function in (
+        lambda w: centre(points, w),
+        lambda w: procrustes(points, other, w),
+        *(lambda w, how=how: superpose(points, other, how, w.expand(4, 6)) for how in ALIGNMENTS),
+        lambda w: distance_spread(points, w.expand(4, 6)),
+        lambda w: pinhole_translation(points, other[..., :2], w),
+    ):
+        assert_close(function(less), function(weights))
 
 
 @pytest.mark.parametrize("dtype", FLOATS)

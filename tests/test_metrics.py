@@ -287,6 +287,15 @@ def test_what_weighs_nothing_may_be_nan():
             assert torch.autograd.grad(found, leaf)[0].isfinite().all()
 
 
+@pytest.mark.parametrize("figure", [mpjpe, e3d, lambda p, t, weights: coverage(p, p[..., 0].abs(), t, weights=weights)])
+def test_weights_below_zero_count_as_zero(figure):
+    """A detector's -1 says that it has seen nothing."""
+    pred, truth = clip(2), clip(2, seed=1)
+    weights = (torch.rand(2, 12, 6, generator=torch.Generator().manual_seed(0)) > 0.3).double()
+    found = figure(pred, truth, weights=weights - (weights == 0).double())
+    torch.testing.assert_close(found, figure(pred, truth, weights=weights))
+
+
 def test_deviation_of_bones_has_a_derivative_where_they_are_constant():
     """The root of a variance of 0 has none, and one such bone made that of the others NaN."""
     points = clip()

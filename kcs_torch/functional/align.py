@@ -40,7 +40,7 @@ def centre(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tenso
 
     Args:
         points: (..., N, D), finite.
-        weights: (..., N), 0 where a joint does not count; all 1 where None. All-zero weights give the mean 0.
+        weights: (..., N), 0 or less where a joint does not count; all 1 where None. All-zero weights give the mean 0.
 
     Returns:
         centred points (..., N, D) and the mean (..., 1, D).
@@ -54,8 +54,9 @@ def centre(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tenso
     else:
         check_core(weights, "centre: weights", points.shape[-2])
         check_batches("centre: points and weights", points, weights, cores=(2, 1))
-        total = or_one(wide(weights).sum(-1)[..., None, None])
-        mean = (wide(points) * weights[..., None]).sum(-2, keepdim=True) / total
+        share = wide(weights).clamp_min(0)
+        total = or_one(share.sum(-1)[..., None, None])
+        mean = (wide(points) * share[..., None]).sum(-2, keepdim=True) / total
         mean = mean.to(torch.promote_types(points.dtype, weights.dtype))
     return points - mean, mean
 
@@ -135,7 +136,7 @@ def procrustes(
     Args:
         source: (..., N, D), centred and finite.
         target: (..., N, D), centred and finite.
-        weights: (..., N) or None.
+        weights: (..., N), 0 or less where a point does not count; all 1 where None.
         reflect: True also admits reflections.
 
     Returns:
@@ -160,7 +161,7 @@ def procrustes(
         check_batches("procrustes: source, target and weights", source, target, weights, cores=(2, 2, 1))
     dtype = torch.promote_types(source.dtype, target.dtype)
     source, target = alike(wide(source), wide(target))
-    left = source if weights is None else source * weights.to(source)[..., None]
+    left = source if weights is None else source * weights.to(source).clamp_min(0)[..., None]
     with full_precision(left):
         rotation = nearest_rotation(left.mT @ target, reflect=reflect)
         size = (left * source).sum((-2, -1))
@@ -216,7 +217,7 @@ def superpose(
         source: (..., T, N, 3), finite; (..., N, 3) will do unless ``how`` is "sequence".
         target: as the source.
         how: a name in :data:`ALIGNMENTS`.
-        weights: (..., T, N), 0 where a joint does not count; all 1 if None.
+        weights: (..., T, N), 0 or less where a joint does not count; all 1 if None.
         root: index of the root joint for ``root`` and ``scale``; the middle of all joints if None.
 
     Returns:
@@ -248,7 +249,7 @@ def superpose(
 
 def _superposed(source: Tensor, target: Tensor, how: str, weights: Tensor | None, root: int | None) -> Tensor:
     """:func:`superpose` of arguments that fit, at least in single precision."""
-    mass = torch.ones_like(target[..., 0]) if weights is None else weights.to(target)
+    mass = torch.ones_like(target[..., 0]) if weights is None else weights.to(target).clamp_min(0)
     sequence = how == "sequence"
     over, counts = 3 if sequence else 2, mass[..., None] > 0
     lost = [LOST * torch.finfo(x.dtype).eps * largest(x, over, counts) for x in (source, target)]  # by centring

@@ -75,7 +75,7 @@ def pinhole_translation(points: Tensor, rays: Tensor, weights: Tensor) -> Tensor
     Args:
         points: (..., N, 3), about any origin; finite.
         rays: (..., N, 2) where the joints are seen, as X/Z and Y/Z; finite.
-        weights: (..., N), 0 where unseen.
+        weights: (..., N), 0 or less where unseen.
 
     Returns:
         (..., 3). Where all rays are the same one, the distance is arbitrary: ten times the body's size.
@@ -91,7 +91,7 @@ def pinhole_translation(points: Tensor, rays: Tensor, weights: Tensor) -> Tensor
     check_floats(points, "pinhole_translation: points", "N", 3)
     check_floats(rays, "pinhole_translation: rays", points.shape[-2], 2)
     check_core(weights, "pinhole_translation: weights", points.shape[-2])
-    share = weights[..., None]
+    share = weights.clamp_min(0)[..., None]
     total = share.sum(-2, keepdim=True)
     total = or_one(total)
     mean = lambda values: (share * values).sum(-2, keepdim=True) / total  # noqa: E731

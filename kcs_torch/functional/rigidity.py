@@ -20,7 +20,8 @@ def distance_spread(points: Tensor, weights: Tensor | None = None) -> tuple[Tens
 
     Args:
         points: (..., T, N, 3), finite.
-        weights: (..., T, N); a pair counts in a frame as much as the lesser of its joints. All 1 where None.
+        weights: (..., T, N); a pair counts in a frame as much as the lesser of its joints, and not below 0. All 1
+            where None.
 
     Returns:
         mean (..., N, N) and standard deviation (..., N, N), both 0 for pairs never seen together. Their
@@ -36,7 +37,7 @@ def distance_spread(points: Tensor, weights: Tensor | None = None) -> tuple[Tens
         mean = distance.mean(-3)
         return mean, safe_root((distance - mean[..., None, :, :]).square().mean(-3))
     check_core(weights, "distance_spread: weights", *points.shape[-3:-1])
-    share = torch.minimum(weights[..., :, None], weights[..., None, :])
+    share = torch.minimum(weights[..., :, None], weights[..., None, :]).clamp_min(0)
     total = share.sum(-3)
     total = or_one(total)
     mean = (share * distance).sum(-3) / total

@@ -43,7 +43,8 @@ class ContactEnergy(SkeletonModule):
         self, skeleton: str | Path | Skeleton, *, slip: float = 0.006, change: float = 0.004, num_steps: int = 10
     ) -> None:
         super().__init__(skeleton)
-        check_positive(self, slip=slip, change=change)
+        check_positive(self, finite=True, slip=slip)
+        check_positive(self, change=change)
         check_whole(self, 0, num_steps=num_steps)
         self.slip, self.change, self.num_steps = slip, change, num_steps
         contacts = torch.tensor(self.skeleton.contacts, dtype=torch.long)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import torch
@@ -48,9 +49,9 @@ class ProcrusteanEnergy(SkeletonModule):
     ) -> None:
         super().__init__(skeleton)
         numbers = is_a(eps, float) and is_a(num_steps, int)
-        if not numbers or not eps > 0 or order not in (0, 1) or num_steps < 0:
+        if not numbers or not 0 < eps < math.inf or order not in (0, 1) or num_steps < 0:
             raise OptionError(
-                "ProcrusteanEnergy: expected eps > 0, order 0 or 1 and num_steps >= 0, "
+                "ProcrusteanEnergy: expected finite eps > 0, order 0 or 1 and num_steps >= 0, "
                 f"got {eps!r}, {order!r} and {num_steps!r}"
             )
         self.eps, self.order, self.num_steps = eps, order, num_steps
