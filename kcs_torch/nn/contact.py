@@ -58,8 +58,7 @@ class ContactEnergy(SkeletonModule):
         Args:
             points: (..., T, N, 3), depth relative to the root or the body's middle.
             velocity: v (..., T), the first frame's does not count; None takes the best one
-                (:func:`kcs_torch.solvers.standing.root_velocity`), at which the energy has hardly any slope in v. It is
-                a constant for autograd: second derivatives lack what it would change.
+                (:func:`kcs_torch.solvers.standing.root_velocity`), through whose reweightings derivatives run.
             standing: c (..., T, C).
             weights: (..., T, N) of the joints: a foot stands no more than it is seen; or (..., T) of the frames, 0 for
                 one that pads a shorter clip.
@@ -103,7 +102,6 @@ class ContactEnergy(SkeletonModule):
                 got = f"{tuple(value.shape)} for points {tuple(points.shape)}"
                 raise ShapeError(f"ContactEnergy: {name}: expected {expected}, got {got}")
 
-    @torch.no_grad()
     def _best(self, step: Tensor, standing: Tensor, inside: Tensor) -> Tensor:
         """The velocity (..., T) that costs least."""
         if not self.contacts.numel() or not step.shape[-2]:
