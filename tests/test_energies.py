@@ -343,7 +343,7 @@ def test_smoothness_of_too_few_frames_is_zero_with_a_gradient():
 
 
 def test_energies_of_no_skeleton_say_so_in_a_line():
-    with pytest.raises(OptionError, match="expected kind 'nuclear' or 'log_det' and finite eps > 0, got a Skeleton and"):
+    with pytest.raises(OptionError, match="expected kind 'nuclear' or 'log_det' and finite eps > 0, got a Skeleton"):
         LowRankEnergy(BODY)
     with pytest.raises(OptionError, match="expected a whole order >= 1, got a Skeleton"):
         SmoothnessEnergy(BODY)

@@ -148,7 +148,8 @@ def euler_angles(order: str, matrices: Tensor) -> Tensor:
         matrices: (..., 3, 3).
 
     Returns:
-        (..., 3) in radians, the second within a quarter turn. Where that is a quarter turn the third is 0.
+        (..., 3) in radians, the second within a quarter turn. Where that is a quarter turn the third is 0, and the
+        second and third have the derivative 0.
 
     Raises:
         OptionError: the order is another one.
@@ -161,14 +162,14 @@ def euler_angles(order: str, matrices: Tensor) -> Tensor:
     i, j, k = (AXES.index(axis) for axis in order)
     sign = 1 if (j - i) % 3 == 1 else -1
     r = matrices
-    sine, cosine = sign * r[..., i, k], torch.hypot(r[..., i, i], r[..., i, j])
-    locked = cosine < 1e-7
-    first = torch.where(
-        locked,
-        torch.atan2(sign * r[..., k, j], r[..., j, j]),
-        torch.atan2(-sign * r[..., j, k], r[..., k, k]),
+    sine, cosine = sign * r[..., i, k], torch.hypot(r[..., i, i].detach(), r[..., i, j].detach())
+    locked = cosine < 1e-7  # there neither a length nor an angle of what is nearly 0 has a derivative
+    along, across = torch.where(locked, 1, r[..., i, i]), torch.where(locked, 0, r[..., i, j])
+    cosine = torch.where(locked, cosine, torch.hypot(along, across))
+    first = torch.atan2(
+        torch.where(locked, sign * r[..., k, j], -sign * r[..., j, k]), torch.where(locked, r[..., j, j], r[..., k, k])
     )
-    third = torch.where(locked, torch.zeros_like(sine), torch.atan2(-sign * r[..., i, j], r[..., i, i]))
+    third = torch.where(locked, torch.zeros_like(sine), torch.atan2(-sign * across, along))
     return torch.stack([first, torch.atan2(sine, cosine), third], -1)
 
 
