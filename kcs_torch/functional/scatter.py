@@ -23,7 +23,8 @@ def scatter_log_det(values: Tensor, eps: Tensor | float) -> Tensor:
 
     Args:
         values: (..., T, D), centred by the caller where a mean is to be free.
-        eps: positive, a number or a tensor that broadcasts against (...), in squared units of the values.
+        eps: positive, a number or a tensor that broadcasts against (...), in squared units of the values. The result is
+            NaN where a tensor's is not.
 
     Returns:
         (...). Differentiable once, in the values; a second derivative raises ``RuntimeError``.

@@ -104,7 +104,8 @@ class ProcrusteanEnergy(SkeletonModule):
             count = share.sum(-2, keepdim=True)
             rows = aligned - (share * aligned).sum(-2, keepdim=True) / or_one(count)
         frames = max(rows.shape[-2], 1)
-        return rows * safe_root(share * frames / or_one(count)), share.amax(-1).sum(-1) / frames
+        most = share.amax(-1) if share.shape[-1] else share.sum(-1)  # a skeleton may have no bones
+        return rows * safe_root(share * frames / or_one(count)), most.sum(-1) / frames
 
 
 def _align(vectors: Tensor, num_steps: int, share: Tensor | None = None) -> Tensor:
