@@ -449,6 +449,9 @@ def test_with_links():
         body.with_links([("left_knee", "left_hip")])
     with pytest.raises(SkeletonError, match="did you mean 'left_wrist'"):
         body.with_links([("left_wrst", "right_wrist")])
+    for wrong in ("ab", ["ab"], [("left_wrist",)]):
+        with pytest.raises(SkeletonError, match="links: expected pairs of joint names, got"):
+            body.with_links(wrong)
 
 
 def test_connected():

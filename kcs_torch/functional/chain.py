@@ -207,7 +207,10 @@ def index_rows(
     """
     shape = f"shape ({what[0].upper()}, {len(form)}) of indices ({', '.join(form)})"
     if not isinstance(rows, Tensor):
-        listed = [tuple(row) for row in rows]
+        try:
+            listed = [tuple(row) for row in rows]
+        except TypeError:
+            raise ShapeError(f"{what}: expected {shape}, got {rows!r}") from None
         for row in listed:
             if len(row) != len(form) or not all(hasattr(i, "__index__") for i in row):
                 raise ShapeError(f"{what}: expected {shape}, got a row {row}")

@@ -161,7 +161,7 @@ def coverage(
     pred = aligned(pred, truth, "none", weights=weights)  # checks the rest; at least in single precision
     mass = torch.ones_like(pred[..., 0]) if weights is None else weights.to(pred).clamp_min(0)
     source, target = centre(pred, mass)[0], centre(truth.to(pred), mass)[0]
-    each, factor = mass[..., None], torch.ones_like(mass[..., 0, 0])
+    each, factor = mass[..., None], mass.new_ones(mass.shape[:-2])
 
     def summed(values: Tensor) -> Tensor:
         return (values * each).sum((-3, -2, -1))
@@ -226,6 +226,10 @@ def bone_pairs(bones: Bones, joints: int | None = None) -> Tensor:
     index = index_rows(bones, joints)
     if not len(index):
         raise ShapeError("bones: expected pairs of joints, got none")
+    if joints is not None and isinstance(bones, Tensor) and not (index.is_meta or torch.compiler.is_compiling()):
+        low, high = int(index.min()), int(index.max())
+        if low < 0 or high >= joints:
+            raise ShapeError(f"bones: expected joint indices 0..{joints - 1}, got {low}..{high}")
     return index
 
 

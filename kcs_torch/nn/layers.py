@@ -186,12 +186,16 @@ class SVT(nn.Module):
         relative: scale the threshold with each matrix.
 
     Raises:
-        OptionError: the threshold is negative, or zero where it is to be learned.
+        OptionError: the threshold is negative, zero where it is to be learned, or a tensor that requires a gradient.
     """
 
     def __init__(self, threshold: float, *, learnable: bool = False, relative: bool = False) -> None:
         super().__init__()
-        number = isinstance(threshold, (Real, Tensor))
+        given: Any = threshold
+        number = isinstance(given, (Real, Tensor))
+        if isinstance(given, Tensor) and given.requires_grad:
+            told = "expected a number, got a tensor that requires a gradient: learnable=True makes a parameter of one"
+            raise OptionError(f"SVT: threshold: {told}")
         if not number or not 0 <= float(threshold) < math.inf or (learnable and threshold == 0):
             kind = "positive" if learnable else "non-negative"
             raise OptionError(f"SVT: expected a {kind}, finite threshold, got {threshold!r}")

@@ -303,7 +303,11 @@ class Skeleton:
         >>> body.is_tree, body.bone_names[-1]
         (False, 'left_wrist-right_wrist')
         """
-        extra = tuple((self.index(a), self.index(b)) for a, b in links)
+        given: list[Any] = list(links)
+        for link in given:
+            if isinstance(link, str) or len(link) != 2:
+                raise SkeletonError(f"links: expected pairs of joint names, got {link!r}")
+        extra = tuple((self.index(a), self.index(b)) for a, b in given)
         return self._with_bones(extra)
 
     def connected(self) -> Skeleton:
