@@ -6,8 +6,17 @@ from numerics import DEVICES, FLOATS, HALVES, leaves_arguments_alone, normal, ro
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
-from kcs_torch.errors import ShapeError
-from kcs_torch.functional import centre, minimal_turn, nearest_rotation, procrustes, similarity, superpose
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.functional import (
+    centre,
+    distance_spread,
+    minimal_turn,
+    nearest_rotation,
+    pinhole_translation,
+    procrustes,
+    similarity,
+    superpose,
+)
 from kcs_torch.metrics import ALIGNMENTS
 
 MIRROR = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
@@ -33,6 +42,37 @@ def test_centre_ignores_what_has_no_weight():
     assert_close(centre(other, weights)[1], centre(points, weights)[1])
     moved, mean = centre(points, torch.zeros(6).double())
     assert torch.equal(moved, points) and torch.equal(mean, torch.zeros(1, 2))
+
+
+def test_weights_below_zero_count_as_zero():
+    points, other, weights = normal(4, 6, 3), normal(4, 6, 3, seed=1), torch.tensor([1.0, 2, 0, 1, 1, 0]).double()
+    less = weights - (weights == 0).double()
+    for function in (
+        lambda w: centre(points, w),
+        lambda w: procrustes(points, other, w),
+        *(lambda w, how=how: superpose(points, other, how, w.expand(4, 6)) for how in ALIGNMENTS),
+        lambda w: distance_spread(points, w.expand(4, 6)),
+        lambda w: pinhole_translation(points, other[..., :2], w),
+    ):
+        assert_close(function(less), function(weights))
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_minimal_turn_is_a_rotation_however_nearly_opposite(dtype):
+    """Below 1e-12 the middle between both was not brought to length 1: reflections came out."""
+    source = normal(20, 3, dtype=dtype)
+    for power in range(3, 22):
+        target = -source + 10.0**-power * normal(20, 3, seed=power, dtype=dtype)
+        turn = minimal_turn(source, target)
+        assert_close(turn @ turn.mT, torch.eye(3, dtype=dtype).expand(20, 3, 3), atol=2e-6, rtol=0)
+        assert_close(torch.linalg.det(turn), torch.ones(20, dtype=dtype), atol=2e-6, rtol=0)
+        unit = [x / x.norm(dim=-1, keepdim=True) for x in (source, target)]
+        assert_close((turn @ unit[0][..., None])[..., 0], unit[1], atol=40 * torch.finfo(dtype).eps, rtol=0)
+
+
+def test_superpose_tells_of_a_root_that_is_none():
+    with pytest.raises(OptionError, match="root: expected a joint index below 5, got 5"):
+        superpose(normal(4, 5, 3), normal(4, 5, 3), "root", root=5)
 
 
 @pytest.mark.parametrize("reflect", [False, True])

@@ -192,3 +192,11 @@ def test_view_energy_of_cameras_that_stand_still():
     points = normal(20, 5, 3)
     right, wrong = view_energy(torch.stack([points, points * torch.tensor([1.0, 1.0, -1.0])]), still)
     assert_close(right, wrong)
+
+
+def test_a_clip_of_one_frame_among_others_stands_still():
+    """Its speed was the median of none, NaN."""
+    clip = rotations(1, seed=3).expand(2, 12, 3, 3).clone()
+    path, angle = constant_path(clip, counts=torch.tensor([1, 12]))
+    assert_close(path, clip)
+    assert angle[0, 1:].isnan().all() and (angle[0, 0] < 1e-6) and (angle[1] < 1e-6).all()

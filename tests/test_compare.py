@@ -179,3 +179,9 @@ def test_against_the_protocol_on_a_lifted_walk(protocol, shared):
     assert found.mpjpe["similarity"] == pytest.approx(expected["pa"], rel=1e-5)
     assert found.mpjpe["sequence"] == pytest.approx(expected["seq_pa"], rel=1e-5)
     assert found.e3d == pytest.approx(expected["e3d"], rel=1e-5)
+
+
+@pytest.mark.parametrize("align", [3, [3]])
+def test_alignments_that_are_no_names_are_told(align):
+    with pytest.raises(OptionError, match="unknown alignment 3"):
+        compare(walking_motion(), walking_motion(), align=align)

@@ -5,6 +5,7 @@ import torch
 from numerics import BATCHES, DEVICES, FLOATS, leaves_arguments_alone, normal
 from torch.testing import assert_close
 
+from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import interpolate
 from kcs_torch.solvers import complete_tracks
 
@@ -72,6 +73,26 @@ def test_frames_without_any_joint_lie_between_their_neighbours(blank):
         low, high = found[blank[0] - 1], found[blank[-1] + 1]
         share = torch.arange(1.0, len(blank) + 1, dtype=torch.float64)[:, None, None] / (len(blank) + 1)
         assert_close(found[blank], low + share * (high - low))
+
+
+def test_frames_that_pad_a_clip_do_not_count():
+    """Gaps at the end were filled towards what they held, if that was said to be seen."""
+    tracks, seen = clip(2)
+    seen = seen.clone()
+    seen[:, 44:48, 3] = False
+    inside = (torch.arange(60) < 48).expand(2, 60)
+    padded = torch.where(inside[..., None, None], tracks, 1e3)
+    found = complete_tracks(padded, seen | ~inside[..., None], inside=inside)
+    assert_close(found[:, :48], complete_tracks(tracks[:, :48], seen[:, :48]))
+    assert (found[:, 48:] == 0).all()
+
+
+def test_what_makes_no_sense_is_refused():
+    tracks, seen = clip()
+    with pytest.raises(OptionError, match=r"expected positive first and last weights, got 0.0 and 0.002"):
+        complete_tracks(tracks, seen, first=0.0)
+    with pytest.raises(ShapeError, match=r"complete_tracks: inside: expected shape \(\.\.\., 60\), got \(59,\)"):
+        complete_tracks(tracks, seen, inside=torch.ones(59, dtype=torch.bool))
 
 
 def test_joints_never_seen_stay_with_the_others():

@@ -113,6 +113,23 @@ def test_the_best_velocity_is_found():
     assert_close(slopes[0], slopes[1], rtol=0, atol=0.02 * float(slopes[1].abs().amax()))
 
 
+@pytest.mark.parametrize("num_steps", [1, 10])
+def test_derivatives_run_through_the_reweightings(num_steps):
+    """Of noisy points they have not converged, and a velocity that was a constant left a third of a slope out."""
+    energy = ContactEnergy(MAN, num_steps=num_steps)
+    walk = walking_person(26, yaw=30.0, dtype=torch.float64).points / 1000 + 0.01 * normal(26, 17, 3)
+    stands = normal(26, 2, seed=2).sigmoid()
+    run = lambda p, s: energy(p, None, s)  # noqa: E731
+    assert gradcheck(run, walk, stands, fast=True)
+    assert torch.autograd.gradgradcheck(lambda p: run(p, stands[:4]), walk[:4].requires_grad_(), fast_mode=True)
+    gone = walk.clone()
+    gone[5] = torch.nan
+    stands[5] = 0
+    gone.requires_grad_()
+    (grad,) = torch.autograd.grad(run(gone, stands), gone)
+    assert grad.isfinite().all() and grad.any()
+
+
 def test_the_best_velocity_in_batches_and_where_nothing_tells():
     energy = ContactEnergy(MAN)
     same_as_loop(lambda p, s: energy(0.01 * p, None, s.sigmoid()), (4, 17, 3), (4, 2))

@@ -10,6 +10,7 @@ from numerics import BATCHES, DEVICES, FLOATS, leaves_arguments_alone, normal
 from torch.testing import assert_close
 
 from kcs_torch.data.synthetic import walking_person
+from kcs_torch.errors import ShapeError
 from kcs_torch.functional import interpolate
 from kcs_torch.solvers import complete_tracks, denoise_tracks
 from kcs_torch.solvers.denoise import _Model
@@ -262,6 +263,18 @@ def test_slow_modes_tell_noise_only_where_they_may():
     tracks = 100 * torch.sin(2 * math.pi * (0.1 + 0.12 * own[0]) * time + 6 * own[1]) + 1000 * own[2]  # 6 to 14 periods
     told = [float(denoise_tracks(tracks, torch.ones(tracks.shape[:2]), quick=quick).noise.mean()) for quick in (12, 24)]
     assert told[0] > 10 and told[1] < 1
+
+
+def test_what_does_not_fit_is_refused():
+    """Transposed weights were those of other joints."""
+    tracks, weights = normal(20, 20, 2), torch.ones(20, 20).double().requires_grad_()
+    assert not any(part.requires_grad for part in denoise_tracks(tracks.requires_grad_(), weights))
+    with pytest.raises(ShapeError, match=r"weights: expected a tensor of shape \(20, 8\), got shape \(8, 20\)"):
+        denoise_tracks(tracks[:, :8], weights[:8])
+    with pytest.raises(ShapeError, match=r"weights: expected a tensor of shape \(20, 20\), got float"):
+        denoise_tracks(tracks, 1.0)
+    with pytest.raises(ShapeError, match="denoise_tracks: tracks: expected floating point, got torch.int64"):
+        denoise_tracks(tracks.long(), weights)
 
 
 @pytest.mark.parametrize("shape", [(0, 20, 4, 2), (0, 4, 2), (3, 0, 4, 2), (20, 0, 2)])

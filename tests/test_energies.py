@@ -343,7 +343,7 @@ def test_smoothness_of_too_few_frames_is_zero_with_a_gradient():
 
 
 def test_energies_of_no_skeleton_say_so_in_a_line():
-    with pytest.raises(OptionError, match="expected kind 'nuclear' or 'log_det' and eps > 0, got a Skeleton and"):
+    with pytest.raises(OptionError, match="expected kind 'nuclear' or 'log_det' and finite eps > 0, got a Skeleton"):
         LowRankEnergy(BODY)
     with pytest.raises(OptionError, match="expected a whole order >= 1, got a Skeleton"):
         SmoothnessEnergy(BODY)
@@ -880,6 +880,34 @@ def test_unknown_skeletons_are_named():
 def test_words_for_numbers_are_refused(make, told):
     with pytest.raises(kt.OptionError, match=told):
         make()
+
+
+INFINITE = {
+    "slip": lambda inf: kt.nn.ContactEnergy("h36m17", slip=inf),
+    "eps": lambda inf: kt.nn.ForeshorteningEnergy("h36m17", eps=inf),
+    "eps of a log-determinant": lambda inf: kt.nn.LowRankEnergy("log_det", eps=inf),
+    "nearest": lambda inf: kt.nn.PerspectiveEnergy(nearest=inf),
+    "kappa": lambda inf: kt.nn.PostureEnergy("h36m17", kappa=inf),
+    "strength": lambda inf: kt.nn.PostureEnergy("h36m17", strength=inf),
+    "eps of bones": lambda inf: kt.nn.ProcrusteanEnergy("h36m17", eps=inf),
+    "fold": lambda inf: kt.nn.StanceEnergy("h36m17", fold=inf),
+}
+
+
+@pytest.mark.parametrize("name", INFINITE)
+def test_infinite_options_are_refused(name):
+    """The energy was NaN."""
+    with pytest.raises(kt.OptionError, match="finite.* got .*inf"):
+        INFINITE[name](float("inf"))
+
+
+def test_infinite_options_that_switch_a_term_off():
+    points = torch.randn(10, 17, 3)
+    assert kt.nn.PostureEnergy("h36m17", correlation=float("inf"))(points) == 0
+    assert kt.nn.ForeshorteningEnergy("h36m17", correlation=float("inf"))(points) == 0
+    lengths = bone_lengths(points, kt.SKELETONS["h36m17"].bone_index()).mean(0)
+    odd = [kt.nn.ProportionEnergy("h36m17", twins=twins)(lengths) for twins in (0.03, float("inf"))]
+    assert 0 < odd[1] < odd[0]
 
 
 def test_lengths_of_each_frame_are_told_apart_from_those_of_clips():

@@ -245,3 +245,10 @@ def test_results_follow_dtype_and_device(dtype, device):
     q = leaves_arguments_alone(ist, motion)
     values = [q, *leaves_arguments_alone(lambda m, s: metric_upgrade(m, s, smoothness=0.1), motion, q)]
     assert {(v.dtype, v.device.type) for v in values} == {(dtype, device)}
+
+
+def test_motion_without_frames_is_told():
+    with pytest.raises(ShapeError, match=r"ist: expected motion \(\.\.\., T, 2, R\) with T >= 1 and R >= 3"):
+        ist(torch.zeros(0, 2, 4))
+    with pytest.raises(ShapeError, match=r"metric_upgrade: expected motion"):
+        metric_upgrade(torch.zeros(0, 2, 4), torch.zeros(4, 3))

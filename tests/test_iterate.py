@@ -2,6 +2,7 @@
 
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from numerics import BATCHES, DEVICES, FLOATS, gradcheck, leaves_arguments_alone, normal, same_as_loop
@@ -268,3 +269,9 @@ def test_results_follow_dtype_and_device(dtype, device):
     lift = lambda t: svt(lambda x: x, lambda y: y, t, threshold=1.0).value  # noqa: E731
     values = [leaves_arguments_alone(run, target), leaves_arguments_alone(lift, target)]
     assert {(v.dtype, v.device.type) for v in values} == {(dtype, device)}
+
+
+def test_counts_may_be_those_of_numpy():
+    start = torch.tensor(8.0, requires_grad=True)
+    found = iterate(lambda x, _: x / 2, start, num_steps=np.int64(6), grad_steps=np.int64(3))
+    assert found.value == 0.125 and found.iterations == 6

@@ -292,3 +292,9 @@ def test_confidences_are_no_coordinate():
 def test_points_without_coordinates_are_refused(module):
     with pytest.raises(ShapeError, match=r"points of 2 or 3 coordinates, got \(5, 17, 0\)"):
         module(torch.ones(5, 17, 0))
+
+
+def test_a_threshold_that_requires_a_gradient_is_told_of_parameters():
+    with pytest.raises(OptionError, match="threshold: expected a number, got a tensor that requires a gradient"):
+        SVT(torch.tensor(0.5, requires_grad=True))
+    assert SVT(torch.tensor(0.5)).threshold == 0.5

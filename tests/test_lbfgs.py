@@ -255,3 +255,9 @@ def test_what_is_no_problem_in_rows_is_told():
         lbfgs(square, torch.ones(2, 3), memory=0)
     nothing = lbfgs(square, torch.ones(0, 3))
     assert nothing.value.shape == (0, 3) and nothing.iterations == 0
+
+
+def test_within_inference_mode_there_are_derivatives():
+    with torch.inference_mode():
+        found = lbfgs(lambda x: (x - 2).square().sum(-1), torch.zeros(2, 3).double())
+    assert_close(found.value, torch.full((2, 3), 2.0).double())

@@ -9,7 +9,7 @@ from numerics import BODY, CHAIN, HALVES, finite, gradcheck, normal, same_as_loo
 from test_posture import BONES, KINDS, MAN, POSTURE, WALK, degenerate
 from torch.testing import assert_close
 
-from kcs_torch.errors import ShapeError, SkeletonError
+from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths
 from kcs_torch.nn import ForeshorteningEnergy, PostureEnergy, ProportionEnergy
 from kcs_torch.nn.lengths import foreshortening, free_bones
@@ -103,6 +103,23 @@ def test_bones_of_no_weight_may_be_anything():
     assert_close(value, energy(WALK[:6], lengths, bone_weights=weights))
     (grad,) = torch.autograd.grad(value, gone)
     assert torch.isfinite(grad).all() and not grad[:, 6].any() and grad.any()
+
+
+def test_noise_of_bones_of_no_weight_may_be_anything():
+    energy, weights = ForeshorteningEnergy(MAN), torch.ones(6, 17).double()
+    weights[2, 6] = 0
+    gone = torch.minimum(weights[:, BONES[:, 0]], weights[:, BONES[:, 1]]) == 0
+    noise = torch.full((6, 16), 0.01).double()
+    expected = energy(WALK[:6], None, weights, bone_noise=noise)
+    points = WALK[:6].clone().requires_grad_()
+    value = energy(points, None, weights, bone_noise=torch.where(gone, torch.nan, noise))
+    assert_close(value, expected)
+    assert torch.autograd.grad(value, points)[0].isfinite().all()
+
+
+def test_weights_of_joints_and_of_bones_are_not_given_together():
+    with pytest.raises(OptionError, match="ForeshorteningEnergy: expected weights or bone_weights, got both"):
+        ForeshorteningEnergy(MAN)(WALK[:6], None, torch.ones(6, 17), bone_weights=torch.ones(6, 16))
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

@@ -215,6 +215,18 @@ def test_gradient_of_batches_by_broadcasting():
     assert gradcheck(run, points, lengths[0], torch.tensor(1.5).double(), fast=True)
 
 
+def test_other_precisions_are_brought_to_that_of_the_points():
+    points, lengths = problem("chain")
+    expected = fit_bones(points, lengths, BONES["chain"], start=points + 0.1)
+    found = fit_bones(points, lengths.float(), BONES["chain"], start=(points + 0.1).float())
+    assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    assert fit_bones(points.float(), lengths, BONES["chain"]).dtype == torch.float32
+    with pytest.raises(ShapeError, match="fit_bones: points: expected floating point, got torch.int64"):
+        fit_bones(points.long(), lengths, BONES["chain"])
+    with pytest.raises(ShapeError, match=r"fit_bones: points and lengths: expected the same batch, got \(2, "):
+        fit_bones(torch.stack([points] * 2), torch.stack([lengths] * 3), BONES["chain"])
+
+
 def test_second_derivative():
     points, lengths = problem("chain")
     leaves = [points.requires_grad_(), lengths.requires_grad_(), torch.tensor(1.5).double().requires_grad_()]

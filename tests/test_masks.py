@@ -134,6 +134,20 @@ def test_what_weighs_nothing_may_be_nan(name):
 
 
 @each
+def test_weights_below_zero_count_as_zero(name):
+    """A detector's -1 says that it has seen nothing."""
+    energy, weights = WEIGHTED[name], gaps()
+    assert_close(energy(WALK, torch.where(weights > 0, weights, -1), ALL), energy(WALK, weights, ALL))
+
+
+@pytest.mark.parametrize("name", ["AdductionEnergy", "ContactEnergy", "HingeEnergy", "PostureEnergy", "StanceEnergy"])
+def test_weights_of_frames_below_zero_count_as_zero(name):
+    energy, weights = WEIGHTED[name], torch.ones(FRAMES).double()
+    weights[-2:] = 0
+    assert_close(energy(WALK, torch.where(weights > 0, weights, -1), ALL), energy(WALK, weights, ALL))
+
+
+@each
 def test_gradient_beside_gaps_and_in_the_weights(name):
     energy, weights = WEIGHTED[name], gaps()
     seen = weights[..., None] > 0

@@ -164,6 +164,12 @@ def test_coverage_of_true_deviations_is_that_of_the_normal_distribution():
     assert coverage(9 * pred, 9 * deviation, truth) < 0.5
 
 
+def test_figures_of_no_frames_are_nan():
+    none = torch.zeros(2, 0, 6, 3)
+    for value in (mpjpe(none, none), e3d(none, none), coverage(none, none[..., 0], none), bone_deviation(none, BONES)):
+        assert value.shape == (2,) and value.isnan().all()
+
+
 def test_coverage_counts_what_is_known_of_the_truth():
     truth, pred = clip(), clip(seed=1)
     deviation = torch.ones(12, 6, dtype=torch.float64)
@@ -287,6 +293,15 @@ def test_what_weighs_nothing_may_be_nan():
             assert torch.autograd.grad(found, leaf)[0].isfinite().all()
 
 
+@pytest.mark.parametrize("figure", [mpjpe, e3d, lambda p, t, weights: coverage(p, p[..., 0].abs(), t, weights=weights)])
+def test_weights_below_zero_count_as_zero(figure):
+    """A detector's -1 says that it has seen nothing."""
+    pred, truth = clip(2), clip(2, seed=1)
+    weights = (torch.rand(2, 12, 6, generator=torch.Generator().manual_seed(0)) > 0.3).double()
+    found = figure(pred, truth, weights=weights - (weights == 0).double())
+    torch.testing.assert_close(found, figure(pred, truth, weights=weights))
+
+
 def test_deviation_of_bones_has_a_derivative_where_they_are_constant():
     """The root of a variance of 0 has none, and one such bone made that of the others NaN."""
     points = clip()
@@ -314,6 +329,9 @@ def test_bones_that_points_have_not_are_told():
         ([(0, 6)], r"bones: expected joint indices 0..5, got \(0, 6\)"),
         ([(0.5, 1)], r"bones: expected shape \(B, 2\) of indices"),
         ([(0, 1, 2)], r"bones: expected shape \(B, 2\) of indices"),
+        (torch.tensor([(0, 6)]), "bones: expected joint indices 0..5, got 0..6"),
+        (torch.tensor([(-1, 3)]), "bones: expected joint indices 0..5, got -1..3"),
+        (3, r"bones: expected shape \(B, 2\) of indices \(parent, child\), got 3"),
         ("h36m17", r"expected points of the 17 joints of skeleton 'h36m17', got 6 joints"),
     ):
         with pytest.raises(ShapeError, match=told):

@@ -195,6 +195,7 @@ def test_receptive_fields():
     assert MLPLifter("h36m17", window=9).receptive_field == 9
     assert TemporalLifter("h36m17").receptive_field == 27
     assert TemporalLifter("h36m17", dilations=(1, 3, 9, 27)).receptive_field == 81
+    assert TemporalLifter("h36m17", dilations=iter((1, 3, 9, 27))).receptive_field == 81
 
 
 def test_ends_are_held(lifter):

@@ -250,6 +250,8 @@ def test_what_does_not_fit_is_said():
             PerspectiveEnergy()(points, wrong, LENS)
     with pytest.raises(ShapeError, match="intrinsics"):
         PerspectiveEnergy()(points, tracks, (1.0, 2.0))
+    with pytest.raises(ShapeError, match=r"PerspectiveEnergy: expected intrinsics \(4,\) that are the same in all"):
+        PerspectiveEnergy()(points, tracks, torch.tensor(LENS).expand(5, 4))
 
 
 def matrix(lens):

@@ -5,7 +5,8 @@ import torch
 from numerics import HALVES, normal, turning
 from torch.testing import assert_close
 
-from kcs_torch.functional import chain_inverse, factorize
+from kcs_torch.functional import chain_inverse, euler_rotation, factorize, minimal_turn, orbit, rotation_angle
+from kcs_torch.nn import PostureEnergy
 from kcs_torch.solvers import (
     choose_path,
     constant_path,
@@ -18,6 +19,14 @@ from kcs_torch.solvers import (
 )
 
 MOTION, PATH = normal(12, 2, 4).float(), turning(12).float()
+
+TURNED = {
+    "euler_rotation": (lambda angles: euler_rotation("ZXY", angles), normal(12, 3).float()),
+    "minimal_turn": (lambda way: minimal_turn(way, way.flip(-1)), normal(12, 3).float()),
+    "orbit": (orbit, 100 * normal(12).float()),
+    "rotation_angle": (lambda turns: rotation_angle(turns, turns.flip(0)), turning(12).float()),
+    "PostureEnergy.frame": (PostureEnergy("h36m17").frame, normal(12, 17, 3).float()),
+}
 
 FUNCTIONS = {
     "chain_inverse": (chain_inverse, torch.tensor([[-1.0, 0], [1, -1], [0, 1]])),
@@ -47,9 +56,9 @@ def test_half_precision_is_widened_and_comes_back(name, dtype):
         assert_close(ours, expected.to(dtype), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", [*FUNCTIONS, *TURNED])
 def test_autocast_makes_no_difference(name):
-    function, values = FUNCTIONS[name]
+    function, values = {**FUNCTIONS, **TURNED}[name]
     with torch.autocast("cpu", dtype=torch.bfloat16):
         found = both(function(values))
     for ours, expected in zip(found, both(function(values)), strict=True):

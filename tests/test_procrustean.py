@@ -267,6 +267,9 @@ def test_distances_and_tree_find_the_rigid_parts():
     weighted = distance_spread(points, torch.ones(60, 6, dtype=torch.float64))
     assert torch.allclose(weighted[1], spread) and torch.allclose(weighted[0], mean)
     assert distance_spread(torch.full((4, 2, 3), torch.nan))[1].isnan().all()
+    large = (1000 * points).half()
+    for part, exact in zip(distance_spread(large), distance_spread(large.double()), strict=True):
+        assert part.dtype == torch.half and (part - exact).abs().max() < 1e-3 * exact.max()
     tree = rigid_tree(spread + 1e-3 * mean)
     assert {frozenset(p) for p in tree.tolist()} == {frozenset(p) for p in BONES.tolist()}
     with pytest.raises(ShapeError):
@@ -318,3 +321,34 @@ def test_energy_does_not_see_turns_and_prefers_few_motions():
         ProcrusteanEnergy(BODY, eps=0.0)
     with pytest.raises(ShapeError):
         energy(points[:, :4])
+
+
+def test_tracks_that_are_unseen_may_be_nan():
+    points, turns = normal(1, 12, 6, 3), torch.eye(3).double().expand(1, 12, 3, 3)
+    weights = torch.ones(12, 6).double()
+    weights[3, 4] = 0
+    image = points[0, ..., :2]
+    gone = torch.where(weights[..., None] > 0, image, torch.nan)
+    found, expected = (
+        procrustean(tracks, points, turns, BONES, weights=weights, noise=0.02, stages=FINE[:1])
+        for tracks in (gone, image)
+    )
+    assert torch.equal(found.points, expected.points) and torch.equal(found.objective, expected.objective)
+
+
+def test_half_precision_is_descended_from_in_single():
+    points, turns = normal(1, 12, 6, 3).half(), torch.eye(3).half().expand(1, 12, 3, 3)
+    found = procrustean(points[0, ..., :2], points, turns, BONES, stages=COARSE[:1])
+    assert found.points.dtype == torch.float32 and found.points.isfinite().all()
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_a_skeleton_without_bones_has_no_energy(order):
+    energy = ProcrusteanEnergy(Skeleton(("a", "b"), (), tree=False), order=order)
+    assert energy(normal(5, 2, 3), None, torch.ones(5, 2)) == energy(normal(5, 2, 3)) == 0
+
+
+def test_an_eps_that_is_not_positive_is_told():
+    for eps in (0.0, -1.0, float("nan")):
+        with pytest.raises(OptionError, match="scatter_log_det: eps: expected a positive number, got"):
+            scatter_log_det(normal(4, 3), eps)

@@ -179,3 +179,14 @@ def test_batches_dtypes_and_devices(dtype, device):
     same_as_loop(rotation_vector, (3,), make=lambda v: (rotation_matrix(v),))
     same_as_loop(lambda a: euler_rotation("XZ", a), (2,))
     assert rotation_matrix(vectors[:0]).shape == (0, 3, 3, 3) and rotation_vector(matrices[:0]).shape == (0, 3, 3)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("quarter", [-math.pi / 2, math.pi / 2])
+def test_euler_angles_have_a_derivative_in_gimbal_lock(order, quarter):
+    """It was NaN: of a length and of angles of what is 0."""
+    matrices = euler_rotation(order, torch.tensor([[0.3, quarter, 0.2], [0.3, 0.5, 0.2]], dtype=torch.float64))
+    angles = euler_angles(order, matrices.requires_grad_())
+    assert_close(euler_rotation(order, angles), matrices)
+    (grad,) = torch.autograd.grad(angles.sum(), matrices)
+    assert grad.isfinite().all() and grad[0].any()

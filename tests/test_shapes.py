@@ -105,6 +105,72 @@ def test_what_does_not_fit_is_told_by_its_name(name):
             function(**{**arguments, what: [1.0]})
 
 
+FLOATING = {
+    "angle_between": ("first", "second"),
+    "back_project": ("tracks", "cameras"),
+    "camera_disagreement": ("first", "second"),
+    "centre": ("points",),
+    "euler_angles": ("matrices",),
+    "euler_rotation": ("angles",),
+    "factorize": ("tracks",),
+    "flexion": ("upper", "lower"),
+    "joint_angles": ("points",),
+    "minimal_turn": ("source", "target"),
+    "pinhole_translation": ("points", "rays"),
+    "procrustes": ("source", "target"),
+    "project": ("points", "cameras"),
+    "rotation_angle": ("first", "second"),
+    "rotation_vector": ("matrices",),
+    "rows_to_cameras": ("rows",),
+    "scatter_log_det": ("values",),
+    "similarity": ("source", "target"),
+    "superpose": ("source", "target"),
+    "viewpoint_turn": ("cameras",),
+}
+
+
+@pytest.mark.parametrize("name", FLOATING)
+def test_whole_numbers_are_refused(name):
+    """They were divided by, or written into, without a fraction."""
+    function, (arguments, _) = getattr(F, name), REFUSED[name]
+    for what in FLOATING[name]:
+        expected = rf"{name}: {what}: expected floating point, got torch.int64: use {what}.float\(\)"
+        with pytest.raises(ShapeError, match=expected):
+            function(**{**arguments, what: (9 * arguments[what]).long()})
+
+
+def test_other_whole_numbers_are_refused():
+    with pytest.raises(ShapeError, match=r"orbit: yaw: expected floating point, got torch.int64: use yaw.float\(\)"):
+        F.orbit(torch.tensor([0, 90]), 20.0)
+    with pytest.raises(ShapeError, match=r"orbit: yaw: expected a tensor, got float: use torch.as_tensor\(yaw\)"):
+        F.orbit(90.0)
+    with pytest.raises(ShapeError, match=r"pose_matrix: points: expected floating point, got torch.int64"):
+        F.pose_matrix(CLIP.long(), [(0, 1)], normalise=True)
+    assert F.pose_matrix(CLIP.long(), [(0, 1)]).dtype == torch.int64
+
+
+PAIRS = {name: names for name, names in FLOATING.items() if len(names) == 2 and name != "pinhole_translation"}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_of_two_precisions_the_result_has_the_finer(name):
+    function, (arguments, _) = getattr(F, name), REFUSED[name]
+    exact = {k: v.double() if isinstance(v, torch.Tensor) else v for k, v in arguments.items()}
+    expected = function(**exact)
+    for what in PAIRS[name]:
+        found = function(**{**exact, what: arguments[what]})
+        for ours, theirs in zip(*(x if isinstance(x, tuple) else (x,) for x in (found, expected)), strict=True):
+            torch.testing.assert_close(ours, theirs)
+
+
+@pytest.mark.parametrize("name", [*PAIRS, "centre"])
+def test_batches_that_do_not_fit_are_told(name):
+    function, (arguments, _) = getattr(F, name), REFUSED[name]
+    for what in [key for key, value in arguments.items() if isinstance(value, torch.Tensor)]:
+        with pytest.raises(ShapeError, match=rf"{name}: .*{what}.*: expected the same batch, got \("):
+            function(**{**arguments, what: torch.cat([arguments[what]] * 2)[:3]})
+
+
 @pytest.mark.parametrize("move", [F.similarity, lambda *pair, **_: F.superpose(*pair, "similarity")])
 def test_single_poses_are_moved_as_clips_are(move):
     turned = CLIP @ TURNS[0].mT + 1

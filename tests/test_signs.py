@@ -125,3 +125,9 @@ def test_shapes_that_do_not_fit():
         for function in (smooth_signs, sign_costs):
             with pytest.raises(ShapeError, match="smooth_signs: expected"):
                 function(torch.ones(2, 5, 1, 4), depths, cap=1.0)
+    for function in (smooth_signs, sign_costs):
+        with pytest.raises(ShapeError, match="of a frame or more, got"):
+            function(torch.ones(2, 0, 1, 4), torch.ones(2, 0, 2), cap=1.0)
+        for shape in ((3, 2, 2), (4, 1, 1), (3, 4, 2, 2), (2, 5, 2, 2)):
+            with pytest.raises(ShapeError, match=r"transition: expected shape \(4, 2, 2\), or \(2, 4, 2, 2\), got"):
+                function(torch.ones(2, 5, 2, 4), torch.ones(2, 5, 2), cap=1.0, transition=torch.zeros(shape))

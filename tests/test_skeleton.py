@@ -449,6 +449,9 @@ def test_with_links():
         body.with_links([("left_knee", "left_hip")])
     with pytest.raises(SkeletonError, match="did you mean 'left_wrist'"):
         body.with_links([("left_wrst", "right_wrist")])
+    for wrong in ("ab", ["ab"], [("left_wrist",)]):
+        with pytest.raises(SkeletonError, match="links: expected pairs of joint names, got"):
+            body.with_links(wrong)
 
 
 def test_connected():
@@ -498,5 +501,7 @@ def test_complete_names_what_it_cannot_take():
         body.complete(body.complete(points)[0])
     with pytest.raises(ShapeError, match=r"expected weights \(\.\.\., 17\) for points \(4, 17, 3\), got \(4, 19\)"):
         body.complete(points, torch.ones(4, 19))
+    with pytest.raises(ShapeError, match=r"complete: points: expected floating point, got torch.int64"):
+        body.complete(points.long())
     with pytest.raises(ShapeError, match=r"got \(17,\)"):
         body.complete(points[0, :, 0])

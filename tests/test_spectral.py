@@ -542,3 +542,8 @@ def test_dct_basis_is_that_of_scipy(length):
 def test_dct_basis_out_of_range(count):
     with pytest.raises(ShapeError, match=r"1\.\.5"):
         dct_basis(5, count)
+
+
+def test_a_threshold_below_zero_counts_as_zero():
+    matrix = normal(2, 5, 3)
+    assert_close(svt(matrix, torch.tensor([-1.0, 0.0])), matrix)

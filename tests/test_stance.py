@@ -108,7 +108,7 @@ def test_what_stands_on_nothing_costs_nothing():
 def test_wrong_calls():
     for name in ("sway", "fold"):
         for value in (0.0, -1.0, math.nan):
-            with pytest.raises(OptionError, match=rf"StanceEnergy: {name}: expected a positive number, got"):
+            with pytest.raises(OptionError, match=rf"StanceEnergy: {name}: expected a positive number"):
                 StanceEnergy(MAN, **{name: value})
     with pytest.raises(ShapeError, match=r"StanceEnergy: expected points \(\.\.\., T, N, 3\)"):
         ENERGY(normal(4, 17, 2))
@@ -119,6 +119,8 @@ def test_wrong_calls():
             ENERGY(normal(3, 4, 17, 3), size)
     with pytest.raises(ShapeError, match=r"StanceEnergy: expected size"):
         ENERGY(normal(3, 4, 17, 3), torch.ones(2))
+    with pytest.raises(ShapeError, match=r"StanceEnergy: expected sizes \(\) that are the same in all frames"):
+        ENERGY(normal(4, 17, 3), torch.ones(4))
 
 
 @pytest.mark.parametrize("size", [0.0, 1, 1.7, np.float64(1.7)])

@@ -219,3 +219,9 @@ def test_what_does_not_fit_is_told():
     with pytest.raises(ShapeError, match="blend_windows: expected parts"):
         blend_windows(torch.zeros(2, 3, 2), [0], 5)
     assert best_path(torch.zeros(2, 0, 3), torch.zeros(2, 0, 3, 3)).shape == (2, 0)
+    for starts in ([0, 5], [0, 4], [0, 6], [-1, 2], [1, 5]):
+        with pytest.raises(
+            OptionError, match=r"blend_windows: starts: expected starts of windows of 3 frames that cover"
+        ):
+            blend_windows(torch.zeros(2, 3, 2), starts, 8)
+    assert torch.equal(blend_windows(torch.ones(2, 3, 2), [3, 0], 6), torch.ones(6, 2))

@@ -10,9 +10,9 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.functional.derivatives import applied, batch_first
 from kcs_torch.functional.guarded import LOST, largest, or_one, unit_size
-from kcs_torch.functional.precision import full_precision, wide
+from kcs_torch.functional.precision import alike, full_precision, wide
 from kcs_torch.functional.rotation import skew
-from kcs_torch.functional.shapes import check_core
+from kcs_torch.functional.shapes import check_batches, check_core, check_floats
 
 __all__ = ["ALIGNMENTS", "centre", "minimal_turn", "nearest_rotation", "procrustes", "similarity", "superpose"]
 
@@ -40,21 +40,23 @@ def centre(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tenso
 
     Args:
         points: (..., N, D), finite.
-        weights: (..., N), 0 where a joint does not count; all 1 where None. All-zero weights give the mean 0.
+        weights: (..., N), 0 or less where a joint does not count; all 1 where None. All-zero weights give the mean 0.
 
     Returns:
         centred points (..., N, D) and the mean (..., 1, D).
 
     Raises:
-        ShapeError: they are not of these shapes.
+        ShapeError: they are not of these shapes, or the points not in floating point.
     """
-    check_core(points, "centre: points", "N", "D")
+    check_floats(points, "centre: points", "N", "D")
     if weights is None:
         mean = points.mean(-2, keepdim=True)
     else:
         check_core(weights, "centre: weights", points.shape[-2])
-        total = or_one(wide(weights).sum(-1)[..., None, None])
-        mean = (wide(points) * weights[..., None]).sum(-2, keepdim=True) / total
+        check_batches("centre: points and weights", points, weights, cores=(2, 1))
+        share = wide(weights).clamp_min(0)
+        total = or_one(share.sum(-1)[..., None, None])
+        mean = (wide(points) * share[..., None]).sum(-2, keepdim=True) / total
         mean = mean.to(torch.promote_types(points.dtype, weights.dtype))
     return points - mean, mean
 
@@ -70,13 +72,20 @@ def minimal_turn(source: Tensor, target: Tensor) -> Tensor:
         (..., 3, 3); the identity where either is zero, a half turn about some normal where they are opposite.
 
     Raises:
-        ShapeError: one of them is not (..., 3).
+        ShapeError: one of them is not (..., 3), or not in floating point.
 
     >>> minimal_turn(torch.tensor([2.0, 0, 0]), torch.tensor([0.0, 3, 0])).tolist()
     [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    check_core(source, "minimal_turn: source", 3)
-    check_core(target, "minimal_turn: target", 3)
+    check_floats(source, "minimal_turn: source", 3)
+    check_floats(target, "minimal_turn: target", 3)
+    check_batches("minimal_turn: source and target", source, target, cores=(1, 1))
+    with full_precision(source):
+        return _minimal_turn(*alike(source, target))
+
+
+def _minimal_turn(source: Tensor, target: Tensor) -> Tensor:
+    """:func:`minimal_turn` of arguments that fit, in one dtype."""
     a, b = (torch.nn.functional.normalize(x / or_one(largest(x, 1)), dim=-1) for x in (source, target))
     a, b = torch.broadcast_tensors(a, b)
     still = (a.square().sum(-1) < 0.5) | (b.square().sum(-1) < 0.5)
@@ -86,11 +95,12 @@ def minimal_turn(source: Tensor, target: Tensor) -> Tensor:
     eye = torch.eye(3, dtype=a.dtype, device=a.device)
     turn = eye + spin + spin @ spin / torch.where(back, torch.ones_like(cosine), 1 + cosine)
     # Farther than a right angle 1 + cosine cancels: a half turn about a, then one about the middle between a and b.
-    apart, middle = a - b, a + b
+    apart, middle, least = a - b, a + b, torch.finfo(a.dtype).eps
     far = torch.where(back[..., 0], apart.square().sum(-1, keepdim=True), 1)
-    middle = middle - (middle * apart).sum(-1, keepdim=True) / far * apart  # lengths of 1 are so up to rounding only
-    opposite = middle.detach().abs().amax(-1, keepdim=True) < LOST * torch.finfo(a.dtype).eps
+    opposite = middle.detach().abs().amax(-1, keepdim=True) < LOST * least
     middle = torch.where(opposite, torch.linalg.cross(a, eye[a.abs().argmin(-1)]), middle)
+    middle = torch.nn.functional.normalize(middle, dim=-1, eps=least)
+    middle = middle - (middle * apart).sum(-1, keepdim=True) / far * apart  # lengths of 1 are so up to rounding only
     half = lambda axis: 2 * axis[..., :, None] * axis[..., None, :] - eye  # noqa: E731
     over = half(torch.nn.functional.normalize(middle, dim=-1)) @ half(a)
     return torch.where(still[..., None, None], eye, torch.where(back, over, turn))
@@ -126,30 +136,32 @@ def procrustes(
     Args:
         source: (..., N, D), centred and finite.
         target: (..., N, D), centred and finite.
-        weights: (..., N) or None.
+        weights: (..., N), 0 or less where a point does not count; all 1 where None.
         reflect: True also admits reflections.
 
     Returns:
         Q (..., D, D), and the least-squares scale (...), so that ``scale * source @ Q`` is nearest to ``target``.
 
     Raises:
-        ShapeError: the shapes differ.
+        ShapeError: the shapes differ, or source or target is not in floating point.
 
     >>> X = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 2, 0], [0, -2, 0]])
     >>> Q, scale = procrustes(X, 2 * X)
     >>> torch.allclose(Q, torch.eye(3)), round(scale.item(), 5)
     (True, 2.0)
     """
-    check_core(source, "procrustes: source", "N", "D")
-    check_core(target, "procrustes: target", "N", "D")
+    check_floats(source, "procrustes: source", "N", "D")
+    check_floats(target, "procrustes: target", "N", "D")
     if source.shape[-2:] != target.shape[-2:]:
         got = f"{tuple(source.shape)} and {tuple(target.shape)}"
         raise ShapeError(f"procrustes: source and target: expected equal shapes, got {got}")
+    check_batches("procrustes: source and target", source, target, cores=(2, 2))
     if weights is not None:
         check_core(weights, "procrustes: weights", source.shape[-2])
+        check_batches("procrustes: source, target and weights", source, target, weights, cores=(2, 2, 1))
     dtype = torch.promote_types(source.dtype, target.dtype)
-    source, target = wide(source), wide(target)
-    left = source if weights is None else source * weights[..., None]
+    source, target = alike(wide(source), wide(target))
+    left = source if weights is None else source * weights.to(source).clamp_min(0)[..., None]
     with full_precision(left):
         rotation = nearest_rotation(left.mT @ target, reflect=reflect)
         size = (left * source).sum((-2, -1))
@@ -174,12 +186,14 @@ def similarity(
         (..., T, N, D).
 
     Raises:
-        ShapeError: the shapes differ.
+        ShapeError: the shapes differ, or source or target is not in floating point.
     """
     core = ("T", "N", "D") if sequence else ("N", "D")
-    check_core(source, "similarity: source", *core)
-    check_core(target, "similarity: target", *source.shape[-len(core) :])
+    check_floats(source, "similarity: source", *core)
+    check_floats(target, "similarity: target", *source.shape[-len(core) :])
+    check_batches("similarity: source and target", source, target, cores=(len(core), len(core)))
     dtype = torch.promote_types(source.dtype, target.dtype)
+    source, target = alike(source, target)
     a, _ = centre(wide(source))
     b, mean = centre(wide(target))
     flat = (lambda x: x.flatten(-3, -2)) if sequence else (lambda x: x)
@@ -203,33 +217,39 @@ def superpose(
         source: (..., T, N, 3), finite; (..., N, 3) will do unless ``how`` is "sequence".
         target: as the source.
         how: a name in :data:`ALIGNMENTS`.
-        weights: (..., T, N), 0 where a joint does not count; all 1 if None.
+        weights: (..., T, N), 0 or less where a joint does not count; all 1 if None.
         root: index of the root joint for ``root`` and ``scale``; the middle of all joints if None.
 
     Returns:
         (..., T, N, 3), where the target is. Differentiable in both.
 
     Raises:
-        OptionError: there is no such alignment.
-        ShapeError: they are not of these shapes.
+        OptionError: there is no such alignment, or no such root.
+        ShapeError: they are not of these shapes, or source or target is not in floating point.
     """
     check_alignment(how, root)
-    core = ("T", "N", 3) if how == "sequence" else ("N", 3)
-    check_core(source, "superpose: source", *core)
-    check_core(target, "superpose: target", *source.shape[-len(core) :])
+    core: tuple[int | str, ...] = ("T", "N", 3) if how == "sequence" else ("N", 3)
+    dims = len(core)
+    check_floats(source, "superpose: source", *core)
+    check_floats(target, "superpose: target", *source.shape[-dims:])
+    check_batches("superpose: source and target", source, target, cores=(dims, dims))
     if weights is not None:
-        check_core(weights, "superpose: weights", *source.shape[-len(core) : -1])
+        check_core(weights, "superpose: weights", *source.shape[-dims:-1])
+        check_batches("superpose: source, target and weights", source, target, weights, cores=(dims, dims, dims - 1))
+    joints = source.shape[-2]
+    if how in ("root", "scale") and root is not None and not -joints <= root < joints:
+        raise OptionError(f"root: expected a joint index below {joints}, got {root}")
     if how == "none":
         return source
     dtype = torch.promote_types(source.dtype, target.dtype)
-    source, target = wide(source), wide(target)
+    source, target = alike(wide(source), wide(target))
     with full_precision(source):
         return _superposed(source, target, how, weights, root).to(dtype)
 
 
 def _superposed(source: Tensor, target: Tensor, how: str, weights: Tensor | None, root: int | None) -> Tensor:
     """:func:`superpose` of arguments that fit, at least in single precision."""
-    mass = torch.ones_like(target[..., 0]) if weights is None else weights.to(target)
+    mass = torch.ones_like(target[..., 0]) if weights is None else weights.to(target).clamp_min(0)
     sequence = how == "sequence"
     over, counts = 3 if sequence else 2, mass[..., None] > 0
     lost = [LOST * torch.finfo(x.dtype).eps * largest(x, over, counts) for x in (source, target)]  # by centring

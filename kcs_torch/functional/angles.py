@@ -9,7 +9,8 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import index_rows
 from kcs_torch.functional.guarded import safe_norm, unit_size
-from kcs_torch.functional.shapes import check_core
+from kcs_torch.functional.precision import alike
+from kcs_torch.functional.shapes import check_batches, check_core, check_floats
 
 __all__ = ["angle_between", "flexion", "joint_angles"]
 
@@ -29,13 +30,15 @@ def angle_between(first: Tensor, second: Tensor) -> Tensor:
         the vectors are parallel, at which it has a kink.
 
     Raises:
-        ShapeError: they have not as many coordinates.
+        ShapeError: they have not as many coordinates, or are not in floating point.
 
     >>> angle_between(torch.tensor([1.0, 0, 0]), torch.tensor([[0.0, 2, 0], [-1, 0, 0], [0, 0, 0]])).tolist()
     [1.5707963705062866, 3.1415927410125732, 0.0]
     """
-    check_core(first, "angle_between: first", "D")
-    check_core(second, "angle_between: second", first.shape[-1])
+    check_floats(first, "angle_between: first", "D")
+    check_floats(second, "angle_between: second", first.shape[-1])
+    check_batches("angle_between: first and second", first, second, cores=(1, 1))
+    first, second = alike(first, second)
     return _between(_unit(first), _unit(second))
 
 
@@ -54,22 +57,25 @@ def flexion(upper: Tensor, lower: Tensor, axis: Tensor | None = None) -> Tensor:
         at times, which is not the wrong way. 0 with the derivative 0 where a bone has no length.
 
     Raises:
-        ShapeError: they are not (..., 3).
+        ShapeError: they are not (..., 3), or not in floating point.
 
     >>> thigh, shank = torch.tensor([0.0, 1, 0]), torch.tensor([0.0, 1, 1])
     >>> left = torch.tensor([1.0, 0, 0])  # y is down and z away from the viewer, whom the person faces
     >>> flexion(thigh, shank, left).rad2deg().item(), flexion(thigh, shank, -left).rad2deg().item()
     (45.0, -45.0)
     """
-    check_core(upper, "flexion: upper", 3)
-    check_core(lower, "flexion: lower", 3)
+    check_floats(upper, "flexion: upper", 3)
+    check_floats(lower, "flexion: lower", 3)
+    check_batches("flexion: upper and lower", upper, lower, cores=(1, 1))
+    upper, lower = alike(upper, lower)
     first, second = _unit(upper), _unit(lower)
     angle = _between(first, second)
     if axis is None:
         return angle
     check_core(axis, "flexion: axis", 3)
+    check_batches("flexion: upper, lower and axis", upper, lower, axis, cores=(1, 1, 1))
     turn = torch.linalg.cross(first.detach(), second.detach())
-    along = (turn * _unit(axis.detach())).sum(-1)
+    along = (turn * _unit(axis.detach().to(turn))).sum(-1)
     return torch.where(along < -AGAINST * safe_norm(turn), -angle, angle)
 
 
@@ -84,13 +90,14 @@ def joint_angles(points: Tensor, joints: Tensor | Sequence[Sequence[int]]) -> Te
         (..., J) in radians: 0 straight, pi folded; 0 with the derivative 0 where two joints coincide.
 
     Raises:
-        ShapeError: ``joints`` is not (J, 3), or a list of joints that the points have not.
+        ShapeError: ``joints`` is not (J, 3), or a list of joints that the points have not; or these are not in floating
+            point.
 
     >>> arm = torch.tensor([[0.0, 0, 0], [0, 3, 0], [2, 3, 0]])
     >>> joint_angles(arm, [(0, 1, 2)]).rad2deg().tolist()
     [90.0]
     """
-    check_core(points, "joint_angles: points", "N", "D")
+    check_floats(points, "joint_angles: points", "N", "D")
     index = index_rows(joints, points.shape[-2], what="joints", form=("parent", "joint", "child"))
     above, here, below = (points.index_select(-2, i) for i in index.to(points.device).unbind(-1))
     return angle_between(here - above, below - here)

@@ -12,10 +12,10 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.angles import angle_between
 from kcs_torch.functional.eigen import eigh
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.functional.precision import wide, widened
+from kcs_torch.functional.precision import alike, full_precision, wide, widened
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rotation import rotation_angle
-from kcs_torch.functional.shapes import check_core
+from kcs_torch.functional.shapes import check_batches, check_core, check_floats
 
 __all__ = [
     "back_project",
@@ -39,10 +39,12 @@ def project(points: Tensor, cameras: Tensor) -> Tensor:
     [[[1.0, 2.0]]]
 
     Raises:
-        ShapeError: they are not of these shapes.
+        ShapeError: they are not of these shapes, or not in floating point.
     """
-    check_core(points, "project: points", "N", 3)
-    check_core(cameras, "project: cameras", 2, 3)
+    check_floats(points, "project: points", "N", 3)
+    check_floats(cameras, "project: cameras", 2, 3)
+    check_batches("project: points and cameras", points, cameras, cores=(2, 2))
+    points, cameras = alike(points, cameras)
     return points @ cameras.mT
 
 
@@ -73,23 +75,23 @@ def pinhole_translation(points: Tensor, rays: Tensor, weights: Tensor) -> Tensor
     Args:
         points: (..., N, 3), about any origin; finite.
         rays: (..., N, 2) where the joints are seen, as X/Z and Y/Z; finite.
-        weights: (..., N), 0 where unseen.
+        weights: (..., N), 0 or less where unseen.
 
     Returns:
         (..., 3). Where all rays are the same one, the distance is arbitrary: ten times the body's size.
 
     Raises:
-        ShapeError: they are not of these shapes.
+        ShapeError: they are not of these shapes, or not in floating point.
 
     >>> X = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 1]])
     >>> t = torch.tensor([1.0, 2, 5])
     >>> pinhole_translation(X, (X + t)[:, :2] / (X + t)[:, 2:], torch.ones(3)).round(decimals=4).tolist()
     [1.0, 2.0, 5.0]
     """
-    check_core(points, "pinhole_translation: points", "N", 3)
-    check_core(rays, "pinhole_translation: rays", points.shape[-2], 2)
+    check_floats(points, "pinhole_translation: points", "N", 3)
+    check_floats(rays, "pinhole_translation: rays", points.shape[-2], 2)
     check_core(weights, "pinhole_translation: weights", points.shape[-2])
-    share = weights[..., None]
+    share = weights.clamp_min(0)[..., None]
     total = share.sum(-2, keepdim=True)
     total = or_one(total)
     mean = lambda values: (share * values).sum(-2, keepdim=True) / total  # noqa: E731
@@ -110,10 +112,12 @@ def back_project(tracks: Tensor, cameras: Tensor) -> Tensor:
     """Return R_t^T w_t, the adjoint of :func:`project`: (..., T, N, 2) to (..., T, N, 3).
 
     Raises:
-        ShapeError: the tracks are not (..., N, 2), or the cameras not (..., 2, 3).
+        ShapeError: the tracks are not (..., N, 2), or the cameras not (..., 2, 3); or not in floating point.
     """
-    check_core(tracks, "back_project: tracks", "N", 2)
-    check_core(cameras, "back_project: cameras", 2, 3)
+    check_floats(tracks, "back_project: tracks", "N", 2)
+    check_floats(cameras, "back_project: cameras", 2, 3)
+    check_batches("back_project: tracks and cameras", tracks, cameras, cores=(2, 2))
+    tracks, cameras = alike(tracks, cameras)
     return tracks @ cameras
 
 
@@ -147,9 +151,9 @@ def factorize(tracks: Tensor, rank: int) -> tuple[Tensor, Tensor]:
         or are 0, as those of tracks that do not move.
 
     Raises:
-        ShapeError: the tracks are not (..., T, N, 2), or the rank is out of range.
+        ShapeError: the tracks are not (..., T, N, 2) in floating point, or the rank is out of range.
     """
-    check_core(tracks, "factorize: tracks", "T", "N", 2)
+    check_floats(tracks, "factorize: tracks", "T", "N", 2)
     frames, joints = tracks.shape[-3:-1]
     if not 1 <= rank <= min(2 * frames, joints):
         raise ShapeError(f"factorize: expected a rank within 1..{min(2 * frames, joints)}, got {rank}")
@@ -191,13 +195,13 @@ def rows_to_cameras(rows: Tensor) -> tuple[Tensor, Tensor]:
         Rows that vanish or are parallel give an arbitrary valid camera.
 
     Raises:
-        ShapeError: the rows are not (..., 2, 3).
+        ShapeError: the rows are not (..., 2, 3), or not in floating point.
 
     Note:
         With n the unit normal of the rows' plane, the second row of a camera in this plane is n x c for a first row c.
         So c.a + (n x c).b = c.(a + b x n) is to be as large as can be, and c is the direction of a + b x n.
     """
-    check_core(rows, "rows_to_cameras: rows", 2, 3)
+    check_floats(rows, "rows_to_cameras: rows", 2, 3)
     dtype, rows = rows.dtype, wide(rows)
     with torch.no_grad():
         size = rows.abs().amax((-2, -1), keepdim=True)
@@ -236,12 +240,14 @@ def viewpoint_turn(cameras: Tensor) -> Tensor:
 
     Returns:
         (...). Turning about the optical axis does not count: it tells nothing of depth. Found in three sweeps, which is
-        exact for a path; of directions scattered at random it may miss a fifth.
+        exact for a path; of directions scattered at random it may miss a fifth. 0 of no frames.
 
     Raises:
-        ShapeError: the cameras are not (..., T, 2, 3).
+        ShapeError: the cameras are not (..., T, 2, 3), or not in floating point.
     """
-    check_core(cameras, "viewpoint_turn: cameras", "T", 2, 3)
+    check_floats(cameras, "viewpoint_turn: cameras", "T", 2, 3)
+    if not cameras.shape[-3]:
+        return cameras.new_zeros(cameras.shape[:-3])
     view = complete_rotation(cameras)[..., 2, :]  # (..., T, 3)
     far = view.mean(-2, keepdim=True)
     for _ in range(3):  # the farthest from the mean, the farthest from that, and once more
@@ -262,10 +268,12 @@ def camera_disagreement(first: Tensor, second: Tensor) -> Tensor:
         (...).
 
     Raises:
-        ShapeError: the paths are not of these shapes.
+        ShapeError: the paths are not of these shapes, or not in floating point.
     """
-    check_core(first, "camera_disagreement: first", "T", 2, 3)
-    check_core(second, "camera_disagreement: second", first.shape[-3], 2, 3)
+    check_floats(first, "camera_disagreement: first", "T", 2, 3)
+    check_floats(second, "camera_disagreement: second", first.shape[-3], 2, 3)
+    check_batches("camera_disagreement: first and second", first, second, cores=(3, 3))
+    first, second = alike(first, second)
     target = complete_rotation(second)
     angles = []
     for depth in (1.0, -1.0):
@@ -286,11 +294,16 @@ def orbit(yaw: Tensor, pitch: float = 0.0) -> Tensor:
     Returns:
         (..., 3, 3); the world has y down, like the camera.
 
+    Raises:
+        ShapeError: the yaw is no tensor of floating-point numbers.
+
     >>> (orbit(torch.tensor(90.0)) @ torch.tensor([1.0, 0, 0])).round().tolist()
     [0.0, 0.0, 1.0]
     """
+    check_floats(yaw, "orbit: yaw")
     angle, p = torch.deg2rad(yaw), math.radians(pitch)
     c, s, o, i = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
     turn = torch.stack([torch.stack(row, -1) for row in ((c, o, -s), (o, i, o), (s, o, c))], -2)
     tilt = yaw.new_tensor([[1, 0, 0], [0, math.cos(p), -math.sin(p)], [0, math.sin(p), math.cos(p)]])
-    return tilt @ turn
+    with full_precision(yaw):
+        return tilt @ turn

@@ -10,7 +10,7 @@ from torch import Tensor
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.guarded import or_one, safe_norm, unit_size
 from kcs_torch.functional.precision import wide, widened
-from kcs_torch.functional.shapes import check_core
+from kcs_torch.functional.shapes import check_core, check_floats
 
 __all__ = [
     "bone_lengths",
@@ -166,12 +166,12 @@ def pose_matrix(
         (..., B, B), in squared units, or without one.
 
     Raises:
-        ShapeError: ``bones`` is not (B, 2).
+        ShapeError: ``bones`` is not (B, 2), or points that are to be normalised are not in floating point.
 
     >>> pose_matrix(torch.tensor([[0.0, 0], [3, 0], [4, 2]]), [(0, 1), (1, 2)]).tolist()
     [[9.0, 3.0], [3.0, 5.0]]
     """
-    check_core(points, "pose_matrix: points", "N", "D")
+    (check_floats if normalise else check_core)(points, "pose_matrix: points", "N", "D")
     parents, children = index_rows(bones, points.shape[-2]).to(points.device).unbind(-1)
     rows = points.mT
     across = rows.index_select(-1, children) - rows.index_select(-1, parents)  # (..., D, B)
@@ -207,7 +207,10 @@ def index_rows(
     """
     shape = f"shape ({what[0].upper()}, {len(form)}) of indices ({', '.join(form)})"
     if not isinstance(rows, Tensor):
-        listed = [tuple(row) for row in rows]
+        try:
+            listed = [tuple(row) for row in rows]
+        except TypeError:
+            raise ShapeError(f"{what}: expected {shape}, got {rows!r}") from None
         for row in listed:
             if len(row) != len(form) or not all(hasattr(i, "__index__") for i in row):
                 raise ShapeError(f"{what}: expected {shape}, got a row {row}")

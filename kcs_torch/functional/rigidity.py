@@ -10,7 +10,7 @@ from torch import Tensor
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.guarded import or_one, safe_root
 from kcs_torch.functional.precision import wide
-from kcs_torch.functional.shapes import check_core
+from kcs_torch.functional.shapes import check_core, check_floats
 
 __all__ = ["distance_spread", "rigid_tree"]
 
@@ -20,27 +20,30 @@ def distance_spread(points: Tensor, weights: Tensor | None = None) -> tuple[Tens
 
     Args:
         points: (..., T, N, 3), finite.
-        weights: (..., T, N); a pair counts in a frame as much as the lesser of its joints. All 1 where None.
+        weights: (..., T, N); a pair counts in a frame as much as the lesser of its joints, and not below 0. All 1
+            where None.
 
     Returns:
         mean (..., N, N) and standard deviation (..., N, N), both 0 for pairs never seen together. Their
         derivatives are 0 where they are 0.
 
     Raises:
-        ShapeError: they are not of these shapes.
+        ShapeError: they are not of these shapes, or the points not in floating point.
     """
-    check_core(points, "distance_spread: points", "T", "N", 3)
-    offset = points[..., :, None, :] - points[..., None, :, :]
-    distance = safe_root(offset.square().sum(-1))  # (..., T, N, N)
+    check_floats(points, "distance_spread: points", "T", "N", 3)
+    full, dtype = wide(points), points.dtype
+    distance = safe_root((full[..., :, None, :] - full[..., None, :, :]).square().sum(-1))  # (..., T, N, N)
     if weights is None:
         mean = distance.mean(-3)
-        return mean, safe_root((distance - mean[..., None, :, :]).square().mean(-3))
+        return mean.to(dtype), safe_root((distance - mean[..., None, :, :]).square().mean(-3)).to(dtype)
     check_core(weights, "distance_spread: weights", *points.shape[-3:-1])
-    share = torch.minimum(weights[..., :, None], weights[..., None, :])
+    weights, dtype = wide(weights), torch.promote_types(dtype, weights.dtype)
+    share = torch.minimum(weights[..., :, None], weights[..., None, :]).clamp_min(0)
     total = share.sum(-3)
     total = or_one(total)
     mean = (share * distance).sum(-3) / total
-    return mean, safe_root((share * (distance - mean[..., None, :, :]).square()).sum(-3) / total)
+    spread = safe_root((share * (distance - mean[..., None, :, :]).square()).sum(-3) / total)
+    return mean.to(dtype), spread.to(dtype)
 
 
 def rigid_tree(cost: Tensor) -> Tensor:

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
-from kcs_torch.functional.shapes import check_core
+from kcs_torch.functional.precision import alike, full_precision
+from kcs_torch.functional.shapes import check_batches, check_core, check_floats
 
 __all__ = ["euler_angles", "euler_rotation", "rotation_angle", "rotation_matrix", "rotation_vector"]
 
@@ -60,7 +61,7 @@ def rotation_vector(matrices: Tensor) -> Tensor:
         (..., 3). Differentiable, also at the identity; where R is a half turn, v and -v are one rotation.
 
     Raises:
-        ShapeError: the matrices are not (..., 3, 3).
+        ShapeError: the matrices are not (..., 3, 3), or not in floating point.
 
     Through the unit quaternion, whose outer square is linear in R: a row of it far from 0 is the quaternion up to a
     factor, however large or small the angle is (Markley 2008).
@@ -68,7 +69,7 @@ def rotation_vector(matrices: Tensor) -> Tensor:
     >>> rotation_vector(rotation_matrix(torch.tensor([0.1, -2.0, 0.5]))).round(decimals=5).tolist()
     [0.10000000149011612, -2.0, 0.5]
     """
-    check_core(matrices, "rotation_vector: matrices", 3, 3)
+    check_floats(matrices, "rotation_vector: matrices", 3, 3)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in matrices.unbind(-2))
     outer = torch.stack(
         [
@@ -95,13 +96,16 @@ def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
     The derivative is 0 where they are equal or a half turn apart, at which it has a kink.
 
     Raises:
-        ShapeError: one of them is not (..., 3, 3).
+        ShapeError: one of them is not (..., 3, 3), or not in floating point.
     """
-    check_core(first, "rotation_angle: first", 3, 3)
-    check_core(second, "rotation_angle: second", 3, 3)
+    check_floats(first, "rotation_angle: first", 3, 3)
+    check_floats(second, "rotation_angle: second", 3, 3)
+    check_batches("rotation_angle: first and second", first, second, cores=(2, 2))
+    first, second = alike(first, second)
     sine = torch.linalg.matrix_norm(first - second) / math.sqrt(8)  # of half the angle
     far = sine > 0.75
-    turn = first.mT @ second
+    with full_precision(first):
+        turn = first.mT @ second
     both = torch.linalg.matrix_norm(turn - turn.mT) / math.sqrt(32)  # sine times cosine, exact near a half turn
     cosine = both / torch.where(far, sine, 1)
     rest = 2 * torch.where(far, cosine, sine).clamp_max(1).asin()
@@ -120,18 +124,19 @@ def euler_rotation(order: str, angles: Tensor) -> Tensor:
 
     Raises:
         OptionError: there is another letter.
-        ShapeError: the angles are not as many.
+        ShapeError: the angles are not as many, or not in floating point.
 
     >>> torch.allclose(euler_rotation("ZX", torch.tensor([0.3, 0.0])), rotation_matrix(torch.tensor([0, 0, 0.3])))
     True
     """
     if not set(order) <= set(AXES):
         raise OptionError(f"euler_rotation: expected axes X, Y and Z, got {order!r}")
-    check_core(angles, "euler_rotation: angles", len(order))
+    check_floats(angles, "euler_rotation: angles", len(order))
     eye = torch.eye(3, dtype=angles.dtype, device=angles.device)
     total = eye.expand(*angles.shape[:-1], 3, 3)
-    for axis, angle in zip(order, angles.unbind(-1), strict=True):
-        total = total @ rotation_matrix(angle[..., None] * eye[AXES.index(axis)])
+    with full_precision(angles):
+        for axis, angle in zip(order, angles.unbind(-1), strict=True):
+            total = total @ rotation_matrix(angle[..., None] * eye[AXES.index(axis)])
     return total
 
 
@@ -143,27 +148,28 @@ def euler_angles(order: str, matrices: Tensor) -> Tensor:
         matrices: (..., 3, 3).
 
     Returns:
-        (..., 3) in radians, the second within a quarter turn. Where that is a quarter turn the third is 0.
+        (..., 3) in radians, the second within a quarter turn. Where that is a quarter turn the third is 0, and the
+        second and third have the derivative 0.
 
     Raises:
         OptionError: the order is another one.
-        ShapeError: the matrices are not (..., 3, 3).
+        ShapeError: the matrices are not (..., 3, 3), or not in floating point.
     """
     if not isinstance(order, str) or sorted(order) != list(AXES):
         order = order if isinstance(order, str) else f"a {type(order).__name__}"
         raise OptionError(f"euler_angles: expected X, Y and Z in some order, got {order!r}")
-    check_core(matrices, "euler_angles: matrices", 3, 3)
+    check_floats(matrices, "euler_angles: matrices", 3, 3)
     i, j, k = (AXES.index(axis) for axis in order)
     sign = 1 if (j - i) % 3 == 1 else -1
     r = matrices
-    sine, cosine = sign * r[..., i, k], torch.hypot(r[..., i, i], r[..., i, j])
-    locked = cosine < 1e-7
-    first = torch.where(
-        locked,
-        torch.atan2(sign * r[..., k, j], r[..., j, j]),
-        torch.atan2(-sign * r[..., j, k], r[..., k, k]),
+    sine, cosine = sign * r[..., i, k], torch.hypot(r[..., i, i].detach(), r[..., i, j].detach())
+    locked = cosine < 1e-7  # there neither a length nor an angle of what is nearly 0 has a derivative
+    along, across = torch.where(locked, 1, r[..., i, i]), torch.where(locked, 0, r[..., i, j])
+    cosine = torch.where(locked, cosine, torch.hypot(along, across))
+    first = torch.atan2(
+        torch.where(locked, sign * r[..., k, j], -sign * r[..., j, k]), torch.where(locked, r[..., j, j], r[..., k, k])
     )
-    third = torch.where(locked, torch.zeros_like(sine), torch.atan2(-sign * r[..., i, j], r[..., i, i]))
+    third = torch.where(locked, torch.zeros_like(sine), torch.atan2(-sign * across, along))
     return torch.stack([first, torch.atan2(sine, cosine), third], -1)
 
 

@@ -7,9 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kcs_torch.errors import OptionError
 from kcs_torch.functional.derivatives import applied, batch_first
 from kcs_torch.functional.precision import wide
-from kcs_torch.functional.shapes import broadcast_shapes, check_core
+from kcs_torch.functional.shapes import broadcast_shapes, check_floats
 
 __all__ = ["inverse_scatter", "scatter_log_det"]
 
@@ -22,18 +23,22 @@ def scatter_log_det(values: Tensor, eps: Tensor | float) -> Tensor:
 
     Args:
         values: (..., T, D), centred by the caller where a mean is to be free.
-        eps: positive, a number or a tensor that broadcasts against (...), in squared units of the values.
+        eps: positive, a number or a tensor that broadcasts against (...), in squared units of the values. The result is
+            NaN where a tensor's is not.
 
     Returns:
         (...). Differentiable once, in the values; a second derivative raises ``RuntimeError``.
 
     Raises:
-        ShapeError: fewer than 2 dimensions.
+        ShapeError: fewer than 2 dimensions, or values that are not in floating point.
+        OptionError: a number for eps is not positive.
 
     >>> scatter_log_det(torch.zeros(4, 3), 1.0).item()
     0.0
     """
-    check_core(values, "scatter_log_det: values", "T", "D")
+    check_floats(values, "scatter_log_det: values", "T", "D")
+    if not isinstance(eps, Tensor) and not eps > 0:
+        raise OptionError(f"scatter_log_det: eps: expected a positive number, got {eps}")
     work = wide(values)  # no LAPACK takes half precision
     level = torch.as_tensor(eps, dtype=work.dtype, device=values.device)
     out: Tensor = applied(_ScatterLogDet, work, level)[0]

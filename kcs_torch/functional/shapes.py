@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 
-__all__ = ["broadcast_shapes", "check_core", "fit_together"]
+__all__ = ["broadcast_shapes", "check_batches", "check_core", "check_floats", "fit_together"]
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> tuple[int, ...]:
@@ -40,6 +41,33 @@ def fit_together(one: Sequence[int], other: Sequence[int]) -> bool:
     (True, False)
     """
     return all(a == b or 1 in (a, b) for a, b in zip(one[::-1], other[::-1], strict=False))
+
+
+def check_batches(what: str, *tensors: Tensor, cores: Sequence[int]) -> None:
+    """Raise a ShapeError unless the dimensions of tensors before so many core ones broadcast.
+
+    >>> import torch
+    >>> check_batches("project: points and cameras", torch.zeros(5, 17, 3), torch.zeros(4, 2, 3), cores=(2, 2))
+    Traceback (most recent call last):
+    kcs_torch.errors.ShapeError: project: points and cameras: expected the same batch, got (5, 17, 3) and (4, 2, 3)
+    """
+    batches = [x.shape[: x.ndim - core] for x, core in zip(tensors, cores, strict=True)]
+    if not all(fit_together(*pair) for pair in combinations(batches, 2)):
+        raise ShapeError(f"{what}: expected the same batch, got {' and '.join(str(tuple(x.shape)) for x in tensors)}")
+
+
+def check_floats(value: Any, what: str, *core: int | str) -> None:
+    """Raise a ShapeError unless ``value`` is a tensor (..., *core) of floating-point numbers.
+
+    >>> import torch
+    >>> check_floats(torch.tensor([[0, 1]]), "centre: points", "N", "D")
+    Traceback (most recent call last):
+    kcs_torch.errors.ShapeError: centre: points: expected floating point, got torch.int64: use points.float()
+    """
+    check_core(value, what, *core)
+    if not value.is_floating_point():
+        name = what.rpartition(" ")[2]
+        raise ShapeError(f"{what}: expected floating point, got {value.dtype}: use {name}.float()")
 
 
 def check_core(value: Any, what: str, *core: int | str) -> None:

@@ -40,7 +40,8 @@ def svt(matrix: Tensor, threshold: Tensor | float, corner: Tensor | float = math
 
     Args:
         matrix: (..., M, N).
-        threshold: non-negative, a number or a tensor that broadcasts against (...); in the unit of the matrix.
+        threshold: non-negative, a number or a tensor that broadcasts against (...); in the unit of the matrix. What a
+            tensor has below 0 counts as 0.
         corner: positive, as the threshold; 0, the size of a matrix of zeros, is taken for infinite.
 
     Returns:
@@ -60,7 +61,7 @@ def svt(matrix: Tensor, threshold: Tensor | float, corner: Tensor | float = math
     level = _level(threshold, "svt: threshold", work, sign=True)
     size = _level(corner, "svt: corner", work, sign=True)
     least = torch.finfo(work.dtype).tiny ** 0.5  # of which the inverse, and its square in the derivative, are finite
-    level = level.clamp_max(1 / least)  # infinite ones leave nothing either way
+    level = level.clamp(0, 1 / least)  # infinite ones leave nothing either way
     bend = torch.where(size > 0, 1 / torch.where(size > 0, size.clamp_min(least), 1), 0)
     bend = torch.where(size.isnan(), torch.nan, bend)
     out: Tensor = applied(ShrinkSingularValues, work, level, bend)[0]

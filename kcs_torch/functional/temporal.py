@@ -169,13 +169,18 @@ def blend_windows(parts: Tensor, starts: list[int], length: int) -> Tensor:
 
     Raises:
         ShapeError: there are no windows, or not one for each start.
+        OptionError: a frame lies in no window, or a window beyond the frames.
     """
     if parts.ndim < 2 or not len(parts) or len(parts) != len(starts):
         raise ShapeError(
             f"blend_windows: expected parts (W, T_w, ...) of as many windows as starts, at least one, got "
             f"{tuple(parts.shape)} and {len(starts)} starts"
         )
-    window = parts.shape[1]
+    window, order = parts.shape[1], sorted(starts)
+    whole = order[0] == 0 and order[-1] + window == length
+    if not whole or any(b - a > window for a, b in itertools.pairwise(order)):
+        expected = f"expected starts of windows of {window} frames that cover {length} frames, and no others"
+        raise OptionError(f"blend_windows: starts: {expected}, got {starts}")
     ramp = torch.arange(1, window + 1, dtype=parts.dtype, device=parts.device)
     ramp = torch.minimum(ramp, ramp.flip(0))
     overlap = max([a + window - b for a, b in itertools.pairwise(starts)], default=1)

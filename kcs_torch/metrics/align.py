@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.errors import ShapeError
 from kcs_torch.functional import ALIGNMENTS, superpose
 from kcs_torch.functional.align import check_alignment
 
@@ -43,8 +43,6 @@ def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = Non
             raise ShapeError(f"{name}: {_not_finite(points)}")
     if weights is not None and weights.shape != truth.shape[:-1]:
         raise ShapeError(f"weights: expected shape {tuple(truth.shape[:-1])}, got {tuple(weights.shape)}")
-    if how in ("root", "scale") and root is not None and not -truth.shape[-2] <= root < truth.shape[-2]:
-        raise OptionError(f"root: expected a joint index below {truth.shape[-2]}, got {root}")
     wide = torch.promote_types(torch.promote_types(pred.dtype, truth.dtype), torch.float32)
     with torch.autocast(pred.device.type, enabled=False):  # rotations need more than three digits
         return superpose(pred.to(wide), truth.to(wide), how, None if weights is None else weights.to(wide), root=root)

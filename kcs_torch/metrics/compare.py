@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -212,7 +212,7 @@ def _same_frames(pred: Motion, truth: Motion, notes: list[str]) -> tuple[Motion,
 def _alignments(align: str | Sequence[str] | None, ratio: float | None, pred: Motion, truth: Motion) -> list[str]:
     if align is None:
         return [how for how in ALIGNMENTS if how in _SIZED or (ratio is not None and how != "none")]
-    align = [align] if isinstance(align, str) else align
+    align = align if isinstance(align, Iterable) and not isinstance(align, str) else [align]
     for how in align:
         if how not in ALIGNMENTS:
             raise unknown("alignment", how, ALIGNMENTS)

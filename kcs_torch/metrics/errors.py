@@ -1,4 +1,4 @@
-"""The figures that papers print, each for a batch of clips."""
+"""The figures that papers print, each for a batch of clips; weights below 0 count as 0."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def e3d(pred: Tensor, truth: Tensor, *, weights: Tensor | None = None) -> Tensor
     pred, truth = _counted(pred, weights), _counted(truth, weights)
     pred = aligned(pred, truth, "none", weights=weights)  # checks the shapes; at least in single precision
     truth = truth.to(pred)
-    mass = torch.ones_like(truth[..., 0]) if weights is None else weights.to(truth)
+    mass = torch.ones_like(truth[..., 0]) if weights is None else weights.to(truth).clamp_min(0)
     source, target = centre(pred, mass)[0], centre(truth, mass)[0]
     with torch.autocast(pred.device.type, enabled=False):
         left = (source * mass[..., None]).flatten(-3, -2)
@@ -159,9 +159,9 @@ def coverage(
     check_core(deviation, "coverage: deviation", *pred.shape[-3:-1])
     pred, truth = _counted(pred, weights), _counted(truth, weights)
     pred = aligned(pred, truth, "none", weights=weights)  # checks the rest; at least in single precision
-    mass = torch.ones_like(pred[..., 0]) if weights is None else weights.to(pred)
+    mass = torch.ones_like(pred[..., 0]) if weights is None else weights.to(pred).clamp_min(0)
     source, target = centre(pred, mass)[0], centre(truth.to(pred), mass)[0]
-    each, factor = mass[..., None], torch.ones_like(mass[..., 0, 0])
+    each, factor = mass[..., None], mass.new_ones(mass.shape[:-2])
 
     def summed(values: Tensor) -> Tensor:
         return (values * each).sum((-3, -2, -1))
@@ -226,6 +226,10 @@ def bone_pairs(bones: Bones, joints: int | None = None) -> Tensor:
     index = index_rows(bones, joints)
     if not len(index):
         raise ShapeError("bones: expected pairs of joints, got none")
+    if joints is not None and isinstance(bones, Tensor) and not (index.is_meta or torch.compiler.is_compiling()):
+        low, high = int(index.min()), int(index.max())
+        if low < 0 or high >= joints:
+            raise ShapeError(f"bones: expected joint indices 0..{joints - 1}, got {low}..{high}")
     return index
 
 
@@ -250,5 +254,5 @@ def _mean(values: Tensor, weights: Tensor | None) -> Tensor:
     """Weighted mean over frames and joints: (..., T, N) -> (...)."""
     if weights is None:
         return values.mean((-2, -1))
-    weights = weights.to(values)  # sums of half precision would be rounded, or infinite
+    weights = weights.to(values).clamp_min(0)  # sums of half precision would be rounded, or infinite
     return (values * weights).sum((-2, -1)) / weights.sum((-2, -1))

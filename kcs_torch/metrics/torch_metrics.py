@@ -61,7 +61,7 @@ class _Mean(Metric):
         return getattr(self, self._count)
 
     def _add(self, values: Tensor, mass: Tensor) -> None:
-        mass = mass.to(values).expand(values.shape)
+        mass = mass.to(values).clamp_min(0).expand(values.shape)
         values = torch.where(mass > 0, values, torch.zeros_like(values))  # NaN where nothing counts
         total = self.total + (values.detach().double() * mass).sum()  # not in place: Lightning validates in inference
         count = self.count + mass.double().sum()  # mode, whose tensors nothing may change later

@@ -90,8 +90,8 @@ class _JointEnergy(SkeletonModule):
     def _share(self, points: Tensor, weights: Tensor) -> Tensor:
         """Weights of the joints' terms, (..., T, H), or of all alike, (..., T, 1)."""
         if weighs_joints(weights, points, self):
-            return weights[..., self.joints].amin(-1)
-        return weights[..., None]
+            return weights[..., self.joints].amin(-1).clamp_min(0)
+        return weights[..., None].clamp_min(0)
 
 
 class HingeEnergy(_JointEnergy):

@@ -43,7 +43,8 @@ class ContactEnergy(SkeletonModule):
         self, skeleton: str | Path | Skeleton, *, slip: float = 0.006, change: float = 0.004, num_steps: int = 10
     ) -> None:
         super().__init__(skeleton)
-        check_positive(self, slip=slip, change=change)
+        check_positive(self, finite=True, slip=slip)
+        check_positive(self, change=change)
         check_whole(self, 0, num_steps=num_steps)
         self.slip, self.change, self.num_steps = slip, change, num_steps
         contacts = torch.tensor(self.skeleton.contacts, dtype=torch.long)
@@ -57,8 +58,7 @@ class ContactEnergy(SkeletonModule):
         Args:
             points: (..., T, N, 3), depth relative to the root or the body's middle.
             velocity: v (..., T), the first frame's does not count; None takes the best one
-                (:func:`kcs_torch.solvers.standing.root_velocity`), at which the energy has hardly any slope in v. It is
-                a constant for autograd: second derivatives lack what it would change.
+                (:func:`kcs_torch.solvers.standing.root_velocity`), through whose reweightings derivatives run.
             standing: c (..., T, C).
             weights: (..., T, N) of the joints: a foot stands no more than it is seen; or (..., T) of the frames, 0 for
                 one that pads a shorter clip.
@@ -102,7 +102,6 @@ class ContactEnergy(SkeletonModule):
                 got = f"{tuple(value.shape)} for points {tuple(points.shape)}"
                 raise ShapeError(f"ContactEnergy: {name}: expected {expected}, got {got}")
 
-    @torch.no_grad()
     def _best(self, step: Tensor, standing: Tensor, inside: Tensor) -> Tensor:
         """The velocity (..., T) that costs least."""
         if not self.contacts.numel() or not step.shape[-2]:

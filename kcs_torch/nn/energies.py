@@ -1,12 +1,13 @@
 """Energies: one module is the loss of a network and the term of a solver.
 
-Each returns energies per frame (..., T) or per clip (...); the reduction is left to the caller. Weights of 0 take a
-joint out, whatever its coordinates are, NaN included, and tracks that are NaN weigh 0; an energy over nothing is 0, not
-NaN. Half precision is widened inside; what it cannot hold comes back as its largest number.
+Each returns energies per frame (..., T) or per clip (...); the reduction is left to the caller. Weights of 0, or below,
+take a joint out, whatever its coordinates are, NaN included, and tracks that are NaN weigh 0; an energy over nothing is
+0, not NaN. Half precision is widened inside; what it cannot hold comes back as its largest number.
 """
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import torch
@@ -128,10 +129,10 @@ class LowRankEnergy(nn.Module):
 
     def __init__(self, kind: str = "nuclear", *, eps: float = 1e-3) -> None:
         super().__init__()
-        if kind not in ("nuclear", "log_det") or not (is_a(eps, float) and eps > 0):
+        if kind not in ("nuclear", "log_det") or not (is_a(eps, float) and 0 < eps < math.inf):
             shown = repr(kind) if isinstance(kind, str) else f"a {type(kind).__name__}"
             raise OptionError(
-                f"LowRankEnergy: expected kind 'nuclear' or 'log_det' and eps > 0, got {shown} and {eps!r}"
+                f"LowRankEnergy: expected kind 'nuclear' or 'log_det' and finite eps > 0, got {shown} and {eps!r}"
             )
         self.kind, self.eps = kind, eps
 
@@ -156,7 +157,8 @@ class LowRankEnergy(nn.Module):
         check_clip(points, self)
         check_weights(weights, points, self)
         matrix = known(points, weights).flatten(-2)
-        share = None if weights is None else weights.repeat_interleave(points.shape[-1], -1)  # (..., T, N D)
+        # (..., T, N D)
+        share = None if weights is None else weights.clamp_min(0).repeat_interleave(points.shape[-1], -1)
         with full_precision(points):
             matrix = wide(matrix)
             if self.kind == "log_det":
@@ -218,7 +220,7 @@ class SmoothnessEnergy(nn.Module):
             return (0 * known(points, weights)).sum((-2, -1))
         square = known(wide(points), weights).diff(n=self.order, dim=-3).square().sum(-1)  # (..., T - n, N)
         if weights is not None:
-            square = square * weights.unfold(-2, self.order + 1, 1).amin(-1)
+            square = square * weights.unfold(-2, self.order + 1, 1).amin(-1).clamp_min(0)
         return narrow(nn.functional.pad(0.5 * square.sum(-1), (self.order, 0)), points)
 
 
@@ -278,9 +280,17 @@ def check_lengths(lengths: Tensor | None, points: Tensor, module: SkeletonModule
     if lengths.shape[-1:] != (count,) or not fit_together(lengths.shape[:-1], points.shape[:-3]):
         expected = f"(..., {count}), the same in all frames, for points {tuple(points.shape)}"
         raise ShapeError(f"{type(module).__name__}: expected lengths {expected}, got {tuple(lengths.shape)}")
-    if points.ndim == 3 and lengths.shape[:-1] == points.shape[:1] and len(points) > 1:
+    check_one(lengths, 1, f"lengths ({count},)", points, module)
+
+
+def check_one(value: Tensor, core: int, what: str, points: Tensor, module: nn.Module) -> None:
+    """Raise a ShapeError if a value with so many core dimensions is of each frame where points are one clip (T, N, D).
+
+    It would pass for one of each of T bodies.
+    """
+    if points.ndim == 3 and value.shape[: value.ndim - core] == points.shape[:1] and len(points) > 1:
         raise ShapeError(
-            f"{type(module).__name__}: expected lengths ({count},) that are the same in all frames of a clip "
-            f"{tuple(points.shape)}, got {tuple(lengths.shape)}: take their median over the frames; if they are of as "
+            f"{type(module).__name__}: expected {what} that are the same in all frames of a clip "
+            f"{tuple(points.shape)}, got {tuple(value.shape)}: take their median over the frames; if they are of as "
             "many bodies, give points[None]"
         )

@@ -87,11 +87,12 @@ def check_joints(module: nn.Module, skeleton: Skeleton, points: Tensor, form: st
     raise ShapeError(message)
 
 
-def check_positive(module: nn.Module, **options: Any) -> None:
-    """Raise an OptionError unless all options are positive numbers."""
+def check_positive(module: nn.Module, *, finite: bool = False, **options: Any) -> None:
+    """Raise an OptionError unless all options are positive numbers, and below infinity if ``finite``."""
     for name, value in options.items():
-        if not isinstance(value, Real) or not float(value) > 0:
-            raise OptionError(f"{type(module).__name__}: {name}: expected a positive number, got {value!r}")
+        if not isinstance(value, Real) or not float(value) > 0 or (finite and float(value) == math.inf):
+            kind = "positive number that is finite" if finite else "positive number"
+            raise OptionError(f"{type(module).__name__}: {name}: expected a {kind}, got {value!r}")
 
 
 def check_whole(module: nn.Module, least: int, **options: Any) -> None:
@@ -185,12 +186,16 @@ class SVT(nn.Module):
         relative: scale the threshold with each matrix.
 
     Raises:
-        OptionError: the threshold is negative, or zero where it is to be learned.
+        OptionError: the threshold is negative, zero where it is to be learned, or a tensor that requires a gradient.
     """
 
     def __init__(self, threshold: float, *, learnable: bool = False, relative: bool = False) -> None:
         super().__init__()
-        number = isinstance(threshold, (Real, Tensor))
+        given: Any = threshold
+        number = isinstance(given, (Real, Tensor))
+        if isinstance(given, Tensor) and given.requires_grad:
+            told = "expected a number, got a tensor that requires a gradient: learnable=True makes a parameter of one"
+            raise OptionError(f"SVT: threshold: {told}")
         if not number or not 0 <= float(threshold) < math.inf or (learnable and threshold == 0):
             kind = "positive" if learnable else "non-negative"
             raise OptionError(f"SVT: expected a {kind}, finite threshold, got {threshold!r}")
@@ -227,6 +232,8 @@ def narrow(value: Tensor, like: Tensor) -> Tensor:
 def seen_weights(tracks: Tensor, weights: Tensor | None) -> Tensor:
     """Weights (..., T, N) of tracks (..., T, N, 2), 0 where these are not finite: NaN is unseen, as everywhere.
 
+    Those below 0 count as 0.
+
     Args:
         tracks: (..., T, N, 2).
         weights: (..., T, N); 1 if None.
@@ -234,6 +241,7 @@ def seen_weights(tracks: Tensor, weights: Tensor | None) -> Tensor:
     finite = tracks.isfinite().all(-1)
     if weights is None:
         return finite.to(tracks.dtype)
+    weights = weights.clamp_min(0)
     return torch.where(finite, weights, torch.zeros((), dtype=weights.dtype, device=weights.device))
 
 

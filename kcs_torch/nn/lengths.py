@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ShapeError, SkeletonError
+from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.guarded import or_one, safe_root
 from kcs_torch.functional.precision import wide
@@ -53,7 +53,8 @@ class ForeshorteningEnergy(SkeletonModule):
 
     def __init__(self, skeleton: str | Path | Skeleton, *, correlation: float = 10.0, eps: float = 0.1) -> None:
         super().__init__(skeleton)
-        check_positive(self, correlation=correlation, eps=eps)
+        check_positive(self, correlation=correlation)
+        check_positive(self, finite=True, eps=eps)
         self.correlation, self.eps = correlation, eps
         self.register_buffer("free", free_bones(self.skeleton), persistent=False)
 
@@ -74,15 +75,19 @@ class ForeshorteningEnergy(SkeletonModule):
                 a hundredth of all bones', so that none is 0.
             weights: (..., T, N) of the joints: a bone weighs as much as the lesser of its two ends.
             bone_weights: (..., T, B) in place of ``weights``.
-            bone_noise: (..., T, B) standard deviation of the bones' lengths in the image, in the points' unit.
+            bone_noise: (..., T, B) standard deviation of the bones' lengths in the image, in the points' unit; anything
+                where the bone's weight is 0.
 
         Returns:
             (...).
 
         Raises:
             ShapeError: the shapes do not fit.
+            OptionError: weights and bone_weights are both given.
         """
         self.check(points, clip=True)
+        if weights is not None and bone_weights is not None:
+            raise OptionError("ForeshorteningEnergy: expected weights or bone_weights, got both")
         if points.shape[-1] != 3:
             raise ShapeError(f"ForeshorteningEnergy: expected points (..., T, N, 3), got {tuple(points.shape)}")
         check_weights(weights, points, self)
@@ -92,6 +97,10 @@ class ForeshorteningEnergy(SkeletonModule):
         check_beside(bone_noise, "bone_noise", bones, points, self)
         if weights is not None:
             bone_weights = bone_share(weights, self.bones)
+        if bone_weights is not None:
+            bone_weights = bone_weights.clamp_min(0)
+            if bone_noise is not None:
+                bone_noise = known(bone_noise[..., None], bone_weights)[..., 0]
         vectors = known(bone_vectors(wide(points), self.bones), bone_weights)
         if lengths is None:
             lengths = usual_size(vectors.square().sum(-1), bone_weights, LEAST)
@@ -157,6 +166,7 @@ class ProportionEnergy(SkeletonModule):
     def _energy(self, lengths: Tensor, weights: Tensor | None) -> Tensor:
         tiny = torch.finfo(lengths.dtype).tiny
         if weights is not None:
+            weights = weights.clamp_min(0)
             lengths = torch.where(weights > 0, lengths, self.usual.to(lengths))
         log = (lengths.clamp_min(tiny) / self.usual.to(lengths).clamp_min(tiny)).log()
         apart = ((log[..., self.pairs[:, 0]] - log[..., self.pairs[:, 1]]) / self.twins).square()

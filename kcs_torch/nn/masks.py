@@ -43,8 +43,8 @@ def known_points(points: Tensor, weights: Tensor | None, module: nn.Module) -> T
 
 
 def bone_share(weights: Tensor, bones: Tensor) -> Tensor:
-    """Weights of the bones (..., B): each weighs as much as the lesser of its two ends (..., N)."""
-    return torch.minimum(weights[..., bones[:, 0]], weights[..., bones[:, 1]])
+    """Weights of the bones (..., B): each weighs as much as the lesser of its two ends (..., N), and not below 0."""
+    return torch.minimum(weights[..., bones[:, 0]], weights[..., bones[:, 1]]).clamp_min(0)
 
 
 def clear_padding(values: Tensor, inside: Tensor | None, trailing: int = 2) -> Tensor:

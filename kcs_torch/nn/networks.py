@@ -208,10 +208,10 @@ class TemporalLifter(_Lifter):
         dilations: Sequence[int] = (1, 3, 9),
         dropout: float = 0.1,
     ) -> None:
-        given: Any = dilations
-        if not isinstance(given, Iterable) or not all(isinstance(d, Integral) and int(d) >= 1 for d in given):
+        given: Any = tuple(dilations) if isinstance(dilations, Iterable) else None  # what iterates once, too
+        if given is None or not all(isinstance(d, Integral) and int(d) >= 1 for d in given):
             raise OptionError(f"TemporalLifter: dilations: expected whole numbers from 1, got {dilations!r}")
-        dilations = tuple(int(d) for d in dilations)
+        dilations = tuple(int(d) for d in given)
         check_whole(self, 1, channels=channels)
         super().__init__(skeleton, width=channels, dropout=dropout, window=1, dilations=dilations)
         self._options = {"channels": channels, "dilations": list(dilations), "dropout": dropout}

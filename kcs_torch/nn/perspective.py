@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -13,7 +14,7 @@ from kcs_torch.functional.guarded import LOST, or_one, safe_root
 from kcs_torch.functional.precision import full_precision, wide
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.weights import known
-from kcs_torch.nn.energies import check_clip, check_weights
+from kcs_torch.nn.energies import check_clip, check_one, check_weights
 from kcs_torch.nn.layers import check_tensor, narrow, seen_weights, shown
 from kcs_torch.nn.reprojection import huber_square
 from kcs_torch.types.hints import is_a
@@ -49,9 +50,10 @@ class PerspectiveEnergy(nn.Module):
 
     def __init__(self, *, translation: bool = True, huber: float | None = None, nearest: float = 0.15) -> None:
         super().__init__()
-        if not all(is_a(x, float) and x > 0 for x in (nearest, 1.0 if huber is None else huber)):
+        numbers = all(is_a(x, float) and x > 0 for x in (nearest, 1.0 if huber is None else huber))
+        if not numbers or nearest == math.inf:
             raise OptionError(
-                "PerspectiveEnergy: expected a positive huber length or None, and a positive nearest depth, "
+                "PerspectiveEnergy: expected a positive huber length or None, and a finite positive nearest depth, "
                 f"got {huber!r} and {nearest!r}"
             )
         self.translation, self.huber, self.nearest = translation, huber, nearest
@@ -89,6 +91,7 @@ class PerspectiveEnergy(nn.Module):
             if not fit_together(lens.shape[:-1], points.shape[:-3]):
                 got = f"got those of {tuple(lens.shape[:-1])} for points {tuple(points.shape)}"
                 raise ShapeError(f"PerspectiveEnergy: expected intrinsics of all clips, or of each, {got}")
+            check_one(lens, 1, "intrinsics (4,)", points, self)
             lens = lens[..., None, None, :]  # (..., 1, 1, 4)
             weights = seen_weights(tracks, weights)
             at, seen = wide(known(points, weights)), known(wide(tracks), weights)

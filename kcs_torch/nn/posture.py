@@ -84,7 +84,8 @@ class PostureEnergy(SkeletonModule):
     ) -> None:
         super().__init__(skeleton)
         body = self.skeleton
-        check_positive(self, strength=strength, kappa=kappa, correlation=correlation)
+        check_positive(self, finite=True, strength=strength, kappa=kappa)
+        check_positive(self, correlation=correlation)
         self.strength, self.kappa, self.correlation = strength, kappa, correlation
         trunk = trunk_joints(body)
         if len(trunk) < 3:
@@ -127,11 +128,12 @@ class PostureEnergy(SkeletonModule):
         self._check(points)
         part = points.index_select(-2, self.trunk)
         part = part - part.mean(-2, keepdim=True)
-        first, second = (self.affine.to(part) @ part).unbind(-2)  # images of the trunk's two long axes
-        first = _unit(first)
-        second = _unit(second - (second * first).sum(-1, keepdim=True) * first)
-        turned = torch.stack([first, second, torch.linalg.cross(first, second)], -1)
-        return turned @ self.axes.to(part).mT
+        with full_precision(part):
+            first, second = (self.affine.to(part) @ part).unbind(-2)  # images of the trunk's two long axes
+            first = _unit(first)
+            second = _unit(second - (second * first).sum(-1, keepdim=True) * first)
+            turned = torch.stack([first, second, torch.linalg.cross(first, second)], -1)
+            return turned @ self.axes.to(part).mT
 
     def directions(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """Bones seen from the trunk over their lengths, (..., T, B, 3), 0 where a length is 0; as in :meth:`forward`.
@@ -197,13 +199,13 @@ class PostureEnergy(SkeletonModule):
                 pull = count * self.kappa / (count + self.kappa)
             elif independent is None and weighs_joints(weights, points, self):
                 firm = torch.minimum(bone_share(weights, self.bones), weights[..., self.trunk].amin(-1, keepdim=True))
-                share = firm.to(local).repeat_interleave(3, -1) / self.correlation  # (..., T, 3B)
+                share = firm.to(local).clamp_min(0).repeat_interleave(3, -1) / self.correlation  # (..., T, 3B)
                 count, own = share.amax(-1).sum(-1), share.sum(-2, keepdim=True)
                 mean = (share * y).sum(-2, keepdim=True) / or_one(own)
                 off = safe_root(share) * (y - mean)
                 mean = mean * safe_root(own * self.kappa / (own + self.kappa))
             else:
-                share = weights.to(local)[..., None] / (self.correlation if independent is None else 1)
+                share = weights.to(local).clamp_min(0)[..., None] / (self.correlation if independent is None else 1)
                 count = share.sum((-2, -1))
                 mean = (share * y).sum(-2, keepdim=True) / or_one(count)[..., None, None]
                 off, each = y - mean, share[..., None, :, :]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import torch
@@ -48,9 +49,9 @@ class ProcrusteanEnergy(SkeletonModule):
     ) -> None:
         super().__init__(skeleton)
         numbers = is_a(eps, float) and is_a(num_steps, int)
-        if not numbers or not eps > 0 or order not in (0, 1) or num_steps < 0:
+        if not numbers or not 0 < eps < math.inf or order not in (0, 1) or num_steps < 0:
             raise OptionError(
-                "ProcrusteanEnergy: expected eps > 0, order 0 or 1 and num_steps >= 0, "
+                "ProcrusteanEnergy: expected finite eps > 0, order 0 or 1 and num_steps >= 0, "
                 f"got {eps!r}, {order!r} and {num_steps!r}"
             )
         self.eps, self.order, self.num_steps = eps, order, num_steps
@@ -103,7 +104,8 @@ class ProcrusteanEnergy(SkeletonModule):
             count = share.sum(-2, keepdim=True)
             rows = aligned - (share * aligned).sum(-2, keepdim=True) / or_one(count)
         frames = max(rows.shape[-2], 1)
-        return rows * safe_root(share * frames / or_one(count)), share.amax(-1).sum(-1) / frames
+        most = share.amax(-1) if share.shape[-1] else share.sum(-1)  # a skeleton may have no bones
+        return rows * safe_root(share * frames / or_one(count)), most.sum(-1) / frames
 
 
 def _align(vectors: Tensor, num_steps: int, share: Tensor | None = None) -> Tensor:

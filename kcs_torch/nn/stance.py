@@ -12,6 +12,7 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.precision import full_precision, wide
+from kcs_torch.nn.energies import check_one
 from kcs_torch.nn.layers import SkeletonModule, check_beside, check_positive, narrow
 from kcs_torch.nn.lengths import usual_size
 from kcs_torch.nn.masks import bone_share, known_points, weighs_joints
@@ -53,7 +54,8 @@ class StanceEnergy(SkeletonModule):
 
     def __init__(self, skeleton: str | Path | Skeleton, *, sway: float = 0.06, fold: float = 0.15) -> None:
         super().__init__(skeleton)
-        check_positive(self, sway=sway, fold=fold)
+        check_positive(self, sway=sway)
+        check_positive(self, finite=True, fold=fold)
         self.sway, self.fold = sway, fold
         self.posture = PostureEnergy(self.skeleton)
         feet, body = list(self.skeleton.contacts), self.skeleton
@@ -105,6 +107,8 @@ class StanceEnergy(SkeletonModule):
         if isinstance(size, (int, float, Real)):
             size = torch.tensor(float(size), dtype=torch.float64)
         check_beside(size, "size", (), points, self)
+        if size is not None:
+            check_one(size, 0, "sizes ()", points, self)
         joints = weights is not None and weighs_joints(weights, points, self)
         with full_precision(points):
             points = wide(known_points(points, weights, self))

@@ -303,7 +303,11 @@ class Skeleton:
         >>> body.is_tree, body.bone_names[-1]
         (False, 'left_wrist-right_wrist')
         """
-        extra = tuple((self.index(a), self.index(b)) for a, b in links)
+        given: list[Any] = list(links)
+        for link in given:
+            if isinstance(link, str) or len(link) != 2:
+                raise SkeletonError(f"links: expected pairs of joint names, got {link!r}")
+        extra = tuple((self.index(a), self.index(b)) for a, b in given)
         return self._with_bones(extra)
 
     def connected(self) -> Skeleton:
@@ -333,7 +337,8 @@ class Skeleton:
             points (..., N, D) and weights (..., N). A virtual joint is seen where all its sources are.
 
         Raises:
-            ShapeError: they are not tensors of these shapes; points that have the virtual joints already are not.
+            ShapeError: they are not tensors of these shapes; points that have the virtual joints already are not. Nor
+                are points that are not in floating point.
         """
         given: dict[str, Any] = {"points": points, "weights": weights}
         for name, value in given.items():
@@ -349,6 +354,8 @@ class Skeleton:
             elif points.ndim >= 2 and points.shape[-1] == self.num_observed:
                 message += ": swap their last two axes, points.mT"
             raise ShapeError(message)
+        if not points.is_floating_point():
+            raise ShapeError(f"complete: points: expected floating point, got {points.dtype}: use points.float()")
         if weights is not None and weights.shape[-1:] != (self.num_observed,):
             raise ShapeError(
                 f"complete: expected weights (..., {self.num_observed}) for points {tuple(points.shape)}, "

@@ -48,7 +48,7 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | No
     Args:
         rotations: (..., T, 3, 3), T >= 2.
         num_steps: Gauss-Newton steps.
-        counts: (...) frames of each clip, 2 or more, where shorter ones are padded at their end.
+        counts: (...) frames of each clip, where shorter ones are padded at their end; a single one stands still.
 
     Returns:
         The paths (..., T, 3, 3), and their angles to each rotation (..., T), in radians; NaN in the padding.
@@ -68,7 +68,7 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | No
     nowhere = torch.where(inside, 0.0, torch.nan).to(time)  # medians pass over NaN
     time = time - last / 2
     step = rotation_vector(rotations[:, 1:] @ rotations[:, :-1].mT)
-    turn = nanmedian(step + nowhere[:, 1:, None], 1)  # (K, 3)
+    turn = torch.where(last > 0, nanmedian(step + nowhere[:, 1:, None], 1), 0.0)  # (K, 3)
     factors = torch.linspace(0.8, 1.2, 161, dtype=turn.dtype, device=turn.device)
     means = _sum_unturned(rotations * inside[..., None, None], factors, time, turn)  # (K, 161, 3, 3)
     starts = nearest_rotation(means)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from kcs_torch.errors import OptionError
+from kcs_torch.functional.shapes import check_core
 from kcs_torch.functional.spectral import singular_values
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.solvers.iterate import fpc
@@ -38,8 +40,19 @@ def complete_tracks(
     Returns:
         (..., T, N, 2), equal to the tracks where they are seen.
 
+    Raises:
+        ShapeError: they are not of these shapes.
+        OptionError: a weight is not positive.
+
     Mazumder, Hastie, Tibshirani 2010 (soft-impute).
     """
+    if not (first > 0 and last > 0):
+        raise OptionError(f"complete_tracks: expected positive first and last weights, got {first} and {last}")
+    if inside is not None:
+        check_core(tracks, "complete_tracks: tracks", "T", "N", 2)
+        check_core(seen, "complete_tracks: seen", *tracks.shape[-3:-1])
+        check_core(inside, "complete_tracks: inside", tracks.shape[-3])
+        seen = seen & inside[..., None]
     filled = interpolate(tracks, seen)
     real = torch.ones_like(seen[..., 0]) if inside is None else inside
     filled = filled * real[..., None, None]

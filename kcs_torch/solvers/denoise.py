@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcs_torch.errors import ShapeError
+from kcs_torch.functional.shapes import check_floats
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.spectrum import TINY, temporal_modes, unshared, white_power
@@ -90,7 +92,11 @@ def denoise_tracks(
         floor: of outliers, a share of the body's size (median distance of its joints from their centre).
 
     Returns:
-        :class:`Denoised`. Clips of fewer than 12 frames are only filled and cleared of outliers; of none, none.
+        :class:`Denoised`, a constant for autograd. Clips of fewer than 12 frames are only filled and cleared of
+        outliers; of none, none.
+
+    Raises:
+        ShapeError: they are not of these shapes, or the tracks not in floating point.
 
     >>> time = torch.linspace(0, 6, 100, dtype=torch.float64)[:, None, None]
     >>> truth = torch.sin(time + torch.arange(8).reshape(4, 2)) * 100
@@ -102,12 +108,17 @@ def denoise_tracks(
 
     Garcia 2010 smooths gappy data by one spectrum in the same way; here the joints' covariance is added.
     """
+    check_floats(tracks, "denoise_tracks: tracks", "T", "N", 2)
     shape = tracks.shape
+    if not isinstance(weights, Tensor) or weights.shape != shape[:-1]:
+        got = f"shape {tuple(weights.shape)}" if isinstance(weights, Tensor) else type(weights).__name__
+        raise ShapeError(f"denoise_tracks: weights: expected a tensor of shape {tuple(shape[:-1])}, got {got}")
+    weights = weights.detach()
     if not tracks.numel():
         none = tracks.new_zeros(*shape[:-3], shape[-2])
-        return Denoised(tracks, weights, none, torch.zeros_like(weights, dtype=torch.bool), none)
+        return Denoised(tracks.detach(), weights, none, torch.zeros_like(weights, dtype=torch.bool), none)
     values = tracks.detach().reshape(-1, *shape[-3:]).double()  # (K, T, N, 2): the spectra span more than float32
-    given = weights.detach().reshape(values.shape[:-1]).double()
+    given = weights.reshape(values.shape[:-1]).double()
     size = body_size(values, given > 0)
     unit = torch.where(size > TINY, size, torch.ones_like(size))[:, None, None, None]
     values = values / unit

@@ -66,7 +66,7 @@ def fixed_point(
         name: what a warning calls the iteration.
 
     Returns:
-        (..., *).
+        (..., *). Differentiable once; a second derivative raises ``RuntimeError``.
 
     Warns:
         ConvergenceWarning: in the backward pass, the adjoint equation was not solved to the tolerance.
@@ -105,12 +105,24 @@ class _Pull(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, value: Tensor, solve: Callable[[Tensor], Tensor]) -> Tensor:
         ctx.solve = solve
+        ctx.save_for_backward(value)
         return value.view_as(value)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        return ctx.solve(grad), None
+        return _Pulled.apply(grad, *ctx.saved_tensors, ctx.solve), None
+
+
+class _Pulled(torch.autograd.Function):
+    """The cotangent, not to be differentiated again: it takes the value so that autograd notices who tries."""
+
+    @staticmethod
+    def forward(ctx: Any, grad: Tensor, value: Tensor, solve: Callable[[Tensor], Tensor]) -> Tensor:
+        return solve(grad)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> None:
+        raise RuntimeError("second derivatives of a fixed point are not supported")
 
 
 def gmres(

@@ -34,7 +34,7 @@ def ist(motion: Tensor, *, weight: float = 1e-3, num_steps: int = 60) -> Tensor:
         Q (..., R, 3), so that ``motion @ Q`` are roughly camera rows; unique up to a rotation or reflection.
 
     Raises:
-        ShapeError: R is below 3.
+        ShapeError: R is below 3, or there are no frames.
 
     Kovalenko et al. 2019, eq. 4-7; Dai, Li, He 2012; Beck, Teboulle 2009.
     """
@@ -111,7 +111,7 @@ def metric_upgrade(
         Q (..., R, 3), scaled so that rows have mean squared length 1, and the defect (...).
 
     Raises:
-        ShapeError: R is below 3, or the shapes do not fit.
+        ShapeError: R is below 3, there are no frames, or the shapes do not fit.
         OptionError: the batch is not made of so many neighbours.
     """
     check_motion(motion, "metric_upgrade")
@@ -254,6 +254,6 @@ def _triangle(matrix: Tensor) -> Tensor:
 
 
 def check_motion(motion: Tensor, name: str) -> None:
-    """Raise a ShapeError unless ``motion`` is (..., T, 2, R) with R >= 3."""
-    if motion.ndim < 3 or motion.shape[-2] != 2 or motion.shape[-1] < 3:
-        raise ShapeError(f"{name}: expected motion (..., T, 2, R) with R >= 3, got {tuple(motion.shape)}")
+    """Raise a ShapeError unless ``motion`` is (..., T, 2, R) with T >= 1 and R >= 3."""
+    if motion.ndim < 3 or motion.shape[-2] != 2 or motion.shape[-1] < 3 or not motion.shape[-3]:
+        raise ShapeError(f"{name}: expected motion (..., T, 2, R) with T >= 1 and R >= 3, got {tuple(motion.shape)}")

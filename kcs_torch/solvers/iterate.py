@@ -80,8 +80,8 @@ def iterate(
         )
     state, recorded, converged = start, torch.is_grad_enabled(), change is None
     partial = recorded and grad_steps is not None and grad_steps < num_steps
-    tail = (grad_steps or 0) if partial else 0  # steps to be recorded after others that are not
-    count, end, moved = 0, num_steps, None
+    tail = int(grad_steps or 0) if partial else 0  # steps to be recorded after others that are not
+    count, end, moved = 0, int(num_steps), None
     while count < end:
         with torch.set_grad_enabled(recorded and (not partial or end - count <= tail)):
             new = step(state, count)

@@ -77,8 +77,8 @@ def lbfgs(
             with torch.no_grad():
                 pair: tuple[Tensor, Tensor] = energy(x)
             return pair
-        with torch.enable_grad():
-            x = x.detach().requires_grad_()
+        with torch.inference_mode(False), torch.enable_grad():  # whose tensors have no derivative
+            x = (x.clone() if x.is_inference() else x.detach()).requires_grad_()
             value = energy(x)
             if value.shape != x.shape[:1]:
                 got = f"shape {tuple(value.shape)} of {len(x)}"

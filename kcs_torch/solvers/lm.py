@@ -11,7 +11,7 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_vectors, incidence, index_rows
 from kcs_torch.functional.coupled import solve_coupled
 from kcs_torch.functional.precision import widened
-from kcs_torch.functional.shapes import broadcast_shapes, check_core
+from kcs_torch.functional.shapes import broadcast_shapes, check_batches, check_core, check_floats
 
 __all__ = ["fit_bones"]
 
@@ -53,7 +53,7 @@ def fit_bones(
         smoothed direction (see Note), so values and gradients stay finite.
 
     Raises:
-        ShapeError: the shapes do not fit.
+        ShapeError: the shapes do not fit, or the points are not in floating point.
         OptionError: ``num_steps``, ``damping`` or a number for ``stiffness`` is negative.
 
     Note:
@@ -66,10 +66,12 @@ def fit_bones(
     >>> A.round(decimals=3).tolist()
     [[-0.5, 0.0, 0.0], [1.5, 0.0, 0.0]]
     """
-    check_core(points, "fit_bones: points", "N", "D")
+    check_floats(points, "fit_bones: points", "N", "D")
     bones = index_rows(bones, points.shape[-2])
     if start is not None:
         check_core(start, "fit_bones: start", *points.shape[-2:])
+        check_batches("fit_bones: points and start", points, start, cores=(2, 2))
+        start = start.to(points.dtype)
     if lengths.shape[-1:] != bones.shape[:1]:
         raise ShapeError(
             f"fit_bones: expected points (..., N, D) and lengths (..., {len(bones)}), "
@@ -79,7 +81,8 @@ def fit_bones(
         raise OptionError(
             f"fit_bones: expected num_steps, damping and stiffness >= 0, got {num_steps}, {damping} and {stiffness}"
         )
-    limits = torch.finfo(points.dtype)
+    check_batches("fit_bones: points and lengths", points, lengths, cores=(2, 1))
+    limits, lengths = torch.finfo(points.dtype), lengths.to(points.dtype)
     matrix = incidence(bones, points.shape[-2], dtype=points.dtype)  # (N, B)
     overlap = matrix.mT @ matrix  # (B, B)
     beta = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device)

@@ -23,7 +23,9 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.guarded import safe_norm
+from kcs_torch.functional.precision import widened
 from kcs_torch.functional.scatter import scatter_log_det
+from kcs_torch.functional.weights import known
 from kcs_torch.solvers.curvature import Levels, shown, whitening
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.memory import give_back
@@ -118,6 +120,7 @@ class Pose:
         )
 
 
+@widened
 def procrustean(
     tracks: Tensor,
     points: Tensor,
@@ -151,7 +154,7 @@ def procrustean(
         anchor: (H,) or a number, weight of half the squared distance of each depth from its start.
 
     Returns:
-        The :class:`Pose` of each start.
+        The :class:`Pose` of each start; of tracks in half precision, in single.
 
     Raises:
         ShapeError: the shapes do not fit, or clips of several lengths are noisy.
@@ -163,6 +166,7 @@ def procrustean(
     rigid = bones if rigid is None else rigid
     stiff = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device).expand(len(rigid))
     share = tracks.new_ones(frames, joints) if weights is None else weights
+    tracks = known(tracks, weights)
     zero = points.new_zeros(hypotheses)
     pose = Pose(points, rotations, zero, zero)
     weight = torch.as_tensor(anchor, dtype=points.dtype, device=points.device).expand(hypotheses)
@@ -212,6 +216,7 @@ def _descend(
     return Pose(points, nearest_rotation(rotations), solution.energy, moved)  # rounding would add up
 
 
+@widened
 def depth_deviation(
     points: Tensor,
     rotations: Tensor,

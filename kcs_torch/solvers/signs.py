@@ -52,7 +52,7 @@ def smooth_signs(
         margins: True also returns the min-marginals.
 
     Raises:
-        ShapeError: the shapes do not fit.
+        ShapeError: the shapes do not fit, or there are no frames.
 
     >>> d = torch.tensor([[2.0, 1.0, 0.0, 1.0, 2.0]])[..., None]
     >>> unary = torch.zeros(1, 5, 1, 2)
@@ -96,11 +96,15 @@ class _Costs:
     def __init__(self, unary: Tensor, depths: Tensor, cap: float, transition: Tensor | None) -> None:
         batch, frames, poses, states = unary.shape
         count = depths.shape[-1]
-        if depths.shape[:2] != (batch, frames) or states != 2**count:
+        if depths.shape[:2] != (batch, frames) or states != 2**count or not frames:
             raise ShapeError(
-                f"smooth_signs: expected unary (K, T, C, 2^M) and depths (K, T, M), got {tuple(unary.shape)} and "
-                f"{tuple(depths.shape)}"
+                "smooth_signs: expected unary (K, T, C, 2^M) and depths (K, T, M) of a frame or more, got "
+                f"{tuple(unary.shape)} and {tuple(depths.shape)}"
             )
+        moves = frames - 1, poses, poses
+        if transition is not None and transition.shape not in (moves, (batch, *moves)):
+            expected = f"expected shape {moves}, or {(batch, *moves)}, got {tuple(transition.shape)}"
+            raise ShapeError(f"smooth_signs: transition: {expected}")
         self.shape = frames, poses, states, batch
         if poses == 1 and transition is not None:  # nothing to choose
             unary = unary + torch.nn.functional.pad(transition[..., 0], (0, 0, 1, 0))[..., None]

@@ -109,7 +109,7 @@ class UnrolledKCS(Unrolled):
                 f"got {tau}, {scale_range} and {arrangement!r}"
             )
         self.skeleton = get_skeleton(skeleton)
-        body = self.skeleton.with_links(tuple(links)) if links else self.skeleton
+        body = self.skeleton.with_links(links) if links else self.skeleton
         body = body.connected()
         self.arrangement, self.scale_range = arrangement, scale_range
         rest = (
