@@ -36,7 +36,6 @@ from kcs_torch.functional.align import similarity
 from kcs_torch.io.atomic import write_table
 from kcs_torch.methods.pkc import Weights
 from kcs_torch.methods.pkc.limbs import SignCosts
-from kcs_torch.methods.pkc.trunk import mirror
 from kcs_torch.nn import PostureEnergy
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -172,9 +171,6 @@ FIXED_VARIANTS = {
     ),
     "lengths tight from the start": Variant(changes=(constant(FIXED, "LOOSE", 1.0),)),
     "limbs do not vote on the trunk's sign": Variant(changes=(constant(FIXED, "TRUST", 0.0),)),
-    "trunk without its leaning siblings": Variant(
-        changes=(constant(FIXED, "siblings", lambda path, axes: torch.stack([path, mirror(path)])),)
-    ),
     "no runs turned over": Variant(changes=(constant(FLIPS, "TIMES", 0),)),
     "no discrete moves": Variant({"rounds": 0}),
     "no signs by aligned bones": Variant(changes=(constant(METHOD, "turned_around", as_found),)),

@@ -17,7 +17,6 @@ from kcs_torch.methods.pkc.trunk import (
     facings,
     image_scale,
     mirror,
-    siblings,
     trunk_misfit,
     trunk_path,
     trunk_turns,
@@ -31,7 +30,8 @@ RIGID = torch.ones(16, dtype=torch.bool)
 
 def paths_of(points):
     """The path that is found, and its mirror image."""
-    return siblings(run(trunk_path(points[..., :2], TRUNK, POSTURE, 15.0, 0.15), facings), POSTURE.axes)[:2]
+    path = run(trunk_path(points[..., :2], TRUNK, POSTURE, 15.0, 0.15), facings)
+    return torch.stack([path, mirror(path)])
 
 
 def angle(a, b):
@@ -76,47 +76,6 @@ def test_mirror():
     flat = normal(20, 8, 3) * torch.tensor([1.0, 1.0, 0.0])  # a flat body looks the same
     assert_close((flat @ other.mT)[..., :2], (flat @ turn.mT)[..., :2])
     assert_close((flat @ other.mT)[..., 2], -(flat @ turn.mT)[..., 2])
-
-
-def about(axis, angle):
-    """Rotation (3, 3) by an angle about a coordinate axis."""
-    vector = torch.zeros(3).double()
-    vector[axis] = angle
-    return torch.linalg.matrix_exp(torch.linalg.cross(torch.eye(3).double(), vector.expand(3, 3)).mT)
-
-
-def test_siblings_are_rotations():
-    path = rotations(20)
-    found = siblings(path, POSTURE.axes)
-    assert found.shape == (4, 20, 3, 3)
-    assert torch.equal(found[0], path)
-    assert_close(found[1], mirror(path))
-    assert_close(found[3], mirror(found[2]))
-    assert_close(found.mT @ found, torch.eye(3).double().expand_as(found))
-    assert_close(torch.linalg.det(found), torch.ones(4, 20).double())
-
-
-def test_siblings_look_alike():
-    """The mirror image of a flat trunk has its image; the others nearly, lean and turn being small."""
-    flat = normal(9, 3) * torch.tensor([1.0, 1.0, 0.0])
-    flat = flat / flat.norm(dim=-1).max()
-    axes = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]).double()  # upwards, sideways, the normal
-    for lean in (0.0, 0.1, -0.3):
-        for turn in (0.0, 0.2, 0.35):
-            path = (about(1, turn) @ about(0, lean))[None]
-            same, reflected, third, fourth = (flat @ siblings(path, axes).mT)[:, 0]
-            assert_close(same, flat @ path[0].mT)
-            assert_close(reflected, same * torch.tensor([1.0, 1.0, -1.0]))
-            for other in (third, fourth):
-                assert_close(other[..., :2], same[..., :2], rtol=0, atol=2 * abs(lean * turn) + 1e-9)
-
-
-def test_siblings_lean_and_turn_each_way():
-    """Of the trunk's two long axes, every combination of signs in depth is there."""
-    path = (about(1, 0.3) @ about(0, 0.25) @ POSTURE.axes.mT)[None]
-    depths = (siblings(path, POSTURE.axes) @ POSTURE.axes)[:, 0, 2, :2]  # (4, 2)
-    assert (depths.abs() > 0.15).all()
-    assert len({tuple(row) for row in depths.sign().tolist()}) == 4
 
 
 def test_misfit_by_hand():
@@ -192,6 +151,6 @@ def test_paths_are_rotations_whatever_is_seen(frames, dtype):
     for image in (still, 0 * still, still * torch.tensor([0.0, 1.0])):
         path = run(trunk_path(image.to(dtype), trunk, posture, 15.0, 0.15), facings)
         assert path.shape == (frames, 3, 3) and path.dtype == dtype
-        found = siblings(path, posture.axes)
+        found = torch.stack([path, mirror(path)])
         assert_close(found.mT @ found, torch.eye(3).expand_as(found).to(found), rtol=0, atol=1e-4)
         assert_close(found, found[:, :1].expand_as(found), rtol=0, atol=1e-3)  # what does not move does not turn

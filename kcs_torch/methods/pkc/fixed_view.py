@@ -19,7 +19,7 @@ from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts, limbs_of, waves
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.placing import placing
-from kcs_torch.methods.pkc.trunk import TURN, Trunk, longest_image, siblings, trunk_misfit, trunk_path, trunk_turns
+from kcs_torch.methods.pkc.trunk import TURN, Trunk, longest_image, mirror, trunk_misfit, trunk_path, trunk_turns
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.nn.lengths import free_bones
 from kcs_torch.skeleton import Skeleton
@@ -212,11 +212,11 @@ class _Search:
         return out
 
     def _settled(self, path: Tensor, trunk: Trunk, lengths: Tensor | None) -> Search[Any, Any, Tensor]:
-        """The path (T, 3, 3), mirrored where the limbs vote for it, and its siblings: (4, T, 3, 3)."""
-        axes = self.objective.posture.axes
-        paths = siblings(path, axes)[:2]
+        """The path (T, 3, 3), mirrored where the limbs vote for it, and the mirror image of that: (2, T, 3, 3)."""
+        paths = torch.stack([path, mirror(path)])
         choice = yield from self._settle(paths, trunk, lengths)
-        return siblings(paths[choice, torch.arange(len(path), device=path.device)], axes)
+        settled = paths[choice, torch.arange(len(path), device=path.device)]
+        return torch.stack([settled, mirror(settled)])
 
     def _settle(self, paths: Tensor, trunk: Trunk, lengths: Tensor | None) -> Search[Any, Any, Tensor]:
         """Which of several trunk paths each frame takes by the limbs' votes, (T,)."""

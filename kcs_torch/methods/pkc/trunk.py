@@ -9,7 +9,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.lockstep import Search
@@ -23,7 +22,6 @@ __all__ = [
     "image_scale",
     "longest_image",
     "mirror",
-    "siblings",
     "trunk_misfit",
     "trunk_path",
     "trunk_turns",
@@ -112,22 +110,6 @@ def mirror(rotations: Tensor) -> Tensor:
     """Rotations (..., 3, 3) of the mirror image in depth, S R S: the same image of a flat body."""
     flip = torch.tensor([1.0, 1.0, -1.0], dtype=rotations.dtype, device=rotations.device)
     return rotations * flip[:, None] * flip
-
-
-def siblings(path: Tensor, axes: Tensor) -> Tensor:
-    """Rotations (T, 3, 3) and those under which a flat trunk looks alike, (4, T, 3, 3).
-
-    The mirror image in depth has the same image. One that faces the viewer may also lean the other way and keep its
-    turn, or turn the other way and keep its lean: the image hardly changes, see :func:`trunk_misfit`.
-
-    Args:
-        path: (T, 3, 3), template to camera.
-        axes: (3, 3), columns: the trunk's two long axes and its normal.
-    """
-    first, second, _ = (path @ axes.to(path)).unbind(-1)
-    leant = first * first.new_tensor([1.0, 1.0, -1.0])
-    other = nearest_rotation(torch.stack([leant, second, torch.linalg.cross(leant, second)], -1) @ axes.to(path).mT)
-    return torch.stack([path, mirror(path), other, mirror(other)])
 
 
 def trunk_misfit(
