@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from numerics import normal, rotations, turning
+from numerics import camera_disagreement, normal, rotations, turning
 from torch.testing import assert_close
 
 import kcs_torch as kt
 from kcs_torch.errors import OptionError
-from kcs_torch.functional import back_project, camera_disagreement, complete_rotation, dct_basis, project
+from kcs_torch.functional import back_project, complete_rotation, dct_basis, project
 from kcs_torch.methods import BMM, CSF, PTA, Rigid
 from kcs_torch.methods.csf import fit_column_space
 from kcs_torch.methods.factorised import camera_rows, fit_basis_shapes, trajectory_design

@@ -12,7 +12,6 @@ from kcs_torch.functional import complete_rotation, nearest_rotation
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.functional.scatter import inverse_scatter, scatter_log_det
-from kcs_torch.functional.temporal import jitter
 from kcs_torch.nn.procrustean import ProcrusteanEnergy
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers import curvature
@@ -280,15 +279,6 @@ def test_distances_have_a_gradient(weighted):
     for points in (normal(5, 4, 3), torch.zeros(5, 4, 3)):
         finite(lambda x: torch.stack(distance_spread(x, weights)), points)
     assert gradcheck(lambda x: distance_spread(x, weights), normal(5, 4, 3).requires_grad_())
-
-
-def test_jitter_tells_noise_from_motion():
-    points, _ = swinging_body(200)
-    seen = torch.ones(200, 6, dtype=torch.bool)
-    noise = torch.randn(200, 6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    assert jitter(points, seen) < 1e-4
-    assert jitter(points + 0.02 * noise, seen) == pytest.approx(0.02, rel=0.1)
-    assert jitter(points[:3], seen[:3]) == 0 and jitter(points, ~seen) == 0
 
 
 @pytest.mark.parametrize("order", [0, 1])

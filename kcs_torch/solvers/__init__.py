@@ -1,6 +1,6 @@
 """Iterations over callables: they know no camera, prior or skeleton."""
 
-from kcs_torch.solvers.camera_path import choose_path, constant_path, settle_path, smooth_path
+from kcs_torch.solvers.camera_path import choose_path, constant_path, settle_path
 from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.denoise import Denoised, denoise_tracks
 from kcs_torch.solvers.implicit import Implicit, fixed_point, gmres
@@ -42,7 +42,6 @@ __all__ = [
     "settle_path",
     "sign_costs",
     "sign_table",
-    "smooth_path",
     "smooth_signs",
     "swapped_frames",
 ]

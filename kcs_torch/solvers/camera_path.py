@@ -19,7 +19,7 @@ from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.functional.spectral import dct_basis
 from kcs_torch.solvers.lbfgs import lbfgs
 
-__all__ = ["CameraPath", "choose_path", "constant_path", "settle_path", "smooth_path", "view_energy"]
+__all__ = ["CameraPath", "choose_path", "constant_path", "settle_path", "view_energy"]
 
 CameraPath = Literal["auto", "free", "smooth", "constant"]
 KINDS: tuple[CameraPath, ...] = get_args(CameraPath)
@@ -94,38 +94,13 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | No
     return path.view(*batch, frames, 3, 3), angle.view(*batch, frames)
 
 
-@widened
-def smooth_path(rotations: Tensor, *, waves: int = WAVES, num_steps: int = ROUNDS) -> tuple[Tensor, Tensor]:
-    """Fit a path whose deviation from a constant angular velocity is a sum of ``waves`` slow cosines, robustly.
-
-    Args:
-        rotations: (T, 3, 3), T >= 2.
-        waves: cosines, the constant included; no more than T.
-        num_steps: rounds of Cauchy weights.
-
-    Returns:
-        The path (T, 3, 3), and its angle to each rotation (T,), in radians.
-
-    Raises:
-        ShapeError: ``rotations`` is not (T, 3, 3) with T >= 2.
-    """
-    _check_rotations(rotations, "smooth_path", 2)
-    return _smoothed(rotations, *constant_path(rotations), waves, num_steps)
-
-
-def _check_rotations(rotations: Tensor, name: str, least: int) -> None:
-    if rotations.ndim != 3 or rotations.shape[1:] != (3, 3) or len(rotations) < least:
-        some = f" of {least} frames or more" if least else ""
-        raise ShapeError(f"{name}: expected rotations (T, 3, 3){some}, got {tuple(rotations.shape)}")
-
-
-def _smoothed(rotations: Tensor, base: Tensor, angle: Tensor, waves: int, num_steps: int) -> tuple[Tensor, Tensor]:
-    """As :func:`smooth_path`, about a constant path and its angles."""
+def _smoothed(rotations: Tensor, base: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
+    """Fit a path whose deviation from a constant path (T, 3, 3) is a sum of slow cosines, robustly; its angles (T,)."""
     frames = len(rotations)
-    basis = dct_basis(frames, min(waves, frames), dtype=base.dtype, device=base.device)  # (T, K)
+    basis = dct_basis(frames, min(WAVES, frames), dtype=base.dtype, device=base.device)  # (T, K)
     deviation = (rotations @ base.mT).flatten(-2)
     path = base
-    for _ in range(num_steps):
+    for _ in range(ROUNDS):
         weight = 1 / (1 + (angle / angle.median().clamp_min(1e-9)).square())
         normal = basis.mT @ (weight[:, None] * basis)
         ridge = 1e-9 * normal.diagonal().mean() * torch.eye(len(normal), dtype=base.dtype, device=base.device)
@@ -152,14 +127,15 @@ def choose_path(rotations: Tensor, kind: CameraPath = "auto") -> tuple[Tensor, C
     """
     if kind not in KINDS:
         raise unknown("camera path", kind, KINDS)
-    _check_rotations(rotations, "choose_path", 0)
+    if rotations.ndim != 3 or rotations.shape[1:] != (3, 3):
+        raise ShapeError(f"choose_path: expected rotations (T, 3, 3), got {tuple(rotations.shape)}")
     zero = rotations.new_zeros(len(rotations))
     if kind == "free" or len(rotations) < 10:
         return rotations, "free", zero
     path, angle = constant_path(rotations)
     if kind != "smooth" and (kind == "constant" or _explains(path, angle)):
         return path, "constant", angle
-    path, angle = _smoothed(rotations, path, angle, WAVES, ROUNDS)
+    path, angle = _smoothed(rotations, path, angle)
     if kind == "smooth" or _explains(path, angle):
         return path, "smooth", angle
     return rotations, "free", zero
