@@ -30,15 +30,24 @@ EVEN = 0.05
 NEAR = math.radians(30)
 """... and below this angle, as a path that races through all directions has length enough for any deviation."""
 
+STEPS = 20
+"""Gauss-Newton steps that fit a path of constant angular velocity."""
+
 WAVES, ROUNDS = 6, 20
 """Cosines of a smooth path, and rounds of weights that fit it."""
+
+LEVELS, SETTLING = (1e-3, 1e-4, 1e-5), 40
+"""Variances that the log-determinant does not look below where a path settles, in order, and L-BFGS steps for each."""
+
+LEAST = 1e-3
+"""Variance that the energy of a view does not look below, a share of the points' mean square."""
 
 RUN = 2000
 """Frames whose waves are summed together: more would only take memory."""
 
 
 @widened
-def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def constant_path(rotations: Tensor, *, counts: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Fit R_t = exp(t w) R_0 to rotations: six numbers, robustly.
 
     Rotations that come from aligning poses also carry the body's own turning; a camera that moves evenly does
@@ -47,7 +56,6 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | No
 
     Args:
         rotations: (..., T, 3, 3), T >= 2.
-        num_steps: Gauss-Newton steps.
         counts: (...) frames of each clip, 2 or more, where shorter ones are padded at their end.
 
     Returns:
@@ -76,7 +84,7 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | No
     row = torch.arange(len(best), device=best.device)
     speed, start = turn * factors[best][:, None], starts[row, best]
     eye = torch.eye(6, dtype=turn.dtype, device=turn.device)
-    for _ in range(num_steps):
+    for _ in range(STEPS):
         turned = time[..., None] * speed[:, None]  # (K, T, 3)
         spin = rotation_matrix(turned)
         error = rotation_vector(rotations @ (spin @ start[:, None]).mT)
@@ -147,21 +155,16 @@ def _explains(path: Tensor, angle: Tensor) -> bool:
 
 
 @differentiating
-def settle_path(
-    vectors: Tensor, path: Tensor, *, waves: int = 0, eps: tuple[float, ...] = (1e-3, 1e-4, 1e-5), num_steps: int = 40
-) -> Tensor:
+def settle_path(vectors: Tensor, path: Tensor) -> Tensor:
     """Refine a camera path so that the world poses vary least: T/2 log det of the scatter of the turned bones.
 
     A path fitted to rotations that align poses inherits the body's own turning. What a camera must explain is only
-    that poses seen from it vary little: the axis and speed of the path (three numbers), and ``waves`` slow cosines
-    of deviation, are moved to where the log-determinant is least.
+    that poses seen from it vary little: the axis and speed of the path, three numbers, are moved to where the
+    log-determinant is least.
 
     Args:
         vectors: (T, B, 3) bones in the camera frame, of size near 1.
-        path: (T, 3, 3) world to camera, of constant angular velocity if ``waves`` is 0.
-        waves: cosines of deviation beside axis and speed.
-        eps: of the log-determinant, in order.
-        num_steps: L-BFGS steps for each.
+        path: (T, 3, 3) world to camera, of constant angular velocity.
 
     Returns:
         (T, 3, 3), turned as a whole nearest to ``path``.
@@ -180,27 +183,22 @@ def settle_path(
     lean = lean + axis[:, None] * axis / frames
     if bool(size * frames < 1e-2):
         lean = torch.eye(3, dtype=path.dtype, device=path.device) / frames
-    basis = dct_basis(frames, waves + 1, dtype=path.dtype, device=path.device)[:, 1:] * math.sqrt(frames)
 
     def turned(u: Tensor) -> Tensor:
-        speed = turn + u[:, :3] @ lean  # (1, 3)
-        out = rotation_matrix(time[:, None] * speed) @ rest
-        if waves:
-            out = rotation_matrix(basis @ u[0, 3:].view(waves, 3)) @ out
-        return out
+        return rotation_matrix(time[:, None] * (turn + u @ lean)) @ rest
 
     def energy(u: Tensor) -> Tensor:
         aligned = (vectors @ turned(u)).flatten(-2)
         return scatter_log_det(aligned - aligned.mean(-2, keepdim=True), level)[None] / frames
 
-    u = path.new_zeros(1, 3 + 3 * waves)
-    for level in eps:  # noqa: B007
-        u = lbfgs(energy, u, num_steps=num_steps, first_step=1e-2).value
+    u = path.new_zeros(1, 3)
+    for level in LEVELS:  # noqa: B007
+        u = lbfgs(energy, u, num_steps=SETTLING, first_step=1e-2).value
     found = turned(u)
     return found @ nearest_rotation((found.mT @ path).sum(0))
 
 
-def view_energy(points: Tensor, path: Tensor, *, correlation: float = 6.0, eps: float = 1e-3) -> Tensor:
+def view_energy(points: Tensor, path: Tensor, *, correlation: float = 6.0) -> Tensor:
     """How much poses vary in the world of known cameras: n/2 log det of their scatter there, n = T / correlation.
 
     Depths of the wrong sign seem to turn with the camera, twice as fast: of a pose and its mirror image the right one
@@ -210,7 +208,6 @@ def view_energy(points: Tensor, path: Tensor, *, correlation: float = 6.0, eps: 
         points: (..., T, N, 3) in the camera frame; the middle of each frame's joints does not count.
         path: (T, 3, 3) world to camera.
         correlation: frames that count as one.
-        eps: variance that is not looked below, a share of the points' mean square.
 
     Returns:
         (...). Only differences mean something, between points of the same clip.
@@ -218,7 +215,7 @@ def view_energy(points: Tensor, path: Tensor, *, correlation: float = 6.0, eps: 
     points = points - points.mean(-2, keepdim=True)
     size = points[..., :2].square().mean((-3, -2, -1), keepdim=True).sqrt()
     world = (points / size.clamp_min(torch.finfo(size.dtype).tiny) @ path).flatten(-2)
-    return scatter_log_det(world - world.mean(-2, keepdim=True), eps) / correlation
+    return scatter_log_det(world - world.mean(-2, keepdim=True), LEAST) / correlation
 
 
 def _sum_unturned(rotations: Tensor, factors: Tensor, time: Tensor, turn: Tensor) -> Tensor:
