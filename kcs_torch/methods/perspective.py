@@ -55,8 +55,6 @@ def reconstruct_perspective(
     cameras: Tensor | None = None,
     *,
     lifted: Reconstruction | None = None,
-    rounds: int | None = None,
-    steps: int = 60,
 ) -> Reconstruction:
     """Reconstruct a body before a pinhole camera by a method made for parallel rays.
 
@@ -76,8 +74,6 @@ def reconstruct_perspective(
         lifted: what the method found in the tracks as if rays were parallel. The focal length is then to be found as
             well, from that of the intrinsics on, and noted; nothing is lifted anew, but each round refines what the one
             before found, as its focal length shows it.
-        rounds: at most; by default 3 of lifting and refining, or 5 of refining.
-        steps: L-BFGS steps of each refinement.
 
     Returns:
         The reconstruction in the camera's frame: ``points + (0, 0, distance)`` projects onto the image. Its unit is one
@@ -89,7 +85,7 @@ def reconstruct_perspective(
     begin = time.perf_counter()
     with apart([tracks]):
         tracks = method.prepared(tracks)
-        result = _reconstruct(method, tracks, intrinsics, cameras, lifted, rounds, steps)
+        result = _reconstruct(method, tracks, intrinsics, cameras, lifted)
     result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
     method._warn(result)
     return result
@@ -101,8 +97,6 @@ def _reconstruct(
     intrinsics: Intrinsics,
     cameras: Tensor | None,
     lifted: Reconstruction | None,
-    rounds: int | None,
-    steps: int,
 ) -> Reconstruction:
     """:func:`reconstruct_perspective` without autograd, on the tracks' device."""
     rate = tracks.fps or 30.0
@@ -124,10 +118,10 @@ def _reconstruct(
     unit: float | None = None
     any_focal = lifted is not None
     soft = SOFT if method.turns_over and not any_focal and len(trunk_joints(tracks.skeleton)) < 3 else 0
-    rounds = rounds or (ROUNDS if lifted is None else FOCAL_ROUNDS)
+    rounds = FOCAL_ROUNDS if any_focal else ROUNDS
     while rounds > 0:
         if best is not None and any_focal:
-            found = refine_again(best, view, feet, steps, method.turns_over)
+            found = refine_again(best, view, feet, method.turns_over)
         else:
             straight = _straighten(tracks, view.rays, distance, depth)
             if lifted is not None:
@@ -135,7 +129,7 @@ def _reconstruct(
             else:
                 step = SfAM() if soft else method.following(tracks.num_frames <= BLOCK)
                 made = _lift(step, straight, view, cameras)
-            given = made, view, distance, depth, rate, feet, steps, unit
+            given = made, view, distance, depth, rate, feet, unit
             flips = method.turns_over and not any_focal  # else a guess is confirmed
             found = refine(*given, mirror=cameras is None, flips=flips, any_focal=any_focal)
         bodies, unit = found.bodies, None if soft else found.scene.unit
@@ -157,7 +151,7 @@ def _reconstruct(
     assert best is not None
     exact = len(trunk_joints(tracks.skeleton)) >= 3 and not detected(tracks)
     if method.turns_over and exact and not best.flat:
-        best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies, steps))
+        best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies))
     return _assemble(method, tracks, best)
 
 

@@ -190,7 +190,7 @@ class SfAM(Method):
         them: their nuclear norm, times how much their bones vary in length.
         """
         counts = None if inside is None else inside.sum((1, 2))
-        rows = camera_choices(filled[:, 0], together=1, counts=counts)[:, :, None]  # (C, K, 1, T, 2, 3)
+        rows = camera_choices(filled[:, 0], counts=counts)[:, :, None]  # (C, K, 1, T, 2, 3)
         if inside is not None:
             rows = rows * inside[..., None, None]
         number = len(rows)
