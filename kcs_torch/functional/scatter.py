@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.derivatives import applied, batch_first
+from kcs_torch.functional.derivatives import Once, applied, batch_first
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.shapes import broadcast_shapes, check_core
 
@@ -80,16 +80,12 @@ class _ScatterLogDet(torch.autograd.Function):
         return _ScatterLogDet.apply(*padded), (0, 0)
 
 
-class _ScatterAdjoint(torch.autograd.Function):
+class _ScatterAdjoint(Once):
     """X (X^T X / T + eps I)^-1, weighed by the cotangent; not to be differentiated."""
 
     @staticmethod
     def forward(grad: Tensor, values: Tensor, factor: Tensor) -> Tensor:
         return (grad[..., None, None] * (values @ torch.cholesky_inverse(factor))).sum_to_size(values.shape)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-        pass
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> None:
