@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.solvers.noise import measure_noise
 from kcs_torch.solvers.spectrum import window_at
 from kcs_torch.types import Tracks
@@ -49,9 +49,9 @@ def found_by_detector(tracks: Tracks) -> bool:
     that detectors have.
     """
     known = detected(tracks)
-    if known or tracks.detector is not None or len(trunk_joints(tracks.skeleton)) < 3:
+    if known or tracks.detector is not None or not has_trunk(tracks.skeleton):
         return known
-    noise = measure_noise(tracks.points, tracks.weights, window=window_at(tracks.fps or 30.0))
+    noise = measure_noise(tracks.points, tracks.weights, window=window_at(tracks.rate))
     if noise is None:
         return False
     ratio, usual = noise.restless / max(noise.white, 1e-12), tracks.skeleton.name in SKELETONS

@@ -23,7 +23,7 @@ from kcs_torch.methods.scene import BLOCK, ahead
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.view import View, lens_note, zoomed
 from kcs_torch.methods.wrong import WHY_LOOSE, what_is_wrong
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
 __all__ = ["WIDE", "feet_on_ground", "reconstruct_perspective"]
@@ -99,7 +99,7 @@ def _reconstruct(
     lifted: Reconstruction | None,
 ) -> Reconstruction:
     """:func:`reconstruct_perspective` without autograd, on the tracks' device."""
-    rate = tracks.fps or 30.0
+    rate = tracks.rate
     rays = intrinsics.rays(tracks.points)
     if bool(tracks.seen.any()) and float(rays[tracks.seen][:, :2].norm(dim=-1).median()) > WIDE:
         warnings.warn(
@@ -117,7 +117,7 @@ def _reconstruct(
     best: Found | None = None
     unit: float | None = None
     any_focal = lifted is not None
-    soft = SOFT if method.turns_over and not any_focal and len(trunk_joints(tracks.skeleton)) < 3 else 0
+    soft = SOFT if method.turns_over and not any_focal and not has_trunk(tracks.skeleton) else 0
     rounds = FOCAL_ROUNDS if any_focal else ROUNDS
     while rounds > 0:
         if best is not None and any_focal:
@@ -149,7 +149,7 @@ def _reconstruct(
         if any_focal:
             view = View.of(tracks, zoomed(view.lens, float(bodies.focal[0])), rate)
     assert best is not None
-    exact = len(trunk_joints(tracks.skeleton)) >= 3 and not detected(tracks)
+    exact = has_trunk(tracks.skeleton) and not detected(tracks)
     if method.turns_over and exact and not best.flat:
         best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies))
     return _assemble(method, tracks, best)

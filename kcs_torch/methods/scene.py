@@ -22,7 +22,7 @@ from kcs_torch.methods.pkc.limbs import limbs_of
 from kcs_torch.methods.pkc.objective import Objective, bone_noise
 from kcs_torch.methods.pkc.run_costs import RunCosts
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.lm import fit_bones
@@ -146,7 +146,7 @@ class Scene:
         therefore refined under perspective. Bodies without a template, and clips of several blocks, are left as they
         are.
         """
-        if len(trunk_joints(self.skeleton)) < 3 or len(self.rays) > BLOCK or not bool(found.energy[0].isfinite()):
+        if not has_trunk(self.skeleton) or len(self.rays) > BLOCK or not bool(found.energy[0].isfinite()):
             return found
         for _ in range(FLIPS):
             better = self._better(found[:1], self._flips(found[:1]))

@@ -111,7 +111,7 @@ def weak_perspectives(tracks: Sequence[Tracks]) -> list[Size]:
 
 def _waves(tracks: Tracks) -> Tensor:
     """What the log of the size may be a sum of, (T, W): slow waves, and steps at the cuts of the film."""
-    waves, cuts = slow_waves(tracks.num_frames, tracks.fps or 30.0, tracks.points), cuts_of(tracks)
+    waves, cuts = slow_waves(tracks.num_frames, tracks.rate, tracks.points), cuts_of(tracks)
     if not cuts:
         return waves
     time = torch.arange(tracks.num_frames, device=waves.device)[:, None]

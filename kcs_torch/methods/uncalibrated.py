@@ -26,7 +26,7 @@ from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
 from kcs_torch.methods.scene import BLOCK, STEPS
 from kcs_torch.methods.view import View, lens_note
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
@@ -61,7 +61,7 @@ EVERY, HOPELESS, AWAY = 20, 10.0, 6.5
 
 def may_be_near(tracks: Tracks) -> bool:
     """Whether perspective can be told: from a body with a template and a trunk, in one shot of one camera."""
-    return len(trunk_joints(tracks.skeleton)) >= 3 and not cuts_of(tracks)
+    return has_trunk(tracks.skeleton) and not cuts_of(tracks)
 
 
 def reconstruct_uncalibrated(
@@ -89,7 +89,7 @@ def reconstruct_uncalibrated(
     Raises:
         OptionError: the skeleton has no template with a trunk.
     """
-    if len(trunk_joints(tracks.skeleton)) < 3:
+    if not has_trunk(tracks.skeleton):
         raise OptionError(
             f"intrinsics: 'auto' needs a skeleton with a template and a trunk, '{tracks.skeleton.name}' has none: "
             "expected (fx, fy, cx, cy) or a matrix K (3, 3)"
@@ -192,9 +192,9 @@ def _nearness(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras:
         return math.inf
     if not (bool(depth.isfinite().all()) and bool(depth.any())):
         return math.inf
-    every = max(1, round((tracks.fps or RATE) / RATE))
+    every = max(1, round(tracks.rate / RATE))
     some = _liveliest(flat[::every], round(SECONDS * RATE)) * every
-    rate = (tracks.fps or RATE) / every
+    rate = tracks.rate / every
     noise, feet = image_noise(tracks, flat, unit), feet_on_ground(tracks, cameras)
     flat, depth = flat[some], depth[some]
     ones = torch.ones_like(depth)

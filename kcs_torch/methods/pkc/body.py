@@ -110,8 +110,7 @@ class Body:
         self, skeleton: Skeleton, image: Tensor, rate: float, noise: Tensor, standing: Tensor | None = None
     ) -> None:
         posture = usual_posture(skeleton, image.dtype, image.device)
-        rigid = torch.zeros(skeleton.num_bones, dtype=torch.bool, device=image.device)
-        rigid[list(skeleton.rigid)] = True
+        rigid = skeleton.rigid_mask(device=image.device)
         scale = image_scale(image, posture.rest_lengths, posture.bones, rigid, bone_noise(noise, posture.bones))
         scale = or_one(scale)
         self.skeleton, self.rate, self.factor = skeleton, rate, 1 / scale
@@ -186,8 +185,7 @@ class Body:
     @property
     def spanned(self) -> bool:
         """Whether bones link all joints, and these do not all lie at one point: what :meth:`polished` needs."""
-        skeleton = self.skeleton
-        return skeleton.is_tree and skeleton.num_bones == skeleton.num_joints - 1 and bool(self.image.any())
+        return self.skeleton.is_tree and bool(self.image.any())
 
     def turns(self, found: Hypotheses, least: float = 0.0) -> bool:
         """Whether the trunk of the best hypothesis turns far enough to tell depth better than the template does.

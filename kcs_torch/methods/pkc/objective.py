@@ -124,8 +124,7 @@ class Objective:
         slip = math.hypot(weights.slip, shaken)
         self.feet = make(ContactEnergy(skeleton, slip=slip, change=weights.change, num_steps=STEADY))
         self.flat = bone_vectors(image, self.bones).square().sum(-1)  # (T, B)
-        self.rigid = torch.zeros(skeleton.num_bones, dtype=image.dtype, device=image.device)
-        self.rigid[list(skeleton.rigid)] = 1
+        self.rigid = skeleton.rigid_mask(dtype=image.dtype, device=image.device)
         self.tree = chain_inverse(incidence(self.bones, skeleton.num_joints, dtype=image.dtype))  # (N, B)
         quiet = self.noise.amin(0)
         usual = quiet.amin()
