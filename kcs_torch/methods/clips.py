@@ -12,7 +12,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from kcs_torch.types import Tracks
 
-__all__ = ["Clips", "in_batches"]
+__all__ = ["SPREAD", "Clips", "in_batches"]
 
 FRAMES = 2048
 """Frames of a batch, padding included, on a processor: more would leave its cache."""

@@ -19,7 +19,7 @@ from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.functional.spectral import dct_basis
 from kcs_torch.solvers.lbfgs import lbfgs
 
-__all__ = ["CameraPath", "choose_path", "constant_path", "settle_path", "view_energy"]
+__all__ = ["EVEN", "CameraPath", "choose_path", "constant_path", "settle_path", "view_energy"]
 
 CameraPath = Literal["auto", "free", "smooth", "constant"]
 KINDS: tuple[CameraPath, ...] = get_args(CameraPath)
