@@ -9,11 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.clean.detector import detected
+from kcs_torch.clean.detector import detected, detector_deviation
 from kcs_torch.clean.timing import cuts_of
 from kcs_torch.errors import counted
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.detector import detector_deviation
 from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.batch import Noisy
 from kcs_torch.methods.pkc.gate import plausible
