@@ -30,7 +30,7 @@ from kcs_torch.solvers.camera_path import choose_path, view_energy
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.procrustean import COARSE, FINE, Stage, align_rotations
 
-__all__ = ["LONG", "ONE", "POLISH", "TOLD", "Body", "Near", "Turned", "alike"]
+__all__ = ["LONG", "ONE", "POLISH", "TOLD", "Body", "Near", "Turned", "agree"]
 
 Turned = Callable[[bool], Search[Any, Any, Tensor]]
 """Depths (T, N) that the viewpoint's turn tells, in the template's units; from many starts if so, else from one."""
@@ -318,8 +318,7 @@ class Body:
                 if float(viewpoint_turn(self.frames(depth, image[some])[:, :2])) < TURNING:
                     return False
                 other = (yield from turned(False))[::stride][some]
-                off = (alike(other, depth) - depth).square().sum()
-                return bool(off <= AGREE**2 * depth.square().sum())
+                return agree(other, depth, AGREE)
 
             return searching(
                 self.skeleton, image[some], rate=rate, noise=noise, rounds=rounds, steps=steps, anchor=anchor,
@@ -357,3 +356,8 @@ class Body:
 def alike(depth: Tensor, other: Tensor) -> Tensor:
     """Depths, or their mirror image if that is more like the others."""
     return torch.where((depth * other).sum() < 0, -depth, depth)
+
+
+def agree(depth: Tensor, other: Tensor, share: float) -> bool:
+    """Whether depths, or their mirror image, differ from the others by a share of these at most, root mean square."""
+    return bool((alike(depth, other) - other).square().sum() <= share**2 * other.square().sum())
