@@ -12,7 +12,7 @@ from kcs_torch.functional.camera import complete_rotation, factorize, rows_to_ca
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.solvers.ist import ist, metric_upgrade
 
-__all__ = ["camera_choices", "orthographic_cameras"]
+__all__ = ["camera_choices", "most_shapes", "orthographic_cameras", "still_cameras"]
 
 
 RUN, MANY = 8, 1024
@@ -56,9 +56,9 @@ def orthographic_cameras(
 
     Kovalenko et al. 2019, section 3.2.
     """
-    held = _most(tracks)
+    held = most_shapes(tracks)
     if held < 1:
-        return _identity(tracks)
+        return still_cameras(tracks)
     most = min(held, MOST)
     ranks = range(min(2, most), most + 1) if rank == "auto" else [min(rank, held)]
     candidates, fault = _candidates(tracks, ranks, together, counts)
@@ -72,23 +72,23 @@ def camera_choices(tracks: Tensor, *, counts: Tensor | None = None) -> Tensor:
     best ones are chosen, as of :func:`orthographic_cameras`; each clip is one window.
     """
     windows, frames, *_ = tracks.shape
-    most = min(_most(tracks), MOST, max(1, frames // 3))
+    most = min(most_shapes(tracks), MOST, max(1, frames // 3))
     if most < 1:
-        return _identity(tracks)[None]
+        return still_cameras(tracks)[None]
     candidates, fault = _candidates(tracks, range(1, most + 1), 1, counts)
     candidates, fault = candidates.unflatten(0, (most, -1)), fault.unflatten(0, (most, -1))
     best = fault.argmin(1)  # (C, W)
     return candidates[torch.arange(most, device=best.device)[:, None], best, torch.arange(windows, device=best.device)]
 
 
-def _most(tracks: Tensor) -> int:
-    """The largest K that the factorisation can hold."""
-    return min(2 * tracks.shape[1], tracks.shape[2] - 1) // 3
+def most_shapes(tracks: Tensor) -> int:
+    """The largest K that the factorisation of tracks (..., T, N, 2) can hold; 0 where it tells no cameras."""
+    return min(2 * tracks.shape[-3], tracks.shape[-2] - 1) // 3
 
 
-def _identity(tracks: Tensor) -> Tensor:
-    """Cameras that do not turn."""
-    return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(*tracks.shape[:2], 2, 3)
+def still_cameras(tracks: Tensor) -> Tensor:
+    """Cameras (..., T, 2, 3) that do not turn, of tracks (..., T, N, 2) that do not tell."""
+    return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(*tracks.shape[:-2], 2, 3)
 
 
 def _candidates(tracks: Tensor, ranks: Sequence[int], together: int, counts: Tensor | None) -> tuple[Tensor, Tensor]:

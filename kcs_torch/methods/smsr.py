@@ -61,12 +61,11 @@ class SMSR(Factorised):
 
     def find_cameras(self, tracks: Tensor) -> Tensor:
         """Factorisation, IST and least squares; the identity for clips with too few frames or joints to tell."""
-        frames, joints = tracks.shape[-3:-1]
 
         def upgrade(motion: Tensor) -> Tensor:
             return metric_upgrade(motion, ist(motion), evenness=1.0, tolerance=1e-6, together=1)[0]
 
-        return upgraded_rows(tracks, 3 * max(1, min(self.rank, frames // 3, (joints - 1) // 3)), upgrade)
+        return upgraded_rows(tracks, self.rank, upgrade)
 
     def find_shape(self, tracks: Tensor, weights: Tensor, cameras: Tensor) -> Solution[Tensor]:
         """Smooth the trajectories, then continue from the back-projected tracks to low rank and a small residual."""
