@@ -54,7 +54,7 @@ def files(inputs: Path, truth: Path) -> Iterator[tuple[str, kt.Tracks, Tensor]]:
 
 
 def measure(name: str, tracks: kt.Tracks, truth: Tensor, paced: bool) -> str:
-    count, fps = tracks.skeleton.num_observed, tracks.fps or 30.0
+    count, fps = tracks.skeleton.num_observed, tracks.rate
     frames = torch.where(tracks.seen[..., None], tracks.points, torch.nan)[:, :count]
     tracker = kt.Tracker(tracks.skeleton, fps=fps, units=tracks.units, wait=not paced)
     poses, waits = [], []

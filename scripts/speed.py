@@ -221,7 +221,7 @@ def on_gpu(device: str, batches: list[int], frames: int, names: Sequence[str], m
     sfam = kt.SfAM()
 
     def layer(points: torch.Tensor) -> None:
-        rows = orthographic_cameras(points, together=1)
+        rows = orthographic_cameras(points)
         sfam.shape(points, rows, torch.ones_like(points[..., 0]), body, one_body=False)
 
     for where, dtype in ((device, torch.float32), ("cpu", torch.float64)):

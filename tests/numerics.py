@@ -7,7 +7,7 @@ import torch
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from kcs_torch.functional import bone_lengths
+from kcs_torch.functional import bone_lengths, complete_rotation, nearest_rotation, rotation_angle
 from kcs_torch.skeleton import Skeleton
 
 BATCHES = [(), (2,), (2, 3)]
@@ -99,6 +99,16 @@ def gradcheck(function, *arguments, fast: bool = False, **options):
     """Compare gradients with finite differences, in double precision."""
     leaves = [a.detach().clone().requires_grad_() for a in arguments]
     return torch.autograd.gradcheck(function, leaves, fast_mode=fast, **options)
+
+
+def camera_disagreement(first, second):
+    """The median angle in degrees between camera rows (T, 2, 3), after the best turn and mirror of the world."""
+    target, angles = complete_rotation(second), []
+    for depth in (1.0, -1.0):
+        source = complete_rotation(first * first.new_tensor([1.0, 1.0, depth]))
+        world = nearest_rotation((source.mT @ target).sum(0))
+        angles.append(torch.rad2deg(rotation_angle(source @ world, target)).median())
+    return torch.minimum(*angles)
 
 
 def dense_fit_bones(points, lengths, bones, stiffness, num_steps, damping=0.0, start=None):

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from numerics import normal, rotations, turning
+from numerics import camera_disagreement, normal, rotations, turning
 from torch.testing import assert_close
 
 import kcs_torch as kt
 from kcs_torch.errors import OptionError
-from kcs_torch.functional import back_project, camera_disagreement, complete_rotation, dct_basis, project
+from kcs_torch.functional import back_project, complete_rotation, dct_basis, project
 from kcs_torch.methods import BMM, CSF, PTA, Rigid
+from kcs_torch.methods.cameras import most_shapes, still_cameras
 from kcs_torch.methods.csf import fit_column_space
 from kcs_torch.methods.factorised import camera_rows, fit_basis_shapes, trajectory_design
 
@@ -260,6 +261,8 @@ def test_cameras_of_next_to_nothing_are_cameras(frames, joints):
     for tracks in (normal(frames, joints, 2), torch.zeros(frames, joints, 2).double()):
         rows = camera_rows(tracks - tracks.mean(1, keepdim=True), 12)
         assert_close(rows @ rows.mT, torch.eye(2).double().expand(frames, 2, 2), rtol=0, atol=1e-9)
+        if most_shapes(tracks) < 1:
+            assert torch.equal(rows, still_cameras(tracks))
 
 
 # ---------------------------------------------------------------------- what every baseline keeps to

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from numerics import normal, rotations, turning
+from numerics import camera_disagreement, normal, rotations, turning
 from torch.testing import assert_close
 
 import kcs_torch as kt
 from kcs_torch.errors import OptionError
-from kcs_torch.functional import back_project, camera_disagreement, complete_rotation, dct_basis, project
+from kcs_torch.functional import back_project, complete_rotation, dct_basis, project
 from kcs_torch.methods import BMM, PND, SMSR, LocalRigidity
 from kcs_torch.methods.local_rigidity import rigid_pairs, triangulation, window_cameras
 

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import nearest_rotation
 from kcs_torch.solvers import constant_path
-from kcs_torch.solvers.camera_path import _left_jacobian, choose_path, settle_path, smooth_path, view_energy
+from kcs_torch.solvers.camera_path import _left_jacobian, choose_path, settle_path, view_energy
 
 
 def path(frames, degrees, axis=(0.2, 1.0, -0.1), seed=0):
@@ -108,14 +108,10 @@ def test_left_jacobian_is_the_derivative_of_the_exponential():
 def test_shapes_that_do_not_fit(shape):
     with pytest.raises(ShapeError, match="constant_path: expected"):
         constant_path(torch.zeros(shape))
-    with pytest.raises(ShapeError, match="smooth_path: expected"):
-        smooth_path(torch.zeros(shape))
 
 
 def test_paths_of_several_clips_or_of_no_kind_are_told():
     """Batches ended in sizes at dimensions; a name that is none was taken for auto."""
-    with pytest.raises(ShapeError, match=r"smooth_path: expected rotations \(T, 3, 3\)"):
-        smooth_path(torch.eye(3).expand(2, 12, 3, 3))
     with pytest.raises(ShapeError, match=r"choose_path: expected rotations \(T, 3, 3\)"):
         choose_path(torch.eye(3).expand(2, 12, 3, 3))
     with pytest.raises(OptionError, match="unknown camera path 'constnat': did you mean 'constant'"):
@@ -129,13 +125,13 @@ def test_results_follow_dtype_and_device(dtype, device):
     assert {(v.dtype, v.device.type) for v in values} == {(dtype, device)}
 
 
-def test_smooth_path_follows_a_swaying_camera_through_noise():
+def test_a_smooth_path_follows_a_swaying_camera_through_noise():
     time = torch.linspace(0, 1, 200, dtype=torch.float64)
     vector = torch.zeros(200, 3, dtype=torch.float64)
     vector[:, 1] = 0.35 * (2 * torch.pi * time).sin()
     truth = roma.rotvec_to_rotmat(vector)
     jolt = 0.05 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    path, angle = smooth_path(roma.rotvec_to_rotmat(jolt) @ truth, waves=8)
+    path, _, angle = choose_path(roma.rotvec_to_rotmat(jolt) @ truth, "smooth")
     assert roma.rotmat_geodesic_distance(path, truth).median() < 0.03
     assert angle.shape == (200,)
     assert torch.allclose(path @ path.mT, torch.eye(3, dtype=torch.float64).expand_as(path), atol=1e-9)

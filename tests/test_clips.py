@@ -156,8 +156,7 @@ def test_padding_and_back(counts):
     values = padded(parts)
     assert values.shape == (len(counts), 5, 2) and (batch.inside is None) == (len(set(counts)) == 1)
     flat = batch.frames(values)
-    assert torch.equal(batch.as_clips(flat.mT, 1), values.movedim(-1, 0))
-    assert torch.equal(flat, torch.cat(parts)) and torch.equal(batch.as_clips(flat), values)
+    assert torch.equal(flat, torch.cat(parts)) and torch.equal(batch.as_clips(flat.mT), values.movedim(-1, 0))
     for one, part, mean in zip(batch.cut(values), parts, batch.mean(values), strict=True):
         assert torch.equal(one, part)
         assert_close(mean, part.mean(0))
@@ -215,7 +214,7 @@ def test_metric_upgrades_of_many_lengths():
 def test_cameras_of_many_lengths():
     parts = [walk(n, turn=120.0).points for n in (30, 40, 36)]
     parts = [(x - x.mean(1, keepdim=True)) / x.std() for x in parts]
-    found = orthographic_cameras(padded(parts), together=1, counts=torch.tensor([30, 40, 36]))
+    found = orthographic_cameras(padded(parts), counts=torch.tensor([30, 40, 36]))
     for one, part in zip(found, parts, strict=True):
         ours, alone = (complete_rotation(x) for x in (one[: len(part)], orthographic_cameras(part[None])[0]))
         turns = [x[1:] @ x[:-1].mT for x in (ours, alone)]  # the world is anybody's

@@ -102,9 +102,9 @@ def test_differentiating_works_in_inference_mode():
 def test_a_camera_path_settles_in_inference_mode():
     vectors = (CLIP.points[:, 1:] - CLIP.points[:, :1]) / 1000
     path = kt.functional.complete_rotation(CLIP.cameras)
-    expected = settle_path(vectors, path, waves=1)
+    expected = settle_path(vectors, path)
     with torch.inference_mode():
-        found = settle_path(vectors + 0, path + 0, waves=1)
+        found = settle_path(vectors + 0, path + 0)
     assert torch.allclose(found, expected, atol=1e-9)
 
 

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from numerics import BATCHES, DEVICES, FLOATS, leaves_arguments_alone, normal, rotations, turning
+from numerics import BATCHES, DEVICES, FLOATS, camera_disagreement, leaves_arguments_alone, normal, rotations, turning
 from torch.testing import assert_close
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.functional import camera_disagreement, factorize, orthonormality_defect, rows_to_cameras
+from kcs_torch.functional import factorize, orthonormality_defect, rows_to_cameras
 from kcs_torch.solvers import metric_upgrade, null_space_upgrade
 
 

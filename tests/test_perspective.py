@@ -296,8 +296,8 @@ def test_a_limb_that_points_the_wrong_way_is_turned_over_under_perspective():
     knee, ankle = body.index("right_knee"), body.index("right_ankle")
     wrong[:20, ankle] = 2 * depth[:20, knee] - depth[:20, ankle]
     view = scene.Scene(body, rays, torch.zeros_like(depth), 30.0, 1000.0, None)
-    found = view.refined(far, wrong[None], 40)
-    better = view.turned_over(found, 40)
+    found = view.refined(far, wrong[None])
+    better = view.turned_over(found)
     assert float(better.energy[0]) < float(found.energy[0]) - scene.GAIN
     off = [float((x.depth[0] - depth)[:, ankle].square().mean().sqrt()) for x in (found, better)]
     assert off[1] < 0.5 * off[0]

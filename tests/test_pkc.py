@@ -10,7 +10,7 @@ from numerics import count_operations, normal
 from torch.testing import assert_close
 
 from kcs_torch import PKC, SKELETONS, ConvergenceWarning, KcsWarning, OptionError, SfAM, Skeleton, Tracks, reconstruct
-from kcs_torch.clean import resample, smooth
+from kcs_torch.clean import detector, resample, smooth
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import (
     bone_lengths,
@@ -20,7 +20,6 @@ from kcs_torch.functional import (
     incidence,
     points_from_bones,
 )
-from kcs_torch.methods import detector
 from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pkc import body as body_module
 from kcs_torch.methods.pkc import method as module

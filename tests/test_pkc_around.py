@@ -12,7 +12,7 @@ from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pkc import around
 from kcs_torch.methods.pkc.around import turned_around
 from kcs_torch.methods.pkc.batch import serve
-from kcs_torch.methods.pkc.body import Body
+from kcs_torch.methods.pkc.body import Body, agree
 from kcs_torch.methods.pkc.flips import flipped_runs
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 
@@ -28,6 +28,12 @@ def walk():
     size = centred(clip.tracks.points).square().mean().sqrt()
     body = Body(clip.skeleton, centred(clip.tracks.points) / size, 30.0, torch.zeros_like(clip.tracks.weights))
     return body, centred(clip.points)[..., 2] / size * body.factor
+
+
+def test_depths_agree_up_to_a_share_and_the_mirror():
+    depth = torch.linspace(-1, 2, 12).view(4, 3)
+    for other in (1.05 * depth, -1.05 * depth):
+        assert agree(other, depth, 0.051) and not agree(other, depth, 0.049)
 
 
 def hypotheses(body, depth):

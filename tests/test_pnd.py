@@ -5,13 +5,13 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from numerics import count_operations, normal, rotations
+from numerics import camera_disagreement, count_operations, normal, rotations
 from test_baselines_later import centre, error, figures, quiet, tumbling
 from torch.testing import assert_close
 
 import kcs_torch as kt
 from kcs_torch.data import walking_person
-from kcs_torch.functional import camera_disagreement, complete_rotation
+from kcs_torch.functional import complete_rotation
 from kcs_torch.methods import PND
 from kcs_torch.methods.clips import padded
 from kcs_torch.methods.pnd import ProcrusteanNormal, align_to_mean, fit_procrustean_normal, procrustean_tangent

@@ -13,7 +13,7 @@ from kcs_torch.data import walking_person
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths
 from kcs_torch.nn import PostureEnergy
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.nn.posture import has_trunk, trunk_joints
 from kcs_torch.skeleton import SKELETONS
 
 MAN = SKELETONS["h36m17"]
@@ -61,7 +61,7 @@ def test_trunk_joints_hang_together_and_hold_both_sides():
         assert len(inside) == len(trunk) - 1, body.name  # one piece
         for left, right in body.mirror:
             assert (left in trunk) == (right in trunk), body.name
-    assert trunk_joints(CHAIN) == []
+    assert trunk_joints(CHAIN) == [] and not has_trunk(CHAIN) and has_trunk(MAN)
     assert {MAN.joints[i] for i in trunk_joints(MAN)} >= {"pelvis", "left_hip", "right_hip", "thorax"}
 
 

@@ -15,7 +15,6 @@ from kcs_torch.solvers import (
     metric_upgrade,
     null_space_upgrade,
     root_velocity,
-    smooth_path,
 )
 
 MOTION, PATH = normal(12, 2, 4).float(), turning(12).float()
@@ -30,7 +29,7 @@ TURNED = {
 
 FUNCTIONS = {
     "chain_inverse": (chain_inverse, torch.tensor([[-1.0, 0], [1, -1], [0, 1]])),
-    "choose_path": (lambda path: choose_path(path)[0], PATH),
+    "choose_path": (lambda path: choose_path(path, "smooth")[::2], PATH),
     "constant_path": (constant_path, PATH),
     "factorize": (lambda tracks: factorize(tracks=tracks, rank=3), normal(12, 5, 2).float()),
     "fit_bones": (lambda points: fit_bones(points, points.new_ones(2), [(0, 1), (1, 2)]), normal(12, 5, 3).float()),
@@ -38,7 +37,6 @@ FUNCTIONS = {
     "metric_upgrade": (lambda motion: metric_upgrade(motion, motion[:2].flatten(0, 1)[:, :3], num_steps=5), MOTION),
     "null_space_upgrade": (null_space_upgrade, MOTION),
     "root_velocity": (lambda move: root_velocity(move, torch.ones_like(move), 0.1, 0.1), normal(12, 2).float()),
-    "smooth_path": (smooth_path, PATH),
 }
 
 

@@ -12,7 +12,6 @@ from kcs_torch.functional import complete_rotation, nearest_rotation
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.functional.scatter import inverse_scatter, scatter_log_det
-from kcs_torch.functional.temporal import jitter
 from kcs_torch.nn.procrustean import ProcrusteanEnergy
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers import curvature
@@ -118,7 +117,7 @@ def test_roots_do_not_depend_on_how_many_frames_are_made_together(free, monkeypa
     precision = torch.rand(2, 9, 6, dtype=torch.float64) if free == 3 else None
     levels = aligned_levels(points, turned, BONES, FINE[0])
     make = lambda: whitening(  # noqa: E731
-        points, turned, BONES, levels, free, BONES, torch.ones(5).double(), 0.01, 3.0, precision
+        points, turned, BONES, levels, free, BONES, torch.ones(5).double(), 0.01, precision
     )
     whole = make()
     monkeypatch.setattr(curvature, "RUN", 4)
@@ -180,19 +179,6 @@ def test_unseen_and_outlying_tracks_do_not_pull():
     before, after = ((x - points)[20:26, 3, :2].norm(dim=-1) for x in (start, found))
     assert after.mean() < 0.6 * before.mean()
     assert (found - points)[40, 5, :2].norm() < 0.1
-
-
-def test_extra_term_takes_part():
-    points, cameras = swinging_body(20)
-    image = points[..., :2]
-    stages = [Stage(1e-3, 20, 1.0, 0.0, 0.1)]
-    plain = procrustean(image, points[None], cameras[None], BONES, stages=stages)
-    raised = procrustean(
-        image, points[None], cameras[None], BONES, stages=stages,
-        extra=lambda x: 1e4 * (x[..., 3, 2] - 2).square().sum(-1),
-    )  # fmt: skip
-    assert (plain.points[0, :, 3, 2] - 2).abs().mean() > 0.5
-    assert (raised.points[0, :, 3, 2] - 2).abs().mean() < 0.05
 
 
 def views(degrees, frames=60):
@@ -283,15 +269,6 @@ def test_distances_have_a_gradient(weighted):
     for points in (normal(5, 4, 3), torch.zeros(5, 4, 3)):
         finite(lambda x: torch.stack(distance_spread(x, weights)), points)
     assert gradcheck(lambda x: distance_spread(x, weights), normal(5, 4, 3).requires_grad_())
-
-
-def test_jitter_tells_noise_from_motion():
-    points, _ = swinging_body(200)
-    seen = torch.ones(200, 6, dtype=torch.bool)
-    noise = torch.randn(200, 6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    assert jitter(points, seen) < 1e-4
-    assert jitter(points + 0.02 * noise, seen) == pytest.approx(0.02, rel=0.1)
-    assert jitter(points[:3], seen[:3]) == 0 and jitter(points, ~seen) == 0
 
 
 @pytest.mark.parametrize("order", [0, 1])

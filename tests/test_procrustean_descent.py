@@ -13,8 +13,6 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.solvers import procrustean_descent as module
 from kcs_torch.solvers.curvature import whitening
 from kcs_torch.solvers.procrustean import (
-    CHANGE,
-    REACH,
     Stage,
     aligned_levels,
     length_energy,
@@ -31,8 +29,7 @@ STAGES = {
 
 
 def problem(
-    body=BODY, frames=12, count=2, noise=0.0, stage=STAGES["changes"], rigid=None, extra=None, dtype=torch.float64,
-    base=None,
+    body=BODY, frames=12, count=2, noise=0.0, stage=STAGES["changes"], rigid=None, dtype=torch.float64, base=None,
 ):  # fmt: skip
     """A descent, and the same energy as a function that autograd differentiates."""
     joints = body.num_joints
@@ -47,7 +44,7 @@ def problem(
     roots = 0.2 * normal(count, frames, size, size, seed=4, dtype=dtype)
     descent = Descent(
         base, turn, roots, bones, rigid, stiff, stage,
-        change=CHANGE, reach=REACH, tracks=tracks, weights=weights, noise=noise, extra=extra,
+        tracks=tracks, weights=weights, noise=noise,
     )  # fmt: skip
 
     def move(u):
@@ -59,8 +56,7 @@ def problem(
     def energy(u):
         x, r = move(u)
         total = motion_energy(x, r, bones, stage) + length_energy(x, rigid, stiff, stage.slack)
-        total = total if not noise else total + track_energy(x, tracks, weights, noise)
-        return total if extra is None else total + extra(x)
+        return total if not noise else total + track_energy(x, tracks, weights, noise)
 
     return descent, move, energy, torch.zeros(count, frames * size, dtype=dtype)
 
@@ -116,7 +112,7 @@ def test_held_depths(noise):
     held, weights = normal(2, 12, BODY.num_joints, seed=8), torch.tensor([3.0, 0.5]).double()
     pulled = Descent(
         descent.points.permute(0, 3, 2, 1), descent.rotations.permute(0, 3, 1, 2), descent.roots, BODY.bone_index(),
-        BODY.bone_index(), descent.stiffness, STAGES["changes"], change=CHANGE, reach=REACH,
+        BODY.bone_index(), descent.stiffness, STAGES["changes"],
         tracks=normal(12, BODY.num_joints, 2, seed=2), weights=normal(12, BODY.num_joints, seed=3).abs(),
         noise=noise, anchor=(held, weights),
     )  # fmt: skip
@@ -138,39 +134,26 @@ def test_padded_clips_are_as_alone(frames, stage):
         one[count:] = 0
     size = BODY.num_joints + 3
     unused = {"tracks": points[0, ..., :2], "weights": points[0, ..., 0], "noise": 0.0}
-    given = {"change": CHANGE, "reach": REACH, "anchor": None} | unused
     levels = lambda x, r, n: aligned_levels(x, r, bones, at, n)  # noqa: E731
-    roots = whitening(
-        points, turn, bones, levels(points, turn, counts), 1, bones, stiff, at.slack, REACH, counts=counts
-    )
+    roots = whitening(points, turn, bones, levels(points, turn, counts), 1, bones, stiff, at.slack, counts=counts)
     assert roots.isfinite().all()
     step = 0.1 * normal(len(frames), longest * size, seed=6)
     for one, count in zip(step, frames, strict=True):
         one[count * size :] = 0  # as there is no slope, nothing moves there
-    many = Descent(points, turn, roots, bones, bones, stiff, at, counts=counts, **given)
+    many = Descent(points, turn, roots, bones, bones, stiff, at, counts=counts, **unused)
     value, slope = many(step)
     for i, count in enumerate(frames):
         x, r = points[i : i + 1, :count], turn[i : i + 1, :count]
-        own = whitening(x, r, bones, levels(x, r, None), 1, bones, stiff, at.slack, REACH)
+        own = whitening(x, r, bones, levels(x, r, None), 1, bones, stiff, at.slack)
         if count > 2:
             assert_close(roots[i : i + 1, :count], own)
-        alone = Descent(x, r, roots[i : i + 1, :count], bones, bones, stiff, at, **given)
+        alone = Descent(x, r, roots[i : i + 1, :count], bones, bones, stiff, at, **unused)
         expected, slopes = alone(step[i : i + 1, : count * size])
         assert_close(value[i : i + 1], expected)
         assert_close(slope[i : i + 1, : count * size], slopes, rtol=1e-8, atol=1e-8 * float(slopes.abs().amax()))
         assert not slope[i, count * size :].any()
         (part,) = many.rows(torch.tensor([i]))(step[i : i + 1])[:1]
         assert_close(part, expected)
-
-
-def test_further_energies():
-    extra = lambda x: (x[..., 3, 2] - 2).square().sum(-1) + x[..., 0].sum((-2, -1))  # noqa: E731
-    for noise in (0.0, 0.1):
-        descent, _, energy, start = problem(noise=noise, extra=extra)
-        with torch.no_grad():
-            found = descent(normal(*start.shape))
-        for one, other in zip(found, by_autograd(energy, normal(*start.shape)), strict=True):
-            assert_close(one, other)
 
 
 def test_bones_that_are_points():

@@ -13,6 +13,7 @@ from torch.testing import assert_close
 
 from kcs_torch.errors import OptionError
 from kcs_torch.functional import euler_angles, euler_rotation, rotation_angle, rotation_matrix, rotation_vector
+from kcs_torch.functional.rotation import running_products
 
 EYE = torch.eye(3, dtype=torch.float64)
 ORDERS = ["".join(order) for order in itertools.permutations("XYZ")]
@@ -39,6 +40,13 @@ def test_matrix_is_the_exponential(size):
 def test_vector_undoes_the_matrix(size):
     vectors = size * torch.nn.functional.normalize(normal(20, 3), dim=-1)
     assert_close(rotation_vector(rotation_matrix(vectors)), vectors, rtol=1e-8 if size > 3 else 1e-12, atol=1e-300)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 7, 16])
+def test_running_products(frames):
+    turns = random_rotations(2 * frames).view(2, frames, 3, 3)
+    expected = list(itertools.accumulate(turns.unbind(1), lambda made, turn: turn @ made))
+    assert_close(running_products(turns), torch.stack(expected, 1))
 
 
 def test_vector_is_that_of_roma_and_the_shorter_way():

@@ -105,6 +105,8 @@ def test_from_names():
     assert body.num_observed == 3 and body.virtual == ((3, (0, 1)),)
     assert body.mirror == ((0, 1),) and body.mirror_bones == ((0, 1),)
     assert body.flexible == (2,) and body.rigid == (0, 1)
+    assert body.rigid_mask().tolist() == [True, True, False]
+    assert torch.equal(body.rigid_mask(dtype=torch.float64), torch.tensor([1.0, 1.0, 0.0]).double())
     assert [body.side(i) for i in range(4)] == ["left", "right", "centre", "centre"]
     assert body.template_points(dtype=torch.float64)[3].tolist() == [0, 0, 0]
     assert body.relative_lengths().tolist() == [0.5, 0.5, 2.0]

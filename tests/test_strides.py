@@ -48,6 +48,19 @@ def test_runs_are_the_cheapest_of_all(seed: int) -> None:
         assert_close(cost + bend[p, turns].sum(), least[v, p])
 
 
+def test_feet_move_with_the_bones_that_lead_to_them():
+    clip = walking_person(8, turn=0.0)
+    image = clip.points[..., :2] - clip.points[..., :2].mean(1, keepdim=True)
+    goal = Body(clip.tracks.skeleton, image, 30.0, torch.zeros_like(image[..., 0])).objective
+    own = torch.randn(8, len(goal.bones), generator=torch.Generator().manual_seed(0), dtype=image.dtype)
+    depth = goal.joints(own)
+    feet = depth[:, list(goal.skeleton.contacts)] - depth[:, goal.posture.trunk].mean(-1, keepdim=True)
+    moved = goal.feet_moved()
+    assert_close(own @ moved, feet)
+    names = clip.tracks.skeleton.bone_names
+    assert not moved[names.index("left_shoulder-left_elbow")].any() and moved[names.index("left_hip-left_knee")].any()
+
+
 def thighs_that_bounce(noise: float = 0.005):
     """A noisy walk from the front, its flips, and its true depths once all of a thigh's are behind the plane."""
     clip = walking_person(80, turn=0.0, yaw=0.0)

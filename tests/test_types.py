@@ -127,7 +127,9 @@ def test_confidence_zero_and_nan_are_the_same_as_nan_points():
 
 @pytest.mark.parametrize("fps", [None, NAN, INF])
 def test_unknown_fps(fps):
-    assert Tracks.from_arrays(grid(), fps=fps).fps is None
+    tracks = Tracks.from_arrays(grid(), fps=fps)
+    assert tracks.fps is None and tracks.rate == 30.0
+    assert Tracks.from_arrays(grid(), fps=12.5).rate == 12.5
 
 
 def test_frames_cuts_a_run():

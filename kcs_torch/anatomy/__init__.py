@@ -1,7 +1,7 @@
 """What the names of joints mean, where a human's joints are, and how they move."""
 
 from kcs_torch.anatomy.limbs import BENDS, Hinge, contacts_by_names, hinges_by_names
-from kcs_torch.anatomy.names import canonical_name, mirror_name, side_of
+from kcs_torch.anatomy.names import mirror_name, side_of
 from kcs_torch.anatomy.quadruped import quadruped_places
 from kcs_torch.anatomy.spread import UNKNOWN_SPREAD, spread_by_names
 from kcs_torch.anatomy.template import KINDS, places_by_names, places_of_known, share_of_stature, template_by_names
@@ -11,7 +11,6 @@ __all__ = [
     "KINDS",
     "UNKNOWN_SPREAD",
     "Hinge",
-    "canonical_name",
     "contacts_by_names",
     "hinges_by_names",
     "mirror_name",

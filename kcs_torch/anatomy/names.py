@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-__all__ = ["FINGER_JOINTS", "canonical_name", "mirror_name", "part_of", "side_of"]
+__all__ = ["FINGER_JOINTS", "mirror_name", "part_of", "side_of"]
 
 FINGER_JOINTS = dict.fromkeys(("thumb", "index", "middle", "ring", "pinky"), ("mcp", "pip", "dip", "tip")) | {
     "thumb": ("cmc", "mcp", "ip", "tip")
@@ -144,16 +144,6 @@ def mirror_name(name: str) -> str:
     twin = (_TWIN | _LEG_TWIN)[word.lower()]
     twin = twin.upper() if word.isupper() else twin.capitalize() if word[0].isupper() else twin
     return name[:start] + twin + name[stop:]
-
-
-def canonical_name(name: str) -> tuple[str, str] | None:
-    """Return (side, part) of a joint of the human body or hand, or None where the name is not one.
-
-    >>> canonical_name("LBigToe"), canonical_name("left_foot_index"), canonical_name("tail1")
-    (('left', 'bigtoe'), ('left', 'bigtoe'), None)
-    """
-    part = part_of(name, "human") or part_of(name, "hand")
-    return None if part is None else (side_of(name), part)
 
 
 def part_of(name: str, kind: str) -> str | None:

@@ -1,13 +1,16 @@
-"""Whether a detector found the joints, so that their errors last."""
+"""Whether a detector found the joints, so that their errors last, and how far off they are then."""
 
 from __future__ import annotations
 
-from kcs_torch.nn.posture import trunk_joints
+import torch
+from torch import Tensor
+
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.solvers.noise import measure_noise
 from kcs_torch.solvers.spectrum import window_at
 from kcs_torch.types import Tracks
 
-__all__ = ["detected", "found_by_detector"]
+__all__ = ["detected", "detector_deviation", "found_by_detector"]
 
 PARTLY, GRADES = 0.05, 10
 """Share of confidences below 1, and number of different ones, from which on they are a detector's."""
@@ -32,6 +35,13 @@ OWN, SMOOTH, SMOOTHED = 0.05, 0.06, 0.03
 """Share that joints do not share of what is a few frames long, from which on it is noise; that of a filtered clip, for
 motion capture that was smoothed comes to .05; and of one that has a detector's skeleton."""
 
+DETECTED = 0.027
+"""Standard deviation of a joint that a detector is sure of, a share of the body's size, however smooth: what it gets
+wrong it gets wrong for many frames."""
+
+UNSURE = 0.05
+"""Least confidence that counts."""
+
 
 def detected(tracks: Tracks) -> bool:
     """Whether a detector found the joints, as is known, or as confidences tell: of many values from 0 to 1."""
@@ -49,9 +59,9 @@ def found_by_detector(tracks: Tracks) -> bool:
     that detectors have.
     """
     known = detected(tracks)
-    if known or tracks.detector is not None or len(trunk_joints(tracks.skeleton)) < 3:
+    if known or tracks.detector is not None or not has_trunk(tracks.skeleton):
         return known
-    noise = measure_noise(tracks.points, tracks.weights, window=window_at(tracks.fps or 30.0))
+    noise = measure_noise(tracks.points, tracks.weights, window=window_at(tracks.rate))
     if noise is None:
         return False
     ratio, usual = noise.restless / max(noise.white, 1e-12), tracks.skeleton.name in SKELETONS
@@ -60,3 +70,10 @@ def found_by_detector(tracks: Tracks) -> bool:
     if usual:
         return max(noise.white, noise.restless) > (NOISY if noise.restless > 0 else LOUD)
     return ratio > LASTING and noise.share > OWN and noise.restless > LOUD
+
+
+def detector_deviation(tracks: Tracks) -> Tensor:
+    """Standard deviation (T, N), a share of the body's size, of joints that a detector found; else 0."""
+    if not detected(tracks):
+        return torch.zeros_like(tracks.weights)
+    return DETECTED / tracks.weights.clamp_min(UNSURE).sqrt()

@@ -12,7 +12,6 @@ from kcs_torch.functional.align import (
 from kcs_torch.functional.angles import angle_between, flexion, joint_angles
 from kcs_torch.functional.camera import (
     back_project,
-    camera_disagreement,
     complete_rotation,
     factorize,
     orbit,
@@ -50,7 +49,7 @@ from kcs_torch.functional.spectral import (
     spectral_norm,
     svt,
 )
-from kcs_torch.functional.temporal import best_path, blend_windows, interpolate, jitter, standing, window_starts
+from kcs_torch.functional.temporal import best_path, blend_windows, interpolate, standing, window_starts
 
 __all__ = [
     "ALIGNMENTS",
@@ -60,7 +59,6 @@ __all__ = [
     "blend_windows",
     "bone_lengths",
     "bone_vectors",
-    "camera_disagreement",
     "centre",
     "chain_inverse",
     "complete_rotation",
@@ -72,7 +70,6 @@ __all__ = [
     "flexion",
     "incidence",
     "interpolate",
-    "jitter",
     "joint_angles",
     "kcs_matrix",
     "log_det",

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, unknown
-from kcs_torch.functional.derivatives import applied, batch_first
+from kcs_torch.functional.derivatives import Once, applied, batch_first
 from kcs_torch.functional.guarded import LOST, largest, or_one, unit_size
 from kcs_torch.functional.precision import alike, full_precision, wide
 from kcs_torch.functional.rotation import skew
@@ -302,7 +302,7 @@ class _Polar(torch.autograd.Function):
         return _Polar.apply(matrix.movedim(in_dims[0] or 0, 0), reflect), (0, 0, 0, 0)
 
 
-class _PolarAdjoint(torch.autograd.Function):
+class _PolarAdjoint(Once):
     """The derivative, not to be differentiated again: it takes the matrix so that autograd notices who tries."""
 
     @staticmethod
@@ -312,10 +312,6 @@ class _PolarAdjoint(torch.autograd.Function):
         firm = total > 1e-6 * size.abs().amax(-1)[..., None, None]  # else any turn in this plane would do
         spin = torch.where(firm, (inner - inner.mT) / torch.where(firm, total, torch.ones_like(total)), 0)
         return u @ spin @ vt
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-        pass
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> None:

@@ -8,18 +8,14 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.angles import angle_between
 from kcs_torch.functional.eigen import eigh
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.precision import alike, full_precision, wide, widened
-from kcs_torch.functional.ranks import median
-from kcs_torch.functional.rotation import rotation_angle
 from kcs_torch.functional.shapes import check_batches, check_core, check_floats
 
 __all__ = [
     "back_project",
-    "camera_disagreement",
     "complete_rotation",
     "factorize",
     "orbit",
@@ -255,33 +251,6 @@ def viewpoint_turn(cameras: Tensor) -> Tensor:
         index = (view - anchor).square().sum(-1).argmax(-1)
         far = view.gather(-2, index[..., None, None].expand(*index.shape, 1, 3))
     return torch.rad2deg(angle_between(anchor, far)).squeeze(-1)
-
-
-def camera_disagreement(first: Tensor, second: Tensor) -> Tensor:
-    """Return the median angle in degrees between two camera paths, after the best turn and mirror of the world.
-
-    Args:
-        first: (..., T, 2, 3), orthonormal rows.
-        second: (..., T, 2, 3).
-
-    Returns:
-        (...).
-
-    Raises:
-        ShapeError: the paths are not of these shapes, or not in floating point.
-    """
-    check_floats(first, "camera_disagreement: first", "T", 2, 3)
-    check_floats(second, "camera_disagreement: second", first.shape[-3], 2, 3)
-    check_batches("camera_disagreement: first and second", first, second, cores=(3, 3))
-    first, second = alike(first, second)
-    target = complete_rotation(second)
-    angles = []
-    for depth in (1.0, -1.0):
-        mirror = torch.tensor([1.0, 1.0, depth], dtype=first.dtype, device=first.device)
-        source = complete_rotation(first * mirror)
-        gauge = nearest_rotation((source.mT @ target).sum(-3))
-        angles.append(median(torch.rad2deg(rotation_angle(source @ gauge[..., None, :, :], target)), -1))
-    return torch.minimum(*angles)
 
 
 def orbit(yaw: Tensor, pitch: float = 0.0) -> Tensor:

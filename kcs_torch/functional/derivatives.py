@@ -18,7 +18,7 @@ from kcs_torch.functional.eigen import eigh
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.precision import full_precision
 
-__all__ = ["LargestSum", "PSDShrink", "ShrinkSingularValues", "applied", "batch_first", "why_failed"]
+__all__ = ["LargestSum", "Once", "PSDShrink", "ShrinkSingularValues", "applied", "batch_first", "why_failed"]
 
 
 def applied(function: type[torch.autograd.Function], *inputs: Any) -> Any:
@@ -69,10 +69,8 @@ def batch_first(info: Any, in_dims: tuple[int | None, ...], tensors: tuple[Tenso
     return padded, [x.shape for x in first]
 
 
-class _Once(torch.autograd.Function):
+class Once(torch.autograd.Function):
     """Base of the adjoints: linear maps of a cotangent, not to be differentiated."""
-
-    cores: tuple[int, ...] = ()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -114,7 +112,7 @@ class ShrinkSingularValues(torch.autograd.Function):
         return ShrinkSingularValues.apply(*padded), (0, 0, 0)
 
 
-class _ShrinkAdjoint(_Once):
+class _ShrinkAdjoint(Once):
     @staticmethod
     def forward(
         grad: Tensor, matrix: Tensor, threshold: Tensor, bend: Tensor, raw: Tensor, right: Tensor
@@ -175,7 +173,7 @@ class PSDShrink(torch.autograd.Function):
         return PSDShrink.apply(*padded), (0, 0, 0)
 
 
-class _PSDAdjoint(_Once):
+class _PSDAdjoint(Once):
     @staticmethod
     def forward(
         grad: Tensor, matrix: Tensor, threshold: Tensor, value: Tensor, vector: Tensor
@@ -220,7 +218,7 @@ class LargestSum(torch.autograd.Function):
         return LargestSum.apply(matrix.movedim(in_dims[0] or 0, 0), count), (0, 0, 0)
 
 
-class _SumAdjoint(_Once):
+class _SumAdjoint(Once):
     @staticmethod
     def forward(grad: Tensor, matrix: Tensor, s: Tensor, right: Tensor) -> Tensor:
         upright = tall(matrix)

@@ -11,7 +11,7 @@ from kcs_torch.errors import OptionError
 from kcs_torch.functional.precision import alike, full_precision
 from kcs_torch.functional.shapes import check_batches, check_core, check_floats
 
-__all__ = ["euler_angles", "euler_rotation", "rotation_angle", "rotation_matrix", "rotation_vector"]
+__all__ = ["euler_angles", "euler_rotation", "rotation_angle", "rotation_matrix", "rotation_vector", "running_products"]
 
 AXES = "XYZ"
 
@@ -178,3 +178,17 @@ def skew(vectors: Tensor) -> Tensor:
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+
+
+def running_products(turns: Tensor) -> Tensor:
+    """Return R_0, R_1 R_0, R_2 R_1 R_0, ... of matrices (..., T, 3, 3), by doubling.
+
+    >>> running_products(torch.eye(3).expand(4, 3, 3) * 2)[:, 0, 0].tolist()
+    [2.0, 4.0, 8.0, 16.0]
+    """
+    span = 1
+    while span < turns.shape[-3]:  # products of the last frames, of twice as many each time
+        later = turns[..., span:, :, :] @ turns[..., :-span, :, :]
+        turns = torch.cat([turns[..., :span, :, :], later], -3)
+        span *= 2
+    return turns

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
-from kcs_torch.functional.derivatives import applied, batch_first
+from kcs_torch.functional.derivatives import Once, applied, batch_first
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.shapes import broadcast_shapes, check_floats
 
@@ -85,16 +85,12 @@ class _ScatterLogDet(torch.autograd.Function):
         return _ScatterLogDet.apply(*padded), (0, 0)
 
 
-class _ScatterAdjoint(torch.autograd.Function):
+class _ScatterAdjoint(Once):
     """X (X^T X / T + eps I)^-1, weighed by the cotangent; not to be differentiated."""
 
     @staticmethod
     def forward(grad: Tensor, values: Tensor, factor: Tensor) -> Tensor:
         return (grad[..., None, None] * (values @ torch.cholesky_inverse(factor))).sum_to_size(values.shape)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-        pass
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> None:

@@ -12,7 +12,7 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.shapes import broadcast_shapes, check_core, fit_together
 
-__all__ = ["best_path", "blend_windows", "fill_between", "interpolate", "jitter", "standing", "window_starts"]
+__all__ = ["best_path", "blend_windows", "fill_between", "interpolate", "standing", "window_starts"]
 
 
 def interpolate(values: Tensor, seen: Tensor) -> Tensor:
@@ -70,34 +70,6 @@ def fill_between(values: Tensor, pick: Tensor, length: int) -> Tensor:
     full = values.new_zeros(len(values), length, 1, values[0, 0].numel())
     full[:, pick] = values.reshape(*values.shape[:2], 1, -1)
     return interpolate(full, known).reshape(len(values), length, *values.shape[2:])
-
-
-def jitter(values: Tensor, seen: Tensor, *, order: int = 4) -> Tensor:
-    """Estimate the standard deviation of independent noise in smooth motion, from its ``order``-th differences.
-
-    Motion has little in its fourth difference, noise most of it: binomial(2 n, n) times its variance. The median makes
-    it blind to outliers and to the few frames where motion is abrupt.
-
-    Args:
-        values: (T, N, D).
-        seen: (T, N), True where ``values`` hold; differences across gaps do not count.
-        order: n.
-
-    Returns:
-        A scalar in the unit of the values; 0 for clips with no more than ``order`` frames in a row.
-
-    Raises:
-        ShapeError: the values are not those of one clip, or ``seen`` is of another shape.
-    """
-    for name, value, form in (("values", values, "(T, N, D)"), ("seen", seen, "(T, N)")):
-        if value.ndim != form.count(",") + 1 or value.shape[:2] != values.shape[:2]:
-            raise ShapeError(f"jitter: {name}: expected shape {form} of one clip, got {tuple(value.shape)}")
-    if len(values) <= order:
-        return values.new_zeros(())
-    change = values.diff(n=order, dim=0)[seen.unfold(0, order + 1, 1).all(-1)]
-    if change.numel() == 0:
-        return values.new_zeros(())
-    return change.abs().median() / (0.6745 * math.comb(2 * order, order) ** 0.5)
 
 
 def standing(image: Tensor, weights: Tensor) -> Tensor:

@@ -58,8 +58,7 @@ class Chain:
     def __init__(self, body: Skeleton, trunk: Tensor, fps: float) -> None:
         self.bones, self.trunk, self.fps = body.bone_index(), trunk, fps
         self.tree = chain_inverse(incidence(self.bones, body.num_joints, dtype=torch.float64))  # (N, B)
-        self.rigid = torch.zeros(body.num_bones, dtype=torch.bool)
-        self.rigid[list(body.rigid)] = True
+        self.rigid = body.rigid_mask()
 
     def place(self, image: Tensor, dz: Tensor, shape: Shape) -> Tensor:
         """Place the joints (N, 3), in the tracks' units, so that rigid bones have their length.

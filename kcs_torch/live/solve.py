@@ -13,7 +13,7 @@ from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.ranks import median
 from kcs_torch.live.filter import Shape, Told
 from kcs_torch.methods.pkc import PKC
-from kcs_torch.nn.posture import PostureEnergy, trunk_joints
+from kcs_torch.nn.posture import PostureEnergy, has_trunk
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
@@ -48,7 +48,7 @@ def solve_window(method: PKC, skeleton: Skeleton, image: Tensor, weights: Tensor
     if not size > 0:
         return None
     tracks = Tracks(torch.where(weights[..., None] > 0, flat / size, 0.0), weights, skeleton, fps=rate)
-    posture = PostureEnergy(skeleton).double() if len(trunk_joints(skeleton)) >= 3 else None
+    posture = PostureEnergy(skeleton).double() if has_trunk(skeleton) else None
     quick = replace(
         method,
         viewpoint="moving" if posture is None else "fixed",

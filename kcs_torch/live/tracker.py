@@ -18,7 +18,7 @@ from kcs_torch.live.pose import Chain, LivePose
 from kcs_torch.live.solve import Solution, solve_window
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Reconstruction, Tracks
 from kcs_torch.types.hints import is_a
@@ -130,7 +130,7 @@ class Tracker:
         self.method = PKC() if method is None else method
         self._filter: BodyFilter | ChainFilter
         self._body, early = outward(body), EARLY
-        if len(trunk_joints(body)) >= 3:
+        if has_trunk(body):
             self._filter, self._delay = BodyFilter(self._body, rate), DELAY
         else:
             self._filter, early, self._delay = ChainFilter(self._body, rate), EARLY[-1:], 1.0

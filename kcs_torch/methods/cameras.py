@@ -12,11 +12,17 @@ from kcs_torch.functional.camera import complete_rotation, factorize, rows_to_ca
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.solvers.ist import ist, metric_upgrade
 
-__all__ = ["camera_choices", "orthographic_cameras"]
+__all__ = ["camera_choices", "most_shapes", "orthographic_cameras", "still_cameras"]
 
 
 RUN, MANY = 8, 1024
 """Clips whose starts are tried together: more would leave a processor's cache, or take a GPU's memory."""
+
+STARTS = 7
+"""Random starts beside the relaxation's."""
+
+SMOOTH = 0.1
+"""Weight of the rows' second differences."""
 
 MOST = 5
 """Shapes K that are tried at most."""
@@ -26,10 +32,7 @@ def orthographic_cameras(
     tracks: Tensor,
     rank: int | Literal["auto"] = "auto",
     *,
-    num_starts: int = 7,
-    smoothness: float = 0.1,
-    seed: int = 0,
-    together: int | None = None,
+    together: int = 1,
     counts: Tensor | None = None,
 ) -> Tensor:
     """Estimate orthographic cameras by rank-3K factorisation and metric upgrade.
@@ -42,11 +45,8 @@ def orthographic_cameras(
     Args:
         tracks: (W, T, N, 2), complete.
         rank: K, or "auto" to try 2..5 (1 where there are too few joints or frames for more).
-        num_starts: random starts beside the relaxation's.
-        smoothness: weight of the rows' second differences.
-        seed: of the random starts.
         together: the batch is of different clips with so many windows each, which are refined as far as a clip is
-            alone; of a single one if None.
+            alone.
         counts: (W,) frames of each clip, where shorter ones are padded with zeros at their end; they have no fewer
             frames than joints, or are all of one length.
 
@@ -56,50 +56,42 @@ def orthographic_cameras(
 
     Kovalenko et al. 2019, section 3.2.
     """
-    held = _most(tracks)
+    held = most_shapes(tracks)
     if held < 1:
-        return _identity(tracks)
+        return still_cameras(tracks)
     most = min(held, MOST)
     ranks = range(min(2, most), most + 1) if rank == "auto" else [min(rank, held)]
-    candidates, fault = _candidates(tracks, ranks, num_starts, smoothness, seed, together, counts)
+    candidates, fault = _candidates(tracks, ranks, together, counts)
     return candidates[fault.argmin(0), torch.arange(len(tracks), device=tracks.device)]
 
 
-def camera_choices(tracks: Tensor, *, together: int | None = None, counts: Tensor | None = None) -> Tensor:
+def camera_choices(tracks: Tensor, *, counts: Tensor | None = None) -> Tensor:
     """The best cameras of each rank K = 1..5, for those who can tell by more than the rows: (C, W, T, 2, 3).
 
     Fewer where there are few joints, or less than three frames for each shape. Arguments, and the fault by which the
-    best ones are chosen, as of :func:`orthographic_cameras`.
+    best ones are chosen, as of :func:`orthographic_cameras`; each clip is one window.
     """
     windows, frames, *_ = tracks.shape
-    most = min(_most(tracks), MOST, max(1, frames // 3))
+    most = min(most_shapes(tracks), MOST, max(1, frames // 3))
     if most < 1:
-        return _identity(tracks)[None]
-    candidates, fault = _candidates(tracks, range(1, most + 1), together=together, counts=counts)
+        return still_cameras(tracks)[None]
+    candidates, fault = _candidates(tracks, range(1, most + 1), 1, counts)
     candidates, fault = candidates.unflatten(0, (most, -1)), fault.unflatten(0, (most, -1))
     best = fault.argmin(1)  # (C, W)
     return candidates[torch.arange(most, device=best.device)[:, None], best, torch.arange(windows, device=best.device)]
 
 
-def _most(tracks: Tensor) -> int:
-    """The largest K that the factorisation can hold."""
-    return min(2 * tracks.shape[1], tracks.shape[2] - 1) // 3
+def most_shapes(tracks: Tensor) -> int:
+    """The largest K that the factorisation of tracks (..., T, N, 2) can hold; 0 where it tells no cameras."""
+    return min(2 * tracks.shape[-3], tracks.shape[-2] - 1) // 3
 
 
-def _identity(tracks: Tensor) -> Tensor:
-    """Cameras that do not turn."""
-    return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(*tracks.shape[:2], 2, 3)
+def still_cameras(tracks: Tensor) -> Tensor:
+    """Cameras (..., T, 2, 3) that do not turn, of tracks (..., T, N, 2) that do not tell."""
+    return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(*tracks.shape[:-2], 2, 3)
 
 
-def _candidates(
-    tracks: Tensor,
-    ranks: Sequence[int],
-    num_starts: int = 7,
-    smoothness: float = 0.1,
-    seed: int = 0,
-    together: int | None = None,
-    counts: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
+def _candidates(tracks: Tensor, ranks: Sequence[int], together: int, counts: Tensor | None) -> tuple[Tensor, Tensor]:
     """Two cameras (C, W, T, 2, 3) of each rank, rank by rank, and their faults (C, W)."""
     windows, frames, *_ = tracks.shape
     motion, _ = factorize(tracks - tracks.mean(-2, keepdim=True), 3 * ranks[-1])
@@ -111,17 +103,17 @@ def _candidates(
     peak = flat.gather(-2, flat.abs().argmax(-2, keepdim=True))[..., None, :]
     motion = motion * torch.where(peak < 0, -torch.ones_like(peak), torch.ones_like(peak))
     relaxed = ist(motion[..., : 3 * ranks[0]], num_steps=30)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     window = torch.arange(windows, device=tracks.device)
     run = RUN if tracks.device.type == "cpu" else MANY
     cameras, defects = [], []
     for k in ranks:
         part = motion[..., : 3 * k]
-        random = torch.randn(num_starts, 1, 3 * k, 3, generator=generator, dtype=torch.float64, device="cpu").to(motion)
+        random = torch.randn(STARTS, 1, 3 * k, 3, generator=generator, dtype=torch.float64, device="cpu").to(motion)
         starts = torch.nn.functional.pad(relaxed, (0, 0, 0, 3 * k - relaxed.shape[-2]))
         starts = torch.cat([starts[None], random.expand(-1, windows, -1, -1)])
         runs = zip(part.split(run), starts.split(run, 1), count.split(run), strict=True)
-        options: dict[str, Any] = {"smoothness": smoothness, "num_steps": 12, "tolerance": 0.0}
+        options: dict[str, Any] = {"smoothness": SMOOTH, "num_steps": 12, "tolerance": 0.0}
         tried = [metric_upgrade(*two, counts=n, **options) for *two, n in runs]
         q, defect = (torch.cat(parts, 1) for parts in zip(*tried, strict=True))
         best = defect.topk(min(2, len(defect)), dim=0, largest=False).indices

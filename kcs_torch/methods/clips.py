@@ -12,7 +12,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from kcs_torch.types import Tracks
 
-__all__ = ["Clips", "in_batches"]
+__all__ = ["SPREAD", "Clips", "in_batches"]
 
 FRAMES = 2048
 """Frames of a batch, padding included, on a processor: more would leave its cache."""
@@ -66,12 +66,12 @@ class Clips:
         """All frames (F, ...) of (K, T, ...), one clip after the other."""
         return values.flatten(0, 1) if self.inside is None else values[self.inside]
 
-    def as_clips(self, values: Tensor, dim: int = 0) -> Tensor:
-        """The way back, where ``dim`` is that of the frames: (..., K, T, ...), 0 in the padding."""
+    def as_clips(self, values: Tensor) -> Tensor:
+        """The way back, of (H, F, ...): (H, K, T, ...), 0 in the padding."""
         if self.inside is None:
-            return values.unflatten(dim, (len(self.counts), -1))
-        out = values.new_zeros(*values.shape[:dim], *self.inside.shape, *values.shape[dim + 1 :])
-        out[(slice(None),) * dim + (self.inside,)] = values
+            return values.unflatten(1, (len(self.counts), -1))
+        out = values.new_zeros(len(values), *self.inside.shape, *values.shape[2:])
+        out[:, self.inside] = values
         return out
 
     def cut(self, values: Tensor) -> list[Tensor]:

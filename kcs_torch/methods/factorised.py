@@ -12,6 +12,7 @@ from torch import Tensor
 
 from kcs_torch.functional.camera import complete_rotation, factorize, rows_to_cameras
 from kcs_torch.methods.base import Estimate, Method
+from kcs_torch.methods.cameras import most_shapes, still_cameras
 from kcs_torch.methods.clips import in_batches
 from kcs_torch.methods.mirror import mirror_sign
 from kcs_torch.methods.unseen import place_unseen
@@ -118,27 +119,27 @@ def camera_rows(tracks: Tensor, rank: int, *, evenness: float = 1.0, num_steps: 
         (..., T, 2, 3) orthonormal rows; the identity for clips too short or with too few joints to tell (2T < 3 or
         N < 4).
     """
-    frames, joints = tracks.shape[-3:-1]
-    rank = max(1, min(rank, frames // 3, (joints - 1) // 3))
 
     def upgrade(motion: Tensor) -> Tensor:
         start = null_space_upgrade(motion)
         return metric_upgrade(motion, start, evenness=evenness, num_steps=num_steps, tolerance=1e-6, together=1)[0]
 
-    return upgraded_rows(tracks, 3 * rank, upgrade, unit=3)
+    return upgraded_rows(tracks, rank, upgrade, unit=3)
 
 
 def upgraded_rows(tracks: Tensor, rank: int, upgrade: Callable[[Tensor], Tensor], unit: int = 1) -> Tensor:
-    """Factorise tracks (..., T, N, 2), upgrade their motion (K, T, 2, R), and return camera rows (..., T, 2, 3).
+    """Factorise tracks (..., T, N, 2), upgrade their motion (B, T, 2, R), and return camera rows (..., T, 2, 3).
 
-    Columns that are rounding would take part like any other: R is the number of those that are more, 3 or more of them
-    and a multiple of ``unit``.
+    There are 3K columns, K the ``rank`` or what clips of so many frames and joints get of it. Those that are rounding
+    would take part like any other: R is the number of those that are more, 3 or more of them and a multiple of
+    ``unit``.
     """
     frames, joints = tracks.shape[-3:-1]
     batch = tracks.shape[:-3]
-    if min(2 * frames, joints - 1) < 3:
-        return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(*batch, frames, 2, 3)
-    motion, _ = factorize(tracks.reshape(-1, frames, joints, 2), rank)
+    if most_shapes(tracks) < 1:
+        return still_cameras(tracks)
+    rank = max(1, min(rank, frames // 3, (joints - 1) // 3))
+    motion, _ = factorize(tracks.reshape(-1, frames, joints, 2), 3 * rank)
     size = torch.linalg.vector_norm(motion, dim=(1, 2))
     told = (size > EMPTY * size[:, :1]).sum(-1)
     columns = ((told + unit - 1) // unit * unit).clamp_min(3)

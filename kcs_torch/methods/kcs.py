@@ -199,7 +199,7 @@ class KCS(Method):
         given = (clips.frames(x) for x in (clips.points, shape, clips.weights, low, high))
         start = None if last is None else clips.frames(last)
         fit = fit_cameras(*given, robust=self.robust, start=start)
-        fit = CameraFit(*(clips.as_clips(x, 1) for x in (fit.rotations, fit.scales, fit.cost)))
+        fit = CameraFit(*(clips.as_clips(x) for x in (fit.rotations, fit.scales, fit.cost)))
         return steady_cameras(fit, self.continuity, inside=clips.inside)
 
     def _constant_bones(self, points: Tensor, body: Skeleton, seen: Tensor) -> Tensor:

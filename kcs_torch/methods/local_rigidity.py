@@ -14,6 +14,8 @@ from kcs_torch.functional.camera import back_project, complete_rotation, factori
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rigidity import distance_spread
+from kcs_torch.functional.rotation import running_products
+from kcs_torch.methods.cameras import most_shapes, still_cameras
 from kcs_torch.methods.factorised import SETTLED, Factorised
 from kcs_torch.solvers.ist import ist, metric_upgrade
 from kcs_torch.solvers.iterate import Solution, iterate, relative_change
@@ -69,8 +71,8 @@ class LocalRigidity(Factorised):
     def find_cameras(self, tracks: Tensor) -> Tensor:
         """Rigid windows, joined; the identity for clips with too few frames or joints to tell."""
         *batch, frames, joints, _ = tracks.shape
-        if min(2 * frames, joints - 1) < 3:
-            return torch.eye(3, dtype=tracks.dtype, device=tracks.device)[:2].expand(*batch, frames, 2, 3)
+        if most_shapes(tracks) < 1:
+            return still_cameras(tracks)
         found = [window_cameras(one, min(self.window, frames)) for one in tracks.reshape(-1, frames, joints, 2)]
         return torch.stack(found).view(*batch, frames, 2, 3)
 
@@ -121,7 +123,7 @@ def window_cameras(tracks: Tensor, window: int) -> Tensor:
     turned = complete_rotation(rows * flip[:, None, None])  # (V, w, 3, 3)
     between = nearest_rotation((turned[1:, :-1].mT @ turned[:-1, 1:]).sum(1))  # from the last window's world
     eye = torch.eye(3, dtype=tracks.dtype, device=tracks.device)[None]
-    turned = turned @ _products(torch.cat([eye, between]))[:, None]
+    turned = turned @ nearest_rotation(running_products(torch.cat([eye, between])))[:, None]
     # Windows count the more, the more rigid they are, and the nearer a frame is to their middle.
     trust = 1 / (misses + RIDGE * misses.mean() + torch.finfo(misses.dtype).tiny)
     ramp = torch.arange(1, window + 1, dtype=tracks.dtype, device=tracks.device)
@@ -209,12 +211,3 @@ def _solve(normal: Tensor, goal: Tensor) -> Tensor:
 
 RIDGE = 1e-3
 """Of a triangulation, a share of its trace: depth that the window does not show is taken for small."""
-
-
-def _products(steps: Tensor) -> Tensor:
-    """Products S_0, S_1 S_0... taken as steps[k] @ ... @ steps[0], (K, 3, 3), by doubling."""
-    span = 1
-    while span < len(steps):
-        steps = torch.cat([steps[:span], steps[span:] @ steps[:-span]])
-        span *= 2
-    return nearest_rotation(steps)

@@ -7,11 +7,11 @@ import math
 import torch
 from torch import Tensor
 
+from kcs_torch.clean.detector import detector_deviation
 from kcs_torch.functional.weights import rms
-from kcs_torch.methods.detector import detector_deviation
 from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.methods.unseen import gap_deviation
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.types import Reconstruction, Tracks
 
 __all__ = ["body_unit", "clean_image", "image_noise"]
@@ -30,13 +30,13 @@ def image_noise(tracks: Tracks, flat: Tensor, unit: float) -> Tensor:
     size = rms(off, torch.ones_like(off[..., 0])) / unit
     stray = (flat - tracks.points).square().sum(-1)[tracks.seen]
     level = math.sqrt(float(stray.median()) / 1.39) / unit / 2 if len(stray) else 0.0  # whatever outliers there are
-    share = gap_deviation(off / (size * unit), tracks.seen, tracks.fps or 30.0)
+    share = gap_deviation(off / (size * unit), tracks.seen, tracks.rate)
     return (size * share.maximum(detector_deviation(tracks))).clamp_min(level)
 
 
 def body_unit(lifted: Reconstruction) -> float:
     """The unit in which the body is about as large as a person of 1.75."""
-    if len(trunk_joints(lifted.skeleton)) >= 3:
+    if has_trunk(lifted.skeleton):
         usual = usual_posture(lifted.skeleton, lifted.lengths.dtype, lifted.lengths.device).rest_lengths
         unit = float((lifted.lengths / usual).median())
     else:

@@ -23,7 +23,7 @@ from kcs_torch.methods.scene import BLOCK, ahead
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.view import View, lens_note, zoomed
 from kcs_torch.methods.wrong import WHY_LOOSE, what_is_wrong
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
 __all__ = ["WIDE", "feet_on_ground", "reconstruct_perspective"]
@@ -55,8 +55,6 @@ def reconstruct_perspective(
     cameras: Tensor | None = None,
     *,
     lifted: Reconstruction | None = None,
-    rounds: int | None = None,
-    steps: int = 60,
 ) -> Reconstruction:
     """Reconstruct a body before a pinhole camera by a method made for parallel rays.
 
@@ -76,8 +74,6 @@ def reconstruct_perspective(
         lifted: what the method found in the tracks as if rays were parallel. The focal length is then to be found as
             well, from that of the intrinsics on, and noted; nothing is lifted anew, but each round refines what the one
             before found, as its focal length shows it.
-        rounds: at most; by default 3 of lifting and refining, or 5 of refining.
-        steps: L-BFGS steps of each refinement.
 
     Returns:
         The reconstruction in the camera's frame: ``points + (0, 0, distance)`` projects onto the image. Its unit is one
@@ -89,7 +85,7 @@ def reconstruct_perspective(
     begin = time.perf_counter()
     with apart([tracks]):
         tracks = method.prepared(tracks)
-        result = _reconstruct(method, tracks, intrinsics, cameras, lifted, rounds, steps)
+        result = _reconstruct(method, tracks, intrinsics, cameras, lifted)
     result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
     method._warn(result)
     return result
@@ -101,11 +97,9 @@ def _reconstruct(
     intrinsics: Intrinsics,
     cameras: Tensor | None,
     lifted: Reconstruction | None,
-    rounds: int | None,
-    steps: int,
 ) -> Reconstruction:
     """:func:`reconstruct_perspective` without autograd, on the tracks' device."""
-    rate = tracks.fps or 30.0
+    rate = tracks.rate
     rays = intrinsics.rays(tracks.points)
     if bool(tracks.seen.any()) and float(rays[tracks.seen][:, :2].norm(dim=-1).median()) > WIDE:
         warnings.warn(
@@ -123,11 +117,11 @@ def _reconstruct(
     best: Found | None = None
     unit: float | None = None
     any_focal = lifted is not None
-    soft = SOFT if method.turns_over and not any_focal and len(trunk_joints(tracks.skeleton)) < 3 else 0
-    rounds = rounds or (ROUNDS if lifted is None else FOCAL_ROUNDS)
+    soft = SOFT if method.turns_over and not any_focal and not has_trunk(tracks.skeleton) else 0
+    rounds = FOCAL_ROUNDS if any_focal else ROUNDS
     while rounds > 0:
         if best is not None and any_focal:
-            found = refine_again(best, view, feet, steps, method.turns_over)
+            found = refine_again(best, view, feet, method.turns_over)
         else:
             straight = _straighten(tracks, view.rays, distance, depth)
             if lifted is not None:
@@ -135,7 +129,7 @@ def _reconstruct(
             else:
                 step = SfAM() if soft else method.following(tracks.num_frames <= BLOCK)
                 made = _lift(step, straight, view, cameras)
-            given = made, view, distance, depth, rate, feet, steps, unit
+            given = made, view, distance, depth, rate, feet, unit
             flips = method.turns_over and not any_focal  # else a guess is confirmed
             found = refine(*given, mirror=cameras is None, flips=flips, any_focal=any_focal)
         bodies, unit = found.bodies, None if soft else found.scene.unit
@@ -155,9 +149,9 @@ def _reconstruct(
         if any_focal:
             view = View.of(tracks, zoomed(view.lens, float(bodies.focal[0])), rate)
     assert best is not None
-    exact = len(trunk_joints(tracks.skeleton)) >= 3 and not detected(tracks)
+    exact = has_trunk(tracks.skeleton) and not detected(tracks)
     if method.turns_over and exact and not best.flat:
-        best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies, steps))
+        best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies))
     return _assemble(method, tracks, best)
 
 

@@ -18,7 +18,7 @@ from kcs_torch.methods.pkc.image import bend_cost
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.methods.plain_body import PlainBody
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["NEAREST", "Body", "PinholeEnergy"]
@@ -156,7 +156,7 @@ class PinholeEnergy:
         self.model: Objective | None = None
         self.body: Descent | PlainBody
         image = self._imaged(self._far(self.depth, self.path, self.wide)[0])
-        if len(trunk_joints(skeleton)) >= 3:
+        if has_trunk(skeleton):
             flat = (tree @ image[0]).permute(2, 1, 0)  # (T, N, 2), centred
             weights = at_pace(Weights(), rate, pace_of(flat, skeleton, rate))
             self.model = Objective(skeleton, flat, weights, noise, standing=standing)

@@ -14,7 +14,7 @@ from kcs_torch.methods.plain_body import ACCELERATION, CLOSE, PlainBody
 if TYPE_CHECKING:
     from kcs_torch.methods.pinhole import PinholeEnergy
 
-__all__ = ["FIRM", "STRAY", "USUAL", "coordinates", "unusual"]
+__all__ = ["FIRM", "STRAY", "USUAL", "coordinates"]
 
 STRAY = 0.1
 """Usual deviation of the distance from what is given, as a share, all frames counting as one."""
@@ -27,11 +27,6 @@ USUAL, FACTOR = 4.5, 1.5
 
 FIRM = math.log(FACTOR) ** -2
 """Curvature of what it costs, in the logarithm."""
-
-
-def unusual(distance: float) -> float:
-    """What a distance costs where the focal length is not known."""
-    return FIRM * math.log(distance / USUAL) ** 2 / 2
 
 
 def coordinates(energy: PinholeEnergy, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -31,9 +31,8 @@ class PlainBody:
     """
 
     def __init__(self, skeleton: Skeleton, near: Tensor, slack: float, slow: float) -> None:
-        rigid = torch.zeros_like(near[0, :, :1])
-        rigid[list(skeleton.rigid)] = 1
-        self.near, self.precision = near, rigid / slack**2  # (B, 1)
+        rigid = skeleton.rigid_mask(dtype=near.dtype, device=near.device)
+        self.near, self.precision = near, rigid[:, None] / slack**2  # (B, 1)
         self.smooth = (ACCELERATION * slow**2) ** -2
 
     def rows(self, index: Tensor) -> PlainBody:

@@ -72,7 +72,6 @@ def refine(
     depth: Tensor,
     rate: float,
     standing: Tensor | None,
-    steps: int,
     unit: float | None,
     *,
     mirror: bool,
@@ -88,7 +87,6 @@ def refine(
         depth: (T, N) by which they were straightened.
         rate: frames a second.
         standing: (T, C) how surely contact points stand still, or None.
-        steps: of the refinement.
         unit: of bodies found before, so that energies compare; that of the lifted one if None.
         mirror: whether depth may have the other sign.
         flips: whether runs of depths may have.
@@ -114,12 +112,12 @@ def refine(
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
     distance, start = distance / scales * (unit / own), start * (unit / own)
-    scene, bodies = _settled(scene, distance, start, steps, flips, any_focal)
+    scene, bodies = _settled(scene, distance, start, flips, any_focal)
     return Found(bodies, others, scene, view, False, lifted.diagnostics.notes)
 
 
 @undifferentiated
-def refine_again(found: Found, view: View, standing: Tensor | None, steps: int, flips: bool) -> Found:
+def refine_again(found: Found, view: View, standing: Tensor | None, flips: bool) -> Found:
     """Refine what was found with its focal length, from the view through such a lens.
 
     Runs of signs that nothing bettered through nearly the same lens are not looked over again.
@@ -130,24 +128,22 @@ def refine_again(found: Found, view: View, standing: Tensor | None, steps: int, 
     rays = view.seen_from(found.view, found.scene.rays)
     scene = replace(found.scene, rays=rays, standing=standing, any_focal=False)
     origin = bodies.origin
-    scene, bodies = _settled(scene, bodies.distance[0], bodies.depth, steps, flips, any_focal=True)
+    scene, bodies = _settled(scene, bodies.distance[0], bodies.depth, flips, any_focal=True)
     bodies = replace(bodies, origin=origin[bodies.origin])
     lifted = tuple(_turned(one, view.look @ found.view.look.mT) for one in found.lifted)
     through = focal if flips else before
     return replace(found, bodies=bodies, lifted=lifted, scene=scene, view=view, through=through)
 
 
-def _settled(
-    scene: Scene, distance: Tensor, depth: Tensor, steps: int, flips: bool, any_focal: bool
-) -> tuple[Scene, Bodies]:
+def _settled(scene: Scene, distance: Tensor, depth: Tensor, flips: bool, any_focal: bool) -> tuple[Scene, Bodies]:
     """Bodies refined from depths (H, T, N) at a distance (T,), best first; and the scene that they explain."""
-    bodies = scene.refined(distance, depth, steps)
+    bodies = scene.refined(distance, depth)
     if flips:
-        bodies = scene.turned_over(bodies, steps)
+        bodies = scene.turned_over(bodies)
     if any_focal:
         # A foot that comes along its ray seems to stand still, and would make the focal length too short.
         scene = replace(scene, any_focal=True, standing=None)
-        best = scene.refined(bodies.distance[0], bodies.depth[:1], steps)
+        best = scene.refined(bodies.distance[0], bodies.depth[:1])
         rest = replace(bodies[1:], energy=bodies.energy[1:] + (best.energy - bodies.energy[:1]))
         bodies = replace(best, origin=bodies.origin[:1]).joined(rest)
     return scene, bodies

@@ -56,7 +56,7 @@ def root_depth(points: Tensor, tracks: Tracks, standing: Tensor | None = None) -
         return None, f"{ABSENT}skeleton '{tracks.skeleton.name}' has no contact points"
     if points.shape[-3] < 3:
         return None, f"{ABSENT}too few frames"
-    slow = 30.0 / min(tracks.fps or 30.0, FASTEST)
+    slow = 30.0 / min(tracks.rate, FASTEST)
     sure = standing_feet(tracks) if standing is None else standing
     if sure is None:
         return None, f"{ABSENT}the feet hardly ever stand still in the image"

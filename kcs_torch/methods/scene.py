@@ -22,15 +22,18 @@ from kcs_torch.methods.pkc.limbs import limbs_of
 from kcs_torch.methods.pkc.objective import Objective, bone_noise
 from kcs_torch.methods.pkc.run_costs import RunCosts
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.lm import fit_bones
 
-__all__ = ["BLOCK", "Bodies", "Scene", "ahead"]
+__all__ = ["BLOCK", "STEPS", "Bodies", "Scene", "ahead"]
 
 BLOCK, OVERLAP = 2000, 100
 """Frames of a long clip that are refined together, at most, and by how many blocks overlap."""
+
+STEPS = 60
+"""Of L-BFGS, in a refinement."""
 
 FLIPS = 8
 """How often flips are tried at most."""
@@ -89,7 +92,7 @@ class Scene:
     standing: Tensor | None
     any_focal: bool = False
 
-    def refined(self, distance: Tensor, depth: Tensor, steps: int, focal: Tensor | None = None) -> Bodies:
+    def refined(self, distance: Tensor, depth: Tensor, focal: Tensor | None = None, *, steps: int = STEPS) -> Bodies:
         """Bodies of least :class:`PinholeEnergy`, each from its own start, best first.
 
         Memory is for as much as a block of a long clip. The liveliest block tells the lengths of the others, whose
@@ -98,8 +101,8 @@ class Scene:
         Args:
             distance: (T,) that the starts were found with.
             depth: (H, T, N) starts.
-            steps: of L-BFGS.
             focal: (1,) that the starts were found with, over that of the rays; 1 if None.
+            steps: of L-BFGS.
         """
         frames = len(self.rays)
         count = max(1, math.ceil((frames - OVERLAP) / (BLOCK - OVERLAP)))
@@ -135,7 +138,7 @@ class Scene:
         number = torch.arange(len(energy), device=z.device)
         return Bodies(z.transpose(0, 1), far.mT, energy, number, focal)[order]
 
-    def turned_over(self, found: Bodies, steps: int) -> Bodies:
+    def turned_over(self, found: Bodies) -> Bodies:
         """Bodies, best first, whose best one no flip of a run of its signs makes better.
 
         Straightened tracks agree with what is wrong in the depths that straightened them, so that no method finds it.
@@ -143,16 +146,16 @@ class Scene:
         therefore refined under perspective. Bodies without a template, and clips of several blocks, are left as they
         are.
         """
-        if len(trunk_joints(self.skeleton)) < 3 or len(self.rays) > BLOCK or not bool(found.energy[0].isfinite()):
+        if not has_trunk(self.skeleton) or len(self.rays) > BLOCK or not bool(found.energy[0].isfinite()):
             return found
         for _ in range(FLIPS):
-            better = self._better(found[:1], self._flips(found[:1]), steps)
+            better = self._better(found[:1], self._flips(found[:1]))
             if better is None:
                 break
             found = found.joined(better)
         return found
 
-    def _better(self, best: Bodies, depth: Tensor, steps: int) -> Bodies | None:
+    def _better(self, best: Bodies, depth: Tensor) -> Bodies | None:
         """The best body that depths (H, T, N) lead to, if it is better.
 
         They are refined a little, and a few of those that are already better then well.
@@ -160,14 +163,14 @@ class Scene:
         if not len(depth):
             return None
         distance = best.distance[0]
-        tried = self.refined(distance, depth, max(steps // 3, 1), best.focal)[:FEW]
+        tried = self.refined(distance, depth, best.focal, steps=STEPS // 3)[:FEW]
         tried = tried[tried.energy < best.energy]
         if not len(tried.energy):
             return None
-        better = self.refined(distance, tried.depth, steps, best.focal)[:1]
+        better = self.refined(distance, tried.depth, best.focal)[:1]
         return replace(better, origin=best.origin) if bool(better.energy < best.energy - GAIN) else None
 
-    def polished(self, found: Bodies, steps: int) -> Bodies:
+    def polished(self, found: Bodies) -> Bodies:
         """Bodies, the best polished on the image that its own depths make (:meth:`Body.polished`).
 
         Polishing moves joints by a few centimetres at most, of the image hardly more than a thousandth of that.
@@ -180,7 +183,7 @@ class Scene:
         points = torch.cat([body.image[None], depth[..., None]], -1)
         lengths = median(bone_lengths(points, body.objective.bones), 1)
         now = Hypotheses(depth, lengths, body.objective(depth, lengths))
-        better = run(body.polished(now, steps), serve).depth / body.factor * self.unit
+        better = run(body.polished(now, STEPS), serve).depth / body.factor * self.unit
         return replace(found, depth=torch.cat([better, found.depth[1:]]))
 
     def points(self, found: Bodies, k: int) -> Tensor:

@@ -27,7 +27,7 @@ from kcs_torch.methods.windows import join_windows, spread_first
 from kcs_torch.nn.unrolled import UnrolledSfAM
 from kcs_torch.nn.unrolled.base import SETTLED
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.solvers.camera_path import constant_path
+from kcs_torch.solvers.camera_path import EVEN, constant_path
 from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.iterate import Solution
 from kcs_torch.types import Tracks
@@ -190,7 +190,7 @@ class SfAM(Method):
         them: their nuclear norm, times how much their bones vary in length.
         """
         counts = None if inside is None else inside.sum((1, 2))
-        rows = camera_choices(filled[:, 0], together=1, counts=counts)[:, :, None]  # (C, K, 1, T, 2, 3)
+        rows = camera_choices(filled[:, 0], counts=counts)[:, :, None]  # (C, K, 1, T, 2, 3)
         if inside is not None:
             rows = rows * inside[..., None, None]
         number = len(rows)
@@ -316,9 +316,6 @@ reweighted."""
 
 SHORT = 10
 """Frames from which on a constant angular velocity is looked for."""
-
-EVEN = 0.05
-"""A constant angular velocity explains the cameras where their median deviation is below this share of its turn."""
 
 
 def _join(

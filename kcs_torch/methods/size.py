@@ -28,6 +28,9 @@ FLOOR = 0.02
 SECONDS = 1.5
 """Half a period of the fastest change of size; slower than steps and turns."""
 
+STEPS = 40
+"""Steps of reweighting."""
+
 LEAST_RANGE, LEAST_GAIN = 1.08, 0.3
 """Largest over smallest size, and share of the bones' deviation that it must explain (the median over bones), for a
 changing size to be believed. Before a distant camera the latter stays below 0.12 on all clips tried; it is above 0.6
@@ -108,7 +111,7 @@ def weak_perspectives(tracks: Sequence[Tracks]) -> list[Size]:
 
 def _waves(tracks: Tracks) -> Tensor:
     """What the log of the size may be a sum of, (T, W): slow waves, and steps at the cuts of the film."""
-    waves, cuts = slow_waves(tracks.num_frames, tracks.fps or 30.0, tracks.points), cuts_of(tracks)
+    waves, cuts = slow_waves(tracks.num_frames, tracks.rate, tracks.points), cuts_of(tracks)
     if not cuts:
         return waves
     time = torch.arange(tracks.num_frames, device=waves.device)[:, None]
@@ -153,14 +156,13 @@ def _told(waves: Tensor, told: Tensor, counts: Sequence[int]) -> Tensor:
     return torch.where(inside[..., None], held, 0)
 
 
-def _regress(value: Tensor, weight: Tensor, waves: Tensor, steps: int = 40) -> tuple[Tensor, Tensor]:
+def _regress(value: Tensor, weight: Tensor, waves: Tensor) -> tuple[Tensor, Tensor]:
     """Paths (K, T) and deviations s (K, P) of least sum_p [sum_t pinball(value - level_p - path_t) / s_p + T log s_p].
 
     Args:
         value: (K, T, P).
         weight: (K, T, P), 1 or 0.
         waves: (K, T, W), of which paths are sums.
-        steps: of reweighting.
     """
     total = weight.sum(1).clamp_min(1)
     level = (weight * value).sum(1) / total
@@ -174,7 +176,7 @@ def _regress(value: Tensor, weight: Tensor, waves: Tensor, steps: int = 40) -> t
         slope = torch.where(off > 0, QUANTILE, 1 - QUANTILE).to(off)
         return off, slope, ((weight * slope * off.abs()).sum(1) / total).clamp_min(FLOOR / 3)
 
-    for _ in range(steps):
+    for _ in range(STEPS):
         off, slope, spread = stray()
         pull = weight * slope / off.abs().clamp_min(1e-3) / spread[:, None]
         each = pull.sum(1)

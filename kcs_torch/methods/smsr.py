@@ -61,12 +61,11 @@ class SMSR(Factorised):
 
     def find_cameras(self, tracks: Tensor) -> Tensor:
         """Factorisation, IST and least squares; the identity for clips with too few frames or joints to tell."""
-        frames, joints = tracks.shape[-3:-1]
 
         def upgrade(motion: Tensor) -> Tensor:
             return metric_upgrade(motion, ist(motion), evenness=1.0, tolerance=1e-6, together=1)[0]
 
-        return upgraded_rows(tracks, 3 * max(1, min(self.rank, frames // 3, (joints - 1) // 3)), upgrade)
+        return upgraded_rows(tracks, self.rank, upgrade)
 
     def find_shape(self, tracks: Tensor, weights: Tensor, cameras: Tensor) -> Solution[Tensor]:
         """Smooth the trajectories, then continue from the back-projected tracks to low rank and a small residual."""
@@ -81,8 +80,8 @@ class SMSR(Factorised):
         start = back_project(smooth, cameras).flatten(-2)
         size = spectral_norm(start)
         falling = torch.stack([mu * size for mu in continuation(self.num_steps, self.mu, self.final)])
-        before = fpc(start, gradient, step=self.tau, weights=falling[:-1], steps_per_weight=1).value
-        shape = fpc(before, gradient, step=self.tau, weights=falling[-1:], steps_per_weight=1).value
+        before = fpc(start, gradient, step=self.tau, weights=falling[:-1])
+        shape = fpc(before, gradient, step=self.tau, weights=falling[-1:])
         change = relative_change(before, shape)
         shape = shape.unflatten(-1, (joints, 3))
         return Solution(shape, bool((change <= SETTLED).all()), self.num_steps, change=change)

@@ -16,20 +16,18 @@ from kcs_torch.types import Tracks
 __all__ = ["clip_scale", "guessed", "rigid_shape"]
 
 
-def clip_scale(tracks: Tracks, rest: Tensor, *, span: int = 60, quantile: float = 0.95) -> Tensor:
+def clip_scale(tracks: Tracks, rest: Tensor) -> Tensor:
     """Weak-perspective scale of each frame, by :func:`kcs_torch.nn.deviation.template_scale`.
 
     Args:
         tracks: the tracks.
         rest: (N, 3) template.
-        span: frames of a span; scales between spans are interpolated.
-        quantile: of a bone's projections within a span.
 
     Returns:
         (T,), positive.
     """
     index = tracks.skeleton.bone_index(device=tracks.points.device)[list(tracks.skeleton.rigid)]
-    return template_scale(tracks.points, tracks.weights, rest, index, span=span, quantile=quantile)
+    return template_scale(tracks.points, tracks.weights, rest, index)
 
 
 def rigid_shape(tracks: Tracks, cameras: Tensor | None = None) -> Tensor:

@@ -20,13 +20,13 @@ from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.perspective import WIDE, feet_on_ground, reconstruct_perspective
 from kcs_torch.methods.pinhole import PinholeEnergy
-from kcs_torch.methods.pinhole_coordinates import USUAL, unusual
+from kcs_torch.methods.pinhole_coordinates import FIRM, USUAL
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
-from kcs_torch.methods.scene import BLOCK
+from kcs_torch.methods.scene import BLOCK, STEPS
 from kcs_torch.methods.view import View, lens_note
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
@@ -34,6 +34,9 @@ __all__ = ["likely_lens", "looking", "may_be_near", "reconstruct_uncalibrated"]
 
 FAR = 34.0
 """Distance, for a body of 1.75, of the far body that a near one is compared with."""
+
+UNUSUAL = FIRM * math.log(FAR / USUAL) ** 2 / 2
+"""What it costs to be as far away, where the focal length is not known."""
 
 NEAR = 10.0
 """Distance up to which a camera is near: from there on a wrong focal length does more harm than parallel rays."""
@@ -45,9 +48,8 @@ BETTER, SEEN = 2.5, -1.0
 """By how much the energy must be lower than of a far body for a near one to be believed; and in a detector's tracks,
 which come from a real camera: these are seldom far, and to take a near one for far does the greater harm."""
 
-SECONDS, RATE, STEPS = 5.0, 30.0, 60
-"""How much of a clip tells whether a camera is near, at how many frames a second at most, and in how many steps; as
-many again where these do not find back to a far body."""
+SECONDS, RATE = 5.0, 30.0
+"""How much of a clip tells whether a camera is near, and at how many frames a second at most."""
 
 DEARER = 6.0
 """By how much a near body must be dearer in the end for the camera to be far: what seemed nearer than that may yet be
@@ -59,7 +61,7 @@ EVERY, HOPELESS, AWAY = 20, 10.0, 6.5
 
 def may_be_near(tracks: Tracks) -> bool:
     """Whether perspective can be told: from a body with a template and a trunk, in one shot of one camera."""
-    return len(trunk_joints(tracks.skeleton)) >= 3 and not cuts_of(tracks)
+    return has_trunk(tracks.skeleton) and not cuts_of(tracks)
 
 
 def reconstruct_uncalibrated(
@@ -87,7 +89,7 @@ def reconstruct_uncalibrated(
     Raises:
         OptionError: the skeleton has no template with a trunk.
     """
-    if len(trunk_joints(tracks.skeleton)) < 3:
+    if not has_trunk(tracks.skeleton):
         raise OptionError(
             f"intrinsics: 'auto' needs a skeleton with a template and a trunk, '{tracks.skeleton.name}' has none: "
             "expected (fx, fy, cx, cy) or a matrix K (3, 3)"
@@ -190,9 +192,9 @@ def _nearness(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras:
         return math.inf
     if not (bool(depth.isfinite().all()) and bool(depth.any())):
         return math.inf
-    every = max(1, round((tracks.fps or RATE) / RATE))
+    every = max(1, round(tracks.rate / RATE))
     some = _liveliest(flat[::every], round(SECONDS * RATE)) * every
-    rate = (tracks.fps or RATE) / every
+    rate = tracks.rate / every
     noise, feet = image_noise(tracks, flat, unit), feet_on_ground(tracks, cameras)
     flat, depth = flat[some], depth[some]
     ones = torch.ones_like(depth)
@@ -216,13 +218,13 @@ def _nearness(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras:
         return len(cost) > 1 and int(made.amin()) % EVERY == 0 and hopeless(state, cost)
 
     state = energy.start
-    for _ in range(2):
+    for _ in range(2):  # once more where a far body is not found back to
         found = lbfgs(energy, state, num_steps=STEPS, tolerance=1e-6, slopes=True, part=energy.rows, enough=enough)
         assert found.energy is not None
         state, gain = found.value, float(found.energy[0] - found.energy[1])
         if hopeless(state, found.energy):
             return math.inf
-        if gain > -unusual(FAR):  # to be as far away costs no more than that
+        if gain > -UNUSUAL:
             break
     found_at = distance(state)
     if gain < -DEARER:

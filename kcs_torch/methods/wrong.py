@@ -45,6 +45,9 @@ of frames that have to show it, from which on it is another joint. Noise of 40 m
 POINT = 1e-6
 """Size in the image, over the depth, up to which a body is a point."""
 
+NAMED = 3
+"""Joints or bones that are told by name, at most."""
+
 WHY_LOOSE = (
     "joints may be wrong, swapped or in another order, the skeleton may be another, parts of the body may bend, or the "
     "camera may be so near that its intrinsics matter"
@@ -83,10 +86,10 @@ def far_joints(images: Tensor, tracks: Tracks) -> str:
     return f"joints are away from their tracks in most frames that show them, {by} of the body's size"
 
 
-def _the_worst(named: Sequence[str], by: Tensor, kind: str = "joint", most: int = 3) -> str:
+def _the_worst(named: Sequence[str], by: Tensor, kind: str = "joint") -> str:
     """The worst of what is ``named``, ``by`` (K,) so much, and how many more there are."""
-    shown = [named[i] for i in by.argsort(descending=True).tolist()]
-    return ", ".join(shown[:most]) + (f" and {counted(len(shown) - most, f'more {kind}')}" if len(shown) > most else "")
+    shown, more = [named[i] for i in by.argsort(descending=True).tolist()], len(named) - NAMED
+    return ", ".join(shown[:NAMED]) + (f" and {counted(more, f'more {kind}')}" if more > 0 else "")
 
 
 def loose_bones(points: Tensor, body: Skeleton, lengths: Tensor | None = None, seen: Tensor | None = None) -> str:

@@ -22,6 +22,10 @@ __all__ = ["Arrangement", "deviation_goal", "deviation_scale", "deviation_step",
 Arrangement = Literal["stacked", "frames"]
 """How deviations form one matrix: 3T x B as printed, or T x 3B (up to the order of rows and columns)."""
 
+SPAN, QUANTILE = 60, 0.95
+"""Frames of a span that tells a template's scale, and what of a bone's projections within it: scales between spans are
+interpolated."""
+
 
 def deviation_goal(rest: Tensor, tracks: Tensor, cameras: Tensor, weights: Tensor) -> Tensor:
     """What the tracks ask of the deviation, W - R X0 about its middle, joints last: (..., T, 2, N).
@@ -98,9 +102,7 @@ def frame_scales(rest: Tensor, tracks: Tensor, cameras: Tensor, weights: Tensor,
     return torch.minimum(torch.maximum(free, low), high)
 
 
-def template_scale(
-    tracks: Tensor, weights: Tensor, rest: Tensor, bones: Tensor, *, span: int = 60, quantile: float = 0.95
-) -> Tensor:
+def template_scale(tracks: Tensor, weights: Tensor, rest: Tensor, bones: Tensor) -> Tensor:
     """Weak-perspective scale of each frame, from the longest projections of the bones around it.
 
     A bone's projection is at most scale times its length, and reaches it where the bone lies in the image plane. In
@@ -112,8 +114,6 @@ def template_scale(
         weights: (..., T, N).
         rest: (N, 3) template.
         bones: (B, 2) that keep their length.
-        span: frames of a span; scales between spans are interpolated.
-        quantile: of a bone's projections within a span.
 
     Returns:
         (..., T), positive.
@@ -127,10 +127,10 @@ def template_scale(
     seen = (weights[..., bones[:, 0]] > 0) & (weights[..., bones[:, 1]] > 0) & (length > 0)
     ratio = bone_vectors(tracks, bones).norm(dim=-1) / or_one(length)
     ratio = torch.where(seen, ratio, torch.nan)
-    count = max(1, round(frames / span))
+    count = max(1, round(frames / SPAN))
     edges = [round(i * frames / count) for i in range(count + 1)]
     spans = list(itertools.pairwise(edges))
-    vote = lambda part: nanmedian(_quantile_of_known(part, quantile), -1)  # noqa: E731
+    vote = lambda part: nanmedian(_quantile_of_known(part, QUANTILE), -1)  # noqa: E731
     overall = vote(ratio)
     overall = torch.where(torch.isfinite(overall) & (overall > 0), overall, fallback)[..., None]
     votes = torch.stack([vote(ratio[..., a:b, :]) for a, b in spans], -1)

@@ -51,9 +51,7 @@ class BoneLengthEnergy(SkeletonModule):
 
     def __init__(self, skeleton: str | Path | Skeleton) -> None:
         super().__init__(skeleton)
-        rigid = torch.zeros(self.skeleton.num_bones)
-        rigid[list(self.skeleton.rigid)] = 1
-        self.register_buffer("rigid", rigid, persistent=False)
+        self.register_buffer("rigid", self.skeleton.rigid_mask(dtype=torch.get_default_dtype()), persistent=False)
 
     def forward(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """Return the energy of each frame.

@@ -23,33 +23,10 @@ from kcs_torch.functional.guarded import or_one
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.reprojection import centred_residual
 
-__all__ = ["majorise_step", "turn_onto_mean", "viewpoint_energy"]
+__all__ = ["majorise_step", "turn_onto_mean"]
 
 REACH = 3.0
 """Residuals beyond this many standard deviations stop pulling."""
-
-
-def viewpoint_energy(
-    points: Tensor,
-    tracks: Tensor,
-    cameras: Tensor,
-    weights: Tensor,
-    lengths: Tensor,
-    *,
-    bones: Tensor,
-    rigid: Tensor,
-    eps: Tensor | float,
-    slack: Tensor | float,
-    noise: Tensor | float,
-) -> Tensor:
-    """F (...) of points (..., T, N, 3); the arguments are those of :func:`majorise_step`."""
-    centred, _, frames = _bones_about_mean(points, bones)
-    scatter = _floor(centred.mT @ centred / frames, eps)
-    far = (_sizes(bone_vectors(points, rigid), lengths) - lengths[..., None, :]) / slack
-    off = centred_residual(project(points, cameras), tracks, weights).square().sum(-1) / noise**2
-    charge = lambda square: REACH**2 / 2 * (square / REACH**2).log1p()  # noqa: E731
-    total = points.shape[-3] / 2 * torch.logdet(scatter) + charge(far.square()).sum((-2, -1))
-    return total + (weights * charge(off)).sum((-2, -1))
 
 
 def majorise_step(

@@ -19,7 +19,10 @@ from kcs_torch.nn.masks import bone_share, known_points, weighs_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.graph import find_pieces
 
-__all__ = ["PostureEnergy", "trunk_joints"]
+__all__ = ["PostureEnergy", "has_trunk", "trunk_joints"]
+
+FEWEST = 3
+"""Joints of a trunk, at least."""
 
 TRUNK_SPREAD = 18.0
 """Bones that stray from the template by less than this, in degrees, are of the trunk."""
@@ -88,7 +91,7 @@ class PostureEnergy(SkeletonModule):
         check_positive(self, correlation=correlation)
         self.strength, self.kappa, self.correlation = strength, kappa, correlation
         trunk = trunk_joints(body)
-        if len(trunk) < 3:
+        if len(trunk) < FEWEST:
             raise SkeletonError(
                 f"skeleton '{body.name}' has no trunk: expected a template and spreads, with at least three joints "
                 f"joined by bones that stray by less than {TRUNK_SPREAD:g} degrees"
@@ -235,6 +238,11 @@ class PostureEnergy(SkeletonModule):
         eye = torch.eye(scatter.shape[-1], dtype=scatter.dtype, device=scatter.device)
         factor, _ = torch.linalg.cholesky_ex(ratio + least[..., None, None] * eye)
         return (count + self.strength) * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+def has_trunk(skeleton: Skeleton) -> bool:
+    """Whether enough joints are the trunk's to tell which way the body faces: at least three."""
+    return len(trunk_joints(skeleton)) >= FEWEST
 
 
 def trunk_joints(skeleton: Skeleton) -> list[int]:

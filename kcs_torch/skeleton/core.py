@@ -247,6 +247,12 @@ class Skeleton:
         """Bones as an integer tensor (B, 2) of (parent, child)."""
         return torch.tensor(self.bones, dtype=torch.long, device=device).reshape(-1, 2)
 
+    def rigid_mask(self, *, dtype: torch.dtype = torch.bool, device: torch.device | str | None = None) -> Tensor:
+        """Which bones have a constant length: (B,), True or 1 where they do."""
+        mask = torch.ones(self.num_bones, dtype=dtype, device=device)
+        mask[list(self.flexible)] = 0
+        return mask
+
     def template_points(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
         """The rest pose as a tensor (N, 3).
 

@@ -1,11 +1,11 @@
 """Iterations over callables: they know no camera, prior or skeleton."""
 
-from kcs_torch.solvers.camera_path import choose_path, constant_path, settle_path, smooth_path
+from kcs_torch.solvers.camera_path import choose_path, constant_path, settle_path
 from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.denoise import Denoised, denoise_tracks
 from kcs_torch.solvers.implicit import Implicit, fixed_point, gmres
 from kcs_torch.solvers.ist import ist, metric_upgrade
-from kcs_torch.solvers.iterate import Solution, fpc, iterate, svt
+from kcs_torch.solvers.iterate import Solution, fpc, iterate
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.noise import Noise, measure_noise
@@ -42,8 +42,6 @@ __all__ = [
     "settle_path",
     "sign_costs",
     "sign_table",
-    "smooth_path",
     "smooth_signs",
-    "svt",
     "swapped_frames",
 ]

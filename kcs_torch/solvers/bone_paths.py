@@ -17,6 +17,9 @@ LONGER = tuple(
 )
 """Lengths that are tried, over the longest image: a bone that passes through the image plane is hardly longer."""
 
+MOST = 6
+"""K, paths to keep of a bone at most."""
+
 JUMP = 25.0
 """Squared second difference of depth, in variances, from which on a path jumps."""
 
@@ -43,7 +46,7 @@ class BonePaths(NamedTuple):
         return BonePaths(self.depth[..., frames], self.cost)
 
 
-def bone_paths(tracks: Tensor, bones: Tensor, count: int = 6) -> BonePaths:
+def bone_paths(tracks: Tensor, bones: Tensor) -> BonePaths:
     """Find what depths bones of constant length may have.
 
     These are s sqrt(L^2 - |b|^2) for several lengths L, the signs s by second-order Viterbi. With the right length
@@ -54,7 +57,6 @@ def bone_paths(tracks: Tensor, bones: Tensor, count: int = 6) -> BonePaths:
     Args:
         tracks: (T, N, 2), complete and without noise.
         bones: (B, 2) joint pairs of constant distance.
-        count: K, paths to keep of a bone at most.
 
     Returns:
         The :class:`BonePaths`.
@@ -76,7 +78,7 @@ def bone_paths(tracks: Tensor, bones: Tensor, count: int = 6) -> BonePaths:
     apart = norm[..., None] + norm[:, None] - 2 * inner.abs()
     same = apart < (APART * longest).square()[:, None, None]
     chosen, costs = [], []
-    for _ in range(min(count, len(LONGER))):
+    for _ in range(MOST):
         best, index = cost.min(-1)
         costs.append(best)
         chosen.append(index)

@@ -19,7 +19,7 @@ from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.functional.spectral import dct_basis
 from kcs_torch.solvers.lbfgs import lbfgs
 
-__all__ = ["CameraPath", "choose_path", "constant_path", "settle_path", "smooth_path", "view_energy"]
+__all__ = ["EVEN", "CameraPath", "choose_path", "constant_path", "settle_path", "view_energy"]
 
 CameraPath = Literal["auto", "free", "smooth", "constant"]
 KINDS: tuple[CameraPath, ...] = get_args(CameraPath)
@@ -30,15 +30,24 @@ EVEN = 0.05
 NEAR = math.radians(30)
 """... and below this angle, as a path that races through all directions has length enough for any deviation."""
 
+STEPS = 20
+"""Gauss-Newton steps that fit a path of constant angular velocity."""
+
 WAVES, ROUNDS = 6, 20
 """Cosines of a smooth path, and rounds of weights that fit it."""
+
+LEVELS, SETTLING = (1e-3, 1e-4, 1e-5), 40
+"""Variances that the log-determinant does not look below where a path settles, in order, and L-BFGS steps for each."""
+
+LEAST = 1e-3
+"""Variance that the energy of a view does not look below, a share of the points' mean square."""
 
 RUN = 2000
 """Frames whose waves are summed together: more would only take memory."""
 
 
 @widened
-def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def constant_path(rotations: Tensor, *, counts: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Fit R_t = exp(t w) R_0 to rotations: six numbers, robustly.
 
     Rotations that come from aligning poses also carry the body's own turning; a camera that moves evenly does
@@ -47,7 +56,6 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | No
 
     Args:
         rotations: (..., T, 3, 3), T >= 2.
-        num_steps: Gauss-Newton steps.
         counts: (...) frames of each clip, where shorter ones are padded at their end; a single one stands still.
 
     Returns:
@@ -76,7 +84,7 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | No
     row = torch.arange(len(best), device=best.device)
     speed, start = turn * factors[best][:, None], starts[row, best]
     eye = torch.eye(6, dtype=turn.dtype, device=turn.device)
-    for _ in range(num_steps):
+    for _ in range(STEPS):
         turned = time[..., None] * speed[:, None]  # (K, T, 3)
         spin = rotation_matrix(turned)
         error = rotation_vector(rotations @ (spin @ start[:, None]).mT)
@@ -94,38 +102,13 @@ def constant_path(rotations: Tensor, *, num_steps: int = 20, counts: Tensor | No
     return path.view(*batch, frames, 3, 3), angle.view(*batch, frames)
 
 
-@widened
-def smooth_path(rotations: Tensor, *, waves: int = WAVES, num_steps: int = ROUNDS) -> tuple[Tensor, Tensor]:
-    """Fit a path whose deviation from a constant angular velocity is a sum of ``waves`` slow cosines, robustly.
-
-    Args:
-        rotations: (T, 3, 3), T >= 2.
-        waves: cosines, the constant included; no more than T.
-        num_steps: rounds of Cauchy weights.
-
-    Returns:
-        The path (T, 3, 3), and its angle to each rotation (T,), in radians.
-
-    Raises:
-        ShapeError: ``rotations`` is not (T, 3, 3) with T >= 2.
-    """
-    _check_rotations(rotations, "smooth_path", 2)
-    return _smoothed(rotations, *constant_path(rotations), waves, num_steps)
-
-
-def _check_rotations(rotations: Tensor, name: str, least: int) -> None:
-    if rotations.ndim != 3 or rotations.shape[1:] != (3, 3) or len(rotations) < least:
-        some = f" of {least} frames or more" if least else ""
-        raise ShapeError(f"{name}: expected rotations (T, 3, 3){some}, got {tuple(rotations.shape)}")
-
-
-def _smoothed(rotations: Tensor, base: Tensor, angle: Tensor, waves: int, num_steps: int) -> tuple[Tensor, Tensor]:
-    """As :func:`smooth_path`, about a constant path and its angles."""
+def _smoothed(rotations: Tensor, base: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
+    """Fit a path whose deviation from a constant path (T, 3, 3) is a sum of slow cosines, robustly; its angles (T,)."""
     frames = len(rotations)
-    basis = dct_basis(frames, min(waves, frames), dtype=base.dtype, device=base.device)  # (T, K)
+    basis = dct_basis(frames, min(WAVES, frames), dtype=base.dtype, device=base.device)  # (T, K)
     deviation = (rotations @ base.mT).flatten(-2)
     path = base
-    for _ in range(num_steps):
+    for _ in range(ROUNDS):
         weight = 1 / (1 + (angle / angle.median().clamp_min(1e-9)).square())
         normal = basis.mT @ (weight[:, None] * basis)
         ridge = 1e-9 * normal.diagonal().mean() * torch.eye(len(normal), dtype=base.dtype, device=base.device)
@@ -152,14 +135,15 @@ def choose_path(rotations: Tensor, kind: CameraPath = "auto") -> tuple[Tensor, C
     """
     if kind not in KINDS:
         raise unknown("camera path", kind, KINDS)
-    _check_rotations(rotations, "choose_path", 0)
+    if rotations.ndim != 3 or rotations.shape[1:] != (3, 3):
+        raise ShapeError(f"choose_path: expected rotations (T, 3, 3), got {tuple(rotations.shape)}")
     zero = rotations.new_zeros(len(rotations))
     if kind == "free" or len(rotations) < 10:
         return rotations, "free", zero
     path, angle = constant_path(rotations)
     if kind != "smooth" and (kind == "constant" or _explains(path, angle)):
         return path, "constant", angle
-    path, angle = _smoothed(rotations, path, angle, WAVES, ROUNDS)
+    path, angle = _smoothed(rotations, path, angle)
     if kind == "smooth" or _explains(path, angle):
         return path, "smooth", angle
     return rotations, "free", zero
@@ -171,21 +155,16 @@ def _explains(path: Tensor, angle: Tensor) -> bool:
 
 
 @differentiating
-def settle_path(
-    vectors: Tensor, path: Tensor, *, waves: int = 0, eps: tuple[float, ...] = (1e-3, 1e-4, 1e-5), num_steps: int = 40
-) -> Tensor:
+def settle_path(vectors: Tensor, path: Tensor) -> Tensor:
     """Refine a camera path so that the world poses vary least: T/2 log det of the scatter of the turned bones.
 
     A path fitted to rotations that align poses inherits the body's own turning. What a camera must explain is only
-    that poses seen from it vary little: the axis and speed of the path (three numbers), and ``waves`` slow cosines
-    of deviation, are moved to where the log-determinant is least.
+    that poses seen from it vary little: the axis and speed of the path, three numbers, are moved to where the
+    log-determinant is least.
 
     Args:
         vectors: (T, B, 3) bones in the camera frame, of size near 1.
-        path: (T, 3, 3) world to camera, of constant angular velocity if ``waves`` is 0.
-        waves: cosines of deviation beside axis and speed.
-        eps: of the log-determinant, in order.
-        num_steps: L-BFGS steps for each.
+        path: (T, 3, 3) world to camera, of constant angular velocity.
 
     Returns:
         (T, 3, 3), turned as a whole nearest to ``path``.
@@ -204,27 +183,22 @@ def settle_path(
     lean = lean + axis[:, None] * axis / frames
     if bool(size * frames < 1e-2):
         lean = torch.eye(3, dtype=path.dtype, device=path.device) / frames
-    basis = dct_basis(frames, waves + 1, dtype=path.dtype, device=path.device)[:, 1:] * math.sqrt(frames)
 
     def turned(u: Tensor) -> Tensor:
-        speed = turn + u[:, :3] @ lean  # (1, 3)
-        out = rotation_matrix(time[:, None] * speed) @ rest
-        if waves:
-            out = rotation_matrix(basis @ u[0, 3:].view(waves, 3)) @ out
-        return out
+        return rotation_matrix(time[:, None] * (turn + u @ lean)) @ rest
 
     def energy(u: Tensor) -> Tensor:
         aligned = (vectors @ turned(u)).flatten(-2)
         return scatter_log_det(aligned - aligned.mean(-2, keepdim=True), level)[None] / frames
 
-    u = path.new_zeros(1, 3 + 3 * waves)
-    for level in eps:  # noqa: B007
-        u = lbfgs(energy, u, num_steps=num_steps, first_step=1e-2).value
+    u = path.new_zeros(1, 3)
+    for level in LEVELS:  # noqa: B007
+        u = lbfgs(energy, u, num_steps=SETTLING, first_step=1e-2).value
     found = turned(u)
     return found @ nearest_rotation((found.mT @ path).sum(0))
 
 
-def view_energy(points: Tensor, path: Tensor, *, correlation: float = 6.0, eps: float = 1e-3) -> Tensor:
+def view_energy(points: Tensor, path: Tensor, *, correlation: float = 6.0) -> Tensor:
     """How much poses vary in the world of known cameras: n/2 log det of their scatter there, n = T / correlation.
 
     Depths of the wrong sign seem to turn with the camera, twice as fast: of a pose and its mirror image the right one
@@ -234,7 +208,6 @@ def view_energy(points: Tensor, path: Tensor, *, correlation: float = 6.0, eps: 
         points: (..., T, N, 3) in the camera frame; the middle of each frame's joints does not count.
         path: (T, 3, 3) world to camera.
         correlation: frames that count as one.
-        eps: variance that is not looked below, a share of the points' mean square.
 
     Returns:
         (...). Only differences mean something, between points of the same clip.
@@ -242,7 +215,7 @@ def view_energy(points: Tensor, path: Tensor, *, correlation: float = 6.0, eps: 
     points = points - points.mean(-2, keepdim=True)
     size = points[..., :2].square().mean((-3, -2, -1), keepdim=True).sqrt()
     world = (points / size.clamp_min(torch.finfo(size.dtype).tiny) @ path).flatten(-2)
-    return scatter_log_det(world - world.mean(-2, keepdim=True), eps) / correlation
+    return scatter_log_det(world - world.mean(-2, keepdim=True), LEAST) / correlation
 
 
 def _sum_unturned(rotations: Tensor, factors: Tensor, time: Tensor, turn: Tensor) -> Tensor:

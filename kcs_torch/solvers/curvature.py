@@ -50,6 +50,15 @@ class Curvature:
         self.matrix.diagonal(dim1=-2, dim2=-1)[..., :count] += torch.cat([precision, precision], -1)
 
 
+CHANGE = 0.1
+"""The eps of the changes, a share of the poses'."""
+
+REACH = 3.0
+"""Residuals beyond this many standard deviations, and lengths beyond this many slacks, stop pulling."""
+
+RIDGE = 1e-6
+"""What is added to a block's diagonal, a share of it and of its mean curvature along the depth."""
+
 RUN = 4096
 """Frames whose blocks are made together: they are as large as all else that a descent keeps."""
 
@@ -63,7 +72,6 @@ def whitening(
     rigid: Tensor,
     stiffness: Tensor,
     slack: float,
-    reach: float,
     precision: Tensor | None = None,
     counts: Tensor | None = None,
     anchor: Tensor | None = None,
@@ -79,7 +87,6 @@ def whitening(
         rigid: (P, 2) pairs that keep their distance.
         stiffness: (P,) weights of their lengths.
         slack: standard deviation of a length.
-        reach: slacks from which on nothing pulls.
         precision: curvature (H, T, N) of the residuals of x and of y, where they are free.
         counts: (H,) frames of each start, where some are padded.
         anchor: (H,) curvature of what pulls on each depth.
@@ -95,7 +102,7 @@ def whitening(
     else:
         off = (length - length.sum(-2, keepdim=True) / counts[:, None, None]) * shown(counts, frames)[..., None]
         spread = off.square().sum(-2) / counts[:, None]
-    pull = stiffness * (1 / (spread + slack**2) - 1 / (spread + (reach * slack) ** 2))
+    pull = stiffness * (1 / (spread + slack**2) - 1 / (spread + (REACH * slack) ** 2))
     size = free * joints + 3
     out = points.new_empty(hypotheses, frames, size, size)
     run = max(1, RUN // max(hypotheses, 1))
@@ -149,7 +156,7 @@ def frame_curvature(points: Tensor, rotations: Tensor, bones: Tensor, precision:
     return Curvature(matrix, free, joints)
 
 
-def block_roots(curvature: Curvature, *, ridge: float = 1e-6) -> Tensor:
+def block_roots(curvature: Curvature) -> Tensor:
     """Return P (H, T, D, D) with P P^T the inverse of each block, shifts along the depth held in place.
 
     A common depth of all joints moves no bone: its curvature, zero, becomes the mean one.
@@ -160,7 +167,7 @@ def block_roots(curvature: Curvature, *, ridge: float = 1e-6) -> Tensor:
     typical = matrix.diagonal(dim1=-2, dim2=-1)[..., depth].mean(-1)
     matrix[..., depth, depth] += (typical / joints)[..., None, None]
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-    diagonal.mul_(1 + ridge).add_(ridge * typical[..., None] + torch.finfo(matrix.dtype).tiny)
+    diagonal.mul_(1 + RIDGE).add_(RIDGE * typical[..., None] + torch.finfo(matrix.dtype).tiny)
     factor, info = torch.linalg.cholesky_ex(matrix)
     plain = diagonal.clamp_min(torch.finfo(matrix.dtype).tiny).sqrt().diag_embed()  # where rounding spoils a block
     factor = torch.where((info == 0)[..., None, None], factor, plain)

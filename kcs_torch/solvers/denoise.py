@@ -13,7 +13,7 @@ from kcs_torch.functional.shapes import check_floats
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
 from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.spectrum import TINY, temporal_modes, unshared, white_power
-from kcs_torch.solvers.stray import FLOOR, STRAY, body_size, each_joint, far_off, stray_from_neighbours
+from kcs_torch.solvers.stray import body_size, each_joint, far_off, stray_from_neighbours
 
 __all__ = ["Denoised", "denoise_tracks"]
 
@@ -51,15 +51,7 @@ class Denoised(NamedTuple):
     left: Tensor
 
 
-def denoise_tracks(
-    tracks: Tensor,
-    weights: Tensor,
-    *,
-    window: int = 64,
-    quick: int = 12,
-    threshold: float = STRAY,
-    floor: float = FLOOR,
-) -> Denoised:
+def denoise_tracks(tracks: Tensor, weights: Tensor, *, window: int = 64, quick: int = 12) -> Denoised:
     r"""Smooth 2D tracks, fill what is unseen and reject outliers; all parameters come from the clip itself.
 
     In windows of L frames, with temporal modes u_i (eigenvectors of the third-difference penalty, polynomials first),
@@ -77,10 +69,10 @@ def denoise_tracks(
     sum w_tn |y_tn - v_tn|^2 / s^2 + sum_i v_i^T (g_i Q_b + c_i)^-1 v_i, by conjugate gradients with the solution for
     even weights as preconditioner, and x_i = g_i Q_b (g_i Q_b + c_i)^-1 v_i. Cost is linear in T.
 
-    A joint is an outlier where it is further from what the rest of the clip predicts than ``threshold`` times the
-    usual distance (the median of the joint's clip, or up to four times that where its surroundings have more) plus
-    ``floor`` of the body's size: first from the nearest frames of the joint, then, twice, from the model without the
-    joint itself.
+    A joint is an outlier where it is further from what the rest of the clip predicts than six times the usual distance
+    (the median of the joint's clip, or up to four times that where its surroundings have more) plus .04 of the body's
+    size, the median distance of its joints from their centre: first from the nearest frames of the joint, then, twice,
+    from the model without the joint itself.
 
     Args:
         tracks: (..., T, N, 2), finite.
@@ -88,8 +80,6 @@ def denoise_tracks(
         window: L, frames solved together; windows overlap by half.
         quick: first mode that may tell noise that lasts from motion: mode i has about i / 2 periods in a window. People
             move together from 2 or 3 Hz on, which is mode 12 of 64 frames at 30 a second.
-        threshold: of outliers, in medians of the prediction error.
-        floor: of outliers, a share of the body's size (median distance of its joints from their centre).
 
     Returns:
         :class:`Denoised`, a constant for autograd. Clips of fewer than 12 frames are only filled and cleared of
@@ -128,7 +118,7 @@ def denoise_tracks(
     index = torch.tensor(starts, device=tracks.device)[:, None] + torch.arange(length, device=tracks.device)
     model = _Model(length, values, quick)
 
-    outliers = each_joint(stray_from_neighbours, values, given > 0, threshold, floor)
+    outliers = each_joint(stray_from_neighbours, values, given > 0)
     points = values
     for last, (rounds, steps) in enumerate(_ROUNDS, start=1 - len(_ROUNDS)):
         live = torch.where(outliers, torch.zeros_like(given), given)
@@ -145,7 +135,7 @@ def denoise_tracks(
         if last == 0:
             break
         error = (values - points).norm(dim=-1) / (1 - model.leverage()[:, None] * live).clamp_min(1e-3)
-        outliers = each_joint(far_off, error, given > 0, threshold, floor)
+        outliers = each_joint(far_off, error, given > 0)
     noise, left = (
         (power.sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints).reshape(*shape[:-3], joints).to(tracks.dtype)
         for power in (model.measured + model.lasting.mean(1), model.left)

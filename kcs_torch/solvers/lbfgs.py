@@ -19,6 +19,9 @@ __all__ = ["History", "lbfgs"]
 PATIENCE = 10
 """Steps over which the energy has to fall."""
 
+TRIALS = 12
+"""Halvings of a step; a problem whose step fails restarts from steepest descent, then rests."""
+
 LEAVE = 0.25
 """Share of the problems that have to be done before the others go on without them."""
 
@@ -30,7 +33,6 @@ def lbfgs(
     num_steps: int = 100,
     memory: int = 10,
     tolerance: float = 1e-6,
-    max_trials: int = 12,
     first_step: float = 1e-2,
     slopes: bool = False,
     part: Callable[[Tensor], Callable[[Tensor], Any]] | None = None,
@@ -48,7 +50,6 @@ def lbfgs(
         num_steps: steps, at most.
         memory: pairs of differences kept.
         tolerance: a problem rests once ten steps lower its energy by less than this share of its size.
-        max_trials: halvings of a step; a problem whose step fails restarts from steepest descent, then rests.
         first_step: length of the first step, a share of the start's root mean square (of 1 where that is 0).
         slopes: ``energy`` returns its gradient, too: (H,) and (H, D). Else autograd tells it.
         part: makes the energy of some rows, whose indices (K,) it gets: problems that are done are then left out.
@@ -91,7 +92,7 @@ def lbfgs(
     found: list[tuple[Tensor, ...]] = []
     while num_steps > 0:
         trial, slope = rows.trial()
-        rows.judge(trial, *evaluate(trial), slope, max_trials)
+        rows.judge(trial, *evaluate(trial), slope)
         done = rows.settle(tolerance, num_steps)
         if done.all() or (enough is not None and enough(*rows.so_far())):
             break
@@ -162,7 +163,7 @@ class _Rows:
             return self.x - down, slope
         return torch.addcmul(self.x, down, self.x.new_tensor(self.length)[:, None], value=-1), slope
 
-    def judge(self, trial: Tensor, value: Tensor, gradient: Tensor, slope: np.ndarray, max_trials: int) -> None:
+    def judge(self, trial: Tensor, value: Tensor, gradient: Tensor, slope: np.ndarray) -> None:
         """Take the steps to trials (H, D) that lower the energy enough, and shorten the others."""
         length = self.length
         now, whole = _numbers(value, gradient.sum(-1))
@@ -171,7 +172,7 @@ class _Rows:
             # the parabola through value, slope and trial, kept within a tenth and a half
             bend = 2 * (now - self.value + length * slope)
             guess = np.where(np.isfinite(now) & (bend > 0), slope * length**2 / bend, 0.1 * length)
-        failed = (self.trials == max_trials - 1) & ~good & ~self.done
+        failed = (self.trials == TRIALS - 1) & ~good & ~self.done
         moved = good | failed
         if good.all():
             self.scale = self.history.add(trial - self.x, gradient - self.gradient, self.scale)

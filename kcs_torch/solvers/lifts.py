@@ -11,7 +11,7 @@ from torch import Tensor
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.guarded import safe_norm
-from kcs_torch.functional.rotation import rotation_matrix
+from kcs_torch.functional.rotation import rotation_matrix, running_products
 
 __all__ = ["random_lifts", "rotations_over_time", "turning_cameras"]
 
@@ -35,12 +35,7 @@ def rotations_over_time(vectors: Tensor) -> Tensor:
     """
     turn = nearest_rotation(vectors[..., 1:, :, :].mT @ vectors[..., :-1, :, :])
     first = torch.eye(3, dtype=turn.dtype, device=turn.device).expand(*vectors.shape[:-3], 1, 3, 3)
-    total = torch.cat([first, turn], -3)
-    step = 1
-    while step < total.shape[-3]:  # products of the last frames, of twice as many each time
-        total = torch.cat([total[..., :step, :, :], total[..., step:, :, :] @ total[..., :-step, :, :]], -3)
-        step *= 2
-    return total
+    return running_products(torch.cat([first, turn], -3))
 
 
 def random_lifts(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.functional.temporal import interpolate, window_starts
 from kcs_torch.solvers.spectrum import TINY, temporal_modes, unshared, white_power
-from kcs_torch.solvers.stray import FLOOR, STRAY, body_size, each_joint, stray_from_neighbours
+from kcs_torch.solvers.stray import body_size, each_joint, stray_from_neighbours
 
 __all__ = ["SHORT", "Noise", "measure_noise"]
 
@@ -63,7 +63,7 @@ def measure_noise(tracks: Tensor, weights: Tensor, *, window: int = 64) -> Noise
     if not bool(size > TINY):
         return None
     values = values / size
-    seen = seen & ~each_joint(stray_from_neighbours, values, seen, STRAY, FLOOR)
+    seen = seen & ~each_joint(stray_from_neighbours, values, seen)
     shown = seen[0].any(1)  # hands are lost as a whole now and then
     steady = seen[0].double().sum(0) >= SEEN * float(shown.sum())
     if int(steady.sum()) < STEADY or float(shown.double().mean()) < SHOWN:

@@ -13,7 +13,7 @@ pulling on bones that vary by more than three times the slack d. All scales fall
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -26,7 +26,7 @@ from kcs_torch.functional.guarded import safe_norm
 from kcs_torch.functional.precision import widened
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.functional.weights import known
-from kcs_torch.solvers.curvature import Levels, shown, whitening
+from kcs_torch.solvers.curvature import CHANGE, REACH, Levels, shown, whitening
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.memory import give_back
 from kcs_torch.solvers.procrustean_descent import Descent
@@ -82,12 +82,6 @@ FULL, LITTLE, MOST = 250.0, 0.005, 0.5
 """Degrees at which depths are as sure as the curvature tells, if the directions of view are spread over all sides; the
 least variance of these directions; and the largest deviation."""
 
-CHANGE = 0.1
-"""The eps of the changes, a share of the poses'."""
-
-REACH = 3.0
-"""Residuals beyond this many standard deviations, and lengths beyond this many slacks, stop pulling."""
-
 
 @dataclass(frozen=True)
 class Pose:
@@ -132,7 +126,6 @@ def procrustean(
     stiffness: Tensor | float = 1.0,
     noise: float = 0.0,
     stages: Sequence[Stage] = COARSE + FINE,
-    extra: Callable[[Tensor], Tensor] | None = None,
     counts: Tensor | None = None,
     anchor: Tensor | float = 0.0,
 ) -> Pose:
@@ -149,7 +142,6 @@ def procrustean(
         noise: standard deviation of the tracks, as a share of their size. 0 takes them as exact and complete, which
             leaves one unknown a joint; else there are three.
         stages: scales and weights, in order.
-        extra: further energy (H,) of points (H, T, N, 3), differentiable.
         counts: (H,) frames of each start, of clips that are padded with zeros to T; not with ``noise``. All if None.
         anchor: (H,) or a number, weight of half the squared distance of each depth from its start.
 
@@ -172,7 +164,7 @@ def procrustean(
     weight = torch.as_tensor(anchor, dtype=points.dtype, device=points.device).expand(hypotheses)
     pull = (points[..., 2], weight) if isinstance(anchor, Tensor) or anchor > 0 else None
     for stage in stages:
-        pose = _descend(pose, tracks, bones, rigid, stiff, stage, share, noise, extra, counts, pull)
+        pose = _descend(pose, tracks, bones, rigid, stiff, stage, share, noise, counts, pull)
     return pose
 
 
@@ -185,7 +177,6 @@ def _descend(
     stage: Stage,
     weights: Tensor,
     noise: float,
-    extra: Callable[[Tensor], Tensor] | None,
     counts: Tensor | None,
     anchor: tuple[Tensor, Tensor] | None,
 ) -> Pose:
@@ -195,20 +186,18 @@ def _descend(
     levels = aligned_levels(points, rotations, bones, stage, counts)
     precision = _precision(points, tracks, weights, noise) if noise > 0 else None
     roots = whitening(
-        points, rotations, bones, levels, 3 if noise > 0 else 1, rigid, stiffness, stage.slack, REACH,
+        points, rotations, bones, levels, 3 if noise > 0 else 1, rigid, stiffness, stage.slack,
         precision, counts, anchor[1] if anchor else None,
     )  # fmt: skip
     del levels
     descent = Descent(
         points, rotations, roots, bones, rigid, stiffness, stage,
-        change=CHANGE, reach=REACH, tracks=tracks, weights=weights, noise=noise, extra=extra,
-        counts=counts, anchor=anchor,
+        tracks=tracks, weights=weights, noise=noise, counts=counts, anchor=anchor,
     )  # fmt: skip
     start = points.new_zeros(len(points), roots[0, ..., 0].numel())
     solution = lbfgs(
-        descent, start, num_steps=stage.num_steps, first_step=1.0, tolerance=1e-8, slopes=True,
-        part=None if extra else descent.rows,  # what else is wanted may be of each hypothesis its own
-    )  # fmt: skip
+        descent, start, num_steps=stage.num_steps, first_step=1.0, tolerance=1e-8, slopes=True, part=descent.rows
+    )
     assert solution.before is not None and solution.energy is not None
     points, rotations = descent.moved(solution.value)
     moved = (points - descent.moved(solution.before)[0]).square().sum(-1).mean(-1).sum(-1)
@@ -250,7 +239,7 @@ def depth_deviation(
     rigid = bones if rigid is None else rigid
     stiff = torch.as_tensor(stiffness, dtype=points.dtype, device=points.device).expand(len(rigid))
     levels = aligned_levels(points, rotations, bones, TELLING)
-    roots = whitening(points, rotations, bones, levels, 1, rigid, stiff, TELLING.slack, REACH)
+    roots = whitening(points, rotations, bones, levels, 1, rigid, stiff, TELLING.slack)
     local = roots[..., :-3, :].norm(dim=-1)
     angle = torch.rad2deg((views[:, 1:] * views[:, :-1]).sum(-1).clamp(-1, 1).arccos().sum(-1)).clamp_min(1.0)
     variance = (1 - views.mean(1).square().sum(-1)).clamp(LITTLE, 1)
@@ -296,23 +285,23 @@ def motion_energy(points: Tensor, rotations: Tensor, bones: Tensor, stage: Stage
     return total
 
 
-def length_energy(points: Tensor, rigid: Tensor, stiffness: Tensor, slack: float, reach: float = REACH) -> Tensor:
-    """sum_p s_p T/2 log((v_p + d^2) / (v_p + (reach d)^2)), v_p the variance of a length over time, (...)."""
+def length_energy(points: Tensor, rigid: Tensor, stiffness: Tensor, slack: float) -> Tensor:
+    """sum_p s_p T/2 log((v_p + d^2) / (v_p + 9 d^2)), v_p the variance of a length over time, (...)."""
     if len(rigid) == 0:
         return points.new_zeros(points.shape[:-3])
     spread = safe_norm(bone_vectors(points, rigid)).var(-2, unbiased=False)
-    return (stiffness * steadiness(spread, points.shape[-3], slack, reach)).sum(-1)
+    return (stiffness * steadiness(spread, points.shape[-3], slack)).sum(-1)
 
 
-def steadiness(spread: Tensor, frames: int, slack: float, reach: float = REACH) -> Tensor:
-    """T/2 log((v + d^2) / (v + (reach d)^2)) of variances v over time (...): the less, the steadier."""
-    return frames / 2 * ((spread + slack**2) / (spread + (reach * slack) ** 2)).log()
+def steadiness(spread: Tensor, frames: int, slack: float) -> Tensor:
+    """T/2 log((v + d^2) / (v + 9 d^2)) of variances v over time (...): the less, the steadier."""
+    return frames / 2 * ((spread + slack**2) / (spread + (REACH * slack) ** 2)).log()
 
 
-def track_energy(points: Tensor, tracks: Tensor, weights: Tensor, noise: float, reach: float = REACH) -> Tensor:
+def track_energy(points: Tensor, tracks: Tensor, weights: Tensor, noise: float) -> Tensor:
     """sum_tn u_tn c^2/2 log(1 + |x_tn - y_tn|^2 / (c noise)^2): Cauchy's, so that outliers do not pull, (...)."""
-    square = (points[..., :2] - tracks).square().sum(-1) / (reach * noise) ** 2
-    return reach**2 / 2 * (weights * square.log1p()).sum((-2, -1))
+    square = (points[..., :2] - tracks).square().sum(-1) / (REACH * noise) ** 2
+    return REACH**2 / 2 * (weights * square.log1p()).sum((-2, -1))
 
 
 def align_rotations(points: Tensor, rotations: Tensor, bones: Tensor, *, num_steps: int = 10) -> Tensor:

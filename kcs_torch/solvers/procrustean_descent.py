@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import incidence
-from kcs_torch.solvers.curvature import shown
+from kcs_torch.solvers.curvature import CHANGE, REACH, shown
 
 if TYPE_CHECKING:
     from kcs_torch.solvers.procrustean import Stage
@@ -39,12 +39,9 @@ class Descent:
         rigid: (P, 2) pairs that keep their distance.
         stiffness: (P,).
         stage: weights and scales.
-        change: eps of the changes, a share of the poses'.
-        reach: slacks, and standard deviations of the tracks, from which on nothing pulls.
         tracks: (T, N, 2), where they are not exact.
         weights: (T, N) of them.
         noise: of them; 0 holds x and y.
-        extra: further energy (H,) of points (H, T, N, 3), whose gradient autograd tells.
         counts: (H,) frames of each start, where some are padded with zeros.
         anchor: depths (H, T, N) that hold each depth, and by what weights (H,); or None.
     """
@@ -59,17 +56,14 @@ class Descent:
         stiffness: Tensor,
         stage: Stage,
         *,
-        change: float,
-        reach: float,
         tracks: Tensor,
         weights: Tensor,
         noise: float,
-        extra: Callable[[Tensor], Tensor] | None = None,
         counts: Tensor | None = None,
         anchor: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         joints = points.shape[-2]
-        self.slack, self.reach, self.noise, self.extra = stage.slack, reach, noise, extra
+        self.slack, self.noise = stage.slack, noise
         self.free = 3 if noise > 0 else 1
         self.points = points.permute(0, 3, 2, 1).contiguous()  # (H, 3, N, T)
         self.rotations = rotations.permute(0, 2, 3, 1).contiguous()  # (H, 3, 3, T)
@@ -94,7 +88,7 @@ class Descent:
         self.counts = points.new_tensor([float(frames)]) if counts is None else counts  # (1,) or (H,)
         self.within = None if counts is None else shown(counts, frames)[:, None]  # (H, 1, T)
         levels = [(stage.still, stage.eps, 0)] if self.still else []
-        levels += [(stage.moving, change * stage.eps, 1)] if self.moving else []
+        levels += [(stage.moving, CHANGE * stage.eps, 1)] if self.moving else []
         # weights, eps and frames less than the clip's of the log-determinants: (levels, 1, 1, 1) each
         *self.levels, less = points.new_tensor(levels).view(len(levels), 3, 1, 1, 1).unbind(1)
         self.frames = (self.counts[:, None, None] - less).clamp_min_(1)  # (levels, 1 or H, 1, 1)
@@ -161,13 +155,6 @@ class Descent:
             off = self.away + shift[:, -1]
             value = value + self.anchor / 2 * off.square().sum((-2, -1))
             slope[:, -1] += self.anchor[:, None, None] * off
-        if self.extra is not None:
-            with torch.enable_grad():
-                leaf = self._placed(shift).requires_grad_()
-                cost = self.extra(leaf)
-                (more,) = torch.autograd.grad(cost.sum(), leaf)
-            value = value + cost.detach()
-            slope += more.permute(0, 3, 2, 1)[:, -self.free :]
         spun = turn.slopes((turned[:, :, None] * self.rotations[:, None]).sum(3))
         step = torch.cat([slope.flatten(1, 2), spun], 1).mT.contiguous()  # (H, T, D)
         return value, (step.unsqueeze(-2) @ self.roots).view(count, -1)
@@ -236,7 +223,7 @@ class Descent:
         if self.within is not None:
             off *= self.within
         spread = self._mean(off.square())[..., 0]
-        low, high = spread + least, spread + self.reach**2 * least
+        low, high = spread + least, spread + REACH**2 * least
         pull = self.stiffness * (1 / low - 1 / high)
         along = off.mul_(pull[..., None]).div_(size.clamp_min_(torch.finfo(size.dtype).tiny ** 0.5))
         value = self.counts / 2 * (self.stiffness * (low / high).log()).sum(-1)
@@ -244,9 +231,9 @@ class Descent:
 
     def _tracks(self, points: Tensor, slope: Tensor) -> Tensor:
         off = points[:, :2] - self.tracks
-        square = off.square().sum(1).mul_(1 / (self.reach * self.noise) ** 2)  # (H, N, T)
+        square = off.square().sum(1).mul_(1 / (REACH * self.noise) ** 2)  # (H, N, T)
         slope[:, :2] += off * (self.weights / self.noise**2 / (1 + square))[:, None]
-        return self.reach**2 / 2 * (self.weights * square.log1p()).sum((-2, -1))
+        return REACH**2 / 2 * (self.weights * square.log1p()).sum((-2, -1))
 
 
 class Turn:

@@ -10,10 +10,13 @@ from torch import Tensor
 
 from kcs_torch.functional.ranks import nanmedian
 
-__all__ = ["FLOOR", "STRAY", "body_size", "each_joint", "far_off", "stray_from_neighbours"]
+__all__ = ["body_size", "each_joint", "far_off", "stray_from_neighbours"]
 
 STRAY, FLOOR = 6.0, 0.04
 """Of outliers: usual distances from what is predicted, and the share of the body's size beside."""
+
+AROUND = 8
+"""Frames before and behind that are a joint's surroundings."""
 
 NUMBERS = 2**18
 """Joints times frames that are judged at once: this takes a hundred times the memory."""
@@ -22,14 +25,14 @@ COMMON, RATIO = 0.7, 1.318
 """A quantile of distances, and what it is over the median for a Gaussian in the plane."""
 
 
-def each_joint(judge: Callable[..., Tensor], values: Tensor, seen: Tensor, *limits: float) -> Tensor:
+def each_joint(judge: Callable[[Tensor, Tensor], Tensor], values: Tensor, seen: Tensor) -> Tensor:
     """(K, T, N) what a judge that looks at each joint by itself says, of few joints at a time where clips are long."""
     few = max(1, NUMBERS // max(values.shape[0] * values.shape[1], 1))
     parts = zip(values.split(few, 2), seen.split(few, 2), strict=True)
-    return torch.cat([judge(*part, *limits) for part in parts], 2)
+    return torch.cat([judge(*part) for part in parts], 2)
 
 
-def stray_from_neighbours(values: Tensor, seen: Tensor, threshold: float, floor: float) -> Tensor:
+def stray_from_neighbours(values: Tensor, seen: Tensor) -> Tensor:
     """(K, T, N) outliers against the median of straight lines through a joint's nearest seen frames."""
     frames = values.shape[1]
     if frames < 5:
@@ -51,19 +54,19 @@ def stray_from_neighbours(values: Tensor, seen: Tensor, threshold: float, floor:
         gap = torch.where(stop == start, torch.ones_like(stop), stop - start)
         lines.append(first + ((time - start) / gap)[..., None] * (last - first))
     error = (values - nanmedian(torch.stack(lines), 0)).norm(dim=-1)
-    return far_off(error, seen & error.isfinite(), threshold, floor)
+    return far_off(error, seen & error.isfinite())
 
 
-def far_off(error: Tensor, seen: Tensor, threshold: float, floor: float, spread: int = 8) -> Tensor:
+def far_off(error: Tensor, seen: Tensor) -> Tensor:
     """(K, T, N), True where a seen joint's error, in body sizes, is far above what is usual for it."""
     known = torch.where(seen, error, torch.full_like(error, math.nan))
     # Of a Gaussian's distances the quantile is at the median. It is above it where a joint is still most of the time
     # and then swings: no quick stride is an outlier, no outliers are as common.
     clip = torch.maximum(nanmedian(known, 1, keepdim=True), known.nanquantile(COMMON, 1, keepdim=True) / RATIO)
-    around = torch.nn.functional.pad(known.mT, (spread, spread), value=math.nan).unfold(-1, 2 * spread + 1, 1)
+    around = torch.nn.functional.pad(known.mT, (AROUND, AROUND), value=math.nan).unfold(-1, 2 * AROUND + 1, 1)
     # Bounded, as near the ends of a clip one outlier may spoil the prediction of all that is around.
     usual = torch.maximum(clip, torch.minimum(nanmedian(around, -1).mT, 4 * clip)).nan_to_num(0.0)
-    return seen & (error > threshold * usual + floor)
+    return seen & (error > STRAY * usual + FLOOR)
 
 
 def body_size(values: Tensor, seen: Tensor) -> Tensor:

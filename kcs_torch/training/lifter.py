@@ -191,7 +191,7 @@ class _Match(NamedTuple):
 def _size(tracks: Tracks) -> Tensor:
     """Size (T,) of the body in the image, of mean 1, where it clearly changes: networks know bodies of one size."""
     image = interpolate(tracks.points, tracks.seen)
-    size = weak_perspective(image, tracks.seen, tracks.skeleton, tracks.fps or 30.0)
+    size = weak_perspective(image, tracks.seen, tracks.skeleton, tracks.rate)
     return size.path if size.sure else torch.ones_like(image[:, 0, 0])
 
 

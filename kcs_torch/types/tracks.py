@@ -37,6 +37,11 @@ class Tracks(Trajectories):
     source: str = "tracks"
     detector: bool | None = None
 
+    @property
+    def rate(self) -> float:
+        """Frames per second, taken to be 30 where unknown."""
+        return self.fps or 30.0
+
     @classmethod
     def from_arrays(
         cls,

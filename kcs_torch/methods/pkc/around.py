@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.methods.lockstep import Search
-from kcs_torch.methods.pkc.body import LONG, ONE, POLISH, Body, alike
+from kcs_torch.methods.pkc.body import LONG, ONE, POLISH, Body, agree
 from kcs_torch.methods.pkc.flips import GAIN, flipped_runs, members, parts_of, signs_of
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
@@ -56,8 +56,7 @@ def turned_around(body: Body, found: Hypotheses, other: Tensor) -> Search[Any, A
         other: depths (T, N) that the viewpoint's turn tells by itself; if they confirm the best one nothing is tried.
     """
     best = found.depth[0]
-    off = (alike(other, best) - best).square().sum()
-    if len(best) > LONG or bool(off <= AGREE**2 * best.square().sum()):
+    if len(best) > LONG or agree(other, best, AGREE):
         return found
     first = now = yield from _settled(body, found.depth[:1])
     for _ in range(TIMES):

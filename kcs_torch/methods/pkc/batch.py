@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kcs_torch.methods.pkc.descents import Descent, descend_all
+from kcs_torch.methods.pkc.descents import TOGETHER, Descent, descend_all
 from kcs_torch.methods.pkc.objective import Objective, Refined
 from kcs_torch.methods.pkc.placing import Placing, limb_paths
 from kcs_torch.methods.pkc.trunk import Facing, facings
@@ -53,10 +53,6 @@ class Sized(NamedTuple):
     """Tracks whose points are images, of which the size over time is wanted, see :func:`weak_perspectives`."""
 
     tracks: Tracks
-
-
-TOGETHER = 1200
-"""Frames of hypotheses that are refined as one batch; more would only fall out of the processor's cache."""
 
 
 def serve(requests: Sequence[Task | Placing | Facing | Descent | Noisy | Sized | Tracks]) -> list[Any]:

@@ -30,7 +30,7 @@ from kcs_torch.solvers.camera_path import choose_path, view_energy
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.procrustean import COARSE, FINE, Stage, align_rotations
 
-__all__ = ["LONG", "ONE", "POLISH", "TOLD", "Body", "Near", "Turned", "alike"]
+__all__ = ["LONG", "ONE", "POLISH", "TOLD", "Body", "Near", "Turned", "agree"]
 
 Turned = Callable[[bool], Search[Any, Any, Tensor]]
 """Depths (T, N) that the viewpoint's turn tells, in the template's units; from many starts if so, else from one."""
@@ -110,8 +110,7 @@ class Body:
         self, skeleton: Skeleton, image: Tensor, rate: float, noise: Tensor, standing: Tensor | None = None
     ) -> None:
         posture = usual_posture(skeleton, image.dtype, image.device)
-        rigid = torch.zeros(skeleton.num_bones, dtype=torch.bool, device=image.device)
-        rigid[list(skeleton.rigid)] = True
+        rigid = skeleton.rigid_mask(device=image.device)
         scale = image_scale(image, posture.rest_lengths, posture.bones, rigid, bone_noise(noise, posture.bones))
         scale = or_one(scale)
         self.skeleton, self.rate, self.factor = skeleton, rate, 1 / scale
@@ -186,8 +185,7 @@ class Body:
     @property
     def spanned(self) -> bool:
         """Whether bones link all joints, and these do not all lie at one point: what :meth:`polished` needs."""
-        skeleton = self.skeleton
-        return skeleton.is_tree and skeleton.num_bones == skeleton.num_joints - 1 and bool(self.image.any())
+        return self.skeleton.is_tree and bool(self.image.any())
 
     def turns(self, found: Hypotheses, least: float = 0.0) -> bool:
         """Whether the trunk of the best hypothesis turns far enough to tell depth better than the template does.
@@ -320,8 +318,7 @@ class Body:
                 if float(viewpoint_turn(self.frames(depth, image[some])[:, :2])) < TURNING:
                     return False
                 other = (yield from turned(False))[::stride][some]
-                off = (alike(other, depth) - depth).square().sum()
-                return bool(off <= AGREE**2 * depth.square().sum())
+                return agree(other, depth, AGREE)
 
             return searching(
                 self.skeleton, image[some], rate=rate, noise=noise, rounds=rounds, steps=steps, anchor=anchor,
@@ -359,3 +356,8 @@ class Body:
 def alike(depth: Tensor, other: Tensor) -> Tensor:
     """Depths, or their mirror image if that is more like the others."""
     return torch.where((depth * other).sum() < 0, -depth, depth)
+
+
+def agree(depth: Tensor, other: Tensor, share: float) -> bool:
+    """Whether depths, or their mirror image, differ from the others by a share of these at most, root mean square."""
+    return bool((alike(depth, other) - other).square().sum() <= share**2 * other.square().sum())

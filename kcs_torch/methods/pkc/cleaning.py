@@ -9,11 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.clean.detector import detected
+from kcs_torch.clean.detector import detected, detector_deviation
 from kcs_torch.clean.timing import cuts_of
 from kcs_torch.errors import counted
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.detector import detector_deviation
 from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.batch import Noisy
 from kcs_torch.methods.pkc.gate import plausible
@@ -62,7 +61,7 @@ def cleaned(
     if not denoise:
         parts = [_complete(shot, interpolate(shot.points, shot.seen), shot.seen, 0.0) for shot in shots]
     else:
-        rate = tracks.fps or 30.0
+        rate = tracks.rate
         window = window_at(rate)
         quick = math.ceil(2 * QUICK * window / rate)
         kept = [plausible(shot.points, shot.seen, shot.skeleton) for shot in shots]
@@ -105,7 +104,7 @@ def _complete(tracks: Tracks, points: Tensor, keep: Tensor, left: float) -> tupl
         flat = torch.nn.functional.pad(points, (0, 1))
         points = place_unseen(flat, known, tracks.skeleton)[..., :2]
     points = within_reach(points, keep, tracks.skeleton)
-    noise = (gap_deviation(points, keep, tracks.fps or 30.0, HELD).square() + left**2).sqrt()
+    noise = (gap_deviation(points, keep, tracks.rate, HELD).square() + left**2).sqrt()
     if detected(tracks):
         noise = noise.maximum(detector_deviation(tracks))
         notes.append("taken for a detector's joints: they may be off by 3 % of the body's size or more, frames on end")

@@ -8,15 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from kcs_torch.methods.clips import SPREAD
 from kcs_torch.solvers.procrustean import Pose, Stage, procrustean
 
-__all__ = ["Descent", "descend_all"]
+__all__ = ["TOGETHER", "Descent", "descend_all"]
 
 TOGETHER = 1200
-"""Frames of starts that are descended from as one batch; more would only fall out of the processor's cache."""
-
-PADDED = 1.5
-"""By how much clips that are padded to one length differ, at most."""
+"""Frames of starts or hypotheses that are taken as one batch; more would only fall out of the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ def descend_all(tasks: Sequence[Descent]) -> list[Pose]:
         for i in group:
             count, frames = tasks[i].points.shape[:2]
             shortest = tasks[run[0]].points.shape[1] if run else frames
-            if run and ((rows + count) * frames > TOGETHER or frames > PADDED * shortest):
+            if run and ((rows + count) * frames > TOGETHER or frames > SPREAD * shortest):
                 out |= zip(run, _descend([tasks[i] for i in run]), strict=True)
                 run, rows = [], 0
             run.append(i)

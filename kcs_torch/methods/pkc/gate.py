@@ -96,9 +96,7 @@ def plausible(points: Tensor, seen: Tensor, skeleton: Skeleton) -> Tensor:
         return seen
     bones = skeleton.bone_index(device=points.device)
     both = seen[:, bones[:, 0]] & seen[:, bones[:, 1]]  # (T, B)
-    rigid = torch.zeros(len(bones), dtype=torch.bool, device=points.device)
-    rigid[list(skeleton.rigid)] = True
-    use = rigid & both.any(0) & (usual > 0)
+    use = skeleton.rigid_mask(device=points.device) & both.any(0) & (usual > 0)
     if not bool(use.any()):
         return seen
     flat = bone_vectors(points, bones)

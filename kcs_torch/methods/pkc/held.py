@@ -24,9 +24,7 @@ def with_lengths_held(image: Tensor, points: Tensor, skeleton: Skeleton) -> Tens
     bones = skeleton.bone_index(device=points.device)
     flat, dz = bone_vectors(image, bones).norm(dim=-1), bone_vectors(points, bones)[..., 2]
     length = torch.maximum(median(bone_lengths(points, bones), 0), flat.amax(0))
-    rigid = torch.zeros(len(bones), dtype=torch.bool, device=points.device)
-    rigid[list(skeleton.rigid)] = True
     held = torch.copysign((length.square() - flat.square()).clamp_min(0).sqrt(), dz)
     tree = chain_inverse(incidence(bones, skeleton.num_joints, dtype=points.dtype))  # (N, B)
-    depth = torch.where(rigid, held, dz) @ tree.mT
+    depth = torch.where(skeleton.rigid_mask(device=points.device), held, dz) @ tree.mT
     return torch.cat([image, (depth - depth.mean(-1, keepdim=True))[..., None]], -1)

@@ -31,7 +31,7 @@ def shortened(tracks: Tracks) -> Tensor | None:
     What is unseen at the clip's ends is no gap.
     """
     shown = tracks.seen.sum(-1) >= min(SHOWN, tracks.num_joints)
-    most = max(2, round(LONGEST * (tracks.fps or 30.0)))
+    most = max(2, round(LONGEST * tracks.rate))
     frames = shown.nonzero().flatten()
     long = frames.diff() > most + 1
     if not bool(long.any()):
@@ -55,7 +55,7 @@ def lengthened(found: Estimate, kept: Tensor, tracks: Tracks, cameras: Tensor | 
         return fill_between(values[None], kept, tracks.num_frames)[0]
 
     points = all_of(found.points)
-    unseen = gap_deviation(points[..., :2], tracks.seen, tracks.fps or 30.0, HELD)
+    unseen = gap_deviation(points[..., :2], tracks.seen, tracks.rate, HELD)
     return replace(
         found,
         points=points,

@@ -34,7 +34,7 @@ from kcs_torch.methods.pkc.sizing import TRIED, resized, with_size
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import Size
-from kcs_torch.nn.posture import trunk_joints
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
@@ -116,7 +116,7 @@ class PKC(Method):
             self._expect(getattr(self, field) >= least, field, f"at least {least}")
 
     def knows_template(self, skeleton: Skeleton) -> bool:
-        return len(trunk_joints(skeleton)) >= 3
+        return has_trunk(skeleton)
 
     def prepared(self, tracks: Tracks) -> Tracks:
         tracks = unswap(without_others(tracks)) if self.denoise else tracks
@@ -192,8 +192,8 @@ class PKC(Method):
     ) -> Search[Any, Any, Estimate]:
         """Solve complete points (T, N, 2) by their image about the middle, in which a body's size may change."""
         skeleton = tracks.skeleton
-        has_trunk = len(trunk_joints(skeleton)) >= 3
-        if self.viewpoint == "fixed" and not has_trunk:
+        template = self.knows_template(skeleton)
+        if self.viewpoint == "fixed" and not template:
             raise OptionError(
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
@@ -204,12 +204,12 @@ class PKC(Method):
         changing, even = size.sure, image / size.path[:, None, None]
         if changing:
             image = even
-        if not has_trunk:
+        if not template:
             made = yield from self._without_template(tracks, image, noise, cameras, notes, enough)
             return with_size(made, size) if changing else made
         still = self.contacts and not _turns(cameras) and self.viewpoint != "moving"
         feet = standing if still else None
-        body = Body(skeleton, image, tracks.fps or 30.0, noise, feet)
+        body = Body(skeleton, image, tracks.rate, noise, feet)
         detections = detected(tracks)  # their errors last, and would be taken for motion
         polished = enough and body.spanned and not detections
         compared = polished and self.viewpoint == "auto"
@@ -228,7 +228,7 @@ class PKC(Method):
                 notes = (*notes, near.told)
             led = compared and body.is_odd(found) and body.turns(found)  # by the viewpoint's turn, not by the template
             if resizing and not led:
-                other = Body(skeleton, even, tracks.fps or 30.0, noise, feet)
+                other = Body(skeleton, even, tracks.rate, noise, feet)
                 better = yield from resized(found, body, other, size, method._moves, self.steps)
                 if better is not None:
                     changing, body, found = True, other, better
@@ -370,5 +370,4 @@ def _turns(cameras: Tensor | None) -> bool:
 
 def _is_whole(tracks: Tracks) -> bool:
     """Whether the bones are a tree of all joints, and these are seen in all frames."""
-    body = tracks.skeleton
-    return body.is_tree and body.num_bones == body.num_joints - 1 and bool(tracks.seen.all())
+    return tracks.skeleton.is_tree and bool(tracks.seen.all())

@@ -204,8 +204,8 @@ def searching(
     """:func:`moving_view` as a search, which may run beside others; arguments as there."""
     frames, joints, _ = image.shape
     rigid = skeleton.bone_index(device=image.device)[list(skeleton.rigid)]
-    is_tree = skeleton.is_tree and len(skeleton.bones) == joints - 1
-    held = is_tree and exact and noise == 0 and len(rigid) == joints - 1
+    is_tree = skeleton.is_tree
+    held = is_tree and exact and noise == 0 and not skeleton.flexible
     small = joints <= ROBOT
     unsure = small and not held
     if too_long(image):

@@ -128,8 +128,7 @@ class Objective:
         slip = math.hypot(weights.slip, shaken)
         self.feet = make(ContactEnergy(skeleton, slip=slip, change=weights.change, num_steps=STEADY))
         self.flat = bone_vectors(image, self.bones).square().sum(-1)  # (T, B)
-        self.rigid = torch.zeros(skeleton.num_bones, dtype=image.dtype, device=image.device)
-        self.rigid[list(skeleton.rigid)] = 1
+        self.rigid = skeleton.rigid_mask(dtype=image.dtype, device=image.device)
         self.tree = chain_inverse(incidence(self.bones, skeleton.num_joints, dtype=image.dtype))  # (N, B)
         quiet = self.noise.amin(0)
         usual = quiet.amin()
@@ -240,9 +239,13 @@ class Objective:
 
     def carries(self, member: Tensor) -> Tensor:
         """Which parts (P,) move feet against the trunk, for members (P, B) that are 1 for a part's bones."""
-        lines = self.joints(torch.eye(member.shape[1], dtype=member.dtype, device=member.device))  # (B, N)
-        moves = lines[:, list(self.skeleton.contacts)] - lines[:, self.posture.trunk].mean(-1, keepdim=True)
-        return member @ (moves.abs() > 1e-9).any(-1).to(member) > 0
+        return member @ self.feet_moved().any(-1).to(member) > 0
+
+    def feet_moved(self) -> Tensor:
+        """How far depths of 1 of each bone move each contact point against the trunk, (B, C)."""
+        lines = self.joints(torch.eye(len(self.bones), dtype=self.tree.dtype, device=self.tree.device))  # (B, N)
+        feet = lines[:, list(self.skeleton.contacts)] - lines[:, self.posture.trunk].mean(-1, keepdim=True)
+        return torch.where(feet.abs() > 1e-9, feet, 0)
 
     def strayed(self, dz: Tensor, lengths: Tensor, flat: Tensor) -> Tensor:
         """How far bones of depths (H, T, B) are from lengths (H, B): c log(1 + off^2 / (c s^2)), (H, T, B).

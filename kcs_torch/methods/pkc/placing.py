@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.temporal import window_starts
+from kcs_torch.methods.clips import SPREAD
 from kcs_torch.methods.pkc.limb_costs import limb_costs
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts
 from kcs_torch.nn.posture import PostureEnergy
@@ -23,9 +24,6 @@ WINDOW, OVERLAP = 200, 40
 
 SAMPLE = 4
 """Windows from which the lengths of a long clip's bones are chosen."""
-
-SPREAD = 1.5
-"""Clips of one window are padded to one length: the longest has at most so many times the frames of the shortest."""
 
 FAR = 1e4
 """Depth where a clip is padded, in accelerations' deviations: what a clip's last frames have to do with it costs the

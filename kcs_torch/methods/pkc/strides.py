@@ -44,9 +44,7 @@ def strides(objective: Objective, own: Tensor, member: Tensor, places: Tensor, b
         bend: (P, T) what changes of sign cost there.
     """
     assert objective.standing is not None
-    lines = objective.joints(torch.eye(own.shape[1], dtype=own.dtype, device=own.device))  # (B, N)
-    feet = lines[:, list(objective.skeleton.contacts)] - lines[:, objective.posture.trunk].mean(-1, keepdim=True)
-    feet = torch.where(feet.abs() > 1e-9, feet, 0)  # (B, C)
+    feet = objective.feet_moved()  # (B, C)
     moves = member @ (feet != 0).to(own) > 0  # (P, C)
     sure = torch.minimum(objective.standing[1:], objective.standing[:-1])  # (T - 1, C)
     step = (own @ feet).diff(dim=0)

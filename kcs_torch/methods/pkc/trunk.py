@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcs_torch.functional.align import centre
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
 from kcs_torch.methods.lockstep import Search
@@ -112,12 +113,16 @@ def mirror(rotations: Tensor) -> Tensor:
     return rotations * flip[:, None] * flip
 
 
+def _facing(image: Tensor, trunk: Trunk, joints: Tensor) -> Facing:
+    """The trunk's joints in an image (T, N, 2), and in rest."""
+    return Facing(centre(image[:, joints])[0], centre(trunk.rest[joints])[0])
+
+
 def trunk_misfit(
     image: Tensor, trunk: Trunk, joints: Tensor, rotations: Tensor, scales: Tensor | float = 1.0
 ) -> Tensor:
     """Half the squared misfit, in deviations, of the trunk's template in each frame, (C, T) of (C, T, 3, 3)."""
-    rest = trunk.rest[joints] - trunk.rest[joints].mean(0)
-    goal = image[:, joints] - image[:, joints].mean(1, keepdim=True)
+    goal, rest = _facing(image, trunk, joints)
     return (scales * (rest @ rotations[..., :2, :].mT) - goal).square().sum((-2, -1)) / (2 * FIT**2)
 
 
@@ -134,9 +139,7 @@ def trunk_path(
         turn: standard deviation of the turn from frame to frame, in radians.
     """
     joints = posture.trunk
-    rest = trunk.rest[joints] - trunk.rest[joints].mean(0)
-    goal = image[:, joints] - image[:, joints].mean(1, keepdim=True)
-    ((rotations, scales),) = yield [Facing(goal, rest)]
+    ((rotations, scales),) = yield [_facing(image, trunk, joints)]
     rotations = torch.cat([rotations, mirror(rotations)])  # (16, T, 3, 3)
     off = trunk_misfit(image, trunk, joints, rotations, scales.repeat(2, 1)[..., None, None])
     choice = best_path(off.mT / correlation, trunk_turns(rotations, turn))
