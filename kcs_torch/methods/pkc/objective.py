@@ -19,7 +19,7 @@ from kcs_torch.methods.pkc.unknowns import Unknowns
 from kcs_torch.methods.pkc.weights import Weights, in_noise
 from kcs_torch.nn.anatomy import AdductionEnergy, HingeEnergy
 from kcs_torch.nn.contact import ContactEnergy
-from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy, oddity
+from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy, foreshortening, oddity
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.nn.stance import StanceEnergy
 from kcs_torch.skeleton import Skeleton
@@ -156,8 +156,9 @@ class Objective:
         """
         w = self.weights
         flat = self.flat if image is None else bone_vectors(image, self.bones).square().sum(-1)
-        points = self._points(depth, image)
-        dz = depth[..., self.bones[:, 1]] - depth[..., self.bones[:, 0]]  # (H, T, B)
+        own = self.image if image is None else image
+        points = torch.cat([own.expand(*depth.shape, 2), depth[..., None]], -1)
+        dz = self._own(depth)
         bend = dz.diff(n=2, dim=1).square()
         if self.time is not None:
             bend = bend * self.time[:, 2:, None]
@@ -168,7 +169,7 @@ class Objective:
             "stance": w.stance * self.stance(points, 1.0, self.time),
             "hinges": w.hinge / w.sine**2 * self.hinges(points, lengths, self.time).sum(-1),
             "adduction": w.adduction / w.sine**2 * self.adduction(points, lengths, self.time).sum(-1),
-            "foreshortening": self.foreshortened(points, lengths, self.clear),
+            "foreshortening": self.foreshortening(points, lengths, bone_weights=self.clear, bone_noise=self.noise),
         }
         return out | self.length_terms(lengths)
 
@@ -214,23 +215,21 @@ class Objective:
         """
         if not self.noisy:
             return depth.new_zeros(len(depth))
-        square = self.noise.square()
-        share = VOLUME * self.clear * square / (square + self.weights.length**2)  # of exact images there is no room
-        few = max(1, MOST // depth.shape[1])
-        parts = zip(depth.split(few), lengths.split(few), strict=True)
-        return torch.cat([self.foreshortened(self._points(one), length, share) for one, length in parts])
+        square, eps = self.noise.square(), self.foreshortening.eps
+        share = VOLUME * self.independent * square / (square + self.weights.length**2)  # exact images leave none
+        few, out = max(1, MOST // depth.shape[1]), []
+        for z, length in zip(depth.split(few), lengths.split(few), strict=True):
+            room = share * foreshortening(self._own(z), length[:, None], eps, self.noise)
+            out.append(room.sum((1, 2)))
+        return torch.cat(out)
 
     def ranking(self, depth: Tensor, lengths: Tensor) -> Tensor:
         """What ranks solutions and does not pull on them, (H,), of depths (H, T, N) and lengths (H, B)."""
         return self.contact(depth) + self.volume(depth, lengths)
 
-    def foreshortened(self, points: Tensor, lengths: Tensor, share: Tensor) -> Tensor:
-        """The foreshortening (H,) of joints (H, T, N, 3) and lengths (H, B), of which images have shares (T, B)."""
-        return self.foreshortening(points, lengths, bone_weights=share, bone_noise=self.noise)
-
-    def _points(self, depth: Tensor, image: Tensor | None = None) -> Tensor:
-        """Joints (H, T, N, 3) of depths (H, T, N)."""
-        return torch.cat([(self.image if image is None else image).expand(*depth.shape, 2), depth[..., None]], -1)
+    def _own(self, depth: Tensor) -> Tensor:
+        """Depths (H, T, B) of bones, of joints' (H, T, N)."""
+        return depth[..., self.bones[:, 1]] - depth[..., self.bones[:, 0]]
 
     def oddity(self, lengths: Tensor) -> float:
         """How far lengths (B,) of rigid bones stray from the template's: root mean square of the logarithm."""
