@@ -106,7 +106,6 @@ def test_what_does_not_fit_is_told_by_its_name(name):
 FLOATING = {
     "angle_between": ("first", "second"),
     "back_project": ("tracks", "cameras"),
-    "camera_disagreement": ("first", "second"),
     "centre": ("points",),
     "euler_angles": ("matrices",),
     "euler_rotation": ("angles",),

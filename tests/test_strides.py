@@ -91,7 +91,7 @@ def test_feet_tell_that_thighs_do_not_bounce() -> None:
     left = (with_feet.depth - objective.joints(true)).square().mean((1, 2)).sqrt()
     assert left.min() < 0.3 * wrong
     best = with_feet[:3]
-    assert_close(best.energy, objective(best.depth, best.lengths) + objective.contact(best.depth))
+    assert_close(best.energy, objective(best.depth, best.lengths) + objective.ranking(best.depth, best.lengths))
     assert (with_feet.energy.diff() >= 0).all()
     objective.standing = None
     without = flipped(objective, parts, start)
