@@ -5,7 +5,7 @@ from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.denoise import Denoised, denoise_tracks
 from kcs_torch.solvers.implicit import Implicit, fixed_point, gmres
 from kcs_torch.solvers.ist import ist, metric_upgrade
-from kcs_torch.solvers.iterate import Solution, fpc, iterate
+from kcs_torch.solvers.iterate import Solution, fpc, iterate, svt
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.noise import Noise, measure_noise
@@ -43,5 +43,6 @@ __all__ = [
     "sign_costs",
     "sign_table",
     "smooth_signs",
+    "svt",
     "swapped_frames",
 ]

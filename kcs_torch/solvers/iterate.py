@@ -1,19 +1,20 @@
-"""The loop that iterative solvers here share, and fixed-point continuation."""
+"""The loop that every iterative solver here shares, and its two textbook uses."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError
+from kcs_torch.errors import ConvergenceWarning, OptionError
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.functional.spectral import svt
+from kcs_torch.functional.spectral import svt as shrink
 
-__all__ = ["Solution", "fpc", "iterate"]
+__all__ = ["Solution", "fpc", "iterate", "svt"]
 
 State = TypeVar("State")
 
@@ -48,6 +49,7 @@ def iterate(
     tolerance: float = 0.0,
     check_every: int = 5,
     grad_steps: int | None = None,
+    warn: str | None = None,
 ) -> Solution[State]:
     """Apply ``state = step(state, k)`` for k = 0, 1, ... until it settles.
 
@@ -60,6 +62,7 @@ def iterate(
         check_every: measure the change at every so-manyth step and at the last (each check waits for the device).
         grad_steps: record only the last so many steps for autograd; None records all, 0 none. An iteration that
             settles before it has recorded them goes on for so many steps.
+        warn: what to call the iteration in a :class:`ConvergenceWarning` if it does not settle; None is quiet.
 
     Returns:
         A :class:`Solution`.
@@ -90,35 +93,114 @@ def iterate(
             if converged:
                 end = min(end, count + tail)
         state = new
+    if not converged and warn is not None:
+        message = f"{warn} did not settle within {num_steps} steps; the result says converged=False"
+        warnings.warn(message, ConvergenceWarning, stacklevel=2)
     return Solution(state, converged, count, change=moved)
 
 
 def fpc(
-    start: Tensor, grad: Callable[[Tensor], Tensor], *, step: Tensor | float, weights: Tensor | Sequence[Tensor | float]
-) -> Tensor:
-    """Fixed-point continuation: X <- shrink(X - step grad(X), step weight), for a falling run of weights.
+    start: Tensor,
+    grad: Callable[[Tensor], Tensor],
+    prox: Callable[[Tensor, Tensor | float], Tensor] = shrink,
+    *,
+    step: Tensor | float,
+    weights: Tensor | list[float],
+    steps_per_weight: int = 10,
+    tolerance: float = 0.0,
+    grad_steps: int | None = None,
+) -> Solution[Tensor]:
+    """Fixed-point continuation: X <- prox(X - step grad(X), step weight), for a falling run of weights.
 
-    These are proximal gradient steps for ``f(X) + weight |X|_*``, one at each weight.
+    Minimises ``f(X) + weight g(X)`` at the last weight, by proximal gradient steps warm-started from the larger ones.
 
     Args:
-        start: first X, (..., M, N).
+        start: first X, any shape that ``prox`` takes (for the nuclear norm (..., M, N)).
         grad: gradient of the smooth term f.
+        prox: proximal map ``prox(X, t)`` of g; singular value shrinkage by default.
         step: step size, a number or a tensor of one element, below 2 over the Lipschitz constant of ``grad``.
         weights: (L,) or (L, ...) weights mu in falling order; each row broadcasts against the batch of X.
+        steps_per_weight: steps at each weight, at most.
+        tolerance: go on to the next weight where a step changes X by less than this share of X.
+        grad_steps: as in :func:`iterate`, counted over all steps.
 
     Returns:
-        The last X.
+        A :class:`Solution`; converged tells of the last weight (True where ``tolerance`` is 0: nothing is measured).
 
     Ma, Goldfarb, Chen 2011; Kovalenko et al. 2019, Algorithm 1, lines 8-11.
 
     >>> Y = torch.diag(torch.tensor([3.0, 1.0]))
-    >>> fpc(torch.zeros(2, 2), lambda X: X - Y, step=1.0, weights=[2.0]).round(decimals=4).tolist()
+    >>> fpc(torch.zeros(2, 2), lambda X: X - Y, step=1.0, weights=[2.0]).value.round(decimals=4).tolist()
     [[1.0, 0.0], [0.0, 0.0]]
     """
-    value = start
-    for weight in weights:
-        value = svt(value - step * grad(value), step * weight)
-    return value
+    value, converged, made = start, False, 0
+    for k, weight in enumerate(weights):
+        after = (len(weights) - 1 - k) * steps_per_weight  # steps at the weights to come
+        last = None if grad_steps is None else max(0, min(steps_per_weight, grad_steps - after))
+        solution = iterate(
+            lambda x, _, w=weight: prox(x - step * grad(x), step * w),  # type: ignore[misc]
+            value,
+            num_steps=steps_per_weight,
+            change=relative_change if tolerance > 0 else None,
+            tolerance=tolerance,
+            grad_steps=last,
+        )
+        value, converged, made = solution.value, solution.converged, made + solution.iterations
+    return Solution(value, converged, made)
+
+
+def svt(
+    forward: Callable[[Tensor], Tensor],
+    adjoint: Callable[[Tensor], Tensor],
+    target: Tensor,
+    *,
+    threshold: Tensor | float,
+    step: float = 1.2,
+    num_steps: int = 200,
+    tolerance: float = 1e-4,
+    grad_steps: int | None = None,
+) -> Solution[Tensor]:
+    """Singular value thresholding: min ||X||_* + 1/(2 threshold) |X|^2 subject to forward(X) = target.
+
+    The dual ascent X = shrink(forward^*(Y), threshold), Y <- Y + step (target - forward(X)).
+
+    Args:
+        forward: linear map from X (..., M, N) to the shape of ``target``.
+        adjoint: its adjoint.
+        target: data.
+        threshold: the larger, the nearer the solution is to that of the nuclear norm alone.
+        step: below 2 over the squared norm of ``forward``.
+        num_steps: at most so many steps.
+        tolerance: stop where the residual is this share of the target, in each problem of a batch: over the last two
+            dimensions of the target (the last one, if it has no other).
+        grad_steps: as in :func:`iterate`.
+
+    Returns:
+        A :class:`Solution` whose value is X.
+
+    Cai, Candes, Shen 2010, Algorithm 1; Wandt et al. 2018, eq. 21.
+
+    >>> Y = torch.diag(torch.tensor([3.0, 1.0]))
+    >>> svt(lambda X: X, lambda Y: Y, Y, threshold=0.5).value.round(decimals=2).tolist()
+    [[3.0, 0.0], [0.0, 1.0]]
+    """
+    norm = lambda x: torch.linalg.vector_norm(x, dim=tuple(range(-min(x.ndim, 2), 0)))  # noqa: E731
+    goal = norm(target.detach()) * tolerance
+
+    def ascend(state: tuple[Tensor, Tensor], _: int) -> tuple[Tensor, Tensor]:
+        dual = state[0]
+        value = shrink(adjoint(dual), threshold)
+        return dual + step * (target - forward(value)), value
+
+    solution = iterate(
+        ascend,
+        (step * target, adjoint(torch.zeros_like(target))),
+        num_steps=num_steps,
+        change=lambda old, new: norm(new[0] - old[0]) / step - goal,
+        tolerance=0.0,
+        grad_steps=grad_steps,
+    )
+    return Solution(solution.value[1], solution.converged, solution.iterations)
 
 
 def relative_change(old: Tensor, new: Tensor) -> Tensor:

@@ -209,9 +209,9 @@ class Objective:
         """What a hypothesis gains by the room that the image's noise leaves its depths, (H,); arguments as of ranking.
 
         A hypothesis is as likely as all depths near it are together, not as its best ones: noise n of a bone's image w
-        lets its depth vary by n |w| / |dz|. The determinant of the curvature is, but for constants, what the
-        foreshortening adds up. Bones that lean away from the image plane all the time would else win, as
-        they can explain any noise.
+        lets its depth vary by n |w| / |dz|. By Laplace's approximation this adds half the logarithm of the curvature's
+        determinant: but for constants, what the foreshortening adds up. Bones that lean away from the image plane all
+        the time would win without it, as they can explain any noise.
         """
         if not self.noisy:
             return depth.new_zeros(len(depth))
