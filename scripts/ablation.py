@@ -3,13 +3,16 @@
     python scripts/ablation.py
     python scripts/ablation.py --parts fixed --cases 20 --csv ablation.csv
     python scripts/ablation.py --variants "no hinges" "no posture" --suites static_walk
+    python scripts/ablation.py --parts others --cases 21
 
-Prints two Markdown tables: ``fixed``, people before a camera that does not move, and ``moving``, bodies without a
-template before one that turns. A figure is the mean over a suite's clips: ``fixed`` shows the distance to the truth
-after one rotation per frame, in mm (the protocol's ``rigid``), ``moving`` that after one rotation for the clip, over
-the deviation of the body (``e3d``); neither fits a scale. Beside them are CPU milliseconds a frame. The truth is for
-scoring alone. Synthetic suites need no data; the others are those of the measuring protocol, where it lies beside the
-repository in ``../shared``, and --cases of each are taken, evenly spread. PyTorch uses one thread.
+Prints a Markdown table a part: ``fixed``, people before a camera that does not move, ``others``, people in motions that
+are not among the measuring protocol's cases, seen from the front and from 60 degrees beside it, without and with 10 mm
+of noise, and ``moving``, bodies without a template before a camera that turns. A figure is the mean over a suite's
+clips: the distance to the truth after one rotation per frame, in mm (the protocol's ``rigid``), for ``moving`` that
+after one rotation for the clip, over the deviation of the body (``e3d``); neither fits a scale. Beside them are CPU
+milliseconds a frame. The truth is for scoring alone. Synthetic suites need no data; the others are those of the
+measuring protocol, or made by it, where it lies beside the repository in ``../shared``, and --cases of each are taken,
+evenly spread. PyTorch uses one thread.
 """
 
 from __future__ import annotations
@@ -39,10 +42,23 @@ from kcs_torch.methods.pkc.limbs import SignCosts
 from kcs_torch.nn import PostureEnergy
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+VIEWS = {
+    "front": {"yaw": 0, "pitch": 10},
+    "60 degrees": {"yaw": 60, "pitch": 10},
+    "front, noise": {"yaw": 0, "pitch": 10, "noise": 10},
+    "60 degrees, noise": {"yaw": 60, "pitch": 10, "noise": 10},
+}
 PARTS = {
     "fixed": ("walk", "walk, 15 mm noise", "static_walk", "static_action", "noise"),
+    "others": tuple(VIEWS),
     "moving": ("tree", "arm", "akhter"),
 }
+OTHERS = (
+    *(f"cmu/cmu_{n}" for n in ("02_01", "05_01", "07_01", "07_02", "08_01", "10_04", "12_01", "16_15", "16_31")),
+    *(f"cmu/cmu_{n}" for n in ("26_01", "29_01", "35_06", "35_07", "35_08", "35_09", "35_10", "39_01")),
+    *(f"cmu/cmu_35_{n}_run30" for n in (17, 18, 19)),
+    "cmu_cs2s/train_soccer_2",
+)
 SYNTHETIC = ("walk", "walk, 15 mm noise", "tree", "arm")
 YAWS = (0.0, 45.0, 90.0, 135.0)
 # import_module, as the package's functions have the names of these modules
@@ -197,7 +213,7 @@ MOVING_VARIANTS = {
     "SfAM's guess as the only start": Variant(changes=(constant(MOVING, "_starts", lambda *_: []),)),
     "no paths of single bones": Variant(changes=(constant(MOVING, "bone_paths", lambda *_: None),)),
 }
-VARIANTS = {"fixed": FIXED_VARIANTS, "moving": MOVING_VARIANTS}
+VARIANTS = {"fixed": FIXED_VARIANTS, "others": FIXED_VARIANTS, "moving": MOVING_VARIANTS}
 
 
 def both_signs(points: Tensor) -> tuple[Tensor, Tensor]:
@@ -219,7 +235,10 @@ def e3d(points: Tensor, truth: Tensor) -> float:
     return float((flat @ u @ v - goal).norm(dim=-1).mean() / spread)
 
 
-FIGURES: dict[str, tuple[Callable[[Tensor, Tensor], float], str]] = {"fixed": (rigid, ".1f"), "moving": (e3d, ".4f")}
+FIGURES: dict[str, tuple[Callable[[Tensor, Tensor], float], str]] = {
+    **{part: (rigid, ".1f") for part in ("fixed", "others")},
+    "moving": (e3d, ".4f"),
+}
 
 
 def synthetic(suite: str, frames: int) -> Iterator[Clip]:
@@ -239,14 +258,14 @@ def synthetic(suite: str, frames: int) -> Iterator[Clip]:
 
 
 def recorded(shared: Path, suite: str, cases: int, frames: int) -> Iterator[Clip]:
-    """Some clips of one of the protocol's suites."""
+    """Some clips of one of the protocol's suites, or of one of the views of other motions."""
     from benchmark import load_input, load_protocol
 
     try:
         protocol = load_protocol(shared)
     except kt.OptionError as error:
         raise SystemExit(f"error: {error}") from None
-    every = protocol.suites()[suite]
+    every = [{"src": src} | VIEWS[suite] for src in OTHERS] if suite in VIEWS else protocol.suites()[suite]
     for i in sorted(set(np.linspace(0, len(every) - 1, min(cases, len(every))).round().astype(int))):
         given, truth = protocol.build(shared / "data", {"max_frames": frames} | every[i])
         label = protocol.case_name(every[i])
