@@ -236,7 +236,7 @@ def e3d(points: Tensor, truth: Tensor) -> float:
 
 
 FIGURES: dict[str, tuple[Callable[[Tensor, Tensor], float], str]] = {
-    **{part: (rigid, ".1f") for part in ("fixed", "others")},
+    **dict.fromkeys(("fixed", "others"), (rigid, ".1f")),
     "moving": (e3d, ".4f"),
 }
 

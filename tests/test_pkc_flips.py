@@ -9,11 +9,11 @@ from torch.testing import assert_close
 from kcs_torch.functional import bone_vectors, standing
 from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pkc import flips as module
-from kcs_torch.methods.pkc.batch import Task, minimise_all
 from kcs_torch.methods.pkc.flips import flipped, flipped_runs, parts_of, signs_of, turned_over
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
 from kcs_torch.methods.pkc.objective import Objective, usual_posture
+from kcs_torch.methods.pkc.refinement import Task, minimise_all
 from kcs_torch.methods.pkc.run_costs import ParallelRays, RunCosts, Runs
 from kcs_torch.methods.pkc.weights import Weights
 from kcs_torch.skeleton import SKELETONS

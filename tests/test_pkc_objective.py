@@ -12,10 +12,11 @@ from torch.testing import assert_close
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths, bone_vectors
 from kcs_torch.methods.lockstep import run, together
-from kcs_torch.methods.pkc import batch
 from kcs_torch.methods.pkc import objective as module
-from kcs_torch.methods.pkc.batch import Task, minimise_all
-from kcs_torch.methods.pkc.objective import BLUR, Objective, Unknowns, bone_noise
+from kcs_torch.methods.pkc import refinement
+from kcs_torch.methods.pkc.objective import BLUR, Objective, bone_noise
+from kcs_torch.methods.pkc.refinement import Task, minimise, minimise_all
+from kcs_torch.methods.pkc.unknowns import Unknowns
 from kcs_torch.methods.pkc.weights import Weights, at_pace, in_noise, pace_of
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.nn import PostureEnergy
@@ -242,7 +243,7 @@ def test_unknowns_make_the_objective_round(noise):
     """The Hessian's condition at a minimum, without the shifts of whole frames, which cost nothing."""
     points = walk(9, yaw=20.0)
     found = objective(points, noise=noise)
-    z, sizes, *_ = found.minimise(points[None, ..., 2], lengths_of(found, points)[None], 100)
+    z, sizes, *_ = minimise(found, points[None, ..., 2], lengths_of(found, points)[None], 100)
     unknowns = Unknowns(found, z, sizes)
     plain = torch.cat([z.flatten(), sizes.flatten().log()])
     curves = []
@@ -272,7 +273,7 @@ def test_few_steps_do(noise, factor):
 
     start = torch.cat([depth.flatten(1), lengths.log()], 1)
     far = plain(lbfgs(plain, start, num_steps=40, tolerance=1e-9).value)
-    energy = found.minimise(depth, lengths, 20)[2]
+    energy = minimise(found, depth, lengths, 20)[2]
     assert energy < far < found(depth, lengths)
 
 
@@ -282,7 +283,7 @@ def test_loose_lengths_first():
     found = objective(points)
     start = of_length(found, points, 1.1)
     loose = objective(points, weights=replace(Weights(), length=7 * Weights().length))
-    for one, other in zip(found.minimise(*start, 8, 7.0)[:3], loose.minimise(*start, 8)[:3], strict=True):
+    for one, other in zip(minimise(found, *start, 8, 7.0)[:3], minimise(loose, *start, 8)[:3], strict=True):
         assert_close(one, other)
     assert found.weights == objective(points).weights
 
@@ -290,7 +291,7 @@ def test_loose_lengths_first():
 def test_where_nothing_is_seen_it_stays_finite():
     for points in (torch.zeros(4, 17, 3).double(), walk(4) * torch.tensor([0.0, 1.0, 1.0])):
         found = objective(points)
-        depth, lengths, energy, *_ = found.minimise(0 * points[None, ..., 2], found.posture.rest_lengths[None], 5)
+        depth, lengths, energy, *_ = minimise(found, 0 * points[None, ..., 2], found.posture.rest_lengths[None], 5)
         assert all(torch.isfinite(x).all() for x in (depth, lengths, energy))
 
 
@@ -323,12 +324,12 @@ def test_minimise_lowers_sorts_and_keeps_good_starts():
     lengths = bone_lengths(points, found.bones).mean(0)
     depth = torch.stack([-points[..., 2], points[..., 2] + 0.02 * normal(40, 17)])
     before = found(depth, lengths.expand(2, -1))
-    z, sizes, energy, _, steps = found.minimise(depth, lengths.expand(2, -1), 25)
+    z, sizes, energy, _, steps = minimise(found, depth, lengths.expand(2, -1), 25)
     assert (energy.diff() >= 0).all() and (energy < before.flip(0)).all()
     assert_close(energy, found(z, sizes))
     assert steps >= 1
     assert (z[0] - points[..., 2]).square().mean().sqrt() < 0.05
-    alone = found.minimise(depth[1:], lengths[None], 25)
+    alone = minimise(found, depth[1:], lengths[None], 25)
     assert_close(alone[2][0], energy[0], rtol=1e-3, atol=0)
 
 
@@ -349,7 +350,7 @@ def test_contacts_rank_solutions():
     assert_close(found.contact(-depth[:1])[0], right)  # the mirror image walks the other way
     assert not plain.contact(depth).any()
     lengths = lengths_of(found, points).expand(2, -1)
-    free, ranked = plain.minimise(depth, lengths, 3), found.minimise(depth, lengths, 3)
+    free, ranked = minimise(plain, depth, lengths, 3), minimise(found, depth, lengths, 3)
     assert_close(ranked.energy - found.contact(ranked.depth), found(ranked.depth, ranked.lengths))
     assert_close(free.depth[free.energy.argmin()], ranked.depth[0])  # contacts do not pull
     shaken = Objective(plain.skeleton, points[..., :2], Weights(), torch.full((60, 17), 0.02).double(), standing=sure)
@@ -377,7 +378,7 @@ def test_noise_leaves_more_room_to_bones_near_the_image_plane():
     assert noisy(1e-5).volume(*both).abs().max() < 1e-2  # and little noise leaves little
     assert_close(noisy(0.005).volume(-both[0], both[1]), torch.stack([swings, leans]))
     found = noisy(0.005)
-    ranked = found.minimise(*both, 3)
+    ranked = minimise(found, *both, 3)
     assert_close(ranked.energy, found(ranked.depth, ranked.lengths) + found.volume(ranked.depth, ranked.lengths))
 
 
@@ -413,7 +414,7 @@ def test_lengths_do_not_grow_under_noise(seed):
     for noise in (0.01, 0.0):
         found = objective(noisy, noise=noise)
         lengths = lengths_of(found, points)
-        z, sizes, *_ = found.minimise(points[None, ..., 2], lengths[None], 60)
+        z, sizes, *_ = minimise(found, points[None, ..., 2], lengths[None], 60)
         grown.append((sizes[0] / lengths)[lengths > 0.2])  # a hip of 0.13 is hardly larger than its noise
         wrong.append(float((z[0] - points[..., 2]).square().mean().sqrt() / points[..., 2].square().mean().sqrt()))
     assert len(grown[0]) >= 10
@@ -502,7 +503,7 @@ def test_clips_together_have_the_energies_of_each():
 def test_clips_are_refined_together_as_alone():
     tasks = several()
     for task, found in zip(tasks, minimise_all(tasks), strict=True):
-        alone = task.objective.minimise(task.depth, task.lengths, task.num_steps, task.loose)
+        alone = minimise(task.objective, task.depth, task.lengths, task.num_steps, task.loose)
         assert_close(found.energy, alone.energy, rtol=1e-6, atol=1e-6)
         assert_close(found.depth, alone.depth, rtol=0, atol=1e-5)
         assert_close(found.moved, alone.moved, rtol=1e-3, atol=1e-6)
@@ -510,19 +511,19 @@ def test_clips_are_refined_together_as_alone():
 
 def test_runs_are_not_too_large(monkeypatch):
     tasks = several()
-    monkeypatch.setattr(batch, "TOGETHER", 100)
-    runs = batch._runs(list(range(3)), tasks)
+    monkeypatch.setattr(refinement, "TOGETHER", 100)
+    runs = refinement._runs(list(range(3)), tasks)
     assert sorted(i for run in runs for i in run) == [0, 1, 2] and len(runs) == 3
 
 
 def test_hypotheses_of_long_clips_are_refined_a_few_at_a_time(monkeypatch):
     task = several()[-1]
-    whole = task.objective.minimise(task.depth, task.lengths, 12)
+    whole = minimise(task.objective, task.depth, task.lengths, 12)
     sizes = []
-    refine = Objective.refined
-    monkeypatch.setattr(Objective, "refined", lambda self, z, *rest: sizes.append(len(z)) or refine(self, z, *rest))
-    monkeypatch.setattr(module, "MOST", 2 * task.depth.shape[1])
-    found = task.objective.minimise(task.depth, task.lengths, 12)
+    refine = refinement._refined
+    monkeypatch.setattr(refinement, "_refined", lambda goal, z, *rest: sizes.append(len(z)) or refine(goal, z, *rest))
+    monkeypatch.setattr(refinement, "MOST", 2 * task.depth.shape[1])
+    found = minimise(task.objective, task.depth, task.lengths, 12)
     assert max(sizes) <= 2 and sum(sizes) == len(task.depth)
     assert_close(found.energy, whole.energy, rtol=1e-6, atol=1e-6)
     assert_close(found.depth, whole.depth, rtol=0, atol=1e-5)

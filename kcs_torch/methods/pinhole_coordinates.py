@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from kcs_torch.methods.pkc.descent import HEAVY
+from kcs_torch.methods.pkc.weights import HEAVY
 from kcs_torch.methods.plain_body import ACCELERATION, CLOSE, PlainBody
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from copy import copy
 import torch
 from torch import Tensor
 
-from kcs_torch.methods.pkc.descent import HEAVY
 from kcs_torch.methods.pkc.image import bend_cost
+from kcs_torch.methods.pkc.weights import HEAVY
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["ACCELERATION", "CLOSE", "PlainBody"]

@@ -1,43 +1,23 @@
-"""Hypotheses of several clips, refined as one batch."""
+"""What the searches of several clips ask for, answered as one batch each."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcs_torch.methods.pkc.descents import TOGETHER, Descent, descend_all
-from kcs_torch.methods.pkc.objective import Objective, Refined
 from kcs_torch.methods.pkc.placing import Placing, limb_paths
+from kcs_torch.methods.pkc.refinement import Task, minimise_all
 from kcs_torch.methods.pkc.trunk import Facing, facings
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.methods.size import weak_perspectives
 from kcs_torch.solvers.denoise import Denoised, denoise_tracks
 from kcs_torch.types import Tracks
 
-__all__ = ["Noisy", "Sized", "Task", "clean_all", "minimise_all", "serve"]
-
-
-@dataclass(frozen=True)
-class Task:
-    """Hypotheses that are to be refined, as :meth:`Objective.minimise` does.
-
-    Attributes:
-        objective: of the clip.
-        depth: (H, T, N).
-        lengths: (H, B).
-        num_steps: of L-BFGS.
-        loose: by how much lengths are less certain.
-    """
-
-    objective: Objective
-    depth: Tensor
-    lengths: Tensor
-    num_steps: int
-    loose: float = 1.0
+__all__ = ["Noisy", "Sized", "clean_all", "serve"]
 
 
 class Noisy(NamedTuple):
@@ -92,53 +72,3 @@ def clean_all(tasks: Sequence[Noisy]) -> list[Denoised]:
             found = denoise_tracks(points, weights, window=first.window, quick=first.quick)
             out |= {i: Denoised(*row) for i, row in zip(run, zip(*found, strict=True), strict=True)}
     return [out[i] for i in range(len(tasks))]
-
-
-def minimise_all(tasks: Sequence[Task]) -> list[Refined]:
-    """:meth:`Objective.minimise` of each task; those of one skeleton and equal settings are refined together."""
-    groups: dict[object, list[int]] = {}
-    for i, task in enumerate(tasks):
-        groups.setdefault(_kind(task), []).append(i)
-    out: dict[int, Refined] = {}
-    for group in groups.values():
-        for run in _runs(sorted(group, key=lambda i: tasks[i].depth.shape[1]), tasks):
-            out |= zip(run, _minimise_joined([tasks[i] for i in run]), strict=True)
-    return [out[i] for i in range(len(tasks))]
-
-
-def _kind(task: Task) -> object:
-    """What tasks must share to be refined together."""
-    firm = tuple(task.objective.hinges.firm.tolist())  # hinges of joints never seen are of no use
-    return task.objective.skeleton, firm, task.num_steps, task.loose, task.depth.dtype, task.depth.device
-
-
-def _runs(order: list[int], tasks: Sequence[Task]) -> list[list[int]]:
-    """Tasks in order of length, cut into runs that are not too large."""
-    runs: list[list[int]] = []
-    rows = 0
-    for i in order:
-        count, frames = tasks[i].depth.shape[:2]
-        if not runs or (rows + count) * frames > TOGETHER:
-            runs.append([])
-            rows = 0
-        runs[-1].append(i)
-        rows += count
-    return runs
-
-
-def _minimise_joined(tasks: list[Task]) -> list[Refined]:
-    """Tasks of one skeleton and equal settings, padded to the longest."""
-    if len(tasks) == 1:
-        (task,) = tasks
-        return [task.objective.minimise(task.depth, task.lengths, task.num_steps, task.loose)]
-    counts = [len(task.depth) for task in tasks]
-    most = max(task.depth.shape[1] for task in tasks)
-    pad = lambda z: torch.nn.functional.pad(z, (0, 0, 0, most - z.shape[1]))  # noqa: E731
-    joined = Objective.joined([task.objective for task in tasks], counts)
-    depth, lengths = torch.cat([pad(task.depth) for task in tasks]), torch.cat([task.lengths for task in tasks])
-    found = joined.refined(depth, lengths, tasks[0].num_steps, tasks[0].loose)
-    out = []
-    for task, *part in zip(tasks, *(x.split(counts) for x in found[:4]), strict=True):
-        z, size, energy, moved = part
-        out.append(task.objective.ranked(Refined(z[:, : task.depth.shape[1]], size, energy, moved, found.steps)))
-    return out

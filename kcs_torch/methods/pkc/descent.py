@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, incidence
 from kcs_torch.methods.pkc.image import Image, Slopes, bend_cost, turned
+from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.sides import Sides
+from kcs_torch.methods.pkc.unknowns import Unknowns
+from kcs_torch.methods.pkc.weights import ANCHOR, CORNER, HEAVY, NOISE, wide
 from kcs_torch.nn.lengths import HIDDEN
 
-if TYPE_CHECKING:
-    from kcs_torch.methods.pkc.objective import Objective
-    from kcs_torch.methods.pkc.unknowns import Unknowns
-
-__all__ = ["ANCHOR", "CORNER", "HEAVY", "NOISE", "Descent", "wide"]
-
-NOISE, CORNER = 0.8, 0.3
-"""Share of the noise's variance that is not to be explained, and how gently its cost sets in."""
-
-HEAVY = 4.0
-"""Squared deviations of a length from here on count like an outlier's, in variances."""
-
-ANCHOR = 0.01
-"""Standard deviation of a length that is known from elsewhere in the clip, as a share."""
+__all__ = ["Descent"]
 
 
 class Descent:
@@ -364,11 +352,6 @@ class Descent:
             growth += wide(obj.held, 1) * away / ANCHOR
             value = value + obj.held * away.square().sum(-1) / 2
         return value
-
-
-def wide(value: Tensor | float, dims: int) -> Tensor | float:
-    """A number, or one for each hypothesis (H,), with further dimensions of one."""
-    return value[(..., *[None] * dims)] if isinstance(value, Tensor) else value
 
 
 def _early(values: Tensor) -> Tensor:

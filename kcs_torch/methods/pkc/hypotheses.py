@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from kcs_torch.methods.lockstep import Search
-from kcs_torch.methods.pkc.batch import Task
 from kcs_torch.methods.pkc.objective import Objective
+from kcs_torch.methods.pkc.refinement import Task
 
 __all__ = ["Hypotheses", "distinct", "refined"]
 

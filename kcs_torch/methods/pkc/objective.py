@@ -7,26 +7,22 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import fields, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.ranks import median
-from kcs_torch.methods.pkc.descent import ANCHOR, CORNER, HEAVY, NOISE, Descent, wide
-from kcs_torch.methods.pkc.unknowns import Unknowns
-from kcs_torch.methods.pkc.weights import Weights, in_noise
+from kcs_torch.methods.pkc.weights import ANCHOR, CORNER, HEAVY, NOISE, Weights, in_noise, wide
 from kcs_torch.nn.anatomy import AdductionEnergy, HingeEnergy
 from kcs_torch.nn.contact import ContactEnergy
 from kcs_torch.nn.lengths import ForeshorteningEnergy, ProportionEnergy, foreshortening, oddity
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.nn.stance import StanceEnergy
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.solvers.lbfgs import lbfgs
-from kcs_torch.solvers.memory import give_back
 
-__all__ = ["Objective", "Refined", "bone_noise", "usual_posture"]
+__all__ = ["MOST", "Objective", "bone_noise", "usual_posture"]
 
 BLUR = 2.0
 """By how much a bone's direction strays, over its noise in the image per length: the trunk's frame is noisy as well."""
@@ -48,35 +44,12 @@ SHORT = 0.001
 """Bones are no shorter than this, a standing person being about 1.75 tall."""
 
 MOST = 40_000
-"""Frames of a clip's hypotheses that are refined together: memory is for few of a very long clip."""
+"""Frames of a clip's hypotheses that are taken together: memory is for few of a very long clip."""
 
 
 def bone_noise(noise: Tensor, bones: Tensor) -> Tensor:
     """Standard deviation (T, B) of bones' images from that of their joints (T, N)."""
     return (noise[:, bones[:, 0]].square() + noise[:, bones[:, 1]].square()).sqrt()
-
-
-class Refined(NamedTuple):
-    """Hypotheses after their refinement.
-
-    Attributes:
-        depth: (H, T, N).
-        lengths: (H, B).
-        energy: (H,).
-        moved: (H,) root mean square change of the depths in the last ten steps.
-        steps: made.
-    """
-
-    depth: Tensor
-    lengths: Tensor
-    energy: Tensor
-    moved: Tensor
-    steps: int
-
-    def sorted(self) -> Refined:
-        """The same, best first."""
-        order = self.energy.argsort()
-        return Refined(self.depth[order], self.lengths[order], self.energy[order], self.moved[order], self.steps)
 
 
 class Objective:
@@ -282,38 +255,6 @@ class Objective:
     def __call__(self, depth: Tensor, lengths: Tensor) -> Tensor:
         """The energy (H,) of depths (H, T, N) and lengths (H, B), less what :meth:`ranking` adds."""
         return torch.stack(list(self.terms(depth, lengths).values())).sum(0)
-
-    def minimise(self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0) -> Refined:
-        """Refine hypotheses (H, T, N) and (H, B), best first.
-
-        A start whose bones are far from constant is best refined with lengths ``loose`` times less certain first; the
-        energies are then those of the loose objective.
-        """
-        few = max(1, MOST // depth.shape[1])
-        parts = zip(depth.split(few), lengths.split(few), strict=True)
-        found = [self.refined(*part, num_steps, loose) for part in parts]
-        z, size, energy, moved, steps = zip(*found, strict=True)
-        return self.ranked(Refined(torch.cat(z), torch.cat(size), torch.cat(energy), torch.cat(moved), max(steps)))
-
-    def ranked(self, found: Refined) -> Refined:
-        """Refined hypotheses, best first, with what :meth:`ranking` adds."""
-        return found._replace(energy=found.energy + self.ranking(found.depth, found.lengths)).sorted()
-
-    def refined(self, depth: Tensor, lengths: Tensor, num_steps: int, loose: float = 1.0) -> Refined:
-        """As :meth:`minimise`, in the order of the hypotheses, and less what :meth:`ranking` adds."""
-        give_back(depth.shape[1])
-        goal = copy(self)
-        goal.weights = replace(self.weights, length=loose * self.weights.length)
-        unknowns = Unknowns(goal, depth, lengths)
-        start = depth.new_zeros(len(depth), unknowns.scale.shape[-1])
-        descent = Descent(goal, unknowns)
-        solution = lbfgs(descent, start, num_steps=num_steps, tolerance=1e-5, slopes=True, part=descent.rows)
-        with torch.no_grad():
-            depth, lengths = unknowns(solution.value)
-            assert solution.before is not None and solution.energy is not None
-            shift = (depth - unknowns(solution.before)[0]).square().sum((1, 2))
-            moved = (shift / (self.count * depth.shape[-1])).sqrt()
-        return Refined(depth, lengths, solution.energy, moved, solution.iterations)
 
     @classmethod
     def joined(cls, parts: Sequence[Objective], counts: Sequence[int]) -> Objective:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from copy import copy
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.methods.pkc.descent import HEAVY, wide
-
-if TYPE_CHECKING:
-    from kcs_torch.methods.pkc.objective import Objective
+from kcs_torch.methods.pkc.objective import Objective
+from kcs_torch.methods.pkc.weights import HEAVY, wide
 
 __all__ = ["Unknowns"]
 

@@ -11,7 +11,16 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.nn.lengths import free_bones
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["Weights", "at_pace", "in_noise", "pace_of"]
+__all__ = ["ANCHOR", "CORNER", "HEAVY", "NOISE", "Weights", "at_pace", "in_noise", "pace_of", "wide"]
+
+NOISE, CORNER = 0.8, 0.3
+"""Share of the noise's variance that is not to be explained, and how gently its cost sets in."""
+
+HEAVY = 4.0
+"""Squared deviations of a length from here on count like an outlier's, in variances."""
+
+ANCHOR = 0.01
+"""Standard deviation of a length that is known from elsewhere in the clip, as a share."""
 
 WALK = 4.3
 """Frames in which a walking person's bones change in the image by as much as they stray, at 30 frames a second."""
@@ -110,3 +119,8 @@ def pace_of(image: Tensor, skeleton: Skeleton, rate: float) -> float:
     spread = float((vectors - vectors.mean(0)).square().sum((1, 2)).mean().sqrt())
     time = spread / moved if moved > spread / len(image) else float(len(image))
     return min(max(least, time / WALK), most)
+
+
+def wide(value: Tensor | float, dims: int) -> Tensor | float:
+    """A number, or one for each hypothesis (H,), with further dimensions of one."""
+    return value[(..., *[None] * dims)] if isinstance(value, Tensor) else value
