@@ -12,7 +12,7 @@ from kcs_torch.errors import listed
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.types import Tracks
 
-__all__ = ["gate"]
+__all__ = ["gate", "steady"]
 
 _SIDE = 5
 """Neighbours looked at before and after a frame, at most; at high frame rates they lie further apart."""
@@ -25,6 +25,9 @@ _AROUND = 8
 
 _ROUNDS = 2
 """What is dropped first no longer spoils the prediction of its neighbours."""
+
+_NUMBERS = 2**16
+"""Detections that are judged at once: this takes some 3 kB each."""
 
 
 def gate(tracks: Tracks, *, threshold: float = 6.0, floor: float = 0.2, reach: float = 0.1) -> Tracks:
@@ -66,13 +69,8 @@ def gate(tracks: Tracks, *, threshold: float = 6.0, floor: float = 0.2, reach: f
     number(reach, "gate: reach", "a positive number of seconds")
     count = tracks.skeleton.num_observed
     points, seen = tracks.points[:, :count].double(), tracks.seen[:, :count]
-    side = 3 if tracks.fps is None else max(3, round(reach * frame_rate(tracks.fps, None, "gate", tracks.source)))
-    offsets = sorted({round(1 + i * (side - 1) / (_SIDE - 1)) for i in range(_SIDE)})
-    size = body_size(points, seen)
-    kept = seen
-    for _ in range(_ROUNDS):
-        error = (points - _line(points, kept, offsets)).norm(dim=-1)
-        kept = seen & ~(error > threshold * _usual(error, kept) + floor * size)  # NaN, not judged, is not above
+    rate = None if tracks.fps is None else frame_rate(tracks.fps, None, "gate", tracks.source)
+    kept = steady(points, seen, rate, threshold, floor, reach)
     dropped = (seen & ~kept).sum(0)
     total = int(dropped.sum())
     which = [f"{tracks.skeleton.joints[n]} {int(dropped[n])}" for n in dropped.argsort(descending=True).tolist()]
@@ -82,8 +80,32 @@ def gate(tracks: Tracks, *, threshold: float = 6.0, floor: float = 0.2, reach: f
     return rebuilt(tracks, tracks.points[:, :count], tracks.weights[:, :count] * kept, note)
 
 
+def steady(
+    points: Tensor, seen: Tensor, rate: float | None, threshold: float = 6.0, floor: float = 0.2, reach: float = 0.1
+) -> Tensor:
+    """Which detections to keep (T, N), of points (T, N, 2) that are seen (T, N); options as of :func:`gate`."""
+    side = 3 if rate is None else max(3, round(reach * rate))
+    offsets = sorted({round(1 + i * (side - 1) / (_SIDE - 1)) for i in range(_SIDE)})
+    size = body_size(points, seen)
+    kept = seen
+    for _ in range(_ROUNDS):
+        error = (points - _line(points, kept, offsets)).norm(dim=-1)
+        kept = seen & ~(error > threshold * _usual(error, kept) + floor * size)  # NaN, not judged, is not above
+    return kept
+
+
 def _line(points: Tensor, seen: Tensor, offsets: list[int]) -> Tensor:
     """(T, N, 2) where the lines through a joint's seen neighbours put it; NaN where there are too few."""
+    few, away = max(1, _NUMBERS // max(points.shape[1], 1)), offsets[-1]
+    lines = []
+    for at in range(0, len(points), few):
+        part = slice(max(0, at - away), at + few + away)
+        lines.append(_line_through(points[part], seen[part], offsets)[min(at, away) :][:few])
+    return torch.cat(lines)
+
+
+def _line_through(points: Tensor, seen: Tensor, offsets: list[int]) -> Tensor:
+    """As :func:`_line`, of all frames at once."""
     frames = len(points)
     shifts = [*(-k for k in reversed(offsets)), *offsets]
     held = torch.where(seen[..., None], points, math.nan)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.clean.detector import detected, detector_deviation
+from kcs_torch.clean.gating import steady
 from kcs_torch.clean.timing import cuts_of
 from kcs_torch.errors import counted
 from kcs_torch.functional.temporal import interpolate
@@ -38,6 +39,9 @@ HINT = "If a detector found the joints, detections=True allows for its errors, w
 UNTOLD = 0.015
 """Noise that is assumed where a clip is too short to tell it: that of good detections."""
 
+FAR = 0.5
+"""Share of the body's size from which on a jump is surely wrong; smaller ones are for the model of the clip to tell."""
+
 HELD = 0.1
 """Standard deviation, a share of the body's size, of joints in frames before the body is first seen and after it was
 last seen, and the largest in gaps."""
@@ -64,7 +68,7 @@ def cleaned(
         rate = tracks.rate
         window = window_at(rate)
         quick = math.ceil(2 * QUICK * window / rate)
-        kept = [plausible(shot.points, shot.seen, shot.skeleton) for shot in shots]
+        kept = [_likely(shot) for shot in shots]
         asked = [torch.where(keep, shot.weights, 0) for shot, keep in zip(shots, kept, strict=True)]
         found = yield [Noisy(shot.points, w, window, quick) for shot, w in zip(shots, asked, strict=True)]
         levels = [one.noise.median().expand(shot.num_frames) for one, shot in zip(found, shots, strict=True)]
@@ -73,6 +77,15 @@ def cleaned(
         parts = [_smoothed(*one, None if clean else level, template) for one in zip(shots, kept, found, strict=True)]
     points, noise, notes = zip(*parts, strict=True)
     return torch.cat(points), torch.cat(noise), tuple(dict.fromkeys(note for some in notes for note in some))
+
+
+def _likely(tracks: Tracks) -> Tensor:
+    """Which detections (T, N) of a shot neither jump far away nor belong to no body: too many would spoil all else."""
+    count = tracks.skeleton.num_observed
+    points, seen = tracks.points[:, :count], tracks.seen[:, :count]
+    still = steady(points, seen, tracks.rate, floor=FAR) if bool(seen.any()) else seen
+    kept = tracks.skeleton.complete(points, still.to(points))[1] > 0
+    return plausible(tracks.points, kept & tracks.seen, tracks.skeleton)
 
 
 def _smoothed(

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.clean.common import rebuilt, share
-from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
@@ -15,6 +15,12 @@ __all__ = ["elsewhere", "plausible", "without_others"]
 
 LONG = 2.0
 """An image longer than so many usual lengths is no bone's."""
+
+SHORTER = 2.5
+"""The longest images of bones are no more than so many times the median of a frame, or of the clip."""
+
+ROUNDS = 4
+"""Times that what is left is looked at again."""
 
 SELDOM = 3
 """Joints that are seen in fewer frames tell nothing of their bones' lengths."""
@@ -75,7 +81,7 @@ def without_others(tracks: Tracks) -> Tracks:
 
 
 def plausible(points: Tensor, seen: Tensor, skeleton: Skeleton) -> Tensor:
-    """Which detections to keep, (T, N): a joint is dropped where all its bones look far too long.
+    """Which detections to keep, (T, N): joints are dropped out of the body's reach, or where all bones are too long.
 
     What is too long is told by the skeleton's usual lengths, at the scale at which most bones look as long as they are.
     Joints that are then left in hardly any frame are dropped altogether, as long as others are seen often.
@@ -95,20 +101,51 @@ def plausible(points: Tensor, seen: Tensor, skeleton: Skeleton) -> Tensor:
     if usual is None:
         return seen
     bones = skeleton.bone_index(device=points.device)
-    both = seen[:, bones[:, 0]] & seen[:, bones[:, 1]]  # (T, B)
-    use = skeleton.rigid_mask(device=points.device) & both.any(0) & (usual > 0)
-    if not bool(use.any()):
-        return seen
-    flat = bone_vectors(points, bones)
-    flat = torch.where(both[..., None], flat, torch.zeros_like(flat))
-    longest = torch.where(both, flat.norm(dim=-1), torch.nan)[:, use].nanquantile(0.985, 0)
-    scale = torch.quantile(longest / usual[use], 0.5)
-    far = both & use & (flat.norm(dim=-1) > LONG * scale * usual)
-    count = torch.zeros_like(points[..., 0])
-    wrong = count.clone()
-    for end in (0, 1):
-        count = count.index_add(1, bones[:, end], both.to(count))
-        wrong = wrong.index_add(1, bones[:, end], far.to(count))
-    kept = seen & ~((wrong > 0) & (wrong == count))
+    use = skeleton.rigid_mask(device=points.device) & (usual > 0)
+    kept, reach = seen, _reach(skeleton, usual)
+    for _ in range(ROUNDS):  # what is dropped no longer spoils the scale
+        before, scale = kept, _scale(points, kept, bones[use], usual[use])
+        if scale is None:
+            break
+        if reach is not None:
+            middle = nanmedian(torch.where(kept[..., None], points, torch.nan), 1, keepdim=True)
+            kept = kept & ~((points - middle).norm(dim=-1) > LONG * scale[:, None] * reach)
+        both = kept[:, bones[:, 0]] & kept[:, bones[:, 1]]
+        length = bone_vectors(points, bones).norm(dim=-1)
+        far = both & use & (length > LONG * scale[:, None] * usual)
+        count = torch.zeros_like(points[..., 0])
+        wrong = count.clone()
+        for end in (0, 1):
+            count = count.index_add(1, bones[:, end], both.to(count))
+            wrong = wrong.index_add(1, bones[:, end], far.to(count))
+        kept = kept & ~((wrong > 0) & (wrong == count))
+        if torch.equal(kept, before):
+            break
     often = kept.sum(0) >= SELDOM
     return kept & often if bool(often.any()) else kept
+
+
+def _scale(points: Tensor, seen: Tensor, bones: Tensor, usual: Tensor) -> Tensor | None:
+    """Per frame (T,), at which scale most bones (B, 2) look as long as is usual (B,); None where none is seen.
+
+    The longest images of each bone tell, but what is wrong may be most of these.
+    """
+    both = seen[:, bones[:, 0]] & seen[:, bones[:, 1]]
+    if not bool(both.any()):
+        return None
+    images = torch.where(both, bone_vectors(points, bones).norm(dim=-1) / usual, torch.nan)
+    longest = nanmedian(images.nanquantile(0.985, 0), 0)
+    here = nanmedian(images, 1)
+    return torch.minimum(longest, SHORTER * torch.fmax(here, nanmedian(here, 0)))
+
+
+def _reach(skeleton: Skeleton, usual: Tensor) -> Tensor | None:
+    """How far from the middle of all joints each may be (N,), by lengths (B,) of bones; None unless these are a tree.
+
+    Half of the joints lie on the other side of the median, whatever the direction.
+    """
+    if not skeleton.is_tree:
+        return None
+    ends = incidence(skeleton.bone_index(device=usual.device), skeleton.num_joints, dtype=usual.dtype)
+    lines = chain_inverse(ends)  # (N, B) the bones on the way to each joint
+    return ((lines[:, None] - lines).abs() @ usual).median(1).values
