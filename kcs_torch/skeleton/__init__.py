@@ -4,6 +4,17 @@ from kcs_torch.anatomy import Hinge
 from kcs_torch.skeleton.builtin import SKELETONS, get_skeleton, guess_skeleton
 from kcs_torch.skeleton.core import Skeleton
 from kcs_torch.skeleton.mapping import map_joints
+from kcs_torch.skeleton.person import has_middle, person_by_names
 from kcs_torch.skeleton.stature import stature_weights
 
-__all__ = ["SKELETONS", "Hinge", "Skeleton", "get_skeleton", "guess_skeleton", "map_joints", "stature_weights"]
+__all__ = [
+    "SKELETONS",
+    "Hinge",
+    "Skeleton",
+    "get_skeleton",
+    "guess_skeleton",
+    "has_middle",
+    "map_joints",
+    "person_by_names",
+    "stature_weights",
+]

@@ -15,7 +15,15 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
-from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton, guess_skeleton, map_joints
+from kcs_torch.skeleton import (
+    SKELETONS,
+    Skeleton,
+    get_skeleton,
+    guess_skeleton,
+    has_middle,
+    map_joints,
+    person_by_names,
+)
 
 __all__ = [
     "FARTHEST",
@@ -131,9 +139,13 @@ def choose_skeleton(
             )
         return body
     known = guess_skeleton(names) if names is not None else None
+    person = person_by_names(names, Path(source).stem) if known is None and names is not None else None
     if edges is None:
         if known is not None:
             return known
+        if person is not None:
+            notes.append(f"a person's bones are taken, by the joints' names{_between(person)}")
+            return person
         try:
             return Skeleton.from_edges([], names or num_joints, name="points", tree=False)
         except SkeletonError as error:
@@ -153,6 +165,9 @@ def choose_skeleton(
     except SkeletonError as error:
         raise SkeletonError(f"{source}: edges: {error}") from None
     if graph.is_tree:
+        if person is not None and person.virtual and not has_middle(graph.joints):
+            notes.append(f"the edges lead past the middle of the trunk: a person's bones are taken{_between(person)}")
+            return person
         return replace(graph, tree=True)
     if known is not None:
         notes.append(
@@ -160,8 +175,17 @@ def choose_skeleton(
         )
         return known
     reason = "close a chain" if graph.cycle() else f"fall into {len(graph.pieces())} pieces"
+    if person is not None:
+        notes.append(f"the edges {reason}: a person's bones are taken, by the joints' names{_between(person)}")
+        return person
     notes.append(f"the edges {reason}: used as a graph of rigid links, not as a tree")
     return graph
+
+
+def _between(person: Skeleton) -> str:
+    """Which joints a person has beside those seen, for a note."""
+    made = [f"{person.joints[v]} between {' and '.join(person.joints[i] for i in ends)}" for v, ends in person.virtual]
+    return f", with a virtual {', and a virtual '.join(made)}" if made else ""
 
 
 MOST_LACKING = 3

@@ -65,10 +65,13 @@ class Tracks(Trajectories):
             skeleton: a :class:`Skeleton`, a built-in name or a YAML/JSON file. If None it is built from
                 ``edges`` and ``joint_names``; names that are exactly a built-in skeleton's select it where
                 the edges are absent (then in any order: the joints are put into the skeleton's) or not a
-                tree. Without any of these the joints have no bones.
+                tree. Of a person's names in another spelling or order, a tree is made in the same cases
+                (:func:`kcs_torch.skeleton.person_by_names`). Without any of these the joints have no bones.
             joint_names: N names. With a skeleton they say which joint is which: joints are matched by name, whatever
                 their order, and those that the skeleton has not are left out.
-            edges: (B, 2) (parent, child) indices. Edges that are not a tree become a graph of rigid links.
+            edges: (B, 2) (parent, child) indices. A person's that lead past the middle of the trunk, from hip to hip
+                or shoulder, give way to ones through a virtual pelvis and neck. Others that are not a tree become a
+                graph of rigid links.
             fps: frames per second; NaN and None mean unknown.
             units: of the points.
             threshold: a joint with less confidence counts as unseen.

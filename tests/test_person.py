@@ -1,0 +1,99 @@
+"""A person's bones by the joints' names: the built-in trees again, other spellings and orders, and what is none."""
+
+import numpy as np
+import pytest
+import torch
+
+import kcs_torch as kt
+from kcs_torch.data import walking_person
+from kcs_torch.skeleton import SKELETONS, has_middle, person_by_names
+
+LIMBS = ["shoulder", "elbow", "wrist", "hip", "knee", "ankle"]
+TWELVE = [f"{side}_{part}" for part in LIMBS for side in ("left", "right")]  # COCO's, without the face
+TORSO = [(0, 1), (0, 6), (1, 7), (6, 7)]
+LINKS = [(0, 2), (2, 4), (1, 3), (3, 5), (6, 8), (8, 10), (7, 9), (9, 11)]
+
+
+def named(body):
+    return {frozenset((body.joints[a], body.joints[b])) for a, b in body.bones}
+
+
+@pytest.mark.parametrize("name", ["coco17", "mediapipe33", "cmu17", "cmu21", "cmu31", "h36m17", "mpii16"])
+def test_names_alone_give_the_built_in_tree(name):
+    body = SKELETONS[name]
+    found = person_by_names(body.joints[: body.num_observed])
+    assert named(found) == named(body)
+    assert found.is_tree and found.template is not None and len(found.hinges) == len(body.hinges)
+    assert {found.bone_names[i] for i in found.flexible} == {body.bone_names[i] for i in body.flexible}
+
+
+@pytest.mark.parametrize("name", [n for n in SKELETONS if n not in ("ap10k", "hand21", "wholebody63")])
+def test_every_person_is_one_tree(name):
+    found = person_by_names(SKELETONS[name].joints[: SKELETONS[name].num_observed])
+    assert found is not None and found.is_tree
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["left_hip", "right_hip", "tail", "left_knee"],  # a name that is no person's
+        ["left_hip", "hip_left", "right_hip", "left_knee"],  # two names of one place
+        ["left_elbow", "left_wrist", "right_elbow", "right_wrist"],  # two pieces
+        ["left_hip", "left_knee", "pelvis", "left_shoulder"],  # a shoulder that nothing links
+        SKELETONS["ap10k"].joints,
+        SKELETONS["hand21"].joints,
+        ["joint0", "joint1", "joint2"],
+    ],
+)
+def test_others_are_none(names):
+    assert person_by_names(list(names)) is None
+
+
+def test_an_arm_needs_no_middle():
+    arm = person_by_names(["LShoulder", "LElbow", "LWrist"])
+    assert arm.bone_names == ("LShoulder-LElbow", "LElbow-LWrist") and not arm.virtual
+    assert not has_middle(arm.joints)
+
+
+def clip(names):
+    """A walk of the library, its joints among COCO's names."""
+    made = walking_person(60, yaw=60, turn=0, skeleton="coco17")
+    at = [made.skeleton.joints.index(n) for n in names]
+    return made.points[:, at], made.tracks.fps
+
+
+def test_edges_that_close_the_torso_are_a_person():
+    points, fps = clip(TWELVE)
+    tracks = kt.Tracks.from_arrays(points[..., :2], joint_names=TWELVE, edges=TORSO + LINKS, fps=fps)
+    body = tracks.skeleton
+    assert body.joints == (*TWELVE, "pelvis", "neck") and body.is_tree
+    assert "close a chain" in tracks.notes[-1] and "virtual pelvis between left_hip and right_hip" in tracks.notes[-1]
+    found = kt.reconstruct(tracks).observed
+    assert found.shape == points.shape
+
+
+def test_a_tree_past_the_middle_gives_way():
+    points, fps = clip(TWELVE)
+    flat = points[..., :2]
+    tracks = kt.Tracks.from_arrays(flat, joint_names=TWELVE, edges=TORSO[:2] + TORSO[3:] + LINKS, fps=fps)
+    assert [tracks.skeleton.joints[v] for v, _ in tracks.skeleton.virtual] == ["pelvis", "neck"]
+    assert "past the middle of the trunk" in tracks.notes[-1]
+    assert torch.equal(tracks.points[:, :12], flat)
+
+
+def test_a_tree_through_the_middle_is_kept():
+    names = ["MidHip", "LHip", "RHip", "LKnee"]
+    edges = [(0, 1), (1, 2), (1, 3)]  # whatever its links are
+    tracks = kt.Tracks.from_arrays(np.random.default_rng(0).normal(size=(5, 4, 2)), joint_names=names, edges=edges)
+    assert tracks.skeleton.bones == tuple(edges) and not tracks.notes
+
+
+@pytest.mark.parametrize("spell", [str.title, lambda n: "_".join(n.split("_")[::-1]), str.upper])
+def test_other_spellings_without_edges(spell):
+    body = SKELETONS["coco17"]
+    names = [spell(n) for n in body.joints[:17]]
+    order = np.random.default_rng(1).permutation(17)
+    points, fps = clip(list(body.joints[:17]))
+    tracks = kt.Tracks.from_arrays(points[:, order, :2], joint_names=[names[i] for i in order], fps=fps)
+    assert tracks.skeleton.joints[:17] == tuple(names[i] for i in order) and tracks.skeleton.template is not None
+    assert tracks.skeleton.num_bones == body.num_bones
