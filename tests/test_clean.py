@@ -12,6 +12,7 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
 import kcs_torch as kt
+from kcs_torch.clean import gating
 from kcs_torch.clean.common import runs
 from kcs_torch.data.synthetic import walking_person
 from kcs_torch.functional import bone_lengths
@@ -315,6 +316,15 @@ def test_gate_judges_nothing_without_neighbours():
     points[:, 0] = 1.0
     points[::10, 1] = np.random.default_rng(0).normal(size=(5, 2)) * 100
     assert kt.clean.gate(tracks_of(points)).notes[-1] == "gate: 0 of 55 (0 %) detections dropped as outliers"
+
+
+def test_gate_looks_at_long_clips_part_by_part(walk, monkeypatch):
+    points = walk.points.clone()
+    points[7, 3] += 500
+    tracks = replace(walk, points=points)
+    whole = kt.clean.gate(tracks)
+    monkeypatch.setattr(gating, "_NUMBERS", 10 * tracks.skeleton.num_observed)
+    assert torch.equal(kt.clean.gate(tracks).seen, whole.seen) and not whole.seen[7, 3]
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3])

@@ -122,3 +122,13 @@ def test_shots_of_other_sizes_are_solved_together():
     assert both.distance is None
     for part, clip in zip((both.points[:30], both.points[30:]), clips, strict=True):
         assert float(kt.metrics.mpjpe(part, clip.points, align="similarity")) < 40
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2])
+def test_joints_at_wrong_places_are_no_cut(share):
+    for seed in range(5):
+        chance = torch.Generator().manual_seed(seed)
+        points = walking_person(60, yaw=60.0, turn=0.0).tracks.points.clone()
+        wrong = torch.rand(points.shape[:2], generator=chance) < share
+        points[wrong] = 6000 * torch.rand(int(wrong.sum()), 2, generator=chance, dtype=points.dtype) - 3000
+        assert cuts_of(kt.Tracks.from_arrays(points, skeleton="h36m17")) == []

@@ -348,6 +348,8 @@ def test_a_zero_is_a_place_unless_it_is_the_corner(tmp_path):
     tracks = load_tracks(lines(tmp_path / "c.csv", *rows))
     assert tracks.seen.tolist() == [[False, True], [True, True]]
     assert any(note.startswith("1 joint that lies exactly at (0, 0) is taken as unseen") for note in tracks.notes)
+    rows = ("frame,a_x,a_y,b_x,b_y", "0,0,0,-1,4", *(f"{t},{t},2,3,4" for t in range(1, 12)))  # one beside the image
+    assert load_tracks(lines(tmp_path / "d.csv", *rows)).seen[0].tolist() == [False, True]
 
 
 # ---------------------------------------------------------------------- tables of pandas and others

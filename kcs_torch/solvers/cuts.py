@@ -16,6 +16,9 @@ of its size, the median distance of joints from there."""
 SUDDEN, BESIDE = 5.0, 8
 """And by more than so many times what they move between any two of so many frames before and after."""
 
+FAR, SIDE = 0.5, 3
+"""A joint that lies farther from the middle of so many places before, and of as many after, is at a wrong place."""
+
 LEAST, JOINTS = 4, 6
 """Frames that there must be on either side, and joints that both frames of a jump show."""
 
@@ -24,7 +27,8 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
     """Find the first frame of each shot but the first: there the pose jumps as it does nowhere near.
 
     Frames in which half of the joints are seen are compared with the next such one, if that follows at once. Sides that
-    a detector takes for each other are no cut, nor is a single wrong frame, which jumps back.
+    a detector takes for each other are no cut, nor is a single wrong frame, which jumps back; nor are joints at wrong
+    places, however many, as these are not where their joint is before or after.
 
     Args:
         points: (T, N, 2).
@@ -43,17 +47,26 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
         return []
     known = torch.where(seen[..., None], points, torch.nan)[shown]  # (K, N, 2)
     known = known - nanmedian(known, 1, keepdim=True)
+    size = nanmedian(known.norm(dim=-1), 1)
+    known = torch.where((_strays(known) > FAR * size[:, None])[..., None], torch.nan, known)
     twins = torch.arange(joints, device=points.device)
     twins[pairs[:, 0]], twins[pairs[:, 1]] = pairs[:, 1], pairs[:, 0]
     before, after = known[:-1], known[1:]
     step = torch.fmin(_moved(before, after), _moved(before, after[:, twins]))
-    size = nanmedian(known.norm(dim=-1), 1)
     step = (step / torch.minimum(size[1:], size[:-1])).nan_to_num(0.0, 0.0)  # a body at one point has no pose
     beside = torch.nn.functional.pad(step, (BESIDE, BESIDE)).unfold(0, 2 * BESIDE + 1, 1).clone()
     beside[:, BESIDE] = 0
     leaps = (step > AWAY) & (step > SUDDEN * beside.amax(1)) & (shown.diff() == 1)
     leaps[: LEAST - 1] = leaps[len(leaps) - LEAST + 1 :] = False
     return (shown[1:][leaps]).tolist()
+
+
+def _strays(poses: Tensor) -> Tensor:
+    """How far joints of poses (K, N, 2) are from the nearer of where they were just before and just after, (K, N)."""
+    blank = torch.full_like(poses[:1], torch.nan).expand(SIDE, -1, -1)
+    runs = nanmedian(torch.cat([blank, poses, blank]).unfold(0, SIDE, 1), -1)  # (K + SIDE + 1, N, 2)
+    before, after = runs[: len(poses)], runs[SIDE + 1 :]
+    return torch.fmin((poses - before).norm(dim=-1), (poses - after).norm(dim=-1))
 
 
 def _moved(before: Tensor, after: Tensor) -> Tensor:

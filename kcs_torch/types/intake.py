@@ -46,6 +46,9 @@ FARTHEST = 1e30  # of coordinates: their sums are finite in single precision, in
 STRAY = 1e12
 """Distance from the clip's middle, over its median or over 1, from which on a joint's number is that of no body."""
 
+WITHIN = 0.9
+"""Share of the joints beyond (0, 0) from which on this is the image's corner."""
+
 RATES = 1e-6, 1e6
 """Frames a second, lowest and highest: a frame in eleven days, and a million a second."""
 
@@ -230,14 +233,15 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
 
 
 def at_the_corner(points: np.ndarray, seen: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Which joints (..., N) of points (..., N, 2) lie exactly at (0, 0), or at (-1, -1), and all others beyond (0, 0).
+    """Which joints (..., N) of points (..., N, 2) lie exactly at (0, 0), or at (-1, -1), and others beyond (0, 0).
 
-    Detectors write unseen joints so. About a middle that is 0 the others lie all around.
+    Detectors write unseen joints so. About a middle that is 0 the others lie all around; of a person at the image's
+    edge a few may lie beside it.
     """
     zero, minus = (seen & (points == place).all(-1) for place in (0, -1))
     corner = zero | minus
     rest = points[seen & ~corner]
-    if not (corner.any() and len(rest) and (rest > 0).all()):
+    if not (corner.any() and len(rest) and (rest > 0).all(-1).mean() >= WITHIN):
         return np.zeros_like(corner)
     for count, place in ((int(zero.sum()), "(0, 0)"), (int(minus.sum()), "(-1, -1)")):
         if count:

@@ -42,6 +42,9 @@ UNTOLD = 0.015
 FAR = 0.5
 """Share of the body's size from which on a jump is surely wrong; smaller ones are for the model of the clip to tell."""
 
+MANY = 0.03
+"""Share of the detections that must jump so: of fewer the model makes sense, and knows quick hands from wrong ones."""
+
 HELD = 0.1
 """Standard deviation, a share of the body's size, of joints in frames before the body is first seen and after it was
 last seen, and the largest in gaps."""
@@ -83,9 +86,12 @@ def _likely(tracks: Tracks) -> Tensor:
     """Which detections (T, N) of a shot neither jump far away nor belong to no body: too many would spoil all else."""
     count = tracks.skeleton.num_observed
     points, seen = tracks.points[:, :count], tracks.seen[:, :count]
-    still = steady(points, seen, tracks.rate, floor=FAR) if bool(seen.any()) else seen
-    kept = tracks.skeleton.complete(points, still.to(points))[1] > 0
-    return plausible(tracks.points, kept & tracks.seen, tracks.skeleton)
+    kept = tracks.seen
+    if bool(seen.any()):
+        still = steady(points, seen, tracks.rate, floor=FAR)
+        if int((seen & ~still).sum()) > MANY * int(seen.sum()):
+            kept = kept & (tracks.skeleton.complete(points, still.to(points))[1] > 0)
+    return plausible(tracks.points, kept, tracks.skeleton)
 
 
 def _smoothed(

@@ -11,13 +11,13 @@ from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
-__all__ = ["elsewhere", "plausible", "without_others"]
+__all__ = ["elsewhere", "plausible", "repeats", "without_others", "without_repeats"]
 
 LONG = 2.0
 """An image longer than so many usual lengths is no bone's."""
 
-SHORTER = 2.5
-"""The longest images of bones are no more than so many times the median of a frame, or of the clip."""
+SHORTER, AROUND = 2.5, 8
+"""The longest images of bones are no more than so many times the median of these frames about each, or of the clip."""
 
 ROUNDS = 4
 """Times that what is left is looked at again."""
@@ -33,6 +33,45 @@ takes several frames to do so."""
 BACK, PART = 0.5, 0.25
 """What leaps away and back ends where it began, but for this share of its leaps, and is away for this share of the
 clip at most."""
+
+
+OFTEN, HELD, MOVED = 0.12, 6, 0.002
+"""Frames that repeat the one before are a slower camera's if this share of all does, no more than so many on end, and
+if most joints move by this share of the body's size where they move: those of somebody who stands still are not."""
+
+
+def repeats(points: Tensor, seen: Tensor) -> Tensor:
+    """Frames (T,) in which a slower camera, or detector, only shows what the frame before did.
+
+    Args:
+        points: (T, N, 2).
+        seen: (T, N) bool.
+    """
+    none = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    shown = seen.sum(-1) > 1
+    equal = ((points[1:] == points[:-1]).all(-1) | ~seen[1:]) & (seen[1:] == seen[:-1])
+    same = torch.cat([none[:1], equal.all(-1) & shown[1:]])
+    length = torch.zeros_like(points[:, 0, 0])  # of the run of repeats up to each frame
+    for _ in range(HELD + 1):
+        length = torch.where(same, 1 + torch.cat([length[:1], length[:-1]]), 0)
+    new = shown[1:] & shown[:-1] & ~same[1:]
+    if int(same.sum()) < OFTEN * int(shown.sum()) or bool((length > HELD).any()) or not bool(new.any()):
+        return none
+    known = torch.where(seen[..., None], points, torch.nan)
+    size = (known - nanmedian(known, 1, keepdim=True)).norm(dim=-1).nanmedian()
+    step = nanmedian((known[1:] - known[:-1]).norm(dim=-1), 1)[new].nanmedian()
+    return same if bool(step > MOVED * size) else none
+
+
+def without_repeats(tracks: Tracks) -> Tracks:
+    """Tracks in which frames that only :func:`repeats` the one before show nothing; a note says how many."""
+    count = tracks.skeleton.num_observed
+    same = repeats(tracks.points[:, :count], tracks.seen[:, :count])
+    if not bool(same.any()):
+        return tracks
+    weights = torch.where(same[:, None], 0, tracks.weights)[:, :count]
+    which = f"{share(int(same.sum()), len(same))} frames repeat the one before, as of a slower camera or detector"
+    return rebuilt(tracks, tracks.points[:, :count], weights, f"{which}: taken as unseen")
 
 
 def elsewhere(points: Tensor, seen: Tensor) -> Tensor:
@@ -135,7 +174,8 @@ def _scale(points: Tensor, seen: Tensor, bones: Tensor, usual: Tensor) -> Tensor
         return None
     images = torch.where(both, bone_vectors(points, bones).norm(dim=-1) / usual, torch.nan)
     longest = nanmedian(images.nanquantile(0.985, 0), 0)
-    here = nanmedian(images, 1)
+    here = torch.nn.functional.pad(nanmedian(images, 1), (AROUND, AROUND), value=torch.nan)
+    here = nanmedian(here.unfold(0, 2 * AROUND + 1, 1), 1)
     return torch.minimum(longest, SHORTER * torch.fmax(here, nanmedian(here, 0)))
 
 

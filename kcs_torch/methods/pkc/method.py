@@ -21,7 +21,7 @@ from kcs_torch.methods.pkc.body import Body, Turned
 from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.fixed_answer import from_hypotheses
 from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of
-from kcs_torch.methods.pkc.gate import without_others
+from kcs_torch.methods.pkc.gate import without_others, without_repeats
 from kcs_torch.methods.pkc.held import with_lengths_held
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.limbs import outward
@@ -119,7 +119,7 @@ class PKC(Method):
         return has_trunk(skeleton)
 
     def prepared(self, tracks: Tracks) -> Tracks:
-        tracks = unswap(without_others(tracks)) if self.denoise else tracks
+        tracks = unswap(without_others(without_repeats(tracks))) if self.denoise else tracks
         told = self.detections
         if told is None and self.denoise and not detected(tracks) and found_by_detector(tracks):
             told = True
