@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 import kcs_torch as kt
 from kcs_torch.cli import app
 from kcs_torch.io import load_reconstruction
-from kcs_torch.methods import perspective, refining, scene, uncalibrated
+from kcs_torch.methods import PKC, perspective, refining, scene, uncalibrated
 from kcs_torch.methods.pkc import body
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
-from kcs_torch.methods.uncalibrated import likely_lens, looking
+from kcs_torch.methods.uncalibrated import likely_lens, looking, may_be_near
 from kcs_torch.types import Intrinsics
 
 LENS = Intrinsics(1500.0, 1500.0, 960.0, 540.0)
@@ -173,6 +173,16 @@ def test_what_is_surely_far_is_asked_about_once(monkeypatch):
         found[times] = quietly(tracks)
         assert len(asked) == times
     assert same(found[1], found[2]) and found[1].distance is None
+
+
+def test_hips_or_shoulders_alone_tell_no_perspective():
+    """Their middle and both ends lie on a line: what turns about it looks like perspective."""
+    legs = [f"{side}_{part}" for part in ("hip", "knee", "ankle") for side in ("left", "right")]
+    whole = [*legs, "left_shoulder", "right_shoulder"]
+    points = torch.rand(30, 8, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for names, near in ((legs, False), (whole, True)):
+        tracks = kt.Tracks.from_arrays(points[:, : len(names)], joint_names=names)
+        assert PKC().knows_template(tracks.skeleton) and may_be_near(tracks) is near
 
 
 def test_who_looks_for_a_near_camera():

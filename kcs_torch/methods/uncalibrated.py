@@ -26,11 +26,14 @@ from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
 from kcs_torch.methods.scene import BLOCK, STEPS
 from kcs_torch.methods.view import View, lens_note
-from kcs_torch.nn.posture import has_trunk
+from kcs_torch.nn.posture import has_trunk, trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
 __all__ = ["likely_lens", "looking", "may_be_near", "reconstruct_uncalibrated"]
+
+NARROW = 0.15
+"""Width of a trunk, over its length, from which on it is more than a line."""
 
 FAR = 34.0
 """Distance, for a body of 1.75, of the far body that a near one is compared with."""
@@ -60,8 +63,16 @@ EVERY, HOPELESS, AWAY = 20, 10.0, 6.5
 
 
 def may_be_near(tracks: Tracks) -> bool:
-    """Whether perspective can be told: from a body with a template and a trunk, in one shot of one camera."""
-    return has_trunk(tracks.skeleton) and not cuts_of(tracks)
+    """Whether perspective can be told: from a body with a template and a whole trunk, in one shot of one camera.
+
+    Hips alone, with the legs, lie on a line: what turns about it looks like perspective.
+    """
+    body = tracks.skeleton
+    if not has_trunk(body) or cuts_of(tracks):
+        return False
+    trunk = body.template_points(dtype=torch.float64)[trunk_joints(body)]
+    long, wide, _ = torch.linalg.svdvals(trunk - trunk.mean(0)).tolist()
+    return wide > NARROW * long
 
 
 def reconstruct_uncalibrated(
