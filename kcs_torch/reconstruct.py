@@ -16,7 +16,7 @@ from kcs_torch.methods.perspective import WIDE, reconstruct_perspective
 from kcs_torch.methods.uncalibrated import looking, may_be_near, reconstruct_uncalibrated
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
-from kcs_torch.types.intake import no_bones
+from kcs_torch.types.bodies import no_bones
 from kcs_torch.types.people import file_and_person
 
 __all__ = ["method_named", "reconstruct", "reconstruct_all", "with_found_bones"]

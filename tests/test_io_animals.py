@@ -30,7 +30,7 @@ from kcs_torch.io.motion import detect_motion_format
 from kcs_torch.io.pickles import load_arrays
 from kcs_torch.io.registry import Probe
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types.intake import no_bones
+from kcs_torch.types.bodies import no_bones
 
 pytest.importorskip("h5py")
 quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -97,3 +97,26 @@ def test_other_spellings_without_edges(spell):
     tracks = kt.Tracks.from_arrays(points[:, order, :2], joint_names=[names[i] for i in order], fps=fps)
     assert tracks.skeleton.joints[:17] == tuple(names[i] for i in order) and tracks.skeleton.template is not None
     assert tracks.skeleton.num_bones == body.num_bones
+
+
+COCO = [(15, 13), (13, 11), (16, 14), (14, 12), (11, 12), (5, 11), (6, 12), (5, 6), (5, 7), (6, 8), (7, 9), (8, 10)]
+COCO += [(1, 2), (0, 1), (0, 2), (1, 3), (2, 4), (3, 5), (4, 6)]
+
+
+def test_published_links_tell_whose_joints_these_are():
+    points, fps = clip(list(SKELETONS["coco17"].joints[:17]))
+    for names in (None, [f"kp{i}" for i in range(17)]):
+        tracks = kt.Tracks.from_arrays(points[..., :2], edges=COCO, joint_names=names, fps=fps)
+        assert tracks.skeleton is SKELETONS["coco17"]
+        assert "the edges are those of skeleton 'coco17'" in tracks.notes[0]
+    other = kt.Tracks.from_arrays(points[..., :2], edges=COCO[:-9], fps=fps)
+    assert other.skeleton.name == "tracks" and other.skeleton.template is None
+
+
+def test_links_of_two_skeletons_are_told():
+    body = SKELETONS["h36m17"]
+    points = np.random.default_rng(0).normal(size=(5, 17, 2))
+    tracks = kt.Tracks.from_arrays(points, edges=body.bones)
+    assert tracks.skeleton.bones == body.bones and tracks.skeleton.template is None
+    assert "skeletons cmu17 and h36m17: skeleton='h36m17'" in tracks.notes[0]
+    assert not kt.Tracks.from_arrays(points, edges=body.bones, joint_names=list("abcdefghijklmnopq")).notes

@@ -1,7 +1,7 @@
 """Skeletons: named joints, the rigid bones between them, and what is known of their shape."""
 
 from kcs_torch.anatomy import Hinge
-from kcs_torch.skeleton.builtin import SKELETONS, get_skeleton, guess_skeleton
+from kcs_torch.skeleton.builtin import SKELETONS, fitting_links, get_skeleton, guess_skeleton
 from kcs_torch.skeleton.core import Skeleton
 from kcs_torch.skeleton.mapping import map_joints
 from kcs_torch.skeleton.person import has_middle, person_by_names
@@ -11,6 +11,7 @@ __all__ = [
     "SKELETONS",
     "Hinge",
     "Skeleton",
+    "fitting_links",
     "get_skeleton",
     "guess_skeleton",
     "has_middle",

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
 from kcs_torch.errors import SkeletonError, unknown
 from kcs_torch.skeleton.core import Skeleton
 
-__all__ = ["SKELETONS", "get_skeleton", "guess_skeleton"]
+__all__ = ["SKELETONS", "fitting_links", "get_skeleton", "guess_skeleton"]
 
 
 class _BuiltIn(Mapping[str, Skeleton]):
@@ -78,3 +78,31 @@ def guess_skeleton(joint_names: Sequence[str], *, ordered: bool = True) -> Skele
         if own == names or (not ordered and sorted(own) == sorted(names)):
             return skeleton
     return None
+
+
+ALIKE = 0.9
+"""Share of the bones of a skeleton with virtual joints that must be among links that are to tell it."""
+
+
+def fitting_links(links: Iterable[Sequence[int]], num_joints: int) -> list[Skeleton]:
+    """Return the built-in skeletons of as many observed joints whose bones these links are, joint by joint.
+
+    Published links of detectors that close chains have more than the bones of a tree with virtual joints, and may lack
+    one or two of these; links that are a tree have to be the same.
+
+    Args:
+        links: pairs of joint indices.
+        num_joints: observed joints.
+
+    >>> body = SKELETONS["body25"]
+    >>> [fits.name for fits in fitting_links(body.bones, 25)], fitting_links(body.bones[1:], 25)
+    (['body25'], [])
+    """
+    given = {frozenset(map(int, link)) for link in links}
+    fitting = []
+    for skeleton in SKELETONS.values():
+        if skeleton.num_observed == num_joints:
+            own = {frozenset(bone) for bone in skeleton.bones if max(bone) < num_joints}
+            if given == own or (skeleton.virtual and len(given & own) >= ALIKE * len(own)):
+                fitting.append(skeleton)
+    return fitting

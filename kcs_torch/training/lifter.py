@@ -21,7 +21,7 @@ from kcs_torch.nn.normalise import normalise_tracks
 from kcs_torch.skeleton import Skeleton, map_joints
 from kcs_torch.training.batch import from_mean_depth
 from kcs_torch.types import Tracks
-from kcs_torch.types.intake import MOST_LACKING
+from kcs_torch.types.bodies import MOST_LACKING
 
 __all__ = ["Lifter"]
 

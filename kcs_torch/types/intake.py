@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
-from dataclasses import replace
 from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,16 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError, SkeletonError
-from kcs_torch.skeleton import (
-    SKELETONS,
-    Skeleton,
-    get_skeleton,
-    guess_skeleton,
-    has_middle,
-    map_joints,
-    person_by_names,
-)
+from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.skeleton import Skeleton, get_skeleton, guess_skeleton
+from kcs_torch.types.bodies import choose_skeleton, joint_order
 
 __all__ = [
     "FARTHEST",
@@ -34,9 +25,6 @@ __all__ = [
     "as_weights",
     "at_the_corner",
     "check_places",
-    "choose_skeleton",
-    "joint_order",
-    "no_bones",
     "take_in",
 ]
 
@@ -88,148 +76,6 @@ def as_number(value: Any) -> float | None:
         return float(value) if isinstance(value, Real) else None
     except OverflowError:
         return None
-
-
-def fitting(num_joints: int) -> list[str]:
-    """Names of the built-in skeletons that have so many observed joints."""
-    return [body.name for body in SKELETONS.values() if body.num_observed == num_joints]
-
-
-def no_bones(body: Skeleton) -> str:
-    """What to say of tracks whose skeleton has no bones."""
-    fits = [name for name in fitting(body.num_joints) if _may_be(body.joints, SKELETONS[name])]
-    choice = f" ({body.num_joints} joints fit {', '.join(fits)})" if fits else ""
-    return (
-        "no bones are given, so joints are taken as points that move freely: give a skeleton"
-        f"{choice}, or skeleton='auto' (--skeleton auto) to find the bones"
-    )
-
-
-def _numbered(names: Sequence[str]) -> bool:
-    """Whether names differ by numbers at their ends alone, so that their order is all that they tell."""
-    return len({re.sub(r"[0-9]+\Z", "", name) for name in names}) == 1
-
-
-def _may_be(names: Sequence[str], body: Skeleton) -> bool:
-    """Whether joints may be those of a body of as many: by their names, unless these are but numbers."""
-    if _numbered(names):
-        return True
-    found = map_joints(names, body.joints[: body.num_observed])
-    if None not in found:
-        return True  # whatever their order, as a skeleton matches joints by name
-    return all(i in (None, j) for j, i in enumerate(found)) and MOST_LACKING * found.count(None) <= len(found)
-
-
-def choose_skeleton(
-    skeleton: str | Path | Skeleton | None,
-    names: Sequence[str] | None,
-    edges: Any,
-    num_joints: int,
-    source: str,
-    notes: list[str],
-) -> Skeleton:
-    """The skeleton that fits what the user gave; says so in ``notes`` where it had to choose."""
-    if skeleton is not None:
-        body = get_skeleton(skeleton)
-        if body.num_observed != num_joints:
-            fits = fitting(num_joints)
-            hint = f"; {num_joints} joints fit {', '.join(fits)}" if fits else ""
-            if num_joints == body.num_joints:
-                virtual = ", ".join(body.joints[body.num_observed :])
-                hint = f": take off the virtual ones, {virtual}, points[:, :{body.num_observed}], which are found anew"
-            raise SkeletonError(
-                f"{source}: expected the {body.num_observed} joints of skeleton '{body.name}', got {num_joints}{hint}"
-            )
-        return body
-    known = guess_skeleton(names) if names is not None else None
-    person = person_by_names(names, Path(source).stem) if known is None and names is not None else None
-    if edges is None:
-        if known is not None:
-            return known
-        if person is not None:
-            notes.append(f"a person's bones are taken, by the joints' names{_between(person)}")
-            return person
-        try:
-            return Skeleton.from_edges([], names or num_joints, name="points", tree=False)
-        except SkeletonError as error:
-            raise SkeletonError(f"{source}: {error}") from None
-    try:
-        try:
-            pairs = np.asarray(edges)
-        except ValueError:
-            raise ShapeError(f"{source}: edges: expected pairs of joint indices, got rows of unequal length") from None
-        if pairs.size == 0:
-            pairs = pairs.reshape(0, 2)
-        if pairs.ndim != 2 or pairs.shape[1] != 2 or not np.issubdtype(pairs.dtype, np.number):
-            raise ShapeError(
-                f"{source}: edges: expected shape (bones, 2) of joint indices, got {pairs.shape} of {pairs.dtype}"
-            )
-        graph = Skeleton.from_edges(pairs.tolist(), names or num_joints, name=Path(source).stem, tree=False)
-    except SkeletonError as error:
-        raise SkeletonError(f"{source}: edges: {error}") from None
-    if graph.is_tree:
-        if person is not None and person.virtual and not has_middle(graph.joints):
-            notes.append(f"the edges lead past the middle of the trunk: a person's bones are taken{_between(person)}")
-            return person
-        return replace(graph, tree=True)
-    if known is not None:
-        notes.append(
-            f"the file's edges are not a tree; used the built-in skeleton '{known.name}', whose joint names it has"
-        )
-        return known
-    reason = "close a chain" if graph.cycle() else f"fall into {len(graph.pieces())} pieces"
-    if person is not None:
-        notes.append(f"the edges {reason}: a person's bones are taken, by the joints' names{_between(person)}")
-        return person
-    notes.append(f"the edges {reason}: used as a graph of rigid links, not as a tree")
-    return graph
-
-
-def _between(person: Skeleton) -> str:
-    """Which joints a person has beside those seen, for a note."""
-    made = [f"{person.joints[v]} between {' and '.join(person.joints[i] for i in ends)}" for v, ends in person.virtual]
-    return f", with a virtual {', and a virtual '.join(made)}" if made else ""
-
-
-MOST_LACKING = 3
-"""One joint in so many may be missing where those of another body are matched by name."""
-
-
-def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[str]) -> list[int] | None:
-    """Return where each joint of ``body`` stands among ``names``, in any spelling; None: take them in their order.
-
-    Of another body's joints those in common are taken, and -1 stands for those that it lacks, a third at most.
-
-    Raises:
-        SkeletonError: too many joints are not among the names, or equally many names stand in another order.
-    """
-    wanted = body.joints[: body.num_observed]
-    if tuple(names) == wanted:
-        return None
-    exact = {n: i for i, n in enumerate(names)}
-    found = [exact.get(n) for n in wanted] if exact.keys() >= set(wanted) else map_joints(names, wanted)
-    ordered = _numbered(names) and found == list(range(len(names)))
-    missing = [n for n, i in zip(wanted, found, strict=True) if i is None or ordered]
-    if not missing:
-        spare = len(names) - len(wanted)
-        notes.append(f"joints matched by name with skeleton '{body.name}'" + (f"; {spare} left out" if spare else ""))
-        return [i for i in found if i is not None]
-    if len(names) == len(wanted) and all(i in (None, j) for j, i in enumerate(found)):
-        pairs = [f"{names[wanted.index(n)]} for {n}" for n in missing]
-        said = f"{', '.join(pairs[:4])}{', ...' if len(pairs) > 4 else ''}"
-        notes.append(f"joints taken in their order as those of skeleton '{body.name}', where names differ: {said}")
-        return None
-    if len(names) != len(wanted) and MOST_LACKING * len(missing) <= len(wanted):
-        notes.append(
-            f"joints matched by name with skeleton '{body.name}'; not among them, so unseen: {', '.join(missing)}"
-        )
-        return [-1 if i is None else i for i in found]
-    listed = ", ".join(names)
-    raise SkeletonError(
-        f"{source}: expected the {len(wanted)} joints of skeleton '{body.name}', got {len(names)} joints, none of them "
-        f"named {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''}; they are {listed[:1000]}"
-        + (" ..." if len(listed) > 1000 else "")
-    )
 
 
 def at_the_corner(points: np.ndarray, seen: np.ndarray, notes: list[str]) -> np.ndarray:

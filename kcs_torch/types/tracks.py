@@ -11,7 +11,8 @@ from torch import Tensor
 
 from kcs_torch.errors import counted
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types.intake import no_bones, take_in
+from kcs_torch.types.bodies import no_bones
+from kcs_torch.types.intake import take_in
 from kcs_torch.types.size import short_unit
 from kcs_torch.types.trajectories import Trajectories
 
