@@ -225,7 +225,7 @@ def test_score_names_what_it_compares(scored):
         assert 10 < float(rows[how].split()[1]) < 60
         assert "100.0 %" in rows[how]
     assert "Pelvis of each frame moved" in rows["root"]
-    assert "no bones in the truth" in told
+    assert "a person's bones are taken, by the joints' names" in told  # of the .trc, which holds none
     assert "mirror image" not in told
     assert f"note: {scored / 'truth.trc'}: y is taken to point up: give up=... (kcs-torch: --truth-up)" in told
     assert "taken to point up" not in run("score", scored / "pred.npz", scored / "truth.trc", "--truth-up", "y").output
@@ -239,9 +239,15 @@ def test_score_as_json(scored):
     )
     assert data["mpjpe"] == pytest.approx(found.mpjpe)
     assert data["joints"][0] == list(found.joints[0])
-    assert data["bone_deviation_truth"] is None
-    assert math.isnan(found.bone_deviation_truth)
+    assert data["bone_deviation_truth"] == pytest.approx(found.bone_deviation_truth)
     assert data["units"] == "mm"
+
+
+def test_score_of_joints_without_bones(scored):
+    truth = scored / "truth.trc"
+    truth.write_text(truth.read_text().replace("LeftWrist", "Beak"))  # so it is no person's
+    assert "no bones in the truth" in run("score", scored / "pred.npz", truth).output
+    assert json.loads(run("score", scored / "pred.npz", truth, "--json").stdout)["bone_deviation_truth"] is None
 
 
 def test_score_tells_of_a_mirror(scored):
