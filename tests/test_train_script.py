@@ -4,7 +4,9 @@ import csv
 import importlib.util
 import json
 import math
+import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -183,6 +185,14 @@ class TestResuming:
         assert all(torch.equal(value, first[f"network.{name}"]) for name, value in old.items())
         assert not same(first, weights(tmp_path / "whole"))
 
+    def test_in_its_own_folder_goes_on_in_its_log(self, run, tmp_path, monkeypatch):
+        killed(monkeypatch, 7, tmp_path, "trainer.max_epochs=4")
+        train(composed("trainer.max_epochs=4", f"resume={tmp_path}"), tmp_path)
+        assert rows(tmp_path / "csv" / "metrics.csv") == rows(run[1] / "csv" / "metrics.csv")
+        with pytest.warns(kt.KcsWarning, match="max_epochs was 4, is 5"):
+            train(composed("trainer.max_epochs=5", f"resume={tmp_path}"), tmp_path)
+        assert len(logged(tmp_path, "val/mpjpe")) == 5 and len(logged(tmp_path, "test/mpjpe")) == 1
+
     def test_the_best_checkpoint_is_missed(self, tmp_path, monkeypatch):
         killed(monkeypatch, 4, tmp_path / "first")
         (tmp_path / "first" / "checkpoints" / "best.ckpt").unlink()
@@ -249,12 +259,25 @@ class TestWrongConfigurations:
             train(config, tmp_path / "run")
         assert not list(tmp_path.glob("run/**/*.ckpt"))
 
+    @pytest.mark.parametrize(
+        ("kind", "told"),
+        [
+            ("Broken", r"the loss 'mine' \(Broken\) was NaN at step 0"),
+            ("Root", "the losses were numbers at step 0, but their gradient was not"),
+        ],
+    )
+    def test_a_loss_of_ones_own_that_is_no_number_is_named(self, tmp_path, kind, told):
+        term = f"{{_target_: kcs_torch.training.LossTerm, loss: {{_target_: {__name__}.{kind}}}}}"
+        with pytest.warns(kt.KcsWarning, match=f"diverged: {told}"):
+            outcome = train(composed(f"+loss.mine={term}"), tmp_path)
+        assert outcome.diverged
+
     @pytest.mark.parametrize("solver", ["none", "sfam"])
     def test_divergence_is_the_worst_value(self, tmp_path, solver):
         """A solver factorises matrices, and takes no NaN."""
-        with pytest.warns(kt.KcsWarning, match="diverged"):
+        with pytest.warns(kt.KcsWarning, match=r"diverged: .*try a smaller module\.lr"):
             outcome = train(composed("+module.lr=1e30", f"solver={solver}"), tmp_path)
-        assert outcome.value == float("inf") and outcome.lifter is None and not outcome.metrics
+        assert outcome.diverged and outcome.value == float("inf") and outcome.lifter is None and not outcome.metrics
 
     def test_a_network_whose_weights_are_numbers_may_still_have_diverged(self, tmp_path):
         with pytest.warns(kt.KcsWarning, match="diverged"):
@@ -274,6 +297,20 @@ class TestWrongConfigurations:
             outcome = train(composed(), tmp_path)
         assert outcome.value == logged(tmp_path, "val/mpjpe")[0]
         assert load_lifter(outcome.lifter).network is not None
+
+
+class Broken(torch.nn.Module):
+    """A loss that is no number."""
+
+    def forward(self, points):
+        return points.mean((-1, -2)) * math.nan
+
+
+class Root(torch.nn.Module):
+    """A loss of 0, with no slope there."""
+
+    def forward(self, points):
+        return (points - points).square().sum((-1, -2)).sqrt()
 
 
 def called(capsys, *arguments: str) -> tuple[int, str, str]:
@@ -335,6 +372,36 @@ class TestCommandLine:
         code, _, err = called(capsys, *SMALL, *argument.split(), f"hydra.run.dir={tmp_path}")
         assert code == 2 and re.search(told, err), err
         assert "Traceback" not in err
+
+    def test_a_wrong_setting_touches_nothing_of_an_earlier_run(self, tmp_path, capsys):
+        words = [*SMALL, "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}"]
+        assert called(capsys, *words)[0] == 0
+
+        def files():
+            own = (
+                p for p in tmp_path.rglob("*") if p.is_file() and p.suffix in (".csv", ".json", ".ckpt", ".safetensors")
+            )
+            return {path: path.read_bytes() for path in own}
+
+        before = files()
+        for wrong in ("optimise=val/foo", "+module.lr=-1", "+data.labelled=2"):
+            assert called(capsys, *words, wrong)[0] == 2
+            assert files() == before
+
+    @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+    @pytest.mark.parametrize("sweep", [(), ("-m",)])
+    def test_a_signal_is_told_as_shells_tell_it(self, tmp_path, capsys, monkeypatch, number, code, sweep):
+        step = LiftingModule.training_step
+
+        def stopped(self, batch, batch_idx):
+            step(self, batch, batch_idx)
+            if int(self.step) == 5:
+                os.kill(os.getpid(), number)
+
+        monkeypatch.setattr(LiftingModule, "training_step", stopped)
+        folders = f"hydra.run.dir={tmp_path}", f"hydra.sweep.dir={tmp_path}"
+        got, _, err = called(capsys, *sweep, *SMALL, *folders, "trainer.max_epochs=5", "seed=3")
+        assert got == code and f"stopped: resume={tmp_path / '0' if sweep else tmp_path} goes on" in err
 
     def test_settings_of_ones_own_may_be_added(self, capsys):
         code, out, err = called(capsys, "--cfg=job", "--resolve", SMALL[0], "+wide=9", "+model.channels=${wide}")
@@ -410,7 +477,6 @@ class TestSweeps:
         assert code == 2 and "lr: expected a positive number" in err and "Traceback" not in err
         assert [row["run"] for row in rows(tmp_path / "sweep" / "results.csv")] == ["0", "2"]
 
-    @pytest.mark.filterwarnings("ignore:Experiment logs directory")
     def test_what_had_ended_is_kept(self, tmp_path, monkeypatch, capsys):
         """A sweep that was stopped goes on: runs without a result are made again, and runs of other settings."""
         monkeypatch.chdir(tmp_path)
@@ -427,7 +493,6 @@ class TestSweeps:
         assert code == 0 and "is kept" not in out
         assert err.count("had ended with other settings, and is replaced") == 2
 
-    @pytest.mark.filterwarnings("ignore:Experiment logs directory")
     def test_figures_of_other_settings_are_not_kept(self, tmp_path, capsys):
         """A debugging run leaves the checkpoints of the run before, but the figures are its own."""
         words = [*SMALL, "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}"]
@@ -442,15 +507,14 @@ class TestSweeps:
         code, out, err = called(capsys, *words, "keep=true")
         assert code == 0 and "had ended, and is kept" in out, err
 
-    @pytest.mark.filterwarnings("ignore:Experiment logs directory")
     def test_a_run_that_diverges_leaves_no_network(self, tmp_path, capsys):
         words = [*SMALL, "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}"]
         assert called(capsys, *words)[0] == 0 and (tmp_path / "lifter.safetensors").is_file()
         code, out, err = called(capsys, *words, "+module.lr=1e30")
-        assert code == 0 and "inf" in out and "diverged" in err
+        assert code == 1 and "inf" in out and "diverged" in err
         assert not list(tmp_path.rglob("*.ckpt")) and not (tmp_path / "lifter.safetensors").exists()
         code, out, err = called(capsys, *words, "+module.lr=1e30", "keep=true")
-        assert code == 0 and "had ended, and is kept" in out, err
+        assert code == 1 and "had ended, and is kept" in out, err
 
     def test_a_folder_that_cannot_be_made(self, tmp_path, capsys):
         (tmp_path / "file").write_text("")
@@ -459,7 +523,6 @@ class TestSweeps:
             assert code == 2 and not out and err.startswith(f"error: {name}={tmp_path}/file/run: cannot be written to")
             assert len(err.splitlines()) == 1
 
-    @pytest.mark.filterwarnings("ignore:Experiment logs directory")
     def test_figures_of_an_earlier_sweep_are_not_those_of_a_run_that_fails(self, tmp_path, monkeypatch, capsys):
         monkeypatch.chdir(tmp_path)
         assert called(capsys, *SWEEP, "+module.lr=1e-3,1e-4")[0] == 0

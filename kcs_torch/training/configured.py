@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import math
 import os
 import re
+import signal
 import sys
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,12 +27,14 @@ from kcs_torch.types.hints import is_a, spoken
 __all__ = [
     "PartFailed",
     "WrongConfiguration",
+    "changes",
     "check_switch",
     "check_threads",
     "check_values",
     "check_whole",
     "command_line",
     "configs",
+    "for_json",
     "in_one_line",
     "method_of",
 ]
@@ -77,6 +81,8 @@ def command_line(program: str, arguments: Sequence[str] | None = None, start: st
         wrong = isinstance(cause, (HydraException, OmegaConfBaseException))
         told = wrong and not isinstance(cause, (InstantiationException, PartFailed))
         raise SystemExit(2 if told else end.code) from None
+    except KeyboardInterrupt:
+        raise SystemExit(128 + signal.SIGINT) from None
     finally:
         sys.argv = before
 
@@ -184,6 +190,29 @@ def check_values(config: Mapping[str, Any], place: str = "") -> None:
             check_values(value, key)
         elif not isinstance(value, list) and name in hints and not is_a(value, hints[name]):
             raise OptionError(f"{key}: expected {spoken(hints[name])}, got {value!r}")
+
+
+def for_json(value: Any) -> Any:
+    """A configuration whose infinite numbers are as YAML writes them, in words: JSON has none."""
+    if isinstance(value, dict):
+        return {name: for_json(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [for_json(inner) for inner in value]
+    return str(value).replace("inf", ".inf") if isinstance(value, float) and math.isinf(value) else value
+
+
+def changes(before: Any, now: Any) -> list[tuple[str, Any, Any]]:
+    """The settings by which a run's figures differ, as they were and as they are."""
+    then, these = _flat(before), _flat(now)
+    keys = sorted({*then, *these} - {"resume", "keep"})
+    return [(key, then.get(key), these.get(key)) for key in keys if then.get(key) != these.get(key)]
+
+
+def _flat(config: Any, key: str = "") -> dict[str, Any]:
+    """A nested configuration with dotted keys."""
+    if not isinstance(config, Mapping):
+        return {key: config}
+    return {name: leaf for k, v in config.items() for name, leaf in _flat(v, f"{key}.{k}".lstrip(".")).items()}
 
 
 def method_of(config: DictConfig) -> Method:
