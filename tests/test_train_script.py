@@ -19,7 +19,7 @@ import kcs_torch as kt
 lightning = pytest.importorskip("lightning", reason="training needs the extra: pip install -e '.[train]'")
 hydra = pytest.importorskip("hydra")
 
-from omegaconf import OmegaConf  # noqa: E402
+from omegaconf import DictConfig, OmegaConf  # noqa: E402
 
 from kcs_torch.training import LiftingModule, load_lifter  # noqa: E402
 from kcs_torch.training.run import configs, main, train  # noqa: E402
@@ -346,17 +346,26 @@ class TestCommandLine:
             ("modle=mlp", "unknown setting 'modle': did you mean .*choices: .*experiment, .*model, "),
             ("+modul.lr=1", "unknown setting 'modul': did you mean 'module' or 'model'"),
             ("hydr/launcher=joblib", "unknown setting 'hydr': did you mean 'hydra'"),
-            ("model.widht=3", "Could not override 'model.widht'"),
+            (
+                "model.chanels=3",
+                r"unknown field of model \(.*TemporalLifter\) 'chanels': did you mean 'channels'",
+            ),
+            (
+                "data.windo=3",
+                r"unknown field of data \(.*TracksDataModule\) 'windo': did you mean 'window'.*choices: batch",
+            ),
+            ("+loss.joints.clip=labelled", r"unknown field of loss.joints \(.*LossTerm\) 'clip': did you mean 'clips'"),
+            ("loss.joint.weight=2", "unknown loss 'joint': did you mean 'joints'"),
             ("+trainer.gradient_clip_val=1", r"gradient_clip_val: .*\+module\.clip"),
             ("+trainer.accumulate_grad_batches=2", r"accumulate_grad_batches: .*data\.batch_size"),
-            ("+data.noisy=1", "data: .*unexpected keyword argument 'noisy'"),
+            ("+data.noisy=1", "unknown field of data .*'noisy': did you mean 'noise'"),
             ("+module.lr=-1", "lr: expected a positive number"),
             ("+module.lr=abc", "error: module.lr: expected a finite number, got 'abc'"),
             ("trainer.max_epochs=hello", "error: trainer.max_epochs: expected a whole number or none, got 'hello'"),
             ("data.fresh_cameras=maybe", "error: data.fresh_cameras: expected true or false, got 'maybe'"),
             ("keep=no", "error: keep: expected true or false, got 'no'"),
             ("optimise=???", "error: optimise: expected a value, got none: add optimise="),
-            ("+trainer.acelerator=cpu", "trainer: .*unexpected keyword argument 'acelerator'"),
+            ("+trainer.acelerator=cpu", "unknown field of trainer .*'acelerator': did you mean 'accelerator'"),
             ("trainer.accelerator=abacus", "abacus"),
             ("data=cmu shared=/nowhere", "/nowhere/data/cmu, found none"),
             ("resume=/nowhere", "resume=/nowhere: expected a run's folder"),
@@ -463,13 +472,13 @@ class TestSweeps:
         monkeypatch.chdir(tmp_path)
         search = ("optuna", "n_trials=4", "n_jobs=1", "sampler.seed=0")
         options = [f"hydra{'.' if '=' in word else '/'}sweeper{'.' if '=' in word else '='}{word}" for word in search]
-        code, _, err = called(capsys, *SWEEP, *options, "+module.lr=tag(log,interval(1e-4,1e-2))")
+        code, _, err = called(capsys, *SWEEP, *options, "module.lr=tag(log,interval(1e-4,1e-2))")
         assert code == 0, err
         tried = {float(row["module.lr"]): float(row["val/mpjpe"]) for row in swept(tmp_path)}
         assert len(tried) == 4 and all(1e-4 <= lr <= 1e-2 for lr in tried)
         best = OmegaConf.load(tmp_path / "sweep" / "optimization_results.yaml")
         assert best.best_value == min(tried.values())
-        assert tried[best.best_params["+module.lr"]] == best.best_value
+        assert tried[best.best_params["++module.lr"]] == best.best_value
 
     def test_a_run_that_fails_does_not_take_the_others_along(self, tmp_path, monkeypatch, capsys):
         monkeypatch.chdir(tmp_path)
@@ -555,6 +564,16 @@ class TestKcsTorchTrain:
         for word in ("data: cmu, files, synthetic", "model: mlp, temporal", "optimise: val/mpjpe", "data=cmu"):
             assert word in done.stdout
         assert "reconstruct_many" not in done.stdout
+        groups = [entry for entry in OmegaConf.load(configs() / "train.yaml").defaults if isinstance(entry, DictConfig)]
+        for group in (str(next(iter(entry))) for entry in groups):
+            assert (
+                f"\n{group}: {', '.join(sorted(p.stem for p in (configs() / group).glob('*.yaml')))}\n" in done.stdout
+            )
+        assert "method:" not in done.stdout
+
+    def test_fields_that_are_not_shown_need_no_plus(self, capsys):
+        code, out, err = called(capsys, "--cfg=job", SMALL[0], "module.lr=0.25", "+model.channels=8", "model.dropout=0")
+        assert code == 0 and all(word in out for word in ("lr: 0.25", "channels: 8", "dropout: 0")), err
 
     def test_trains(self, tmp_path):
         words = (*SMALL, "trainer.max_epochs=1", "hydra.run.dir=out")

@@ -72,6 +72,20 @@ def test_files_of_another_rate_unit_and_order(tmp_path):
     assert far.abs().max() < 0.02
 
 
+def test_names_of_another_body_are_refused_and_no_names_are_told(tmp_path):
+    """As many joints as the skeleton has, in their order: only who knows the file can say whether they are these."""
+    points = motion(12, skeleton="cmu21").points
+    read = lambda name: file_clips([tmp_path / name], skeleton="hand21", fps=30, up="y", units="mm")  # noqa: E731
+    kt.save(kt.Motion.from_arrays(points, skeleton="cmu21", fps=30, units="mm"), tmp_path / "named.npz")
+    with pytest.raises(
+        SkeletonError, match=r"named\.npz: expected the joints of skeleton 'hand21', .* they are pelvis"
+    ):
+        read("named.npz")
+    kt.save(kt.Motion.from_arrays(points, fps=30, units="mm"), tmp_path / "numbers.npz")
+    with pytest.warns(KcsWarning, match=r"numbers\.npz: joints taken in their order as those of skeleton 'hand21'"):
+        assert len(read("numbers.npz")) == 1
+
+
 def test_bodies_on_their_heads_are_told(tmp_path):
     walk = kt.Motion.from_arrays(walking_person(40).points, up="-y", skeleton="h36m17", fps=30, units="mm")
     for name, up in (("right", "y"), ("wrong", "-y")):

@@ -73,7 +73,8 @@ def command_line(program: str, arguments: Sequence[str] | None = None, start: st
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     # Hydra looks nowhere else, and takes flags before overrides only.
-    sys.argv = [start or before[0], *sorted(given, key=lambda one: re.match(r"~|[^-][^=]*=", one) is not None)]
+    ordered = sorted(given, key=lambda one: re.match(r"~|[^-][^=]*=", one) is not None)
+    sys.argv = [start or before[0], *map(_or_added, ordered)]
     try:
         yield
     except SystemExit as end:  # Hydra leaves with 1 whatever it was; what it was is the context
@@ -85,6 +86,11 @@ def command_line(program: str, arguments: Sequence[str] | None = None, start: st
         raise SystemExit(128 + signal.SIGINT) from None
     finally:
         sys.argv = before
+
+
+def _or_added(argument: str) -> str:
+    """An override that may also add a field: of a name that is not shown Hydra says to add it, be it right or wrong."""
+    return f"++{argument}" if re.match(r"(?!hydra\.)[A-Za-z_]\w*\.[^=]*=", argument) else argument
 
 
 def _check_folders(arguments: Sequence[str]) -> None:
@@ -178,14 +184,17 @@ def check_threads(value: Any) -> None:
 
 
 def check_values(config: Mapping[str, Any], place: str = "") -> None:
-    """Make sure that numbers, words and switches are what the classes that are named take; some of them never look.
+    """Make sure that fields are what the classes that are named take, numbers, words and switches too; some never look.
 
     Raises:
-        OptionError: a value is something else.
+        OptionError: there is no such field, or a value is something else.
     """
     hints = _hints(config["_target_"]) if "_target_" in config else {}
+    known = _fields(config["_target_"]) if "_target_" in config else None
     for name, value in config.items():
         key = f"{place}.{name}".lstrip(".")
+        if known is not None and not str(name).startswith("_") and name not in known:
+            raise unknown(f"field of {place or 'the configuration'} ({config['_target_']})", name, known)
         if isinstance(value, Mapping):
             check_values(value, key)
         elif not isinstance(value, list) and name in hints and not is_a(value, hints[name]):
@@ -242,6 +251,19 @@ def _hints(target: str) -> dict[str, Any]:
         return typing.get_type_hints(found.__init__ if inspect.isclass(found) else found)
     except Exception:  # whatever importing it, or reading annotations that are text, comes to
         return {}
+
+
+def _fields(target: str) -> list[str] | None:
+    """The names of what a class takes; None where it takes any, or where they cannot be told."""
+    try:
+        takes = inspect.signature(get_object(target)).parameters.values()
+    except Exception:  # whatever importing it comes to
+        return None
+    return (
+        None
+        if any(p.kind is p.VAR_KEYWORD for p in takes)
+        else [p.name for p in takes if p.kind is not p.VAR_POSITIONAL]
+    )
 
 
 def _not_imported(what: str, error: BaseException) -> str:

@@ -25,7 +25,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException, SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 
-from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError, warnings_told
+from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError, unknown, warnings_told
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.training.callbacks import Best, Diverged, Last, Log, Watch
 from kcs_torch.training.checkpoint import describe, save_lifter
@@ -188,6 +188,10 @@ def _check(config: Mapping[str, Any]) -> None:
     solver = config.get("solver")
     if solver is not None and "_target_" not in solver:
         raise OptionError(f"solver: there is none to set {', '.join(solver)} of: choose one first, as solver=sfam does")
+    losses = config.get("loss")
+    for name, term in losses.items() if isinstance(losses, Mapping) else ():
+        if isinstance(term, Mapping) and "_target_" not in term:
+            raise unknown("loss", name, [other for other in losses if other != name])
 
 
 def _checkpoint(path: Path, config: Mapping[str, Any]) -> tuple[Path, int]:

@@ -105,14 +105,14 @@ def no_bones(body: Skeleton) -> str:
     )
 
 
-def _numbered(names: Sequence[str]) -> bool:
+def numbered(names: Sequence[str]) -> bool:
     """Whether names differ by numbers at their ends alone, so that their order is all that they tell."""
     return len({re.sub(r"[0-9]+\Z", "", name) for name in names}) == 1
 
 
 def _may_be(names: Sequence[str], body: Skeleton) -> bool:
     """Whether joints may be those of a body of as many: by their names, unless these are but numbers."""
-    if _numbered(names):
+    if numbered(names):
         return True
     found = map_joints(names, body.joints[: body.num_observed])
     if None not in found:
@@ -195,6 +195,10 @@ MOST_LACKING = 3
 """One joint in so many may be missing where those of another body are matched by name."""
 
 
+IN_ORDER = "joints taken in their order as those of skeleton"
+"""How the note begins where as many joints as the skeleton has go by other names."""
+
+
 def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[str]) -> list[int] | None:
     """Return where each joint of ``body`` stands among ``names``, in any spelling; None: take them in their order.
 
@@ -208,7 +212,7 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
         return None
     exact = {n: i for i, n in enumerate(names)}
     found = [exact.get(n) for n in wanted] if exact.keys() >= set(wanted) else map_joints(names, wanted)
-    ordered = _numbered(names) and found == list(range(len(names)))
+    ordered = numbered(names) and found == list(range(len(names)))
     missing = [n for n, i in zip(wanted, found, strict=True) if i is None or ordered]
     if not missing:
         spare = len(names) - len(wanted)
@@ -217,7 +221,7 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
     if len(names) == len(wanted) and all(i in (None, j) for j, i in enumerate(found)):
         pairs = [f"{names[wanted.index(n)]} for {n}" for n in missing]
         said = f"{', '.join(pairs[:4])}{', ...' if len(pairs) > 4 else ''}"
-        notes.append(f"joints taken in their order as those of skeleton '{body.name}', where names differ: {said}")
+        notes.append(f"{IN_ORDER} '{body.name}', where names differ: {said}")
         return None
     if len(names) != len(wanted) and MOST_LACKING * len(missing) <= len(wanted):
         notes.append(
