@@ -122,6 +122,67 @@ class TestARun:
         assert not same(weights(run[1]), weights(tmp_path))
 
 
+class Own(torch.nn.Module):
+    """A network of one's own."""
+
+    def __init__(self, skeleton: str, width: int = 8) -> None:
+        super().__init__()
+        self.skeleton = kt.SKELETONS[skeleton]
+        count = self.skeleton.num_joints
+        self.layers = torch.nn.Sequential(torch.nn.Linear(2 * count, width), torch.nn.Linear(width, count))
+
+    def forward(self, tracks, weights=None):
+        return torch.cat([tracks, self.layers(tracks.flatten(-2))[..., None]], -1)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("own")
+    words = [word for word in SMALL if "model" not in word]
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(configs())):
+        config = hydra.compose("train", overrides=[*words, f"model._target_={__name__}.Own"])
+    with pytest.warns(kt.KcsWarning, match=r"best\.ckpt.*load_lifter\(.*network="):
+        assert train(config, folder).lifter is None
+    return folder / "checkpoints" / "best.ckpt"
+
+
+class TestANetworkOfOnesOwn:
+    def test_is_used_from_its_checkpoint(self, trained):
+        lifter = load_lifter(trained, network=Own("cmu21"))
+        held = torch.load(trained, weights_only=True)["state_dict"]
+        assert lifter.fps == 30 and not lifter.network.training
+        assert same({f"network.{name}": value for name, value in lifter.network.state_dict().items()}, {
+            name: value for name, value in held.items() if name.startswith("network.")
+        })  # fmt: skip
+        assert (
+            kt.reconstruct(kt.data.walking_person(12, skeleton="coco17").tracks, method=lifter).points.isfinite().all()
+        )
+
+    def test_errors_say_how(self, trained, run):
+        with pytest.raises(kt.FormatError, match=r"weights of a Own made as this one is, got others: layers\.0\.bias"):
+            load_lifter(trained, network=Own("cmu21", width=9))
+        with pytest.raises(kt.FormatError, match="expected a checkpoint of a LiftingModule"):
+            load_lifter(run[1] / "lifter.safetensors", network=Own("cmu21"))
+        with pytest.raises(kt.FormatError, match=r"lifter\.safetensors of the same run, or give .*network="):
+            load_lifter(trained)
+        with pytest.raises(kt.OptionError, match=r"expected network=\.\.\. and losses=.*load_lifter\(path, network="):
+            LiftingModule.load_from_checkpoint(trained)
+        tracks = kt.data.walking_person(12, skeleton="cmu21").tracks
+        with pytest.raises(kt.OptionError, match=r"got the file .*load_lifter"):
+            kt.reconstruct(tracks, method=str(trained))
+
+    def test_lift_says_how(self, trained, tmp_path):
+        from typer.testing import CliRunner
+
+        from kcs_torch.cli import app
+
+        kt.save(kt.data.walking_person(12, skeleton="cmu21").tracks, tmp_path / "in.npz")
+        done = CliRunner().invoke(
+            app, ["lift", str(tmp_path / "in.npz"), "-o", str(tmp_path / "a.csv"), "-m", str(trained)]
+        )
+        assert done.exit_code == 2 and "load_lifter(path, network=...)" in done.stderr
+
+
 def test_callbacks_of_ones_own_join_in(tmp_path):
     stopping = "{_target_: lightning.pytorch.callbacks.EarlyStopping, monitor: val/mpjpe, patience: 1, min_delta: 1e9}"
     for given in (stopping, f"[{stopping}]"):

@@ -160,7 +160,7 @@ def lift(
         from kcs_torch.types.tracks import unseen_notes
 
         output = check_outputs(output, source=tracks)
-        learned = _learned(method, settings) if method.endswith(LEARNED) else None
+        learned = _learned(method, settings) if method.endswith((LEARNED, ".ckpt")) else None
         fields = {} if learned is not None else method_fields(method, settings)
         if intrinsics is not None:
             fields["intrinsics"] = _lens(intrinsics)

@@ -117,6 +117,25 @@ class LiftingModule(lightning.LightningModule):
                 metrics["bone_deviation"] = BoneDeviation(skeleton)
             self.measured[stage] = nn.ModuleDict(metrics)
 
+    @classmethod
+    def load_from_checkpoint(cls, checkpoint_path: Any, *args: Any, **kwargs: Any) -> Any:
+        """Lightning's: it needs ``network``, ``losses`` and what else the module was made with.
+
+        Raises:
+            OptionError: network or losses are not given.
+        """
+        lacking = [name for name in ("network", "losses") if name not in kwargs]
+        if cls is LiftingModule and lacking:
+            raise OptionError(
+                f"LiftingModule.load_from_checkpoint: expected {' and '.join(f'{name}=...' for name in lacking)}, as "
+                "the module was made; to use a trained network: kcs_torch.training.load_lifter(path, network=...)"
+            )
+        return super().load_from_checkpoint(checkpoint_path, *args, **kwargs)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep the frame rate of the data, by which a trained network warns of tracks at another."""
+        checkpoint["fps"] = getattr(getattr(self.trainer, "datamodule", None), "fps", None)
+
     def forward(self, tracks: Tensor, weights: Tensor | None = None) -> Tensor:
         """Lift tracks (..., T, N, 2) with weights (..., T, N) to points (..., T, N, 3)."""
         points: Tensor = self.network(tracks, weights)

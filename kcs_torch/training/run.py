@@ -171,7 +171,10 @@ def _savable(network: Any) -> bool:
     try:
         describe(network)
     except OptionError as error:
-        text = f"there will be checkpoints, but no lifter.safetensors: {error}"
+        text = (
+            "there will be no lifter.safetensors, but checkpoints/best.ckpt, which load_lifter(path, network=...) "
+            f"takes: {error}"
+        )
         warnings.warn(text, KcsWarning, stacklevel=2)
         return False
     return True
@@ -189,7 +192,8 @@ def _check(config: Mapping[str, Any]) -> None:
     if solver is not None and "_target_" not in solver:
         raise OptionError(f"solver: there is none to set {', '.join(solver)} of: choose one first, as solver=sfam does")
     losses = config.get("loss")
-    for name, term in losses.items() if isinstance(losses, Mapping) else ():
+    losses = losses if isinstance(losses, Mapping) else {}
+    for name, term in losses.items():
         if isinstance(term, Mapping) and "_target_" not in term:
             raise unknown("loss", name, [other for other in losses if other != name])
 
