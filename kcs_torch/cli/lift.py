@@ -83,7 +83,7 @@ def lift(
             "-o",
             metavar="FILE",
             help="Where to write: .npz (everything); .bvh, .c3d, .trc, .csv or .json; .html (a player), .png, .gif, "
-            ".mp4 or .rrd (rerun); may be repeated.",
+            ".mp4 or .rrd (rerun); may be repeated. A file that is there is replaced.",
             show_default=False,
         ),
     ],
