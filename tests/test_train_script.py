@@ -210,6 +210,15 @@ def killed(monkeypatch, at: int, folder: Path, *overrides: str) -> None:
             train(composed(*overrides), folder)
 
 
+def test_tracks_of_ones_own_are_trained_on_without_labels(tmp_path):
+    kt.save(kt.data.walking_person(40, skeleton="coco17").tracks, tmp_path / "walk.npz")
+    words = "loss=hybrid", f"+data.folder={tmp_path}", "+data.tracks=*.npz", "skeleton=coco17", "trainer.max_epochs=1"
+    outcome = train(composed(*words), tmp_path / "run")
+    assert outcome.value < math.inf and outcome.lifter is not None
+    alone = "+data.labelled=0", "+data.unlabelled=false", "loss=bones"
+    assert train(composed(*words, *alone), tmp_path / "alone").value < math.inf
+
+
 class TestResuming:
     @pytest.mark.parametrize("at", [6, 10])
     def test_a_killed_run_goes_on_as_if_nothing_had_happened(self, run, tmp_path, monkeypatch, at):

@@ -45,8 +45,20 @@ class Clip(NamedTuple):
     skeleton: Skeleton
 
 
-def find_files(patterns: str | Path | Sequence[str | Path], folder: str | Path = ".") -> list[Path]:
+def find_files(
+    patterns: str | Path | Sequence[str | Path],
+    folder: str | Path = ".",
+    *,
+    of: str = "3D motion",
+    folders: bool = False,
+) -> list[Path]:
     """List the files of one pattern or several in natural order, without those of patterns that begin with ``!``.
+
+    Args:
+        patterns: one or several.
+        folder: that they are relative to.
+        of: what is in the files, for messages.
+        folders: whether a folder counts as a file (OpenPose writes one a clip).
 
     Raises:
         OptionError: there are none.
@@ -56,11 +68,13 @@ def find_files(patterns: str | Path | Sequence[str | Path], folder: str | Path =
     left_out: set[Path] = set()
     for pattern in map(str, every):
         files = (Path(p) for p in glob.glob(str(Path(folder, pattern.removeprefix("!"))), recursive=True))
-        (left_out if pattern.startswith("!") else found).update(p for p in files if p.is_file())
+        (left_out if pattern.startswith("!") else found).update(
+            p for p in files if p.is_file() or (folders and p.is_dir())
+        )
     out = sorted(found - left_out, key=lambda p: natural_key(str(p)))
     if not out:
         raise OptionError(
-            f"data: expected files of 3D motion that match {', '.join(map(str, every)) or 'a pattern'} in "
+            f"data: expected files of {of} that match {', '.join(map(str, every)) or 'a pattern'} in "
             f"{Path(folder).resolve()}, found none"
         )
     return out
