@@ -262,7 +262,7 @@ def method_named(method: str | Method, fields: dict[str, Any]) -> Method:
         return method
     if method == "auto":
         method = DEFAULT
-    if isinstance(method, str) and method.endswith(".safetensors"):
+    if isinstance(method, str) and method.endswith((".safetensors", ".ckpt")):
         raise OptionError(
             f"method: expected a name or a Method, got the file {method!r}: use kcs_torch.training.load_lifter(file)"
         )

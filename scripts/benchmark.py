@@ -2,7 +2,7 @@
 
     python scripts/benchmark.py method=sfam suite=akhter
     python scripts/benchmark.py -m method=kcs,sfam suite=static_walk,orbit
-    python scripts/benchmark.py method=sfam suite=akhter cameras=true +method.beta=0
+    python scripts/benchmark.py method=sfam suite=akhter cameras=true method.beta=0
     python scripts/benchmark.py suite=[real_openpose,real_mediapipe] intrinsics=true
     python scripts/benchmark.py paper.parts=all    # the tables of the two seed papers instead, see papers.py
 

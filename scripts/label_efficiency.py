@@ -1,6 +1,6 @@
 """What few labels and many windows without any are worth: the table of a sweep, beside methods without training.
 
-    python scripts/train.py -m experiment=labels,hybrid +data.labelled=0.01,0.05,0.25,1 seed=0,1,2
+    python scripts/train.py -m experiment=labels,hybrid data.labelled=0.01,0.05,0.25,1 seed=0,1,2
     python scripts/train.py -m experiment=two_d_only seed=0,1,2
     python scripts/label_efficiency.py outputs/train/FIRST outputs/train/SECOND methods=[pkc,kcs,sfam]
 

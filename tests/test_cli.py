@@ -54,6 +54,13 @@ def test_help_names_every_suffix():
         assert suffix in run("lift", "--help").stdout
 
 
+def test_help_tells_exit_codes_and_what_is_replaced():
+    text = " ".join(run("--help").stdout.replace("│", " ").split())
+    assert "0 done; 2 an input or the call is wrong" in text and "130 stopped by Ctrl-C, 143 by SIGTERM" in text
+    for command in ("lift", "view"):
+        assert "A file that is there is replaced." in " ".join(run(command, "--help").stdout.replace("│", " ").split())
+
+
 def test_version():
     assert run("--version").stdout.strip() == f"kcs-torch {kt.__version__}"
 

@@ -1,7 +1,6 @@
 """``kcs-torch convert`` and ``score``: raw detections to files of other tools and back, and what they say."""
 
 import json
-import math
 
 import numpy as np
 import pytest

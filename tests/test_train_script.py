@@ -4,7 +4,9 @@ import csv
 import importlib.util
 import json
 import math
+import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +19,7 @@ import kcs_torch as kt
 lightning = pytest.importorskip("lightning", reason="training needs the extra: pip install -e '.[train]'")
 hydra = pytest.importorskip("hydra")
 
-from omegaconf import OmegaConf  # noqa: E402
+from omegaconf import DictConfig, OmegaConf  # noqa: E402
 
 from kcs_torch.training import LiftingModule, load_lifter  # noqa: E402
 from kcs_torch.training.run import configs, main, train  # noqa: E402
@@ -120,6 +122,67 @@ class TestARun:
         assert not same(weights(run[1]), weights(tmp_path))
 
 
+class Own(torch.nn.Module):
+    """A network of one's own."""
+
+    def __init__(self, skeleton: str, width: int = 8) -> None:
+        super().__init__()
+        self.skeleton = kt.SKELETONS[skeleton]
+        count = self.skeleton.num_joints
+        self.layers = torch.nn.Sequential(torch.nn.Linear(2 * count, width), torch.nn.Linear(width, count))
+
+    def forward(self, tracks, weights=None):
+        return torch.cat([tracks, self.layers(tracks.flatten(-2))[..., None]], -1)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("own")
+    words = [word for word in SMALL if "model" not in word]
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(configs())):
+        config = hydra.compose("train", overrides=[*words, f"model._target_={__name__}.Own"])
+    with pytest.warns(kt.KcsWarning, match=r"best\.ckpt.*load_lifter\(.*network="):
+        assert train(config, folder).lifter is None
+    return folder / "checkpoints" / "best.ckpt"
+
+
+class TestANetworkOfOnesOwn:
+    def test_is_used_from_its_checkpoint(self, trained):
+        lifter = load_lifter(trained, network=Own("cmu21"))
+        held = torch.load(trained, weights_only=True)["state_dict"]
+        assert lifter.fps == 30 and not lifter.network.training
+        assert same({f"network.{name}": value for name, value in lifter.network.state_dict().items()}, {
+            name: value for name, value in held.items() if name.startswith("network.")
+        })  # fmt: skip
+        assert (
+            kt.reconstruct(kt.data.walking_person(12, skeleton="coco17").tracks, method=lifter).points.isfinite().all()
+        )
+
+    def test_errors_say_how(self, trained, run):
+        with pytest.raises(kt.FormatError, match=r"weights of a Own made as this one is, got others: layers\.0\.bias"):
+            load_lifter(trained, network=Own("cmu21", width=9))
+        with pytest.raises(kt.FormatError, match="expected a checkpoint of a LiftingModule"):
+            load_lifter(run[1] / "lifter.safetensors", network=Own("cmu21"))
+        with pytest.raises(kt.FormatError, match=r"lifter\.safetensors of the same run, or give .*network="):
+            load_lifter(trained)
+        with pytest.raises(kt.OptionError, match=r"expected network=\.\.\. and losses=.*load_lifter\(path, network="):
+            LiftingModule.load_from_checkpoint(trained)
+        tracks = kt.data.walking_person(12, skeleton="cmu21").tracks
+        with pytest.raises(kt.OptionError, match=r"got the file .*load_lifter"):
+            kt.reconstruct(tracks, method=str(trained))
+
+    def test_lift_says_how(self, trained, tmp_path):
+        from typer.testing import CliRunner
+
+        from kcs_torch.cli import app
+
+        kt.save(kt.data.walking_person(12, skeleton="cmu21").tracks, tmp_path / "in.npz")
+        done = CliRunner().invoke(
+            app, ["lift", str(tmp_path / "in.npz"), "-o", str(tmp_path / "a.csv"), "-m", str(trained)]
+        )
+        assert done.exit_code == 2 and "load_lifter(path, network=...)" in done.stderr
+
+
 def test_callbacks_of_ones_own_join_in(tmp_path):
     stopping = "{_target_: lightning.pytorch.callbacks.EarlyStopping, monitor: val/mpjpe, patience: 1, min_delta: 1e9}"
     for given in (stopping, f"[{stopping}]"):
@@ -145,6 +208,15 @@ def killed(monkeypatch, at: int, folder: Path, *overrides: str) -> None:
         patch.setattr(LiftingModule, "training_step", dies)
         with pytest.raises(Killed):
             train(composed(*overrides), folder)
+
+
+def test_tracks_of_ones_own_are_trained_on_without_labels(tmp_path):
+    kt.save(kt.data.walking_person(40, skeleton="coco17").tracks, tmp_path / "walk.npz")
+    words = "loss=hybrid", f"+data.folder={tmp_path}", "+data.tracks=*.npz", "skeleton=coco17", "trainer.max_epochs=1"
+    outcome = train(composed(*words), tmp_path / "run")
+    assert outcome.value < math.inf and outcome.lifter is not None
+    alone = "+data.labelled=0", "+data.unlabelled=false", "loss=bones"
+    assert train(composed(*words, *alone), tmp_path / "alone").value < math.inf
 
 
 class TestResuming:
@@ -182,6 +254,14 @@ class TestResuming:
         first = torch.load(tmp_path / "whole" / "checkpoints" / "best.ckpt", weights_only=True)["state_dict"]
         assert all(torch.equal(value, first[f"network.{name}"]) for name, value in old.items())
         assert not same(first, weights(tmp_path / "whole"))
+
+    def test_in_its_own_folder_goes_on_in_its_log(self, run, tmp_path, monkeypatch):
+        killed(monkeypatch, 7, tmp_path, "trainer.max_epochs=4")
+        train(composed("trainer.max_epochs=4", f"resume={tmp_path}"), tmp_path)
+        assert rows(tmp_path / "csv" / "metrics.csv") == rows(run[1] / "csv" / "metrics.csv")
+        with pytest.warns(kt.KcsWarning, match="max_epochs was 4, is 5"):
+            train(composed("trainer.max_epochs=5", f"resume={tmp_path}"), tmp_path)
+        assert len(logged(tmp_path, "val/mpjpe")) == 5 and len(logged(tmp_path, "test/mpjpe")) == 1
 
     def test_the_best_checkpoint_is_missed(self, tmp_path, monkeypatch):
         killed(monkeypatch, 4, tmp_path / "first")
@@ -249,12 +329,25 @@ class TestWrongConfigurations:
             train(config, tmp_path / "run")
         assert not list(tmp_path.glob("run/**/*.ckpt"))
 
+    @pytest.mark.parametrize(
+        ("kind", "told"),
+        [
+            ("Broken", r"the loss 'mine' \(Broken\) was NaN at step 0"),
+            ("Root", "the losses were numbers at step 0, but their gradient was not"),
+        ],
+    )
+    def test_a_loss_of_ones_own_that_is_no_number_is_named(self, tmp_path, kind, told):
+        term = f"{{_target_: kcs_torch.training.LossTerm, loss: {{_target_: {__name__}.{kind}}}}}"
+        with pytest.warns(kt.KcsWarning, match=f"diverged: {told}"):
+            outcome = train(composed(f"+loss.mine={term}"), tmp_path)
+        assert outcome.diverged
+
     @pytest.mark.parametrize("solver", ["none", "sfam"])
     def test_divergence_is_the_worst_value(self, tmp_path, solver):
         """A solver factorises matrices, and takes no NaN."""
-        with pytest.warns(kt.KcsWarning, match="diverged"):
+        with pytest.warns(kt.KcsWarning, match=r"diverged: .*try a smaller module\.lr"):
             outcome = train(composed("+module.lr=1e30", f"solver={solver}"), tmp_path)
-        assert outcome.value == float("inf") and outcome.lifter is None and not outcome.metrics
+        assert outcome.diverged and outcome.value == float("inf") and outcome.lifter is None and not outcome.metrics
 
     def test_a_network_whose_weights_are_numbers_may_still_have_diverged(self, tmp_path):
         with pytest.warns(kt.KcsWarning, match="diverged"):
@@ -274,6 +367,20 @@ class TestWrongConfigurations:
             outcome = train(composed(), tmp_path)
         assert outcome.value == logged(tmp_path, "val/mpjpe")[0]
         assert load_lifter(outcome.lifter).network is not None
+
+
+class Broken(torch.nn.Module):
+    """A loss that is no number."""
+
+    def forward(self, points):
+        return points.mean((-1, -2)) * math.nan
+
+
+class Root(torch.nn.Module):
+    """A loss of 0, with no slope there."""
+
+    def forward(self, points):
+        return (points - points).square().sum((-1, -2)).sqrt()
 
 
 def called(capsys, *arguments: str) -> tuple[int, str, str]:
@@ -309,17 +416,26 @@ class TestCommandLine:
             ("modle=mlp", "unknown setting 'modle': did you mean .*choices: .*experiment, .*model, "),
             ("+modul.lr=1", "unknown setting 'modul': did you mean 'module' or 'model'"),
             ("hydr/launcher=joblib", "unknown setting 'hydr': did you mean 'hydra'"),
-            ("model.widht=3", "Could not override 'model.widht'"),
+            (
+                "model.chanels=3",
+                r"unknown field of model \(.*TemporalLifter\) 'chanels': did you mean 'channels'",
+            ),
+            (
+                "data.windo=3",
+                r"unknown field of data \(.*TracksDataModule\) 'windo': did you mean 'window'.*choices: batch",
+            ),
+            ("+loss.joints.clip=labelled", r"unknown field of loss.joints \(.*LossTerm\) 'clip': did you mean 'clips'"),
+            ("loss.joint.weight=2", "unknown loss 'joint': did you mean 'joints'"),
             ("+trainer.gradient_clip_val=1", r"gradient_clip_val: .*\+module\.clip"),
             ("+trainer.accumulate_grad_batches=2", r"accumulate_grad_batches: .*data\.batch_size"),
-            ("+data.noisy=1", "data: .*unexpected keyword argument 'noisy'"),
+            ("+data.noisy=1", "unknown field of data .*'noisy': did you mean 'noise'"),
             ("+module.lr=-1", "lr: expected a positive number"),
             ("+module.lr=abc", "error: module.lr: expected a finite number, got 'abc'"),
             ("trainer.max_epochs=hello", "error: trainer.max_epochs: expected a whole number or none, got 'hello'"),
             ("data.fresh_cameras=maybe", "error: data.fresh_cameras: expected true or false, got 'maybe'"),
             ("keep=no", "error: keep: expected true or false, got 'no'"),
             ("optimise=???", "error: optimise: expected a value, got none: add optimise="),
-            ("+trainer.acelerator=cpu", "trainer: .*unexpected keyword argument 'acelerator'"),
+            ("+trainer.acelerator=cpu", "unknown field of trainer .*'acelerator': did you mean 'accelerator'"),
             ("trainer.accelerator=abacus", "abacus"),
             ("data=cmu shared=/nowhere", "/nowhere/data/cmu, found none"),
             ("resume=/nowhere", "resume=/nowhere: expected a run's folder"),
@@ -335,6 +451,36 @@ class TestCommandLine:
         code, _, err = called(capsys, *SMALL, *argument.split(), f"hydra.run.dir={tmp_path}")
         assert code == 2 and re.search(told, err), err
         assert "Traceback" not in err
+
+    def test_a_wrong_setting_touches_nothing_of_an_earlier_run(self, tmp_path, capsys):
+        words = [*SMALL, "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}"]
+        assert called(capsys, *words)[0] == 0
+
+        def files():
+            own = (
+                p for p in tmp_path.rglob("*") if p.is_file() and p.suffix in (".csv", ".json", ".ckpt", ".safetensors")
+            )
+            return {path: path.read_bytes() for path in own}
+
+        before = files()
+        for wrong in ("optimise=val/foo", "+module.lr=-1", "+data.labelled=2"):
+            assert called(capsys, *words, wrong)[0] == 2
+            assert files() == before
+
+    @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+    @pytest.mark.parametrize("sweep", [(), ("-m",)])
+    def test_a_signal_is_told_as_shells_tell_it(self, tmp_path, capsys, monkeypatch, number, code, sweep):
+        step = LiftingModule.training_step
+
+        def stopped(self, batch, batch_idx):
+            step(self, batch, batch_idx)
+            if int(self.step) == 5:
+                os.kill(os.getpid(), number)
+
+        monkeypatch.setattr(LiftingModule, "training_step", stopped)
+        folders = f"hydra.run.dir={tmp_path}", f"hydra.sweep.dir={tmp_path}"
+        got, _, err = called(capsys, *sweep, *SMALL, *folders, "trainer.max_epochs=5", "seed=3")
+        assert got == code and f"stopped: resume={tmp_path / '0' if sweep else tmp_path} goes on" in err
 
     def test_settings_of_ones_own_may_be_added(self, capsys):
         code, out, err = called(capsys, "--cfg=job", "--resolve", SMALL[0], "+wide=9", "+model.channels=${wide}")
@@ -396,13 +542,13 @@ class TestSweeps:
         monkeypatch.chdir(tmp_path)
         search = ("optuna", "n_trials=4", "n_jobs=1", "sampler.seed=0")
         options = [f"hydra{'.' if '=' in word else '/'}sweeper{'.' if '=' in word else '='}{word}" for word in search]
-        code, _, err = called(capsys, *SWEEP, *options, "+module.lr=tag(log,interval(1e-4,1e-2))")
+        code, _, err = called(capsys, *SWEEP, *options, "module.lr=tag(log,interval(1e-4,1e-2))")
         assert code == 0, err
         tried = {float(row["module.lr"]): float(row["val/mpjpe"]) for row in swept(tmp_path)}
         assert len(tried) == 4 and all(1e-4 <= lr <= 1e-2 for lr in tried)
         best = OmegaConf.load(tmp_path / "sweep" / "optimization_results.yaml")
         assert best.best_value == min(tried.values())
-        assert tried[best.best_params["+module.lr"]] == best.best_value
+        assert tried[best.best_params["++module.lr"]] == best.best_value
 
     def test_a_run_that_fails_does_not_take_the_others_along(self, tmp_path, monkeypatch, capsys):
         monkeypatch.chdir(tmp_path)
@@ -410,7 +556,6 @@ class TestSweeps:
         assert code == 2 and "lr: expected a positive number" in err and "Traceback" not in err
         assert [row["run"] for row in rows(tmp_path / "sweep" / "results.csv")] == ["0", "2"]
 
-    @pytest.mark.filterwarnings("ignore:Experiment logs directory")
     def test_what_had_ended_is_kept(self, tmp_path, monkeypatch, capsys):
         """A sweep that was stopped goes on: runs without a result are made again, and runs of other settings."""
         monkeypatch.chdir(tmp_path)
@@ -427,7 +572,6 @@ class TestSweeps:
         assert code == 0 and "is kept" not in out
         assert err.count("had ended with other settings, and is replaced") == 2
 
-    @pytest.mark.filterwarnings("ignore:Experiment logs directory")
     def test_figures_of_other_settings_are_not_kept(self, tmp_path, capsys):
         """A debugging run leaves the checkpoints of the run before, but the figures are its own."""
         words = [*SMALL, "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}"]
@@ -442,15 +586,14 @@ class TestSweeps:
         code, out, err = called(capsys, *words, "keep=true")
         assert code == 0 and "had ended, and is kept" in out, err
 
-    @pytest.mark.filterwarnings("ignore:Experiment logs directory")
     def test_a_run_that_diverges_leaves_no_network(self, tmp_path, capsys):
         words = [*SMALL, "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}"]
         assert called(capsys, *words)[0] == 0 and (tmp_path / "lifter.safetensors").is_file()
         code, out, err = called(capsys, *words, "+module.lr=1e30")
-        assert code == 0 and "inf" in out and "diverged" in err
+        assert code == 1 and "inf" in out and "diverged" in err
         assert not list(tmp_path.rglob("*.ckpt")) and not (tmp_path / "lifter.safetensors").exists()
         code, out, err = called(capsys, *words, "+module.lr=1e30", "keep=true")
-        assert code == 0 and "had ended, and is kept" in out, err
+        assert code == 1 and "had ended, and is kept" in out, err
 
     def test_a_folder_that_cannot_be_made(self, tmp_path, capsys):
         (tmp_path / "file").write_text("")
@@ -459,7 +602,6 @@ class TestSweeps:
             assert code == 2 and not out and err.startswith(f"error: {name}={tmp_path}/file/run: cannot be written to")
             assert len(err.splitlines()) == 1
 
-    @pytest.mark.filterwarnings("ignore:Experiment logs directory")
     def test_figures_of_an_earlier_sweep_are_not_those_of_a_run_that_fails(self, tmp_path, monkeypatch, capsys):
         monkeypatch.chdir(tmp_path)
         assert called(capsys, *SWEEP, "+module.lr=1e-3,1e-4")[0] == 0
@@ -492,6 +634,16 @@ class TestKcsTorchTrain:
         for word in ("data: cmu, files, synthetic", "model: mlp, temporal", "optimise: val/mpjpe", "data=cmu"):
             assert word in done.stdout
         assert "reconstruct_many" not in done.stdout
+        groups = [entry for entry in OmegaConf.load(configs() / "train.yaml").defaults if isinstance(entry, DictConfig)]
+        for group in (str(next(iter(entry))) for entry in groups):
+            assert (
+                f"\n{group}: {', '.join(sorted(p.stem for p in (configs() / group).glob('*.yaml')))}\n" in done.stdout
+            )
+        assert "method:" not in done.stdout
+
+    def test_fields_that_are_not_shown_need_no_plus(self, capsys):
+        code, out, err = called(capsys, "--cfg=job", SMALL[0], "module.lr=0.25", "+model.channels=8", "model.dropout=0")
+        assert code == 0 and all(word in out for word in ("lr: 0.25", "channels: 8", "dropout: 0")), err
 
     def test_trains(self, tmp_path):
         words = (*SMALL, "trainer.max_epochs=1", "hydra.run.dir=out")

@@ -72,6 +72,20 @@ def test_files_of_another_rate_unit_and_order(tmp_path):
     assert far.abs().max() < 0.02
 
 
+def test_names_of_another_body_are_refused_and_no_names_are_told(tmp_path):
+    """As many joints as the skeleton has, in their order: only who knows the file can say whether they are these."""
+    points = motion(12, skeleton="cmu21").points
+    read = lambda name: file_clips([tmp_path / name], skeleton="hand21", fps=30, up="y", units="mm")  # noqa: E731
+    kt.save(kt.Motion.from_arrays(points, skeleton="cmu21", fps=30, units="mm"), tmp_path / "named.npz")
+    with pytest.raises(
+        SkeletonError, match=r"named\.npz: expected the joints of skeleton 'hand21', .* they are pelvis"
+    ):
+        read("named.npz")
+    kt.save(kt.Motion.from_arrays(points, fps=30, units="mm"), tmp_path / "numbers.npz")
+    with pytest.warns(KcsWarning, match=r"numbers\.npz: joints taken in their order as those of skeleton 'hand21'"):
+        assert len(read("numbers.npz")) == 1
+
+
 def test_bodies_on_their_heads_are_told(tmp_path):
     walk = kt.Motion.from_arrays(walking_person(40).points, up="-y", skeleton="h36m17", fps=30, units="mm")
     for name, up in (("right", "y"), ("wrong", "-y")):
@@ -380,6 +394,54 @@ def test_without_unlabelled_windows_the_steps_stay(folder):
     assert torch.equal(both.labelled_items, alone.labelled_items)
     assert len(both.train_dataloader()) == len(alone.train_dataloader()) == 18
     assert all((batch.labelled == 1).all() for batch in alone.train_dataloader())
+
+
+@pytest.fixture
+def detections(folder):
+    """A clip of 2D tracks, at twice the rate and of other joints, in which nothing is seen for a while."""
+    tracks = walking_person(80, skeleton="coco17", fps=60).tracks
+    points = tracks.points[:, :17].clone()
+    points[40:44] = math.nan
+    kt.save(kt.Tracks.from_arrays(points, skeleton="coco17", fps=60, units="px"), folder / "own" / "walk.npz")
+    return folder
+
+
+@pytest.mark.parametrize(("labelled", "unlabelled"), [(1.0, True), (0.5, True), (0.5, False)])
+def test_own_tracks_stand_among_the_windows_without_truth(detections, labelled, unlabelled):
+    data = module(detections, tracks="own/*.npz", labelled=labelled, unlabelled=unlabelled, batch_size=6)
+    data.setup("fit")
+    windows = data.detected
+    assert windows.starts.tolist() == [0, 10, 30] and windows.tracks.shape == (40, 17, 2)
+    names = data.skeleton.joints
+    assert not windows.weights[0, names.index("spine")] and windows.weights[0, names.index("left_knee")] == 1
+    every = windows.batch(torch.arange(3)).tracks
+    filmed, own = 0, 0
+    for _ in range(3):
+        for batch in data.train_dataloader():
+            assert batch.labelled.tolist() == [1.0] * 3 + [0.0] * 3
+            assert not batch.points[3:].any() and not batch.pseudo[3:].any()
+            for tracks in batch.tracks[3:]:
+                mine = bool((every == tracks).all(-1).all(-1).all(-1).any())
+                own, filmed = own + mine, filmed + (not mine)
+    assert own and bool(filmed) == (labelled < 1 and unlabelled)
+
+
+def test_own_tracks_may_be_all_that_is_trained_on(detections):
+    data = module(detections, tracks=["own/*"], labelled=0, unlabelled=False, batch_size=2, steps_per_epoch=3)
+    data.setup("fit")
+    drawn = torch.cat([batch.tracks for batch in data.train_dataloader()])
+    assert len(drawn.unique(dim=0)) == 3
+
+
+def test_own_tracks_that_do_not_fit_are_told(detections):
+    def told(error, match, **options):
+        with pytest.raises(error, match=match):
+            module(detections, **{"tracks": "own/*.npz", **options}).setup("fit")
+
+    told(OptionError, "expected files of 2D tracks that match none", tracks="none")
+    told(ShapeError, r"walk\.npz: expected at least a window of 41 frames, got 40", window=41)
+    told(FormatError, r"walk\.npz: none of its windows of 30 frames has half of the joints", window=30)
+    told(OptionError, "batch_size: expected at least 2", batch_size=1)
 
 
 def test_validation_and_test_show_everything_once_to_the_end(folder):

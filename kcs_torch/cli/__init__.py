@@ -13,6 +13,8 @@ __all__ = ["app", "main"]
 app = typer.Typer(
     name="kcs-torch",
     help="Turn 2D joint tracks into 3D motion of articulated bodies, without training data.",
+    epilog="Exit codes: 0 done; 2 an input or the call is wrong (one line says what); 1 anything else, such as "
+    "training that diverged; 130 stopped by Ctrl-C, 143 by SIGTERM.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -153,7 +153,7 @@ def view(
             "-o",
             metavar="FILE",
             help="Where to write: .html (a player), .png (key frames), .gif, .mp4, .rrd, .csv or .json; may be "
-            "repeated. If not given, the first RESULT with the suffix .html.",
+            "repeated. If not given, the first RESULT with the suffix .html. A file that is there is replaced.",
             show_default=False,
         ),
     ] = [],  # noqa: B006 (typer reads it and never changes it)

@@ -83,7 +83,7 @@ def lift(
             "-o",
             metavar="FILE",
             help="Where to write: .npz (everything); .bvh, .c3d, .trc, .csv or .json; .html (a player), .png, .gif, "
-            ".mp4 or .rrd (rerun); may be repeated.",
+            ".mp4 or .rrd (rerun); may be repeated. A file that is there is replaced.",
             show_default=False,
         ),
     ],
@@ -160,7 +160,7 @@ def lift(
         from kcs_torch.types.tracks import unseen_notes
 
         output = check_outputs(output, source=tracks)
-        learned = _learned(method, settings) if method.endswith(LEARNED) else None
+        learned = _learned(method, settings) if method.endswith((LEARNED, ".ckpt")) else None
         fields = {} if learned is not None else method_fields(method, settings)
         if intrinsics is not None:
             fields["intrinsics"] = _lens(intrinsics)

@@ -2,18 +2,84 @@
 
 from __future__ import annotations
 
+import csv
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.loggers.csv_logs import ExperimentWriter
+from lightning.pytorch.loggers.logger import rank_zero_experiment
 
 from kcs_torch.errors import OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
 
-__all__ = ["Best", "Diverged", "Last", "Watch"]
+__all__ = ["Best", "Diverged", "Last", "Log", "Watch"]
+
+
+class Log(CSVLogger):
+    """The figures of all steps and epochs, as a table. It replaces an earlier run's once it has a figure to write.
+
+    Args:
+        folder: of the run; the table is its ``csv/metrics.csv``.
+        goes_on: the last epoch of an earlier run in this folder that this one goes on from, whose figures are kept up
+            to there; None where it replaces them.
+    """
+
+    def __init__(self, folder: Path, goes_on: int | None = None) -> None:
+        super().__init__(folder, "csv", "")
+        self.goes_on = goes_on
+
+    @property
+    @rank_zero_experiment
+    def experiment(self) -> Any:
+        """What writes the table; Lightning asks for it before anything is trained."""
+        if self._experiment is None:
+            self._experiment = _Table(self.log_dir, self.goes_on)
+        return self._experiment
+
+
+class _Table(ExperimentWriter):
+    """Lightning's writer, but that it touches no file before there is a figure."""
+
+    def __init__(self, log_dir: str, goes_on: int | None) -> None:
+        self.goes_on, self.begun = goes_on, False
+        super().__init__(log_dir)
+
+    def _check_log_dir_exists(self) -> None:
+        """Nothing: Lightning removes here what it finds."""
+
+    def log_hparams(self, params: dict[str, Any]) -> None:
+        """Nothing: they are in the files of the settings."""
+
+    def log_metrics(self, *args: Any, **kwargs: Any) -> None:
+        if not self.begun:
+            path, self.begun = Path(self.metrics_file_path), True
+            self.metrics = [] if self.goes_on is None else _rows_until(path, self.goes_on)
+            path.unlink(missing_ok=True)
+        super().log_metrics(*args, **kwargs)
+
+    def save(self) -> None:
+        if self.metrics:  # else it would write a file of hyperparameters
+            super().save()
+
+
+def _rows_until(path: Path, epoch: int) -> list[dict[str, Any]]:
+    """The figures of the epochs up to this one, without those of the test, which is made at the end."""
+    rows: list[dict[str, str]] = []
+    with suppress(OSError, UnicodeError, csv.Error), path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    out = []
+    for row in rows:
+        figures = {name: figure for name, figure in row.items() if name and figure}
+        of_test = any(name.startswith("test/") for name in figures)
+        if not of_test and figures.get("epoch", "").isdecimal() and int(figures["epoch"]) <= epoch:
+            out.append(figures)
+    return out
 
 
 class Best(ModelCheckpoint):
@@ -65,10 +131,20 @@ class Diverged(Exception):
 
 
 class Watch(Callback):
-    """Keeps the configuration in every checkpoint, and ends training that came to nothing."""
+    """Keeps the configuration in every checkpoint, and ends training that came to nothing.
 
-    def __init__(self, config: dict[str, Any]) -> None:
-        self.config = config
+    Args:
+        config: the configuration.
+        result: the file of the figures, which an earlier run may have left: it goes once training begins, and not
+            before all that can be told beforehand was found in order.
+    """
+
+    def __init__(self, config: dict[str, Any], result: Path) -> None:
+        self.config, self.result = config, result
+
+    def on_train_start(self, trainer: Any, pl_module: Any) -> None:
+        """Remove the figures of an earlier run."""
+        self.result.unlink(missing_ok=True)
 
     def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
         """Make sure, before the first epoch is spent, that there will be a validation to choose the best one by.

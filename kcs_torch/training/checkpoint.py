@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kcs_torch.errors import FormatError, KcsError, OptionError, OutputError, unknown
+from kcs_torch.errors import FormatError, KcsError, OptionError, OutputError, listed, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.registry import need, read_error
 from kcs_torch.nn import MLPLifter, RefinedLifter, TemporalLifter, UnrolledFPC, UnrolledSfAM
@@ -31,6 +31,12 @@ SOLVERS: dict[str, type[UnrolledFPC] | type[UnrolledSfAM]] = {"UnrolledFPC": Unr
 
 KEY = "kcs_torch"
 """Under which the file's metadata says, as JSON, what it is."""
+
+ZIP = b"PK\x03\x04"
+"""How checkpoints begin."""
+
+OF_NETWORK = "network."
+"""How the names of a network's weights begin in a checkpoint of its training."""
 
 LARGEST = 2**20
 """No option of a network is larger; a file that says so is damaged."""
@@ -95,20 +101,31 @@ def describe(network: nn.Module) -> dict[str, Any]:
     return facts | {"network": kind, "options": inner.options, "skeleton": inner.skeleton.to_dict()}
 
 
-def load_lifter(path: str | Path, *, device: torch.device | str = "cpu") -> Lifter:
-    """Read a network that :func:`save_lifter` wrote, as a method: ``kt.reconstruct(tracks, method=load_lifter(path))``.
+def load_lifter(path: str | Path, *, network: nn.Module | None = None, device: torch.device | str = "cpu") -> Lifter:
+    """Read a trained network as a method: ``kt.reconstruct(tracks, method=load_lifter(path))``.
 
-    Only networks of this package are made, and no code of the file is run.
+    Networks of this package are in files that :func:`save_lifter` wrote, and are made from what these say. A network of
+    one's own is in the checkpoints of its training alone, and has to be given. No code of the file is run.
 
     Args:
-        path: the file.
+        path: the file; with ``network``, a checkpoint of a :class:`kcs_torch.training.LiftingModule`.
+        network: made as it was for the training; it gets the weights of the checkpoint. Behind it was a solver: a
+            :class:`kcs_torch.nn.RefinedLifter` of both.
         device: where the network is to run.
 
     Raises:
-        FormatError: the file cannot be read, is damaged, or is something else.
+        FormatError: the file cannot be read, is damaged, or is something else, or its weights are of another network.
+        OptionError: the network has no skeleton.
     """
     path = Path(path)
+    if network is not None:
+        return _of_checkpoint(path, network, device)
     data = _bytes(path)
+    if data.startswith(ZIP):
+        raise FormatError(
+            f"{path}: expected a network that save_lifter wrote, got what seems to be a checkpoint: take "
+            "lifter.safetensors of the same run, or give the network that it is of: load_lifter(path, network=...)"
+        )
     library = need("safetensors.torch", str(path), FormatError)
     try:
         tensors: dict[str, Tensor] = library.load(data)
@@ -119,16 +136,41 @@ def load_lifter(path: str | Path, *, device: torch.device | str = "cpu") -> Lift
         raise FormatError(f"{path}: expected a network that save_lifter wrote, got another safetensors file") from None
     except Exception as error:  # the package raises its own kind, which it does not derive from ValueError
         raise FormatError(f"{path}: expected a network that save_lifter wrote, got {error}") from None
-    network = _build(path, facts, tensors)
+    built = _build(path, facts, tensors)
     fps = facts.get("fps")
     if fps is not None and not (isinstance(fps, (int, float)) and 0 < fps < float("inf")):
         raise FormatError(f"{path}: fps: expected a positive number, got {fps!r}")
-    return Lifter(network.to(device).eval(), fps=None if fps is None else float(fps))
+    return Lifter(built.to(device).eval(), fps=None if fps is None else float(fps))
 
 
-def _bytes(path: Path) -> bytes:
+def _of_checkpoint(path: Path, network: nn.Module, device: torch.device | str) -> Lifter:
+    """A network with the weights that a checkpoint of its training holds."""
+    _bytes(path, 1)  # so that a file that is not there is told as everywhere
     try:
-        return path.read_bytes()
+        held = torch.load(path, map_location="cpu", weights_only=True)
+        states = {name: value for name, value in held["state_dict"].items() if name.startswith(OF_NETWORK)}
+        fps = held.get("fps")
+    except Exception:  # whatever torch, zipfile and pickle make of a file that is something else
+        raise FormatError(
+            f"{path}: expected a checkpoint of a LiftingModule, got something else (a file that save_lifter wrote "
+            "needs no network=...)"
+        ) from None
+    states = {name.removeprefix(OF_NETWORK): value for name, value in states.items()}
+    own = network.state_dict()
+    wrong = sorted(n for n in {*own, *states} if n not in own or n not in states or own[n].shape != states[n].shape)
+    if wrong:
+        raise FormatError(
+            f"{path}: expected the weights of a {type(network).__name__} made as this one is, got others: "
+            f"{listed(wrong, 4)}"
+        )
+    network.load_state_dict(states)
+    return Lifter(network.to(device).eval(), fps=fps if isinstance(fps, (int, float)) else None)
+
+
+def _bytes(path: Path, most: int = -1) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(most)
     except OSError as error:
         raise read_error(path, error) from None
 

@@ -13,12 +13,13 @@ import torch
 from torch import Tensor
 
 from kcs_torch.data import random_motion, walking_person
-from kcs_torch.errors import FormatError, KcsWarning, OptionError, SkeletonError
+from kcs_torch.errors import FormatError, KcsWarning, OptionError, SkeletonError, listed
 from kcs_torch.io import load_motion
 from kcs_torch.io.folders import natural_key
-from kcs_torch.skeleton import Skeleton, get_skeleton
+from kcs_torch.skeleton import Skeleton, get_skeleton, map_joints
 from kcs_torch.training.seeds import generator_of
 from kcs_torch.types.axes import from_y_up
+from kcs_torch.types.bodies import IN_ORDER, numbered
 from kcs_torch.types.size import unit_ratio
 from kcs_torch.types.upright import upside_down
 
@@ -44,8 +45,20 @@ class Clip(NamedTuple):
     skeleton: Skeleton
 
 
-def find_files(patterns: str | Path | Sequence[str | Path], folder: str | Path = ".") -> list[Path]:
+def find_files(
+    patterns: str | Path | Sequence[str | Path],
+    folder: str | Path = ".",
+    *,
+    of: str = "3D motion",
+    folders: bool = False,
+) -> list[Path]:
     """List the files of one pattern or several in natural order, without those of patterns that begin with ``!``.
+
+    Args:
+        patterns: one or several.
+        folder: that they are relative to.
+        of: what is in the files, for messages.
+        folders: whether a folder counts as a file (OpenPose writes one a clip).
 
     Raises:
         OptionError: there are none.
@@ -55,11 +68,13 @@ def find_files(patterns: str | Path | Sequence[str | Path], folder: str | Path =
     left_out: set[Path] = set()
     for pattern in map(str, every):
         files = (Path(p) for p in glob.glob(str(Path(folder, pattern.removeprefix("!"))), recursive=True))
-        (left_out if pattern.startswith("!") else found).update(p for p in files if p.is_file())
+        (left_out if pattern.startswith("!") else found).update(
+            p for p in files if p.is_file() or (folders and p.is_dir())
+        )
     out = sorted(found - left_out, key=lambda p: natural_key(str(p)))
     if not out:
         raise OptionError(
-            f"data: expected files of 3D motion that match {', '.join(map(str, every)) or 'a pattern'} in "
+            f"data: expected files of {of} that match {', '.join(map(str, every)) or 'a pattern'} in "
             f"{Path(folder).resolve()}, found none"
         )
     return out
@@ -86,17 +101,26 @@ def file_clips(
 
     Raises:
         FormatError: a file is no motion, or its frame rate or unit is unknown.
-        SkeletonError: a file has other joints than the first one, or none for a joint of the skeleton.
+        SkeletonError: a file has other joints than the first one, none for a joint of the skeleton, or as many but with
+            names most of which are not the skeleton's.
 
     Warns:
+        KcsWarning: a file has as many joints as the skeleton, without its names or some of them: they are taken in
+            their order.
         KcsWarning: a body stands on its head, as the file does not say which axis is up.
     """
     body = None if skeleton is None else get_skeleton(skeleton)
     out = []
+    told: set[str] = set()
     for path in files:
         motion = load_motion(path, skeleton=body if skeleton is not None else None, up=up, units=file_units)
         if body is None:
             body = motion.skeleton
+        elif skeleton is not None and (taken := [note for note in motion.notes if note.startswith(IN_ORDER)]):
+            _check_names(load_motion(path, up=up, units=file_units).skeleton, body, path)
+            if taken[0] not in told:
+                warnings.warn(f"{path}: {taken[0]}", KcsWarning, stacklevel=2)
+            told.add(taken[0])
         elif motion.skeleton != body and motion.skeleton.joints != body.joints:
             raise SkeletonError(
                 f"{path}: expected the joints of {files[0]} ({', '.join(body.joints)}), got "
@@ -131,6 +155,22 @@ def file_clips(
             )
         out.append(clip)
     return out
+
+
+def _check_names(own: Skeleton, body: Skeleton, path: Path) -> None:
+    """Make sure that joints that are to be taken in their order are those of the skeleton, where they have names.
+
+    Raises:
+        SkeletonError: most names are of something else.
+    """
+    names, wanted = own.joints[: own.num_observed], body.joints[: body.num_observed]
+    lacking = [name for name, found in zip(wanted, map_joints(names, wanted), strict=True) if found is None]
+    if not numbered(names) and 2 * len(lacking) > len(wanted):
+        raise SkeletonError(
+            f"{path}: expected the joints of skeleton '{body.name}', got as many others, none of them named "
+            f"{listed(lacking, 6)}; they are {listed(names, 40)}: choose a skeleton whose joints these are, or write "
+            "one with these names"
+        )
 
 
 def synthetic_clips(

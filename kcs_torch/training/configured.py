@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import math
 import os
 import re
+import signal
 import sys
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,12 +27,14 @@ from kcs_torch.types.hints import is_a, spoken
 __all__ = [
     "PartFailed",
     "WrongConfiguration",
+    "changes",
     "check_switch",
     "check_threads",
     "check_values",
     "check_whole",
     "command_line",
     "configs",
+    "for_json",
     "in_one_line",
     "method_of",
 ]
@@ -69,7 +73,8 @@ def command_line(program: str, arguments: Sequence[str] | None = None, start: st
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     # Hydra looks nowhere else, and takes flags before overrides only.
-    sys.argv = [start or before[0], *sorted(given, key=lambda one: re.match(r"~|[^-][^=]*=", one) is not None)]
+    ordered = sorted(given, key=lambda one: re.match(r"~|[^-][^=]*=", one) is not None)
+    sys.argv = [start or before[0], *map(_or_added, ordered)]
     try:
         yield
     except SystemExit as end:  # Hydra leaves with 1 whatever it was; what it was is the context
@@ -77,8 +82,15 @@ def command_line(program: str, arguments: Sequence[str] | None = None, start: st
         wrong = isinstance(cause, (HydraException, OmegaConfBaseException))
         told = wrong and not isinstance(cause, (InstantiationException, PartFailed))
         raise SystemExit(2 if told else end.code) from None
+    except KeyboardInterrupt:
+        raise SystemExit(128 + signal.SIGINT) from None
     finally:
         sys.argv = before
+
+
+def _or_added(argument: str) -> str:
+    """An override that may also add a field: of a name that is not shown Hydra says to add it, be it right or wrong."""
+    return f"++{argument}" if re.match(r"(?!hydra\.)[A-Za-z_]\w*\.[^=]*=", argument) else argument
 
 
 def _check_folders(arguments: Sequence[str]) -> None:
@@ -172,18 +184,44 @@ def check_threads(value: Any) -> None:
 
 
 def check_values(config: Mapping[str, Any], place: str = "") -> None:
-    """Make sure that numbers, words and switches are what the classes that are named take; some of them never look.
+    """Make sure that fields are what the classes that are named take, numbers, words and switches too; some never look.
 
     Raises:
-        OptionError: a value is something else.
+        OptionError: there is no such field, or a value is something else.
     """
     hints = _hints(config["_target_"]) if "_target_" in config else {}
+    known = _fields(config["_target_"]) if "_target_" in config else None
     for name, value in config.items():
         key = f"{place}.{name}".lstrip(".")
+        if known is not None and not str(name).startswith("_") and name not in known:
+            raise unknown(f"field of {place or 'the configuration'} ({config['_target_']})", name, known)
         if isinstance(value, Mapping):
             check_values(value, key)
         elif not isinstance(value, list) and name in hints and not is_a(value, hints[name]):
             raise OptionError(f"{key}: expected {spoken(hints[name])}, got {value!r}")
+
+
+def for_json(value: Any) -> Any:
+    """A configuration whose infinite numbers are as YAML writes them, in words: JSON has none."""
+    if isinstance(value, dict):
+        return {name: for_json(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [for_json(inner) for inner in value]
+    return str(value).replace("inf", ".inf") if isinstance(value, float) and math.isinf(value) else value
+
+
+def changes(before: Any, now: Any) -> list[tuple[str, Any, Any]]:
+    """The settings by which a run's figures differ, as they were and as they are."""
+    then, these = _flat(before), _flat(now)
+    keys = sorted({*then, *these} - {"resume", "keep"})
+    return [(key, then.get(key), these.get(key)) for key in keys if then.get(key) != these.get(key)]
+
+
+def _flat(config: Any, key: str = "") -> dict[str, Any]:
+    """A nested configuration with dotted keys."""
+    if not isinstance(config, Mapping):
+        return {key: config}
+    return {name: leaf for k, v in config.items() for name, leaf in _flat(v, f"{key}.{k}".lstrip(".")).items()}
 
 
 def method_of(config: DictConfig) -> Method:
@@ -213,6 +251,19 @@ def _hints(target: str) -> dict[str, Any]:
         return typing.get_type_hints(found.__init__ if inspect.isclass(found) else found)
     except Exception:  # whatever importing it, or reading annotations that are text, comes to
         return {}
+
+
+def _fields(target: str) -> list[str] | None:
+    """The names of what a class takes; None where it takes any, or where they cannot be told."""
+    try:
+        takes = inspect.signature(get_object(target)).parameters.values()
+    except Exception:  # whatever importing it comes to
+        return None
+    return (
+        None
+        if any(p.kind is p.VAR_KEYWORD for p in takes)
+        else [p.name for p in takes if p.kind is not p.VAR_POSITIONAL]
+    )
 
 
 def _not_imported(what: str, error: BaseException) -> str:

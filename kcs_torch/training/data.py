@@ -15,6 +15,7 @@ from kcs_torch.methods import METHODS, Method
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.training.batch import Batch
 from kcs_torch.training.clips import SYNTHETIC, Clip, file_clips, find_files, synthetic_clips
+from kcs_torch.training.detections import DetectedWindows
 from kcs_torch.training.loader import BatchLoader, Deck
 from kcs_torch.training.options import AMOUNT, COUNT, COUNT_OR_NONE, POSITIVE, SHARE, WHOLE, check_options
 from kcs_torch.training.pseudo import pseudo_labels
@@ -41,13 +42,18 @@ class TracksDataModule(lightning.LightningDataModule):
         val: files for validation, as of ``train``.
         test: files for the test, as of ``train``. With synthetic motion for training and nothing named here, validation
             and test have synthetic motion of their own.
+        tracks: files of 2D tracks to train on as well, which have no truth: any that :func:`kcs_torch.load_tracks`
+            reads, the most seen person of each, as patterns; a folder that one matches is a clip. Joints are matched by
+            name, and a third of them may be missing. Windows with half of the joints seen in every frame stand among
+            those without truth, and serve losses that need none.
         folder: that patterns are relative to.
         skeleton: whose joints are found by name in every file; that of the first file if None ("h36m17" of synthetic
             motion).
         up: the axis that points up in the files; as they say if None.
         units: of the tracks: mm, cm or m.
         file_units: of the files, where they do not say (BVH).
-        fps: frames per second that all motion is brought to; None takes it as it is.
+        fps: frames per second that all motion is brought to; None takes it as it is. 2D tracks that do not
+            say theirs are taken as they are.
         window: frames of a window.
         stride: frames from one training window to the next; ``window`` if None.
         views: cameras of each clip.
@@ -61,7 +67,7 @@ class TracksDataModule(lightning.LightningDataModule):
         labelled: share of the training windows' frames that show their truth, at most, but one window of frames at
             least. A window is labelled where all of its frames show it; the others use none of it.
         labelled_per_batch: share of a batch that is taken from these, where there are others.
-        unlabelled: False leaves out those without truth: the same steps on labelled windows only.
+        unlabelled: False leaves out those without truth: the same steps on labelled windows, and on ``tracks``, only.
         pseudo: a :class:`kcs_torch.Method` or its name, whose reconstructions are the labels of unlabelled windows.
         pseudo_trust: standard deviation of depth, as a share of the size of the body (root mean square of its tracks),
             at which a pseudo-label has half weight; used where the method tells its uncertainty.
@@ -85,6 +91,7 @@ class TracksDataModule(lightning.LightningDataModule):
         *,
         val: Patterns = (),
         test: Patterns = (),
+        tracks: Patterns = (),
         folder: str | Path = ".",
         skeleton: str | Path | Skeleton | None = None,
         up: str | None = None,
@@ -128,9 +135,10 @@ class TracksDataModule(lightning.LightningDataModule):
             clips=(clips, COUNT),
             seed=(seed, WHOLE),
         )
-        if batch_size == 1 and 0 < labelled < 1 and 0 < labelled_per_batch < 1 and unlabelled:
+        others = bool(tracks) or (labelled < 1 and unlabelled)
+        if batch_size == 1 and labelled > 0 and 0 < labelled_per_batch < 1 and others:
             raise OptionError("data: batch_size: expected at least 2, so that a batch has windows of both kinds, got 1")
-        if labelled == 0 and not unlabelled:
+        if labelled == 0 and not unlabelled and not tracks:
             raise OptionError("data: unlabelled: nothing is left to train on without labelled windows (labelled=0)")
         if isinstance(pseudo, str):
             if pseudo not in METHODS:
@@ -139,6 +147,7 @@ class TracksDataModule(lightning.LightningDataModule):
         if pseudo is not None and fresh_cameras:
             raise OptionError("data: pseudo: reconstructions are of tracks that stay the same: not with fresh_cameras")
         self.files = {"train": train, "val": val, "test": test}
+        self.tracks = tracks
         self.folder, self.body, self.up, self.units, self.fps = folder, skeleton, up, units, fps
         self.file_units = file_units
         self.window, self.stride, self.views = window, stride or window, views
@@ -149,6 +158,7 @@ class TracksDataModule(lightning.LightningDataModule):
         self.pseudo, self.pseudo_trust, self.cache = pseudo, pseudo_trust, cache
         self.num_clips, self.seed = clips, seed
         self.sets: dict[str, FilmedWindows] = {}
+        self.detected: DetectedWindows | None = None
 
     @property
     def skeleton(self) -> Skeleton:
@@ -174,6 +184,8 @@ class TracksDataModule(lightning.LightningDataModule):
         ):
             if split == "train" or self._named(split):
                 self._set(split)
+        if stage in (None, "fit"):
+            self._detected()
         if stage in (None, "fit") and self.pseudo is not None and self.unlabelled and len(self.unlabelled_items):
             train = self._set("train")
             if train.pseudo_points is None:
@@ -195,9 +207,13 @@ class TracksDataModule(lightning.LightningDataModule):
 
     def train_dataloader(self) -> BatchLoader:
         """Mixed batches, labelled windows first."""
-        items = self._set("train")
+        items, detected = self._set("train"), self._detected()
         seen, blind = self.labelled_items, self.unlabelled_items
         blind = blind if self.unlabelled else blind[:0]
+        count = len(items)
+        if detected is not None:  # numbered after the filmed ones
+            blind = torch.cat([blind, count + torch.arange(len(detected))])
+            count += len(detected)
         share = 1.0 if not len(blind) else self.labelled_per_batch if len(seen) else 0.0
         first = round(share * self.batch_size)
         if len(seen) and len(blind) and self.batch_size > 1 and 0 < share < 1:
@@ -207,16 +223,24 @@ class TracksDataModule(lightning.LightningDataModule):
             (Deck(blind, self.seed, "unlabelled"), self.batch_size - first),
         ]
         mark = torch.arange(self.batch_size) < first
-        steps = self.steps_per_epoch or math.ceil(len(items) / self.batch_size)
+        steps = self.steps_per_epoch or math.ceil(count / self.batch_size)
 
         still = getattr(self.trainer, "overfit_batches", 0) > 0  # the same few batches, again and again
 
         def make(epoch: int, step: int) -> Batch:
             epoch = 0 if still else epoch
-            count = epoch * steps + step
-            drawn = torch.cat([deck.draw(count * size, size) for deck, size in decks])
+            number = epoch * steps + step
+            drawn = torch.cat([deck.draw(number * size, size) for deck, size in decks])
             fresh = generator_of(self.seed, "fresh", epoch, step) if self.fresh_cameras else None
-            return items.batch(drawn, mark, fresh)
+            filmed = drawn < len(items)
+            if detected is None or bool(filmed.all()):
+                return items.batch(drawn, mark, fresh)
+            own = detected.batch(drawn[~filmed] - len(items))
+            if not bool(filmed.any()):
+                return own
+            other = items.batch(drawn[filmed], mark[filmed], fresh)
+            back = torch.cat([filmed.nonzero(), (~filmed).nonzero()]).flatten().argsort()
+            return Batch(*(torch.cat(pair)[back] for pair in zip(other, own, strict=True)))
 
         return BatchLoader(make, steps)
 
@@ -238,6 +262,18 @@ class TracksDataModule(lightning.LightningDataModule):
             return items.batch(own, torch.ones_like(own, dtype=torch.bool))
 
         return BatchLoader(make, math.ceil(len(items) / self.batch_size), fixed=True)
+
+    def _detected(self) -> DetectedWindows | None:
+        """The windows of 2D tracks, where there are any."""
+        if self.tracks and self.detected is None:
+            self.detected = DetectedWindows.cut(
+                find_files(self.tracks, self.folder, of="2D tracks", folders=True),
+                skeleton=self.skeleton,
+                fps=self.fps,
+                window=self.window,
+                stride=self.stride,
+            )
+        return self.detected
 
     def _named(self, split: str) -> Patterns:
         """The files of a split, or what stands for made-up motion; nothing where there is none."""

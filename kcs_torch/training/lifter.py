@@ -100,8 +100,8 @@ class Lifter(Method):
     def _estimate(self, clips: Sequence[Tracks], cameras: Tensor | None) -> list[Estimate]:
         """Lift clips of one skeleton and equally many frames."""
         first = clips[0]
-        match = _match(first.skeleton, self.body, first.source)
-        sizes = [_size(one) for one in clips]
+        match = match_joints(first.skeleton, self.body, first.source)
+        sizes = [body_size(one) for one in clips]
         points = torch.stack([one.points / size[:, None, None] for one, size in zip(clips, sizes, strict=True)])
         lifted = self._lift(*match.take(points, torch.stack([one.weights for one in clips]), self.body))
         out = []
@@ -149,7 +149,7 @@ class Lifter(Method):
         ]
 
 
-class _Match(NamedTuple):
+class Match(NamedTuple):
     """Which joint of tracks is which of a network.
 
     Attributes:
@@ -188,14 +188,14 @@ class _Match(NamedTuple):
         return torch.cat([torch.where(shown, image, placed[..., :2]), placed[..., 2:]], -1)
 
 
-def _size(tracks: Tracks) -> Tensor:
+def body_size(tracks: Tracks) -> Tensor:
     """Size (T,) of the body in the image, of mean 1, where it clearly changes: networks know bodies of one size."""
     image = interpolate(tracks.points, tracks.seen)
     size = weak_perspective(image, tracks.seen, tracks.skeleton, tracks.rate)
     return size.path if size.sure else torch.ones_like(image[:, 0, 0])
 
 
-def _match(own: Skeleton, body: Skeleton, source: str) -> _Match:
+def match_joints(own: Skeleton, body: Skeleton, source: str) -> Match:
     """Match the joints of tracks with those of a network, by name.
 
     Raises:
@@ -203,7 +203,7 @@ def _match(own: Skeleton, body: Skeleton, source: str) -> _Match:
     """
     everyone = list(range(len(body.joints)))
     if own.joints == body.joints and own.virtual == body.virtual:
-        return _Match(True, everyone, everyone, ())
+        return Match(True, everyone, everyone, ())
     wanted = body.joints[: body.num_observed]
     found = map_joints(own.joints, wanted)
     missing = [name for name, i in zip(wanted, found, strict=True) if i is None]
@@ -222,7 +222,7 @@ def _match(own: Skeleton, body: Skeleton, source: str) -> _Match:
         notes.append(f"not among the tracks, so unseen by the network: {', '.join(missing)}")
     if unknown:
         notes.append(f"not among the network's joints, so their depth is the template's: {', '.join(unknown)}")
-    return _Match(False, [-1 if i is None else i for i in found], back, tuple(notes))
+    return Match(False, [-1 if i is None else i for i in found], back, tuple(notes))
 
 
 @contextmanager

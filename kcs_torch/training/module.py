@@ -26,6 +26,9 @@ ALIGNED = {"mpjpe": "root", "n_mpjpe": "scale", "pa_mpjpe": "similarity", "rigid
 """What is logged in validation and tests (as ``val/mpjpe``, ...), in the unit of the truth, and how it is aligned."""
 
 
+OUT_OF_ORDER = 1e4
+"""A network whose points are as far out has diverged itself: losses see clips at root mean square 1."""
+
 RESERVED = ("loss", "critic", "critic_own")
 """What is logged under these names is not a single term."""
 
@@ -106,12 +109,32 @@ class LiftingModule(lightning.LightningModule):
         self.lr, self.weight_decay, self.clip, self.seed = lr, weight_decay, clip, seed
         self.register_buffer("step", torch.zeros((), dtype=torch.long))
         self._counted = False  # whether any clip has counted in any loss
+        self.trouble: str | None = None  # what was NaN or infinite first, in words
         self.measured = nn.ModuleDict()
         for stage in ("val", "test"):
             metrics: dict[str, nn.Module] = {name: MPJPE(align=align) for name, align in ALIGNED.items()}
             if isinstance(skeleton, Skeleton) and skeleton.rigid:
                 metrics["bone_deviation"] = BoneDeviation(skeleton)
             self.measured[stage] = nn.ModuleDict(metrics)
+
+    @classmethod
+    def load_from_checkpoint(cls, checkpoint_path: Any, *args: Any, **kwargs: Any) -> Any:
+        """Lightning's: it needs ``network``, ``losses`` and what else the module was made with.
+
+        Raises:
+            OptionError: network or losses are not given.
+        """
+        lacking = [name for name in ("network", "losses") if name not in kwargs]
+        if cls is LiftingModule and lacking:
+            raise OptionError(
+                f"LiftingModule.load_from_checkpoint: expected {' and '.join(f'{name}=...' for name in lacking)}, as "
+                "the module was made; to use a trained network: kcs_torch.training.load_lifter(path, network=...)"
+            )
+        return super().load_from_checkpoint(checkpoint_path, *args, **kwargs)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep the frame rate of the data, by which a trained network warns of tracks at another."""
+        checkpoint["fps"] = getattr(getattr(self.trainer, "datamodule", None), "fps", None)
 
     def forward(self, tracks: Tensor, weights: Tensor | None = None) -> Tensor:
         """Lift tracks (..., T, N, 2) with weights (..., T, N) to points (..., T, N, 3)."""
@@ -158,7 +181,7 @@ class LiftingModule(lightning.LightningModule):
 
     def on_train_start(self) -> None:
         """Begin where the trainer is: what an earlier one counted would leave only the smallest steps."""
-        self._counted = False
+        self._counted, self.trouble = False, None
         self.step.fill_(self.trainer.global_step)
 
     def on_train_epoch_end(self) -> None:
@@ -201,6 +224,8 @@ class LiftingModule(lightning.LightningModule):
         if self.critic is not None:
             values["critic"] = generator_loss(self.critic(centre(points)[0])).mean()
             total = total + self.critic_weight * values["critic"]
+        if self.trouble is None and not bool(total.isfinite()):
+            self.trouble = self._trouble(points, values)
         self._advance(optimisers[0], total)
         if self.critic is not None and bool((batch.labelled > 0).any()):
             true = centre(batch.points[batch.labelled > 0])[0]
@@ -210,6 +235,20 @@ class LiftingModule(lightning.LightningModule):
             self._advance(optimisers[1], cost, counts=False)
         self.log_dict({f"train/{name}": value.detach() for name, value in values.items()}, batch_size=len(points))
         self.log("train/loss", total.detach(), prog_bar=True, batch_size=len(points))
+
+    def _trouble(self, points: Tensor, values: Mapping[str, Tensor]) -> str:
+        """What is to blame for a loss that is no number: one term, where the network's points are still in order."""
+        number = int(self.step)
+        wrong = [name for name, value in values.items() if not bool(value.isfinite())]
+        if wrong and bool((points.abs() < OUT_OF_ORDER).all()):
+            name = wrong[0]
+            kind = self.critic if name not in self.losses else self.losses[name].loss
+            what = "NaN" if bool(values[name].isnan()) else "infinite"
+            return (
+                f"the loss '{name}' ({type(kind).__name__}) was {what} at step {number}, though all points of the "
+                "network were in order: look at this loss, or leave it out"
+            )
+        return f"the network's points were out of all bounds at step {number}: try a smaller module.lr"
 
     def _advance(self, optimiser: Any, cost: Tensor, *, counts: bool = True) -> None:
         size = self.lr * step_share(int(self.step), self.total_steps)
@@ -224,7 +263,16 @@ class LiftingModule(lightning.LightningModule):
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Cut gradients; what half precision had scaled them by is undone by now."""
-        nn.utils.clip_grad_norm_([p for group in optimizer.param_groups for p in group["params"]], self.clip)
+        size = nn.utils.clip_grad_norm_([p for group in optimizer.param_groups for p in group["params"]], self.clip)
+        if (
+            self.trouble is None
+            and getattr(self.trainer.precision_plugin, "scaler", None) is None
+            and not bool(size.isfinite())
+        ):
+            self.trouble = (
+                f"the losses were numbers at step {int(self.step)}, but their gradient was not: a loss that divides by "
+                "0, or has a root or a norm of 0, does this; else try a smaller module.lr"
+            )
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Measure the network on clips with labels."""

@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import re
+import signal
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,32 +21,31 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from hydra.utils import instantiate
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException, SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 
-from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError, warnings_told
+from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError, unknown, warnings_told
 from kcs_torch.io.atomic import atomic_path
-from kcs_torch.training.callbacks import Best, Diverged, Last, Watch
+from kcs_torch.training.callbacks import Best, Diverged, Last, Log, Watch
 from kcs_torch.training.checkpoint import describe, save_lifter
 from kcs_torch.training.configured import (
+    changes,
     check_switch,
     check_threads,
     check_values,
     check_whole,
     command_line,
     configs,
+    for_json,
     in_one_line,
 )
-from kcs_torch.training.sweep import RESULT, tabulate
+from kcs_torch.training.sweep import RESULT, SETTINGS, tabulate
 
 __all__ = ["Outcome", "configs", "job", "main", "train"]
 
 LIFTER = "lifter.safetensors"
 """The file of a run's network."""
-
-SETTINGS = "settings.json"
-"""The file of the settings that gave a run's figures: Hydra's own are of whatever was called last."""
 
 QUIET = (
     r".*does not have many workers.*",  # batches are made faster than they are used
@@ -67,11 +67,13 @@ class Outcome:
         metrics: the figures of the test clips, by the weights of that epoch.
         lifter: the file of these weights, for :func:`kcs_torch.training.load_lifter`; None where they are no good, or
             with ``fast_dev_run``, which tests and saves nothing.
+        diverged: whether training ended early, as weights were not numbers any more; the best epoch may lie before.
     """
 
     value: float
     metrics: Mapping[str, float]
     lifter: Path | None
+    diverged: bool = False
 
 
 def train(config: DictConfig, folder: Path) -> Outcome:
@@ -88,13 +90,16 @@ def train(config: DictConfig, folder: Path) -> Outcome:
     _check(plain)
     check_values(plain)
     torch.set_num_threads(config.threads)
-    resumed = None if config.resume is None else _checkpoint(Path(config.resume), plain)
+    resumed, epoch = (None, None) if config.resume is None else _checkpoint(Path(config.resume), plain)
+    goes_on = resumed is not None and resumed.is_relative_to(folder.resolve())
+    diverged = False
     with _quiet():
         lightning.seed_everything(config.seed, verbose=False)
         data = instantiate(config.data, _convert_="all")
         module = instantiate(config.module, _convert_="all")
         savable = _savable(module.network)
         best = Best(folder / "checkpoints", config.optimise, config.mode, resumed)
+        last = Last(folder / "checkpoints")
         own = config.trainer
         more: Any = []
         if "callbacks" in own:  # to stand beside those of every run
@@ -102,45 +107,57 @@ def train(config: DictConfig, folder: Path) -> Outcome:
             more = more if isinstance(more, list) else [more]
             own = OmegaConf.create({name: value for name, value in plain["trainer"].items() if name != "callbacks"})
         made: dict[str, Any] = {
-            "callbacks": [Watch(plain), best, Last(folder / "checkpoints"), *more],
+            "callbacks": [Watch(plain, folder / RESULT), best, last, *more],
             "default_root_dir": folder,
         }
         if "logger" not in config.trainer:
-            made["logger"] = [
-                kind(folder, name, "") for kind, name in ((CSVLogger, "csv"), (TensorBoardLogger, "tensorboard"))
-            ]
+            made["logger"] = [Log(folder, epoch if goes_on else None), TensorBoardLogger(folder, "tensorboard", "")]
         if "enable_progress_bar" not in config.trainer:
             made["enable_progress_bar"] = sys.stderr.isatty()
         trainer = instantiate(own, **made, _convert_="all")
         try:
             trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
         except (Diverged, NotFiniteError):  # a loss or a solver was given NaN
-            text = "training diverged: what was best before that counts; try a smaller module.lr"
+            diverged = True
+            why = getattr(module, "trouble", None) or "the weights are not numbers any more: try a smaller module.lr"
+            text = f"training diverged: {why}; what was best before that counts"
             warnings.warn(text, KcsWarning, stacklevel=2)
             if best.best_model_score is None:
                 _clear(folder)
-                return Outcome(math.inf if config.mode == "min" else -math.inf, {}, None)
+                return Outcome(math.inf if config.mode == "min" else -math.inf, {}, None, diverged)
         except (RuntimeError, ValueError) as error:  # of a module's state, of an optimiser's
             if resumed is None or not re.search("state.dict", str(error)):
                 raise
             raise OptionError(f"resume={resumed}: does not fit this configuration: {error}") from None
-        except SystemExit:  # so Lightning ends at Ctrl-C
-            if trainer.interrupted and (folder / "checkpoints" / "last.ckpt").is_file():
+        except SystemExit as end:
+            if trainer.interrupted and (last.best_model_path or goes_on):
                 print(f"stopped: resume={folder} goes on", file=sys.stderr)
-            raise
+            raise SystemExit(_exit_code(end)) from None
         if trainer.fast_dev_run and config.optimise in trainer.callback_metrics:  # which keeps no checkpoints to test
-            return Outcome(float(trainer.callback_metrics[config.optimise]), {}, None)
+            return Outcome(float(trainer.callback_metrics[config.optimise]), {}, None, diverged)
         if best.best_model_score is None:
             raise OptionError("train: expected at least one epoch with validation, got none: see the group trainer")
-        tested = trainer.test(module, datamodule=data, ckpt_path=best.best_model_path, verbose=False, weights_only=True)
+        try:
+            tested = trainer.test(
+                module, datamodule=data, ckpt_path=best.best_model_path, verbose=False, weights_only=True
+            )
+        except SystemExit as end:
+            raise SystemExit(_exit_code(end)) from None
     metrics = {name: float(figure) for figures in tested for name, figure in figures.items()}
-    notes = {"config": _for_json(plain), "metrics": {name: f for name, f in metrics.items() if math.isfinite(f)}}
+    notes = {"config": for_json(plain), "metrics": {name: f for name, f in metrics.items() if math.isfinite(f)}}
     lifter = folder / LIFTER
     if savable:
         save_lifter(lifter, module.network, fps=data.fps, notes=notes)
     else:
         lifter.unlink(missing_ok=True)
-    return Outcome(float(best.best_model_score), metrics, lifter if savable else None)
+    return Outcome(float(best.best_model_score), metrics, lifter if savable else None, diverged)
+
+
+def _exit_code(end: SystemExit) -> Any:
+    """As shells tell it where a signal has made Lightning stop, which says 0 or 1 itself."""
+    if isinstance(end, SIGTERMException):
+        return 128 + signal.SIGTERM
+    return 128 + signal.SIGINT if isinstance(end.__context__, KeyboardInterrupt) else end.code
 
 
 def _clear(folder: Path) -> None:
@@ -154,7 +171,10 @@ def _savable(network: Any) -> bool:
     try:
         describe(network)
     except OptionError as error:
-        text = f"there will be checkpoints, but no lifter.safetensors: {error}"
+        text = (
+            "there will be no lifter.safetensors, but checkpoints/best.ckpt, which load_lifter(path, network=...) "
+            f"takes: {error}"
+        )
         warnings.warn(text, KcsWarning, stacklevel=2)
         return False
     return True
@@ -171,58 +191,37 @@ def _check(config: Mapping[str, Any]) -> None:
     solver = config.get("solver")
     if solver is not None and "_target_" not in solver:
         raise OptionError(f"solver: there is none to set {', '.join(solver)} of: choose one first, as solver=sfam does")
+    losses = config.get("loss")
+    losses = losses if isinstance(losses, Mapping) else {}
+    for name, term in losses.items():
+        if isinstance(term, Mapping) and "_target_" not in term:
+            raise unknown("loss", name, [other for other in losses if other != name])
 
 
-def _checkpoint(path: Path, config: Mapping[str, Any]) -> Path:
-    """The checkpoint that ``resume`` means; it says where its run was configured otherwise."""
+def _checkpoint(path: Path, config: Mapping[str, Any]) -> tuple[Path, int]:
+    """The checkpoint that ``resume`` means, and its epoch; it says where its run was configured otherwise."""
     found = path / "checkpoints" / "last.ckpt" if path.is_dir() else path
     if not found.is_file():
         raise OptionError(
             f"resume={path}: expected a run's folder, with checkpoints/last.ckpt, or a checkpoint, got none"
         )
     try:
-        differing = _differing(found, config)
+        held = torch.load(found, map_location="cpu", weights_only=True)
+        differing, epoch = changes(held["config"], config), int(held["epoch"])
     except Exception:  # whatever torch, zipfile and pickle make of a file that is something else
         raise OptionError(f"resume={found}: expected a checkpoint of a training run, got something else") from None
     for key, before, now in differing:
         warnings.warn(f"resume: {key} was {before}, is {now}", KcsWarning, stacklevel=2)
-    return found.resolve()
-
-
-def _differing(checkpoint: Path, config: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """The settings that a checkpoint's run had otherwise, as they were and as they are."""
-    return _changes(torch.load(checkpoint, map_location="cpu", weights_only=True)["config"], config)
-
-
-def _changes(then: Any, config: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    before, now = _flat(then), _flat(config)
-    keys = sorted({*before, *now} - {"resume", "keep"})
-    return [(key, before.get(key), now.get(key)) for key in keys if before.get(key) != now.get(key)]
+    return found.resolve(), epoch
 
 
 def _ended(config: DictConfig, folder: Path) -> dict[str, float | None] | None:
     """The figures of a run of the same settings that ended in this folder before; None where there is none."""
     with suppress(Exception):  # whatever is wrong with its files, it did not end
         result, then = (json.loads((folder / name).read_text(encoding="utf-8")) for name in (RESULT, SETTINGS))
-        if not _changes(then, _for_json(OmegaConf.to_container(config, resolve=True))):
+        if not changes(then, for_json(OmegaConf.to_container(config, resolve=True))):
             return dict(result)
     return None
-
-
-def _for_json(value: Any) -> Any:
-    """A configuration whose infinite numbers are as YAML writes them, in words: JSON has none."""
-    if isinstance(value, dict):
-        return {name: _for_json(inner) for name, inner in value.items()}
-    if isinstance(value, list):
-        return [_for_json(inner) for inner in value]
-    return str(value).replace("inf", ".inf") if isinstance(value, float) and math.isinf(value) else value
-
-
-def _flat(config: Any, key: str = "") -> dict[str, Any]:
-    """A nested configuration with dotted keys."""
-    if not isinstance(config, Mapping):
-        return {key: config}
-    return {name: leaf for k, v in config.items() for name, leaf in _flat(v, f"{key}.{k}".lstrip(".")).items()}
 
 
 @contextmanager
@@ -257,21 +256,24 @@ def job(config: DictConfig) -> float:
         if settings.mode == RunMode.MULTIRUN:
             tabulate(Path(settings.sweep.dir))
         value = ended.get(config.optimise)
+        if value is None and settings.mode != RunMode.MULTIRUN:
+            raise SystemExit(1)  # as when it diverged
         return (math.inf if config.mode == "min" else -math.inf) if value is None else value
     if config.keep and (folder / RESULT).is_file():
         print(f"{folder}: had ended with other settings, and is replaced: runs go by their number", file=sys.stderr)
-    (folder / RESULT).unlink(missing_ok=True)  # of an earlier run, whose settings Hydra has replaced
     with in_one_line(MisconfigurationException), warnings_told(_to_stderr):
         outcome = train(config, folder)
     figures = {config.optimise: outcome.value} | dict(outcome.metrics)
     result = {name: figure if math.isfinite(figure) else None for name, figure in figures.items()}
-    plain = _for_json(OmegaConf.to_container(config, resolve=True))
+    plain = for_json(OmegaConf.to_container(config, resolve=True))
     for name, content in ((SETTINGS, plain), (RESULT, result)):  # who finds a result finds the settings of it
         with atomic_path(folder / name) as temporary:
             temporary.write_text(json.dumps(content, indent=2), encoding="utf-8")
     print("  ".join(f"{name} {value:.4g}" for name, value in figures.items()), outcome.lifter or folder, sep="\n")
     if settings.mode == RunMode.MULTIRUN:
         tabulate(Path(settings.sweep.dir))
+    elif outcome.diverged:  # a sweep goes on
+        raise SystemExit(1)
     return outcome.value
 
 

@@ -22,10 +22,13 @@ from kcs_torch.skeleton import (
     person_by_names,
 )
 
-__all__ = ["MOST_LACKING", "choose_skeleton", "joint_order", "no_bones"]
+__all__ = ["IN_ORDER", "MOST_LACKING", "choose_skeleton", "joint_order", "no_bones", "numbered"]
 
 MOST_LACKING = 3
 """One joint in so many may be missing where those of another body are matched by name."""
+
+IN_ORDER = "joints taken in their order as those of skeleton"
+"""How the note begins where as many joints as the skeleton has go by other names."""
 
 
 def fitting(num_joints: int) -> list[str]:
@@ -43,14 +46,14 @@ def no_bones(body: Skeleton) -> str:
     )
 
 
-def _numbered(names: Sequence[str]) -> bool:
+def numbered(names: Sequence[str]) -> bool:
     """Whether names differ by numbers at their ends alone, so that their order is all that they tell."""
     return len({re.sub(r"[0-9]+\Z", "", name) for name in names}) == 1
 
 
 def _may_be(names: Sequence[str], body: Skeleton) -> bool:
     """Whether joints may be those of a body of as many: by their names, unless these are but numbers."""
-    if _numbered(names):
+    if numbered(names):
         return True
     found = map_joints(names, body.joints[: body.num_observed])
     if None not in found:
@@ -103,7 +106,7 @@ def _by_names(names: Sequence[str] | None, num_joints: int, source: str, notes: 
 
 def _by_links(graph: Skeleton, names: Sequence[str] | None, notes: list[str]) -> Skeleton:
     """The skeleton of joints that are linked as in the graph, or as a person's or a detector's are known to be."""
-    told = names is not None and not _numbered(names)
+    told = names is not None and not numbered(names)
     fits = [] if told else fitting_links(graph.bones, graph.num_joints)
     if len(fits) == 1:
         notes.append(f"the edges are those of skeleton '{fits[0].name}', so the joints are taken for its")
@@ -166,7 +169,7 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
         return None
     exact = {n: i for i, n in enumerate(names)}
     found = [exact.get(n) for n in wanted] if exact.keys() >= set(wanted) else map_joints(names, wanted)
-    ordered = _numbered(names) and found == list(range(len(names)))
+    ordered = numbered(names) and found == list(range(len(names)))
     missing = [n for n, i in zip(wanted, found, strict=True) if i is None or ordered]
     if not missing:
         spare = len(names) - len(wanted)
@@ -175,7 +178,7 @@ def joint_order(names: Sequence[str], body: Skeleton, source: str, notes: list[s
     if len(names) == len(wanted) and all(i in (None, j) for j, i in enumerate(found)):
         pairs = [f"{names[wanted.index(n)]} for {n}" for n in missing]
         said = f"{', '.join(pairs[:4])}{', ...' if len(pairs) > 4 else ''}"
-        notes.append(f"joints taken in their order as those of skeleton '{body.name}', where names differ: {said}")
+        notes.append(f"{IN_ORDER} '{body.name}', where names differ: {said}")
         return None
     if len(names) != len(wanted) and MOST_LACKING * len(missing) <= len(wanted):
         notes.append(
