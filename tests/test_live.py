@@ -246,6 +246,25 @@ def test_a_jump_in_the_image_changes_nothing_and_a_bad_detection_little(clip, po
     assert error(points, clip.points[82:90]) < 60
 
 
+@pytest.mark.parametrize(("joint", "off"), [(9, 2000), (9, 200), (7, 2000), (5, 2000), (11, 2000)])
+def test_a_wrong_joint_moves_no_other(clip, poses, joint, off):
+    frames = observed(clip)[:58].clone()
+    frames[55, joint] += off  # mm
+    found = follow(kt.Tracker("coco17", fps=30), frames)
+    assert bool(found[54].seen[joint]) and not bool(found[55].seen[joint]) and bool(found[56].seen[joint])
+    moved = (found[55].points - poses[1][55].points)[:17, :2].norm(dim=-1)
+    assert float(moved[torch.arange(17) != joint].max()) < 10 and float(moved[joint]) < 100
+    assert float((found[57].points - poses[1][57].points).norm(dim=-1).median()) < 10
+
+
+def test_a_joint_that_stays_where_it_jumped_to_is_believed(clip):
+    frames = observed(clip)[:40].clone()
+    frames[25:, 9] += 400
+    found = follow(kt.Tracker("coco17", fps=30), frames)
+    seen = [bool(p.seen[9]) for p in found[25:]]
+    assert not seen[0] and all(seen[4:])
+
+
 def test_finds_the_body_again_after_it_turned_unseen(clip):
     behind = walking_person(60, skeleton="coco17", yaw=-150, turn=0)
     frames = torch.cat([observed(clip)[:60], torch.full((30, 17, 2), torch.nan), observed(behind)])

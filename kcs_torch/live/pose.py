@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.ranks import median
 from kcs_torch.live.filter import Shape
 from kcs_torch.skeleton import Skeleton
 
@@ -18,6 +19,9 @@ FOUND, USUAL = 0.02, 0.1
 
 FLAT = 0.25
 """Share of its length below which a bone's depth is no better known for being small."""
+
+APART = 3.0
+"""A joint that is so many times as far from where the chain places it as usual counts a fourth for the body's place."""
 
 DRIFT, FARTHEST = 1.0, 0.3
 """Speed at which an unseen joint's deviation grows, a second, and how far; a person being 1.75 tall."""
@@ -60,13 +64,15 @@ class Chain:
         self.tree = chain_inverse(incidence(self.bones, body.num_joints, dtype=torch.float64))  # (N, B)
         self.rigid = body.rigid_mask()
 
-    def place(self, image: Tensor, dz: Tensor, shape: Shape) -> Tensor:
+    def place(self, image: Tensor, weights: Tensor, dz: Tensor, shape: Shape) -> Tensor:
         """Place the joints (N, 3), in the tracks' units, so that rigid bones have their length.
 
         A bone that looks too long is shortened. Bones of the trunk keep the direction that image and rotation give.
+        The body is where most of its seen joints are in the image: one that is elsewhere moves no other.
 
         Args:
             image: (N, 2), complete.
+            weights: (N,) confidences, 0 where ``image`` is a guess.
             dz: (B,) depths of the bones, in the template's units.
             shape: what is known of the body.
         """
@@ -80,8 +86,8 @@ class Chain:
         vectors = torch.cat([flat * share[:, None], depth[:, None]], -1)
         vectors = torch.where(self.rigid[:, None], vectors, torch.cat([flat, dz[:, None]], -1))
         points = self.tree @ vectors
-        middle = torch.nn.functional.pad(image.mean(0), (0, 1))
-        return (points - points.mean(0) + middle) / shape.factor
+        shift = torch.cat([_middle(image - points[:, :2], weights), -points[:, 2].mean(0, keepdim=True)])
+        return (points + shift) / shape.factor
 
     def deviation(self, dz: Tensor, shape: Shape, doubt: Tensor, age: Tensor, found: bool) -> Tensor:
         """Standard deviation of the joints' depths (N,), in the tracks' units; infinite while no bone has a length.
@@ -102,3 +108,15 @@ class Chain:
         variance = self.tree.square() @ (off.square() + doubt * (2 * dz).square())
         variance = variance + (age * (DRIFT / self.fps)).clamp_max(FARTHEST).square()
         return variance.sqrt() / shape.factor
+
+
+def _middle(off: Tensor, weights: Tensor) -> Tensor:
+    """Mean (D,) of the joints' offsets (N, D), those far from their median counting less; of all, if none is seen."""
+    weights = weights if bool((weights > 0).any()) else torch.ones_like(weights)
+    middle = median(off[weights > 0], 0)
+    far = (off - middle).norm(dim=-1)
+    usual = median(far[weights > 0], 0)
+    if not bool(usual > 0):
+        return middle
+    share = weights / (1 + (far / (APART * usual)).square()).square()
+    return share @ off / share.sum()

@@ -13,7 +13,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.live.filter import BodyFilter, ChainFilter, Shape
-from kcs_torch.live.frame import Sight, take_frame
+from kcs_torch.live.frame import FASTEST, Sight, take_frame
 from kcs_torch.live.pose import Chain, LivePose
 from kcs_torch.live.solve import Solution, solve_window
 from kcs_torch.methods.pkc import PKC
@@ -148,7 +148,7 @@ class Tracker:
         self._weights: deque[Tensor] = deque(maxlen=self.window)
         self._shape: Shape | None = None
         self._longest = torch.zeros(self.skeleton.num_bones, dtype=torch.float64)  # of the bones' images
-        self._sight = Sight(self.skeleton)
+        self._sight = Sight(self._body)
         self._solving: Future[Solution | None] | None = None
         self._asked = self._ready = -1  # frames at which the running solve began, and at which it is taken over
         self._solved = -1  # frame at which the last solve began
@@ -162,7 +162,8 @@ class Tracker:
         Args:
             xy: (num_observed, 2) array or tensor; NaN where unseen. Without confidences, joints exactly at (0, 0)
                 or (-1, -1) are unseen, too, if all others lie to the right of (0, 0) and below it. A frame of NaN, or
-                of zeros, is one without the person; after a whole window of them the tracker starts anew.
+                of zeros, is one without the person; after a whole window of them the tracker starts anew. A joint
+                that jumps too far for a body, from one frame to the next, counts as unseen there.
             confidence: (num_observed,) in 0..1; 1 where None.
 
         Raises:
@@ -173,6 +174,11 @@ class Tracker:
             raise OptionError("Tracker: closed: it takes no frames any more; make another one")
         points, weights, like = take_frame(self.skeleton, self._frame + 1, xy, confidence, self.threshold)
         self._frame += 1
+        last = self._image[-1] if self._image else None
+        if last is not None:
+            shape = self._shape or self._filter.guess(self._longest)
+            lengths, reach = shape.lengths / shape.factor, FASTEST / self.fps / shape.factor
+            points, weights = self._sight.trusted(points, weights, last, lengths, reach)
         seen = weights > 0
         if not self._image and not bool(seen.any()):
             self._due = deque(frame + 1 for frame in self._due)
@@ -181,13 +187,13 @@ class Tracker:
         if float(self._sight.age.amin()) > LOST * self.fps and bool(seen.any()):
             self._filter.reset()
             self._begun = self._frame
-        image = self._sight.complete(points, seen, self._image[-1] if self._image else None)
+        image = self._sight.complete(points, seen, last)
         self._image.append(image)
         self._weights.append(weights)
         self._longest = torch.maximum(self._longest, bone_vectors(image, self._chain.bones).norm(dim=-1))
         shape = self._shape or self._filter.guess(self._longest)
         dz = self._filter.step(image, weights, shape)
-        points = self._chain.place(image, dz, shape).to(like)
+        points = self._chain.place(image, weights, dz, shape).to(like)
         unsure = self._chain.deviation(dz, shape, self._filter.doubt, self._sight.age, self._shape is not None).to(like)
         delay = self._frame - self._solved if self._shape else -1
         out = LivePose(self._frame, points, unsure, seen.to(points.device), self._shape is not None, delay)
