@@ -78,7 +78,38 @@ def test_bones_keep_their_length(poses):
     until = next((p.frame for p in found if p.frame > since and p.delay < found[p.frame - 1].delay), FRAMES)
     rigid = tracker.skeleton.bone_index()[list(tracker.skeleton.rigid)]
     lengths = bone_lengths(torch.stack([p.points for p in found[since:until]]), rigid)
-    assert float((lengths.std(0) / lengths.mean(0)).max()) < 1e-9
+    size = lengths.mean(1, keepdim=True)  # the body's, in the image
+    assert float((size / size.mean() - 1).abs().max()) < 0.02
+    assert float(((lengths / size).std(0) / (lengths / size).mean(0)).max()) < 1e-9
+
+
+def seen_from_afar(depth, yaw):
+    """(T, 17, 2) in px of a walk at a depth (T,), in mm."""
+    points = walking_person(len(depth), skeleton="coco17", yaw=yaw, turn=0).points
+    points = points - points.mean(1, keepdim=True)
+    return 1000 * points[:, :17, :2] / (points[:, :17, 2:] + depth[:, None, None])
+
+
+@pytest.mark.parametrize("depth", [torch.linspace(6000, 3000, 150), torch.linspace(3500, 6500, 150)])
+def test_a_body_that_comes_nearer_or_goes_away_keeps_to_the_image(depth):
+    image = seen_from_afar(depth.double(), 30)
+    with kt.Tracker("coco17", fps=30, period=1000) as tracker:
+        points = torch.stack([p.points for p in follow(tracker, image)])[:, :17, :2]
+    height = image[..., 1].amax(1) - image[..., 1].amin(1)
+    off = (points - image).norm(dim=-1).amax(1) / height
+    assert height[40] / height[-1] > 1.3 or height[-1] / height[40] > 1.3
+    assert float(off[40:].max()) < 0.05
+
+
+def test_a_body_without_a_template_grows_with_the_image():
+    body = replace(kt.SKELETONS["coco17"], template=None, spread=None, proportions=None)
+    clip = walking_person(110, skeleton="coco17", turn=300)
+    scale = torch.cat([torch.ones(60), torch.linspace(1, 1.5, 50)])[:, None, None].double()
+    image = scale * (clip.tracks.points - clip.tracks.points.mean(1, keepdim=True))[:, :17]
+    with kt.Tracker(body, fps=30, window=24, period=1000, method=kt.METHODS["pkc"](lifts=1)) as tracker:
+        found = follow(tracker, image)
+    lengths = bone_lengths(torch.stack([p.points for p in found]), tracker.skeleton.bone_index()[:12]).mean(1)
+    assert found[55].ready and 1.35 < float(lengths[109] / lengths[59]) < 1.65
 
 
 def test_the_same_frames_give_the_same_poses_and_later_ones_change_nothing(clip, poses):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -12,9 +13,10 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.live.filter import BodyFilter, ChainFilter, Shape
+from kcs_torch.live.filter import BodyFilter, ChainFilter, Shape, Told
 from kcs_torch.live.frame import FASTEST, Sight, take_frame
 from kcs_torch.live.pose import Chain, LivePose
+from kcs_torch.live.size import SizeFilter, longest_image
 from kcs_torch.live.solve import Solution, solve_window
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
@@ -61,11 +63,12 @@ class Tracker:
     the window's. Where frames come faster, or the machine is slow, that one update waits for the thread, unless
     ``wait`` is False.
 
-    Bone lengths in the tracks' units change when a window has been solved, not between: so does the size of a body that
-    comes nearer. The camera is taken to move little. Without a template the viewpoint has to turn: depths are guesses
-    and ``ready`` is False until a full window has been solved, two windows from the start. All work is done on the CPU
-    in double precision; poses come back on the device and in the dtype of the input. Memory does not grow beyond the
-    window.
+    Bones keep their proportions until a window has been solved again. The size of a body that comes nearer or goes
+    away is followed from frame to frame, by its trunk and the bones that look longest; without a template only growth
+    is, until the next solve. The camera is taken to move little. Without a template the viewpoint has to turn: depths
+    are guesses and ``ready`` is False until a full window has been solved, two windows from the start. All work is done
+    on the CPU in double precision; poses come back on the device and in the dtype of the input. Memory does not grow
+    beyond the window.
 
     Args:
         skeleton: name, file or :class:`kcs_torch.Skeleton`; its bones form a tree.
@@ -135,6 +138,7 @@ class Tracker:
         else:
             self._filter, early, self._delay = ChainFilter(self._body, rate), EARLY[-1:], 1.0
         self._early = [min(max(LEAST, round(share * window)), window) for share in early]
+        self._rigid = list(self._body.rigid)
         self._chain = Chain(self._body, self._filter.body, rate)
         self._thread = ThreadPoolExecutor(1, "kcs_torch.live")
         self._closed = False
@@ -149,6 +153,7 @@ class Tracker:
         self._shape: Shape | None = None
         self._longest = torch.zeros(self.skeleton.num_bones, dtype=torch.float64)  # of the bones' images
         self._sight = Sight(self._body)
+        self._size = SizeFilter(self.fps)
         self._solving: Future[Solution | None] | None = None
         self._asked = self._ready = -1  # frames at which the running solve began, and at which it is taken over
         self._solved = -1  # frame at which the last solve began
@@ -176,7 +181,7 @@ class Tracker:
         self._frame += 1
         last = self._image[-1] if self._image else None
         if last is not None:
-            shape = self._shape or self._filter.guess(self._longest)
+            shape = self._body_now()
             lengths, reach = shape.lengths / shape.factor, FASTEST / self.fps / shape.factor
             points, weights = self._sight.trusted(points, weights, last, lengths, reach)
         seen = weights > 0
@@ -184,15 +189,14 @@ class Tracker:
             self._due = deque(frame + 1 for frame in self._due)
             blank, unsure = (points.new_full((len(points), 3), x).to(like) for x in (torch.nan, torch.inf))
             return LivePose(self._frame, blank, unsure[:, 0], seen.to(blank.device), False, -1)
-        if float(self._sight.age.amin()) > LOST * self.fps and bool(seen.any()):
-            self._filter.reset()
-            self._begun = self._frame
+        away = float(self._sight.age.amin()) > LOST * self.fps and bool(seen.any())
         image = self._sight.complete(points, seen, last)
+        if away:
+            self._begin_again(image, weights)
         self._image.append(image)
         self._weights.append(weights)
         self._longest = torch.maximum(self._longest, bone_vectors(image, self._chain.bones).norm(dim=-1))
-        shape = self._shape or self._filter.guess(self._longest)
-        dz = self._filter.step(image, weights, shape)
+        dz, shape = self._follow(image, weights)
         points = self._chain.place(image, weights, dz, shape).to(like)
         unsure = self._chain.deviation(dz, shape, self._filter.doubt, self._sight.age, self._shape is not None).to(like)
         delay = self._frame - self._solved if self._shape else -1
@@ -238,6 +242,44 @@ class Tracker:
         """
         return self.method(self.tracks())
 
+    # ------------------------------------------------------------------ the newest frame
+
+    def _body_now(self) -> Shape:
+        """The body, as large as it was in the frame before."""
+        if self._shape is None:
+            return self._filter.guess(self._longest)
+        return self._shape.sized(self._size.value)
+
+    def _follow(self, image: Tensor, weights: Tensor, told: Told | None = None) -> tuple[Tensor, Shape]:
+        """Have a frame filtered: dz (B,) of its bones, and the body, as large as frames tell.
+
+        Args:
+            image: (N, 2), complete.
+            weights: (N,) confidences.
+            told: what a window solve says of this frame, if anything.
+        """
+        if told is None:
+            self._size.predict()
+        else:
+            self._size.value = float(told.sizes)
+        shape = self._body_now()
+        dz = self._filter.step(image, weights, shape, told)
+        if told is None and self._shape is not None:
+            self._size.correct(self._looks(image, weights, shape), self._filter.size)
+        return dz, shape
+
+    def _looks(self, image: Tensor, weights: Tensor, shape: Shape) -> float:
+        """Log of how long bones that hardly tilt look in a frame, over what is usual; NaN where too few are seen."""
+        lengths = shape.lengths[self._rigid] / shape.factor
+        return float(longest_image(image, weights > 0, self._chain.bones[self._rigid], lengths)) - shape.usual
+
+    def _begin_again(self, image: Tensor, weights: Tensor) -> None:
+        """Find a known body anew, of any heading and size, in a frame."""
+        self._filter.reset()
+        self._begun = self._frame
+        looks = self._looks(image, weights, self._body_now())
+        self._size.value, self._size.slope = self._size.value + (0.0 if math.isnan(looks) else looks), 0.0
+
     # ------------------------------------------------------------------ the window
 
     def _advance(self) -> None:
@@ -266,4 +308,4 @@ class Tracker:
         again = min(REPLAYED + since, len(frames), self._frame + 1 - self._begun)
         self._filter.reset()
         for i, (image, weights) in enumerate(frames[-again:], count + since - again):
-            self._filter.step(image, weights, shape, found.told[i] if i < count else None)
+            self._follow(image, weights, found.told[i] if i < count else None)
