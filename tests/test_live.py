@@ -112,6 +112,23 @@ def test_a_body_without_a_template_grows_with_the_image():
     assert found[55].ready and 1.35 < float(lengths[109] / lengths[59]) < 1.65
 
 
+def test_what_is_off_in_the_image_is_doubted(clip):
+    frames = observed(clip)[:61].clone()
+    frames[60] *= 1.18
+    found = follow(kt.Tracker("coco17", fps=30), frames)[60]
+    off = (found.points[:17, :2] - frames[60]).norm(dim=-1)
+    assert float(off.max()) > 50 and bool((found.uncertainty[:17] >= off).all())
+
+
+def test_deviations_are_true_of_a_hand_too():
+    hand = kt.SKELETONS["hand21"]
+    clip = kt.data.random_motion(hand, 150, fps=30, turn=0, generator=torch.Generator().manual_seed(1))
+    with kt.Tracker(hand, fps=30) as tracker:
+        found = [p for p in follow(tracker, clip.tracks.points) if p.ready]
+    points, spread = (torch.stack([getattr(p, name) for p in found]) for name in ("points", "uncertainty"))
+    assert 0.5 < float(kt.metrics.coverage(points, spread, clip.points[found[0].frame :])) < 0.9  # .32 by lengths alone
+
+
 def test_the_same_frames_give_the_same_poses_and_later_ones_change_nothing(clip, poses):
     again = follow(kt.Tracker("coco17", fps=30), observed(clip)[:60])
     for a, b in zip(again, poses[1], strict=False):
@@ -126,7 +143,7 @@ def test_memory_is_bounded_by_the_window(clip):
         if t % 60 == 59:
             state = [v for v in vars(tracker).values() if hasattr(v, "maxlen")]
             sizes.append([len(v) for v in state])
-            assert all(len(v) <= 20 for v in state) and len(state) == 3
+            assert all(len(v) <= 20 for v in state) and len(state) == 4
     assert sizes[0] == sizes[-1]
     assert tracker.tracks().num_frames == 20
 

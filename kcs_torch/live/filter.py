@@ -45,12 +45,15 @@ class Shape:
         lengths: (B,), in units of the template.
         trunk: (trunk joints, 3) in rest, centred; empty where there is no trunk.
         usual: log of how long bones usually look that hardly tilt, over their lengths.
+        deviation: (N,) standard deviation of the joints' depths, in units of the template; None where no
+            window has told it.
     """
 
     factor: float
     lengths: Tensor
     trunk: Tensor
     usual: float = 0.0
+    deviation: Tensor | None = None
 
     def blended(self, before: Shape, share: float) -> Shape:
         """This size with the proportions of an earlier shape, of which this one counts ``share``."""

@@ -81,4 +81,6 @@ def solve_window(method: PKC, skeleton: Skeleton, image: Tensor, weights: Tensor
     looks = looks[looks.isfinite()]
     if len(looks):
         shape = replace(shape, usual=float(torch.quantile(looks, TURNS if posture is None else 0.5)))
+    if found.deviation is not None:
+        shape = replace(shape, deviation=factor * found.deviation.square().mean(0).sqrt())
     return Solution(shape, Told(factor * bone_vectors(points, bones)[..., 2], rotations, sizes))

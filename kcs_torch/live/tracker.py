@@ -150,13 +150,16 @@ class Tracker:
         self._filter.reset()
         self._image: deque[Tensor] = deque(maxlen=self.window)  # complete, (N, 2)
         self._weights: deque[Tensor] = deque(maxlen=self.window)
+        self._depths: deque[Tensor] = deque(maxlen=self.window)  # of the joints (N,), in the template's units
         self._shape: Shape | None = None
+        self._stray = torch.zeros(self.skeleton.num_joints, dtype=torch.float64)  # of depths from what solves found
         self._longest = torch.zeros(self.skeleton.num_bones, dtype=torch.float64)  # of the bones' images
         self._sight = Sight(self._body)
         self._size = SizeFilter(self.fps)
         self._solving: Future[Solution | None] | None = None
         self._asked = self._ready = -1  # frames at which the running solve began, and at which it is taken over
         self._solved = -1  # frame at which the last solve began
+        self._known = self._frame  # frame from which on bone lengths are known
         self._told = 0  # frames that the proportions come from
         self._begun = self._frame + 1  # frame from which the filter follows the body without a break
         self._due = deque(self._begun + frames - 1 for frames in self._early)
@@ -197,10 +200,13 @@ class Tracker:
         self._weights.append(weights)
         self._longest = torch.maximum(self._longest, bone_vectors(image, self._chain.bones).norm(dim=-1))
         dz, shape = self._follow(image, weights)
-        points = self._chain.place(image, weights, dz, shape).to(like)
-        unsure = self._chain.deviation(dz, shape, self._filter.doubt, self._sight.age, self._shape is not None).to(like)
+        points = self._chain.place(image, weights, dz, shape)
+        off = (points[:, :2] - image).norm(dim=-1)
+        unsure = self._chain.deviation(dz, shape, self._filter.doubt, self._sight.age, self._stray, off)
+        self._depths.append(shape.factor * points[:, 2])
         delay = self._frame - self._solved if self._shape else -1
-        out = LivePose(self._frame, points, unsure, seen.to(points.device), self._shape is not None, delay)
+        ready = self._shape is not None
+        out = LivePose(self._frame, points.to(like), unsure.to(like), seen.to(like.device), ready, delay)
         if float(self._sight.age.amin()) >= self.window:
             self.reset()
         else:
@@ -301,7 +307,10 @@ class Tracker:
         """Take over the body that was found, and let the filter take the window's last frames again."""
         count = len(found.told.depths)
         self._told = min(self._told + count, REMEMBERED * self.window)
-        shape = found.shape if self._shape is None else found.shape.blended(self._shape, count / self._told)
+        share = count / self._told
+        shape = found.shape if self._shape is None else found.shape.blended(self._shape, share)
+        self._learn(found.told, share)
+        self._known = self._frame if self._shape is None else self._known
         self._shape, self._solved = shape, self._asked
         frames = list(zip(self._image, self._weights, strict=True))
         since = self._frame - self._asked
@@ -309,3 +318,14 @@ class Tracker:
         self._filter.reset()
         for i, (image, weights) in enumerate(frames[-again:], count + since - again):
             self._follow(image, weights, found.told[i] if i < count else None)
+
+    def _learn(self, told: Told, share: float) -> None:
+        """Learn from frames with bone lengths how far depths are from what a solve, counting ``share``, finds later."""
+        depths = list(self._depths)[: len(self._depths) - (self._frame - self._asked)]
+        depths = depths[max(0, len(depths) - (self._asked - self._known)) :]
+        if self._shape is None or len(depths) < LEAST:
+            return
+        solved = told.depths[len(told.depths) - len(depths) :] @ self._chain.tree.mT
+        off = (torch.stack(depths) - solved + solved.mean(-1, keepdim=True)).square().mean(0)
+        before = self._stray.square()
+        self._stray = torch.lerp(before, off, share if bool(before.any()) else 1.0).sqrt()
