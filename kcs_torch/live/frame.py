@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,7 +39,8 @@ def take_frame(
         threshold: a joint with less confidence counts as unseen.
 
     Returns:
-        Points (N, 2), 0 where unseen, and weights (N,), on the CPU in double precision; and ``xy`` as a tensor.
+        Points (N, 2), 0 where unseen, and weights (N,), on the CPU in double precision; and ``xy`` as a tensor of the
+        dtype that poses have.
 
     Raises:
         ShapeError: the shape is wrong or a value infinite or out of range.
@@ -50,6 +52,8 @@ def take_frame(
         expected = f"({count}, 2) for skeleton '{body.name}'"
         raise ShapeError(f"{where}: xy: expected shape {expected}, got {tuple(given.shape)}")
     points = given.detach().to("cpu", torch.float64)
+    if isinstance(xy, np.ndarray) and xy.dtype.kind == "f" and xy.dtype.itemsize <= 4:
+        given = given.float()  # as of tensors: arrays were made double
     check_places(points, f"{where}: xy", body.joints)
     seen = torch.isfinite(points).all(-1)
     if confidence is None:
