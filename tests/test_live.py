@@ -219,10 +219,16 @@ def test_low_confidence_is_unseen(clip):
     assert not bool(pose.seen[4]) and float(pose.points.abs().max()) < 1e5
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+HALF = (torch.float16, torch.bfloat16)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, *HALF, np.float16, np.float32, ">f4", np.float64, int])
 def test_dtype_follows_the_input(clip, dtype):
-    pose = kt.Tracker("coco17", fps=30).update(observed(clip)[0].to(dtype))
-    assert pose.points.dtype == pose.uncertainty.dtype == dtype
+    frame = observed(clip)[0]
+    frame = frame.to(dtype) if isinstance(dtype, torch.dtype) else frame.numpy().astype(dtype)
+    pose = kt.Tracker("coco17", fps=30).update(frame)
+    expected = torch.float64 if dtype in (torch.float64, np.float64, int) else torch.float32
+    assert pose.points.dtype == pose.uncertainty.dtype == expected
 
 
 def test_arrays_do_as_well(clip):
@@ -410,6 +416,15 @@ def test_bad_options():
         kt.Tracker("auto")
     with pytest.raises(kt.ShapeError, match="nothing to reconstruct"):
         kt.Tracker("coco17").result()
+
+
+def test_options_cannot_change():
+    with kt.Tracker("coco17") as tracker:
+        for name in ("skeleton", "fps", "window", "period", "units", "threshold", "wait", "method"):
+            before = getattr(tracker, name)
+            with pytest.raises(AttributeError, match=rf"Tracker: {name} cannot change: make a new one.*{name}=15"):
+                setattr(tracker, name, 15)
+            assert getattr(tracker, name) == before
 
 
 @pytest.mark.parametrize("option", [{"units": 5}, {"wait": "no"}])

@@ -50,6 +50,9 @@ REPLAYED = 15
 LOST = 0.5
 """Seconds without the body after which the filter starts anew from many headings."""
 
+OPTIONS = ("skeleton", "fps", "window", "period", "units", "threshold", "wait", "method")
+"""Arguments of a tracker, and its attributes; all that it holds is made for them."""
+
 
 class Tracker:
     """3D poses of one body from 2D joints, frame by frame.
@@ -67,8 +70,11 @@ class Tracker:
     away is followed from frame to frame, by its trunk and the bones that look longest; without a template only growth
     is, until the next solve. The camera is taken to move little. Without a template the viewpoint has to turn: depths
     are guesses and ``ready`` is False until a full window has been solved, two windows from the start. All work is done
-    on the CPU in double precision; poses come back on the device and in the dtype of the input. Memory does not grow
-    beyond the window.
+    on the CPU in double precision; poses come back on the device and in the dtype of the input, float32 for half
+    precision, float64 for whole numbers and lists. Memory does not grow beyond the window.
+
+    Frames come evenly in time: where a camera dropped some, call :meth:`update` with a frame of NaN for each. The
+    arguments are attributes that cannot change: for another rate make a new tracker.
 
     Args:
         skeleton: name, file or :class:`kcs_torch.Skeleton`; its bones form a tree.
@@ -144,6 +150,11 @@ class Tracker:
         self._closed = False
         self._frame = -1
         self.reset()
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in OPTIONS and name in vars(self):
+            raise AttributeError(f"Tracker: {name} cannot change: make a new one, Tracker(..., {name}={value!r})")
+        super().__setattr__(name, value)
 
     def reset(self) -> None:
         """Forget the body, its bone lengths and the window; frames are counted on."""
