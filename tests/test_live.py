@@ -78,7 +78,55 @@ def test_bones_keep_their_length(poses):
     until = next((p.frame for p in found if p.frame > since and p.delay < found[p.frame - 1].delay), FRAMES)
     rigid = tracker.skeleton.bone_index()[list(tracker.skeleton.rigid)]
     lengths = bone_lengths(torch.stack([p.points for p in found[since:until]]), rigid)
-    assert float((lengths.std(0) / lengths.mean(0)).max()) < 1e-9
+    size = lengths.mean(1, keepdim=True)  # the body's, in the image
+    assert float((size / size.mean() - 1).abs().max()) < 0.02
+    assert float(((lengths / size).std(0) / (lengths / size).mean(0)).max()) < 1e-9
+
+
+def seen_from_afar(depth, yaw):
+    """(T, 17, 2) in px of a walk at a depth (T,), in mm."""
+    points = walking_person(len(depth), skeleton="coco17", yaw=yaw, turn=0).points
+    points = points - points.mean(1, keepdim=True)
+    return 1000 * points[:, :17, :2] / (points[:, :17, 2:] + depth[:, None, None])
+
+
+@pytest.mark.parametrize("depth", [torch.linspace(6000, 3000, 150), torch.linspace(3500, 6500, 150)])
+def test_a_body_that_comes_nearer_or_goes_away_keeps_to_the_image(depth):
+    image = seen_from_afar(depth.double(), 30)
+    with kt.Tracker("coco17", fps=30, period=1000) as tracker:
+        points = torch.stack([p.points for p in follow(tracker, image)])[:, :17, :2]
+    height = image[..., 1].amax(1) - image[..., 1].amin(1)
+    off = (points - image).norm(dim=-1).amax(1) / height
+    assert height[40] / height[-1] > 1.3 or height[-1] / height[40] > 1.3
+    assert float(off[40:].max()) < 0.05
+
+
+def test_a_body_without_a_template_grows_with_the_image():
+    body = replace(kt.SKELETONS["coco17"], template=None, spread=None, proportions=None)
+    clip = walking_person(110, skeleton="coco17", turn=300)
+    scale = torch.cat([torch.ones(60), torch.linspace(1, 1.5, 50)])[:, None, None].double()
+    image = scale * (clip.tracks.points - clip.tracks.points.mean(1, keepdim=True))[:, :17]
+    with kt.Tracker(body, fps=30, window=24, period=1000, method=kt.METHODS["pkc"](lifts=1)) as tracker:
+        found = follow(tracker, image)
+    lengths = bone_lengths(torch.stack([p.points for p in found]), tracker.skeleton.bone_index()[:12]).mean(1)
+    assert found[55].ready and 1.35 < float(lengths[109] / lengths[59]) < 1.65
+
+
+def test_what_is_off_in_the_image_is_doubted(clip):
+    frames = observed(clip)[:61].clone()
+    frames[60] *= 1.18
+    found = follow(kt.Tracker("coco17", fps=30), frames)[60]
+    off = (found.points[:17, :2] - frames[60]).norm(dim=-1)
+    assert float(off.max()) > 50 and bool((found.uncertainty[:17] >= off).all())
+
+
+def test_deviations_are_true_of_a_hand_too():
+    hand = kt.SKELETONS["hand21"]
+    clip = kt.data.random_motion(hand, 150, fps=30, turn=0, generator=torch.Generator().manual_seed(1))
+    with kt.Tracker(hand, fps=30) as tracker:
+        found = [p for p in follow(tracker, clip.tracks.points) if p.ready]
+    points, spread = (torch.stack([getattr(p, name) for p in found]) for name in ("points", "uncertainty"))
+    assert 0.5 < float(kt.metrics.coverage(points, spread, clip.points[found[0].frame :])) < 0.9  # .32 by lengths alone
 
 
 def test_the_same_frames_give_the_same_poses_and_later_ones_change_nothing(clip, poses):
@@ -95,7 +143,7 @@ def test_memory_is_bounded_by_the_window(clip):
         if t % 60 == 59:
             state = [v for v in vars(tracker).values() if hasattr(v, "maxlen")]
             sizes.append([len(v) for v in state])
-            assert all(len(v) <= 20 for v in state) and len(state) == 3
+            assert all(len(v) <= 20 for v in state) and len(state) == 4
     assert sizes[0] == sizes[-1]
     assert tracker.tracks().num_frames == 20
 
@@ -171,10 +219,16 @@ def test_low_confidence_is_unseen(clip):
     assert not bool(pose.seen[4]) and float(pose.points.abs().max()) < 1e5
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+HALF = (torch.float16, torch.bfloat16)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, *HALF, np.float16, np.float32, ">f4", np.float64, int])
 def test_dtype_follows_the_input(clip, dtype):
-    pose = kt.Tracker("coco17", fps=30).update(observed(clip)[0].to(dtype))
-    assert pose.points.dtype == pose.uncertainty.dtype == dtype
+    frame = observed(clip)[0]
+    frame = frame.to(dtype) if isinstance(dtype, torch.dtype) else frame.numpy().astype(dtype)
+    pose = kt.Tracker("coco17", fps=30).update(frame)
+    expected = torch.float64 if dtype in (torch.float64, np.float64, int) else torch.float32
+    assert pose.points.dtype == pose.uncertainty.dtype == expected
 
 
 def test_arrays_do_as_well(clip):
@@ -244,6 +298,25 @@ def test_a_jump_in_the_image_changes_nothing_and_a_bad_detection_little(clip, po
     found = follow(kt.Tracker("coco17", fps=30), frames)
     points = torch.stack([p.points for p in found[82:]])
     assert error(points, clip.points[82:90]) < 60
+
+
+@pytest.mark.parametrize(("joint", "off"), [(9, 2000), (9, 200), (7, 2000), (5, 2000), (11, 2000)])
+def test_a_wrong_joint_moves_no_other(clip, poses, joint, off):
+    frames = observed(clip)[:58].clone()
+    frames[55, joint] += off  # mm
+    found = follow(kt.Tracker("coco17", fps=30), frames)
+    assert bool(found[54].seen[joint]) and not bool(found[55].seen[joint]) and bool(found[56].seen[joint])
+    moved = (found[55].points - poses[1][55].points)[:17, :2].norm(dim=-1)
+    assert float(moved[torch.arange(17) != joint].max()) < 10 and float(moved[joint]) < 100
+    assert float((found[57].points - poses[1][57].points).norm(dim=-1).median()) < 10
+
+
+def test_a_joint_that_stays_where_it_jumped_to_is_believed(clip):
+    frames = observed(clip)[:40].clone()
+    frames[25:, 9] += 400
+    found = follow(kt.Tracker("coco17", fps=30), frames)
+    seen = [bool(p.seen[9]) for p in found[25:]]
+    assert not seen[0] and all(seen[4:])
 
 
 def test_finds_the_body_again_after_it_turned_unseen(clip):
@@ -343,6 +416,15 @@ def test_bad_options():
         kt.Tracker("auto")
     with pytest.raises(kt.ShapeError, match="nothing to reconstruct"):
         kt.Tracker("coco17").result()
+
+
+def test_options_cannot_change():
+    with kt.Tracker("coco17") as tracker:
+        for name in ("skeleton", "fps", "window", "period", "units", "threshold", "wait", "method"):
+            before = getattr(tracker, name)
+            with pytest.raises(AttributeError, match=rf"Tracker: {name} cannot change: make a new one.*{name}=15"):
+                setattr(tracker, name, 15)
+            assert getattr(tracker, name) == before
 
 
 @pytest.mark.parametrize("option", [{"units": 5}, {"wait": "no"}])

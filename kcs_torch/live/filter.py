@@ -44,17 +44,26 @@ class Shape:
         factor: units of the template per unit of the tracks.
         lengths: (B,), in units of the template.
         trunk: (trunk joints, 3) in rest, centred; empty where there is no trunk.
+        usual: log of how long bones usually look that hardly tilt, over their lengths.
+        deviation: (N,) standard deviation of the joints' depths, in units of the template; None where no
+            window has told it.
     """
 
     factor: float
     lengths: Tensor
     trunk: Tensor
+    usual: float = 0.0
+    deviation: Tensor | None = None
 
     def blended(self, before: Shape, share: float) -> Shape:
         """This size with the proportions of an earlier shape, of which this one counts ``share``."""
         tiny = torch.finfo(self.lengths.dtype).tiny
         lengths = self.lengths.clamp_min(tiny) ** share * before.lengths.clamp_min(tiny) ** (1 - share)
-        return Shape(self.factor, lengths, torch.lerp(before.trunk, self.trunk, share))
+        return replace(self, lengths=lengths, trunk=torch.lerp(before.trunk, self.trunk, share))
+
+    def sized(self, size: float) -> Shape:
+        """The same body, larger in the image by the log ``size``."""
+        return replace(self, factor=self.factor * math.exp(-size))
 
 
 @dataclass(frozen=True)
@@ -64,13 +73,16 @@ class Told:
     Attributes:
         depths: dz (T, B) of the bones, in units of the template.
         rotations: (T, 3, 3) of the trunk, template to camera.
+        sizes: (T,) log of the body's size in the image, over that of the last frame.
     """
 
     depths: Tensor
     rotations: Tensor
+    sizes: Tensor
 
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        return self.depths[index], self.rotations[index]
+    def __getitem__(self, index: int) -> Told:
+        """What is said of one frame."""
+        return Told(self.depths[index], self.rotations[index], self.sizes[index])
 
 
 class _Group:
@@ -120,7 +132,10 @@ class BodyFilter:
     Attributes:
         body: (B,) bool, bones of the trunk.
         doubt: (B,) chance that the sign of a bone's depth is wrong.
+        size: log of the trunk's size in the newest frame, over the body's; NaN where the frame does not tell it.
     """
+
+    size: float | None
 
     def __init__(self, skeleton: Skeleton, rate: float) -> None:
         slow = 30.0 / rate
@@ -144,6 +159,7 @@ class BodyFilter:
         sizes = sorted({len(limb.bones) for limb in self.limbs}, reverse=True)
         self.groups = [_Group([x for x in self.limbs if len(x.bones) == m], self.posture, self.costs) for m in sizes]
         self.rotation: Tensor | None = None
+        self.size = math.nan
         self.vote = self.posture.rest.new_zeros(2)
         self.doubt = self.posture.rest.new_zeros(len(self.bones))
 
@@ -153,18 +169,18 @@ class BodyFilter:
         scale = float(torch.quantile(longest / self.posture.rest_lengths.clamp_min(1e-9), 0.6))
         return Shape(1 / scale if scale > 0 else 1.0, self.posture.rest_lengths, rest - rest.mean(0))
 
-    def step(self, image: Tensor, weights: Tensor, shape: Shape, told: tuple[Tensor, Tensor] | None = None) -> Tensor:
+    def step(self, image: Tensor, weights: Tensor, shape: Shape, told: Told | None = None) -> Tensor:
         """Take a frame and return its bones' dz (B,), signed, in units of the template.
 
         Args:
             image: (N, 2), complete, in the tracks' units.
             weights: (N,) confidences, for the trunk.
             shape: of the body.
-            told: dz (B,) and rotation (3, 3) that a window solve found, or None.
+            told: what a window solve says of this frame, dz (B,) and rotation (3, 3), or None.
         """
         image = image * shape.factor
-        before = self.rotation
-        self.rotation = self._turned(image, weights, shape) if told is None else told[1]
+        before, self.size = self.rotation, math.nan
+        self.rotation = self._turned(image, weights, shape) if told is None else told.rotations
         both = torch.stack([self.rotation, mirror(self.rotation)])  # (2, 3, 3)
         moves = self._moves(self.rotation if before is None else before, both)
         unit = bone_vectors(image, self.bones) / shape.lengths[:, None]  # (B, 2)
@@ -180,7 +196,7 @@ class BodyFilter:
             fit = still[:, group.bones].sum(-1)[..., None] + swing[:, group.bones] @ group.signs.mT  # (2, J, S)
             unary = fit / (2 * self.costs.posture) + group.hinges(unit, deep, both)
             if told is not None:
-                share = (told[0] / shape.lengths)[group.bones].clamp(-1, 1)
+                share = (told.depths / shape.lengths)[group.bones].clamp(-1, 1)
                 unary = unary + SOLVED * (-(share[:, None] * group.signs)).clamp_min(0).sum(-1)
             depth = (deep * shape.lengths)[group.bones] / self.costs.acceleration
             margins.append(group.filter.step(unary.transpose(0, 1), depth, moves))  # (J, 2, S)
@@ -210,6 +226,8 @@ class BodyFilter:
             return fit.rotations[fit.cost[:, 0].argmin(), 0]
         start = self.rotation[None]
         fit = fit_cameras(goal, rest, share, low, high, robust=None, start=start, num_yaws=1, num_steps=STEPS)
+        if bool((weights[joints] > 0).all()):
+            self.size = math.log(float(fit.scales[0, 0]))
         return fit.rotations[0, 0]
 
     def _moves(self, before: Tensor, both: Tensor) -> Tensor:
@@ -229,7 +247,10 @@ class ChainFilter:
     Attributes:
         body: (B,) bool, all False: there is no trunk.
         doubt: (B,) chance that the sign of a bone's depth is wrong.
+        size: None: there is no trunk that tells it.
     """
+
+    size: float | None = None
 
     def __init__(self, skeleton: Skeleton, rate: float) -> None:
         costs = SignCosts()
@@ -249,13 +270,13 @@ class ChainFilter:
         factor = 2.0 / size if size > 0 else 1.0
         return Shape(factor, longest * factor, longest.new_zeros(0, 3))
 
-    def step(self, image: Tensor, weights: Tensor, shape: Shape, told: tuple[Tensor, Tensor] | None = None) -> Tensor:
+    def step(self, image: Tensor, weights: Tensor, shape: Shape, told: Told | None = None) -> Tensor:
         """Take a frame and return its bones' dz (B,); as :meth:`BodyFilter.step`."""
         flat = bone_vectors(image * shape.factor, self.bones).square().sum(-1)
         depth = (shape.lengths.square() - flat).clamp_min(0).sqrt()
         unary = depth.new_zeros(len(depth), 1, 2)
         if told is not None:
-            share = told[0] / shape.lengths
+            share = told.depths / shape.lengths
             unary = SOLVED * torch.stack([-share, share], -1).clamp_min(0)[:, None]
         margins = self.filter.step(unary, depth[:, None] / self.acceleration)[:, 0]
         self.doubt = torch.softmax(-margins, -1).amin(-1)

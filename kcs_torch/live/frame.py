@@ -4,15 +4,25 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.ranks import median
 from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.intake import as_floats, as_weights, check_places
 
 __all__ = ["Sight", "take_frame"]
+
+FASTEST, LONG = 6.0, 1.2
+"""Least speed at which a joint jumps, a second, a person being 1.75 tall; and least image of one of its bones over the
+bone's length. Both show an error of the detector."""
+
+FEW = 3
+"""Of so many joints one may jump; where more do, it is the body that moves."""
 
 
 def take_frame(
@@ -29,7 +39,8 @@ def take_frame(
         threshold: a joint with less confidence counts as unseen.
 
     Returns:
-        Points (N, 2), 0 where unseen, and weights (N,), on the CPU in double precision; and ``xy`` as a tensor.
+        Points (N, 2), 0 where unseen, and weights (N,), on the CPU in double precision; and ``xy`` as a tensor of the
+        dtype that poses have.
 
     Raises:
         ShapeError: the shape is wrong or a value infinite or out of range.
@@ -41,6 +52,8 @@ def take_frame(
         expected = f"({count}, 2) for skeleton '{body.name}'"
         raise ShapeError(f"{where}: xy: expected shape {expected}, got {tuple(given.shape)}")
     points = given.detach().to("cpu", torch.float64)
+    if isinstance(xy, np.ndarray) and xy.dtype.kind == "f" and xy.dtype.itemsize <= 4:
+        given = given.float()  # as of tensors: arrays were made double
     check_places(points, f"{where}: xy", body.joints)
     seen = torch.isfinite(points).all(-1)
     if confidence is None:
@@ -64,11 +77,43 @@ class Sight:
 
     def __init__(self, body: Skeleton) -> None:
         self.body = body
+        self.rigid = list(body.rigid)
+        self.bones = body.bone_index()[self.rigid]
         self.age = torch.zeros(body.num_joints, dtype=torch.float64)
         self.met = torch.zeros(body.num_joints, dtype=torch.bool)
 
+    def trusted(
+        self, points: Tensor, weights: Tensor, last: Tensor, lengths: Tensor, reach: float
+    ) -> tuple[Tensor, Tensor]:
+        """A frame's points and weights without the joints that jump away for a moment, whose bones would be too long.
+
+        Args:
+            points: (N, 2), 0 where unseen.
+            weights: (N,), 0 where unseen.
+            last: (N, 2) the frame before, complete.
+            lengths: (B,) of the bones, in the points' units.
+            reach: how far a joint may move in a frame, in the points' units; more often if it has not been seen.
+        """
+        seen = weights > 0
+        if not bool(seen.any()):
+            return points, weights
+        moved = points - last
+        far = (moved - median(moved[seen], 0)).norm(dim=-1) > reach * (1 + self.age)
+        far = far & seen & self.met
+        if not bool(far.any()):
+            return points, weights
+        both = seen[self.bones].all(-1)
+        loose = self.bones[both & (bone_vectors(points, self.bones).norm(dim=-1) > LONG * lengths[self.rigid])]
+        wrong = far & torch.zeros_like(far).index_fill(0, loose.flatten(), True)
+        wrong[self.body.num_observed :] = False
+        if not bool(wrong.any()) or FEW * int(wrong.sum()) > int(seen.sum()):
+            return points, weights
+        observed = slice(self.body.num_observed)
+        weights = weights.masked_fill(wrong, 0.0)[observed]
+        return self.body.complete(torch.where(weights[:, None] > 0, points[observed], 0.0), weights)
+
     def complete(self, points: Tensor, seen: Tensor, last: Tensor | None) -> Tensor:
-        """Take a frame, and place its unseen joints where they were, moved as the seen ones moved.
+        """Take a frame, and place its unseen joints where they were, moved as most of the seen ones moved.
 
         Args:
             points: (N, 2).
@@ -80,7 +125,7 @@ class Sight:
         if bool(seen.all()):
             return points
         if last is not None:
-            shift = (points - last)[seen].mean(0) if bool(seen.any()) else points.new_zeros(2)
+            shift = median((points - last)[seen], 0) if bool(seen.any()) else points.new_zeros(2)
             points = torch.where(seen[:, None], points, last + shift)
         if not bool(self.met.all()) and bool(self.met.any()):
             flat = torch.nn.functional.pad(points, (0, 1))[None]

@@ -12,6 +12,7 @@ from kcs_torch.errors import KcsError
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.ranks import median
 from kcs_torch.live.filter import Shape, Told
+from kcs_torch.live.size import longest_image
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.nn.posture import PostureEnergy, has_trunk
 from kcs_torch.skeleton import Skeleton
@@ -21,6 +22,9 @@ __all__ = ["Solution", "solve_window"]
 
 STEPS, ROUNDS = 12, 1
 """Most L-BFGS steps of a refinement, and rounds of discrete moves, of a window: the frames to come do not wait."""
+
+TURNS = 0.9
+"""Share of a window's frames in which a body without a trunk looks smaller than usual, as it turns."""
 
 
 class Solution(NamedTuple):
@@ -62,16 +66,21 @@ def solve_window(method: PKC, skeleton: Skeleton, image: Tensor, weights: Tensor
     except KcsError:
         return None
     points = found.points - found.points.mean(1, keepdim=True)
-    bones = skeleton.bone_index()
+    bones, rigid = skeleton.bone_index(), list(skeleton.rigid)
     length = median(bone_lengths(points, bones), 0)
     if posture is None:
         factor, rotations, trunk = 0.5, torch.eye(3).to(points).expand(len(points), 3, 3), points.new_zeros(0, 3)
     else:
-        rigid = list(skeleton.rigid)
         factor = 1 / float((length / posture.rest_lengths)[rigid].median().clamp_min(1e-9))
         rotations = posture.frame(points)
         part = factor * points[:, posture.trunk]
         trunk = ((part - part.mean(1, keepdim=True)) @ rotations).mean(0)
-    now = float(found.scales[-1])  # the body's size in the image may change: that of the newest frame counts
-    shape = Shape(factor / (size * now), (length * factor).clamp_min(1e-6), trunk)
-    return Solution(shape, Told(factor * bone_vectors(points, bones)[..., 2], rotations))
+    sizes = (found.scales / found.scales[-1]).log()  # it may change in the image: that of the newest frame counts
+    shape = Shape(factor / (size * float(found.scales[-1])), (length * factor).clamp_min(1e-6), trunk)
+    looks = longest_image(image, weights > 0, bones[rigid], shape.lengths[rigid] / shape.factor) - sizes
+    looks = looks[looks.isfinite()]
+    if len(looks):
+        shape = replace(shape, usual=float(torch.quantile(looks, TURNS if posture is None else 0.5)))
+    if found.deviation is not None:
+        shape = replace(shape, deviation=factor * found.deviation.square().mean(0).sqrt())
+    return Solution(shape, Told(factor * bone_vectors(points, bones)[..., 2], rotations, sizes))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -12,9 +13,10 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.live.filter import BodyFilter, ChainFilter, Shape
-from kcs_torch.live.frame import Sight, take_frame
+from kcs_torch.live.filter import BodyFilter, ChainFilter, Shape, Told
+from kcs_torch.live.frame import FASTEST, Sight, take_frame
 from kcs_torch.live.pose import Chain, LivePose
+from kcs_torch.live.size import SizeFilter, longest_image
 from kcs_torch.live.solve import Solution, solve_window
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
@@ -48,6 +50,9 @@ REPLAYED = 15
 LOST = 0.5
 """Seconds without the body after which the filter starts anew from many headings."""
 
+OPTIONS = ("skeleton", "fps", "window", "period", "units", "threshold", "wait", "method")
+"""Arguments of a tracker, and its attributes; all that it holds is made for them."""
+
 
 class Tracker:
     """3D poses of one body from 2D joints, frame by frame.
@@ -61,11 +66,15 @@ class Tracker:
     the window's. Where frames come faster, or the machine is slow, that one update waits for the thread, unless
     ``wait`` is False.
 
-    Bone lengths in the tracks' units change when a window has been solved, not between: so does the size of a body that
-    comes nearer. The camera is taken to move little. Without a template the viewpoint has to turn: depths are guesses
-    and ``ready`` is False until a full window has been solved, two windows from the start. All work is done on the CPU
-    in double precision; poses come back on the device and in the dtype of the input. Memory does not grow beyond the
-    window.
+    Bones keep their proportions until a window has been solved again. The size of a body that comes nearer or goes
+    away is followed from frame to frame, by its trunk and the bones that look longest; without a template only growth
+    is, until the next solve. The camera is taken to move little. Without a template the viewpoint has to turn: depths
+    are guesses and ``ready`` is False until a full window has been solved, two windows from the start. All work is done
+    on the CPU in double precision; poses come back on the device and in the dtype of the input, float32 for half
+    precision, float64 for whole numbers and lists. Memory does not grow beyond the window.
+
+    Frames come evenly in time: where a camera dropped some, call :meth:`update` with a frame of NaN for each. The
+    arguments are attributes that cannot change: for another rate make a new tracker.
 
     Args:
         skeleton: name, file or :class:`kcs_torch.Skeleton`; its bones form a tree.
@@ -135,23 +144,33 @@ class Tracker:
         else:
             self._filter, early, self._delay = ChainFilter(self._body, rate), EARLY[-1:], 1.0
         self._early = [min(max(LEAST, round(share * window)), window) for share in early]
+        self._rigid = list(self._body.rigid)
         self._chain = Chain(self._body, self._filter.body, rate)
         self._thread = ThreadPoolExecutor(1, "kcs_torch.live")
         self._closed = False
         self._frame = -1
         self.reset()
 
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in OPTIONS and name in vars(self):
+            raise AttributeError(f"Tracker: {name} cannot change: make a new one, Tracker(..., {name}={value!r})")
+        super().__setattr__(name, value)
+
     def reset(self) -> None:
         """Forget the body, its bone lengths and the window; frames are counted on."""
         self._filter.reset()
         self._image: deque[Tensor] = deque(maxlen=self.window)  # complete, (N, 2)
         self._weights: deque[Tensor] = deque(maxlen=self.window)
+        self._depths: deque[Tensor] = deque(maxlen=self.window)  # of the joints (N,), in the template's units
         self._shape: Shape | None = None
+        self._stray = torch.zeros(self.skeleton.num_joints, dtype=torch.float64)  # of depths from what solves found
         self._longest = torch.zeros(self.skeleton.num_bones, dtype=torch.float64)  # of the bones' images
-        self._sight = Sight(self.skeleton)
+        self._sight = Sight(self._body)
+        self._size = SizeFilter(self.fps)
         self._solving: Future[Solution | None] | None = None
         self._asked = self._ready = -1  # frames at which the running solve began, and at which it is taken over
         self._solved = -1  # frame at which the last solve began
+        self._known = self._frame  # frame from which on bone lengths are known
         self._told = 0  # frames that the proportions come from
         self._begun = self._frame + 1  # frame from which the filter follows the body without a break
         self._due = deque(self._begun + frames - 1 for frames in self._early)
@@ -162,7 +181,8 @@ class Tracker:
         Args:
             xy: (num_observed, 2) array or tensor; NaN where unseen. Without confidences, joints exactly at (0, 0)
                 or (-1, -1) are unseen, too, if all others lie to the right of (0, 0) and below it. A frame of NaN, or
-                of zeros, is one without the person; after a whole window of them the tracker starts anew.
+                of zeros, is one without the person; after a whole window of them the tracker starts anew. A joint
+                that jumps too far for a body, from one frame to the next, counts as unseen there.
             confidence: (num_observed,) in 0..1; 1 where None.
 
         Raises:
@@ -173,24 +193,31 @@ class Tracker:
             raise OptionError("Tracker: closed: it takes no frames any more; make another one")
         points, weights, like = take_frame(self.skeleton, self._frame + 1, xy, confidence, self.threshold)
         self._frame += 1
+        last = self._image[-1] if self._image else None
+        if last is not None:
+            shape = self._body_now()
+            lengths, reach = shape.lengths / shape.factor, FASTEST / self.fps / shape.factor
+            points, weights = self._sight.trusted(points, weights, last, lengths, reach)
         seen = weights > 0
         if not self._image and not bool(seen.any()):
             self._due = deque(frame + 1 for frame in self._due)
             blank, unsure = (points.new_full((len(points), 3), x).to(like) for x in (torch.nan, torch.inf))
             return LivePose(self._frame, blank, unsure[:, 0], seen.to(blank.device), False, -1)
-        if float(self._sight.age.amin()) > LOST * self.fps and bool(seen.any()):
-            self._filter.reset()
-            self._begun = self._frame
-        image = self._sight.complete(points, seen, self._image[-1] if self._image else None)
+        away = float(self._sight.age.amin()) > LOST * self.fps and bool(seen.any())
+        image = self._sight.complete(points, seen, last)
+        if away:
+            self._begin_again(image, weights)
         self._image.append(image)
         self._weights.append(weights)
         self._longest = torch.maximum(self._longest, bone_vectors(image, self._chain.bones).norm(dim=-1))
-        shape = self._shape or self._filter.guess(self._longest)
-        dz = self._filter.step(image, weights, shape)
-        points = self._chain.place(image, dz, shape).to(like)
-        unsure = self._chain.deviation(dz, shape, self._filter.doubt, self._sight.age, self._shape is not None).to(like)
+        dz, shape = self._follow(image, weights)
+        points = self._chain.place(image, weights, dz, shape)
+        off = (points[:, :2] - image).norm(dim=-1)
+        unsure = self._chain.deviation(dz, shape, self._filter.doubt, self._sight.age, self._stray, off)
+        self._depths.append(shape.factor * points[:, 2])
         delay = self._frame - self._solved if self._shape else -1
-        out = LivePose(self._frame, points, unsure, seen.to(points.device), self._shape is not None, delay)
+        ready = self._shape is not None
+        out = LivePose(self._frame, points.to(like), unsure.to(like), seen.to(like.device), ready, delay)
         if float(self._sight.age.amin()) >= self.window:
             self.reset()
         else:
@@ -232,6 +259,44 @@ class Tracker:
         """
         return self.method(self.tracks())
 
+    # ------------------------------------------------------------------ the newest frame
+
+    def _body_now(self) -> Shape:
+        """The body, as large as it was in the frame before."""
+        if self._shape is None:
+            return self._filter.guess(self._longest)
+        return self._shape.sized(self._size.value)
+
+    def _follow(self, image: Tensor, weights: Tensor, told: Told | None = None) -> tuple[Tensor, Shape]:
+        """Have a frame filtered: dz (B,) of its bones, and the body, as large as frames tell.
+
+        Args:
+            image: (N, 2), complete.
+            weights: (N,) confidences.
+            told: what a window solve says of this frame, if anything.
+        """
+        if told is None:
+            self._size.predict()
+        else:
+            self._size.value = float(told.sizes)
+        shape = self._body_now()
+        dz = self._filter.step(image, weights, shape, told)
+        if told is None and self._shape is not None:
+            self._size.correct(self._looks(image, weights, shape), self._filter.size)
+        return dz, shape
+
+    def _looks(self, image: Tensor, weights: Tensor, shape: Shape) -> float:
+        """Log of how long bones that hardly tilt look in a frame, over what is usual; NaN where too few are seen."""
+        lengths = shape.lengths[self._rigid] / shape.factor
+        return float(longest_image(image, weights > 0, self._chain.bones[self._rigid], lengths)) - shape.usual
+
+    def _begin_again(self, image: Tensor, weights: Tensor) -> None:
+        """Find a known body anew, of any heading and size, in a frame."""
+        self._filter.reset()
+        self._begun = self._frame
+        looks = self._looks(image, weights, self._body_now())
+        self._size.value, self._size.slope = self._size.value + (0.0 if math.isnan(looks) else looks), 0.0
+
     # ------------------------------------------------------------------ the window
 
     def _advance(self) -> None:
@@ -253,11 +318,25 @@ class Tracker:
         """Take over the body that was found, and let the filter take the window's last frames again."""
         count = len(found.told.depths)
         self._told = min(self._told + count, REMEMBERED * self.window)
-        shape = found.shape if self._shape is None else found.shape.blended(self._shape, count / self._told)
+        share = count / self._told
+        shape = found.shape if self._shape is None else found.shape.blended(self._shape, share)
+        self._learn(found.told, share)
+        self._known = self._frame if self._shape is None else self._known
         self._shape, self._solved = shape, self._asked
         frames = list(zip(self._image, self._weights, strict=True))
         since = self._frame - self._asked
         again = min(REPLAYED + since, len(frames), self._frame + 1 - self._begun)
         self._filter.reset()
         for i, (image, weights) in enumerate(frames[-again:], count + since - again):
-            self._filter.step(image, weights, shape, found.told[i] if i < count else None)
+            self._follow(image, weights, found.told[i] if i < count else None)
+
+    def _learn(self, told: Told, share: float) -> None:
+        """Learn from frames with bone lengths how far depths are from what a solve, counting ``share``, finds later."""
+        depths = list(self._depths)[: len(self._depths) - (self._frame - self._asked)]
+        depths = depths[max(0, len(depths) - (self._asked - self._known)) :]
+        if self._shape is None or len(depths) < LEAST:
+            return
+        solved = told.depths[len(told.depths) - len(depths) :] @ self._chain.tree.mT
+        off = (torch.stack(depths) - solved + solved.mean(-1, keepdim=True)).square().mean(0)
+        before = self._stray.square()
+        self._stray = torch.lerp(before, off, share if bool(before.any()) else 1.0).sqrt()
