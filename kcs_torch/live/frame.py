@@ -13,7 +13,7 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.ranks import median
 from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types.intake import as_floats, as_weights, check_places
+from kcs_torch.types.intake import WITHIN, as_floats, as_weights, check_places
 
 __all__ = ["Sight", "take_frame"]
 
@@ -34,7 +34,7 @@ def take_frame(
         body: the skeleton.
         number: of the frame, for messages.
         xy: (num_observed, 2); NaN where unseen. Without confidences, joints exactly at (0, 0) or (-1, -1) are unseen,
-            too, if all others lie to the right of (0, 0) and below it, or if there are none.
+            too, if others lie to the right of (0, 0) and below it (one in ten may not), or if there are none.
         confidence: (num_observed,) in 0..1; 1 where None.
         threshold: a joint with less confidence counts as unseen.
 
@@ -58,7 +58,8 @@ def take_frame(
     seen = torch.isfinite(points).all(-1)
     if confidence is None:
         corner = seen & ((points == 0).all(-1) | (points == -1).all(-1))
-        away = bool((points[seen & ~corner] > 0).all())
+        rest = points[seen & ~corner] > 0
+        away = not len(rest) or float(rest.all(-1).double().mean()) >= WITHIN
         weights = (seen & ~corner if away else seen).double()
     else:
         told = as_floats(confidence, f"{where}: confidence", 1).detach().to("cpu", torch.float64)

@@ -19,6 +19,7 @@ from kcs_torch.types.bodies import choose_skeleton, joint_order
 __all__ = [
     "FARTHEST",
     "RATES",
+    "WITHIN",
     "Intake",
     "as_floats",
     "as_number",
