@@ -134,6 +134,18 @@ def test_outliers_are_no_swaps():
     assert kt.clean.unswap(tracks) is tracks
 
 
+def test_joints_anywhere_are_no_swaps():
+    for seed in range(3):
+        tracks, chance = walk(), torch.Generator().manual_seed(seed)
+        count = tracks.skeleton.num_observed
+        points = tracks.points[:, :count].clone()
+        wrong = torch.rand(points.shape[:2], generator=chance) < 0.2
+        points[wrong] = 6000 * torch.rand(int(wrong.sum()), 2, generator=chance, dtype=points.dtype) - 3000
+        points, weights = tracks.skeleton.complete(points, tracks.weights[:, :count])
+        tracks = replace(tracks, points=points, weights=weights)
+        assert kt.clean.unswap(tracks) is tracks
+
+
 def test_a_body_that_turns_about_itself_is_left_alone():
     tracks = walking_person(90, turn=1080).tracks
     assert kt.clean.unswap(tracks) is tracks

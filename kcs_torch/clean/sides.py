@@ -11,6 +11,7 @@ from kcs_torch.clean.timing import cuts_of
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.graph import find_pieces
+from kcs_torch.solvers.stray import from_beside
 from kcs_torch.solvers.swaps import swapped_frames
 from kcs_torch.types import Tracks
 
@@ -18,6 +19,9 @@ __all__ = ["unswap"]
 
 _BODY, _LIMB = 16.0, 8.0
 """What a change costs that all pairs of joints make, and those of a limb."""
+
+_FAR = 0.5
+"""A pair that lies so many body sizes from where it is just before and just after, on either side, tells nothing."""
 
 _FEWEST = 2
 """Pairs of joints of which a limb consists, at least: one pair by itself may be an outlier."""
@@ -55,6 +59,8 @@ def unswap(tracks: Tracks) -> Tracks:
     for name, some in (("", pairs), *_limbs(body, pairs)):
         left, right = torch.tensor(some, device=points.device).T
         seen = (weights[:, left] > 0) & (weights[:, right] > 0)
+        apart = torch.where(seen[..., None], points[:, left] - points[:, right], torch.nan)
+        seen = seen & ~(from_beside(apart, mirrored=True) > _FAR * size)  # NaN is not above
         penalty = _LIMB if name else _BODY
         swapped = [
             swapped_frames(points[shot, left], points[shot, right], seen[shot], size, penalty)

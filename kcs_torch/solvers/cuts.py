@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.ranks import nanmedian
+from kcs_torch.solvers.stray import from_beside
 
 __all__ = ["find_cuts"]
 
@@ -16,8 +17,8 @@ of its size, the median distance of joints from there."""
 SUDDEN, BESIDE = 5.0, 8
 """And by more than so many times what they move between any two of so many frames before and after."""
 
-FAR, SIDE = 0.5, 3
-"""A joint that lies farther from the middle of so many places before, and of as many after, is at a wrong place."""
+FAR = 0.5
+"""A joint that lies farther from where it was just before, and from where it is just after, is at a wrong place."""
 
 LEAST, JOINTS = 4, 6
 """Frames that there must be on either side, and joints that both frames of a jump show."""
@@ -48,7 +49,7 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
     known = torch.where(seen[..., None], points, torch.nan)[shown]  # (K, N, 2)
     known = known - nanmedian(known, 1, keepdim=True)
     size = nanmedian(known.norm(dim=-1), 1)
-    known = torch.where((_strays(known) > FAR * size[:, None])[..., None], torch.nan, known)
+    known = torch.where((from_beside(known) > FAR * size[:, None])[..., None], torch.nan, known)
     twins = torch.arange(joints, device=points.device)
     twins[pairs[:, 0]], twins[pairs[:, 1]] = pairs[:, 1], pairs[:, 0]
     before, after = known[:-1], known[1:]
@@ -59,14 +60,6 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
     leaps = (step > AWAY) & (step > SUDDEN * beside.amax(1)) & (shown.diff() == 1)
     leaps[: LEAST - 1] = leaps[len(leaps) - LEAST + 1 :] = False
     return (shown[1:][leaps]).tolist()
-
-
-def _strays(poses: Tensor) -> Tensor:
-    """How far joints of poses (K, N, 2) are from the nearer of where they were just before and just after, (K, N)."""
-    blank = torch.full_like(poses[:1], torch.nan).expand(SIDE, -1, -1)
-    runs = nanmedian(torch.cat([blank, poses, blank]).unfold(0, SIDE, 1), -1)  # (K + SIDE + 1, N, 2)
-    before, after = runs[: len(poses)], runs[SIDE + 1 :]
-    return torch.fmin((poses - before).norm(dim=-1), (poses - after).norm(dim=-1))
 
 
 def _moved(before: Tensor, after: Tensor) -> Tensor:

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import reduce
 
 import torch
 from torch import Tensor
 
 from kcs_torch.functional.ranks import nanmedian
 
-__all__ = ["body_size", "each_joint", "far_off", "stray_from_neighbours"]
+__all__ = ["body_size", "each_joint", "far_off", "from_beside", "stray_from_neighbours"]
 
 STRAY, FLOOR = 6.0, 0.04
 """Of outliers: usual distances from what is predicted, and the share of the body's size beside."""
 
 AROUND = 8
 """Frames before and behind that are a joint's surroundings."""
+
+SIDE = 3
+"""Frames before, and after, that tell where a joint is just beside a frame."""
 
 NUMBERS = 2**18
 """Joints times frames that are judged at once: this takes a hundred times the memory."""
@@ -67,6 +71,21 @@ def far_off(error: Tensor, seen: Tensor) -> Tensor:
     # Bounded, as near the ends of a clip one outlier may spoil the prediction of all that is around.
     usual = torch.maximum(clip, torch.minimum(nanmedian(around, -1).mT, 4 * clip)).nan_to_num(0.0)
     return seen & (error > STRAY * usual + FLOOR)
+
+
+def from_beside(values: Tensor, mirrored: bool = False) -> Tensor:
+    """How far values (T, N, D) are from the nearer of their medians just before and just after, (T, N); NaN: unknown.
+
+    Args:
+        values: NaN where unseen.
+        mirrored: whether values of the opposite sign are the same.
+    """
+    blank = torch.full_like(values[:1], math.nan).expand(SIDE, -1, -1)
+    runs = nanmedian(torch.cat([blank, values, blank]).unfold(0, SIDE, 1), -1)  # (T + SIDE + 1, N, D)
+    before, after = runs[: len(values)], runs[SIDE + 1 :]
+    signs = (1, -1) if mirrored else (1,)
+    away = [(sign * values - place).norm(dim=-1) for sign in signs for place in (before, after)]
+    return reduce(torch.fmin, away)
 
 
 def body_size(values: Tensor, seen: Tensor) -> Tensor:
