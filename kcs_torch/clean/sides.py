@@ -20,7 +20,7 @@ __all__ = ["unswap"]
 _BODY, _LIMB = 16.0, 8.0
 """What a change costs that all pairs of joints make, and those of a limb."""
 
-_FAR = 0.5
+_FAR = 2.0
 """A pair that lies so many body sizes from where it is just before and just after, on either side, tells nothing."""
 
 _FEWEST = 2
@@ -60,7 +60,9 @@ def unswap(tracks: Tracks) -> Tracks:
         left, right = torch.tensor(some, device=points.device).T
         seen = (weights[:, left] > 0) & (weights[:, right] > 0)
         apart = torch.where(seen[..., None], points[:, left] - points[:, right], torch.nan)
-        seen = seen & ~(from_beside(apart, mirrored=True) > _FAR * size)  # NaN is not above
+        near = seen & ~(from_beside(apart, mirrored=True) > _FAR * size)  # NaN is not above
+        lone = near.sum(1) < torch.minimum(seen.sum(1), seen.new_tensor(_FEWEST, dtype=torch.long))
+        seen = near & ~lone[:, None]
         penalty = _LIMB if name else _BODY
         swapped = [
             swapped_frames(points[shot, left], points[shot, right], seen[shot], size, penalty)
