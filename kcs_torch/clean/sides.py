@@ -20,7 +20,7 @@ __all__ = ["unswap"]
 _BODY, _LIMB = 16.0, 8.0
 """What a change costs that all pairs of joints make, and those of a limb."""
 
-_FAR = 2.0
+_FAR = 1.0
 """A pair that lies so many body sizes from where it is just before and just after, on either side, tells nothing."""
 
 _FEWEST = 2
