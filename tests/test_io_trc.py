@@ -89,11 +89,12 @@ def test_the_header_is_not_believed(tmp_path):
 def test_real_files(shared):
     folder = shared / "data" / "raw_formats" / "trc"
     raw = load_motion(folder / "S00_P00_T01_BalancingTrial_0-100.trc")
-    assert (raw.num_frames, raw.num_joints, raw.fps, raw.units) == (100, 21, 60, "m")
+    assert (raw.num_frames, raw.skeleton.num_observed, raw.fps, raw.units) == (100, 21, 60, "m")
+    assert raw.skeleton.joints[21:] == ("pelvis",) and raw.skeleton.is_tree  # by the names
     head, ankle = raw.skeleton.index("Head"), raw.skeleton.index("RAnkle")
     assert float((raw.points[:, head, 1] - raw.points[:, ankle, 1]).mean()) > 1.2
     table = np.loadtxt(folder / "S00_P00_T01_BalancingTrial_0-100.trc", skiprows=5, delimiter="\t", usecols=range(65))
-    assert np.array_equal(raw.points.numpy().reshape(100, -1), table[:, 2:])
+    assert np.array_equal(raw.points[:, :21].numpy().reshape(100, -1), table[:, 2:])
     markers = load_motion(folder / "pyomeca_markers.trc")
     assert (markers.num_joints, markers.units) == (51, "mm")
     assert "the header tells 652 frames, the file has 93" in markers.notes
