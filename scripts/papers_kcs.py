@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmark import load_input
 from papers import Part, Row, Settings
 from robustness import generator
 
@@ -46,8 +45,9 @@ class Walk:
         """Tracks and truth (T, N, 3) from a camera path."""
         truth = np.einsum("tij,tnj->tni", protocol.rotation(yaw, pitch), self.points)
         truth = truth - truth[:1].mean((0, 1))
-        given = {"points2d": truth[..., :2], "confidence": np.ones(truth.shape[:2]), "edges": self.edges}
-        return load_input(given | {"joint_names": self.names, "fps": self.fps, "units": "mm"}, "walk"), truth
+        body = kt.Skeleton.from_edges(self.edges.tolist(), self.names.tolist(), name="walk")  # these bones, whatever
+        tracks = kt.Tracks.from_arrays(truth[..., :2], skeleton=body, fps=self.fps, units="mm", source="walk")
+        return tracks, truth
 
 
 def load_walk(settings: Settings, name: str, joints: int = 17) -> Walk:

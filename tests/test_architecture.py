@@ -33,7 +33,7 @@ ALLOWED = {
     "io": {"functional", "viewer"} | BASE,
     "reconstruct": {"functional", "solvers", "nn", "methods"} | BASE,
     "live": {"functional", "solvers", "nn", "methods"} | BASE,
-    "training": {"functional", "solvers", "nn", "methods", "metrics", "data", "io"} | BASE,
+    "training": {"functional", "solvers", "nn", "methods", "metrics", "clean", "data", "io"} | BASE,
     "cli": {
         "",
         "functional",

@@ -479,7 +479,11 @@ class TestCommandLine:
 
         monkeypatch.setattr(LiftingModule, "training_step", stopped)
         folders = f"hydra.run.dir={tmp_path}", f"hydra.sweep.dir={tmp_path}"
-        got, _, err = called(capsys, *sweep, *SMALL, *folders, "trainer.max_epochs=5", "seed=3")
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which shells ignore in the background
+        try:
+            got, _, err = called(capsys, *sweep, *SMALL, *folders, "trainer.max_epochs=5", "seed=3")
+        finally:
+            signal.signal(signal.SIGINT, before)
         assert got == code and f"stopped: resume={tmp_path / '0' if sweep else tmp_path} goes on" in err
 
     def test_settings_of_ones_own_may_be_added(self, capsys):

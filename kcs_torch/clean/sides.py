@@ -20,8 +20,9 @@ __all__ = ["unswap"]
 _BODY, _LIMB = 16.0, 8.0
 """What a change costs that all pairs of joints make, and those of a limb."""
 
-_FAR = 1.0
-"""A pair that lies so many body sizes from where it is just before and just after, on either side, tells nothing."""
+_FAR, _MANY = 1.0, 0.05
+"""A pair that lies so many body sizes from where it is just before and just after, on either side, tells nothing where
+there is more than this share of such pairs. What is swapped for a moment may be as far off."""
 
 _FEWEST = 2
 """Pairs of joints of which a limb consists, at least: one pair by itself may be an outlier."""
@@ -61,8 +62,9 @@ def unswap(tracks: Tracks) -> Tracks:
         seen = (weights[:, left] > 0) & (weights[:, right] > 0)
         apart = torch.where(seen[..., None], points[:, left] - points[:, right], torch.nan)
         near = seen & ~(from_beside(apart, mirrored=True) > _FAR * size)  # NaN is not above
-        lone = near.sum(1) < torch.minimum(seen.sum(1), seen.new_tensor(_FEWEST, dtype=torch.long))
-        seen = near & ~lone[:, None]
+        if int(near.sum()) < (1 - _MANY) * int(seen.sum()):
+            lone = near.sum(1) < torch.minimum(seen.sum(1), seen.new_tensor(_FEWEST, dtype=torch.long))
+            seen = near & ~lone[:, None]
         penalty = _LIMB if name else _BODY
         swapped = [
             swapped_frames(points[shot, left], points[shot, right], seen[shot], size, penalty)
