@@ -47,8 +47,6 @@ _MIDDLES = (("pelvis", "hip", ("midhip", "sacrum")), ("neck", "shoulder", ("neck
 _HEAD = frozenset(["nose", "mouth", "chin", "eyeinner", "eye", "eyeouter", "ear"])
 """What moves against the neck when the head nods."""
 
-Place = tuple[str, str]
-
 
 def has_middle(names: Sequence[str]) -> bool:
     """Whether one of the joints lies in the middle of a person's trunk.
@@ -76,17 +74,14 @@ def person_by_names(names: Sequence[str], name: str = "person") -> Skeleton | No
     """
     places = places_of_known(names)
     virtual: dict[str, list[str]] = {}
-    for middle, part, there in (
-        ("pelvis", "hip", ("midhip", "sacrum")),
-        ("neck", "shoulder", ("neck", "thorax", "spine3")),
-    ):
+    for middle, part, there in _MIDDLES:
         ends = [n for n, place in zip(names, places, strict=True) if place in (("left", part), ("right", part))]
         if len(ends) == 2 and not any(("centre", place) in places for place in there):
             virtual[middle] = ends
     everyone = [*names, *virtual]
     if len(set(everyone)) < len(everyone):
         return None
-    at: dict[Place, str] = {}
+    at: dict[tuple[str, str], str] = {}
     for joint, place in zip(everyone, places_of_known(everyone), strict=True):
         if place is None or place in at:
             return None
