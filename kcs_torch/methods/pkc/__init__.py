@@ -5,6 +5,7 @@ from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.method import PKC
 from kcs_torch.methods.pkc.moving_view import MovingView, moving_view
 from kcs_torch.methods.pkc.objective import Objective
+from kcs_torch.methods.pkc.refinement import minimise
 from kcs_torch.methods.pkc.weights import Weights
 
-__all__ = ["PKC", "Hypotheses", "MovingView", "Objective", "Weights", "fixed_view", "moving_view"]
+__all__ = ["PKC", "Hypotheses", "MovingView", "Objective", "Weights", "fixed_view", "minimise", "moving_view"]
