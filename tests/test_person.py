@@ -81,6 +81,14 @@ def test_a_tree_past_the_middle_gives_way():
     assert torch.equal(tracks.points[:, :12], flat)
 
 
+def test_a_tree_past_the_middle_gives_way_to_a_built_in_one():
+    names = SKELETONS["coco17"].joints[:17]
+    face, torso = [(0, 1), (0, 2), (1, 3), (2, 4), (0, 5)], [(5, 6), (5, 11), (11, 12)]
+    limbs = [(5, 7), (7, 9), (6, 8), (8, 10), (11, 13), (13, 15), (12, 14), (14, 16)]
+    tracks = kt.Tracks.from_arrays(clip(names)[0][..., :2], joint_names=names, edges=face + torso + limbs)
+    assert tracks.skeleton is SKELETONS["coco17"] and "past the middle" in tracks.notes[0]
+
+
 def test_a_tree_through_the_middle_is_kept():
     names = ["MidHip", "LHip", "RHip", "LKnee"]
     edges = [(0, 1), (1, 2), (1, 3)]  # whatever its links are

@@ -93,7 +93,7 @@ class Sight:
             weights: (N,), 0 where unseen.
             last: (N, 2) the frame before, complete.
             lengths: (B,) of the bones, in the points' units.
-            reach: how far a joint may move in a frame, in the points' units; more often if it has not been seen.
+            reach: how far a joint may move in a frame, in the points' units; farther if it was not seen before.
         """
         seen = weights > 0
         if not bool(seen.any()):

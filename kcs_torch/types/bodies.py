@@ -115,23 +115,19 @@ def _by_links(graph: Skeleton, names: Sequence[str] | None, notes: list[str]) ->
         which = " and ".join(fit.name for fit in fits)
         notes.append(f"the edges are those of skeletons {which}: skeleton='{fits[-1].name}' would tell much more")
     known = guess_skeleton(graph.joints)
-    person = None if known is not None else person_by_names(graph.joints, graph.name)
-    if graph.is_tree:
-        if person is not None and person.virtual and not has_middle(graph.joints):
-            notes.append(f"the edges lead past the middle of the trunk: a person's bones are taken{_between(person)}")
-            return person
+    body = known or person_by_names(graph.joints, graph.name)
+    if graph.is_tree and (body is None or not body.virtual or has_middle(graph.joints)):
         return replace(graph, tree=True)
-    if known is not None:
-        notes.append(
-            f"the file's edges are not a tree; used the built-in skeleton '{known.name}', whose joint names it has"
-        )
-        return known
-    reason = "close a chain" if graph.cycle() else f"fall into {len(graph.pieces())} pieces"
-    if person is not None:
-        notes.append(f"the edges {reason}: a person's bones are taken, by the joints' names{_between(person)}")
-        return person
-    notes.append(f"the edges {reason}: used as a graph of rigid links, not as a tree")
-    return graph
+    cut = f"fall into {len(graph.pieces())} pieces" if len(graph.pieces()) > 1 else "lead past the middle of the trunk"
+    reason = "close a chain" if graph.cycle() else cut
+    if body is None:
+        notes.append(f"the edges {reason}: used as a graph of rigid links, not as a tree")
+        return graph
+    if known is None:
+        notes.append(f"the edges {reason}: a person's bones are taken, by the joints' names{_between(body)}")
+    else:
+        notes.append(f"the edges {reason}: used the built-in skeleton '{known.name}', whose joint names these are")
+    return body
 
 
 def _pairs(edges: Any, source: str) -> list[list[int]]:

@@ -71,8 +71,8 @@ class Tracks(Trajectories):
             joint_names: N names. With a skeleton they say which joint is which: joints are matched by name, whatever
                 their order, and those that the skeleton has not are left out.
             edges: (B, 2) (parent, child) indices. A person's that lead past the middle of the trunk, from hip to hip
-                or shoulder, give way to ones through a virtual pelvis and neck. Others that are not a tree become a
-                graph of rigid links.
+                or shoulder, give way to ones through a virtual pelvis and neck. Without names, those of a built-in
+                skeleton select it. Others that are not a tree become a graph of rigid links.
             fps: frames per second; NaN and None mean unknown.
             units: of the points.
             threshold: a joint with less confidence counts as unseen.

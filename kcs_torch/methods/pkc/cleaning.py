@@ -83,7 +83,7 @@ def cleaned(
 
 
 def _likely(tracks: Tracks) -> Tensor:
-    """Which detections (T, N) of a shot neither jump far away nor belong to no body: too many would spoil all else."""
+    """Which detections (T, N) of a shot a body may have made, without those that jump far away where many do."""
     count = tracks.skeleton.num_observed
     points, seen = tracks.points[:, :count], tracks.seen[:, :count]
     kept = tracks.seen
