@@ -57,7 +57,7 @@ ODDITY = 0.09
 """By how much a usual body's lengths stray from the template's. One of twice that is told by it half as well, and so
 the viewpoint's turn tells as much where it is half as far."""
 
-TURN, POWER = 26.0, 1.2
+TURN, POWER = 30.0, 1.25
 """Degrees of the viewpoint's turn that tell as much as the template, and the power of the turn that deviations fall
 with, as those of the moving viewpoint do."""
 
