@@ -64,7 +64,7 @@ YAWS = (0.0, 45.0, 90.0, 135.0)
 # import_module, as the package's functions have the names of these modules
 BODY, FIXED, FLIPS, METHOD, MOVING, OBJECTIVE, DESCENT, DESCENTS = (
     import_module(f"kcs_torch.methods.pkc.{name}")
-    for name in ("body", "fixed_view", "flips", "method", "moving_view", "objective", "descent", "descents")
+    for name in ("body", "fixed_view", "flips", "method", "moving_search", "objective", "descent", "descents")
 )
 LENGTHS = import_module("kcs_torch.nn.lengths")
 WRITTEN_OUT = {"posture": "_posture", "foreshortening": "_foreshortening", "proportions": "_sizes"}
@@ -210,7 +210,7 @@ MOVING_VARIANTS = {
         )
     ),
     "no coarse stages": Variant(changes=(constant(MOVING, "COARSE", ()), constant(MOVING, "KEPT", ()))),
-    "SfAM's guess as the only start": Variant(changes=(constant(MOVING, "_starts", lambda *_: []),)),
+    "SfAM's guess as the only start": Variant(changes=(constant(MOVING.MovingSearch, "_starts", lambda *_: []),)),
     "no paths of single bones": Variant(changes=(constant(MOVING, "bone_paths", lambda *_: None),)),
 }
 VARIANTS = {"fixed": FIXED_VARIANTS, "others": FIXED_VARIANTS, "moving": MOVING_VARIANTS}

@@ -167,7 +167,7 @@ def test_few_bones_of_constant_length_are_put_together_from_paths(robot):
 
 def test_long_clips_are_not_put_together_from_paths(robot, monkeypatch):
     points, skeleton = robot
-    module = sys.modules["kcs_torch.methods.pkc.moving_view"]
+    module = sys.modules["kcs_torch.methods.pkc.moving_search"]
     monkeypatch.setattr(module, "LONG", 100)
     monkeypatch.setattr(module, "bone_paths", None)  # to call it would fail
     found = solve(points, skeleton)

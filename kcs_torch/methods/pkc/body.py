@@ -21,7 +21,7 @@ from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.fixed_view import searching
 from kcs_torch.methods.pkc.gaps import fill_gaps, gaps_of
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
-from kcs_torch.methods.pkc.moving_view import soften
+from kcs_torch.methods.pkc.moving_search import soften
 from kcs_torch.methods.pkc.objective import Objective, bone_noise, usual_posture
 from kcs_torch.methods.pkc.trunk import image_scale
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of

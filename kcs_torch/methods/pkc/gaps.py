@@ -10,7 +10,8 @@ from torch import Tensor
 from kcs_torch.functional.ranks import kth_smallest
 from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.descents import Descent
-from kcs_torch.methods.pkc.moving_view import FINER, ROBOT, MovingView, relative_weights, soften, too_long
+from kcs_torch.methods.pkc.moving_search import FINER, ROBOT, soften, too_long
+from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights
 from kcs_torch.solvers.procrustean import FINE, Pose
 
 __all__ = ["fill_gaps", "fillable", "freed", "gaps_of"]

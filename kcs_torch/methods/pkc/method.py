@@ -27,8 +27,8 @@ from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.long_gaps import first_frame, lengthened, shortened
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
+from kcs_torch.methods.pkc.moving_search import MovingSearch
 from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights, settled
-from kcs_torch.methods.pkc.moving_view import searching as turning
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR, Asked
 from kcs_torch.methods.pkc.sizing import TRIED, resized, with_size
 from kcs_torch.methods.root import standing_feet
@@ -309,10 +309,11 @@ class PKC(Method):
         (first,) = yield [_complete(tracks, image)]
         start, usual = (first.points, complete_rotation(first.cameras)), float(noise.median())
         weights = relative_weights(noise, usual) if usual > 0 else None
-        moving = yield from turning(
+        search = MovingSearch(
             image, tracks.skeleton, *start, weights=weights, noise=usual, lifts=self.lifts, alternatives=count,
             exact=usual == 0, seed=self.seed,
         )  # fmt: skip
+        moving = yield from search.solve()
         return moving, first
 
     def _in_space(self, tracks: Tracks, image: Tensor, noise: Tensor) -> Search[Any, Any, tuple[MovingView, Estimate]]:

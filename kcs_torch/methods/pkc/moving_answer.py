@@ -12,7 +12,7 @@ from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.methods.finish import Estimate
 from kcs_torch.methods.pkc.body import TOLD
 from kcs_torch.methods.pkc.leaps import leaps_of
-from kcs_torch.methods.pkc.moving_view import MovingView
+from kcs_torch.methods.pkc.moving_solutions import MovingView
 from kcs_torch.methods.wrong import loose_bones
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.camera_path import view_energy
