@@ -119,3 +119,8 @@ def test_script(script, part, suite, variant, tmp_path, capsys, monkeypatch):
         errors = [float(run["error"]) for run in runs if run["variant"] == name]
         assert cells[0] == name and float(cells[1]) == pytest.approx(np.mean(errors), abs=0.051)
         assert 0 < float(cells[1]) < 100 and float(cells[2]) > 0
+
+
+def test_without_coarse_stages_a_clip_of_more_frames_than_are_compared_is_solved(script):
+    tree = next(iter(script.synthetic("tree", 104)))[1]
+    assert lifted(script.MOVING_VARIANTS["no coarse stages"], tree).points.isfinite().all()

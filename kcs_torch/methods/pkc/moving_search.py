@@ -209,6 +209,8 @@ class MovingSearch:
 
     def _descended(self, pose: Pose, pull: float, stages: tuple[Stage, ...]) -> Search[Descent, Pose, Pose]:
         """Solutions of a few or of all frames after some stages, whose lengths count ``pull`` each."""
+        if not stages:
+            return pose
         tracks, weights = self._seen(pose)
         noise = self.noise
         if stages[0].eps > max(FREEING, 0.1 * noise**2):
