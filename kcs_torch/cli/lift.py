@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,7 +22,7 @@ from kcs_torch.cli.cleaning import (
     finisher,
     frame_range,
 )
-from kcs_torch.cli.detect import DetectorName, Models, What, numbered, people_of
+from kcs_torch.cli.detect import DetectorName, Models, What, people_of
 from kcs_torch.cli.options import (
     AsJson,
     FormatName,
@@ -33,12 +32,12 @@ from kcs_torch.cli.options import (
     Trust,
     check_outputs,
     image_size,
-    new_folders,
     person_number,
     use_one_thread,
 )
-from kcs_torch.cli.outputs import Scale, Units, Up, Written, check_units, check_up, parse_scale, sized, write_files
-from kcs_torch.cli.report import answer, describe, one_line, print_json, progress, summary
+from kcs_torch.cli.outputs import Scale, Units, Up, check_units, check_up, parse_scale, sized
+from kcs_torch.cli.report import answer, one_line, print_json, progress
+from kcs_torch.cli.results import Lifted, Results
 
 if TYPE_CHECKING:
     from kcs_torch.methods import Method
@@ -68,10 +67,6 @@ Settings = Annotated[
         show_default=False,
     ),
 ]
-
-
-FEW = 0.1
-"""Share of the frames; of everybody, those in sight for less are warned of."""
 
 
 def lift(
@@ -154,11 +149,6 @@ def lift(
 ) -> None:
     """Turn 2D joint tracks, or a video where a detector is installed, into 3D motion."""
     with answer(as_json) as said:
-        from kcs_torch.io import save_people, writer_for
-        from kcs_torch.types.people import shared
-        from kcs_torch.types.size import check_size
-        from kcs_torch.types.tracks import unseen_notes
-
         output = check_outputs(output, source=tracks)
         learned = _learned(method, settings) if method.endswith((LEARNED, ".ckpt")) else None
         fields = {} if learned is not None else method_fields(method, settings)
@@ -168,6 +158,7 @@ def lift(
         finish = finisher(smooth_3d)
         size_of = parse_scale(scale)
         check_up(up, output)
+        results = Results(output, person == "all", frames, up, units, size_of, quiet=as_json)
         find, skeleton = skeleton == "auto", None if skeleton == "auto" else skeleton
         if format is None and _is_video(tracks):
             clean = cleaner(SEEN if frames == SEEN else None, unswap, gate, fill, smooth, resample)
@@ -199,54 +190,15 @@ def lift(
             if person == "all" and frames is not None:
                 people = _in_sight(people, frames)
         use_one_thread()
-        reports: list[dict[str, Any]] = []
-        results, every = [], Written()
-        together = [path for path in output if person == "all" and writer_for(path).write_people is not None]
-        if together and frames == "seen":  # each has a first frame of their own then
-            say = "with --frames seen people begin at different frames"
-            typer.echo(f"note: {', '.join(map(str, together))} not written: {say}", err=True)
-            together = []
+        together = results.together()
         for number, one in people:
-            names = [numbered(path, number) if person == "all" else path for path in output]
-            check_outputs(names, source=tracks, skeleton=None if find else one.skeleton)
-            check_units(units, one.units, size_of)
-            if size_of is not None and not find:
-                check_size(one.skeleton, next(name for name in size_of if name != "units"), "--scale")
-            share = float(one.seen.any(1).double().mean())
-            if person == "all" and share < FEW:
-                say = f"visible in only {100 * share:.0f} % of the frames: the rest is guessed"
-                typer.echo(f"warning: {one_line(one.source)}: {say}", err=True)
+            results.check(number, one, tracks, find)
         cleaned = [clean(one) for _, one in people]
         chosen = (one.solution(solution) for one in _lifted(cleaned, learned or method, fields, find))
         found = [sized(finish(one.mirrored() if mirror else one), size_of) for one in chosen]
-        common = shared([(*one.tracks.notes, *one.diagnostics.notes) for one in found])
-        for (number, one), neat, result in zip(people, cleaned, found, strict=True):
-            names = [numbered(path, number) if person == "all" else path for path in output]
-            made = new_folders(names)
-            written = write_files(result, names, up, units)
-            made = [folder for folder in made if folder.exists()]
-            every.errors.extend(written.errors)
-            if together:
-                results.append(result)
-            reports.append(summary(result, solution))
-            reports[-1]["notes"] += written.notes
-            known = {*one.notes, *unseen_notes(neat.weights, neat.skeleton)}
-            reports[-1]["cleaning"] = [note for note in neat.notes if note not in known]
-            if not as_json:
-                typer.echo(describe(reports[-1], common))
-                folders = f", in new folders: {', '.join(map(str, made))}" if made else ""
-                if written.files:
-                    typer.echo(f"  wrote {', '.join(map(str, written.files))}{folders}")
-            reports[-1] |= {"person": number, "files": written.files, "new_folders": made}
-        if common and not as_json:
-            typer.echo("\n".join(["everybody:", *(f"  note: {one_line(note)}" for note in common)]))
-        for path in together:
-            every.attempt(path, partial(save_people, results, path))
-        if not as_json:
-            for path in every.files:
-                typer.echo(f"wrote {path}: everybody")
-        said |= {"people": reports, **({"together": every.files} if together else {})}
-        every.check()
+        everyone = zip(people, cleaned, found, strict=True)
+        said |= results.write([Lifted(*one, neat, motion) for one, neat, motion in everyone], solution, together)
+        results.written.check()
         if as_json:
             print_json(said)
 
