@@ -176,34 +176,8 @@ def take_in(
 ) -> Intake:
     """Check arrays of one body's motion in ``dims`` dimensions; arguments and errors as of ``Tracks.from_arrays``."""
     remarks = list(notes)
-    xy = as_floats(points, f"{source}: points (frames, joints, {dims})", None)
-    if xy.ndim != 3:
-        raise ShapeError(
-            f"{source}: points (frames, joints, {dims}): expected 3 dimensions, got shape {tuple(xy.shape)}"
-            f"{_other_dimensions(xy.shape, dims)}"
-        )
-    if confidence is not None:
-        confidence = as_floats(confidence, f"{source}: confidence (frames, joints)", 2)
-    if xy.shape[-1] != dims:
-        hint = "; confidences go into an array of their own" if xy.shape[-1] == dims + 1 else ""
-        if xy.shape[1] == dims:
-            hint = ": the last two axes are swapped, points.swapaxes(1, 2) puts them right"
-        raise ShapeError(f"{source}: points: expected shape (frames, joints, {dims}), got {tuple(xy.shape)}{hint}")
-    num_frames, num_joints = xy.shape[:2]
-    if num_frames < 1:
-        raise ShapeError(f"{source}: expected at least 1 frame, got none")
-    if num_joints < 2:
-        raise ShapeError(f"{source}: expected at least 2 joints, got {num_joints}")
-    rate = as_number(fps)
-    if fps is not None and (rate is None or rate <= 0):
-        raise ShapeError(f"{source}: fps: expected a positive number, got {fps!r}; leave it out where it is not known")
-    if rate is not None and not math.isfinite(rate):
-        rate = None
-    if rate is not None and not RATES[0] <= rate <= RATES[1]:
-        raise ShapeError(
-            f"{source}: fps: expected {RATES[0]:g} to {RATES[1]:g} frames a second, got {rate:g}; leave it out where "
-            "it is not known"
-        )
+    xy, confidence = _shaped(points, confidence, dims, source)
+    num_joints, rate = xy.shape[1], _rate(fps, source)
     least = as_number(threshold)
     if least is None or not 0 <= least <= 1:
         raise OptionError(f"{source}: threshold: expected a confidence within 0..1, got {threshold!r}")
@@ -232,7 +206,52 @@ def take_in(
         raise ShapeError(
             f"{source}: no joint is seen in any frame (confidence threshold {threshold:g}): nothing to reconstruct"
         )
-    off = (xy - xy[seen].median(0).values).detach().abs().amax(-1)
+    _check_near(xy, seen, body, source)
+    xy = torch.where(seen[..., None], xy, torch.zeros_like(xy))
+    return Intake(xy, weights, body, rate, remarks)
+
+
+def _shaped(points: Any, confidence: Any, dims: int, source: str) -> tuple[Tensor, Tensor | None]:
+    """Points (T, N, dims) and confidences (T, N) as numbers, of at least one frame and two joints."""
+    xy = as_floats(points, f"{source}: points (frames, joints, {dims})", None)
+    if xy.ndim != 3:
+        raise ShapeError(
+            f"{source}: points (frames, joints, {dims}): expected 3 dimensions, got shape {tuple(xy.shape)}"
+            f"{_other_dimensions(xy.shape, dims)}"
+        )
+    if confidence is not None:
+        confidence = as_floats(confidence, f"{source}: confidence (frames, joints)", 2)
+    if xy.shape[-1] != dims:
+        hint = "; confidences go into an array of their own" if xy.shape[-1] == dims + 1 else ""
+        if xy.shape[1] == dims:
+            hint = ": the last two axes are swapped, points.swapaxes(1, 2) puts them right"
+        raise ShapeError(f"{source}: points: expected shape (frames, joints, {dims}), got {tuple(xy.shape)}{hint}")
+    num_frames, num_joints = xy.shape[:2]
+    if num_frames < 1:
+        raise ShapeError(f"{source}: expected at least 1 frame, got none")
+    if num_joints < 2:
+        raise ShapeError(f"{source}: expected at least 2 joints, got {num_joints}")
+    return xy, confidence
+
+
+def _rate(fps: Any, source: str) -> float | None:
+    """Frames a second, None where not known."""
+    rate = as_number(fps)
+    if fps is not None and (rate is None or rate <= 0):
+        raise ShapeError(f"{source}: fps: expected a positive number, got {fps!r}; leave it out where it is not known")
+    if rate is None or not math.isfinite(rate):
+        return None
+    if not RATES[0] <= rate <= RATES[1]:
+        raise ShapeError(
+            f"{source}: fps: expected {RATES[0]:g} to {RATES[1]:g} frames a second, got {rate:g}; leave it out where "
+            "it is not known"
+        )
+    return rate
+
+
+def _check_near(points: Tensor, seen: Tensor, body: Skeleton, source: str) -> None:
+    """Raise a ShapeError where a joint (T, N, D) that counts as seen lies absurdly far from all others."""
+    off = (points - points[seen].median(0).values).detach().abs().amax(-1)
     usual = float(off[seen].median())
     stray = seen & (off > STRAY * max(usual, 1.0))
     if stray.any():
@@ -241,5 +260,3 @@ def take_in(
             f"{source}: points: {where} lies {most:.3g} off the clip's middle, half of all joints within {usual:.3g}: "
             "write NaN where a joint is unseen"
         )
-    xy = torch.where(seen[..., None], xy, torch.zeros_like(xy))
-    return Intake(xy, weights, body, rate, remarks)
