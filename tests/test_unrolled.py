@@ -410,9 +410,10 @@ def test_learning_lowers_the_error_and_keeps_parameters_positive():
 def test_parameters_pushed_far_stay_harmless(dtype):
     """A softplus underflows to zero in the end."""
     tracks, cameras, weights = scene(BODY, "gaps", dtype=dtype)
-    module = UnrolledSfAM(BODY, 4, articulate_from=0.0).to(dtype)
-    for value in (-2000.0, -100.0, 50.0):
-        for name in ("raw_threshold", "raw_stiffness", "raw_corner"):
+    own = {"lengths": range(1, BODY.num_bones + 1), "learnable_lengths": True}
+    for value in (-2000.0, -740.0, -100.0, 50.0):
+        for name in ("raw_threshold", "raw_stiffness", "raw_corner", "raw_length"):
+            module = UnrolledSfAM(BODY, 4, articulate_from=0.0, **own).to(dtype)
             with torch.no_grad():
                 getattr(module, name).fill_(value)
             run, parameters = with_parameters(module)

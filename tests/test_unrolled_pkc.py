@@ -169,11 +169,12 @@ def test_degenerate_clips_are_finite(body, kind, dtype):
     finite(lambda w, r, *v: run((w, r), v, weights=weights), tracks, cameras, *parameters)
 
 
-@pytest.mark.parametrize("value", [-2000.0, 50.0])
+@pytest.mark.parametrize("value", [-2000.0, -740.0, 50.0])
 def test_parameters_pushed_far_stay_harmless(value):
     tracks, cameras, weights = scene(BODY, "gaps")
-    for name in ("raw_eps", "raw_slack", "raw_noise"):
-        module = UnrolledPKC(BODY, 4)
+    own = {"lengths": range(1, BODY.num_bones + 1), "learnable_lengths": True}
+    for name in ("raw_eps", "raw_slack", "raw_noise", "raw_length"):
+        module = UnrolledPKC(BODY, 4, **own)
         with torch.no_grad():
             getattr(module, name).fill_(value)
         run, parameters = with_parameters(module)

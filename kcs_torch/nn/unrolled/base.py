@@ -31,6 +31,9 @@ SETTLED = 5e-3
 SHARPEST = 1e-6
 """Least corner that a step may learn: at 0 nothing would be shrunk but what is 0."""
 
+SHORTEST = 1e-6
+"""Least relative length that a bone may learn: measured lengths are divided by it."""
+
 
 class Unrolled(nn.Module):
     """Base of the unrolled solvers: ``num_steps`` steps, each with parameters of its own.
@@ -206,6 +209,10 @@ class Unrolled(nn.Module):
                 )
         known = (known / known.mean()).clamp_min(1e-3)  # a bone without length in the template may grow
         self._positive("length", known, learnable=learnable)
+
+    def _lengths(self, like: Tensor) -> Tensor:
+        """Relative bone lengths (B,) that the module holds."""
+        return self._values("length", like).clamp_min(SHORTEST)
 
     def _check(
         self,

@@ -145,7 +145,7 @@ class UnrolledKCS(Unrolled):
             return rest
         vectors = bone_vectors(rest, self.bones)
         own = vectors.norm(dim=-1)
-        factor = self._values("length", like) * own.mean() / or_one(own)
+        factor = self._lengths(like) * own.mean() / or_one(own)
         return self.inverse.to(like) @ (factor[:, None] * vectors)
 
     def find_cameras(

@@ -167,7 +167,7 @@ class UnrolledPKC(Unrolled):
             begin = clear_padding(begin - begin.mean(-2, keepdim=True), inside)
             fixed, relative = (None if lengths is None else lengths.to(wide) / size[..., 0, 0]), lengths is None
             if lengths is None and self.has_lengths:
-                fixed = self._values("length", flat)
+                fixed = self._lengths(flat)
             # Floors far below any useful value: what is learned may run away, the factorisations must not fail.
             eps, slack, noise = (
                 self._values(name, flat).clamp_min(least)

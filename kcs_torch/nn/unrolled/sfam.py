@@ -168,7 +168,7 @@ class UnrolledSfAM(Unrolled):
         if lengths is not None:
             lengths = lengths.to(tracks.dtype)
         elif self.has_lengths:
-            lengths = self._values("length", tracks)
+            lengths = self._lengths(tracks)
         fixed = None if lengths is None else lengths[..., self.rigid]
         graded = not self.skeleton.tree
         earlier = list(held or ())
