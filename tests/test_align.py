@@ -70,6 +70,13 @@ def test_minimal_turn_is_a_rotation_however_nearly_opposite(dtype):
         assert_close((turn @ unit[0][..., None])[..., 0], unit[1], atol=40 * torch.finfo(dtype).eps, rtol=0)
 
 
+def test_minimal_turn_has_derivatives_under_vmap():
+    source, target = normal(4, 3), normal(4, 3, seed=1)
+    slope = torch.func.grad(lambda a, b: minimal_turn(a, b).square()[0].sum())
+    each = torch.stack([slope(*pair) for pair in zip(source, target, strict=True)])
+    assert_close(torch.func.vmap(slope)(source, target), each)
+
+
 def test_superpose_tells_of_a_root_that_is_none():
     with pytest.raises(OptionError, match="root: expected a joint index below 5, got 5"):
         superpose(normal(4, 5, 3), normal(4, 5, 3), "root", root=5)

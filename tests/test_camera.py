@@ -19,7 +19,7 @@ from numerics import (
 )
 from torch.testing import assert_close
 
-from kcs_torch.errors import ShapeError
+from kcs_torch.errors import NotFiniteError, ShapeError
 from kcs_torch.functional import (
     back_project,
     complete_rotation,
@@ -187,6 +187,14 @@ def test_batches_equal_loops():
     same_as_loop(orthonormality_defect, (4, 2, 3))
     same_as_loop(rows_to_cameras, (4, 2, 3))
     same_as_loop(lambda x: viewpoint_turn(rows_to_cameras(x)[0]), (4, 2, 3))
+
+
+@pytest.mark.parametrize("frames", [2, 9])
+def test_factorize_refuses_nan_in_our_words(frames):
+    tracks = normal(frames, 5, 2)
+    tracks[1, 2] = torch.nan
+    with pytest.raises(NotFiniteError, match="expected finite numbers, got NaN.*weights of 0"):
+        factorize(tracks, 3)
 
 
 @pytest.mark.parametrize("joints", [5, 12])

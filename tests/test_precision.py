@@ -5,7 +5,19 @@ import torch
 from numerics import HALVES, normal, turning
 from torch.testing import assert_close
 
-from kcs_torch.functional import chain_inverse, euler_rotation, factorize, minimal_turn, orbit, rotation_angle
+from kcs_torch.functional import (
+    back_project,
+    chain_inverse,
+    euler_rotation,
+    factorize,
+    kcs_matrix,
+    minimal_turn,
+    orbit,
+    points_from_bones,
+    pose_matrix,
+    project,
+    rotation_angle,
+)
 from kcs_torch.nn import PostureEnergy
 from kcs_torch.solvers import (
     choose_path,
@@ -18,6 +30,14 @@ from kcs_torch.solvers import (
 )
 
 MOTION, PATH = normal(12, 2, 4).float(), turning(12).float()
+
+PRODUCTS = {
+    "back_project": (lambda tracks: back_project(tracks, PATH[:, :2]), normal(12, 5, 2).float()),
+    "kcs_matrix": (kcs_matrix, normal(12, 5, 3).float()),
+    "points_from_bones": (lambda vectors: points_from_bones(vectors, torch.eye(5)), normal(12, 5, 3).float()),
+    "pose_matrix": (lambda points: pose_matrix(points, [(0, 1), (1, 2)]), normal(12, 5, 3).float()),
+    "project": (lambda points: project(points, PATH[:, :2]), normal(12, 5, 3).float()),
+}
 
 TURNED = {
     "euler_rotation": (lambda angles: euler_rotation("ZXY", angles), normal(12, 3).float()),
@@ -54,9 +74,9 @@ def test_half_precision_is_widened_and_comes_back(name, dtype):
         assert_close(ours, expected.to(dtype), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("name", [*FUNCTIONS, *TURNED])
+@pytest.mark.parametrize("name", [*FUNCTIONS, *PRODUCTS, *TURNED])
 def test_autocast_makes_no_difference(name):
-    function, values = {**FUNCTIONS, **TURNED}[name]
+    function, values = {**FUNCTIONS, **PRODUCTS, **TURNED}[name]
     with torch.autocast("cpu", dtype=torch.bfloat16):
         found = both(function(values))
     for ours, expected in zip(found, both(function(values)), strict=True):

@@ -50,6 +50,7 @@ REFUSED = {
     ),
     "bone_vectors": ({"points": CLIP, "bones": [(0, 1)]}, {"points": (3,)}),
     "centre": ({"points": CLIP, "weights": MASS}, {"points": (3,), "weights": (2, 5, 4, 1)}),
+    "chain_inverse": ({"matrix": F.incidence([(0, 1), (1, 2)], 3)}, {"matrix": (3,)}),
     "complete_rotation": ({"cameras": ROWS}, {"cameras": (5, 3, 3)}),
     "distance_spread": ({"points": CLIP, "weights": MASS}, {"points": (5, 4, 2), "weights": (4, 4)}),
     "euler_angles": ({"order": "XYZ", "matrices": TURNS}, {"matrices": (5, 2, 3)}),
@@ -58,11 +59,15 @@ REFUSED = {
     "flexion": ({"upper": WAY, "lower": WAY, "axis": WAY}, {"upper": (2,), "lower": (5, 2), "axis": ()}),
     "interpolate": ({"values": CLIP, "seen": MASS > 0}, {"values": (4, 3)}),
     "joint_angles": ({"points": CLIP, "joints": [(0, 1, 2)]}, {"points": (3,)}),
+    "kcs_matrix": ({"vectors": CLIP}, {"vectors": (3,)}),
     "log_det": ({"matrix": TURNS @ TURNS.mT, "eps": torch.ones(5)}, {"matrix": (3,), "eps": (4,)}),
     "minimal_turn": ({"source": WAY, "target": WAY}, {"source": (5, 2), "target": (5, 4)}),
     "nearest_rotation": ({"matrix": TURNS}, {"matrix": (5, 2, 3)}),
     "orthonormality_defect": ({"rows": ROWS}, {"rows": (5, 3, 3)}),
-    "perspective": ({"points": CLIP + 1, "intrinsics": torch.ones(4)}, {"points": (4, 4), "intrinsics": (3, 3)}),
+    "perspective": (
+        {"points": CLIP + 1, "intrinsics": torch.ones(2, 1, 1, 4)},
+        {"points": (4, 4), "intrinsics": (3, 3)},
+    ),
     "pinhole_translation": (
         {"points": CLIP, "rays": IMAGE, "weights": MASS},
         {"points": (2, 5, 4, 4), "rays": (2, 5, 3, 2), "weights": (2, 5, 4, 1)},
@@ -107,6 +112,7 @@ FLOATING = {
     "angle_between": ("first", "second"),
     "back_project": ("tracks", "cameras"),
     "centre": ("points",),
+    "chain_inverse": ("matrix",),
     "euler_angles": ("matrices",),
     "euler_rotation": ("angles",),
     "factorize": ("tracks",),
@@ -160,7 +166,9 @@ def test_of_two_precisions_the_result_has_the_finer(name):
             torch.testing.assert_close(ours, theirs)
 
 
-@pytest.mark.parametrize("name", [*PAIRS, "centre"])
+@pytest.mark.parametrize(
+    "name", [*PAIRS, "centre", "distance_spread", "perspective", "pinhole_translation", "standing"]
+)
 def test_batches_that_do_not_fit_are_told(name):
     function, (arguments, _) = getattr(F, name), REFUSED[name]
     for what in [key for key, value in arguments.items() if isinstance(value, torch.Tensor)]:

@@ -98,7 +98,8 @@ def _minimal_turn(source: Tensor, target: Tensor) -> Tensor:
     apart, middle, least = a - b, a + b, torch.finfo(a.dtype).eps
     far = torch.where(back[..., 0], apart.square().sum(-1, keepdim=True), 1)
     opposite = middle.detach().abs().amax(-1, keepdim=True) < LOST * least
-    middle = torch.where(opposite, torch.linalg.cross(a, eye[a.abs().argmin(-1)]), middle)
+    axis = torch.arange(3, device=a.device) == a.abs().argmin(-1, keepdim=True)  # a comparison, which vmap can follow
+    middle = torch.where(opposite, torch.linalg.cross(a, axis.to(a.dtype)), middle)
     middle = torch.nn.functional.normalize(middle, dim=-1, eps=least)
     middle = middle - (middle * apart).sum(-1, keepdim=True) / far * apart  # lengths of 1 are so up to rounding only
     half = lambda axis: 2 * axis[..., :, None] * axis[..., None, :] - eye  # noqa: E731

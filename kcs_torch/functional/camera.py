@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.angles import angle_between
+from kcs_torch.functional.derivatives import why_failed
 from kcs_torch.functional.eigen import eigh
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.precision import alike, full_precision, wide, widened
@@ -41,7 +42,8 @@ def project(points: Tensor, cameras: Tensor) -> Tensor:
     check_floats(cameras, "project: cameras", 2, 3)
     check_batches("project: points and cameras", points, cameras, cores=(2, 2))
     points, cameras = alike(points, cameras)
-    return points @ cameras.mT
+    with full_precision(points):
+        return points @ cameras.mT
 
 
 def perspective(points: Tensor, intrinsics: Tensor) -> Tensor:
@@ -62,6 +64,7 @@ def perspective(points: Tensor, intrinsics: Tensor) -> Tensor:
     """
     check_core(points, "perspective: points", 3)
     check_core(intrinsics, "perspective: intrinsics", 4)
+    check_batches("perspective: points and intrinsics", points, intrinsics, cores=(1, 1))
     return intrinsics[..., :2] * points[..., :2] / points[..., 2:] + intrinsics[..., 2:]
 
 
@@ -87,6 +90,7 @@ def pinhole_translation(points: Tensor, rays: Tensor, weights: Tensor) -> Tensor
     check_floats(points, "pinhole_translation: points", "N", 3)
     check_floats(rays, "pinhole_translation: rays", points.shape[-2], 2)
     check_core(weights, "pinhole_translation: weights", points.shape[-2])
+    check_batches("pinhole_translation: points, rays and weights", points, rays, weights, cores=(2, 2, 1))
     share = weights.clamp_min(0)[..., None]
     total = share.sum(-2, keepdim=True)
     total = or_one(total)
@@ -114,7 +118,8 @@ def back_project(tracks: Tensor, cameras: Tensor) -> Tensor:
     check_floats(cameras, "back_project: cameras", 2, 3)
     check_batches("back_project: tracks and cameras", tracks, cameras, cores=(2, 2))
     tracks, cameras = alike(tracks, cameras)
-    return tracks @ cameras
+    with full_precision(tracks):
+        return tracks @ cameras
 
 
 def complete_rotation(cameras: Tensor) -> Tensor:
@@ -148,17 +153,21 @@ def factorize(tracks: Tensor, rank: int) -> tuple[Tensor, Tensor]:
 
     Raises:
         ShapeError: the tracks are not (..., T, N, 2) in floating point, or the rank is out of range.
+        NotFiniteError: the tracks hold NaN.
     """
     check_floats(tracks, "factorize: tracks", "T", "N", 2)
     frames, joints = tracks.shape[-3:-1]
     if not 1 <= rank <= min(2 * frames, joints):
         raise ShapeError(f"factorize: expected a rank within 1..{min(2 * frames, joints)}, got {rank}")
     stacked = tracks.mT.flatten(-3, -2)  # (..., 2T, N), rows x1, y1, x2, y2, ...
-    if stacked.shape[-2] >= joints:
-        _, vectors = eigh(stacked.mT @ stacked)
-        shape = vectors.flip(-1)[..., :rank].mT
-    else:
-        shape = torch.linalg.svd(stacked, full_matrices=False)[2][..., :rank, :]
+    try:
+        if stacked.shape[-2] >= joints:
+            _, vectors = eigh(stacked.mT @ stacked)
+            shape = vectors.flip(-1)[..., :rank].mT
+        else:
+            shape = torch.linalg.svd(stacked, full_matrices=False)[2][..., :rank, :]
+    except torch.linalg.LinAlgError as error:
+        raise why_failed(stacked, error) from None
     motion = stacked @ shape.mT
     return motion.unflatten(-2, (frames, 2)), shape
 

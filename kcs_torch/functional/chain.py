@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.guarded import or_one, safe_norm, unit_size
-from kcs_torch.functional.precision import wide, widened
+from kcs_torch.functional.precision import full_precision, wide, widened
 from kcs_torch.functional.shapes import check_core, check_floats
 
 __all__ = [
@@ -65,11 +65,15 @@ def chain_inverse(matrix: Tensor) -> Tensor:
     Returns:
         (N, B) matrix D (the D of KCS Algorithm 1, transposed as points are rows here).
 
+    Raises:
+        ShapeError: the matrix is not (N, B), or not in floating point.
+
     >>> C = incidence([(0, 1), (1, 2)], 3)
     >>> X = torch.tensor([[0.0, 0, 0], [0, 1, 0], [0, 2, 0]])
     >>> (chain_inverse(C) @ (C.mT @ X)).round(decimals=5).tolist()
     [[0.0, -1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     """
+    check_floats(matrix, "chain_inverse: matrix", "N", "B")
     return torch.linalg.pinv(matrix).mT
 
 
@@ -88,7 +92,8 @@ def points_from_bones(vectors: Tensor, inverse: Tensor) -> Tensor:
     """
     check_core(vectors, "points_from_bones: vectors", "B", "D")
     check_core(inverse, "points_from_bones: inverse", "N", vectors.shape[-2])
-    return inverse @ vectors
+    with full_precision(vectors):
+        return inverse @ vectors
 
 
 def bone_vectors(points: Tensor, bones: Tensor | Sequence[Sequence[int]]) -> Tensor:
@@ -137,10 +142,15 @@ def kcs_matrix(vectors: Tensor) -> Tensor:
     Returns:
         (..., B, B), in squared units; unchanged by any rotation or reflection of the pose.
 
+    Raises:
+        ShapeError: the vectors are not (..., B, D).
+
     >>> kcs_matrix(torch.tensor([[3.0, 0], [1, 2]])).tolist()
     [[9.0, 3.0], [3.0, 5.0]]
     """
-    return vectors @ vectors.mT
+    check_core(vectors, "kcs_matrix: vectors", "B", "D")
+    with full_precision(vectors):
+        return vectors @ vectors.mT
 
 
 def pose_matrix(
@@ -179,7 +189,8 @@ def pose_matrix(
         if weights is not None:  # a bone to an unseen joint says nothing of the body's size
             across = torch.where(weights[..., None, :] > 0, across, torch.zeros_like(across))
         across = unit_size(across, 2)
-    matrix = torch.bmm(across.mT, across) if across.ndim == 3 else across.mT @ across
+    with full_precision(across):
+        matrix = torch.bmm(across.mT, across) if across.ndim == 3 else across.mT @ across
     if not normalise:
         return matrix
     square = matrix.diagonal(dim1=-2, dim2=-1)

@@ -10,7 +10,7 @@ from torch import Tensor
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.guarded import or_one, safe_root
 from kcs_torch.functional.precision import wide
-from kcs_torch.functional.shapes import check_core, check_floats
+from kcs_torch.functional.shapes import check_batches, check_core, check_floats
 
 __all__ = ["distance_spread", "rigid_tree"]
 
@@ -37,6 +37,7 @@ def distance_spread(points: Tensor, weights: Tensor | None = None) -> tuple[Tens
         mean = distance.mean(-3)
         return mean.to(dtype), safe_root((distance - mean[..., None, :, :]).square().mean(-3)).to(dtype)
     check_core(weights, "distance_spread: weights", *points.shape[-3:-1])
+    check_batches("distance_spread: points and weights", points, weights, cores=(3, 2))
     weights, dtype = wide(weights), torch.promote_types(dtype, weights.dtype)
     share = torch.minimum(weights[..., :, None], weights[..., None, :]).clamp_min(0)
     total = share.sum(-3)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.precision import wide
-from kcs_torch.functional.shapes import broadcast_shapes, check_core, fit_together
+from kcs_torch.functional.shapes import broadcast_shapes, check_batches, check_core, fit_together
 
 __all__ = ["best_path", "blend_windows", "fill_between", "interpolate", "standing", "window_starts"]
 
@@ -92,6 +92,7 @@ def standing(image: Tensor, weights: Tensor) -> Tensor:
     """
     check_core(image, "standing: image", "T", "C", 2)
     check_core(weights, "standing: weights", *image.shape[-3:-1])
+    check_batches("standing: image and weights", image, weights, cores=(3, 2))
     seen = (weights > 0) & image.isfinite().all(-1)
     dtype = image.dtype if image.is_floating_point() else torch.float32
     if image.shape[-3] < 3 or not image.numel():
