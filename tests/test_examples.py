@@ -23,4 +23,10 @@ def test_example_is_short_shown_and_true(path, capsys):
 
 
 def test_examples_are_there():
-    assert {path.stem for path in EXAMPLES} == {"fit_clip", "kcs_loss", "refine_network", "train_unrolled"}
+    assert {path.stem for path in EXAMPLES} == {
+        "fit_clip",
+        "kcs_loss",
+        "lift_without_labels",
+        "refine_network",
+        "train_unrolled",
+    }
