@@ -1,6 +1,6 @@
 """Methods: one file a paper."""
 
-from kcs_torch.methods.base import Method
+from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.bmm import BMM
 from kcs_torch.methods.csf import CSF
 from kcs_torch.methods.found import find_skeleton
@@ -22,6 +22,7 @@ __all__ = [
     "PND",
     "PTA",
     "SMSR",
+    "Estimate",
     "LocalRigidity",
     "Method",
     "Rigid",
