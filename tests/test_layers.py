@@ -25,13 +25,17 @@ from kcs_torch.nn import (
     BoneLengths,
     BoneVectors,
     JointDistance,
+    KCSCritic,
     KCSDistance,
     KCSMatrix,
     LowRankEnergy,
+    MLPLifter,
     PerspectiveEnergy,
+    PostureEnergy,
     ReprojectionEnergy,
     SmoothnessEnergy,
     SymmetryEnergy,
+    UnrolledSfAM,
 )
 from kcs_torch.nn.layers import inverse_softplus, narrow
 from kcs_torch.skeleton import SKELETONS
@@ -277,6 +281,15 @@ def test_what_no_precision_holds_is_the_largest_number(dtype):
     assert value[:2].tolist() == [top, -top] and value[3] == 1.5 and value[4].isnan()
     (grad,) = torch.autograd.grad(value[:4].sum(), wide)
     assert grad[2:4].tolist() == [1, 1] and grad.isfinite().all()
+
+
+@pytest.mark.parametrize("make", [BoneLengths, KCSMatrix, PostureEnergy, KCSCritic, MLPLifter, UnrolledSfAM])
+def test_a_module_elsewhere_is_told_to_move(make):
+    """Some moved their indices silently in each call, others failed inside torch."""
+    module, points = make("h36m17").to("meta"), torch.randn(4, 17, 3)
+    given = (points[..., :2], torch.eye(3)[:2].expand(4, 2, 3)) if make is UnrolledSfAM else (points,)
+    with pytest.raises(ShapeError, match=rf"{make.__name__}: .* module, meta, got cpu: .*module.to\(points.device\)"):
+        module(*given)
 
 
 def test_confidences_are_no_coordinate():

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -61,15 +61,21 @@ def check_coordinates(points: Tensor, module: nn.Module) -> None:
 
 
 def check_joints(module: nn.Module, skeleton: Skeleton, points: Tensor, form: str) -> None:
-    """Raise a ShapeError unless ``points`` have the joints of the skeleton.
+    """Raise a ShapeError unless ``points`` have the joints of the skeleton, and are where the module is.
 
     Args:
-        module: which is asking.
+        module: which is asking; holds the skeleton's bones.
         skeleton: whose joints they have to be.
         points: (..., N, D).
         form: such as "points (..., T, {}, 3)": what is expected, with a place for the number of joints.
     """
-    joints = skeleton.num_joints
+    joints, own = skeleton.num_joints, cast(Tensor, module.bones).device
+    if own != points.device:
+        name = type(module).__name__
+        raise ShapeError(
+            f"{name}: expected points on the device of the module, {own}, got {points.device}: move the module, "
+            "module.to(points.device)"
+        )
     if points.ndim >= form.count(",") and points.shape[-2] == joints:
         return
     dims = int(form.rstrip(")").rpartition(" ")[2])
