@@ -5,6 +5,7 @@ import roma
 import torch
 from numerics import finite, normal
 from torch.autograd import gradcheck
+from torch.testing import assert_close
 
 from kcs_torch.data.synthetic import walking_person
 from kcs_torch.errors import OptionError, ShapeError
@@ -298,6 +299,17 @@ def test_energy_does_not_see_turns_and_prefers_few_motions():
         ProcrusteanEnergy(BODY, eps=0.0)
     with pytest.raises(ShapeError):
         energy(points[:, :4])
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_energy_does_not_see_places_where_joints_are_unseen(order):
+    """Bones from unseen joints, which led to the origin, were among those that frames were first turned onto."""
+    points, weights = swinging_body(20)[0], torch.ones(20, 6).double()
+    weights[torch.arange(20), 2 + torch.arange(20) % 4] = 0  # no frame shows the whole body
+    energy = ProcrusteanEnergy(BODY, order=order)
+    expected = energy(points, weights=weights)
+    for shift in (normal(3), 100 * normal(20, 1, 3)):
+        assert_close(energy(points + shift, weights=weights), expected)
 
 
 def test_tracks_that_are_unseen_may_be_nan():

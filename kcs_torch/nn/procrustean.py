@@ -78,8 +78,10 @@ class ProcrusteanEnergy(SkeletonModule):
             expected = f"points (..., T, {points.shape[-2]}, 3) and rotations (..., T, 3, 3) or None"
             raise ShapeError(f"ProcrusteanEnergy: expected {expected}, got points {tuple(points.shape)}")
         with full_precision(points):
-            vectors = bone_vectors(wide(known(points, weights)), self.bones)
-            share = None if weights is None else bone_share(weights, self.bones).to(vectors.dtype)[..., None]
+            vectors, share = bone_vectors(wide(points), self.bones), None
+            if weights is not None:
+                share = bone_share(weights, self.bones).to(vectors.dtype)
+                vectors, share = known(vectors, share), share[..., None]
             if rotations is None:
                 rotations = _align(vectors, self.num_steps, share)
             aligned = (vectors @ rotations.to(vectors.dtype)).flatten(-2)
