@@ -166,8 +166,8 @@ def test_implicit_gradient_reaches_the_last_step_alone_and_no_start():
     value.square().sum().backward()
     assert start.grad is None
     assert torch.equal(module.raw_threshold.grad != 0, torch.tensor([False, False, True]))
-    # A fixed point does not depend on the step size that leads to it.
-    assert (module.raw_step.grad.abs() < 1e-3 * module.raw_threshold.grad.abs().max()).all()
+    # A fixed point does not depend on the step size that leads to it: Adam would follow what rounding leaves.
+    assert not module.raw_step.grad.any()
 
 
 def test_implicit_goes_on_until_the_shape_stands_still():

@@ -164,6 +164,14 @@ class Unrolled(nn.Module):
     def _values(self, name: str, like: Tensor) -> Tensor:
         return nn.functional.softplus(getattr(self, f"raw_{name}")).to(like)
 
+    def _step_sizes(self, like: Tensor) -> Tensor:
+        """Step size of each step, with the derivative 0 where a fixed point is sought, which hardly depends on it.
+
+        What has not settled leaves some slope. Adam, which divides by its size, would go on to steps that diverge.
+        """
+        size = self._values("step", like)
+        return size if self.implicit is None else size.detach() + 0 * size
+
     def _hold_corner(self, corner: float) -> None:
         """Hold the corner of each step; an infinite one is the plain nuclear norm, and nothing to learn."""
         self.corner = corner

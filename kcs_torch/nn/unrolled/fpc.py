@@ -118,7 +118,7 @@ class UnrolledFPC(Unrolled):
         weights = self._check(tracks, cameras, weights, start, inside=inside)
         given, tracks = tracks, wide(known(tracks, weights))
         cameras, weights = clear_padding(wide(cameras), inside), wide(weights)
-        threshold, step = self._values("threshold", tracks), self._values("step", tracks)
+        threshold, step = self._values("threshold", tracks), self._step_sizes(tracks)
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
             corners = self._corners(scale)

@@ -240,7 +240,7 @@ class UnrolledKCS(Unrolled):
         with full_precision(tracks):
             points, share = self._centred(wide(tracks), wide(weights))
             rows, rest = clear_padding(wide(cameras), inside), self.template(points)
-            threshold, step = self._values("threshold", points), self._values("step", points)
+            threshold, step = self._values("threshold", points), self._step_sizes(points)
             matrix, inverse = self.matrix.to(points), self.inverse.to(points)
             if scales is None:
                 with torch.no_grad():

@@ -163,7 +163,7 @@ class UnrolledSfAM(Unrolled):
         )
         given, tracks = tracks, wide(known(tracks, weights))
         cameras, weights = clear_padding(wide(cameras), inside), wide(weights)
-        threshold, step = self._values("threshold", tracks), self._values("step", tracks)
+        threshold, step = self._values("threshold", tracks), self._step_sizes(tracks)
         stiffness = self._values("stiffness", tracks)
         if lengths is not None:
             lengths = lengths.to(tracks.dtype)
