@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 import kcs_torch as kt
 from kcs_torch.cli import app
 from kcs_torch.data import random_motion, walking_person
-from kcs_torch.errors import FormatError, OptionError, OutputError, SkeletonError
+from kcs_torch.errors import FormatError, OptionError, OutputError, ShapeError, SkeletonError
 from kcs_torch.nn import CameraHead, MLPLifter, TemporalLifter
 from kcs_torch.skeleton import SKELETONS, Skeleton
 from kcs_torch.training import Lifter, load_lifter, save_lifter
@@ -46,6 +46,18 @@ class Truth(torch.nn.Module):
     def forward(self, tracks, weights):
         assert tracks.shape[-3:-1] == self.points.shape[:2]
         return torch.cat([tracks, self.points[..., 2:].expand(*tracks.shape[:-1], 1)], -1)
+
+
+@pytest.mark.parametrize(
+    ("answer", "got"),
+    [(lambda x: x, r"\(1, 9, 17, 2\)"), (lambda x: x[:, 4], r"\(1, 17, 2\)"), (lambda x: (x, x), "a tuple")],
+)
+def test_a_network_that_answers_with_no_points_is_told(answer, got):
+    network = Truth(torch.zeros(1, 9, 17, 3), SKELETONS["h36m17"])
+    network.forward = lambda tracks, weights: answer(tracks)
+    expected = rf"lifter: Truth: expected an answer of points \(C, T, N, 3\) = \(1, 9, 17, 3\), got {got}"
+    with pytest.raises(ShapeError, match=expected):
+        kt.reconstruct(walking_person(9, skeleton="h36m17").tracks, method=Lifter(network))
 
 
 # ---------------------------------------------------------------- files

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kcs_torch.errors import OptionError, SkeletonError, listed
+from kcs_torch.errors import OptionError, ShapeError, SkeletonError, listed
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods import Method
 from kcs_torch.methods.base import Estimate
@@ -133,6 +133,7 @@ class Lifter(Method):
             for start in range(0, frames, step):
                 low, high = max(0, start - reach), min(frames, start + step + reach)
                 part = self.network(image[:, low:high], seen[:, low:high], **options)
+                _check_answer(self.network, part, (len(image), high - low, image.shape[2], 3))
                 parts.append(part[:, start - low : start - low + step])
         return torch.cat(parts, 1).to(points)
 
@@ -223,6 +224,15 @@ def match_joints(own: Skeleton, body: Skeleton, source: str) -> Match:
     if unknown:
         notes.append(f"not among the network's joints, so their depth is the template's: {', '.join(unknown)}")
     return Match(False, [-1 if i is None else i for i in found], back, tuple(notes))
+
+
+def _check_answer(network: nn.Module, answer: Any, expected: tuple[int, ...]) -> None:
+    """Raise a ShapeError unless a network of the user's own answers with points of this shape."""
+    if not isinstance(answer, Tensor) or answer.shape != expected:
+        got = tuple(answer.shape) if isinstance(answer, Tensor) else f"a {type(answer).__name__}"
+        raise ShapeError(
+            f"lifter: {type(network).__name__}: expected an answer of points (C, T, N, 3) = {expected}, got {got}"
+        )
 
 
 @contextmanager
