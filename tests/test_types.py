@@ -359,8 +359,10 @@ def test_unknown_skeletons():
         Tracks.from_arrays(grid(), skeleton="coco")
     with pytest.raises(SkeletonError, match="unknown skeleton 'COCO17': did you mean 'coco17'"):
         Tracks.from_arrays(grid(), skeleton="COCO17")
-    with pytest.raises(SkeletonError, match="unknown skeleton 17"):
-        Tracks.from_arrays(grid(), skeleton=17)
+    for other, shown in ((17, "17"), ([(0, 1), (1, 2)], r"\[\(0, 1\), \(1, 2\)\]")):
+        expected = f"unknown skeleton {shown}: .*got an? {type(other).__name__}: .*Skeleton.from_edges"
+        with pytest.raises(SkeletonError, match=expected):
+            Tracks.from_arrays(grid(), skeleton=other)
     with pytest.raises(FormatError, match="nowhere.yaml: cannot be read"):
         Tracks.from_arrays(grid(), skeleton="nowhere.yaml")
 

@@ -60,6 +60,11 @@ def get_skeleton(skeleton: str | Path | Skeleton) -> Skeleton:
         return Skeleton.load(skeleton)
     if isinstance(skeleton, str) and skeleton not in SKELETONS and Path(skeleton).is_file():
         raise SkeletonError(f"{skeleton}: expected a skeleton's file to be called .yaml or .json")
+    if not isinstance(skeleton, str):
+        raise SkeletonError(
+            f"unknown skeleton {str(skeleton)[:100]}: expected a Skeleton, a built-in name or a file, got a "
+            f"{type(skeleton).__name__}: Skeleton.from_names(joints, bones) or Skeleton.from_edges(edges, joints)"
+        )
     if skeleton not in SKELETONS:
         raise unknown("skeleton", skeleton, SKELETONS, SkeletonError)
     return SKELETONS[skeleton]
