@@ -49,6 +49,25 @@ def test_noise_gaps_and_wrong_frames_are_no_cuts():
     assert find_cuts(torch.zeros(30, 8, 2), torch.ones(30, 8, dtype=torch.bool), NONE) == []
 
 
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.3, 0.4])
+def test_joints_that_come_and_go_are_no_cuts(share):
+    """Neither moves the body's middle, nor do sides alone tell how far a body moved that few joints show."""
+    for seed, yaw in enumerate((0.0, 60.0, 120.0)):
+        tracks = walking_person(120, skeleton="coco17", yaw=yaw, turn=0.0).tracks
+        draw = torch.Generator().manual_seed(seed)
+        gone = torch.rand(tracks.weights.shape, generator=draw) < share
+        assert cuts_of(replace(tracks, weights=torch.where(gone, 0, tracks.weights))) == []
+
+
+def test_cuts_are_found_where_joints_come_and_go():
+    tracks, _ = film(0.0, 90.0)
+    found = 0
+    for seed in range(8):
+        gone = torch.rand(tracks.weights.shape, generator=torch.Generator().manual_seed(seed)) < 0.15
+        found += cuts_of(replace(tracks, weights=torch.where(gone, 0, tracks.weights))) == [24]
+    assert found >= 6
+
+
 def test_sides_that_a_detector_takes_for_each_other_are_no_cut():
     tracks = walking_person(40, yaw=0.0, turn=0.0).tracks
     points = tracks.points.clone()

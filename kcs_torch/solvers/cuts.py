@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.ranks import nanmedian
+from kcs_torch.functional.temporal import interpolate
 from kcs_torch.solvers.stray import from_beside
 
 __all__ = ["find_cuts"]
@@ -46,14 +47,17 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
     shown = (2 * seen.sum(-1) >= joints).nonzero().flatten()
     if joints < JOINTS or len(shown) < 2 * LEAST:
         return []
-    known = torch.where(seen[..., None], points, torch.nan)[shown]  # (K, N, 2)
-    known = known - nanmedian(known, 1, keepdim=True)
-    size = nanmedian(known.norm(dim=-1), 1)
+    some = seen.any(0)
+    whole = interpolate(points, seen)[shown][:, some]  # with those that are seen in a frame its middle would leap
+    middle = nanmedian(whole, 1, keepdim=True)
+    size = nanmedian((whole - middle).norm(dim=-1), 1)
+    known = torch.where(seen[..., None], points, torch.nan)[shown] - middle  # (K, N, 2)
     known = torch.where((from_beside(known) > FAR * size[:, None])[..., None], torch.nan, known)
     twins = torch.arange(joints, device=points.device)
     twins[pairs[:, 0]], twins[pairs[:, 1]] = pairs[:, 1], pairs[:, 0]
     before, after = known[:-1], known[1:]
-    step = torch.fmin(_moved(before, after), _moved(before, after[:, twins]))
+    own, swapped = _moved(before, after), _moved(before, after[:, twins])
+    step = torch.minimum(own, swapped.nan_to_num(torch.inf))
     step = (step / torch.minimum(size[1:], size[:-1])).nan_to_num(0.0, 0.0)  # a body at one point has no pose
     beside = torch.nn.functional.pad(step, (BESIDE, BESIDE)).unfold(0, 2 * BESIDE + 1, 1).clone()
     beside[:, BESIDE] = 0
