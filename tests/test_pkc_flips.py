@@ -32,6 +32,7 @@ def test_parts_of_a_body():
     assert all(tuple(pair) in parts for pair in BODY.mirror_bones)
     outer = {b for limb in limbs for b in limb.bones}
     assert tuple(b for b in range(16) if b not in outer) in [tuple(sorted(part)) for part in parts]
+    assert tuple(range(16)) in parts  # all of it: the mirror image, which no ray tells
 
 
 def bones_of(frames=40, seed=0):
@@ -205,6 +206,49 @@ def test_a_wrong_run_is_turned_over(stands):
     apart = lambda z: float((z - start.depth[0]).square().mean().sqrt())  # noqa: E731
     assert apart(found.depth[0]) < 0.3 * apart(wrong.depth[0])
     assert 20 < found.steps < 20 + 4 * 2 * 30
+
+
+def exact_walk(frames=60):
+    """An objective, its parts, the true bones' depths (T, B) and lengths (1, B) of a walk before a still camera."""
+    points = walk(frames, yaw=45.0)
+    image = points[..., :2] - points[..., :2].mean(1, keepdim=True)
+    objective = Objective(BODY, image, Weights(), torch.zeros(frames, 17).double())
+    bones = bone_vectors(points, objective.bones)
+    parts = parts_of(BODY, limbs_of(BODY, objective.posture.trunk.tolist()))
+    return objective, parts, bones[..., 2], bones.norm(dim=-1).mean(0, keepdim=True)
+
+
+def hypothesis(objective, own, lengths):
+    depth = objective.joints(own)[None]
+    return Hypotheses(depth, lengths, objective(depth, lengths))
+
+
+def test_a_body_that_is_mirrored_for_a_while_is_turned_over_at_once():
+    objective, parts, own, lengths = exact_walk()
+    objective.weights = Weights(acceleration=1.0)  # so that it may start where the body is away from the image plane
+    true = hypothesis(objective, own, lengths)
+    for run_of in (slice(None), slice(30, None)):
+        wrong = own.clone()
+        wrong[run_of] *= -1
+        flips = flipped(objective, parts, hypothesis(objective, wrong, lengths))
+        same = (flips.depth - true.depth).abs().amax((1, 2)) < 1e-9
+        assert same.sum() == 1
+
+
+@pytest.mark.parametrize("between", [0.0, 0.02, -0.02])
+def test_a_jump_with_a_frame_in_its_middle_is_a_jump(between):
+    """Descent leaves one there, with a bone too short; what follows is turned over all the same, and is whole."""
+    objective, parts, own, lengths = exact_walk()
+    bone = int(own.abs().amin(0).argmax())  # one that stays away from the image plane
+    assert own[:, bone].abs().amin() > 0.03
+    wrong = own.clone()
+    wrong[31:, bone] *= -1
+    wrong[30, bone] = between
+    start = hypothesis(objective, wrong, lengths)
+    flips = flipped(objective, parts, start)
+    true = objective.joints(own)
+    off = (flips.depth - true).abs().amax((1, 2))
+    assert off.amin() < 1e-6 and flips.energy[off.argmin()] < start.energy[0]
 
 
 def task(objective, depth, lengths):

@@ -17,6 +17,7 @@ from kcs_torch.methods.pkc.limbs import Limb
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.run_costs import ParallelRays, RunCosts, Runs, Turnable, inside
 from kcs_torch.methods.pkc.strides import strides
+from kcs_torch.methods.pkc.weights import HEAVY
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["flipped", "flipped_runs", "members", "parts_of", "promising", "signs_of", "turned_over"]
@@ -67,6 +68,7 @@ def parts_of(skeleton: Skeleton, limbs: Sequence[Limb]) -> list[tuple[int, ...]]
     central = tuple(b for b in range(skeleton.num_bones) if b not in twins)
     parts = [part for limb in limbs for part in (*((b,) for b in limb.bones), limb.bones)]
     parts += [along, across, along + across, central, *skeleton.mirror_bones, *((b,) for b in trunk)]
+    parts.append(tuple(range(skeleton.num_bones)))
     return [part for part in dict.fromkeys(parts) if part]
 
 
@@ -128,7 +130,7 @@ def flipped(
         body: the same, if it is not seen along parallel rays.
     """
     if body is None:
-        body = ParallelRays(objective, bone_vectors(best.depth[0, ..., None], objective.bones)[..., 0])
+        body = ParallelRays(objective, _one_sided(objective, best))
     own = body.own
     member = members(parts, own)
     runs = flipped_runs(own, member, objective.weights.acceleration)
@@ -151,6 +153,19 @@ def flipped(
     if objective.standing is None or not objective.noisy:  # of exact images the motion tells where bones pass the plane
         return found
     return found.joined(_strides(objective, body, member, runs, best))
+
+
+def _one_sided(objective: Objective, best: Hypotheses) -> Tensor:
+    """Depths (T, B) of the best solution's bones, as long as their bones are in frames that lie between two signs.
+
+    Where a sign jumps away from the image plane, descent leaves a frame in the middle, in which the bone is far too
+    short and points neither way: it would hide that the motion is smooth if all that follows is turned over.
+    """
+    own = bone_vectors(best.depth[0, ..., None], objective.bones)[..., 0]
+    square, lengths = own.square(), best.lengths[0]
+    whole = lengths.square() - objective.flat
+    short = (whole - square) / (2 * lengths) > (HEAVY / objective.precision(best.lengths[:1])[0]).sqrt()
+    return torch.where(short, torch.copysign(whole.clamp_min(0).sqrt(), own), own)
 
 
 def _strides(objective: Objective, body: Turnable, member: Tensor, runs: Runs, best: Hypotheses) -> Hypotheses:
