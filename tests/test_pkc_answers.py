@@ -1,12 +1,15 @@
 """What is told beside the best solution: which bones the prior decided, and how sure depth is."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from numerics import CHAIN
 from torch.testing import assert_close
 
+from kcs_torch import reconstruct
+from kcs_torch.data import walking_person
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.methods.pkc import answers
 from kcs_torch.methods.pkc.answers import angle_doubt, depth_deviation, told_by_prior
@@ -177,3 +180,15 @@ def test_noise_in_one_frame_is_that_frame_s_and_lengths_share_it(monkeypatch):
     assert (found[others] > clean[others]).any() and (found[others] <= spread[others]).all()
     monkeypatch.setattr(answers, "NOISE", 0.0)
     assert_close(deviation(noise), deviation(even))
+
+
+@pytest.mark.parametrize(("swing", "noisy"), [(0.0, True), (1.0, False)])
+def test_a_body_at_rest_is_as_unsure_as_a_few_frames_are(swing, noisy):
+    """It shows one pose, however long: with exact lengths a body unlike its template would lean."""
+    clip = walking_person(60, turn=0.0, yaw=50.0, generator=torch.Generator().manual_seed(0)).tracks
+    first = clip.points[:1]
+    tracks = replace(clip, points=first + swing * (clip.points - first))
+    long, short = (reconstruct(tracks.frames(0, n), intrinsics="parallel") for n in (60, 6))
+    assert (long.uncertainty.mean() > 0.7 * short.uncertainty.mean()) == noisy
+    same = (long.points[:6] - short.points).norm(dim=-1).mean() / short.points.norm(dim=-1).mean()
+    assert not noisy or same < 0.1

@@ -17,7 +17,9 @@ from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.batch import Noisy
 from kcs_torch.methods.pkc.gate import plausible
+from kcs_torch.methods.pkc.weights import slowness
 from kcs_torch.methods.unseen import gap_deviation, place_unseen, within_reach
+from kcs_torch.nn.posture import has_trunk
 from kcs_torch.solvers.denoise import Denoised
 from kcs_torch.solvers.noise import SHORT
 from kcs_torch.solvers.spectrum import window_at
@@ -37,7 +39,8 @@ QUICK = 2.2
 HINT = "If a detector found the joints, detections=True allows for its errors, which last"
 
 UNTOLD = 0.015
-"""Noise that is assumed where a clip is too short to tell it: that of good detections."""
+"""Noise that is assumed where a clip is too short to tell it, or shows hardly more than one pose: that of good
+detections."""
 
 FAR = 0.5
 """Share of the body's size from which on a jump is surely wrong; smaller ones are for the model of the clip to tell."""
@@ -127,7 +130,7 @@ def _complete(tracks: Tracks, points: Tensor, keep: Tensor, left: float) -> tupl
     if detected(tracks):
         noise = noise.maximum(detector_deviation(tracks))
         notes.append("taken for a detector's joints: they may be off by 3 % of the body's size or more, frames on end")
-    if len(points) < SHORT:
+    if len(points) / _alike(tracks, points) < SHORT:
         noise = noise.clamp_min(UNTOLD)
     held = _nearest_shown(keep)
     away = held != torch.arange(len(held), device=held.device)
@@ -137,6 +140,12 @@ def _complete(tracks: Tracks, points: Tensor, keep: Tensor, left: float) -> tupl
         show = "shows" if count == 1 else "show"
         notes.append(f"{counted(count, 'frame')} at the clip's ends {show} nobody: nearest pose held")
     return points, noise, notes
+
+
+def _alike(tracks: Tracks, points: Tensor) -> float:
+    """How many frames of a shot tell as much as one of a person who walks, at least 1; 1 where no template tells."""
+    body = tracks.skeleton
+    return max(1.0, slowness(points, body, tracks.rate)) if has_trunk(body) else 1.0
 
 
 def _nearest_shown(seen: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.nn.lengths import free_bones
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["ANCHOR", "CORNER", "HEAVY", "NOISE", "Weights", "at_pace", "in_noise", "pace_of", "wide"]
+__all__ = ["ANCHOR", "CORNER", "HEAVY", "NOISE", "Weights", "at_pace", "in_noise", "pace_of", "slowness", "wide"]
 
 NOISE, CORNER = 0.8, 0.3
 """Share of the noise's variance that is not to be explained, and how gently its cost sets in."""
@@ -99,17 +99,24 @@ def in_noise(weights: Weights, noise: float) -> Weights:
 def pace_of(image: Tensor, skeleton: Skeleton, rate: float) -> float:
     """How many frames tell as much as one of a walking person's at 30 frames a second, usually at least ``rate / 30``.
 
-    The deviation of the bones' images over that of their changes: the time in which a pose changes into another. But no
-    clip, not even a single image, tells less of a body's posture than :data:`LEAST` of such frames: else a template
-    whose proportions are not the body's would have it lean, which makes all bones look shorter.
+    As :func:`slowness` says. But no clip, not even a single image, tells less of a body's posture than :data:`LEAST` of
+    such frames: else a template whose proportions are not the body's would have it lean, which makes all bones look
+    shorter.
 
     Args:
         image: (T, N, 2).
         skeleton: with a template or proportions.
         rate: frames a second.
     """
-    most = len(image) / (LEAST * Weights.posture)
-    least = min(rate / 30, most)
+    return min(slowness(image, skeleton, rate), len(image) / (LEAST * Weights.posture))
+
+
+def slowness(image: Tensor, skeleton: Skeleton, rate: float) -> float:
+    """The deviation of the bones' images over that of their changes, in which a pose changes into another.
+
+    It is over the same of a walking person, and at least ``rate / 30``; arguments as of :func:`pace_of`.
+    """
+    least = rate / 30
     usual = skeleton.relative_lengths(dtype=image.dtype, device=image.device)
     if len(image) < 3 or usual is None:
         return least
@@ -118,7 +125,7 @@ def pace_of(image: Tensor, skeleton: Skeleton, rate: float) -> float:
     moved = float(vectors.diff(dim=0).square().sum((1, 2)).mean().sqrt())
     spread = float((vectors - vectors.mean(0)).square().sum((1, 2)).mean().sqrt())
     time = spread / moved if moved > spread / len(image) else float(len(image))
-    return min(max(least, time / WALK), most)
+    return max(least, time / WALK)
 
 
 def wide(value: Tensor | float, dims: int) -> Tensor | float:
