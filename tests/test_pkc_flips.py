@@ -33,6 +33,12 @@ def test_parts_of_a_body():
     outer = {b for limb in limbs for b in limb.bones}
     assert tuple(b for b in range(16) if b not in outer) in [tuple(sorted(part)) for part in parts]
     assert tuple(range(16)) in parts  # all of it: the mirror image, which no ray tells
+    both = {tuple(sorted({*one.bones, *other.bones})) for one in limbs for other in limbs if twins(one, other)}
+    assert len(both) == 2 and both <= set(parts)  # both arms, both legs
+
+
+def twins(one, other):
+    return set(zip(one.bones, other.bones, strict=False)) <= set(BODY.mirror_bones) and len(one.bones) == 2
 
 
 def bones_of(frames=40, seed=0):
@@ -223,13 +229,18 @@ def hypothesis(objective, own, lengths):
     return Hypotheses(depth, lengths, objective(depth, lengths))
 
 
-def test_a_body_that_is_mirrored_for_a_while_is_turned_over_at_once():
+@pytest.mark.parametrize("which", [None, ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")])
+def test_what_is_mirrored_for_a_while_is_turned_over_at_once(which):
+    """The body, or both arms or legs: one alone would be unlike its twin, and so dearer."""
     objective, parts, own, lengths = exact_walk()
     objective.weights = Weights(acceleration=1.0)  # so that it may start where the body is away from the image plane
     true = hypothesis(objective, own, lengths)
-    for run_of in (slice(None), slice(30, None)):
+    ends = [BODY.bone_names[b].split("-") for b in range(16)]
+    of = [b for b, end in enumerate(ends) if not which or all(name.endswith(which) for name in end)]
+    assert len(of) == (4 if which else 16)
+    for frames in (slice(None), slice(30, None)):
         wrong = own.clone()
-        wrong[run_of] *= -1
+        wrong[frames, of] *= -1
         flips = flipped(objective, parts, hypothesis(objective, wrong, lengths))
         same = (flips.depth - true.depth).abs().amax((1, 2)) < 1e-9
         assert same.sum() == 1

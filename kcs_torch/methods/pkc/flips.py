@@ -60,7 +60,7 @@ SLIGHT = 0.006
 
 
 def parts_of(skeleton: Skeleton, limbs: Sequence[Limb]) -> list[tuple[int, ...]]:
-    """Bones whose signs change together: of limbs each, both, and their twins; the trunk's long and cross bones."""
+    """Bones whose signs change together: of limbs, with their twins; the trunk's long and cross bones; all."""
     twins = {b for pair in skeleton.mirror_bones for b in pair}
     outer = {b for limb in limbs for b in limb.bones}
     trunk = [b for b in range(skeleton.num_bones) if b not in outer]
@@ -68,6 +68,9 @@ def parts_of(skeleton: Skeleton, limbs: Sequence[Limb]) -> list[tuple[int, ...]]
     central = tuple(b for b in range(skeleton.num_bones) if b not in twins)
     parts = [part for limb in limbs for part in (*((b,) for b in limb.bones), limb.bones)]
     parts += [along, across, along + across, central, *skeleton.mirror_bones, *((b,) for b in trunk)]
+    twin = {a: b for pair in skeleton.mirror_bones for a, b in (pair, pair[::-1])}
+    long = [limb.bones for limb in limbs if len(limb.bones) > 1]
+    parts += [tuple(sorted({*bones, *(twin.get(b, b) for b in bones)})) for bones in long]
     parts.append(tuple(range(skeleton.num_bones)))
     return [part for part in dict.fromkeys(parts) if part]
 
