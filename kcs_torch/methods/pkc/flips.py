@@ -168,6 +168,8 @@ def _one_sided(objective: Objective, best: Hypotheses) -> Tensor:
     square, lengths = own.square(), best.lengths[0]
     whole = lengths.square() - objective.flat
     short = (whole - square) / (2 * lengths) > (HEAVY / objective.precision(best.lengths[:1])[0]).sqrt()
+    short[1:-1] &= own[:-2] * own[2:] < 0
+    short[[0, -1]] = False
     return torch.where(short, torch.copysign(whole.clamp_min(0).sqrt(), own), own)
 
 
