@@ -59,7 +59,7 @@ the viewpoint's turn tells as much where it is half as far."""
 
 TURN, POWER = 30.0, 1.25
 """Degrees of the viewpoint's turn that tell as much as the template, and the power of the turn that deviations fall
-with, as those of the moving viewpoint do."""
+with."""
 
 SHORT, LEAST_FRAMES, AROUND = 10.0, 12, 240.0
 """Independent frames up to which angles are the less sure the fewer there are, up to three times; frames from which on,
