@@ -8,6 +8,7 @@ import torch
 from kcs_torch.clean.common import check_tracks, number, rebuilt, runs, share
 from kcs_torch.errors import OptionError, unknown
 from kcs_torch.types import Tracks
+from kcs_torch.types.arrays import as_doubles
 from kcs_torch.types.hints import is_a
 
 __all__ = ["fill"]
@@ -47,8 +48,8 @@ def fill(tracks: Tracks, longest: int, *, kind: str = "cubic", weight: float = 0
     from scipy.interpolate import PchipInterpolator
 
     count = tracks.skeleton.num_observed
-    points = tracks.points[:, :count].detach().double().cpu().numpy().copy()
-    weights = tracks.weights[:, :count].detach().double().cpu().numpy().copy()
+    points = as_doubles(tracks.points[:, :count]).copy()
+    weights = as_doubles(tracks.weights[:, :count]).copy()
     unseen, filled, gaps = int((weights == 0).sum()), 0, 0
     time = np.arange(len(points))
     for joint in range(count):

@@ -17,6 +17,7 @@ from kcs_torch.clean.filters import FILTERS, Filter
 from kcs_torch.clean.sides import unswap
 from kcs_torch.errors import KcsWarning, unknown, users_level
 from kcs_torch.types import Reconstruction, Tracks
+from kcs_torch.types.arrays import as_doubles
 
 __all__ = ["SMOOTHERS", "smooth"]
 
@@ -71,8 +72,8 @@ def smooth(
     if isinstance(motion, Reconstruction):
         return _smooth_result(motion, method, cutoff, rate)
     count = tracks.skeleton.num_observed
-    points = tracks.points[:, :count].detach().double().cpu().numpy()
-    weights = tracks.weights[:, :count].detach().double().cpu().numpy()
+    points = as_doubles(tracks.points[:, :count])
+    weights = as_doubles(tracks.weights[:, :count])
     seen = weights > 0
     chosen = FILTERS[method](cutoff, rate, _size(points, seen))
     moved, short = _smooth_runs(points, weights, chosen)
@@ -107,7 +108,7 @@ def _smooth_runs(points: Array, weights: Array, chosen: Filter) -> tuple[Array, 
 
 def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: float) -> Reconstruction:
     """A result with smoothed points and root; the other solutions are smoothed like it."""
-    points = result.points.detach().double().cpu().numpy()
+    points = as_doubles(result.points)
     chosen = FILTERS[method](cutoff, rate, _size(points, np.ones(points.shape[:2], dtype=bool)))
     words = chosen.words
     if len(points) < chosen.least:
@@ -121,7 +122,7 @@ def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: flo
     def path(values: torch.Tensor | None) -> torch.Tensor | None:
         if values is None:
             return None
-        one = values.detach().double().cpu().numpy()[:, None]
+        one = as_doubles(values)[:, None]
         return torch.from_numpy(chosen.apply(one, np.ones(len(one)))[:, 0].copy()).to(values)  # no negative strides
 
     return replace(

@@ -13,6 +13,7 @@ from kcs_torch.clean.common import check_rate, check_tracks, frame_rate, rebuilt
 from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.solvers.cuts import find_cuts
 from kcs_torch.types import Tracks
+from kcs_torch.types.arrays import as_doubles
 from kcs_torch.types.hints import is_a
 
 __all__ = ["cuts_of", "resample", "split", "trim"]
@@ -120,8 +121,8 @@ def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: flo
     if length > 1_000_000 and length > 10 * frames:
         raise OptionError(f"resample: fps: expected a rate near the {rate:g} frames a second of the clip, got {fps:g}")
     place = np.minimum(np.arange(length) * (rate / fps), frames - 1)  # in old frames
-    points = tracks.points[:, :count].detach().double().cpu().numpy()
-    weights = tracks.weights[:, :count].detach().double().cpu().numpy()
+    points = as_doubles(tracks.points[:, :count])
+    weights = as_doubles(tracks.weights[:, :count])
     new_points, new_weights = np.zeros((length, count, 2)), np.zeros((length, count))
     for joint in range(count):
         for start, stop in runs(weights[:, joint] > 0):

@@ -9,8 +9,8 @@ import numpy as np
 from kcs_torch.errors import OutputError
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.formats.text import cell, write_table
-from kcs_torch.io.plain import plain
 from kcs_torch.types import JointAngles
+from kcs_torch.types.arrays import as_array
 
 __all__ = ["check_table", "save_angles"]
 
@@ -31,9 +31,9 @@ def save_angles(angles: JointAngles, path: str | Path) -> Path:
     check_table(path)
     columns = {}
     for name, values in angles.degrees.items():
-        columns[f"{cell(name)} [deg]"] = plain(values)
+        columns[f"{cell(name)} [deg]"] = as_array(values)
         if angles.deviation is not None:
-            columns[f"{cell(name)}_deviation [deg]"] = plain(angles.deviation[name])
+            columns[f"{cell(name)}_deviation [deg]"] = as_array(angles.deviation[name])
     with atomic_path(path) as temporary:
         write_table(columns, np.stack(list(columns.values()), 1), angles.fps, temporary)
     return Path(path)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from kcs_torch.errors import OptionError
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
+from kcs_torch.types.arrays import as_doubles
 from kcs_torch.types.hints import is_a
 from kcs_torch.types.people import files_named
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
@@ -164,7 +165,7 @@ def _pose(tracks: Tracks, frame: int) -> Array:
     """(N, 2); NaN where unseen."""
     if frame >= tracks.num_frames:
         return np.full((tracks.num_joints, 2), np.nan)
-    points = tracks.points[frame].detach().cpu().double().numpy()
+    points = as_doubles(tracks.points[frame])
     return np.where(tracks.seen[frame].cpu().numpy()[:, None], points, np.nan)
 
 

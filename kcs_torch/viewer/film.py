@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import OutputError
 from kcs_torch.types import Reconstruction
+from kcs_torch.types.arrays import as_doubles
 from kcs_torch.types.people import files_named
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.draw import frame_alone, new_figure
@@ -36,7 +37,7 @@ class Film:
         self.total, self.faster = total, faster
         self.points = points_together(people)
         seen = [r.tracks.seen.cpu().numpy() for r in people]
-        tracks = [r.tracks.points.detach().cpu().double().numpy() for r in people]
+        tracks = [as_doubles(r.tracks.points) for r in people]
         self.tracks = [np.where(s[..., None], x, np.nan) for x, s in zip(tracks, seen, strict=True)]
         # Among several people one is shown from the first frame in which anything is seen of them to the last.
         there = [np.flatnonzero(s.any(1)) for s in seen]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import OutputError
 from kcs_torch.types import Reconstruction
+from kcs_torch.types.arrays import as_doubles
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.names import as_people, clip_rate, person_names, printable
 from kcs_torch.viewer.together import points_together
@@ -68,14 +69,14 @@ def need_rerun() -> tuple[Any, Any]:
 def _log(recording: Any, rr: Any, name: str, result: Reconstruction, points: NDArray[np.float64]) -> None:
     body = result.skeleton
     seen = result.tracks.seen.cpu().numpy()
-    places = result.tracks.points.detach().cpu().double().numpy()
+    places = as_doubles(result.tracks.points)
     bones = body.bone_index().numpy()
     hues, limbs = _colours(joint_keys(body)), _colours(bone_keys(body))
     labels = [printable(j) for j in body.joints]
     rigid = np.array(body.rigid, dtype=int)
     lengths = np.linalg.norm(points[:, bones[rigid, 1]] - points[:, bones[rigid, 0]], axis=-1)
     deviation = 100 * (lengths / np.maximum(np.nanmean(lengths, 0), 1e-12) - 1) if len(rigid) else lengths
-    spread = None if result.uncertainty is None else result.uncertainty.detach().cpu().double().numpy()
+    spread = None if result.uncertainty is None else as_doubles(result.uncertainty)
     names = [f"{labels[a]}-{labels[b]}" for a, b in bones[rigid]]
     if len(rigid):
         recording.log(["lengths", name], rr.SeriesLines(names=names, colors=limbs[rigid]), static=True)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.metrics import difference
 from kcs_torch.types import Reconstruction
+from kcs_torch.types.arrays import as_doubles
 from kcs_torch.types.intake import FARTHEST
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.names import clip_rate, person_names
@@ -56,7 +57,7 @@ def scene_of(results: Sequence[Reconstruction], names: Sequence[str] | None = No
         if (most := float(np.abs(known).max())) > FARTHEST:
             raise OutputError(f"{name}: an HTML page needs coordinates up to {FARTHEST:g}, got {most:.3g}: scale them")
     middle = np.median(np.concatenate(finite), axis=0)
-    seen = [r.tracks.points.double().numpy(force=True)[r.tracks.seen.cpu().numpy()] for r in results]
+    seen = [as_doubles(r.tracks.points)[r.tracks.seen.cpu().numpy()] for r in results]
     together = np.concatenate(seen)
     middle2d = np.median(together, axis=0) if len(together) else np.zeros(2)
     return {
@@ -74,7 +75,7 @@ def scene_of(results: Sequence[Reconstruction], names: Sequence[str] | None = No
 
 
 def _points(result: Reconstruction) -> Array:
-    return result.points.detach().cpu().double().numpy()
+    return as_doubles(result.points)
 
 
 def _numbers(result: Reconstruction) -> int:
@@ -89,8 +90,8 @@ def _person(
 ) -> dict[str, Any]:
     """One of the people, whose points are to be shifted and are told about the scene's middle."""
     body, tracks, middle = result.skeleton, result.tracks, middle - shift
-    weights = tracks.weights.detach().cpu().double().numpy()[frames]
-    places = tracks.points.detach().cpu().double().numpy()[frames] - middle2d
+    weights = as_doubles(tracks.weights)[frames]
+    places = as_doubles(tracks.points)[frames] - middle2d
     return {
         "name": name,
         "summary": summarise(result),
@@ -115,10 +116,10 @@ def _solution(result: Reconstruction, frames: slice, middle: Array, middle2d: Ar
     path = result.root_depth if result.distance is None else result.distance
     return {
         **_motion(_points(result)[frames] - middle),
-        "path": None if path is None else _floats(path[frames].detach().cpu().double().numpy()),
+        "path": None if path is None else _floats(as_doubles(path[frames])),
         "lens": None if result.distance is None else _lens(result, middle2d),
         "fit": None if result.distance is not None else _floats(_fit(result, middle, middle2d)[frames]),
-        "spread": None if result.uncertainty is None else _whole(result.uncertainty[frames].double().numpy(force=True)),
+        "spread": None if result.uncertainty is None else _whole(as_doubles(result.uncertainty[frames])),
     }
 
 
@@ -131,9 +132,9 @@ def _motion(points: Array) -> dict[str, Any]:
 
 def _fit(result: Reconstruction, middle: Array, middle2d: Array) -> Array:
     """(T, 3): scale and shift of each frame that take the middled points onto the middled tracks."""
-    weights = result.tracks.weights.detach().cpu().double().numpy()
-    places = result.tracks.points.detach().cpu().double().numpy() - middle2d
-    scales = result.scales.detach().cpu().double().numpy()
+    weights = as_doubles(result.tracks.weights)
+    places = as_doubles(result.tracks.points) - middle2d
+    scales = as_doubles(result.scales)
     drawn = scales[:, None, None] * (_points(result) - middle)[..., :2]
     weights = np.where(np.isfinite(drawn).all(-1), weights, 0)[..., None]
     gap = np.where(weights > 0, places - drawn, 0)
@@ -148,9 +149,9 @@ def _fit(result: Reconstruction, middle: Array, middle2d: Array) -> Array:
 
 def _lens(result: Reconstruction, middle2d: Array) -> list[float]:
     """Focal lengths and principal point that take the points in space onto the middled tracks (least squares)."""
-    space = result.in_space().detach().cpu().double().numpy()
+    space = as_doubles(result.in_space())
     known = result.tracks.seen.cpu().numpy() & np.isfinite(space).all(-1) & (space[..., 2] > 0)
-    image = result.tracks.points.detach().cpu().double().numpy()[known] - middle2d
+    image = as_doubles(result.tracks.points)[known] - middle2d
     rays = space[known][:, :2] / space[known][:, 2:]
     lines = [np.polyfit(rays[:, a], image[:, a], 1) if len(rays) > 1 else np.zeros(2) for a in range(2)]
     return [float(lines[0][0]), float(lines[1][0]), float(lines[0][1]), float(lines[1][1])]

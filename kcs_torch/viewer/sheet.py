@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import OptionError, OutputError
 from kcs_torch.types import Reconstruction
+from kcs_torch.types.arrays import as_doubles
 from kcs_torch.types.hints import is_a
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
 from kcs_torch.viewer.draw import frame_alone, new_figure
@@ -51,10 +52,10 @@ def sheet(result: Reconstruction, *, frames: int = 8, turn: float = TURN) -> Fig
     """
     if not (is_a(frames, int) and frames >= 1):
         raise OptionError(f"frames: expected a whole number, at least 1, got {frames!r}")
-    points = result.points.detach().cpu().double().numpy()
+    points = as_doubles(result.points)
     if not np.isfinite(points).all(-1).any():
         raise OutputError("a picture needs at least one joint at a finite place")
-    tracks = result.tracks.points.detach().cpu().double().numpy()
+    tracks = as_doubles(result.tracks.points)
     seen = result.tracks.seen.cpu().numpy()
     tracks = np.where(seen[..., None], tracks, np.nan)
     shown = np.flatnonzero(seen.any(1)) if seen.any() else np.arange(len(points))

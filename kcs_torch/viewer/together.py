@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.types import Reconstruction
+from kcs_torch.types.arrays import as_doubles
 
 __all__ = ["beside", "points_together"]
 
@@ -31,5 +32,5 @@ def beside(results: Sequence[Reconstruction]) -> list[Array]:
 
 def points_together(results: Sequence[Reconstruction]) -> list[Array]:
     """Points (T, N, 3) of people who stand beside one another."""
-    every = (result.points.detach().cpu().double().numpy() for result in results)
+    every = (as_doubles(result.points) for result in results)
     return [points + shift for points, shift in zip(every, beside(results), strict=True)]

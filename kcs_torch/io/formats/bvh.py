@@ -24,11 +24,11 @@ from torch import Tensor
 from kcs_torch.errors import FormatError, listed
 from kcs_torch.functional import euler_angles, euler_rotation
 from kcs_torch.io.build_motion import build_motion, distinct, numbers, read_lines
-from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer
 from kcs_torch.io.rig import Rig, check_tree, fit_rig
 from kcs_torch.io.times import plain_rate
 from kcs_torch.types import Motion
+from kcs_torch.types.arrays import as_array
 from kcs_torch.types.axes import from_y_up
 from kcs_torch.types.size import METRES
 
@@ -256,12 +256,12 @@ def _write_rig(rig: Rig, path: Path, rate: float) -> None:
             lines += [f"{tab}\tEnd Site", f"{tab}\t{{", f"{tab}\t\tOFFSET 0.000000 0.000000 0.000000", f"{tab}\t}}"]
         stack.append((~node, depth))
         stack += [(child, depth + 1) for child in reversed(children[node])]
-    angles = plain(euler_angles("ZXY", rig.turns[:, order]).rad2deg())
+    angles = as_array(euler_angles("ZXY", rig.turns[:, order]).rad2deg())
     angles = np.unwrap(angles, axis=0, period=360).reshape(len(angles), -1)
     lines += ["MOTION", f"Frames: {len(angles)}", f"Frame Time: {1 / rate:.12f}"]
     with path.open("w", encoding="utf-8", errors="replace", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
-        for root, row in zip(plain(rig.root).tolist(), angles.tolist(), strict=True):
+        for root, row in zip(as_array(rig.root).tolist(), angles.tolist(), strict=True):
             file.write(" ".join([*(f"{v:.{places}f}" for v in root), *(f"{v:.6f}" for v in row)]) + "\n")
 
 

@@ -15,11 +15,11 @@ import torch
 
 from kcs_torch.errors import FormatError, OutputError, listed
 from kcs_torch.io.build_motion import build_motion, distinct
-from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer, need
 from kcs_torch.io.worker import ask_worker
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion
+from kcs_torch.types.arrays import as_array
 from kcs_torch.types.axes import from_y_up
 from kcs_torch.types.size import short_unit
 
@@ -97,7 +97,7 @@ def _check_count(body: Skeleton) -> None:
 def write(motion: Motion, path: Path, saving: Saving) -> None:
     """Write the joints as markers; the file holds single precision."""
     ezc3d = need("ezc3d", str(path), OutputError)
-    points, seen = plain(from_y_up(motion.points, saving.up)), plain(motion.seen) > 0
+    points, seen = as_array(from_y_up(motion.points, saving.up)), as_array(motion.seen) > 0
     frames, count = seen.shape
     file = ezc3d.c3d()
     whole = np.ones((4, count, frames))

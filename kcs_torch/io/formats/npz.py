@@ -34,11 +34,11 @@ from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io.archive import Archive, array_names
 from kcs_torch.io.build import build_tracks
 from kcs_torch.io.build_motion import build_motion
-from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, Saving, Writer
 from kcs_torch.io.shares import are_shares, in_pixels
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Intrinsics, Motion, Reconstruction, Tracks
+from kcs_torch.types.arrays import as_array
 from kcs_torch.types.axes import AXES, from_y_up
 
 __all__ = ["MOTION_READERS", "READERS", "WRITERS", "load_reconstruction"]
@@ -92,8 +92,8 @@ def write_tracks(tracks: Tracks, path: Path) -> None:
 def write_motion(motion: Motion, path: Path, saving: Saving) -> None:
     """Write 3D motion, so that :func:`kcs_torch.load_motion` gives it back."""
     body = motion.skeleton
-    points = plain(from_y_up(motion.points, saving.up))
-    weights = plain(motion.weights)
+    points = as_array(from_y_up(motion.points, saving.up))
+    weights = as_array(motion.weights)
     arrays = {
         "points3d": np.where(weights[..., None] > 0, points, np.nan),
         "confidence": weights,
@@ -112,7 +112,7 @@ def write_motion(motion: Motion, path: Path, saving: Saving) -> None:
 def _tracks_out(tracks: Tracks) -> dict[str, Any]:
     body = tracks.skeleton
     n = body.num_observed
-    points, weights = plain(tracks.points), plain(tracks.weights)
+    points, weights = as_array(tracks.points), as_array(tracks.weights)
     inside = [b for b in body.bones if max(b) < n]
     arrays: dict[str, Any] = {
         "points2d": np.where(weights[:, :n, None] > 0, points[:, :n], np.nan),
@@ -146,7 +146,7 @@ def write(result: Reconstruction, path: Path) -> None:
     """Write everything that a result holds, so that :func:`load_reconstruction` gives it back exactly."""
     body = result.skeleton
     arrays = _tracks_out(result.tracks) | {
-        "points3d": plain(result.observed),
+        "points3d": as_array(result.observed),
         "joint_names_all": np.array(body.joints),
         "bones": np.array(body.bones, np.int64).reshape(-1, 2),
         "alternatives": np.int64(len(result.alternatives)),
@@ -164,10 +164,10 @@ def _prefix(number: int) -> str:
 def _solution_out(result: Reconstruction) -> dict[str, Any]:
     """What solutions of the same tracks do not share."""
     arrays = {
-        "points3d_all": plain(result.points),
-        "lengths": plain(result.lengths),
-        "cameras": plain(result.cameras),
-        "scales": plain(result.scales),
+        "points3d_all": as_array(result.points),
+        "lengths": as_array(result.lengths),
+        "cameras": as_array(result.cameras),
+        "scales": as_array(result.scales),
         "units3d": np.array(result.units),
         "method": np.array(result.method),
         "objective": np.float64(result.objective),
@@ -176,7 +176,7 @@ def _solution_out(result: Reconstruction) -> dict[str, Any]:
     if result.intrinsics is not None:
         arrays["intrinsics"] = np.array(dataclasses.astuple(result.intrinsics), np.float64)
     maybe = {"uncertainty": result.uncertainty, "root_depth": result.root_depth, "distance": result.distance}
-    return arrays | {key: plain(value) for key, value in maybe.items() if value is not None}
+    return arrays | {key: as_array(value) for key, value in maybe.items() if value is not None}
 
 
 def load_reconstruction(path: str | Path) -> Reconstruction:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcs_torch.errors import OutputError
-from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import Saving, Writer
 from kcs_torch.types import Motion, Reconstruction
+from kcs_torch.types.arrays import as_array
 from kcs_torch.types.axes import from_y_up
 
 __all__ = ["WRITERS", "cell", "write_table"]
@@ -30,14 +30,14 @@ def write_csv(result: Reconstruction, path: Path) -> None:
     ``time [s]`` is empty where the frame rate is unknown; ``distance [px]`` comes last where it is known. Numbers have
     9 significant digits.
     """
-    more = {} if result.distance is None else {"distance": plain(result.distance)}
-    _write_rows(plain(result.points), result, more, path)
+    more = {} if result.distance is None else {"distance": as_array(result.distance)}
+    _write_rows(as_array(result.points), result, more, path)
 
 
 def write_motion_csv(motion: Motion, path: Path, saving: Saving) -> None:
     """Write the same of motion, with y or z up; the cells of joints that are unseen are empty."""
-    points = plain(from_y_up(motion.points, saving.up))
-    _write_rows(np.where(plain(motion.seen)[..., None] > 0, points, np.nan), motion, {}, path)
+    points = as_array(from_y_up(motion.points, saving.up))
+    _write_rows(np.where(as_array(motion.seen)[..., None] > 0, points, np.nan), motion, {}, path)
 
 
 def _write_rows(
@@ -100,7 +100,7 @@ def cell(name: str) -> str:
 
 def _listed(tensor: Tensor) -> Any:
     """Nested lists of a tensor's numbers, to 9 significant digits."""
-    array = plain(tensor)
+    array = as_array(tensor)
     short = np.array([float(f"{v:.9g}") for v in array.ravel().tolist()], object).reshape(array.shape)
     return _finite(short.tolist())
 

@@ -20,10 +20,10 @@ import torch
 from kcs_torch.errors import FormatError, counted
 from kcs_torch.io.build_motion import build_motion, distinct, numbers, read_lines
 from kcs_torch.io.folders import frame_numbers
-from kcs_torch.io.plain import plain
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer
 from kcs_torch.io.times import rate_of_times
 from kcs_torch.types import Motion
+from kcs_torch.types.arrays import as_array
 from kcs_torch.types.axes import from_y_up
 from kcs_torch.types.size import short_unit
 
@@ -128,7 +128,7 @@ def _rate(text: str, path: Path) -> float | None:
 
 def write(motion: Motion, path: Path, saving: Saving) -> None:
     """Write the joints as markers; numbers have 9 significant digits."""
-    points, seen = plain(from_y_up(motion.points, saving.up)), plain(motion.seen) > 0
+    points, seen = as_array(from_y_up(motion.points, saving.up)), as_array(motion.seen) > 0
     rate, count = saving.rate(motion), motion.num_frames
     names = [re.sub(r"\s+", "_", joint) for joint in motion.skeleton.joints]
     facts = (f"{rate:.9g}", f"{rate:.9g}", count, len(names), motion.units, f"{rate:.9g}", 1, count)
