@@ -9,6 +9,7 @@ from collections.abc import Hashable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
@@ -146,7 +147,7 @@ def _without_zeros(frames: Sequence[Sequence[Sighting]], measured: bool, notes: 
     joints = np.stack(everybody)
     seen = joints[..., 2] > 0
     if measured:
-        zero = at_the_corner(joints[..., :2], seen, notes) | ~seen
+        zero = at_the_corner(torch.from_numpy(joints[..., :2]), torch.from_numpy(seen), notes).numpy() | ~seen
     else:
         zero, minus = (joints[..., :2] == 0).any(-1), (joints[..., :2] == -1).all(-1)
         for gone, how in ((zero, "whose x or y is exactly 0"), (minus, "whose x and y are both -1")):

@@ -13,7 +13,7 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.ranks import median
 from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types.intake import WITHIN, as_floats, as_weights, check_places
+from kcs_torch.types.intake import as_floats, as_weights, at_the_corner, check_places
 
 __all__ = ["Sight", "take_frame"]
 
@@ -57,10 +57,7 @@ def take_frame(
     check_places(points, f"{where}: xy", body.joints)
     seen = torch.isfinite(points).all(-1)
     if confidence is None:
-        corner = seen & ((points == 0).all(-1) | (points == -1).all(-1))
-        rest = points[seen & ~corner] > 0
-        away = not len(rest) or float(rest.all(-1).double().mean()) >= WITHIN
-        weights = (seen & ~corner if away else seen).double()
+        weights = (seen & ~at_the_corner(points, seen, [], alone=True)).double()
     else:
         told = as_floats(confidence, f"{where}: confidence", 1).detach().to("cpu", torch.float64)
         weights = as_weights(told, seen, threshold, f"{where}: confidence", body.joints)

@@ -19,7 +19,6 @@ from kcs_torch.types.bodies import choose_skeleton, joint_order
 __all__ = [
     "FARTHEST",
     "RATES",
-    "WITHIN",
     "Intake",
     "as_floats",
     "as_number",
@@ -30,7 +29,6 @@ __all__ = [
 ]
 
 FARTHEST = 1e30  # of coordinates: their sums are finite in single precision, in which pages are written
-
 
 STRAY = 1e12
 """Distance from the clip's middle, over its median or over 1, from which on a joint's number is that of no body."""
@@ -79,17 +77,19 @@ def as_number(value: Any) -> float | None:
         return None
 
 
-def at_the_corner(points: np.ndarray, seen: np.ndarray, notes: list[str]) -> np.ndarray:
+def at_the_corner(points: Tensor, seen: Tensor, notes: list[str], *, alone: bool = False) -> Tensor:
     """Which joints (..., N) of points (..., N, 2) lie exactly at (0, 0), or at (-1, -1), and others beyond (0, 0).
 
     Detectors write unseen joints so. About a middle that is 0 the others lie all around; of a person at the image's
-    edge a few may lie beside it.
+    edge a few may lie beside it. Where there are no others, ``alone`` decides.
     """
     zero, minus = (seen & (points == place).all(-1) for place in (0, -1))
     corner = zero | minus
-    rest = points[seen & ~corner]
-    if not (corner.any() and len(rest) and (rest > 0).all(-1).mean() >= WITHIN):
-        return np.zeros_like(corner)
+    if not bool(corner.any()):
+        return corner
+    beyond = (points[seen & ~corner] > 0).all(-1)
+    if not (int(beyond.sum()) / len(beyond) >= WITHIN if len(beyond) else alone):
+        return torch.zeros_like(corner)
     for count, place in ((int(zero.sum()), "(0, 0)"), (int(minus.sum()), "(-1, -1)")):
         if count:
             are = f"joint that lies exactly at {place} is" if count == 1 else f"joints that lie exactly at {place} are"
@@ -195,8 +195,7 @@ def take_in(
     check_places(xy, f"{source}: points", body.joints)
     seen = torch.isfinite(xy).all(-1)
     if confidence is None and dims == 2:
-        corner = at_the_corner(xy.numpy(force=True), seen.numpy(force=True), remarks)
-        seen = seen & ~torch.as_tensor(corner, device=seen.device)
+        seen = seen & ~at_the_corner(xy, seen, remarks)
     if confidence is None:
         weights = seen.to(xy.dtype)
     else:
