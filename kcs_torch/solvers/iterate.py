@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -10,7 +9,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import ConvergenceWarning, OptionError
+from kcs_torch.errors import OptionError
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.spectral import svt as shrink
 
@@ -49,7 +48,6 @@ def iterate(
     tolerance: float = 0.0,
     check_every: int = 5,
     grad_steps: int | None = None,
-    warn: str | None = None,
 ) -> Solution[State]:
     """Apply ``state = step(state, k)`` for k = 0, 1, ... until it settles.
 
@@ -62,7 +60,6 @@ def iterate(
         check_every: measure the change at every so-manyth step and at the last (each check waits for the device).
         grad_steps: record only the last so many steps for autograd; None records all, 0 none. An iteration that
             settles before it has recorded them goes on for so many steps.
-        warn: what to call the iteration in a :class:`ConvergenceWarning` if it does not settle; None is quiet.
 
     Returns:
         A :class:`Solution`.
@@ -93,9 +90,6 @@ def iterate(
             if converged:
                 end = min(end, count + tail)
         state = new
-    if not converged and warn is not None:
-        message = f"{warn} did not settle within {num_steps} steps; the result says converged=False"
-        warnings.warn(message, ConvergenceWarning, stacklevel=2)
     return Solution(state, converged, count, change=moved)
 
 
