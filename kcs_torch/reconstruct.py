@@ -175,7 +175,7 @@ def reconstruct_all(
         if may_be_near(one):
             found[i] = reconstruct_uncalibrated(chosen, one, lifted=lifted)
         else:
-            chosen._warn(lifted)
+            chosen.warn(lifted)
     return _apart(found)
 
 

@@ -51,9 +51,9 @@ class Method(ABC):
     keeps_lengths: ClassVar[bool] = True
     """Whether bones keep their length as far as the tracks admit; else lengths that vary say nothing of the tracks."""
     knows_bones: ClassVar[bool] = True
-    """Whether the result depends on the skeleton's bones: then a user who gives none should know."""
+    """Whether the result depends on the skeleton's bones; then a user who gives none should know."""
     learned: ClassVar[bool] = False
-    """Whether depth comes from examples: then it does not rest on the viewpoint's turn."""
+    """Whether depth comes from examples; then it does not rest on the viewpoint's turn."""
     turns_over: ClassVar[bool] = False
     """Whether it looks for runs of depths with the wrong sign, so that they are looked for under perspective, too."""
     reckons_in_seconds: ClassVar[bool] = False
@@ -156,7 +156,7 @@ class Method(ABC):
                 result = finish(self, here, found.to("cpu"), size.cpu(), known.cpu(), seconds)
                 result = result.moved(lambda x: x.to(device), tracks)
         result = plain(result, keep=tracks)
-        self._warn(result)
+        self.warn(result)
         return result
 
     def _mended(self, tracks: Tracks) -> Tracks:
@@ -178,8 +178,8 @@ class Method(ABC):
         inner = dataclasses.replace(tracks, points=centred / size, weights=tracks.weights.clone())
         return inner, size, tracks.seen.any(-1)
 
-    def _warn(self, result: Reconstruction) -> None:
-        """Tell what the user should not miss."""
+    def warn(self, result: Reconstruction) -> None:
+        """Tell what the user should not miss; for those who call :meth:`solve` and more by themselves."""
         tracks, found = result.tracks, result.diagnostics
         if found.doubt:
             warnings.warn(f"{tracks.source}: {found.doubt}", KcsWarning, stacklevel=users_level())

@@ -87,7 +87,7 @@ def reconstruct_perspective(
         tracks = method.prepared(tracks)
         result = _reconstruct(method, tracks, intrinsics, cameras, lifted)
     result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
-    method._warn(result)
+    method.warn(result)
     return result
 
 

@@ -127,7 +127,7 @@ def reconstruct_uncalibrated(
             result = near
         elif judge is not method or ended:
             result = method(tracks, cameras)
-    method._warn(result)
+    method.warn(result)
     notes = tuple(note for note in result.diagnostics.notes if note != SEEMS_FAR)
     spent = before + time.perf_counter() - begin
     return replace(result, diagnostics=replace(result.diagnostics, seconds=spent, notes=notes))

@@ -163,7 +163,7 @@ class Motion(Trajectories):
 
     @property
     def variation(self) -> BoneVariation:
-        """How much rigid bones change their length, per cent: that of the median bone, the largest, and whose it is."""
+        """How much rigid bones change their length, in per cent; of the median bone and of the worst."""
         return bone_variation(self._lengths(), self.skeleton)
 
     def filled(self) -> Tensor:

@@ -131,7 +131,7 @@ class Reconstruction:
 
     @property
     def observed(self) -> Tensor:
-        """(T, num_observed, 3): the joints of the tracks as they were given, without the virtual ones."""
+        """The joints (T, num_observed, 3) of the tracks as they were given, without the virtual ones."""
         return self.points[:, : self.skeleton.num_observed]
 
     def to(self, *args: Any, **kwargs: Any) -> Reconstruction:
