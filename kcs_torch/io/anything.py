@@ -8,9 +8,9 @@ from pathlib import Path
 from kcs_torch.errors import FormatError, OptionError, unknown
 from kcs_torch.io.archive import Archive
 from kcs_torch.io.formats.npz import load_reconstruction
-from kcs_torch.io.load import READERS, detect_format, load_tracks
+from kcs_torch.io.load import READERS, describe, load_tracks
 from kcs_torch.io.motion import MOTION_READERS, load_motion
-from kcs_torch.io.registry import Probe, check_fps
+from kcs_torch.io.registry import Probe, check_fps, only_format
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion, Reconstruction, Tracks
 
@@ -87,9 +87,7 @@ def kind_of(path: str | Path, format: str | None = None) -> str:
         return "motion" if holds and (format not in READERS or holds(probe)) else "tracks"
     if any(reader.recognises(probe) for reader in MOTION_READERS.values()):
         return "motion"
-    try:
-        detect_format(probe.path)
-    except FormatError as error:
-        words = str(error).replace("expected tracks in one of the formats", "expected tracks or motion in one of")
-        raise FormatError(words.replace(", got", f", {', '.join(MOTION_READERS)}, got", 1)) from None
+    if only_format(READERS, probe) is None:
+        known = ", ".join([*READERS, *MOTION_READERS])
+        raise FormatError(f"{path}: expected tracks or motion in one of {known}, got {describe(probe)}")
     return "tracks"

@@ -10,7 +10,7 @@ from pathlib import Path
 from kcs_torch.errors import FormatError, OptionError, listed, unknown
 from kcs_torch.io.hdf5 import read_tree
 from kcs_torch.io.motion import MOTION_READERS
-from kcs_torch.io.registry import Options, Probe, Reader, brief, check_fps, discover
+from kcs_torch.io.registry import Options, Probe, Reader, brief, check_fps, discover, only_format
 from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
@@ -19,7 +19,7 @@ from kcs_torch.types.people import tell_apart
 
 __all__ = [
     *("READERS", "WRITERS"),
-    *("check_person", "check_reading", "detect_format", "load_people", "load_tracks", "most_seen"),
+    *("check_person", "check_reading", "describe", "detect_format", "load_people", "load_tracks", "most_seen"),
 ]
 
 READERS, WRITERS = discover()
@@ -36,12 +36,10 @@ def detect_format(path: str | Path) -> str:
         FormatError: nothing is there, it is empty, or no reader recognises it.
     """
     probe = Probe(path)
-    found = [reader.name for reader in READERS.values() if reader.recognises(probe)]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise FormatError(f"{path}: may be {' or '.join(found)}: say which with format=...")
-    raise FormatError(f"{path}: expected tracks in one of the formats {', '.join(READERS)}, got {_describe(probe)}")
+    found = only_format(READERS, probe)
+    if found is None:
+        raise FormatError(f"{path}: expected tracks in one of the formats {', '.join(READERS)}, got {describe(probe)}")
+    return found
 
 
 def load_people(
@@ -207,7 +205,7 @@ def _clips(probe: Probe) -> str:
     return " and ".join(found)
 
 
-def _describe(probe: Probe) -> str:
+def describe(probe: Probe) -> str:
     """What a path that no reader recognises holds, in a few words."""
     motion = [reader.name for reader in MOTION_READERS.values() if reader.recognises(probe)]
     if motion:

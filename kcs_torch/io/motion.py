@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from kcs_torch.errors import FormatError, unknown
-from kcs_torch.io.registry import MotionOptions, Probe, check_fps, discover_motion
+from kcs_torch.io.registry import MotionOptions, Probe, check_fps, discover_motion, only_format
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion
 from kcs_torch.types.axes import AXES
@@ -22,16 +22,13 @@ def detect_motion_format(path: str | Path) -> str:
     Raises:
         FormatError: nothing is there, it is empty, or no reader recognises it.
     """
-    probe = Probe(path)
-    found = [reader.name for reader in MOTION_READERS.values() if reader.recognises(probe)]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise FormatError(f"{path}: may be {' or '.join(found)}: say which with format=...")
-    raise FormatError(
-        f"{path}: expected 3D motion in one of the formats {', '.join(MOTION_READERS)}, got something else; "
-        "load_tracks() reads 2D tracks"
-    )
+    found = only_format(MOTION_READERS, Probe(path))
+    if found is None:
+        raise FormatError(
+            f"{path}: expected 3D motion in one of the formats {', '.join(MOTION_READERS)}, got something else; "
+            "load_tracks() reads 2D tracks"
+        )
+    return found
 
 
 def load_motion(

@@ -40,6 +40,7 @@ __all__ = [
     "discover",
     "discover_motion",
     "need",
+    "only_format",
     "read_error",
 ]
 
@@ -270,6 +271,18 @@ def _modules() -> list[ModuleType]:
     from kcs_torch.io import formats
 
     return [importlib.import_module(f"{formats.__name__}.{m.name}") for m in pkgutil.iter_modules(formats.__path__)]
+
+
+def only_format(readers: Mapping[str, Reader] | Mapping[str, MotionReader], probe: Probe) -> str | None:
+    """The name of the reader that recognises a path; None if none does.
+
+    Raises:
+        FormatError: several do.
+    """
+    found = [reader.name for reader in readers.values() if reader.recognises(probe)]
+    if len(found) > 1:
+        raise FormatError(f"{probe.path}: may be {' or '.join(found)}: say which with format=...")
+    return found[0] if found else None
 
 
 def need(package: str, what: str, error: type[KcsError]) -> ModuleType:
