@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -121,12 +122,50 @@ def metric_upgrade(
     whole = type(together) is int and together >= 1
     if together is not None and (not whole or total % together):
         raise OptionError(f"metric_upgrade: together: expected a divisor of the {total} motions, got {together!r}")
-    a, b = motion[..., 0, :], motion[..., 1, :]
-    rank = motion.shape[-1]
     count = motion.new_full((), motion.shape[-3]) if counts is None else counts.to(motion)
+    batch, rank = motion.shape[:-3], motion.shape[-1]
+    shape = broadcast_shapes(start.shape[:-2], batch)
+    starts = math.prod(shape[: len(shape) - len(batch)])
+    rows = start.expand(*shape, rank, 3).reshape(starts, -1, rank, 3).movedim(0, 1).mT.contiguous()
+    state = _begin(rows, batch, _costs(motion, count, smoothness, evenness))
+    found, left = state.rows, torch.arange(len(rows), device=motion.device)
+    for made in range(0, num_steps, CHECK):
+        state = iterate(_descend, state, num_steps=min(CHECK, num_steps - made)).value
+        found = found.index_copy(0, left, state.rows)
+        goes_on = (state.progress > tolerance).any(-1)
+        if together is not None:
+            goes_on = goes_on.view(-1, together).any(-1).repeat_interleave(together)
+        if not bool(goes_on.any()):
+            break
+        if together is not None and not bool(goes_on.all()):  # what has settled takes no more steps
+            state, left = _Upgrade(*(x[goes_on] for x in state)), left[goes_on]
+    q = found.mT.movedim(1, 0).reshape(*shape, rank, 3)
+    return q, orthonormality_defect(motion @ q[..., None, :, :]).sum(-1) / count
+
+
+CHECK = 5
+"""Steps from one look at whether motions have settled to the next."""
+
+
+class _Upgrade(NamedTuple):
+    """Where Levenberg-Marquardt is: S starts of each motion lie beside each other, so that one product serves all."""
+
+    rows: Tensor  # (B, S, 3, R), Q^T
+    residual: Tensor  # (B, S, M)
+    cost: Tensor  # (B, S)
+    damping: Tensor  # (B, S)
+    progress: Tensor  # (B, S)
+    gram: Tensor  # (B, R, R): mean squared row length is tr(Q^T gram Q)
+    forms: Tensor  # (B, R, R, M): residuals are half of <form, Q Q^T>
+    bending: Tensor  # (B, R, R) of the second differences
+    stiff: Tensor  # (B, 1, 3R, 3R), the same for all three rows
+
+
+def _costs(motion: Tensor, count: Tensor, smoothness: float, evenness: float) -> tuple[Tensor, ...]:
+    """The last fields of :class:`_Upgrade`, of motion (..., T, 2, R) with so many frames (...)."""
+    a, b = motion[..., 0, :], motion[..., 1, :]
     frames = count[..., None, None]
-    gram = (a.mT @ a + b.mT @ b) / (2 * frames)  # mean squared row length is tr(Q^T gram Q)
-    # Residuals are <form, Q Q^T> of forms (..., M, R, R); here they are twice that, forms last.
+    gram = (a.mT @ a + b.mT @ b) / (2 * frames)
     forms = (2 * _quadratic_forms(a, b, evenness) / frames[..., None].sqrt()).movedim(-3, -1).contiguous()
     if smoothness > 0 and motion.shape[-3] > 2:
         bend = motion.diff(n=2, dim=-3)
@@ -134,80 +173,68 @@ def metric_upgrade(
         bend = (bend * inside[..., None, None]).flatten(-3, -2)
     else:
         bend = motion[..., :0, 0, :]
-    bending = smoothness / frames * (bend.mT @ bend)  # (..., R, R)
-    three = torch.eye(3, dtype=motion.dtype, device=motion.device)
-    stiff = torch.einsum("kl,...ij->...kilj", three, bending).reshape(*bending.shape[:-2], 1, 3 * rank, 3 * rank)
-    tiny = torch.finfo(motion.dtype).tiny
-
-    # Unknowns are Q^T (B, S, 3, R), the starts S next to its rows: a product with any matrix is one for all starts.
-    def times(rows: Tensor, matrix: Tensor) -> Tensor:
-        return (rows.flatten(-3, -2) @ matrix).unflatten(-2, rows.shape[-3:-1])
-
-    def normalise(rows: Tensor, gram: Tensor) -> Tensor:
-        size = (rows * times(rows, gram)).sum((-2, -1))
-        return rows / or_one(size).sqrt()[..., None, None]
-
-    def evaluate(rows: Tensor, forms: Tensor, bending: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals (B, S, M) of the defect, and the cost (B, S)."""
-        residual = (rows.mT @ rows).flatten(-2) @ forms.flatten(-3, -2) / 2
-        return residual, residual.square().sum(-1) + (rows * times(rows, bending)).sum((-2, -1))
-
-    def step(state: tuple[Tensor, ...], _: int) -> tuple[Tensor, ...]:
-        rows, residual, cost, damping, progress, *given = state
-        gram, forms, bending, stiff = given
-        jacobian = times(rows, forms.flatten(-2)).unflatten(-1, (rank, -1)).flatten(-3, -2)  # (B, S, 3R, M)
-        normal = jacobian @ jacobian.mT
-        normal += stiff
-        gradient = (jacobian @ residual[..., None]).squeeze(-1) + times(rows, bending).flatten(-2)
-        size = normal.diagonal(dim1=-2, dim2=-1).mean(-1)
-        # The residuals are homogeneous, so the plain step would only shrink Q: hold its scale.
-        radial = times(rows, gram).flatten(-2)
-        radial = radial / torch.linalg.vector_norm(radial, dim=-1, keepdim=True).clamp_min(tiny)
-        gradient = gradient - (gradient * radial).sum(-1, keepdim=True) * radial
-        normal += (1e3 * rank * size[..., None] * radial)[..., :, None] * radial[..., None, :]
-        normal.diagonal(dim1=-2, dim2=-1).add_((damping * size + tiny)[..., None])
-        factor, _ = torch.linalg.cholesky_ex(normal)
-        move = torch.cholesky_solve(gradient[..., None], factor).squeeze(-1)
-        trial = normalise(rows - move.unflatten(-1, (3, rank)), gram)
-        moved, new = evaluate(trial, forms, bending)
-        better = new < cost  # False for NaN, too: a failed factorisation only raises the damping
-        return (
-            torch.where(better[..., None, None], trial, rows),
-            torch.where(better[..., None], moved, residual),
-            torch.where(better, new, cost),
-            torch.where(better, damping / 4, damping * 3).clamp(1e-9, 1e6),
-            progress / 2 + torch.where(better, 1 - new / cost, 0),  # halved, not zeroed, by a refused step
-            *given,
-        )
-
-    batch = motion.shape[:-3]
-    shape = broadcast_shapes(start.shape[:-2], batch)
-    starts = math.prod(shape[: len(shape) - len(batch)])
-    rows = start.expand(*shape, rank, 3).reshape(starts, -1, rank, 3).movedim(0, 1).mT.contiguous()
-    given = [
-        x.expand(*batch, *x.shape[-d:]).reshape(-1, *x.shape[-d:])
-        for x, d in ((gram, 2), (forms, 3), (bending, 2), (stiff, 3))
-    ]
-    rows = normalise(rows, given[0])
-    residual, cost = evaluate(rows, *given[1:3])
-    state = (rows, residual, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost), *given)
-    found, left = rows, torch.arange(len(rows), device=motion.device)
-    for made in range(0, num_steps, CHECK):
-        state = iterate(step, state, num_steps=min(CHECK, num_steps - made)).value
-        found = found.index_copy(0, left, state[0])
-        goes_on = (state[4] > tolerance).any(-1)
-        if together is not None:
-            goes_on = goes_on.view(-1, together).any(-1).repeat_interleave(together)
-        if not bool(goes_on.any()):
-            break
-        if together is not None and not bool(goes_on.all()):  # what has settled takes no more steps
-            state, left = tuple(x[goes_on] for x in state), left[goes_on]
-    q = found.mT.movedim(1, 0).reshape(*shape, rank, 3)
-    return q, orthonormality_defect(motion @ q[..., None, :, :]).sum(-1) / count
+    bending = smoothness / frames * (bend.mT @ bend)
+    three, size = torch.eye(3, dtype=motion.dtype, device=motion.device), 3 * motion.shape[-1]
+    stiff = torch.einsum("kl,...ij->...kilj", three, bending).reshape(*bending.shape[:-2], 1, size, size)
+    return gram, forms, bending, stiff
 
 
-CHECK = 5
-"""Steps from one look at whether motions have settled to the next."""
+def _begin(rows: Tensor, batch: torch.Size, costs: tuple[Tensor, ...]) -> _Upgrade:
+    """The state at rows (B, S, 3, R), with the costs of motions (...)."""
+    gram, forms, bending, stiff = (
+        x.expand(*batch, *x.shape[-d:]).reshape(-1, *x.shape[-d:]) for x, d in zip(costs, (2, 3, 2, 3), strict=True)
+    )
+    rows = _normalise(rows, gram)
+    residual, cost = _evaluate(rows, forms, bending)
+    return _Upgrade(
+        rows, residual, cost, torch.full_like(cost, 1e-2), torch.ones_like(cost), gram, forms, bending, stiff
+    )
+
+
+def _descend(state: _Upgrade, _: int) -> _Upgrade:
+    """One step, kept only where it lowers the cost."""
+    rows, residual, cost, damping, progress, gram, forms, bending, stiff = state
+    rank, tiny = rows.shape[-1], torch.finfo(rows.dtype).tiny
+    jacobian = _times(rows, forms.flatten(-2)).unflatten(-1, (rank, -1)).flatten(-3, -2)  # (B, S, 3R, M)
+    normal = jacobian @ jacobian.mT
+    normal += stiff
+    gradient = (jacobian @ residual[..., None]).squeeze(-1) + _times(rows, bending).flatten(-2)
+    size = normal.diagonal(dim1=-2, dim2=-1).mean(-1)
+    # The residuals are homogeneous, so the plain step would only shrink Q: hold its scale.
+    radial = _times(rows, gram).flatten(-2)
+    radial = radial / torch.linalg.vector_norm(radial, dim=-1, keepdim=True).clamp_min(tiny)
+    gradient = gradient - (gradient * radial).sum(-1, keepdim=True) * radial
+    normal += (1e3 * rank * size[..., None] * radial)[..., :, None] * radial[..., None, :]
+    normal.diagonal(dim1=-2, dim2=-1).add_((damping * size + tiny)[..., None])
+    factor, _info = torch.linalg.cholesky_ex(normal)
+    move = torch.cholesky_solve(gradient[..., None], factor).squeeze(-1)
+    trial = _normalise(rows - move.unflatten(-1, (3, rank)), gram)
+    moved, new = _evaluate(trial, forms, bending)
+    better = new < cost  # False for NaN, too: a failed factorisation only raises the damping
+    return state._replace(
+        rows=torch.where(better[..., None, None], trial, rows),
+        residual=torch.where(better[..., None], moved, residual),
+        cost=torch.where(better, new, cost),
+        damping=torch.where(better, damping / 4, damping * 3).clamp(1e-9, 1e6),
+        progress=progress / 2 + torch.where(better, 1 - new / cost, 0),  # halved, not zeroed, by a refused step
+    )
+
+
+def _times(rows: Tensor, matrix: Tensor) -> Tensor:
+    """Rows (B, S, 3, R) times a matrix (B, R, K)."""
+    return (rows.flatten(-3, -2) @ matrix).unflatten(-2, rows.shape[-3:-1])
+
+
+def _normalise(rows: Tensor, gram: Tensor) -> Tensor:
+    """Rows of mean squared length 1."""
+    size = (rows * _times(rows, gram)).sum((-2, -1))
+    return rows / or_one(size).sqrt()[..., None, None]
+
+
+def _evaluate(rows: Tensor, forms: Tensor, bending: Tensor) -> tuple[Tensor, Tensor]:
+    """Residuals (B, S, M) of the defect, and the cost (B, S)."""
+    residual = (rows.mT @ rows).flatten(-2) @ forms.flatten(-3, -2) / 2
+    return residual, residual.square().sum(-1) + (rows * _times(rows, bending)).sum((-2, -1))
 
 
 def _quadratic_forms(a: Tensor, b: Tensor, evenness: float = 0.0) -> Tensor:
