@@ -9,6 +9,7 @@ from kcs_torch.functional.chain import bone_vectors, incidence
 from kcs_torch.methods.pkc.image import Image, Slopes, bend_cost, turned
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.sides import Sides
+from kcs_torch.methods.pkc.trunk_frame import TrunkFrame
 from kcs_torch.methods.pkc.unknowns import Unknowns
 from kcs_torch.methods.pkc.weights import ANCHOR, CORNER, HEAVY, NOISE, wide
 from kcs_torch.nn.lengths import HIDDEN
@@ -177,15 +178,9 @@ class Descent:
     def _posture(self, dz: Tensor, lengths: Tensor, image: Image, depths: Tensor, out: Slopes) -> Tensor:
         obj, posture = self.objective, self.objective.posture
         count, bones, frames = dz.shape
-        first, second = torch.cat([image.plane.expand(count, -1, -1, -1), depths[:, :, None]], 2).unbind(1)  # (H, 3, T)
-        over = (first.square().sum(1, keepdim=True) + 1e-18).rsqrt()
-        first = first * over
-        along = (second * first).sum(1, keepdim=True)
-        square = second - along * first
-        down = (square.square().sum(1, keepdim=True) + 1e-18).rsqrt()
-        up = square * down
-        frame = torch.stack([first, up, torch.linalg.cross(first, up, dim=1)], 1).flatten(2)  # (H, 3, 3 T)
-        turn = (self.axes @ frame).view(count, 3, 3, 1, frames)  # [k, j]: how much of coordinate j is in direction k
+        trunk = TrunkFrame(*torch.cat([image.plane.expand(count, -1, -1, -1), depths[:, :, None]], 2).unbind(1))
+        turn = self.axes @ trunk.directions().flatten(2)
+        turn = turn.view(count, 3, 3, 1, frames)  # [k, j]: how much of coordinate j is in direction k
         # How bones stray from their usual directions, seen from the trunk, less that share of their mean for which the
         # prior does not charge: log det(I + Z Z^T) is then all there is to it.
         sides = self.sides
@@ -206,19 +201,11 @@ class Descent:
         seen.mul_(root * scale)
         self._lower(seen, root * (self.mean + (1 - part) * mean))
         halves = sides.apart(seen)  # (S H, K, T)
-        few = frames < halves.shape[1]  # Z^T Z is then the smaller matrix, and (I + Z Z^T)^-1 Z = Z (I + Z^T Z)^-1
-        scatter = torch.bmm(halves.mT, halves) if few else torch.bmm(halves, halves.mT)
-        scatter.diagonal(dim1=-2, dim2=-1).add_(1)
-        factor, info = torch.linalg.cholesky_ex(scatter)
+        log_det, pull = _log_det(halves)
         firm = amount + posture.strength
-        log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        if bool(info.any()):  # a step so far that rounding or overflow leaves no scatter: it costs infinitely much
-            log_det = torch.where(info > 0, torch.inf, log_det)
-            factor = torch.where((info > 0)[:, None, None], torch.ones_like(factor[0, 0]).diag(), factor)
         log_det = log_det.view(-1, count).sum(0)
         value = log_det * (firm[:, 0, 0] if isinstance(firm, Tensor) else firm)
-        inverse = torch.cholesky_inverse(factor)
-        pull = sides.joined(torch.bmm(halves, inverse) if few else torch.bmm(inverse, halves), count)  # (H, 3B, T)
+        pull = sides.joined(pull, count)  # (H, 3B, T)
         moved = (pull * seen).sum(-1, keepdim=True)
         pull.mul_(firm * root * scale)
         total = pull.sum(-1, keepdim=True)
@@ -228,16 +215,9 @@ class Descent:
         pull = pull.view_as(y)
         pull[:, ::2].addcmul_(strayed[:, :, None], self.feet[:, None])
         out.depth.add_((pull * turn[:, :, 2]).sum(1).index_select(1, sides.back))
-        turned = [(pull * v[:, None]).sum(2) for v in (*image.seen, own)]  # (H, 3, T): of k, for each j
-        into = self.axes.mT @ torch.stack(turned, 2).flatten(2)  # (H, 3, 3 T)
-        a, b, c = into.view(count, 3, 3, frames).unbind(1)
-        a = a + torch.linalg.cross(up, c, dim=1)
-        b = b + torch.linalg.cross(c, first, dim=1)
-        b = (b - up * (up * b).sum(1, keepdim=True)) * down
-        slant = (b * first).sum(1, keepdim=True)
-        a = a - along * b - slant * second
-        b = b - slant * first
-        a = (a - first * (first * a).sum(1, keepdim=True)) * over
+        each = [(pull * v[:, None]).sum(2) for v in (*image.seen, own)]  # (H, 3, T): of k, for each j
+        into = self.axes.mT @ torch.stack(each, 2).flatten(2)  # (H, 3, 3 T)
+        a, b = trunk.slopes(into.view(count, 3, 3, frames))
         out.lines[:, 0], out.lines[:, 1] = a[:, 2], b[:, 2]
         if out.image is not None:
             for j in (0, 1):
@@ -352,6 +332,20 @@ class Descent:
             growth += wide(obj.held, 1) * away / ANCHOR
             value = value + obj.held * away.square().sum(-1) / 2
         return value
+
+
+def _log_det(z: Tensor) -> tuple[Tensor, Tensor]:
+    """Of Z (M, K, T) log det(I + Z Z^T), (M,), and (I + Z Z^T)^-1 Z."""
+    few = z.shape[2] < z.shape[1]  # Z^T Z is then the smaller matrix, and (I + Z Z^T)^-1 Z = Z (I + Z^T Z)^-1
+    scatter = torch.bmm(z.mT, z) if few else torch.bmm(z, z.mT)
+    scatter.diagonal(dim1=-2, dim2=-1).add_(1)
+    factor, info = torch.linalg.cholesky_ex(scatter)
+    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    if bool(info.any()):  # a step so far that rounding or overflow leaves no scatter: it costs infinitely much
+        log_det = torch.where(info > 0, torch.inf, log_det)
+        factor = torch.where((info > 0)[:, None, None], torch.ones_like(factor[0, 0]).diag(), factor)
+    inverse = torch.cholesky_inverse(factor)
+    return log_det, torch.bmm(z, inverse) if few else torch.bmm(inverse, z)
 
 
 def _early(values: Tensor) -> Tensor:
