@@ -19,6 +19,7 @@ from torch.testing import assert_close
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import bone_lengths, bone_vectors, kcs_matrix, svt
+from kcs_torch.functional.precision import narrow
 from kcs_torch.nn import (
     SVT,
     BoneLengthEnergy,
@@ -37,7 +38,7 @@ from kcs_torch.nn import (
     SymmetryEnergy,
     UnrolledSfAM,
 )
-from kcs_torch.nn.layers import inverse_softplus, narrow
+from kcs_torch.nn.layers import inverse_softplus
 from kcs_torch.skeleton import SKELETONS
 
 BONES = BODY.bone_index()

@@ -10,7 +10,7 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-__all__ = ["alike", "full_precision", "wide", "widened"]
+__all__ = ["alike", "full_precision", "narrow", "wide", "widened"]
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -34,6 +34,16 @@ def alike(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 def wide(tensor: Tensor) -> Tensor:
     """At least in single precision: squares of millimetres or pixels leave the range of half precision."""
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+
+
+def narrow(value: Tensor, like: Tensor) -> Tensor:
+    """A value in the dtype of ``like``; beyond its range it is the largest number, with the gradient it has."""
+    if value.dtype == like.dtype:
+        return value
+    top = torch.finfo(like.dtype).max
+    # In this order: beside a value that is far larger, its largest number would be lost to rounding. Infinity less
+    # itself is NaN.
+    return ((value - value.detach()).nan_to_num() + value.detach().clamp(-top, top)).to(like.dtype)
 
 
 def widened(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from kcs_torch.functional.guarded import or_one
 
-__all__ = ["known", "rms"]
+__all__ = ["known", "known_frames", "rms", "seen_weights"]
 
 
 def known(values: Tensor, weights: Tensor | None) -> Tensor:
@@ -23,3 +23,24 @@ def rms(vectors: Tensor, weights: Tensor) -> Tensor:
     top = or_one(vectors.abs().amax())
     square = (vectors / top).square().sum(-1) * weights
     return top * (square.sum() / weights.sum()).sqrt()
+
+
+def known_frames(points: Tensor, weights: Tensor | None) -> Tensor:
+    """Points (..., T, N, D), 0 in frames whose weight (..., T) is 0."""
+    return points if weights is None else known(points.flatten(-2), weights).unflatten(-1, points.shape[-2:])
+
+
+def seen_weights(tracks: Tensor, weights: Tensor | None) -> Tensor:
+    """Weights (..., T, N) of tracks (..., T, N, 2), 0 where these are not finite: NaN is unseen, as everywhere.
+
+    Those below 0 count as 0.
+
+    Args:
+        tracks: (..., T, N, 2).
+        weights: (..., T, N); 1 if None.
+    """
+    finite = tracks.isfinite().all(-1)
+    if weights is None:
+        return finite.to(tracks.dtype)
+    weights = weights.clamp_min(0)
+    return torch.where(finite, weights, torch.zeros((), dtype=weights.dtype, device=weights.device))

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.functional.precision import wide
+from kcs_torch.functional.precision import narrow, wide
 from kcs_torch.functional.weights import known
-from kcs_torch.nn.energies import check_lengths
-from kcs_torch.nn.layers import SkeletonModule, narrow
+from kcs_torch.nn.checks import check_lengths
+from kcs_torch.nn.layers import SkeletonModule
 from kcs_torch.nn.masks import known_points, weighs_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.hints import is_a

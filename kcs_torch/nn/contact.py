@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import ShapeError
-from kcs_torch.functional.precision import wide
+from kcs_torch.functional.precision import narrow, wide
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.weights import known
-from kcs_torch.nn.layers import SkeletonModule, check_positive, check_tensor, check_whole, narrow
+from kcs_torch.nn.checks import check_positive, check_tensor, check_whole
+from kcs_torch.nn.layers import SkeletonModule
 from kcs_torch.nn.masks import weighs_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.standing import RIDGE, root_velocity

@@ -11,11 +11,11 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.align import check_alignment, superpose
 from kcs_torch.functional.chain import pose_matrix
 from kcs_torch.functional.guarded import or_one, safe_norm
-from kcs_torch.functional.precision import full_precision, wide
+from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.shapes import fit_together
-from kcs_torch.functional.weights import known
-from kcs_torch.nn.energies import check_clip, check_weights
-from kcs_torch.nn.layers import SkeletonModule, check_tensor, narrow, seen_weights, shown
+from kcs_torch.functional.weights import known, seen_weights
+from kcs_torch.nn.checks import check_clip, check_tensor, check_weights, shown
+from kcs_torch.nn.layers import SkeletonModule
 from kcs_torch.nn.masks import bone_share
 from kcs_torch.skeleton import Skeleton
 

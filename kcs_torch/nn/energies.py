@@ -16,18 +16,18 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.guarded import largest, or_one, safe_root
-from kcs_torch.functional.precision import full_precision, wide
+from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.spectral import log_det, nuclear_norm, svt
 from kcs_torch.functional.weights import known
-from kcs_torch.nn.layers import (
-    SkeletonModule,
-    check_coordinates,
-    check_points,
+from kcs_torch.nn.checks import (
+    check_clip,
+    check_lengths,
     check_tensor,
-    narrow,
+    check_weights,
     shown,
 )
+from kcs_torch.nn.layers import SkeletonModule
 from kcs_torch.nn.masks import bone_share
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lm import fit_bones
@@ -246,49 +246,3 @@ class SymmetryEnergy(SkeletonModule):
             share = bone_share(weights, self.bones)
             square = square * torch.minimum(share[..., self.pairs[:, 0]], share[..., self.pairs[:, 1]])
         return narrow(0.5 * square.sum(-1), points)
-
-
-def check_clip(points: Tensor, module: nn.Module) -> None:
-    """Raise a ShapeError unless ``points`` are (..., T, N, D)."""
-    check_points(points, module)
-    if points.ndim < 3:
-        raise ShapeError(f"{type(module).__name__}: expected points (..., T, N, D), got {tuple(points.shape)}")
-    check_coordinates(points, module)
-
-
-def check_weights(weights: Tensor | None, points: Tensor, module: nn.Module) -> None:
-    """Raise a ShapeError unless ``weights`` are (..., T, N) for points (..., T, N, D)."""
-    if weights is None:
-        return
-    check_tensor(weights, "weights", module)
-    if weights.shape[-2:] != points.shape[-3:-1] or not fit_together(weights.shape[:-2], points.shape[:-3]):
-        expected = f"(..., {points.shape[-3]}, {points.shape[-2]}) for points {tuple(points.shape)}"
-        message = f"{type(module).__name__}: expected weights {expected}, got {tuple(weights.shape)}"
-        if weights.shape[-1:] == points.shape[-3:-2]:
-            message += ": those of frames are weights[..., None].expand(..., N)"
-        raise ShapeError(message)
-
-
-def check_lengths(lengths: Tensor | None, points: Tensor, module: SkeletonModule) -> None:
-    """Raise a ShapeError unless ``lengths`` are (..., B) for points (..., T, N, D) of the module's skeleton."""
-    if lengths is None:
-        return
-    check_tensor(lengths, "lengths", module)
-    count = module.skeleton.num_bones
-    if lengths.shape[-1:] != (count,) or not fit_together(lengths.shape[:-1], points.shape[:-3]):
-        expected = f"(..., {count}), the same in all frames, for points {tuple(points.shape)}"
-        raise ShapeError(f"{type(module).__name__}: expected lengths {expected}, got {tuple(lengths.shape)}")
-    check_one(lengths, 1, f"lengths ({count},)", points, module)
-
-
-def check_one(value: Tensor, core: int, what: str, points: Tensor, module: nn.Module) -> None:
-    """Raise a ShapeError if a value with so many core dimensions is of each frame where points are one clip (T, N, D).
-
-    It would pass for one of each of T bodies.
-    """
-    if points.ndim == 3 and value.shape[: value.ndim - core] == points.shape[:1] and len(points) > 1:
-        raise ShapeError(
-            f"{type(module).__name__}: expected {what} that are the same in all frames of a clip "
-            f"{tuple(points.shape)}, got {tuple(value.shape)}: take their median over the frames; if they are of as "
-            "many bodies, give points[None]"
-        )

@@ -11,11 +11,11 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.guarded import or_one, safe_root
-from kcs_torch.functional.precision import wide
+from kcs_torch.functional.precision import narrow, wide
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.weights import known
-from kcs_torch.nn.energies import check_lengths, check_weights
-from kcs_torch.nn.layers import SkeletonModule, check_beside, check_points, check_positive, check_tensor, narrow
+from kcs_torch.nn.checks import check_beside, check_lengths, check_points, check_positive, check_tensor, check_weights
+from kcs_torch.nn.layers import SkeletonModule
 from kcs_torch.nn.masks import bone_share
 from kcs_torch.skeleton import Skeleton
 

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.shapes import fit_together
-from kcs_torch.functional.weights import known
-from kcs_torch.nn.layers import check_tensor, known_frames
+from kcs_torch.functional.weights import known, known_frames
+from kcs_torch.nn.checks import check_tensor
 
 __all__ = ["bone_share", "clear_padding", "known_points", "weighs_joints"]
 

@@ -18,15 +18,9 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.nn.layers import (
-    SkeletonModule,
-    check_beside,
-    check_joints,
-    check_points,
-    check_tensor,
-    check_whole,
-    narrow,
-)
+from kcs_torch.functional.precision import narrow
+from kcs_torch.nn.checks import check_beside, check_joints, check_points, check_tensor, check_whole
+from kcs_torch.nn.layers import SkeletonModule
 from kcs_torch.nn.normalise import NormalisedTracks, neighbours, normalise_tracks
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.hints import is_a

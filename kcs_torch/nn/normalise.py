@@ -11,7 +11,7 @@ from torch import Tensor
 from kcs_torch.functional.guarded import largest, or_one, safe_root
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.nn.layers import seen_weights
+from kcs_torch.functional.weights import seen_weights
 
 __all__ = ["NormalisedTracks", "neighbours", "normalise_tracks"]
 

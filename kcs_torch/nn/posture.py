@@ -11,9 +11,9 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.guarded import or_one, safe_root
-from kcs_torch.functional.precision import full_precision, wide
-from kcs_torch.nn.energies import check_lengths
-from kcs_torch.nn.layers import SkeletonModule, check_beside, check_positive, narrow
+from kcs_torch.functional.precision import full_precision, narrow, wide
+from kcs_torch.nn.checks import check_beside, check_lengths, check_positive
+from kcs_torch.nn.layers import SkeletonModule
 from kcs_torch.nn.lengths import LEAST, usual_size
 from kcs_torch.nn.masks import bone_share, known_points, weighs_joints
 from kcs_torch.skeleton import Skeleton

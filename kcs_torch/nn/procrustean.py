@@ -12,11 +12,11 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.guarded import or_one, safe_root
-from kcs_torch.functional.precision import full_precision, wide
+from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.functional.weights import known
-from kcs_torch.nn.energies import check_weights
-from kcs_torch.nn.layers import SkeletonModule, check_beside, narrow
+from kcs_torch.nn.checks import check_beside, check_weights
+from kcs_torch.nn.layers import SkeletonModule
 from kcs_torch.nn.masks import bone_share
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.hints import is_a

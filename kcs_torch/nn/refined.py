@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from kcs_torch.errors import SkeletonError
 from kcs_torch.functional import centre
 from kcs_torch.functional.guarded import largest, or_one
-from kcs_torch.functional.precision import wide
-from kcs_torch.nn.layers import narrow, seen_weights
+from kcs_torch.functional.precision import narrow, wide
+from kcs_torch.functional.weights import seen_weights
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["RefinedLifter"]

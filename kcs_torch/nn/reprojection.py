@@ -8,11 +8,10 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import back_project, project
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.functional.precision import full_precision, wide
+from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.shapes import fit_together
-from kcs_torch.functional.weights import known
-from kcs_torch.nn.energies import check_clip, check_weights
-from kcs_torch.nn.layers import check_tensor, narrow, seen_weights, shown
+from kcs_torch.functional.weights import known, seen_weights
+from kcs_torch.nn.checks import check_clip, check_tensor, check_weights, shown
 from kcs_torch.types.hints import is_a
 
 __all__ = ["ReprojectionEnergy", "centred_residual", "huber_square"]

@@ -11,9 +11,9 @@ from torch import Tensor
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.functional.precision import full_precision, wide
-from kcs_torch.nn.energies import check_one
-from kcs_torch.nn.layers import SkeletonModule, check_beside, check_positive, narrow
+from kcs_torch.functional.precision import full_precision, narrow, wide
+from kcs_torch.nn.checks import check_beside, check_one, check_positive
+from kcs_torch.nn.layers import SkeletonModule
 from kcs_torch.nn.lengths import usual_size
 from kcs_torch.nn.masks import bone_share, known_points, weighs_joints
 from kcs_torch.nn.posture import PostureEnergy

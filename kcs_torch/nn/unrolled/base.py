@@ -12,8 +12,9 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.shapes import fit_together
-from kcs_torch.nn.energies import check_weights
-from kcs_torch.nn.layers import check_beside, check_joints, check_points, check_tensor, inverse_softplus, seen_weights
+from kcs_torch.functional.weights import seen_weights
+from kcs_torch.nn.checks import check_beside, check_joints, check_points, check_tensor, check_weights
+from kcs_torch.nn.layers import inverse_softplus
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.steps import corner_of
 from kcs_torch.skeleton import Skeleton

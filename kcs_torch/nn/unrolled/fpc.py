@@ -8,9 +8,8 @@ from dataclasses import replace
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
-from kcs_torch.functional.precision import full_precision, wide
+from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.weights import known
-from kcs_torch.nn.layers import narrow
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.steps import continuation, data_scale, shape_step, start_shape
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled

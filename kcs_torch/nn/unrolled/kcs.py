@@ -14,7 +14,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_lengths, bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.functional.precision import full_precision, wide
+from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.functional.weights import known
 from kcs_torch.nn.deviation import (
@@ -25,7 +25,6 @@ from kcs_torch.nn.deviation import (
     frame_scales,
     template_scale,
 )
-from kcs_torch.nn.layers import narrow
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.reprojection import centred_residual
 from kcs_torch.nn.steps import continuation

@@ -11,10 +11,9 @@ from torch import Tensor
 from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.functional.precision import full_precision
+from kcs_torch.functional.precision import full_precision, narrow
 from kcs_torch.functional.shapes import broadcast_shapes
 from kcs_torch.functional.weights import known
-from kcs_torch.nn.layers import narrow
 from kcs_torch.nn.majorise import majorise_step, turn_onto_mean
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.reprojection import centred_residual

@@ -10,9 +10,8 @@ from pathlib import Path
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
-from kcs_torch.functional.precision import full_precision, wide
+from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.weights import known
-from kcs_torch.nn.layers import narrow
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape, to_scale
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
