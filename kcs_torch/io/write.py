@@ -83,6 +83,21 @@ def save(
     if writer.write_motion is None:
         raise OutputError(f"{path}: expected a result, got motion, which goes to {_suffixes('write_motion')}")
     check_skeleton(path, data.skeleton)
+    motion = _as_motion(data, writer, units, path, saving)
+    with atomic_path(path) as temporary:
+        writer.write_motion(motion, temporary, saving)
+    if notes is not None:
+        notes.extend([*saving.warnings, *saving.notes])
+    else:
+        for warning in saving.warnings:
+            warnings.warn(f"{path}: {warning}", KcsWarning, stacklevel=users_level())
+    return Path(path)
+
+
+def _as_motion(
+    data: Reconstruction | Motion, writer: Writer, units: str | None, path: str | Path, saving: Saving
+) -> Motion:
+    """Motion in the unit that the file is to have; what there is to say of it goes to ``saving``."""
     motion = Motion.of(data) if isinstance(data, Reconstruction) else data
     motion = replace(motion, points=motion.points.detach())
     if isinstance(data, Reconstruction):
@@ -102,14 +117,7 @@ def save(
             f"the true size is not known: lengths are in {motion.units or 'an unknown unit'}; set it with "
             f"{size_hint(motion.skeleton)}"
         )
-    with atomic_path(path) as temporary:
-        writer.write_motion(motion, temporary, saving)
-    if notes is not None:
-        notes.extend([*saving.warnings, *saving.notes])
-    else:
-        for warning in saving.warnings:
-            warnings.warn(f"{path}: {warning}", KcsWarning, stacklevel=users_level())
-    return Path(path)
+    return motion
 
 
 def takes_up(path: str | Path) -> bool:

@@ -69,13 +69,7 @@ def arguments(
         if not isinstance(mapping, (Mapping, type(None))):
             raise SkeletonError(f"{what} of skeleton '{name}': expected a mapping from names, got {mapping!r}")
     virtual = {str(v): listed(s, f"virtual joint '{v}'", name) for v, s in (virtual or {}).items()}
-    joints = listed(list(joints) if isinstance(joints, str) else joints, "joints", name)
-    if any(isinstance(joint, bool) for joint in joints):
-        raise SkeletonError(
-            f"joints of skeleton '{name}': expected names, got True or False: YAML reads on, off, yes and no as such, "
-            "so put them in quotes"
-        )
-    names = (*(str(j) for j in joints), *virtual)
+    names = (*_observed(joints, name), *virtual)
     position = {n: i for i, n in enumerate(names)}
     if doubled := sorted({n for n in names if names.count(n) > 1}):  # else the joint that one replaced would be unknown
         raise SkeletonError(f"skeleton '{name}': joint names must differ; given twice: {', '.join(doubled)}")
@@ -172,6 +166,17 @@ def find_mirror(names: Sequence[str]) -> tuple[Pair, ...]:
     position = {n: i for i, n in enumerate(names)}
     twins = ((n, mirror_name(n)) for n in names if side_of(n) == "left")
     return tuple((position[a], position[b]) for a, b in twins if b in position)
+
+
+def _observed(joints: Sequence[str], name: str) -> list[str]:
+    """The names of the joints that tracks have."""
+    joints = listed(list(joints) if isinstance(joints, str) else joints, "joints", name)
+    if any(isinstance(joint, bool) for joint in joints):
+        raise SkeletonError(
+            f"joints of skeleton '{name}': expected names, got True or False: YAML reads on, off, yes and no as such, "
+            "so put them in quotes"
+        )
+    return [str(joint) for joint in joints]
 
 
 def _read_hinge(

@@ -11,6 +11,7 @@ import itertools
 import math
 import re
 from array import array
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -54,33 +55,8 @@ def read(path: Path, options: MotionOptions) -> Motion:
         names.pop()
     if not names:
         raise FormatError(f"{path}: line {at + 1}: expected names of markers, got none")
-    frames: list[array[float]] = []
-    numbered: list[str] = []
-    told_at: dict[int, float] = {}
-    short = 0
-    for number, line in enumerate(lines[at + 1 :], at + 2):
-        row = cells_of(line)
-        if not any(row) or not row[0]:  # the line below the names holds X1, Y1, Z1, ...; an empty one may follow
-            continue
-        cells = row[2:]
-        if any(cells[3 * len(names) :]):
-            raise FormatError(
-                f"{path}: line {number}: expected {3 * len(names)} numbers of {len(names)} markers, got {len(cells)}"
-            )
-        short += len(cells) < 3 * len(names) - 2  # of an unseen last marker there may be but one cell
-        cells = cells[: 3 * len(names)] + [""] * (3 * len(names) - len(cells))
-        filled = iter(numbers([c for c in cells if c not in _UNSEEN], f"{path}: line {number}"))
-        with suppress(ValueError, IndexError):
-            told_at[len(frames)] = float(row[1])
-        numbered.append(row[0])
-        frames.append(array("d", [math.nan if c in _UNSEEN else next(filled) for c in cells]))
-    if not frames:
-        raise FormatError(f"{path}: expected a line a frame below the names of the markers, got none")
     notes: list[str] = []
-    if short:
-        notes.append(
-            f"{counted(short, 'row')} end{'' if short > 1 else 's'} before the last marker: the rest is unseen"
-        )
+    frames, numbered, told_at = _rows(map(cells_of, lines[at + 1 :]), at + 2, len(names), path, notes)
     places = _places(numbered, path, notes)
     times = {places[i]: time for i, time in told_at.items()}
     told = header.get("NumFrames", "")
@@ -101,6 +77,44 @@ def read(path: Path, options: MotionOptions) -> Motion:
         units=short_unit(header.get("Units", "")),
         notes=notes,
     )
+
+
+def _rows(
+    rows: Iterable[list[str]], first: int, markers: int, path: Path, notes: list[str]
+) -> tuple[list[array[float]], list[str], dict[int, float]]:
+    """Numbers of each frame, NaN where unseen; what stands as its number; and times of those frames that have one.
+
+    Args:
+        rows: cells of the lines below the names.
+        first: number of the first of them.
+        markers: how many there are.
+        path: of the file.
+        notes: gets a sentence on rows that are too short.
+    """
+    frames: list[array[float]] = []
+    numbered: list[str] = []
+    told_at: dict[int, float] = {}
+    width, short = 3 * markers, 0
+    for number, row in enumerate(rows, first):
+        if not any(row) or not row[0]:  # the line below the names holds X1, Y1, Z1, ...; an empty one may follow
+            continue
+        cells = row[2:]
+        if any(cells[width:]):
+            raise FormatError(f"{path}: line {number}: expected {width} numbers of {markers} markers, got {len(cells)}")
+        short += len(cells) < width - 2  # of an unseen last marker there may be but one cell
+        cells = cells[:width] + [""] * (width - len(cells))
+        filled = iter(numbers([c for c in cells if c not in _UNSEEN], f"{path}: line {number}"))
+        with suppress(ValueError, IndexError):
+            told_at[len(frames)] = float(row[1])
+        numbered.append(row[0])
+        frames.append(array("d", [math.nan if c in _UNSEEN else next(filled) for c in cells]))
+    if not frames:
+        raise FormatError(f"{path}: expected a line a frame below the names of the markers, got none")
+    if short:
+        notes.append(
+            f"{counted(short, 'row')} end{'' if short > 1 else 's'} before the last marker: the rest is unseen"
+        )
+    return frames, numbered, told_at
 
 
 def _places(numbered: list[str], path: Path, notes: list[str]) -> list[int]:
