@@ -120,14 +120,7 @@ def reconstruct_folder(
         raise OptionError(f"shard: expected a number from 0 to {shards - 1} of shards={shards}, got {shard}")
     if batch < 1:
         raise OptionError(f"batch: expected at least 1 clip, got {batch}")
-    suffixes = [suffixes] if isinstance(suffixes, str) else suffixes
-    suffixes = [s if s.startswith(".") else f".{s}" for s in suffixes]
-    if not suffixes:
-        raise OptionError("suffixes: expected at least one, such as .npz, got none")
-    for suffix in suffixes:
-        ready_writer(Path(f"NAME{suffix}"))
-    if up is not None and not any(takes_up(Path(f"x{suffix}")) for suffix in suffixes):
-        raise OptionError(f"up: none of {', '.join(suffixes)} holds results with y or z up")
+    suffixes = _checked_suffixes(suffixes, up)
     if units not in (None, "px", *METRES):
         raise unknown("unit of length", units, METRES)
     size = None if scale is None else parse_size(scale)
@@ -145,19 +138,8 @@ def reconstruct_folder(
     _sweep(Path(output), workplace)
     doubted: list[tuple[Path, str]] = []
     work = _Work(method, suffixes, everybody, workplace, size, up, units, intrinsics, find, how, doubted)
-    todo: list[Clip] = []
-    outdated: list[Path] = []
-    failed: list[tuple[Path, str]] = []
-    skipped = 0
-    for clip in clips:
-        results = work.results(clip)
-        if results:  # perhaps but those of another call's suffixes, which failed
-            skipped += 1
-            outdated += [clip.source] if clip.is_newer_than(results) else []
-        elif clip.failure.exists() and not retry:
-            failed.append((clip.source, clip.failure.read_text("utf-8", "replace").partition("\n")[0]))
-        else:
-            todo.append(clip)
+    todo, outdated, failed = _still_to_do(work, clips, retry)
+    skipped = len(clips) - len(todo) - len(failed)
     done = frames = 0
     told = begin
     for start in range(0, len(todo), batch):
@@ -173,6 +155,37 @@ def reconstruct_folder(
     _sweep(Path(output), workplace)
     told_of = tuple(outdated), tuple(doubted), tuple(failed)
     return Outcome(len(clips), done, skipped, *told_of, frames, time.monotonic() - begin)
+
+
+def _checked_suffixes(suffixes: str | Sequence[str], up: str | None) -> list[str]:
+    """With their dots; all can be written, and one with an axis up if that is asked for."""
+    given = [suffixes] if isinstance(suffixes, str) else suffixes
+    dotted = [s if s.startswith(".") else f".{s}" for s in given]
+    if not dotted:
+        raise OptionError("suffixes: expected at least one, such as .npz, got none")
+    for suffix in dotted:
+        ready_writer(Path(f"NAME{suffix}"))
+    if up is not None and not any(takes_up(Path(f"x{suffix}")) for suffix in dotted):
+        raise OptionError(f"up: none of {', '.join(dotted)} holds results with y or z up")
+    return dotted
+
+
+def _still_to_do(
+    work: _Work, clips: Sequence[Clip], retry: bool
+) -> tuple[list[Clip], list[Path], list[tuple[Path, str]]]:
+    """Clips without results; the sources that are newer than theirs; and those that failed before, and why."""
+    todo: list[Clip] = []
+    outdated: list[Path] = []
+    failed: list[tuple[Path, str]] = []
+    for clip in clips:
+        results = work.results(clip)
+        if results:  # perhaps but those of another call's suffixes, which failed
+            outdated += [clip.source] if clip.is_newer_than(results) else []
+        elif clip.failure.exists() and not retry:
+            failed.append((clip.source, clip.failure.read_text("utf-8", "replace").partition("\n")[0]))
+        else:
+            todo.append(clip)
+    return todo, outdated, failed
 
 
 @dataclass(frozen=True)

@@ -100,21 +100,8 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         savable = _savable(module.network)
         best = Best(folder / "checkpoints", config.optimise, config.mode, resumed)
         last = Last(folder / "checkpoints")
-        own = config.trainer
-        more: Any = []
-        if "callbacks" in own:  # to stand beside those of every run
-            more = instantiate(own.callbacks, _convert_="all") or []
-            more = more if isinstance(more, list) else [more]
-            own = OmegaConf.create({name: value for name, value in plain["trainer"].items() if name != "callbacks"})
-        made: dict[str, Any] = {
-            "callbacks": [Watch(plain, folder / RESULT), best, last, *more],
-            "default_root_dir": folder,
-        }
-        if "logger" not in config.trainer:
-            made["logger"] = [Log(folder, epoch if goes_on else None), TensorBoardLogger(folder, "tensorboard", "")]
-        if "enable_progress_bar" not in config.trainer:
-            made["enable_progress_bar"] = sys.stderr.isatty()
-        trainer = instantiate(own, **made, _convert_="all")
+        watch = [Watch(plain, folder / RESULT), best, last]
+        trainer = _trainer(config.trainer, watch, folder, epoch if goes_on else None)
         try:
             trainer.fit(module, datamodule=data, ckpt_path=resumed, weights_only=True)
         except (Diverged, NotFiniteError):  # a loss or a solver was given NaN
@@ -151,6 +138,28 @@ def train(config: DictConfig, folder: Path) -> Outcome:
     else:
         lifter.unlink(missing_ok=True)
     return Outcome(float(best.best_model_score), metrics, lifter if savable else None, diverged)
+
+
+def _trainer(config: DictConfig, callbacks: list[Any], folder: Path, epoch: int | None) -> Any:
+    """Lightning's trainer, with what every run has where the configuration does not say otherwise.
+
+    Args:
+        config: of the trainer.
+        callbacks: of every run; those of the configuration stand beside them.
+        folder: of the run.
+        epoch: after which a run goes on whose log is there; None for a new one.
+    """
+    made: dict[str, Any] = {"callbacks": callbacks, "default_root_dir": folder}
+    if "callbacks" in config:
+        more = instantiate(config.callbacks, _convert_="all") or []
+        made["callbacks"] = [*callbacks, *(more if isinstance(more, list) else [more])]
+        plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+        config = OmegaConf.create({name: value for name, value in plain.items() if name != "callbacks"})
+    if "logger" not in config:
+        made["logger"] = [Log(folder, epoch), TensorBoardLogger(folder, "tensorboard", "")]
+    if "enable_progress_bar" not in config:
+        made["enable_progress_bar"] = sys.stderr.isatty()
+    return instantiate(config, **made, _convert_="all")
 
 
 def _exit_code(end: SystemExit) -> Any:
