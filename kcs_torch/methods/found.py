@@ -58,6 +58,35 @@ def find_skeleton(
     """
     if not rigid_below >= 0:
         raise OptionError(f"find_skeleton: rigid_below: expected a share >= 0, got {rigid_below}")
+    points, weights, joints = _given(source, weights, joints)
+    mean, spread = distance_spread(points, weights)
+    # Between equally rigid pairs, those of a body at rest say, the shorter is the likelier bone.
+    cost = spread + 1e-3 * mean
+    apart = torch.zeros_like(cost, dtype=torch.bool)
+    if weights is not None:  # what was never seen together is joined last, and nobody knows how far apart it is
+        apart = torch.minimum(weights[:, :, None], weights[:, None, :]).sum(0) == 0
+        cost = torch.where(apart, 1e3 * (1 + cost.amax()) + mean, cost)
+    bones = rigid_tree(cost)
+    size = bone_lengths(points, bones)
+    ratio = spread[bones[:, 0], bones[:, 1]] / mean[bones[:, 0], bones[:, 1]].clamp_min(torch.finfo(mean.dtype).tiny)
+    lengths = median(size, 0)
+    loose = (ratio > rigid_below) | apart[bones[:, 0], bones[:, 1]]
+    flexible = tuple(loose.nonzero().flatten().tolist())
+    sway = bone_vectors(points, bones).std(0, correction=0).norm(dim=-1)
+    _warn(len(flexible) == len(bones), len(bones) > 1 and bool((sway <= rigid_below * lengths).all()), rigid_below)
+    return Skeleton(
+        joints=tuple(joints) if joints is not None else tuple(f"joint{i}" for i in range(points.shape[1])),
+        bones=tuple((int(a), int(b)) for a, b in bones.tolist()),
+        name="found",
+        proportions=tuple(lengths.tolist()) if bool((lengths > 0).all()) else None,
+        flexible=flexible,
+    )
+
+
+def _given(
+    source: Tracks | Reconstruction | Tensor, weights: Tensor | None, joints: Sequence[str] | None
+) -> tuple[Tensor, Tensor | None, Sequence[str] | None]:
+    """Points (T, N, 3), weights (T, N) and the joints' names, checked."""
     if isinstance(source, Tracks):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)  # of depths that nobody sees
@@ -78,38 +107,22 @@ def find_skeleton(
         raise ShapeError("find_skeleton: expected finite points; give weights 0 where a joint is unseen")
     if weights is not None and weights.shape != source.shape[:2]:
         raise ShapeError(f"find_skeleton: expected weights {tuple(source.shape[:2])}, got {tuple(weights.shape)}")
-    mean, spread = distance_spread(source, weights)
-    # Between equally rigid pairs, those of a body at rest say, the shorter is the likelier bone.
-    cost = spread + 1e-3 * mean
-    apart = torch.zeros_like(cost, dtype=torch.bool)
-    if weights is not None:  # what was never seen together is joined last, and nobody knows how far apart it is
-        apart = torch.minimum(weights[:, :, None], weights[:, None, :]).sum(0) == 0
-        cost = torch.where(apart, 1e3 * (1 + cost.amax()) + mean, cost)
-    bones = rigid_tree(cost)
-    size = bone_lengths(source, bones)
-    ratio = spread[bones[:, 0], bones[:, 1]] / mean[bones[:, 0], bones[:, 1]].clamp_min(torch.finfo(mean.dtype).tiny)
-    lengths = median(size, 0)
-    loose = (ratio > rigid_below) | apart[bones[:, 0], bones[:, 1]]
-    flexible = tuple(loose.nonzero().flatten().tolist())
-    if len(flexible) == len(bones):
+    return source, weights, joints
+
+
+def _warn(loose: bool, resting: bool, rigid_below: float) -> None:
+    """Tell what makes bones a guess."""
+    if loose:
         warnings.warn(
             f"find_skeleton: no two joints keep their distance within {100 * rigid_below:g} %, so that no lengths hold "
             "the joints together: give the skeleton, if you know it, or tracks in which the viewpoint turns further",
             KcsWarning,
             stacklevel=users_level(),
         )
-    sway = bone_vectors(source, bones).std(0, correction=0).norm(dim=-1)
-    if len(bones) > 1 and bool((sway <= rigid_below * lengths).all()):
+    if resting:
         warnings.warn(
             "find_skeleton: a single frame, or a body at rest: all joints keep their distances, and bones join the "
             "nearest. Give the skeleton, if you know it, or tracks in which the body moves",
             KcsWarning,
             stacklevel=users_level(),
         )
-    return Skeleton(
-        joints=tuple(joints) if joints is not None else tuple(f"joint{i}" for i in range(source.shape[1])),
-        bones=tuple((int(a), int(b)) for a, b in bones.tolist()),
-        name="found",
-        proportions=tuple(lengths.tolist()) if bool((lengths > 0).all()) else None,
-        flexible=flexible,
-    )

@@ -208,19 +208,9 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
     images = intrinsics.project(points)
     off = (images - tracks.points)[:, :n][tracks.seen[:, :n]]
     points = torch.cat([points[..., :2], points[..., 2:] - root[:, None, None]], -1)
-    told = () if k else found.notes  # the best solution's; "the mirror image", say, is true of none any more
-    # True of what was lifted, perhaps not of this.
-    stale = (WHY_LOOSE, HARDLY, SEEMS_NEAR, "weak perspective", "did not settle")
-    notes = [n for n in told if not n.startswith((ABSENT, FOUND)) and not any(part in n for part in stale)]
-    before = lifted.diagnostics
-    if not (k or before.converged):
-        notes.append(method.unsettled(before.iterations))
     cameras = (found.view.look.mT @ complete_rotation(lifted.cameras))[:, :2]
     turn = float(viewpoint_turn(cameras))
-    if not k and (little := little_turn(method, body, turn)):
-        notes.append(little)
-    if not k:
-        notes.extend(what_is_wrong(method, points, images, tracks, before.converged))
+    notes = [] if k else _notes_on_best(method, tracks, found, points, images, turn)
     notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
     if scene.any_focal:
         notes.append(lens_note(intrinsics, tracks.units))
@@ -229,7 +219,7 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
     if doubt == nothing_else(method, body, first.viewpoint_turn):  # by the turn before the lens was known
         doubt = nothing_else(method, body, turn)
     facts = replace(
-        before,
+        lifted.diagnostics,
         viewpoint_turn=turn,
         reprojection_rms=float(off.square().sum(-1).mean().sqrt()),
         notes=tuple(notes),
@@ -249,3 +239,20 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
         intrinsics=intrinsics,
         alternatives=(),
     ).remeasured()
+
+
+def _notes_on_best(
+    method: Method, tracks: Tracks, found: Found, points: Tensor, images: Tensor, turn: float
+) -> list[str]:
+    """What is said of the best solution alone; "the mirror image", say, is true of none of the others any more."""
+    # True of what was lifted, perhaps not of this.
+    stale = (WHY_LOOSE, HARDLY, SEEMS_NEAR, "weak perspective", "did not settle")
+    notes = [
+        note for note in found.notes if not note.startswith((ABSENT, FOUND)) and not any(part in note for part in stale)
+    ]
+    before = found.lifted[int(found.bodies.origin[0])].diagnostics
+    if not before.converged:
+        notes.append(method.unsettled(before.iterations))
+    if little := little_turn(method, tracks.skeleton, turn):
+        notes.append(little)
+    return [*notes, *what_is_wrong(method, points, images, tracks, before.converged)]
