@@ -58,6 +58,11 @@ def turning(frames: int, degrees: float = 120.0, *, tilt: float = 0.2, dtype: to
     return (nod @ yaw.reshape(-1, 3, 3)).to(dtype)
 
 
+def tumbling(frames: int, degrees: float = 400.0) -> torch.Tensor:
+    """Camera rows (T, 2, 3) that turn about two axes."""
+    return (turning(frames, degrees, tilt=0.5) @ rotations(seed=3) @ turning(frames, 130.0, tilt=-0.3).mT)[:, :2]
+
+
 def same_as_loop(function, *shapes, make=None):
     """Check that a function of tensors gives for a batch what it gives one by one."""
     for batch in BATCHES:

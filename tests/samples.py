@@ -69,6 +69,11 @@ def person(num_frames: int = 4, joints: int = 25, *, at=(200.0, 300.0), confiden
 # ---------------------------------------------------------------------- one small file of every format, 4 frames long
 
 
+def numbers(tracks, joints=17):
+    """x, y and confidence (frames, joints, 3) of the first joints, as files have them."""
+    return torch.cat([tracks.points, tracks.weights[..., None]], -1)[:, :joints].numpy()
+
+
 def write_npz(folder: Path) -> Path:
     np.savez(path := folder / "a.npz", points2d=person()[..., :2])
     return path

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from numerics import camera_disagreement, normal, rotations, turning
+from numerics import camera_disagreement, normal, rotations, tumbling, turning
 from torch.testing import assert_close
 
 import kcs_torch as kt
@@ -16,11 +16,6 @@ from kcs_torch.methods.factorised import camera_rows, fit_basis_shapes, trajecto
 
 BASELINES = (Rigid, PTA, CSF, BMM)
 quiet = pytest.mark.filterwarnings("ignore::kcs_torch.errors.KcsWarning")
-
-
-def tumbling(frames, degrees=400.0):
-    """Camera rows (T, 2, 3) that turn about two axes."""
-    return (turning(frames, degrees, tilt=0.5) @ rotations(seed=3) @ turning(frames, 130.0, tilt=-0.3).mT)[:, :2]
 
 
 def seen_from(world, cameras, **options):

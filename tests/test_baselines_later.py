@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from numerics import camera_disagreement, normal, rotations, turning
+from numerics import camera_disagreement, normal, rotations, tumbling
 from torch.testing import assert_close
 
 import kcs_torch as kt
@@ -20,11 +20,6 @@ quiet = pytest.mark.filterwarnings("ignore::kcs_torch.errors.KcsWarning")
 
 def centre(points):
     return points - points.mean(1, keepdim=True)
-
-
-def tumbling(frames, degrees=400.0):
-    """Camera rows (T, 2, 3) that turn about two axes."""
-    return (turning(frames, degrees, tilt=0.5) @ rotations(seed=3) @ turning(frames, 130.0, tilt=-0.3).mT)[:, :2]
 
 
 def error(found, truth):

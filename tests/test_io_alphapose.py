@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-import torch
-from samples import person, write_json
+from samples import numbers, person, write_json
 
 from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io import detect_format, load_people, load_tracks
@@ -18,10 +17,6 @@ def entry(frame, joints, image="{}.jpg", **more):
 
 def write(tmp_path, people):
     return write_json(tmp_path / "alphapose-results.json", people)
-
-
-def numbers(tracks, joints=17):
-    return torch.cat([tracks.points, tracks.weights[..., None]], -1)[:, :joints].numpy()
 
 
 def test_images_are_in_natural_order(tmp_path):

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-import torch
-from samples import coco_annotations, person, write_json
+from samples import coco_annotations, numbers, person, write_json
 
 from kcs_torch.errors import KcsError
 from kcs_torch.io import detect_format, load_people, load_tracks
@@ -14,10 +13,6 @@ A, B = person(6, 17), person(6, 17, at=(900.0, 300.0), confidence=0.6)
 
 def result(image, joints, **more):
     return {"image_id": image, "category_id": 1, "keypoints": np.ravel(joints).tolist(), "score": 0.9, **more}
-
-
-def numbers(tracks, joints=17):
-    return torch.cat([tracks.points, tracks.weights[..., None]], -1)[:, :joints].numpy()
 
 
 # ---------------------------------------------------------------------- results

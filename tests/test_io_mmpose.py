@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-import torch
-from samples import mmpose_frames, person, write_json
+from samples import mmpose_frames, numbers, person, write_json
 
 from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io import detect_format, load_people, load_tracks
@@ -18,10 +17,6 @@ AP10K = (
     "L_Eye R_Eye Nose Neck Root_of_tail L_Shoulder L_Elbow L_F_Paw R_Shoulder R_Elbow R_F_Paw L_Hip L_Knee L_B_Paw "
     "R_Hip R_Knee R_B_Paw"
 )
-
-
-def numbers(tracks, joints=17):
-    return torch.cat([tracks.points, tracks.weights[..., None]], -1)[:, :joints].numpy()
 
 
 def with_meta(joints, **meta):

@@ -127,6 +127,9 @@ def bone_lengths(points: Tensor, bones: Tensor | Sequence[Sequence[int]]) -> Ten
     Returns:
         (..., B), in the unit of the points.
 
+    Raises:
+        ShapeError: as of :func:`bone_vectors`.
+
     >>> bone_lengths(torch.tensor([[0.0, 0, 0], [0, 3, 4]]), [(0, 1)]).tolist()
     [5.0]
     """
