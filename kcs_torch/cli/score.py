@@ -135,16 +135,13 @@ def _spoken(found: Comparison, pred: str, truth: str, mirror: bool) -> str:
         if how in ("root", "scale"):
             what = what.replace("the root joint", found.root if found.root else "the middle")
         lines.append(f"{how:<12}{error:>14.4g}{share}  {what}")
-    rows: dict[str, Any] = {"e3d": f"{found.e3d:.4f} (one orthogonal matrix for the clip)"}
-    true = found.bone_deviation_truth
-    variation = BoneVariation(100 * found.bone_deviation, 100 * found.largest_deviation, found.loosest_bone)
-    theirs = "no bones in the truth" if math.isnan(true) else f"truth: {100 * true:.2f} %"
-    rows["bone deviation"] = f"{variation}; {theirs}"
-    if math.isnan(found.e3d):
-        del rows["e3d"]
-    if math.isnan(found.bone_deviation):
-        del rows["bone deviation"]
-    lines += [f"{name:<16}{text}" for name, text in rows.items()]
+    if not math.isnan(found.e3d):
+        lines.append(f"{'e3d':<16}{found.e3d:.4f} (one orthogonal matrix for the clip)")
+    if not math.isnan(found.bone_deviation):
+        true = found.bone_deviation_truth
+        variation = BoneVariation(100 * found.bone_deviation, 100 * found.largest_deviation, found.loosest_bone)
+        theirs = "no bones in the truth" if math.isnan(true) else f"truth: {100 * true:.2f} %"
+        lines.append(f"{'bone deviation':<16}{variation}; {theirs}")
     lines += [f"note: {one_line(note)}" for note in found.notes]
     better = [how for how in found.mpjpe if found.mirrored[how] < 0.98 * found.mpjpe[how]]
     turned = min(found.mirrored.values()) < 0.98 * min(found.mpjpe.values())  # else the axes are to blame

@@ -105,10 +105,11 @@ def compare(
     if ratio is None and pred.units and pred.units == truth.units:
         ratio = 1.0
     chosen = _alignments(align, ratio, pred, truth)
+    ours = [pred.skeleton.index(name) for name, _ in names]
     theirs = [truth.skeleton.index(name) for _, name in names]
-    points = (ratio or 1.0) * pred.points[:, [pred.skeleton.index(name) for name, _ in names]].to(truth.points)
+    points = (ratio or 1.0) * pred.points[:, ours].to(truth.points)
     target = truth.points[:, theirs]
-    gone = ~pred.seen[:, [pred.skeleton.index(name) for name, _ in names]].to(target.device)
+    gone = ~pred.seen[:, ours].to(target.device)
     if bool(gone.any()):
         notes.append(f"{100 * float(gone.double().mean()):.1f} % of the prediction's joints are missing: not compared")
     weights = (truth.seen[:, theirs] & ~gone).to(target)
@@ -116,7 +117,7 @@ def compare(
         raise ShapeError("compare: expected a frame in which 3 joints of both are seen, got none")
     if ratio is not None:
         notes += _odd_size(points, target, weights, pred.units)
-    at = _root(root, truth, names, theirs)
+    at = _root(root, [name for _, name in names])
     flip = points * points.new_tensor([1.0, 1.0, -1.0])
     if mirror:
         points, flip = flip, points
@@ -225,9 +226,8 @@ def _alignments(align: str | Sequence[str] | None, ratio: float | None, pred: Mo
     return list(dict.fromkeys(align))
 
 
-def _root(name: str | None, truth: Motion, names: Sequence[tuple[str, str]], theirs: Sequence[int]) -> int | None:
+def _root(name: str | None, shared: Sequence[str]) -> int | None:
     """Where the root is among the compared joints."""
-    shared = [b for _, b in names]
     if name is not None:
         if name not in shared:
             raise unknown("root among the compared joints", name, shared, SkeletonError)
