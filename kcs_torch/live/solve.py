@@ -18,7 +18,7 @@ from kcs_torch.nn.posture import PostureEnergy, has_trunk
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
-__all__ = ["Solution", "solve_window"]
+__all__ = ["Solved", "solve_window"]
 
 STEPS, ROUNDS = 12, 1
 """Most L-BFGS steps of a refinement, and rounds of discrete moves, of a window: the frames to come do not wait."""
@@ -27,14 +27,14 @@ TURNS = 0.9
 """Share of a window's frames in which a body without a trunk looks smaller than usual, as it turns."""
 
 
-class Solution(NamedTuple):
+class Solved(NamedTuple):
     """What a window's frames tell: the body, and each frame's pose."""
 
     shape: Shape
     told: Told
 
 
-def solve_window(method: PKC, skeleton: Skeleton, image: Tensor, weights: Tensor, rate: float) -> Solution | None:
+def solve_window(method: PKC, skeleton: Skeleton, image: Tensor, weights: Tensor, rate: float) -> Solved | None:
     """Solve a window by the method: before a fixed viewpoint where there is a template, else by the viewpoint's turn.
 
     Args:
@@ -83,4 +83,4 @@ def solve_window(method: PKC, skeleton: Skeleton, image: Tensor, weights: Tensor
         shape = replace(shape, usual=float(torch.quantile(looks, TURNS if posture is None else 0.5)))
     if found.deviation is not None:
         shape = replace(shape, deviation=factor * found.deviation.square().mean(0).sqrt())
-    return Solution(shape, Told(factor * bone_vectors(points, bones)[..., 2], rotations, sizes))
+    return Solved(shape, Told(factor * bone_vectors(points, bones)[..., 2], rotations, sizes))

@@ -17,7 +17,7 @@ from kcs_torch.live.filter import BodyFilter, ChainFilter, Shape, Told
 from kcs_torch.live.frame import FASTEST, Sight, take_frame
 from kcs_torch.live.pose import Chain, LivePose
 from kcs_torch.live.size import SizeFilter, longest_image
-from kcs_torch.live.solve import Solution, solve_window
+from kcs_torch.live.solve import Solved, solve_window
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.nn.posture import has_trunk
@@ -167,7 +167,7 @@ class Tracker:
         self._longest = torch.zeros(self.skeleton.num_bones, dtype=torch.float64)  # of the bones' images
         self._sight = Sight(self._body)
         self._size = SizeFilter(self.fps)
-        self._solving: Future[Solution | None] | None = None
+        self._solving: Future[Solved | None] | None = None
         self._asked = self._ready = -1  # frames at which the running solve began, and at which it is taken over
         self._solved = -1  # frame at which the last solve began
         self._known = self._frame  # frame from which on bone lengths are known
@@ -314,7 +314,7 @@ class Tracker:
             self._asked = self._frame
             self._ready = self._frame + max(1, round(self._delay * len(image)))
 
-    def _adopt(self, found: Solution) -> None:
+    def _adopt(self, found: Solved) -> None:
         """Take over the body that was found, and let the filter take the window's last frames again."""
         count = len(found.told.depths)
         self._told = min(self._told + count, REMEMBERED * self.window)

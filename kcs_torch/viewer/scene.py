@@ -74,10 +74,6 @@ def scene_of(results: Sequence[Reconstruction], names: Sequence[str] | None = No
     }
 
 
-def _points(result: Reconstruction) -> Array:
-    return as_doubles(result.points)
-
-
 def _numbers(result: Reconstruction) -> int:
     """How many 16-bit numbers a result takes."""
     frames, joints = result.points.shape[:2]
@@ -115,7 +111,7 @@ def _solution(result: Reconstruction, frames: slice, middle: Array, middle2d: Ar
     """What solutions of the same tracks do not share."""
     path = result.root_depth if result.distance is None else result.distance
     return {
-        **_motion(_points(result)[frames] - middle),
+        **_motion(as_doubles(result.points)[frames] - middle),
         "path": None if path is None else _floats(as_doubles(path[frames])),
         "lens": None if result.distance is None else _lens(result, middle2d),
         "fit": None if result.distance is not None else _floats(_fit(result, middle, middle2d)[frames]),
@@ -135,7 +131,7 @@ def _fit(result: Reconstruction, middle: Array, middle2d: Array) -> Array:
     weights = as_doubles(result.tracks.weights)
     places = as_doubles(result.tracks.points) - middle2d
     scales = as_doubles(result.scales)
-    drawn = scales[:, None, None] * (_points(result) - middle)[..., :2]
+    drawn = scales[:, None, None] * (as_doubles(result.points) - middle)[..., :2]
     weights = np.where(np.isfinite(drawn).all(-1), weights, 0)[..., None]
     gap = np.where(weights > 0, places - drawn, 0)
     total = weights.sum(1)
@@ -169,7 +165,8 @@ def _difference(best: Reconstruction, other: Reconstruction) -> str:
     found = difference(best, other)
     if found.mirrored:
         return "nearly the mirror image" if found.beside_mirror else "mirror image"
-    ours, theirs = ((z - np.nanmean(z, 1, keepdims=True)) for z in (_points(r)[..., 2] for r in (best, other)))
+    depths = [as_doubles(r.points)[..., 2] for r in (best, other)]
+    ours, theirs = (z - np.nanmean(z, 1, keepdims=True) for z in depths)
     apart = np.sqrt(np.nanmean((ours - theirs) ** 2, 0))
     most = np.argsort(-np.nan_to_num(apart))
     worst = [best.skeleton.joints[j] for j in most if apart[j] > 0.6 * apart[most[0]]]
