@@ -93,12 +93,12 @@ def load_tracks(
     image_size: tuple[int, int] | None = None,
     trust: bool = False,
 ) -> Tracks:
-    """Read one person's tracks from a file or folder. Arguments as of :func:`load_people`.
+    """Read one person's tracks from a file or folder. Arguments as of :func:`kcs_torch.io.load_people`.
 
     Args:
         path: a file, a folder of files, or the beginning of the names of a folder's files.
         format: a name in ``kcs_torch.io.READERS``; found by content if None.
-        person: which one, counted from 0 in the order of :func:`load_people`; the most seen if None.
+        person: which one, counted from 0 in the order of :func:`~kcs_torch.io.load_people`; the most seen if None.
         skeleton: a :class:`Skeleton`, a built-in name or a YAML/JSON file; as the file says if None.
         fps: frames per second; as the file says if None.
         threshold: a joint with less confidence counts as unseen, 0..1. None: .3, or 0 for tracks that this library

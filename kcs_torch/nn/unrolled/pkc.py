@@ -111,7 +111,7 @@ class UnrolledPKC(Unrolled):
         lengths: Tensor | None = None,
         inside: Tensor | None = None,
     ) -> Tensor:
-        """Return the shape in the world frame of the cameras, which are held but for what :attr:`realign_from` says.
+        """Return the shape in the world frame of the cameras, held but for what ``realign_from`` says.
 
         Args:
             tracks: (..., T, N, 2), NaN where unseen.
