@@ -1,18 +1,20 @@
-"""What a skeleton must satisfy."""
+"""What a skeleton must satisfy, and what it is given."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING, Any
 
+from torch import Tensor
+
 from kcs_torch.anatomy import Hinge
-from kcs_torch.errors import SkeletonError
+from kcs_torch.errors import ShapeError, SkeletonError
 from kcs_torch.skeleton.parse import index_pairs
 
 if TYPE_CHECKING:
     from kcs_torch.skeleton.core import Skeleton
 
-__all__ = ["as_tuples", "check_facts", "check_tree"]
+__all__ = ["as_tuples", "check_facts", "check_observed", "check_tree"]
 
 
 def as_tuples(body: Skeleton) -> dict[str, Any]:
@@ -128,4 +130,29 @@ def check_tree(body: Skeleton) -> None:
             f"skeleton '{body.name}': expected one connected tree, got {len(pieces)} pieces; not joined to "
             f"'{body.joints[main[0]]}': {', '.join(loose)}. Add a bone to each piece, drop those joints, "
             "or pass tree=False."
+        )
+
+
+def check_observed(body: Skeleton, points: Tensor, weights: Tensor | None) -> None:
+    """Raise a ShapeError unless points (..., num_observed, D) and weights of them are what ``complete`` takes."""
+    given: dict[str, Any] = {"points": points, "weights": weights}
+    for name, value in given.items():
+        if value is not None and not isinstance(value, Tensor):
+            raise ShapeError(
+                f"complete: expected a tensor of {name}, got {type(value).__name__}: use torch.as_tensor({name})"
+            )
+    if points.ndim < 2 or points.shape[-2] != body.num_observed:
+        message = f"complete: expected points (..., {body.num_observed}, D) for skeleton '{body.name}', "
+        message += f"got {tuple(points.shape)}"
+        if points.ndim >= 2 and body.virtual and points.shape[-2] == body.num_joints:
+            message += ", which have its virtual joints already"
+        elif points.ndim >= 2 and points.shape[-1] == body.num_observed:
+            message += ": swap their last two axes, points.mT"
+        raise ShapeError(message)
+    if not points.is_floating_point():
+        raise ShapeError(f"complete: points: expected floating point, got {points.dtype}: use points.float()")
+    if weights is not None and weights.shape[-1:] != (body.num_observed,):
+        raise ShapeError(
+            f"complete: expected weights (..., {body.num_observed}) for points {tuple(points.shape)}, "
+            f"got {tuple(weights.shape)}"
         )

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from kcs_torch.anatomy import UNKNOWN_SPREAD, Hinge
-from kcs_torch.errors import FormatError, ShapeError, SkeletonError, unknown
-from kcs_torch.skeleton.check import as_tuples, check_facts, check_tree
+from kcs_torch.errors import FormatError, SkeletonError, unknown
+from kcs_torch.skeleton.check import as_tuples, check_facts, check_observed, check_tree
 from kcs_torch.skeleton.files import as_mapping, check_mapping, read_mapping
 from kcs_torch.skeleton.graph import find_cycle, find_pieces, find_twins
 from kcs_torch.skeleton.mapping import map_joints
@@ -346,27 +346,7 @@ class Skeleton:
             ShapeError: they are not tensors of these shapes; points that have the virtual joints already are not. Nor
                 are points that are not in floating point.
         """
-        given: dict[str, Any] = {"points": points, "weights": weights}
-        for name, value in given.items():
-            if value is not None and not isinstance(value, Tensor):
-                raise ShapeError(
-                    f"complete: expected a tensor of {name}, got {type(value).__name__}: use torch.as_tensor({name})"
-                )
-        if points.ndim < 2 or points.shape[-2] != self.num_observed:
-            message = f"complete: expected points (..., {self.num_observed}, D) for skeleton '{self.name}', "
-            message += f"got {tuple(points.shape)}"
-            if points.ndim >= 2 and self.virtual and points.shape[-2] == self.num_joints:
-                message += ", which have its virtual joints already"
-            elif points.ndim >= 2 and points.shape[-1] == self.num_observed:
-                message += ": swap their last two axes, points.mT"
-            raise ShapeError(message)
-        if not points.is_floating_point():
-            raise ShapeError(f"complete: points: expected floating point, got {points.dtype}: use points.float()")
-        if weights is not None and weights.shape[-1:] != (self.num_observed,):
-            raise ShapeError(
-                f"complete: expected weights (..., {self.num_observed}) for points {tuple(points.shape)}, "
-                f"got {tuple(weights.shape)}"
-            )
+        check_observed(self, points, weights)
         if weights is None:
             weights = torch.ones_like(points[..., 0])
         for _, sources in self.virtual:

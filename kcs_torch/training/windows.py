@@ -88,25 +88,10 @@ class FilmedWindows:
         starts, clip_of, first = [], [], 0
         body = clips[0].skeleton
         for i, clip in enumerate(clips):
-            frames = len(clip.points)
-            if frames < window:
-                raise ShapeError(
-                    f"{clip.source}: expected at least a window of {window} frames, got {frames}: choose a smaller "
-                    "window, or leave this clip out (a file by a pattern that begins with !)"
-                )
-            own = list(range(0, frames - window + 1, stride))
-            if to_the_end and own[-1] < frames - window:
-                own.append(frames - window)
-            whole = clip.known.all(1).unfold(0, window, 1).all(-1)
-            own = [s for s in own if bool(whole[s])]  # there is no truth to learn or to score elsewhere
-            if not own:
-                gaps = [body.joints[n] for n in (~clip.known).any(0).nonzero().flatten().tolist()]
-                raise FormatError(
-                    f"{clip.source}: none of its windows of {window} frames has all joints; gaps in {', '.join(gaps)}"
-                )
+            own = _whole_windows(clip, window, stride, to_the_end)
             starts += [first + s for s in own]
             clip_of += [i] * len(own)
-            first += frames
+            first += len(clip.points)
         generator = generator_of(*key, "cameras")
         cameras = random_cameras((len(clips), views), pitch, generator)
         generator = generator_of(*key, "tracks")
@@ -200,3 +185,24 @@ class FilmedWindows:
             points = torch.where(shown, points, self.pseudo_points[view[:, None], frames])
             pseudo = torch.where(shown[..., 0], pseudo, self.pseudo_weights[view[:, None], frames])
         return Batch(tracks, weights, points, mark, pseudo)
+
+
+def _whole_windows(clip: Clip, window: int, stride: int, to_the_end: bool) -> list[int]:
+    """First frames of a clip's windows in which all joints are known: elsewhere is no truth to learn or to score."""
+    frames = len(clip.points)
+    if frames < window:
+        raise ShapeError(
+            f"{clip.source}: expected at least a window of {window} frames, got {frames}: choose a smaller "
+            "window, or leave this clip out (a file by a pattern that begins with !)"
+        )
+    starts = list(range(0, frames - window + 1, stride))
+    if to_the_end and starts[-1] < frames - window:
+        starts.append(frames - window)
+    whole = clip.known.all(1).unfold(0, window, 1).all(-1)
+    starts = [start for start in starts if bool(whole[start])]
+    if not starts:
+        gaps = [clip.skeleton.joints[n] for n in (~clip.known).any(0).nonzero().flatten().tolist()]
+        raise FormatError(
+            f"{clip.source}: none of its windows of {window} frames has all joints; gaps in {', '.join(gaps)}"
+        )
+    return starts
