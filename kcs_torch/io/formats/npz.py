@@ -91,39 +91,39 @@ def write_tracks(tracks: Tracks, path: Path) -> None:
 
 def write_motion(motion: Motion, path: Path, saving: Saving) -> None:
     """Write 3D motion, so that :func:`kcs_torch.load_motion` gives it back."""
-    body = motion.skeleton
     points = as_array(from_y_up(motion.points, saving.up))
     weights = as_array(motion.weights)
     arrays = {
         "points3d": np.where(weights[..., None] > 0, points, np.nan),
         "confidence": weights,
-        "joint_names": np.array(body.joints),
-        "edges": np.array(body.bones, np.int64).reshape(-1, 2),
-        "fps": np.float64(math.nan if motion.fps is None else motion.fps),
-        "units": np.array(motion.units),
         "up": np.array(saving.up),
-        "source": np.array(motion.source),
-        "skeleton": np.array(json.dumps(body.to_dict())),
-        "notes": np.array(json.dumps(motion.notes)),
     }
-    _save(arrays, path)
+    _save(arrays | _facts_out(motion, motion.skeleton.num_joints), path)
+
+
+def _facts_out(clip: Tracks | Motion, joints: int) -> dict[str, Any]:
+    """What a file tells of the first so many joints besides where they are."""
+    body = clip.skeleton
+    bones = [pair for pair in body.bones if max(pair) < joints]
+    return {
+        "joint_names": np.array(body.joints[:joints]),
+        "edges": np.array(bones, np.int64).reshape(-1, 2),
+        "fps": np.float64(math.nan if clip.fps is None else clip.fps),
+        "units": np.array(clip.units),
+        "source": np.array(clip.source),
+        "skeleton": np.array(json.dumps(body.to_dict())),
+        "notes": np.array(json.dumps(clip.notes)),
+    }
 
 
 def _tracks_out(tracks: Tracks) -> dict[str, Any]:
     body = tracks.skeleton
     n = body.num_observed
     points, weights = as_array(tracks.points), as_array(tracks.weights)
-    inside = [b for b in body.bones if max(b) < n]
     arrays: dict[str, Any] = {
         "points2d": np.where(weights[:, :n, None] > 0, points[:, :n], np.nan),
         "confidence": weights[:, :n],
-        "joint_names": np.array(body.joints[:n]),
-        "edges": np.array(inside, np.int64).reshape(-1, 2),
-        "fps": np.float64(math.nan if tracks.fps is None else tracks.fps),
-        "units": np.array(tracks.units),
-        "source": np.array(tracks.source),
-        "skeleton": np.array(json.dumps(body.to_dict())),
-        "notes": np.array(json.dumps(tracks.notes)),
+        **_facts_out(tracks, n),
     }
     if tracks.detector is not None:
         arrays["detector"] = np.bool_(tracks.detector)
