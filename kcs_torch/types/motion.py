@@ -95,16 +95,7 @@ class Motion(Trajectories):
             body = get_skeleton(skeleton)
             extra = set(body.joints[body.num_observed :])
             if extra & set(names) and set(body.joints[: body.num_observed]) <= set(names):
-                points = as_floats(points, f"{source}: points", 3)
-                sure = points.new_ones(points.shape[:2]) if confidence is None else confidence
-                sure = as_floats(sure, f"{source}: confidence (frames, joints)", 2)
-                if points.shape[1] != len(names):
-                    raise ShapeError(f"{source}: joint_names: expected {points.shape[1]} names, got {len(names)}")
-                check_places(points, f"{source}: points", names)
-                sure = as_weights(sure.to(points), torch.isfinite(points).all(-1), 0.0, f"{source}: confidence", names)
-                keep = [i for i, n in enumerate(names) if n not in extra]
-                own = [(n, points[:, i], sure[:, i]) for i, n in enumerate(names) if n in extra]
-                points, names, confidence = points[:, keep], [names[i] for i in keep], sure[:, keep]
+                points, confidence, names, own = _apart(points, confidence, names, extra, source)
         taken = take_in(
             points,
             confidence,
@@ -266,20 +257,8 @@ class Motion(Trajectories):
             image, units = points[..., :2].clone(), self.units or "px"
         else:
             lens = Intrinsics.of(intrinsics)
-            if distance is None:  # of a ball around it all that fits into the nearer half of the image
-                half = min(lens.cx, lens.cy)
-                if not half > 0:
-                    raise OptionError(
-                        "distance: expected a number, as a principal point at the image's edge does not tell how large "
-                        f"the image is, got {distance!r}"
-                    )
-                distance = float(points.norm(dim=-1).max()) * (1 + lens.focal / half)
-            if not is_a(distance, float):
-                raise OptionError(f"distance: expected a number, got {distance!r}")
-            if not (math.isfinite(distance) and distance > 0 and float(points[..., 2].min()) + distance > 0):
-                least = -float(points[..., 2].min())
-                raise OptionError(f"distance: expected more than {least:g}, before all joints, got {distance}")
-            image, units = lens.project(points + points.new_tensor([0.0, 0.0, distance])), "px"
+            far = _distance(points, lens, distance)
+            image, units = lens.project(points + points.new_tensor([0.0, 0.0, far])), "px"
         if noise:
             draw = torch.randn(image.shape, generator=generator, dtype=image.dtype, device=image.device)
             image = image + noise * draw
@@ -320,3 +299,37 @@ def _same(names: Sequence[str], edges: Any) -> Skeleton | None:
             if pairs == {frozenset((body.joints[a], body.joints[b])) for a, b in body.bones}:
                 return body
     return None
+
+
+def _apart(
+    points: Any, confidence: Any, names: list[str], extra: set[str], source: str
+) -> tuple[Tensor, Tensor, list[str], list[tuple[str, Tensor, Tensor]]]:
+    """Places, confidences and names without the ``extra`` joints, and name, place and confidence of each of these."""
+    points = as_floats(points, f"{source}: points", 3)
+    sure = points.new_ones(points.shape[:2]) if confidence is None else confidence
+    sure = as_floats(sure, f"{source}: confidence (frames, joints)", 2)
+    if points.shape[1] != len(names):
+        raise ShapeError(f"{source}: joint_names: expected {points.shape[1]} names, got {len(names)}")
+    check_places(points, f"{source}: points", names)
+    sure = as_weights(sure.to(points), torch.isfinite(points).all(-1), 0.0, f"{source}: confidence", names)
+    keep = [i for i, n in enumerate(names) if n not in extra]
+    own = [(n, points[:, i], sure[:, i]) for i, n in enumerate(names) if n in extra]
+    return points[:, keep], sure[:, keep], [names[i] for i in keep], own
+
+
+def _distance(points: Tensor, lens: Intrinsics, distance: float | None) -> float:
+    """How far a camera stands from the middle of points (T, N, 3): as given, or so that all is in the image."""
+    if distance is None:  # of a ball around it all that fits into the nearer half of the image
+        half = min(lens.cx, lens.cy)
+        if not half > 0:
+            raise OptionError(
+                "distance: expected a number, as a principal point at the image's edge does not tell how large "
+                f"the image is, got {distance!r}"
+            )
+        distance = float(points.norm(dim=-1).max()) * (1 + lens.focal / half)
+    if not is_a(distance, float):
+        raise OptionError(f"distance: expected a number, got {distance!r}")
+    if not (math.isfinite(distance) and distance > 0 and float(points[..., 2].min()) + distance > 0):
+        least = -float(points[..., 2].min())
+        raise OptionError(f"distance: expected more than {least:g}, before all joints, got {distance}")
+    return distance
