@@ -27,7 +27,7 @@ DEFAULT = "pkc"
 WITHOUT = ("auto", "parallel")
 """What may be asked for in place of intrinsics."""
 
-SHARED = (
+MAY_BE_SHARES = (
     "coordinates lie within 0 and 1 and are taken as they are: if they are shares of the image, multiply x by its "
     "width and y by its height, or the body is as distorted as the image is not square; else say units=..."
 )
@@ -112,7 +112,7 @@ def reconstruct(
     else:
         tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units or "px")
         if units is None and not isinstance(lens, Intrinsics) and _within_one(tracks):
-            warnings.warn(f"{tracks.source}: {SHARED}", KcsWarning, stacklevel=users_level())
+            warnings.warn(f"{tracks.source}: {MAY_BE_SHARES}", KcsWarning, stacklevel=users_level())
     if find:
         tracks = with_found_bones(tracks)
     chosen = method_named(method, fields)
@@ -165,7 +165,7 @@ def reconstruct_all(
     if isinstance(lens, Intrinsics):
         return [_before(lens, chosen, one) for one in people]
     if lens == "auto":
-        return _apart([_before(lens, chosen, one) for one in people])
+        return _told_of_lenses([_before(lens, chosen, one) for one in people])
     if lens == "parallel" or not chosen.turns_over:
         return chosen.many(people)
     with warnings.catch_warnings():
@@ -176,10 +176,10 @@ def reconstruct_all(
             found[i] = reconstruct_uncalibrated(chosen, one, lifted=lifted)
         else:
             chosen.warn(lifted)
-    return _apart(found)
+    return _told_of_lenses(found)
 
 
-def _apart(found: list[Reconstruction]) -> list[Reconstruction]:
+def _told_of_lenses(found: list[Reconstruction]) -> list[Reconstruction]:
     """The same; the user is told where people of one file got lenses of their own."""
     clips: dict[str, list[Reconstruction]] = {}
     for one in found:
