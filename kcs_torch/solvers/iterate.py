@@ -26,7 +26,7 @@ class Solution(Generic[State]):
         value: the last state.
         converged: whether the stopping rule was met (True where there was none).
         iterations: steps made.
-        before: the value some steps earlier (ten of L-BFGS), where the solver tells it.
+        before: the value some steps earlier (``memory`` of L-BFGS), where the solver tells it.
         energy: of the last state, where the solver knows it.
         change: what was measured last, of each problem where the measure tells them apart; None where nothing was.
     """
