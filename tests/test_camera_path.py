@@ -116,6 +116,8 @@ def test_paths_of_several_clips_or_of_no_kind_are_told():
         choose_path(torch.eye(3).expand(2, 12, 3, 3))
     with pytest.raises(OptionError, match="unknown camera path 'constnat': did you mean 'constant'"):
         choose_path(torch.eye(3).expand(12, 3, 3), "constnat")
+    with pytest.raises(ShapeError, match=r"settle_path: expected vectors \(T, B, 3\)"):
+        settle_path(torch.ones(4, 5, 3), torch.eye(3))
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -13,6 +13,7 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.functional import standing
 from kcs_torch.nn import ContactEnergy
 from kcs_torch.skeleton import SKELETONS
+from kcs_torch.solvers import root_velocity
 
 MAN = SKELETONS["h36m17"]
 
@@ -164,3 +165,10 @@ def test_feet_that_do_not_stand_may_be_anything():
     assert_close(value, energy(points, velocity, stand))
     (grad,) = torch.autograd.grad(value, gone)
     assert torch.isfinite(grad).all() and not grad[2, first].any()
+
+
+def test_changes_of_depth_that_do_not_fit():
+    move = normal(9, 2)
+    for arguments, named in (((move[0, 0], move), "move"), ((move, move[:, :1]), "weight")):
+        with pytest.raises(ShapeError, match=f"root_velocity: {named}: expected"):
+            root_velocity(*arguments, 0.006, 0.004)

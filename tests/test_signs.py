@@ -125,6 +125,8 @@ def test_shapes_that_do_not_fit():
         for function in (smooth_signs, sign_costs):
             with pytest.raises(ShapeError, match="smooth_signs: expected"):
                 function(torch.ones(2, 5, 1, 4), depths, cap=1.0)
+            with pytest.raises(ShapeError, match="smooth_signs: expected"):
+                function(torch.ones(5, 4), depths, cap=1.0)
     for function in (smooth_signs, sign_costs):
         with pytest.raises(ShapeError, match="of a frame or more, got"):
             function(torch.ones(2, 0, 1, 4), torch.ones(2, 0, 2), cap=1.0)

@@ -9,6 +9,7 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.data.synthetic import random_motion, walking_person
+from kcs_torch.errors import ShapeError
 from kcs_torch.solvers import swapped_frames
 from kcs_torch.solvers.swaps import LEAST, MEMORY, MOST, PAIRS, USUAL
 
@@ -224,3 +225,10 @@ def test_legs_of_an_animal():
     mended = kt.clean.unswap(swap(tracks, list(range(20, 33)), front))
     assert "13" in mended.notes[-1]
     same(mended, tracks)
+
+
+def test_shapes_that_do_not_fit():
+    left, seen = torch.ones(6, 2, 2), torch.ones(6, 2, dtype=torch.bool)
+    for arguments in ((left[0], left[0], seen), (left, left[1:], seen), (left, left, seen[:, :1])):
+        with pytest.raises(ShapeError, match=r"swapped_frames: expected left and right \(T, P, 2\)"):
+            swapped_frames(*arguments, 1.0, 1.5)

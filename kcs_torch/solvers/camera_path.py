@@ -168,7 +168,13 @@ def settle_path(vectors: Tensor, path: Tensor) -> Tensor:
 
     Returns:
         (T, 3, 3), turned as a whole nearest to ``path``.
+
+    Raises:
+        ShapeError: they are not of these shapes.
     """
+    if path.ndim != 3 or path.shape[1:] != (3, 3) or vectors.ndim != 3 or vectors.shape[::2] != path.shape[:2]:
+        got = f"{tuple(vectors.shape)} and {tuple(path.shape)}"
+        raise ShapeError(f"settle_path: expected vectors (T, B, 3) and a path (T, 3, 3), got {got}")
     frames = len(path)
     if frames < 3:
         return path

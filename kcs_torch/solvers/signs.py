@@ -94,13 +94,13 @@ class _Costs:
     """
 
     def __init__(self, unary: Tensor, depths: Tensor, cap: float, transition: Tensor | None) -> None:
-        batch, frames, poses, states = unary.shape
-        count = depths.shape[-1]
-        if depths.shape[:2] != (batch, frames) or states != 2**count or not frames:
+        fits = unary.ndim == 4 and depths.ndim == 3 and unary.shape[:2] == depths.shape[:2]
+        if not fits or unary.shape[3] != 2 ** depths.shape[2] or not depths.shape[1]:
             raise ShapeError(
                 "smooth_signs: expected unary (K, T, C, 2^M) and depths (K, T, M) of a frame or more, got "
                 f"{tuple(unary.shape)} and {tuple(depths.shape)}"
             )
+        batch, frames, poses, states = unary.shape
         moves = frames - 1, poses, poses
         if transition is not None and transition.shape not in (moves, (batch, *moves)):
             expected = f"expected shape {moves}, or {(batch, *moves)}, got {tuple(transition.shape)}"

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.precision import widened
+from kcs_torch.functional.shapes import check_core
 from kcs_torch.functional.tridiagonal import solve_tridiagonal
 
 __all__ = ["RIDGE", "root_velocity"]
@@ -34,10 +35,17 @@ def root_velocity(
     Returns:
         v (..., T), the body's change of depth from a frame to the next.
 
+    Raises:
+        ShapeError: they are not of these shapes.
+
     >>> move = torch.tensor([[-0.1], [-0.1], [-0.1], [0.3]])  # the foot stands, and then swings
     >>> root_velocity(move, torch.tensor([[1.0], [1.0], [1.0], [0.0]]), 0.006, 0.004).round(decimals=2).tolist()
     [0.1, 0.1, 0.1, 0.1]
     """
+    check_core(move, "root_velocity: move", "T", "C")
+    check_core(weight, "root_velocity: weight", *move.shape[-2:])
+    if inside is not None:
+        check_core(inside, "root_velocity: inside", move.shape[-2])
     velocity = torch.zeros_like(move[..., 0])
     tie = torch.full_like(velocity[..., 1:], -1 / change**2)  # of each to the next
     if inside is not None:

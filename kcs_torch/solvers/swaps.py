@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kcs_torch.errors import ShapeError
 from kcs_torch.functional.ranks import nanmedian
 
 __all__ = ["swapped_frames"]
@@ -53,6 +54,9 @@ def swapped_frames(left: Tensor, right: Tensor, seen: Tensor, size: float, penal
     Returns:
         (T,), True where the sides have to change places.
 
+    Raises:
+        ShapeError: they are not of these shapes.
+
     >>> time = torch.linspace(0, 3, 40, dtype=torch.float64)[:, None, None]
     >>> left = torch.cat([torch.cos(time), torch.sin(time)], -1).expand(-1, 2, -1).clone()
     >>> right = -left
@@ -60,6 +64,9 @@ def swapped_frames(left: Tensor, right: Tensor, seen: Tensor, size: float, penal
     >>> swapped_frames(left, right, torch.ones(40, 2, dtype=torch.bool), 1.0, 8.0).nonzero().flatten().tolist()
     [10, 11, 12, 13, 14]
     """
+    if left.ndim != 3 or left.shape[-1] != 2 or right.shape != left.shape or seen.shape != left.shape[:2]:
+        got = ", ".join(str(tuple(x.shape)) for x in (left, right, seen))
+        raise ShapeError(f"swapped_frames: expected left and right (T, P, 2) and seen (T, P), got {got}")
     swapped = torch.zeros(len(left), dtype=torch.bool, device=left.device)
     shown = seen.any(1).nonzero().flatten()
     memory = min(MEMORY, len(shown) - 1)
