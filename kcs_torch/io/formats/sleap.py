@@ -28,6 +28,7 @@ _FIRST = ["track", "frame_idx", "instance.score"]
 _ORDERS = (("track", "xy", "node", "frame"), ("frame", "track", "node", "xy"))
 """Of the dimensions of ``tracks``: SLEAP's own, which MATLAB sees reversed, and that of sleap-io's "standard" files."""
 _WANTED = ("tracks", "point_scores", "node_names", "track_names", "edge_inds")
+_Frames = dict[int, list[NDArray[np.float64]]]  # of one track, by frame
 
 
 def recognises(probe: Probe) -> bool:
@@ -171,32 +172,7 @@ def _edges(tree: Tree, nodes: int, path: Path) -> NDArray[np.int64] | None:
 
 def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
     """Read the table with one line for every animal in every frame."""
-    instances: dict[str, dict[int, list[NDArray[np.float64]]]] = {}
-    try:
-        with bounded_rows(path) as lines:
-            header: list[str] = next(lines, [])
-            names = list(dict.fromkeys(c.rpartition(".")[0] for c in header[3:]))
-            places = [[_place(header, f"{n}.{c}") for c in ("x", "y", "score")] for n in names]
-            if not names or any(None in p[:2] for p in places):
-                raise FormatError(
-                    f"{path}: expected columns node.x, node.y, node.score, got {brief(', '.join(header[3:7]))}"
-                )
-            for line in lines:
-                if len(line) != len(header):
-                    raise FormatError(f"{path}: line {lines.line_num}: expected {len(header)} cells, got {len(line)}")
-                try:
-                    frame = as_frame_number(float(line[1]))  # tables that pandas wrote again may say 7.0
-                    values = [[as_float(line[i]) if i is not None else math.nan for i in p] for p in places]
-                except ValueError:
-                    wrong = no_numbers([f"'{brief(column)}'" for column in header[1:]], line[1:])
-                    raise FormatError(f"{path}: line {lines.line_num}: {wrong}") from None
-                if frame is None or not 0 <= frame < 10**15:
-                    raise FormatError(f"{path}: line {lines.line_num}: expected a frame number, got {brief(line[1])}")
-                instances.setdefault(line[0], {}).setdefault(frame, []).append(np.array(values))
-    except csv.Error as error:
-        raise FormatError(f"{path}: expected SLEAP's analysis CSV, got damaged text: {error}") from None
-    if not instances:
-        raise FormatError(f"{path}: expected at least one animal, got a header only")
+    names, instances = _instances(path)
     numbers = sorted({f for frames in instances.values() for f in frames})
     places_of = dict(zip(numbers, frames_of([(f,) for f in numbers], path, notes)[1], strict=True))
     length = places_of[numbers[-1]] + 1
@@ -224,13 +200,44 @@ def _read_csv(path: Path, options: Options, notes: list[str]) -> list[Animal]:
     ]
 
 
+def _instances(path: Path) -> tuple[list[str], dict[str, _Frames]]:
+    """The nodes' names, and what stands of each track in each frame: (nodes, 3) places and scores, perhaps several."""
+    instances: dict[str, _Frames] = {}
+    try:
+        with bounded_rows(path) as lines:
+            header: list[str] = next(lines, [])
+            names = list(dict.fromkeys(c.rpartition(".")[0] for c in header[3:]))
+            places = [[_place(header, f"{n}.{c}") for c in ("x", "y", "score")] for n in names]
+            if not names or any(None in p[:2] for p in places):
+                raise FormatError(
+                    f"{path}: expected columns node.x, node.y, node.score, got {brief(', '.join(header[3:7]))}"
+                )
+            for line in lines:
+                if len(line) != len(header):
+                    raise FormatError(f"{path}: line {lines.line_num}: expected {len(header)} cells, got {len(line)}")
+                try:
+                    frame = as_frame_number(float(line[1]))  # tables that pandas wrote again may say 7.0
+                    values = [[as_float(line[i]) if i is not None else math.nan for i in p] for p in places]
+                except ValueError:
+                    wrong = no_numbers([f"'{brief(column)}'" for column in header[1:]], line[1:])
+                    raise FormatError(f"{path}: line {lines.line_num}: {wrong}") from None
+                if frame is None or not 0 <= frame < 10**15:
+                    raise FormatError(f"{path}: line {lines.line_num}: expected a frame number, got {brief(line[1])}")
+                instances.setdefault(line[0], {}).setdefault(frame, []).append(np.array(values))
+    except csv.Error as error:
+        raise FormatError(f"{path}: expected SLEAP's analysis CSV, got damaged text: {error}") from None
+    if not instances:
+        raise FormatError(f"{path}: expected at least one animal, got a header only")
+    return names, instances
+
+
 def _split(tracks: dict[str, NDArray[np.float64]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     every = np.stack(list(tracks.values()))
     return every[..., :2], every[..., 2]
 
 
 def _linked(
-    frames: dict[int, list[NDArray[np.float64]]],
+    frames: _Frames,
     places: dict[int, int],
     length: int,
     joints: int,
