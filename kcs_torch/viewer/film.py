@@ -30,8 +30,6 @@ class Film:
     """The figure, and what changes in it from frame to frame."""
 
     def __init__(self, people: list[Reconstruction], faster: float) -> None:
-        from matplotlib.collections import LineCollection
-
         total = max(len(r.points) for r in people)
         self.fps = next((r.fps for r in people if r.fps), None)
         self.total, self.faster = total, faster
@@ -62,6 +60,12 @@ class Film:
         doubts = dict.fromkeys(r.diagnostics.brief_doubt for r in people if r.diagnostics.doubt)
         self.doubt = "".join(f" · {doubt}" for doubt in doubts)
         self.head = self.figure.suptitle("", fontsize=10, y=0.985, parse_math=False)
+        self._draw(people, axes)
+
+    def _draw(self, people: list[Reconstruction], axes: Any) -> None:
+        """Make what moves from frame to frame: names, floor, shadows, bones and joints."""
+        from matplotlib.collections import LineCollection
+
         self.artists: list[tuple[Any, Any, list[str]]] = []  # bones, joints, the bones' colours
         self.tags = [
             axes[1].text(0, 0, n if len(people) > 1 else "", ha="center", fontsize=8) for n in person_names(people)
