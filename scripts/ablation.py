@@ -107,7 +107,9 @@ def without(term: str, **costs: float) -> Variant:
 
         return kept
 
-    nothing = constant(DESCENT.Descent, WRITTEN_OUT[term], lambda self, first, *_: first.new_zeros(len(first)))
+    nothing = constant(
+        DESCENT.ObjectiveGradient, WRITTEN_OUT[term], lambda self, first, *_: first.new_zeros(len(first))
+    )
     signs = searched(lambda usual: replace(usual, **costs))
     return Variant(changes=((OBJECTIVE.Objective, "terms", fewer), nothing, signs))
 

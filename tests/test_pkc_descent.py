@@ -10,7 +10,7 @@ from test_pkc_objective import lengths_of, objective, several, walk
 from torch.testing import assert_close
 
 from kcs_torch.functional import bone_lengths, bone_vectors
-from kcs_torch.methods.pkc.descent import Descent
+from kcs_torch.methods.pkc.descent import ObjectiveGradient
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.unknowns import Unknowns
 from kcs_torch.methods.pkc.weights import Weights
@@ -27,7 +27,7 @@ def agree(goal, depth, lengths, size=2.0, rtol=1e-9):
     """Both at a random state, of which some rows are far."""
     unknowns = Unknowns(goal, depth, lengths)
     state = size * normal(*unknowns.scale.shape)
-    for one, other in zip(Descent(goal, unknowns)(state), by_autograd(goal, unknowns, state), strict=True):
+    for one, other in zip(ObjectiveGradient(goal, unknowns)(state), by_autograd(goal, unknowns, state), strict=True):
         assert torch.isfinite(other).all()
         assert_close(one, other, rtol=rtol, atol=rtol * float(other.abs().amax()))
 
@@ -96,7 +96,7 @@ def test_flat_and_empty_images():
     found = objective(0 * flat)
     agree(found, walk(5)[None, ..., 2], found.posture.rest_lengths[None], rtol=1e-6)  # a trunk in one line has no frame
     unknowns = Unknowns(found, 0 * flat[None, ..., 2], found.posture.rest_lengths[None])
-    value, slope = Descent(found, unknowns)(torch.zeros_like(unknowns.scale))
+    value, slope = ObjectiveGradient(found, unknowns)(torch.zeros_like(unknowns.scale))
     assert torch.isfinite(value).all() and torch.isfinite(slope).all()
 
 
@@ -108,7 +108,7 @@ def test_padded_clips_as_autograd_and_frames_that_pad_have_no_slope():
     depth, lengths = torch.cat([pad(task.depth) for task in tasks]), torch.cat([task.lengths for task in tasks])
     agree(joined, depth, lengths, 0.5)
     unknowns = Unknowns(joined, depth, lengths)
-    slope = Descent(joined, unknowns)(0.5 * normal(*unknowns.scale.shape))[1][:, :-16].view(-1, 16, 33)
+    slope = ObjectiveGradient(joined, unknowns)(0.5 * normal(*unknowns.scale.shape))[1][:, :-16].view(-1, 16, 33)
     assert (slope[:2, :, 20:] == 0).all() and (slope[:2, :, :20] != 0).any(-1).all()
 
 
@@ -118,7 +118,7 @@ def test_slopes_are_differences():
     found = objective(points, noise=0.01)
     unknowns = Unknowns(found, points[None, ..., 2], 1.02 * lengths_of(found, points)[None])
     state, step = 0.3 * normal(*unknowns.scale.shape), 1e-5
-    slope = Descent(found, unknowns)(state)[1][0]
+    slope = ObjectiveGradient(found, unknowns)(state)[1][0]
     for i in range(0, len(slope), 7):
         ahead = torch.zeros_like(state)
         ahead[0, i] = step
@@ -130,7 +130,7 @@ def test_far_states_give_no_numbers_rather_than_errors():
     points = walk(4)
     found = objective(points)
     unknowns = Unknowns(found, points[None, ..., 2], lengths_of(found, points)[None])
-    value, _ = Descent(found, unknowns)(torch.full_like(unknowns.scale, torch.nan))
+    value, _ = ObjectiveGradient(found, unknowns)(torch.full_like(unknowns.scale, torch.nan))
     assert value.isnan().all()
 
 
@@ -143,7 +143,7 @@ def test_follows_dtype_and_leaves_its_arguments_alone(dtype):
     unknowns = Unknowns(found, walk(6, "coco17")[None, ..., 2].to(dtype), found.posture.rest_lengths[None].to(dtype))
     state = 0.1 * normal(*unknowns.scale.shape, dtype=dtype)
     before = state.clone()
-    descent = Descent(found, unknowns)
+    descent = ObjectiveGradient(found, unknowns)
     first, again = descent(state), descent(state)
     assert all(x.dtype == dtype for x in first) and points.dtype == dtype
     assert torch.equal(state, before)
@@ -156,7 +156,7 @@ def test_fewer_operations_than_autograd_takes():
     for noise, most in ((0.0, 340), (0.01, 385)):
         found = objective(points, noise=noise)
         unknowns = Unknowns(found, points[None, ..., 2], lengths_of(found, points)[None])
-        state, descent = torch.zeros_like(unknowns.scale), Descent(found, unknowns)
+        state, descent = torch.zeros_like(unknowns.scale), ObjectiveGradient(found, unknowns)
         ours = count_operations(lambda d=descent, s=state: d(s))
         naive = count_operations(lambda f=found, u=unknowns, s=state: by_autograd(f, u, s))
         assert ours.total < most and ours.total < naive.total / 1.7
@@ -197,7 +197,7 @@ def test_with_an_image_that_goes_with_the_depths(skeleton, frames, noise):
     drawn, grown, turned = torch.autograd.grad(expected.sum(), leaves)
     mixed = found.complete.mT @ tree @ inside[0][:, :2]  # virtual joints among them
     image = mixed[:, :, ends[1]] - mixed[:, :, ends[0]]
-    energy, slope, growth, pull, wider = Descent(found).with_image(inside[0][:, 2], lengths, image, rays)
+    energy, slope, growth, pull, wider = ObjectiveGradient(found).with_image(inside[0][:, 2], lengths, image, rays)
     assert_close(energy, expected)
     back = torch.zeros(2, 2, *mixed.shape[2:]).double().index_add_(2, ends[1], pull).index_add_(2, ends[0], -pull)
     pull = (found.complete.mT @ tree).mT @ back

@@ -13,7 +13,7 @@ from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.spectral import dct_basis
 from kcs_torch.methods.pinhole_coordinates import FIRM, STRAY, USUAL, coordinates
-from kcs_torch.methods.pkc.descent import Descent
+from kcs_torch.methods.pkc.descent import ObjectiveGradient
 from kcs_torch.methods.pkc.image import bend_cost
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
@@ -154,13 +154,13 @@ class PinholeEnergy:
         self.waves = waves if self.known else waves[:, 1:]  # (T, K)
         self.rough = (ROOT * self.slow**2) ** -2
         self.model: Objective | None = None
-        self.body: Descent | PlainBody
+        self.body: ObjectiveGradient | PlainBody
         image = self._imaged(self._far(self.depth, self.path, self.wide)[0])
         if has_trunk(skeleton):
             flat = (tree @ image[0]).permute(2, 1, 0)  # (T, N, 2), centred
             weights = at_pace(Weights(), rate, pace_of(flat, skeleton, rate))
             self.model = Objective(skeleton, flat, weights, noise, standing=standing)
-            self.body = Descent(self.model)
+            self.body = ObjectiveGradient(self.model)
             self.share = self.model.independent.mT  # (B, T)
         else:
             slack = math.hypot(Weights().length, float(noise.median()) if noise.numel() else 0.0)

@@ -44,7 +44,7 @@ class PlainBody:
     def with_image(
         self, own: Tensor, lengths: Tensor, bones: Tensor, rays: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """As :meth:`kcs_torch.methods.pkc.descent.Descent.with_image`.
+        """As :meth:`kcs_torch.methods.pkc.descent.ObjectiveGradient.with_image`.
 
         Args:
             own: (H, B, T) depths of bones.

@@ -14,10 +14,10 @@ from kcs_torch.methods.pkc.unknowns import Unknowns
 from kcs_torch.methods.pkc.weights import ANCHOR, CORNER, HEAVY, NOISE, wide
 from kcs_torch.nn.lengths import HIDDEN
 
-__all__ = ["Descent"]
+__all__ = ["ObjectiveGradient"]
 
 
-class Descent:
+class ObjectiveGradient:
     """Energy (H,) and gradient (H, B T + B) over the unknowns, equal to autograd's of :meth:`Objective.terms`.
 
     All terms are functions of the bones' depths dz and of the logarithms of their lengths: joints are never formed,
@@ -94,11 +94,11 @@ class Descent:
         growth += (slope * u.shear).sum(-1)
         return value, torch.cat([slope.flatten(1), growth], 1).mul_(u.scale)
 
-    def rows(self, index: Tensor) -> Descent:
+    def rows(self, index: Tensor) -> ObjectiveGradient:
         """That of some hypotheses."""
         assert self.unknowns is not None
         unknowns = self.unknowns.rows(index)
-        return Descent(unknowns.objective, unknowns)
+        return ObjectiveGradient(unknowns.objective, unknowns)
 
     def at(self, own: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Value (H,) of bones' depths (H, B, T) and lengths (H, B), its derivatives in depths and log lengths."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcs_torch.methods.pkc.descent import Descent
+from kcs_torch.methods.pkc.descent import ObjectiveGradient
 from kcs_torch.methods.pkc.descents import TOGETHER
 from kcs_torch.methods.pkc.objective import MOST, Objective
 from kcs_torch.methods.pkc.unknowns import Unknowns
@@ -127,7 +127,7 @@ def _refined(objective: Objective, depth: Tensor, lengths: Tensor, num_steps: in
     goal.weights = replace(objective.weights, length=loose * objective.weights.length)
     unknowns = Unknowns(goal, depth, lengths)
     start = depth.new_zeros(len(depth), unknowns.scale.shape[-1])
-    descent = Descent(goal, unknowns)
+    descent = ObjectiveGradient(goal, unknowns)
     solution = lbfgs(descent, start, num_steps=num_steps, tolerance=1e-5, slopes=True, part=descent.rows)
     with torch.no_grad():
         depth, lengths = unknowns(solution.value)
