@@ -83,6 +83,19 @@ def test_noise_that_lasts_is_told(kind):
     assert 0.4 * error < float(found.left[0]) < 1.3 * error
 
 
+@pytest.mark.parametrize("shown", [0, 30])
+def test_joints_that_are_hardly_seen_do_not_hide_the_noise_of_others(shown):
+    """What is filled has no noise of its own."""
+    tracks = walk()
+    noise = 0.02 * rms(tracks - tracks.mean(1, keepdim=True))
+    spoiled = tracks + noise * normal(*tracks.shape)
+    weights = torch.ones(tracks.shape[:2], dtype=torch.float64)
+    weights[shown:, : tracks.shape[1] // 2] = 0
+    found = denoise_tracks(spoiled, weights)
+    assert_close(found.noise.mean(), torch.tensor(noise, dtype=torch.float64), rtol=0.2, atol=0)
+    assert rms((found.points - tracks)[weights > 0]) < 0.6 * noise
+
+
 def test_gaps_are_filled_better_than_by_time_or_rank_alone():
     tracks = walk()
     seen = gaps(*tracks.shape[:2])

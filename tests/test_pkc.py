@@ -27,7 +27,7 @@ from kcs_torch.methods.pkc.batch import Noisy, clean_all, serve
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.descents import Descent
-from kcs_torch.methods.pkc.gaps import gaps_of
+from kcs_torch.methods.pkc.gaps import gaps_of, usual_noise
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.root import standing_feet
 from kcs_torch.metrics import e3d
@@ -358,6 +358,17 @@ def test_a_gap_at_the_end_of_a_clip_does_not_spoil_it(protocol, shared):
     )
     found = PKC()(tracks)
     assert protocol.score(found.observed.numpy(), truth["points3d"], truth["edges"])["rigid"] < 40  # flat is at 107
+
+
+def test_joints_never_seen_do_not_tell_the_noise():
+    noise = torch.full((40, 17), 0.004, dtype=torch.float64)
+    noise[:, 7:] = 0.1  # more than half
+    noise[:30, 0] = 0.1
+    assert usual_noise(noise) == usual_noise(noise[:, :7]) == 0.004
+    clip = walking_person(40, turn=0.0)
+    image = centred(clip.points / 1000)[..., :2]
+    few, all_seen = (Body(clip.skeleton, image, 30.0, each).objective for each in (noise, noise.clamp_max(0.004)))
+    assert_close(few.weights.acceleration, all_seen.weights.acceleration, rtol=0.1, atol=0)
 
 
 def test_what_counts_as_a_gap():

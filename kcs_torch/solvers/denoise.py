@@ -63,11 +63,12 @@ def denoise_tracks(tracks: Tensor, weights: Tensor, *, window: int = 64, quick: 
     g_i is the clip's spectrum and Q_b its covariance between the 2N coordinates, for every band b of modes, both
     estimated from the clip (moments, with shrinkage to independent joints). s^2 is the level at which the spectrum
     stops falling, unless joints move together there, and at least what quick modes do not share: clean tracks come back
-    as they are but for their own jitter. c_i is twice what the modes of a band do not share beyond s^2, where that is
-    more than motion leaves unshared, about a tenth of the band's deviation; slower modes, which motion fills, have what
-    quicker ones tell. Given these, v = x + r is the minimum of
-    sum w_tn |y_tn - v_tn|^2 / s^2 + sum_i v_i^T (g_i Q_b + c_i)^-1 v_i, by conjugate gradients with the solution for
-    even weights as preconditioner, and x_i = g_i Q_b (g_i Q_b + c_i)^-1 v_i. Cost is linear in T.
+    as they are but for their own jitter. Joints that are seen less than half as often as any do not count there, as
+    what fills their gaps has no noise, and would make that of the others seem less. c_i is twice what the modes of a
+    band do not share beyond s^2, where that is more than motion leaves unshared, about a tenth of the band's deviation;
+    slower modes, which motion fills, have what quicker ones tell. Given these, v = x + r is the minimum of sum w_tn
+    |y_tn - v_tn|^2 / s^2 + sum_i v_i^T (g_i Q_b + c_i)^-1 v_i, by conjugate gradients with the solution for even
+    weights as preconditioner, and x_i = g_i Q_b (g_i Q_b + c_i)^-1 v_i. Cost is linear in T.
 
     A joint is an outlier where it is further from what the rest of the clip predicts than six times the usual distance
     (the median of the joint's clip, or up to four times that where its surroundings have more) plus .04 of the body's
@@ -163,11 +164,12 @@ class _Model:
         windows, length, size = y.shape[1:]
         self.share = w.mean((1, 2, 3)).clamp_min(1e-3)[:, None, None, None]
         z = self.basis.mT @ (x + w * (y - x))
-        self.measured = white_power(z) / self.share.flatten()
+        each = w.mean(2)
+        self.measured = white_power(z, each)
         self.noise = self.measured.clamp_min(_LEAST_NOISE**2)
         among = self.share.flatten()
-        self.lasting = self._lasting(z, self.measured * among) / among[:, None]
-        left = (self.noise[:, None] + self.lasting) * among[:, None]  # noise power in a mode: what is filled has none
+        self.lasting = self._lasting(z, each)
+        left = (self.noise[:, None] + self.lasting) * among[:, None]  # noise power in a mode
         order = torch.arange(1, length + 1, dtype=y.dtype, device=y.device)
         near = torch.exp(-0.5 * ((order.log()[:, None] - order.log()) / 0.15) ** 2)
         near = near / near.sum(1, keepdim=True)
@@ -203,17 +205,18 @@ class _Model:
         spoilt = (self.measured / usual.clamp_min(1e-3))[:, None, None] + lasting
         self.left = (motion * spoilt / (motion + spoilt)).mean((1, 2))  # of the posterior
 
-    def _lasting(self, z: Tensor, white: Tensor) -> Tensor:
-        """Power (K, L) of noise in modes z (K, H, L, M) beyond white noise of the power (K,).
+    def _lasting(self, z: Tensor, each: Tensor) -> Tensor:
+        """Power (K, L) of noise in modes z (K, H, L, M) beyond white noise, of which each (K, H, M) is left.
 
         Quick modes tell it for slower ones, in which motion hides it.
         """
-        level, out = white, []
+        white = level = self.measured
+        out = []
         for a, b in reversed(self.bands):
             if a >= self.quick:
-                part = z[:, :, a:b].flatten(1, 2)
-                own, surely = unshared(part)
-                among = (surely / part.square().mean((1, 2)).clamp_min(TINY)).sqrt()
+                part = z[:, :, a:b]
+                own, surely = unshared(part, each)
+                among = (surely * self.share.flatten() / part.square().mean((1, 2, 3)).clamp_min(TINY)).sqrt()
                 noisy = ((among - _LASTS[0]) / (_LASTS[1] - _LASTS[0])).clamp(0, 1)
                 known = torch.where(own.isfinite(), own, level)
                 level = torch.lerp(torch.minimum(known, level), known, noisy)

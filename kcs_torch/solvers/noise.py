@@ -76,9 +76,9 @@ def measure_noise(tracks: Tensor, weights: Tensor, *, window: int = 64) -> Noise
     index = index + torch.arange(length, device=tracks.device)
     modes = temporal_modes(length).to(points).mT @ (points - points.mean(1, keepdim=True))[:, index].flatten(-2)
     white = math.sqrt(float(white_power(modes)))
-    part = modes[:, :, slice(*RESTLESS)].flatten(1, 2)
+    part = modes[:, :, slice(*RESTLESS)]
     _, own = unshared(part)
     if not bool(own.isfinite()):
         return Noise(white, 0.0, 0.0)
-    share = own / part.square().mean((1, 2)).clamp_min(TINY)
+    share = own / part.square().mean((1, 2, 3)).clamp_min(TINY)
     return Noise(white, math.sqrt(float(own)), math.sqrt(float(share)))

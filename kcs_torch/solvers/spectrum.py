@@ -8,7 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.ranks import median
+from kcs_torch.functional.ranks import nanmedian
 
 __all__ = ["TINY", "spectrum_floor", "temporal_modes", "unshared", "white_power", "window_at"]
 
@@ -21,6 +21,9 @@ WINDOW = 64
 SHARED = (0.15, 0.35)
 """The floor of a spectrum is motion where less than the first share of its power is every joint's own, and noise from
 the second on."""
+
+FILLED = 0.5
+"""Share of the noise that any joint has left, at most, below which a joint is mostly filled and tells of none."""
 
 TINY = 1e-30
 """Sizes and powers up to it are those of nothing."""
@@ -59,35 +62,51 @@ def spectrum_floor(power: Tensor) -> Tensor:
     return (scale * level[:, 0]).flatten(1).gather(1, best)[:, 0]
 
 
-def white_power(modes: Tensor) -> Tensor:
+def white_power(modes: Tensor, share: Tensor | None = None) -> Tensor:
     """Power (K,) of the white noise in temporal modes (K, H, L, M) of K clips' H windows and M coordinates.
 
     The level at which the spectrum stops falling, unless joints move together there, and at least what the quicker half
-    of the modes do not share.
+    of the modes do not share. Where gaps were filled, ``share`` (K, H, M) of the noise's power is left.
     """
-    typical = median(modes.square().movedim(2, 1).flatten(2), -1) / 0.4549  # of chi-square: blind to impacts
+    square = modes.square()
+    if share is not None:
+        known = share >= FILLED * share.amax((1, 2), keepdim=True)
+        square = torch.where(known[:, :, None], square / share.clamp_min(TINY)[:, :, None], math.nan)
+    typical = nanmedian(square.movedim(2, 1).flatten(2), -1) / 0.4549  # of chi-square: blind to impacts
     floor = spectrum_floor(typical)
-    alone, _ = unshared(modes[:, :, modes.shape[2] // 2 :].flatten(1, 2))
+    alone, _ = unshared(modes[:, :, modes.shape[2] // 2 :], share)
     alone = torch.where(alone.isfinite(), alone, floor)
     own = ((alone / floor.clamp_min(TINY) - SHARED[0]) / (SHARED[1] - SHARED[0])).clamp(0, 1)
     return torch.lerp(alone, torch.maximum(alone, floor), own)
 
 
-def unshared(modes: Tensor) -> tuple[Tensor, Tensor]:
-    """Variance (K,) of what modes (K, n, M) do not share, and a cautious guess: noise is every joint's own, motion not.
+def unshared(modes: Tensor, share: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Variance (K,) of what modes do not share, and a cautious guess: noise is every joint's own, motion is not.
 
     The smaller eigenvalues of the coordinates' covariance, over those of as much white noise of variance 1; infinite
-    where there are too few modes to tell. The guess takes fewer of them.
+    where there are too few modes or coordinates to tell. The guess takes fewer of them. Arguments are those of
+    :func:`white_power`; coordinates that are mostly filled, and had no noise as it seems, do not count.
     """
+    modes = modes.flatten(1, 2)
     count, size = modes.shape[1:]
-    if count < ENOUGH or size < 8:
-        return (modes.new_full((len(modes),), math.inf),) * 2
-    usual, found = _white_spectrum(count, size).to(modes), torch.linalg.eigvalsh(modes.mT @ modes)
-    rank = min(size, count)
-    first = size - rank + rank // 8  # virtual joints are no measurements
-    low = [slice(first, size - rank + last) for last in (rank // 2, 3 * rank // 8)]
-    half, less = (found[..., i].mean(-1).clamp_min(0) / usual[..., i].mean(-1).clamp_min(TINY) for i in low)
-    return half, less
+    number = [size] * len(modes)
+    if share is not None:
+        usual = share.mean(1)  # (K, M)
+        known = usual >= FILLED * usual.amax(-1, keepdim=True)
+        modes = modes * (known / usual.clamp_min(TINY).sqrt())[:, None]
+        number = known.sum(-1).tolist()
+    found = torch.linalg.eigvalsh(modes.mT @ modes)
+    half: list[Tensor] = []
+    less: list[Tensor] = []
+    for own, told in zip(found, number, strict=True):  # the smallest are those of coordinates that do not count
+        enough = count >= ENOUGH and told >= 8
+        rank = min(told, count)
+        for out, last in ((half, rank // 2), (less, 3 * rank // 8)):
+            some = slice(told - rank + rank // 8, told - rank + last)  # virtual joints are no measurements
+            white = _white_spectrum(count, told).to(modes)[some].mean() if enough else 0.0
+            power = own[size - told :][some].mean().clamp_min(0)
+            out.append(power / white if enough else modes.new_tensor(math.inf))
+    return torch.stack(half), torch.stack(less)
 
 
 @lru_cache(maxsize=64)

@@ -19,7 +19,7 @@ from kcs_torch.methods.lockstep import Search, together
 from kcs_torch.methods.pkc.assembly import TIGHT
 from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.fixed_view import searching
-from kcs_torch.methods.pkc.gaps import fill_gaps, gaps_of
+from kcs_torch.methods.pkc.gaps import fill_gaps, gaps_of, usual_noise
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.moving_search import soften
 from kcs_torch.methods.pkc.objective import Objective, bone_noise, usual_posture
@@ -258,7 +258,7 @@ class Body:
         """
         skeleton, bones, frames = self.skeleton, self.objective.bones, len(self.image)
         size = self.image.square().mean().sqrt()
-        level = float(self.noise.median() / size)
+        level = usual_noise(self.noise) / float(size)
         if self.objective.noisy:  # where gaps were filled, at least
             level = max(level, LEVEL)
         sure = (level * size / self.noise.clamp_min(level * size)).square() if level > 0 else None

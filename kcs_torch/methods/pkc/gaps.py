@@ -14,7 +14,7 @@ from kcs_torch.methods.pkc.moving_search import FINER, ROBOT, soften, too_long
 from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights
 from kcs_torch.solvers.procrustean import FINE, Pose
 
-__all__ = ["fill_gaps", "fillable", "freed", "gaps_of"]
+__all__ = ["fill_gaps", "fillable", "freed", "gaps_of", "usual_noise"]
 
 GAP, SHOWN = 3.0, 0.1
 """How many times as noisy a joint is in a frame that does not show it, at least, as in frames that do; and the share of
@@ -30,7 +30,12 @@ SURER = 0.2
 def gaps_of(noise: Tensor) -> Tensor:
     """Which joints (T, N) are seen in other frames only, of their noise (T, N) in the image."""
     usual = _shown(noise)
-    return (noise > GAP * usual) & (usual <= GAP * usual.amin())
+    return (noise > GAP * usual) & _ever(usual)
+
+
+def usual_noise(noise: Tensor) -> float:
+    """Median of the noise (T, N), of joints that some frame shows: that of others is a guess."""
+    return float(noise[:, _ever(_shown(noise))].median())
 
 
 def fill_gaps(image: Tensor, polished: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -62,6 +67,11 @@ def freed(moving: MovingView, image: Tensor, noise: Tensor) -> Search[Descent, P
         Descent(image, pose.points, pose.rotations, moving.bones, weights, moving.rigid, pull, EXACT, stages)
     ]
     return replace(moving, pose=pose)
+
+
+def _ever(usual: Tensor) -> Tensor:
+    """Which joints (N,) some frame shows, of their noise where they are shown."""
+    return usual <= GAP * usual.amin()
 
 
 def _shown(noise: Tensor) -> Tensor:

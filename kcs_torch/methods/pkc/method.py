@@ -20,7 +20,7 @@ from kcs_torch.methods.pkc.batch import Sized, serve
 from kcs_torch.methods.pkc.body import Body, Turned
 from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.fixed_answer import from_hypotheses
-from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of
+from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of, usual_noise
 from kcs_torch.methods.pkc.gate import without_others, without_repeats
 from kcs_torch.methods.pkc.held import with_lengths_held
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
@@ -307,7 +307,7 @@ class PKC(Method):
     ) -> Search[Any, Any, tuple[MovingView, Estimate]]:
         """So many solutions of the moving viewpoint at most; and the first guess, SfAM's."""
         (first,) = yield [_complete(tracks, image)]
-        start, usual = (first.points, complete_rotation(first.cameras)), float(noise.median())
+        start, usual = (first.points, complete_rotation(first.cameras)), usual_noise(noise)
         weights = relative_weights(noise, usual) if usual > 0 else None
         search = MovingSearch(
             image, tracks.skeleton, *start, weights=weights, noise=usual, lifts=self.lifts, alternatives=count,
@@ -318,7 +318,7 @@ class PKC(Method):
 
     def _in_space(self, tracks: Tracks, image: Tensor, noise: Tensor) -> Search[Any, Any, tuple[MovingView, Estimate]]:
         """As :meth:`_moving`; where exact tracks have gaps, once more with these filled by the first one."""
-        count, exact = max(1, self.alternatives), float(noise.median()) == 0
+        count, exact = max(1, self.alternatives), usual_noise(noise) == 0
         moving, first = yield from self._moving(tracks, image, noise, count)
         if self.rounds and exact and fillable(image) and bool(gaps_of(noise).any()):
             moving = yield from freed(moving, image, noise)

@@ -85,7 +85,10 @@ class Objective:
         self.bones = skeleton.bone_index(device=image.device)
         self.noise = bone_noise(noise, self.bones)  # (T, B)
         self.noisy = bool((self.noise > 0).any())
-        self.weights = in_noise(weights, float(self.noise.median())) if self.noisy else weights
+        quiet = self.noise.amin(0)
+        usual = quiet.amin()
+        never = quiet > NEVER * usual  # bones of joints that no frame shows
+        self.weights = in_noise(weights, float(self.noise[:, ~never].median())) if self.noisy else weights
         make = lambda module: module.to(image)  # noqa: E731
         plain = usual_posture(skeleton, image.dtype, image.device)
         blur = BLUR * median(self.noise, 0) / plain.rest_lengths.clamp_min(SHORT)
@@ -103,9 +106,6 @@ class Objective:
         self.flat = bone_vectors(image, self.bones).square().sum(-1)  # (T, B)
         self.rigid = skeleton.rigid_mask(dtype=image.dtype, device=image.device)
         self.tree = chain_inverse(incidence(self.bones, skeleton.num_joints, dtype=image.dtype))  # (N, B)
-        quiet = self.noise.amin(0)
-        usual = quiet.amin()
-        never = quiet > NEVER * usual  # bones of joints that no frame shows
         self.hinges.firm[never[self.hinges.limbs].any(-1)] = 0
         feet = torch.tensor(self.stance.feet, dtype=torch.long, device=image.device)
         guessed = not len(feet) or bool(never[torch.isin(self.bones, feet).any(-1)].any())
