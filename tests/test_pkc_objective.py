@@ -548,6 +548,18 @@ def test_searches_in_lockstep():
     assert run(together([]), minimise_all) == []
 
 
+def test_images_of_any_size_compare():
+    """Foreshortening is the logarithm of a density in the image, which falls with its area."""
+    points = walking_person(20).points[:, :17] / 1000
+    plain, large = objective(points), objective(2 * points)
+    costs = []
+    for found, size in ((plain, 1.0), (large, 2.0)):
+        terms = found.terms(size * points[None, ..., 2], size * lengths_of(found, points)[None])
+        costs.append(terms["foreshortening"][0] + found.drawn(points.new_full((20,), 1 / size)))
+    assert_close(costs[0], costs[1], rtol=1e-4, atol=0)
+    assert costs[0] != 0 == plain.drawn(points.new_ones(20))
+
+
 def test_joints_never_seen_are_no_evidence():
     clip = walking_person(20)
     body = clip.skeleton

@@ -34,6 +34,29 @@ def test_a_distant_camera_keeps_its_scale(yaw, turn):
     assert not weak_perspective(clip.tracks.points, clip.tracks.seen, clip.skeleton, 30.0).sure
 
 
+def test_fingers_that_look_shorter_together_do_not_change_the_size(shared, protocol):
+    """A hand that turns before a distant camera."""
+    data = protocol.load(shared / "data", "hand/manipnet_mug1_rightHand")
+    joint = dict(zip(data["joint_names"].tolist(), data["points3d"][240:480:2].transpose(1, 0, 2), strict=True))
+    parts = [joint["WRIST"], joint["THUMB_CMC_FE"]]
+    for finger in ("THUMB", "INDEX", "MIDDLE", "RING", "PINKY"):
+        names = ("MCP_FE", "IP_FE") if finger == "THUMB" else ("MCP", "PIP_FE", "DIP_FE")
+        chain = [joint[f"{finger}_{name}"] for name in names]
+        parts += [*chain, 1.9 * chain[-1] - 0.9 * chain[-2]]  # its tip
+    points = torch.tensor(protocol.np.stack(parts, 1)).double() * torch.tensor([-1.0, 1, 1])  # a right hand's
+    turn = torch.tensor(protocol.rotation(protocol.np.linspace(0, 90, 120), 0.0))
+    truth = points @ turn.mT
+    truth = truth - truth.mean(1, keepdim=True)
+    spread = truth.square().sum(-1).mean().sqrt()
+    noise = 0.01 * spread * torch.tensor(protocol.np.random.default_rng(5).standard_normal((120, 21, 2)))
+    tracks = kt.Tracks.from_arrays(truth[..., :2] + noise, skeleton="hand21", fps=30, units="mm")
+    size = weak_perspective(tracks.points, tracks.seen, tracks.skeleton, 30.0)
+    assert size.range > 1.08 and not size.likely
+    found = kt.reconstruct(tracks, intrinsics="parallel", detections=False)
+    off = found.points - found.points.mean(1, keepdim=True) - truth
+    assert float(off.square().sum(-1).mean().sqrt()) < 0.1 * float(spread)
+
+
 def test_gaps_and_outliers_do_not_change_the_size():
     clip = walking_person(90, turn=0, yaw=20)
     image, size = grown(clip, 1.8)

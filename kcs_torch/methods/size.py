@@ -33,8 +33,12 @@ STEPS = 40
 
 LEAST_RANGE, LEAST_GAIN = 1.08, 0.3
 """Largest over smallest size, and share of the bones' deviation that it must explain (the median over bones), for a
-changing size to be believed. Before a distant camera the latter stays below 0.12 on all clips tried; it is above 0.6
-where a person walks towards a camera some metres away."""
+changing size to be believed. Before a distant camera the latter stays below 0.12 of people; it is above 0.6 where a
+person walks towards a camera some metres away."""
+
+SURELY = 0.7
+"""Share of that deviation from which on nothing else explains it. Fingers, which point to one side, look shorter
+together as a hand turns: that explains up to 0.61."""
 
 
 class Size(NamedTuple):
@@ -42,16 +46,31 @@ class Size(NamedTuple):
 
     Attributes:
         path: (T,), of mean 1.
-        sure: whether the tracks clearly ask for it.
+        gain: share of the bones' deviation that it explains, the median over bones.
     """
 
     path: Tensor
-    sure: bool
+    gain: float
 
     @property
     def range(self) -> float:
         """The largest size over the smallest."""
         return float(self.path.amax() / self.path.amin())
+
+    @property
+    def sure(self) -> bool:
+        """Whether the tracks clearly ask for it."""
+        return self.range >= LEAST_RANGE and self.gain >= LEAST_GAIN
+
+    @property
+    def surely(self) -> bool:
+        """Whether nothing else can explain them."""
+        return self.sure and self.gain >= SURELY
+
+    @property
+    def likely(self) -> bool:
+        """Whether it may be so: a large change would explain much, a small one need not."""
+        return self.range < LEAST_RANGE or self.sure
 
 
 def slow_waves(frames: int, rate: float, like: Tensor, *, most: int = 12) -> Tensor:
@@ -120,9 +139,8 @@ def _waves(tracks: Tracks) -> Tensor:
 
 
 def _judged(path: Tensor, gain: Tensor) -> Size:
-    """A path (T,), and whether what it explains (P,) of the bones' deviations is worth it."""
-    sure = float(path.amax() / path.amin()) >= LEAST_RANGE and float(gain.median()) >= LEAST_GAIN
-    return Size(path / path.mean(), sure)
+    """A path (T,) that explains so much (P,) of the bones' deviations."""
+    return Size(path / path.mean(), float(gain.median()))
 
 
 def _paths(

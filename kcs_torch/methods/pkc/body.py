@@ -99,6 +99,7 @@ class Body:
         rate: frames a second.
         noise: (T, N) standard deviation of the joints in the image.
         standing: (T, C) how surely the skeleton's contact points stand still, or None where nothing tells.
+        pace: of the motion, see :func:`kcs_torch.methods.pkc.weights.pace_of`; None: as the image tells.
 
     Attributes:
         factor: units of the template per unit of the image.
@@ -107,7 +108,13 @@ class Body:
     """
 
     def __init__(
-        self, skeleton: Skeleton, image: Tensor, rate: float, noise: Tensor, standing: Tensor | None = None
+        self,
+        skeleton: Skeleton,
+        image: Tensor,
+        rate: float,
+        noise: Tensor,
+        standing: Tensor | None = None,
+        pace: float | None = None,
     ) -> None:
         posture = usual_posture(skeleton, image.dtype, image.device)
         rigid = skeleton.rigid_mask(device=image.device)
@@ -116,7 +123,8 @@ class Body:
         self.skeleton, self.rate, self.factor = skeleton, rate, 1 / scale
         self.image = image / scale
         self.noise = noise / scale
-        weights = at_pace(Weights(), rate, pace_of(image, skeleton, rate))
+        self.pace = pace_of(image, skeleton, rate) if pace is None else pace
+        weights = at_pace(Weights(), rate, self.pace)
         self.objective = Objective(skeleton, self.image, weights, self.noise, standing=standing)
 
     def frames(self, depth: Tensor, image: Tensor | None = None) -> Tensor:

@@ -201,7 +201,9 @@ class PKC(Method):
             tracks.num_frames >= MANY_FRAMES or (tracks.num_frames >= LEAST_FRAMES and _is_whole(tracks))
         )
         many = enough and tracks.num_frames >= MANY_FRAMES
-        changing, even = size.sure, image / size.path[:, None, None]
+        # With a template, solutions with and without a change of size may be compared.
+        changing = size.surely if template and many and self.viewpoint != "moving" else size.sure
+        even = image / size.path[:, None, None]
         if changing:
             image = even
         if not template:
@@ -218,8 +220,8 @@ class PKC(Method):
             moving, _ = yield from self._moving(tracks, image, noise)
             found = yield from self._ranked(body, moving)
         else:
-            resizing = many and not changing and size.range >= TRIED  # what is compared must be searched alike
-            compare = turned if compared and many and not resizing else None
+            resizing = many and not changing and size.range >= TRIED and size.likely
+            compare = turned if compared and many and not resizing else None  # what is compared must be searched alike
             near = Asked(self._seems_near, tracks, points, cameras, body)
             found = yield from body.search(self._moves, self.steps, compare, near)
             if near.told == SEEMS_NEAR:  # the rest is as under perspective
@@ -227,8 +229,8 @@ class PKC(Method):
             if near.told and (near.told != SEEMS_FAR or not body.turns(found)):  # else signs were poor: ask again later
                 notes = (*notes, near.told)
             led = compared and body.is_odd(found) and body.turns(found)  # by the viewpoint's turn, not by the template
-            if resizing and not led:
-                other = Body(skeleton, even, tracks.rate, noise, feet)
+            if resizing and (size.sure or not led):
+                other = Body(skeleton, even, tracks.rate, noise, feet, body.pace)
                 better = yield from resized(found, body, other, size, method._moves, self.steps)
                 if better is not None:
                     changing, body, found = True, other, better

@@ -188,13 +188,26 @@ class Objective:
         """
         if not self.noisy:
             return depth.new_zeros(len(depth))
-        square, eps = self.noise.square(), self.foreshortening.eps
-        share = VOLUME * self.independent * square / (square + self.weights.length**2)  # exact images leave none
+        share, eps = self._room, self.foreshortening.eps
         few, out = max(1, MOST // depth.shape[1]), []
         for z, length in zip(depth.split(few), lengths.split(few), strict=True):
             room = share * foreshortening(self._own(z), length[:, None], eps, self.noise)
             out.append(room.sum((1, 2)))
         return torch.cat(out)
+
+    @property
+    def _room(self) -> Tensor:
+        """How much room counts for each bone, (T, B): exact images leave none."""
+        square = self.noise.square()
+        return VOLUME * self.independent * square / (square + self.weights.length**2)
+
+    def drawn(self, size: Tensor) -> Tensor:
+        """What an image costs that is drawn ``size`` (T,) times as large as this one.
+
+        A density of places in an image falls with its area. Of one image it is a constant; among several, of which
+        each is the same tracks divided by another size, small ones would win without it.
+        """
+        return 2 * ((self.independent + self._room).sum(-1) * size.log()).sum()
 
     def ranking(self, depth: Tensor, lengths: Tensor) -> Tensor:
         """What ranks solutions and does not pull on them, (H,), of depths (H, T, N) and lengths (H, B)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from kcs_torch.methods.base import Estimate
@@ -39,7 +40,9 @@ def resized(
         rounds: of discrete moves of a new search.
         steps: of each refinement.
     """
-    before = found.energy[0]
+    even = torch.ones_like(size.path)
+    before = found.energy[0] + body.objective.drawn(even / body.factor)
+    before = before - other.objective.drawn(size.path / other.factor)
     if size.range < AT_ONCE:
         ratio = other.factor / body.factor
         few = found[:FEW]
