@@ -36,6 +36,9 @@ LEAST_RANGE, LEAST_GAIN = 1.08, 0.3
 changing size to be believed. Before a distant camera the latter stays below 0.12 of people; it is above 0.6 where a
 person walks towards a camera some metres away."""
 
+MUCH = 1.15
+"""Largest over smallest size from which on a change that is true explains at least as much."""
+
 SURELY = 0.7
 """Share of that deviation from which on nothing else explains it. Fingers, which point to one side, look shorter
 together as a hand turns: that explains up to 0.61."""
@@ -70,7 +73,7 @@ class Size(NamedTuple):
     @property
     def likely(self) -> bool:
         """Whether it may be so: a large change would explain much, a small one need not."""
-        return self.range < LEAST_RANGE or self.sure
+        return self.range < MUCH or self.sure
 
 
 def slow_waves(frames: int, rate: float, like: Tensor, *, most: int = 12) -> Tensor:
