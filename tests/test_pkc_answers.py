@@ -168,6 +168,25 @@ def test_angles_are_surer_of_a_body_that_is_seen_from_aside(degrees):
     assert aside / front < (0.55 if degrees < 20 else 0.35)
 
 
+@pytest.mark.parametrize("degrees", [20.0, 40.0, 90.0])
+def test_angles_are_less_sure_of_a_body_that_is_seen_from_above(degrees):
+    """All bones along it are foreshortened together; straight from above no more than the steepest that count."""
+    skeleton = SKELETONS["h36m17"]
+    rest = skeleton.template_points(dtype=torch.float64)
+    rest = (rest - rest.mean(0)) @ torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]).double().mT
+    doubts = []
+    for angle in (0.0, degrees):
+        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        body = (rest @ torch.tensor([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]).double().mT).expand(30, -1, -1)
+        goal = Objective(skeleton, body[..., :2], Weights(), torch.zeros(30, 17).double())
+        lengths = bone_lengths(body, goal.bones).mean(0)
+        doubts.append(angle_doubt(goal, body[..., 2], lengths, 0.0))
+    level, tilted = doubts
+    least = answers.FRONT**2 / (1 + 1 / answers.ASIDE**2) + answers.SIDE**2
+    more = answers.TILT**2 * s**2 / max(c**2, 1 - answers.STEEP**2)
+    assert (tilted / level) ** 2 == pytest.approx(1 + more / least, rel=0.03)
+
+
 def test_noise_in_one_frame_is_that_frame_s_and_lengths_share_it(monkeypatch):
     """A length takes on the mean over the clip: of a few frames in many it is hardly less sure."""
     noise = torch.zeros(5, 4).double()

@@ -25,10 +25,14 @@ ANGLE = 0.15
 """Standard deviation, in radians, of a bone's angle to the image plane where it is nearest to it: what postures, hinges
 and proportions tell of a length that no crossing of the plane tells."""
 
-FRONT, SIDE, ASIDE = 2.4, 0.5, 0.1
+FRONT, SIDE, ASIDE = 2.4, 0.45, 0.1
 """How uncertain angles are, in ``ANGLE``, of a body that is seen exactly from the front or from behind, what is left of
 that from the side, and the sine of the direction from which on it falls: a body that leans moves in the image only if
 it is seen from aside."""
+
+TILT = 1.2
+"""How uncertain angles are, in ``ANGLE``, for each unit of the slope at which the body's long axis comes towards the
+camera, as one that looks down sees it: all bones along it are foreshortened at once, and only proportions tell."""
 
 USUAL = 0.12
 """Standard deviation of a length of which the image tells nothing, as a share: bodies differ by so much."""
@@ -95,8 +99,8 @@ def told_by_prior(found: Hypotheses, skeleton: Skeleton) -> list[str]:
 def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: float) -> float:
     """How uncertain angles of a solution (T, N), (B,) are, over those of usual postures before a camera at rest.
 
-    More where postures stray from the template, the body is seen from the front or in a short clip, and less where it
-    is seen from aside or the viewpoint turned by ``turn`` degrees.
+    More where postures stray from the template, the body is seen from the front, from above or in a short clip, and
+    less where it is seen from aside or the viewpoint turned by ``turn`` degrees.
     """
     posture = objective.posture
     points = torch.cat([objective.image, depth[..., None]], -1)
@@ -104,8 +108,9 @@ def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: floa
     strange = float(posture(points[None], lengths[None])) / counted / POSTURE
     odd = max(1.0, objective.oddity(lengths) / ODDITY)
     strange = max(strange, strange**STRANGE)
-    aside = float(posture.frame(points)[..., 0, 2].square().mean())
-    view = FRONT**2 / (1 + aside / ASIDE**2) + SIDE**2
+    trunk = posture.frame(points).square().mean(0)
+    aside, tilt = float(trunk[0, 2]), float(trunk[2, 1])  # which way it faces, and where it stands upright
+    view = FRONT**2 / (1 + aside / ASIDE**2) + SIDE**2 + TILT**2 * tilt / max(1 - tilt, 1 - STEEP**2)
     told = 1 / view + (odd * turn / TURN) ** (2 * POWER)
     frames = len(depth)
     few = SHORT * posture.correlation / frames if frames >= LEAST_FRAMES else 1.0
