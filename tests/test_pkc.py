@@ -21,6 +21,7 @@ from kcs_torch.functional import (
     points_from_bones,
 )
 from kcs_torch.methods.lockstep import run
+from kcs_torch.methods.pkc import batch
 from kcs_torch.methods.pkc import body as body_module
 from kcs_torch.methods.pkc import method as module
 from kcs_torch.methods.pkc.batch import Noisy, clean_all, serve
@@ -30,6 +31,7 @@ from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.gaps import gaps_of, usual_noise
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.root import standing_feet
+from kcs_torch.methods.size import Size
 from kcs_torch.metrics import e3d
 
 # Many tests take few steps, after which nothing has settled.
@@ -886,3 +888,16 @@ def test_a_body_unlike_its_template_is_not_searched_again_for_a_change_of_size(w
     with warnings.catch_warnings(action="ignore", category=KcsWarning):
         PKC(steps=10)(Tracks.from_arrays((tracks.points * size)[:, :17], skeleton="coco17", fps=30.0))
     assert len(tried) == (width == 1.0)
+
+
+@pytest.mark.parametrize("detections", [False, True])
+def test_a_large_change_of_size_that_explains_little_is_tried_of_a_detector_s_tracks_alone(detections, monkeypatch):
+    """Whose errors hide what it explains."""
+    tried, real = [], module.resized
+    monkeypatch.setattr(module, "resized", lambda *given: tried.append(given) or real(*given))
+    path = torch.linspace(0.9, 1.1, 40, dtype=torch.float64)
+    sizes = lambda tracks: [Size(path, 0.1) for _ in tracks]  # noqa: E731
+    monkeypatch.setattr(batch, "weak_perspectives", sizes)
+    clip = walking_person(40, turn=0, yaw=40)
+    PKC(steps=3, rounds=0, detections=detections)(clip.tracks)
+    assert len(tried) == detections

@@ -37,7 +37,8 @@ changing size to be believed. Before a distant camera the latter stays below 0.1
 person walks towards a camera some metres away."""
 
 MUCH = 1.15
-"""Largest over smallest size from which on a change that is true explains at least as much."""
+"""Largest over smallest size from which on a change that is true explains at least as much, but for the errors of a
+detector, which last."""
 
 SURELY = 0.7
 """Share of that deviation from which on nothing else explains it. Fingers, which point to one side, look shorter

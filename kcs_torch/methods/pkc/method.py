@@ -201,6 +201,7 @@ class PKC(Method):
             tracks.num_frames >= MANY_FRAMES or (tracks.num_frames >= LEAST_FRAMES and _is_whole(tracks))
         )
         many = enough and tracks.num_frames >= MANY_FRAMES
+        detections = detected(tracks)  # their errors last, would be taken for motion, and hide what a size explains
         # With a template, solutions with and without a change of size may be compared.
         changing = size.surely if template and many and self.viewpoint != "moving" else size.sure
         even = image / size.path[:, None, None]
@@ -212,7 +213,6 @@ class PKC(Method):
         still = self.contacts and not _turns(cameras) and self.viewpoint != "moving"
         feet = standing if still else None
         body = Body(skeleton, image, tracks.rate, noise, feet)
-        detections = detected(tracks)  # their errors last, and would be taken for motion
         polished = enough and body.spanned and not detections
         compared = polished and self.viewpoint == "auto"
         turned, method = self._turned(tracks, image, noise, body.factor), self
@@ -220,7 +220,7 @@ class PKC(Method):
             moving, _ = yield from self._moving(tracks, image, noise)
             found = yield from self._ranked(body, moving)
         else:
-            resizing = many and not changing and size.range >= TRIED and size.likely
+            resizing = many and not changing and size.range >= TRIED and (detections or size.likely)
             compare = turned if compared and many and not resizing else None  # what is compared must be searched alike
             near = Asked(self._seems_near, tracks, points, cameras, body)
             found = yield from body.search(self._moves, self.steps, compare, near)
