@@ -31,8 +31,8 @@ that from the side, and the sine of the direction from which on it falls: a body
 it is seen from aside."""
 
 TILT = 1.2
-"""How uncertain angles are, in ``ANGLE``, for each unit of the slope at which the body's long axis comes towards the
-camera, as one that looks down sees it: all bones along it are foreshortened at once, and only proportions tell."""
+"""How uncertain angles are, in ``ANGLE``, for each unit of the slope at which the template's upright axis comes towards
+the camera, as one that looks down sees it: all bones along it are foreshortened at once, and only proportions tell."""
 
 USUAL = 0.12
 """Standard deviation of a length of which the image tells nothing, as a share: bodies differ by so much."""
@@ -109,7 +109,7 @@ def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: floa
     odd = max(1.0, objective.oddity(lengths) / ODDITY)
     strange = max(strange, strange**STRANGE)
     trunk = posture.frame(points).square().mean(0)
-    aside, tilt = float(trunk[0, 2]), float(trunk[2, 1])  # which way it faces, and where it stands upright
+    aside, tilt = float(trunk[0, 2]), float(trunk[2, 1])  # of forward across, of upright towards
     view = FRONT**2 / (1 + aside / ASIDE**2) + SIDE**2 + TILT**2 * tilt / max(1 - tilt, 1 - STEEP**2)
     told = 1 / view + (odd * turn / TURN) ** (2 * POWER)
     frames = len(depth)

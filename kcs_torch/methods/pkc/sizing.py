@@ -41,6 +41,7 @@ def resized(
         steps: of each refinement.
     """
     even = torch.ones_like(size.path)
+    # Energies compare as those of the tracks themselves, in which both images have one size.
     before = found.energy[0] + body.objective.drawn(even / body.factor)
     before = before - other.objective.drawn(size.path / other.factor)
     if size.range < AT_ONCE:
