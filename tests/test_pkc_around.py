@@ -65,6 +65,14 @@ def test_a_wrong_run_is_found(walk, joint):
     assert_close(better.energy, found.energy, rtol=0, atol=0)
 
 
+def test_runs_of_several_bones_are_turned_over_at_once(walk, monkeypatch):
+    body, depth = walk
+    wrong = with_wrong_run(body, with_wrong_run(body, depth, "right_ankle"), "left_elbow")
+    monkeypatch.setattr(around, "TIMES", 1)
+    better = run(turned_around(body, hypotheses(body, wrong), 0.5 * depth), serve)
+    assert_close(better.depth[0], depth, rtol=0, atol=0.03)
+
+
 def test_what_is_right_or_confirmed_stays(walk):
     """Nothing is asked for where the turn confirms what was found, or its mirror image."""
     body, depth = walk

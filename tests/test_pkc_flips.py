@@ -10,7 +10,7 @@ from kcs_torch.functional import bone_vectors, standing
 from kcs_torch.methods.lockstep import run
 from kcs_torch.methods.pkc import flips as module
 from kcs_torch.methods.pkc.flips import flipped, flipped_runs, parts_of, signs_of, turned_over
-from kcs_torch.methods.pkc.hypotheses import Hypotheses
+from kcs_torch.methods.pkc.hypotheses import Hypotheses, combined
 from kcs_torch.methods.pkc.limbs import limbs_of
 from kcs_torch.methods.pkc.objective import Objective, usual_posture
 from kcs_torch.methods.pkc.refinement import Task, minimise_all
@@ -244,6 +244,42 @@ def test_what_is_mirrored_for_a_while_is_turned_over_at_once(which):
         flips = flipped(objective, parts, hypothesis(objective, wrong, lengths))
         same = (flips.depth - true.depth).abs().amax((1, 2)) < 1e-9
         assert same.sum() == 1
+
+
+def test_two_changes_that_have_nothing_to_do_with_each_other_are_made_at_once():
+    objective, _, own, lengths = exact_walk()
+    best = hypothesis(objective, own, lengths)
+    changes = own.new_zeros(5, *own.shape)
+    changes[0, :20, 2] = changes[1, 10:20, 2] = changes[2, 30:, 2] = changes[3, :, 9] = changes[4, :, 5] = 0.1
+    depth = objective.joints(own + changes)
+    gains = own.new_tensor([9.0, 8.0, 7.0, 5.0, 0.2])
+    longer = lengths * (1 + 0.01 * torch.eye(5, 16).double())
+    found = Hypotheses(depth, longer, best.energy - gains, 30)
+    both = combined(found, best, 0.3, objective.bones)
+    assert_close(both.depth, objective.joints(own + changes[0] + changes[2])[None])
+    assert_close(both.lengths[0, :4] / lengths[0, :4], own.new_tensor([1.01, 1.0, 1.01, 1.0]))
+    assert_close(both.energy, best.energy - 16)
+    assert both.steps == 0
+    for few in (found[:0], found[:1], found[:2], found[3:]):  # none, one, two of one run, and one gains too little
+        assert combined(few, best, 0.3, objective.bones).depth.shape == (0, *best.depth.shape[1:])
+
+
+def test_two_wrong_runs_are_turned_over_in_one_round(monkeypatch):
+    """Of a thigh and a forearm, up to their first passages; a second round finds that nothing is left to do."""
+    objective, parts, own, lengths = exact_walk(90)
+    (true,) = minimise_all([task(objective, objective.joints(own)[None], lengths)])
+    wrong = own.clone()
+    for name in ("right_hip-right_knee", "right_elbow-right_wrist"):
+        bone = BODY.bone_names.index(name)
+        wrong[: int((own[1:, bone] * own[:-1, bone] < 0).nonzero()[0]) + 1, bone] *= -1
+    (start,) = minimise_all([task(objective, objective.joints(wrong)[None], lengths)])
+    start = Hypotheses(start.depth, start.lengths, start.energy)
+    assert start.energy > true.energy + 5
+    rounds = []
+    monkeypatch.setattr(module, "flipped", lambda *args: rounds.append(0) or flipped(*args))
+    found = run(turned_over(objective, parts, start, 20), minimise_all)
+    assert found.energy[0] < true.energy[0] + 0.1
+    assert len(rounds) == 2
 
 
 @pytest.mark.parametrize("between", [0.0, 0.02, -0.02])

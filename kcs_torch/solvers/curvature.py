@@ -59,8 +59,8 @@ REACH = 3.0
 RIDGE = 1e-6
 """What is added to a block's diagonal, a share of it and of its mean curvature along the depth."""
 
-RUN = 4096
-"""Frames whose blocks are made together: they are as large as all else that a descent keeps."""
+RUN = 2**20
+"""Numbers of blocks that are made together: all would take much memory, and fall out of the processor's cache."""
 
 
 def whitening(
@@ -77,6 +77,9 @@ def whitening(
     anchor: Tensor | None = None,
 ) -> Tensor:
     """Return roots (H, T, D, D) of the inverse of each frame's Hessian, of lengths and log-determinants.
+
+    Where tracks are noisy they come in single precision. Any roots give the same minimum, these are the largest thing
+    that a descent reads, and what they round away is far below the noise.
 
     Args:
         points: (H, T, N, 3).
@@ -104,8 +107,8 @@ def whitening(
         spread = off.square().sum(-2) / counts[:, None]
     pull = stiffness * (1 / (spread + slack**2) - 1 / (spread + (REACH * slack) ** 2))
     size = free * joints + 3
-    out = points.new_empty(hypotheses, frames, size, size)
-    run = max(1, RUN // max(hypotheses, 1))
+    out = points.new_empty(hypotheses, frames, size, size, dtype=None if precision is None else torch.float32)
+    run = max(1, RUN // (max(hypotheses, 1) * size**2))
     for part in (slice(first, first + run) for first in range(0, frames, run)):
         curvature = frame_curvature(points[:, part], rotations[:, part], bones, inverse, free)
         curvature.add_lengths(points[:, part], rigid, pull)
@@ -143,8 +146,7 @@ def frame_curvature(points: Tensor, rotations: Tensor, bones: Tensor, precision:
     nine = (ends @ nine @ ends.mT).flatten(1, 2).flatten(-2)  # (H, 9, N N)
     rows = rotations[:, :, 3 - free :]  # (H, T, free, 3)
     pairs = (rows[:, :, :, None, :, None] * rows[:, :, None, :, None, :]).flatten(-2)  # (H, T, free, free, 9)
-    joint = (pairs.flatten(1, 3) @ nine).view(hypotheses, frames, free, free, joints, joints)
-    joint = joint.transpose(3, 4).flatten(4, 5).flatten(2, 3)
+    joint = (pairs.flatten(1, 3) @ nine).view(hypotheses, frames, free, free, joints, joints).transpose(3, 4)
     # A turn by w moves a bone b by b x w, before the rotation.
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
     turned = torch.linalg.cross(vectors[..., None, :].expand(*vectors.shape, 3), eye.expand(*vectors.shape, 3), dim=-1)
@@ -152,7 +154,11 @@ def frame_curvature(points: Tensor, rotations: Tensor, bones: Tensor, precision:
     weighed = (turned.mT.flatten(1, 2) @ precision).unflatten(1, (frames, 3)).mT  # (H, T, 3B, 3)
     cross = torch.einsum("htik,htbkw->htibw", rows, weighed.unflatten(-2, (count, 3)))
     cross = (ends @ cross).flatten(2, 3)  # (H, T, free N, 3)
-    matrix = torch.cat([torch.cat([joint, cross], -1), torch.cat([cross.mT, turned.mT @ weighed], -1)], -2)
+    size = free * joints
+    matrix = points.new_empty(hypotheses, frames, size + 3, size + 3)
+    matrix[..., :size, :size].view(*joint.shape).copy_(joint)
+    matrix[..., :size, size:], matrix[..., size:, :size] = cross, cross.mT
+    matrix[..., size:, size:] = turned.mT @ weighed
     return Curvature(matrix, free, joints)
 
 
@@ -169,7 +175,8 @@ def block_roots(curvature: Curvature) -> Tensor:
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
     diagonal.mul_(1 + RIDGE).add_(RIDGE * typical[..., None] + torch.finfo(matrix.dtype).tiny)
     factor, info = torch.linalg.cholesky_ex(matrix)
-    plain = diagonal.clamp_min(torch.finfo(matrix.dtype).tiny).sqrt().diag_embed()  # where rounding spoils a block
-    factor = torch.where((info == 0)[..., None, None], factor, plain)
+    if bool(info.any()):  # rounding spoilt a block
+        plain = diagonal.clamp_min(torch.finfo(matrix.dtype).tiny).sqrt().diag_embed()
+        factor = torch.where((info == 0)[..., None, None], factor, plain)
     eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
     return torch.linalg.solve_triangular(factor, eye, upper=False).mT.contiguous()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.body import LONG, ONE, POLISH, Body, agree
 from kcs_torch.methods.pkc.flips import GAIN, flipped_runs, members, parts_of, signs_of
-from kcs_torch.methods.pkc.hypotheses import Hypotheses
+from kcs_torch.methods.pkc.hypotheses import Hypotheses, combined
 from kcs_torch.methods.pkc.limbs import limbs_of
 from kcs_torch.methods.pkc.run_costs import ParallelRays, RunCosts
 from kcs_torch.solvers.procrustean import COARSE, FINE, align_rotations, motion_energy
@@ -36,14 +36,6 @@ ROWS = 16384
 """Frames of flips whose aligned bones are looked at together."""
 
 
-class _Settled(NamedTuple):
-    """Solutions that may be compared: depths (K, T, N), lengths (K, B) and costs (K,)."""
-
-    depth: Tensor
-    lengths: Tensor
-    cost: Tensor
-
-
 def turned_around(body: Body, found: Hypotheses, other: Tensor) -> Search[Any, Any, Hypotheses]:
     """Hypotheses whose best one no flip of a run makes better, for aligned bones and the template together.
 
@@ -64,10 +56,12 @@ def turned_around(body: Body, found: Hypotheses, other: Tensor) -> Search[Any, A
         if not len(flips):
             break
         tried = yield from _settled(body, flips)
-        least = tried.cost.argmin()
-        if not bool(tried.cost[least] < now.cost[0] - GAIN):
+        both = combined(tried, now, GAIN, body.objective.bones)
+        if len(both.depth):
+            tried = tried.joined((yield from _settled(body, both.depth)))
+        if not bool(tried.energy[0] < now.energy[0] - GAIN):
             break
-        now = _Settled(*(part[least, None] for part in tried))
+        now = tried[:1]
     if now is first:
         return found
     depth, image, _ = yield from body.descended(now.depth, POLISH)
@@ -79,15 +73,16 @@ def turned_around(body: Body, found: Hypotheses, other: Tensor) -> Search[Any, A
     )
 
 
-def _settled(body: Body, depth: Tensor) -> Search[Any, Any, _Settled]:
-    """Depths (K, T, N) after some steps, and what they cost."""
+def _settled(body: Body, depth: Tensor) -> Search[Any, Any, Hypotheses]:
+    """Depths (K, T, N) after some steps, by what they cost for the template and aligned bones, best first."""
     objective = body.objective
     depth, _, value = yield from body.descended(depth, JUDGED)
     lengths = body.lengths(depth)
-    return _Settled(depth, lengths, objective(depth, lengths) + objective.ranking(depth, lengths) + value / ONE)
+    cost = objective(depth, lengths) + objective.ranking(depth, lengths) + value / ONE
+    return Hypotheses(depth, lengths, cost)[cost.argsort()]
 
 
-def _flips(body: Body, now: _Settled) -> Tensor:
+def _flips(body: Body, now: Hypotheses) -> Tensor:
     """Depths (K, T, N) of a solution's flips that are worth trying, the cheapest first; they have not settled yet."""
     objective, bones = body.objective, body.objective.bones
     own = bone_vectors(now.depth[0, ..., None], bones)[..., 0]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.methods.lockstep import Search
-from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
+from kcs_torch.methods.pkc.hypotheses import Hypotheses, combined, refined
 from kcs_torch.methods.pkc.limbs import Limb
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.run_costs import ParallelRays, RunCosts, Runs, Turnable, inside
@@ -80,7 +80,8 @@ def turned_over(
 ) -> Search[Any, Any, Hypotheses]:
     """Hypotheses, best first, whose best one no flip of a run makes better; ``steps`` as in a refinement.
 
-    The flips that cost little more are among them: they are what else the motion may have been.
+    The flips that cost little more are among them: they are what else the motion may have been. Two that gain are tried
+    together, too, which takes fewer rounds where several runs are wrong.
     """
     for _ in range(TIMES):
         best, gain = found[:1], found.energy[0] - GAIN
@@ -91,6 +92,8 @@ def turned_over(
             if not len(tried.energy):
                 return found
             tried = yield from refined(objective, tried, count)
+            if limits is FIRST:
+                tried = tried.joined(combined(tried, best, GAIN, objective.bones))
         if not bool(tried.energy[0] < gain):  # what has far to go may get there yet
             assert tried.moved is not None
             far = (_change(tried, best) > LARGE) & (tried.energy < best.energy + NEAR) & (tried.moved > MOVING)

@@ -8,11 +8,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.methods.lockstep import Search
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.refinement import Task
 
-__all__ = ["Hypotheses", "distinct", "refined"]
+__all__ = ["Hypotheses", "combined", "distinct", "refined"]
+
+APART = 0.25
+"""Cosine of the sizes of two changes below which they have nothing to do with each other."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,29 @@ def distinct(found: Hypotheses, count: int, apart: float) -> Hypotheses:
         if bool(torch.isfinite(found.energy[k])) and all(d > apart for d in far):
             keep.append(k)
     return found[torch.tensor(keep or [0], device=found.energy.device)]
+
+
+def combined(found: Hypotheses, best: Hypotheses, gain: float, bones: Tensor) -> Hypotheses:
+    """The best one with two changes at once: the one that gains most, and the next that has nothing to do with it.
+
+    Args:
+        found: it with a change each, best first.
+        best: one hypothesis.
+        gain: in energy, of each change at least.
+        bones: (B, 2).
+
+    Returns:
+        One hypothesis, its energy if both gain as much together; or none, if there are no two such changes.
+    """
+    cheaper = found[found.energy < best.energy - gain]
+    change = bone_vectors((cheaper.depth - best.depth)[..., None], bones).flatten(1).abs()
+    other = (torch.cosine_similarity(change, change[:1]) < APART).nonzero()[:1, 0]
+    (first, second), sizes = (cheaper[pick] for pick in (slice(len(other)), other)), or_one(best.lengths)
+    return Hypotheses(
+        first.depth + second.depth - best.depth,
+        first.lengths * second.lengths / sizes,
+        first.energy + second.energy - best.energy,
+    )
 
 
 def refined(objective: Objective, found: Hypotheses, steps: int, loose: float = 1.0) -> Search[Any, Any, Hypotheses]:
