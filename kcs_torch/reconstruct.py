@@ -11,9 +11,9 @@ from typing import Any
 from kcs_torch.errors import KcsWarning, OptionError, ShapeError, unknown, users_level
 from kcs_torch.methods import METHODS
 from kcs_torch.methods.base import Method, check_tracks
-from kcs_torch.methods.found import find_skeleton
-from kcs_torch.methods.perspective import WIDE, reconstruct_perspective
-from kcs_torch.methods.uncalibrated import looking, may_be_near, reconstruct_uncalibrated
+from kcs_torch.methods.found_skeleton import find_skeleton
+from kcs_torch.methods.perspective.calibrated import WIDE, reconstruct_perspective
+from kcs_torch.methods.perspective.uncalibrated import looking, may_be_near, reconstruct_uncalibrated
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.bodies import no_bones

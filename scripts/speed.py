@@ -36,7 +36,7 @@ import torch
 import kcs_torch as kt
 from kcs_torch.data import SyntheticClip, random_motion, walking_person
 from kcs_torch.io.atomic import write_table
-from kcs_torch.methods.cameras import orthographic_cameras
+from kcs_torch.methods.clips.cameras import orthographic_cameras
 
 TESTS = Path(__file__).resolve().parents[1] / "tests"
 FRAMES, TURN = 300, 180.0

@@ -6,8 +6,8 @@ from torch.testing import assert_close
 
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_lengths, bone_vectors
-from kcs_torch.methods.along_rays import AlongRays
-from kcs_torch.methods.pinhole import NEAREST
+from kcs_torch.methods.perspective.along_rays import AlongRays
+from kcs_torch.methods.perspective.pinhole import NEAREST
 from kcs_torch.methods.pkc.flips import flipped_runs, signs_of
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.run_costs import ParallelRays, RunCosts

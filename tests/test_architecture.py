@@ -51,6 +51,10 @@ ALLOWED = {
     "many": {"io", "methods", "reconstruct"} | BASE,
     "": {"functional", "solvers", "nn", "methods", "reconstruct", "live", "io", "metrics"} | BASE,
 }
+# The folders and files of a part from the bottom up: each imports those before it only. "*" are those not named.
+ORDER = {
+    "methods": ["clips", "answer", "base", "factorised", "sfam", "*", "perspective", "__init__"],
+}
 # Imports made only when called, against the direction: a convenience of the object that the user holds.
 LATE = {("types", "io")}
 
@@ -126,6 +130,35 @@ def test_imports_run_one_way(path):
         if not allowed:
             wrong.append(f"{path.relative_to(ROOT)}:{line} imports {name}")
     assert not wrong, "\n".join(wrong)
+
+
+def imported_anyway(path: Path):
+    """Names that importing a file imports: not those in functions, nor those for type checkers."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    typed = {
+        node.lineno
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+        for node in block.body
+    }
+    return [name for name, line, late in imports(path) if not late and line not in typed]
+
+
+@pytest.mark.parametrize("name", ORDER)
+def test_folders_of_a_part_import_one_way(name):
+    order = ORDER[name]
+    known = {path.name.removesuffix(".py") for path in (PACKAGE / name).iterdir()}
+    assert set(order) - {"*"} <= known
+
+    def height(first: str) -> int:
+        return order.index(first if first in order else "*")
+
+    for path in sorted((PACKAGE / name).rglob("*.py")):
+        own = path.relative_to(PACKAGE / name).parts[0].removesuffix(".py")
+        for other in imported_anyway(path):
+            words = other.split(".")
+            if words[:2] == ["kcs_torch", name] and len(words) > 2 and words[2] in known - {own}:
+                assert height(words[2]) <= height(own), f"{path.relative_to(ROOT)} imports {other}"
 
 
 def test_functional_needs_torch_only():

@@ -10,7 +10,7 @@ import kcs_torch as kt
 from kcs_torch.errors import OptionError
 from kcs_torch.functional import back_project, complete_rotation, dct_basis, project
 from kcs_torch.methods import BMM, CSF, PTA, Rigid
-from kcs_torch.methods.cameras import most_shapes, still_cameras
+from kcs_torch.methods.clips.cameras import most_shapes, still_cameras
 from kcs_torch.methods.csf import fit_column_space
 from kcs_torch.methods.factorised import camera_rows, fit_basis_shapes, trajectory_design
 

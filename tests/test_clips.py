@@ -13,10 +13,10 @@ from kcs_torch import KCS, METHODS, SfAM, Tracks
 from kcs_torch.data import walking_person
 from kcs_torch.functional import best_path, complete_rotation, orbit
 from kcs_torch.methods import PND
-from kcs_torch.methods import clips as module
-from kcs_torch.methods.cameras import orthographic_cameras
-from kcs_torch.methods.clips import Clips, in_batches, padded
-from kcs_torch.methods.mirror import mirror_sign
+from kcs_torch.methods.answer.mirror import mirror_sign
+from kcs_torch.methods.clips import batches as module
+from kcs_torch.methods.clips.batches import Clips, in_batches, padded
+from kcs_torch.methods.clips.cameras import orthographic_cameras
 from kcs_torch.solvers import complete_tracks, constant_path
 from kcs_torch.solvers.ist import ist, metric_upgrade
 

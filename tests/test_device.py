@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 import kcs_torch as kt
 from kcs_torch.data import walking_person
-from kcs_torch.methods.root import standing_feet
+from kcs_torch.methods.answer.root import standing_feet
 
 METHODS = ("kcs", "sfam", "pkc")
 

@@ -8,7 +8,7 @@ from test_procrustean import BONES, swinging_body
 
 from kcs_torch.data import walking_person
 from kcs_torch.errors import KcsWarning, OptionError, ShapeError
-from kcs_torch.methods.found import find_skeleton
+from kcs_torch.methods.found_skeleton import find_skeleton
 from kcs_torch.reconstruct import reconstruct
 from kcs_torch.types import Tracks
 

@@ -20,7 +20,7 @@ from kcs_torch.functional import (
     project,
     similarity,
 )
-from kcs_torch.methods.mirror import mirror_sign
+from kcs_torch.methods.answer.mirror import mirror_sign
 
 NAN = math.nan
 CLIP = walking_person(40, turn=60.0)

@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 import kcs_torch as kt
 from kcs_torch.cli import app
 from kcs_torch.io import load_reconstruction
-from kcs_torch.methods import perspective, scene
-from kcs_torch.methods.root import ABSENT, FOUND
+from kcs_torch.methods.answer.root import ABSENT, FOUND
+from kcs_torch.methods.perspective import calibrated, scene
 from kcs_torch.types import Intrinsics, Motion
 
 LENS = (1500.0, 1480.0, 960.0, 540.0)
@@ -435,7 +435,7 @@ def test_a_frame_far_beside_the_camera_is_told(method, factor):
 
 
 def test_solutions_that_are_not_finite_are_dropped(monkeypatch):
-    real = perspective.refine
+    real = calibrated.refine
 
     def refined(*given, **options):
         found = real(*given, **options)
@@ -445,7 +445,7 @@ def test_solutions_that_are_not_finite_are_dropped(monkeypatch):
     tracks, _ = filmed(frames=8)
     given = {"intrinsics": LENS, "method": "pkc", "steps": 3, "rounds": 0, "alternatives": 2}
     assert reconstruct(tracks, **given).alternatives
-    monkeypatch.setattr(perspective, "refine", refined)
+    monkeypatch.setattr(calibrated, "refine", refined)
     assert reconstruct(tracks, **given).alternatives == ()
 
 
@@ -540,7 +540,7 @@ class Noted(kt.KCS):
 @pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
 def test_what_was_done_to_the_tracks_is_told_whichever_solution_wins(monkeypatch):
     """The method's notes on the tracks are the best solution's, although it was an alternative; its own are of none."""
-    real = perspective.refine
+    real = calibrated.refine
 
     def others_first(*arguments, **options):
         found = real(*arguments, **options)
@@ -551,7 +551,7 @@ def test_what_was_done_to_the_tracks_is_told_whichever_solution_wins(monkeypatch
     image = lens.project(clip.points + clip.points.new_tensor([0.0, 0.0, 3000.0]))
     tracks = kt.Tracks.from_arrays(image[:, :17], skeleton="coco17", fps=30.0)
     for order in (real, others_first):
-        monkeypatch.setattr(perspective, "refine", order)
+        monkeypatch.setattr(calibrated, "refine", order)
         found = kt.reconstruct(tracks, method=Noted(), intrinsics=lens)
         assert "tracks smoothed" in found.diagnostics.notes
         assert not any("mirror image" in note for one in (found, *found.alternatives) for note in one.diagnostics.notes)
@@ -582,5 +582,5 @@ def test_bodies_without_a_template_are_lifted_softly_first(monkeypatch):
     body = replace(tracks.skeleton, name="free", template=None, proportions=None, spread=None, hinges=())
     tracks = replace(tracks, skeleton=body)
     off = error(reconstruct(tracks, intrinsics=LENS).observed, truth)
-    monkeypatch.setattr(perspective, "SOFT", 0)
+    monkeypatch.setattr(calibrated, "SOFT", 0)
     assert off < 20 < error(reconstruct(tracks, intrinsics=LENS).observed, truth) / 2, off

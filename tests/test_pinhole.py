@@ -9,8 +9,8 @@ from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths, bone_vectors
-from kcs_torch.methods import pinhole, plain_body
-from kcs_torch.methods.pinhole import PinholeEnergy
+from kcs_torch.methods.perspective import pinhole, plain_body
+from kcs_torch.methods.perspective.pinhole import PinholeEnergy
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.solvers.lbfgs import lbfgs

@@ -20,7 +20,9 @@ from kcs_torch.functional import (
     incidence,
     points_from_bones,
 )
-from kcs_torch.methods.lockstep import run
+from kcs_torch.methods.answer.root import standing_feet
+from kcs_torch.methods.clips.lockstep import run
+from kcs_torch.methods.clips.size import Size
 from kcs_torch.methods.pkc import batch
 from kcs_torch.methods.pkc import body as body_module
 from kcs_torch.methods.pkc import method as module
@@ -30,8 +32,6 @@ from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.gaps import gaps_of, usual_noise
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
-from kcs_torch.methods.root import standing_feet
-from kcs_torch.methods.size import Size
 from kcs_torch.metrics import e3d
 
 # Many tests take few steps, after which nothing has settled.

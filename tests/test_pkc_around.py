@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths, bone_vectors
-from kcs_torch.methods.lockstep import run
+from kcs_torch.methods.clips.lockstep import run
 from kcs_torch.methods.pkc import around
 from kcs_torch.methods.pkc.around import turned_around
 from kcs_torch.methods.pkc.batch import serve

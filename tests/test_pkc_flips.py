@@ -7,7 +7,7 @@ from samples import walk_in_template_units as walk
 from torch.testing import assert_close
 
 from kcs_torch.functional import bone_vectors, standing
-from kcs_torch.methods.lockstep import run
+from kcs_torch.methods.clips.lockstep import run
 from kcs_torch.methods.pkc import flips as module
 from kcs_torch.methods.pkc.flips import flipped, flipped_runs, parts_of, signs_of, turned_over
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, combined

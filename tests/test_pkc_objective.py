@@ -11,14 +11,14 @@ from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths, bone_vectors
-from kcs_torch.methods.lockstep import run, together
+from kcs_torch.methods.answer.root import standing_feet
+from kcs_torch.methods.clips.lockstep import run, together
 from kcs_torch.methods.pkc import objective as module
 from kcs_torch.methods.pkc import refinement
 from kcs_torch.methods.pkc.objective import BLUR, Objective, bone_noise
 from kcs_torch.methods.pkc.refinement import Task, minimise, minimise_all
 from kcs_torch.methods.pkc.unknowns import Unknowns
 from kcs_torch.methods.pkc.weights import Weights, at_pace, in_noise, pace_of
-from kcs_torch.methods.root import standing_feet
 from kcs_torch.nn import PostureEnergy
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.solvers import lbfgs

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
 from kcs_torch.functional import best_path, bone_lengths
-from kcs_torch.methods.lockstep import run
+from kcs_torch.methods.clips.lockstep import run
 from kcs_torch.methods.pkc.trunk import (
     FIT,
     Facing,

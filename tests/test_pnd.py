@@ -13,7 +13,7 @@ import kcs_torch as kt
 from kcs_torch.data import walking_person
 from kcs_torch.functional import complete_rotation
 from kcs_torch.methods import PND
-from kcs_torch.methods.clips import padded
+from kcs_torch.methods.clips.batches import padded
 from kcs_torch.methods.pnd import ProcrusteanNormal, align_to_mean, fit_procrustean_normal, procrustean_tangent
 from kcs_torch.methods.pnd import fit as module
 from kcs_torch.methods.pnd.fit import FARTHEST, Image, expect

@@ -9,8 +9,8 @@ from torch.testing import assert_close
 
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import standing
-from kcs_torch.methods import root
-from kcs_torch.methods.root import root_depth
+from kcs_torch.methods.answer import root
+from kcs_torch.methods.answer.root import root_depth
 from kcs_torch.nn import ContactEnergy
 
 

@@ -11,8 +11,8 @@ from kcs_torch import KcsWarning, OptionError, SfAM, Skeleton, Tracks
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_lengths, complete_rotation, window_starts
 from kcs_torch.methods import sfam
-from kcs_torch.methods.cameras import camera_choices
-from kcs_torch.methods.windows import spread_first
+from kcs_torch.methods.clips.cameras import camera_choices
+from kcs_torch.methods.clips.windows import spread_first
 from kcs_torch.metrics import e3d
 from kcs_torch.nn import UnrolledSfAM
 from kcs_torch.skeleton import SKELETONS

@@ -10,7 +10,7 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.data.synthetic import walking_person
-from kcs_torch.methods.size import size_path, slow_waves, weak_perspective, weak_perspectives
+from kcs_torch.methods.clips.size import size_path, slow_waves, weak_perspective, weak_perspectives
 
 
 def grown(clip, ratio):

@@ -10,12 +10,12 @@ from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths, bone_vectors
+from kcs_torch.methods.answer.root import standing_feet
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.flips import flipped, parts_of
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.limbs import limbs_of
 from kcs_torch.methods.pkc.strides import cheapest_runs, strides
-from kcs_torch.methods.root import standing_feet
 
 
 def brute_force(steps: torch.Tensor, places: list[int], bend: torch.Tensor) -> float:

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 from kcs_torch import Skeleton, Tracks
 from kcs_torch.data import walking_person
 from kcs_torch.functional import similarity
-from kcs_torch.methods.template import clip_scale, rigid_shape
+from kcs_torch.methods.clips.template import clip_scale, rigid_shape
 from kcs_torch.skeleton import SKELETONS
 
 BODY = SKELETONS["h36m17"]

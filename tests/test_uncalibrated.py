@@ -14,10 +14,11 @@ from typer.testing import CliRunner
 import kcs_torch as kt
 from kcs_torch.cli import app
 from kcs_torch.io import load_reconstruction
-from kcs_torch.methods import PKC, perspective, refining, scene, uncalibrated
+from kcs_torch.methods import PKC
+from kcs_torch.methods.perspective import calibrated, refining, scene, uncalibrated
+from kcs_torch.methods.perspective.uncalibrated import likely_lens, looking, may_be_near
 from kcs_torch.methods.pkc import body
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
-from kcs_torch.methods.uncalibrated import likely_lens, looking, may_be_near
 from kcs_torch.types import Intrinsics
 
 LENS = Intrinsics(1500.0, 1500.0, 960.0, 540.0)
@@ -77,8 +78,8 @@ def test_a_near_camera_takes_one_search(monkeypatch):
 def test_runs_are_turned_over_once_through_one_lens(monkeypatch):
     """A round whose focal length hardly differs from that of the last flips would find what they found."""
     focals, flips = [], []
-    again, over = perspective.refine_again, scene.Scene.turned_over
-    monkeypatch.setattr(perspective, "refine_again", lambda *given: focals.append(given[1].lens.focal) or again(*given))
+    again, over = calibrated.refine_again, scene.Scene.turned_over
+    monkeypatch.setattr(calibrated, "refine_again", lambda *given: focals.append(given[1].lens.focal) or again(*given))
     monkeypatch.setattr(scene.Scene, "turned_over", lambda *given: flips.append(focals[-1]) or over(*given))
     assert quietly(filmed(3000.0, frames=30)[0]).distance is not None
     assert len(focals) > len(flips) >= 1 and flips[0] == focals[0]

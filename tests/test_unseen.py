@@ -8,7 +8,7 @@ from numerics import leaves_arguments_alone, normal, turning
 from torch.testing import assert_close
 
 from kcs_torch.functional import bone_lengths
-from kcs_torch.methods.unseen import BEND, LEAST, gap_deviation, place_unseen, within_reach
+from kcs_torch.methods.clips.unseen import BEND, LEAST, gap_deviation, place_unseen, within_reach
 from kcs_torch.skeleton import SKELETONS, Skeleton
 
 BODY = SKELETONS["h36m17"]

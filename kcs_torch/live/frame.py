@@ -11,7 +11,7 @@ from torch import Tensor
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.ranks import median
-from kcs_torch.methods.unseen import place_unseen
+from kcs_torch.methods.clips.unseen import place_unseen
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.intake import as_floats, as_weights, at_the_corner, check_places
 

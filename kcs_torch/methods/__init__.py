@@ -1,9 +1,13 @@
-"""Methods: one file a paper."""
+"""Methods: one file or folder a paper.
+
+They share ``base`` (what a method is), ``factorised`` (the classical ones), ``clips`` (what is asked of tracks before
+they are solved) and ``answer`` (what is made of a solution). ``perspective`` takes any of them before a pinhole camera.
+"""
 
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.bmm import BMM
 from kcs_torch.methods.csf import CSF
-from kcs_torch.methods.found import find_skeleton
+from kcs_torch.methods.found_skeleton import find_skeleton
 from kcs_torch.methods.kcs import KCS
 from kcs_torch.methods.local_rigidity import LocalRigidity
 from kcs_torch.methods.pkc import PKC

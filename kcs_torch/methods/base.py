@@ -28,8 +28,8 @@ from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.inference import plain
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.functional.weights import rms
-from kcs_torch.methods.finish import BY_SHOTS, HEADSTAND, Estimate, finish
-from kcs_torch.methods.wrong import WHY_LOOSE
+from kcs_torch.methods.answer.finish import BY_SHOTS, HEADSTAND, Estimate, finish
+from kcs_torch.methods.answer.wrong import WHY_LOOSE
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
 from kcs_torch.types.hints import is_a, spoken

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.camera import complete_rotation, factorize, rows_to_cameras
+from kcs_torch.methods.answer.mirror import mirror_sign
 from kcs_torch.methods.base import Estimate, Method
-from kcs_torch.methods.cameras import most_shapes, still_cameras
-from kcs_torch.methods.clips import in_batches
-from kcs_torch.methods.mirror import mirror_sign
-from kcs_torch.methods.unseen import place_unseen
+from kcs_torch.methods.clips.batches import in_batches
+from kcs_torch.methods.clips.cameras import most_shapes, still_cameras
+from kcs_torch.methods.clips.unseen import place_unseen
 from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.ist import metric_upgrade
 from kcs_torch.solvers.iterate import Solution

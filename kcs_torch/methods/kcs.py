@@ -16,10 +16,10 @@ from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.chain import bone_lengths, chain_inverse, incidence
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
+from kcs_torch.methods.answer.mirror import mirror_sign
 from kcs_torch.methods.base import Estimate, Method
-from kcs_torch.methods.clips import Clips, in_batches, padded
-from kcs_torch.methods.mirror import mirror_sign
-from kcs_torch.methods.template import clip_scale, guessed, rigid_shape
+from kcs_torch.methods.clips.batches import Clips, in_batches, padded
+from kcs_torch.methods.clips.template import clip_scale, guessed, rigid_shape
 from kcs_torch.nn.deviation import Arrangement, deviation_goal, deviation_scale, deviation_step, frame_scales
 from kcs_torch.nn.steps import continuation
 from kcs_torch.skeleton import Skeleton

@@ -15,7 +15,7 @@ from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rigidity import distance_spread
 from kcs_torch.functional.rotation import running_products
-from kcs_torch.methods.cameras import most_shapes, still_cameras
+from kcs_torch.methods.clips.cameras import most_shapes, still_cameras
 from kcs_torch.methods.factorised import SETTLED, Factorised
 from kcs_torch.solvers.ist import ist, metric_upgrade
 from kcs_torch.solvers.iterate import Solution, iterate, relative_change

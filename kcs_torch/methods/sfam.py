@@ -18,12 +18,12 @@ from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.spectral import dct_basis, nuclear_norm
 from kcs_torch.functional.temporal import interpolate, window_starts
+from kcs_torch.methods.answer.mirror import mirror_sign
 from kcs_torch.methods.base import Estimate, Method
-from kcs_torch.methods.cameras import camera_choices, orthographic_cameras
-from kcs_torch.methods.clips import Clips, in_batches, padded
-from kcs_torch.methods.mirror import mirror_sign
-from kcs_torch.methods.unseen import place_unseen
-from kcs_torch.methods.windows import join_windows, spread_first
+from kcs_torch.methods.clips.batches import Clips, in_batches, padded
+from kcs_torch.methods.clips.cameras import camera_choices, orthographic_cameras
+from kcs_torch.methods.clips.unseen import place_unseen
+from kcs_torch.methods.clips.windows import join_windows, spread_first
 from kcs_torch.nn.unrolled import UnrolledSfAM
 from kcs_torch.nn.unrolled.base import SETTLED
 from kcs_torch.skeleton import Skeleton

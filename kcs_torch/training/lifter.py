@@ -14,8 +14,8 @@ from kcs_torch.errors import OptionError, ShapeError, SkeletonError, listed
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods import Method
 from kcs_torch.methods.base import Estimate
-from kcs_torch.methods.size import weak_perspective
-from kcs_torch.methods.unseen import place_unseen
+from kcs_torch.methods.clips.size import weak_perspective
+from kcs_torch.methods.clips.unseen import place_unseen
 from kcs_torch.nn.networks import MLPLifter, TemporalLifter
 from kcs_torch.nn.normalise import normalise_tracks
 from kcs_torch.skeleton import Skeleton, map_joints

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.methods.lockstep import Search
+from kcs_torch.methods.clips.lockstep import Search
 from kcs_torch.methods.pkc.body import LONG, ONE, POLISH, Body, agree
 from kcs_torch.methods.pkc.flips import GAIN, flipped_runs, members, parts_of, signs_of
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, combined

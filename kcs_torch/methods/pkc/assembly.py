@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence, points_from_bones
-from kcs_torch.methods.lockstep import Search
+from kcs_torch.methods.clips.lockstep import Search
 from kcs_torch.solvers.bone_paths import BonePaths, nearest_paths
 from kcs_torch.solvers.corners import Corners, agreeing_paths
 from kcs_torch.solvers.lifts import rotations_over_time

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from kcs_torch.methods.clips.size import weak_perspectives
 from kcs_torch.methods.pkc.descents import TOGETHER, Descent, descend_all
 from kcs_torch.methods.pkc.placing import Placing, limb_paths
 from kcs_torch.methods.pkc.refinement import Task, minimise_all
 from kcs_torch.methods.pkc.trunk import Facing, facings
 from kcs_torch.methods.sfam import SfAM
-from kcs_torch.methods.size import weak_perspectives
 from kcs_torch.solvers.denoise import Denoised, denoise_tracks
 from kcs_torch.types import Tracks
 

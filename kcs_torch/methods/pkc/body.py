@@ -15,7 +15,7 @@ from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.temporal import blend_windows, fill_between, window_starts
-from kcs_torch.methods.lockstep import Search, together
+from kcs_torch.methods.clips.lockstep import Search, together
 from kcs_torch.methods.pkc.assembly import TIGHT
 from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.fixed_view import searching

@@ -14,11 +14,11 @@ from kcs_torch.clean.gating import steady
 from kcs_torch.clean.timing import cuts_of
 from kcs_torch.errors import counted
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.lockstep import Search
+from kcs_torch.methods.clips.lockstep import Search
+from kcs_torch.methods.clips.unseen import gap_deviation, place_unseen, within_reach
 from kcs_torch.methods.pkc.batch import Noisy
 from kcs_torch.methods.pkc.gate import plausible
 from kcs_torch.methods.pkc.weights import slowness
-from kcs_torch.methods.unseen import gap_deviation, place_unseen, within_reach
 from kcs_torch.nn.posture import has_trunk
 from kcs_torch.solvers.denoise import Denoised
 from kcs_torch.solvers.noise import SHORT

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kcs_torch.methods.clips import SPREAD
+from kcs_torch.methods.clips.batches import SPREAD
 from kcs_torch.solvers.procrustean import Pose, Stage, procrustean
 
 __all__ = ["TOGETHER", "Descent", "descend_all"]

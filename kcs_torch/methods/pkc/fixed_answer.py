@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.camera import viewpoint_turn
-from kcs_torch.methods.finish import Estimate
+from kcs_torch.methods.answer.finish import Estimate
 from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
-from kcs_torch.methods.lockstep import Search, run, together
+from kcs_torch.methods.clips.lockstep import Search, run, together
 from kcs_torch.methods.pkc.batch import serve
 from kcs_torch.methods.pkc.flips import flipped, parts_of, turned_over
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct, refined

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.methods.lockstep import Search
+from kcs_torch.methods.clips.lockstep import Search
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, combined, refined
 from kcs_torch.methods.pkc.limbs import Limb
 from kcs_torch.methods.pkc.objective import Objective

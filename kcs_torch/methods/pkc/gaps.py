@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.ranks import kth_smallest
-from kcs_torch.methods.lockstep import Search
+from kcs_torch.methods.clips.lockstep import Search
 from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.moving_search import FINER, ROBOT, soften, too_long
 from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights

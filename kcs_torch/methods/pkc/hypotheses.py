@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.methods.lockstep import Search
+from kcs_torch.methods.clips.lockstep import Search
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.refinement import Task
 

@@ -11,8 +11,8 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.temporal import fill_between
 from kcs_torch.methods.base import Estimate
+from kcs_torch.methods.clips.unseen import gap_deviation
 from kcs_torch.methods.pkc.cleaning import HELD
-from kcs_torch.methods.unseen import gap_deviation
 from kcs_torch.types import Tracks
 
 __all__ = ["first_frame", "lengthened", "shortened"]

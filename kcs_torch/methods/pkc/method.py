@@ -13,8 +13,10 @@ from kcs_torch.clean.detector import detected, found_by_detector
 from kcs_torch.clean.sides import unswap
 from kcs_torch.errors import OptionError
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
+from kcs_torch.methods.answer.root import standing_feet
 from kcs_torch.methods.base import Estimate, Method
-from kcs_torch.methods.lockstep import Search, run, together
+from kcs_torch.methods.clips.lockstep import Search, run, together
+from kcs_torch.methods.clips.size import Size
 from kcs_torch.methods.pkc.around import turned_around
 from kcs_torch.methods.pkc.batch import Sized, serve
 from kcs_torch.methods.pkc.body import Body, Turned
@@ -31,9 +33,7 @@ from kcs_torch.methods.pkc.moving_search import MovingSearch
 from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights, settled
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR, Asked
 from kcs_torch.methods.pkc.sizing import TRIED, resized, with_size
-from kcs_torch.methods.root import standing_feet
 from kcs_torch.methods.sfam import SfAM
-from kcs_torch.methods.size import Size
 from kcs_torch.nn.posture import has_trunk
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
@@ -132,7 +132,7 @@ class PKC(Method):
         return _Followed(**{f.name: getattr(self, f.name) for f in fields(self)} | {"contacts": False})
 
     def _seems_near(self, tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras: Tensor | None) -> str:
-        """How near the camera seems: nothing is said here, but see :mod:`kcs_torch.methods.uncalibrated`."""
+        """How near the camera seems: nothing is said here, but see :mod:`~kcs_torch.methods.perspective`."""
         return ""
 
     @property

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
-from kcs_torch.methods.finish import Estimate
+from kcs_torch.methods.answer.finish import Estimate
+from kcs_torch.methods.answer.wrong import loose_bones
 from kcs_torch.methods.pkc.body import TOLD
 from kcs_torch.methods.pkc.leaps import leaps_of
 from kcs_torch.methods.pkc.moving_solutions import MovingView
-from kcs_torch.methods.wrong import loose_bones
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.camera_path import view_energy
 from kcs_torch.solvers.procrustean import COARSE, FINE

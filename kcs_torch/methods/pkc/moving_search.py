@@ -12,7 +12,7 @@ from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.functional.temporal import fill_between
-from kcs_torch.methods.lockstep import Search
+from kcs_torch.methods.clips.lockstep import Search
 from kcs_torch.methods.pkc.assembly import SLACK, TIGHT, WORTH, Assembly, followed
 from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.leaps import leaps_of, without_leaps

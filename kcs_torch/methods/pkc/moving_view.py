@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcs_torch.methods.lockstep import Search, run
+from kcs_torch.methods.clips.lockstep import Search, run
 from kcs_torch.methods.pkc.descents import Descent, descend_all
 from kcs_torch.methods.pkc.moving_search import TURNS, MovingSearch
 from kcs_torch.methods.pkc.moving_solutions import MovingView

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.temporal import window_starts
-from kcs_torch.methods.clips import SPREAD
+from kcs_torch.methods.clips.batches import SPREAD
 from kcs_torch.methods.pkc.limb_costs import limb_costs
 from kcs_torch.methods.pkc.limbs import Limb, SignCosts
 from kcs_torch.nn.posture import PostureEnergy

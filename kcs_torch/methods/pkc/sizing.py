@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from kcs_torch.methods.base import Estimate
-from kcs_torch.methods.lockstep import Search
+from kcs_torch.methods.clips.lockstep import Search
+from kcs_torch.methods.clips.size import Size
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
-from kcs_torch.methods.size import Size
 
 __all__ = ["TRIED", "resized", "with_size"]
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcs_torch.functional.align import centre
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import best_path
-from kcs_torch.methods.lockstep import Search
+from kcs_torch.methods.clips.lockstep import Search
 from kcs_torch.nn.posture import PostureEnergy
 from kcs_torch.solvers.pose import fit_cameras
 

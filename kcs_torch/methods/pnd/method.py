@@ -12,11 +12,11 @@ from torch import Tensor
 
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.methods.base import Estimate, Method
-from kcs_torch.methods.clips import in_batches, padded
+from kcs_torch.methods.clips.batches import in_batches, padded
+from kcs_torch.methods.clips.unseen import place_unseen
 from kcs_torch.methods.pnd.distribution import ProcrusteanNormal
 from kcs_torch.methods.pnd.fit import fit_procrustean_normal
 from kcs_torch.methods.sfam import SfAM
-from kcs_torch.methods.unseen import place_unseen
 from kcs_torch.types import Tracks
 
 __all__ = ["PND"]

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from kcs_torch.methods.perspective.plain_body import ACCELERATION, CLOSE, PlainBody
 from kcs_torch.methods.pkc.weights import HEAVY
-from kcs_torch.methods.plain_body import ACCELERATION, CLOSE, PlainBody
 
 if TYPE_CHECKING:
-    from kcs_torch.methods.pinhole import PinholeEnergy
+    from kcs_torch.methods.perspective.pinhole import PinholeEnergy
 
 __all__ = ["FIRM", "STRAY", "USUAL", "coordinates"]
 

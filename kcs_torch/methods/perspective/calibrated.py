@@ -14,15 +14,15 @@ from kcs_torch.clean.detector import detected
 from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.inference import undifferentiated
+from kcs_torch.methods.answer.finish import HARDLY, little_turn, nothing_else
+from kcs_torch.methods.answer.root import ABSENT, FOUND, standing_feet
+from kcs_torch.methods.answer.wrong import WHY_LOOSE, what_is_wrong
 from kcs_torch.methods.base import Method, apart, check_cameras
-from kcs_torch.methods.finish import HARDLY, little_turn, nothing_else
+from kcs_torch.methods.perspective.refining import Found, refine, refine_again, seen_along
+from kcs_torch.methods.perspective.scene import BLOCK, ahead
+from kcs_torch.methods.perspective.view import View, lens_note, zoomed
 from kcs_torch.methods.pkc.near import SEEMS_NEAR
-from kcs_torch.methods.refining import Found, refine, refine_again, seen_along
-from kcs_torch.methods.root import ABSENT, FOUND, standing_feet
-from kcs_torch.methods.scene import BLOCK, ahead
 from kcs_torch.methods.sfam import SfAM
-from kcs_torch.methods.view import View, lens_note, zoomed
-from kcs_torch.methods.wrong import WHY_LOOSE, what_is_wrong
 from kcs_torch.nn.posture import has_trunk
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 

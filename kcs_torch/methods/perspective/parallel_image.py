@@ -9,8 +9,8 @@ from torch import Tensor
 
 from kcs_torch.clean.detector import detector_deviation
 from kcs_torch.functional.weights import rms
+from kcs_torch.methods.clips.unseen import gap_deviation
 from kcs_torch.methods.pkc.objective import usual_posture
-from kcs_torch.methods.unseen import gap_deviation
 from kcs_torch.nn.posture import has_trunk
 from kcs_torch.types import Reconstruction, Tracks
 

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.inference import undifferentiated
-from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
+from kcs_torch.methods.perspective.parallel_image import body_unit, clean_image, image_noise
+from kcs_torch.methods.perspective.scene import Bodies, Scene, ahead
+from kcs_torch.methods.perspective.view import View, slow_part
 from kcs_torch.methods.pkc.limbs import outward
-from kcs_torch.methods.scene import Bodies, Scene, ahead
-from kcs_torch.methods.view import View, slow_part
 from kcs_torch.types import Reconstruction, Tracks
 
 __all__ = ["Found", "refine", "refine_again", "seen_along"]

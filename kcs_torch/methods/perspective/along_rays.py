@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.methods.pinhole import NEAREST
+from kcs_torch.methods.perspective.pinhole import NEAREST
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.run_costs import Flipped
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from kcs_torch.anatomy import quadruped_places, template_by_names
 from kcs_torch.functional.camera import back_project
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.cameras import orthographic_cameras
+from kcs_torch.methods.clips.cameras import orthographic_cameras
 from kcs_torch.nn.deviation import template_scale
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks

@@ -14,18 +14,18 @@ from torch import Tensor
 from kcs_torch.clean.detector import detected
 from kcs_torch.clean.timing import cuts_of
 from kcs_torch.errors import KcsWarning, OptionError
+from kcs_torch.methods.answer.finish import Estimate, extent
 from kcs_torch.methods.base import Method, apart, check_cameras
-from kcs_torch.methods.finish import Estimate, extent
-from kcs_torch.methods.lockstep import Search
-from kcs_torch.methods.parallel_image import body_unit, clean_image, image_noise
-from kcs_torch.methods.perspective import WIDE, feet_on_ground, reconstruct_perspective
-from kcs_torch.methods.pinhole import PinholeEnergy
-from kcs_torch.methods.pinhole_coordinates import FIRM, USUAL
+from kcs_torch.methods.clips.lockstep import Search
+from kcs_torch.methods.perspective.calibrated import WIDE, feet_on_ground, reconstruct_perspective
+from kcs_torch.methods.perspective.parallel_image import body_unit, clean_image, image_noise
+from kcs_torch.methods.perspective.pinhole import PinholeEnergy
+from kcs_torch.methods.perspective.pinhole_coordinates import FIRM, USUAL
+from kcs_torch.methods.perspective.scene import BLOCK, STEPS
+from kcs_torch.methods.perspective.view import View, lens_note
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
-from kcs_torch.methods.scene import BLOCK, STEPS
-from kcs_torch.methods.view import View, lens_note
 from kcs_torch.nn.posture import has_trunk, trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
@@ -136,7 +136,7 @@ def reconstruct_uncalibrated(
 def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrinsics | None:
     """A lens through which a body looks more likely than under the parallel rays that it was solved for.
 
-    The solution is refined twice under perspective (:class:`kcs_torch.methods.pinhole.PinholeEnergy`), at a distance of
+    The solution is refined twice under perspective (:class:`.PinholeEnergy`), at a distance of
     34 of its units (a person is 1.75 tall), and at any distance. Five seconds of the clip tell.
 
     Args:

@@ -14,7 +14,7 @@ from kcs_torch.functional.align import centre
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.ranks import median, nanmedian
 from kcs_torch.functional.weights import rms
-from kcs_torch.methods.template import guessed
+from kcs_torch.methods.clips.template import guessed
 from kcs_torch.nn.lengths import oddity
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks

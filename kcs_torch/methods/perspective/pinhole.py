@@ -12,12 +12,12 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.spectral import dct_basis
-from kcs_torch.methods.pinhole_coordinates import FIRM, STRAY, USUAL, coordinates
+from kcs_torch.methods.perspective.pinhole_coordinates import FIRM, STRAY, USUAL, coordinates
+from kcs_torch.methods.perspective.plain_body import PlainBody
 from kcs_torch.methods.pkc.descent import ObjectiveGradient
 from kcs_torch.methods.pkc.image import bend_cost
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
-from kcs_torch.methods.plain_body import PlainBody
 from kcs_torch.nn.posture import has_trunk
 from kcs_torch.skeleton import Skeleton
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.pinhole import NEAREST
-from kcs_torch.methods.size import slow_waves, weak_perspective
+from kcs_torch.methods.clips.size import slow_waves, weak_perspective
+from kcs_torch.methods.perspective.pinhole import NEAREST
 from kcs_torch.types import Intrinsics, Tracks
 
 __all__ = ["View", "lens_note", "slow_part", "zoomed"]

@@ -17,8 +17,8 @@ from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.functional.weights import rms
-from kcs_torch.methods.root import root_depth
-from kcs_torch.methods.wrong import LOOSE, what_is_wrong
+from kcs_torch.methods.answer.root import root_depth
+from kcs_torch.methods.answer.wrong import LOOSE, what_is_wrong
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Reconstruction, Tracks
 from kcs_torch.types.upright import lies_down, upside_down

@@ -11,9 +11,9 @@ from torch import Tensor
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.temporal import blend_windows, window_starts
-from kcs_torch.methods.along_rays import AlongRays
-from kcs_torch.methods.lockstep import run
-from kcs_torch.methods.pinhole import NEAREST, PinholeEnergy
+from kcs_torch.methods.clips.lockstep import run
+from kcs_torch.methods.perspective.along_rays import AlongRays
+from kcs_torch.methods.perspective.pinhole import NEAREST, PinholeEnergy
 from kcs_torch.methods.pkc.batch import serve
 from kcs_torch.methods.pkc.body import DAMPING, HOLD, Body
 from kcs_torch.methods.pkc.flips import flipped, parts_of, promising

@@ -13,7 +13,7 @@ from kcs_torch.clean.timing import cuts_of
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.temporal import interpolate
-from kcs_torch.methods.clips import Clips, in_batches, padded
+from kcs_torch.methods.clips.batches import Clips, in_batches, padded
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
