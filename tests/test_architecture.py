@@ -54,6 +54,7 @@ ALLOWED = {
 # The folders and files of a part from the bottom up: each imports those before it only. "*" are those not named.
 ORDER = {
     "methods": ["clips", "answer", "base", "factorised", "sfam", "*", "perspective", "__init__"],
+    "io": ["folders", "registry", "workers", "containers", "contents", "tables", "formats", "*", "__init__"],
 }
 # Imports made only when called, against the direction: a convenience of the object that the user holds.
 LATE = {("types", "io")}

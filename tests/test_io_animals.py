@@ -24,11 +24,14 @@ from samples import (
 
 import kcs_torch as kt
 from kcs_torch.errors import FormatError, KcsError, ShapeError, SkeletonError
-from kcs_torch.io import READERS, animals, detect_format, hdf5, load_people, load_tracks
+from kcs_torch.io import READERS, detect_format, load_people, load_tracks
+from kcs_torch.io.containers import hdf5
+from kcs_torch.io.containers.pickles import load_arrays
+from kcs_torch.io.contents import animals
 from kcs_torch.io.formats import sleap
 from kcs_torch.io.motion import detect_motion_format
-from kcs_torch.io.pickles import load_arrays
 from kcs_torch.io.registry import Probe
+from kcs_torch.io.tables import bounded
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.bodies import no_bones
 
@@ -657,7 +660,7 @@ def test_tables_of_text_are_bounded(tmp_path, monkeypatch, bound, value):
         write_deeplabcut_csv(tmp_path / "a.csv", *_animal()),
         write_sleap_csv(tmp_path / "b.csv", [["a", t, 0.9, *CELLS] for t in range(9)]),
     ]
-    monkeypatch.setattr(animals, bound, value)
+    monkeypatch.setattr(bounded, bound, value)
     for path in paths:
         with pytest.raises(FormatError, match=r"line \d: expected up to .* lines of .* letters"):
             load_tracks(path)

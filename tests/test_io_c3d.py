@@ -105,16 +105,16 @@ def test_damaged_files_end_in_our_errors(tmp_path):
 
 
 def test_a_crash_of_the_library_is_an_error_of_the_file(tmp_path, monkeypatch):
-    from kcs_torch.io import worker
+    from kcs_torch.io.workers import ask
 
     path = save(walk(4), tmp_path / "w.c3d")
-    script = tmp_path / "c3d_worker.py"
+    script = tmp_path / "c3d.py"
     script.write_text("import os; os.abort()")
-    monkeypatch.setattr(worker, "__file__", str(tmp_path / "worker.py"))
+    monkeypatch.setattr(ask, "__file__", str(tmp_path / "ask.py"))
     with pytest.raises(FormatError, match="ezc3d failed on it: it ended with status -6"):
         load_motion(path)
     script.write_text("import time; time.sleep(60)")
-    monkeypatch.setattr(worker, "PATIENCE", 0.3)
+    monkeypatch.setattr(ask, "PATIENCE", 0.3)
     with pytest.raises(FormatError, match="gave no answer"):
         load_motion(path)
 

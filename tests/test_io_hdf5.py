@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from kcs_torch.errors import FormatError, KcsError
-from kcs_torch.io import hdf5, load_tracks, worker
-from kcs_torch.io.hdf5 import read_hdf5
+from kcs_torch.io import load_tracks
+from kcs_torch.io.containers import hdf5
+from kcs_torch.io.containers.hdf5 import read_hdf5
+from kcs_torch.io.workers import ask
 from kcs_torch.types import Tracks
 
 h5py = pytest.importorskip("h5py")
@@ -39,8 +41,8 @@ def rich(file):
 
 def pretend(tmp_path, monkeypatch, code):
     """Let a script of ours answer instead of the worker."""
-    (tmp_path / "hdf5_worker.py").write_text(code)
-    monkeypatch.setattr(worker, "__file__", str(tmp_path / "worker.py"))
+    (tmp_path / "hdf5.py").write_text(code)
+    monkeypatch.setattr(ask, "__file__", str(tmp_path / "ask.py"))
 
 
 def test_reads_w_among_variables_of_every_class(tmp_path):
@@ -109,7 +111,7 @@ def test_a_crash_costs_no_more_than_the_file(tmp_path, monkeypatch, code, messag
 
 def test_it_does_not_wait_for_ever(tmp_path, monkeypatch):
     pretend(tmp_path, monkeypatch, "while True: pass")
-    monkeypatch.setattr(worker, "PATIENCE", 0.2)
+    monkeypatch.setattr(ask, "PATIENCE", 0.2)
     with pytest.raises(FormatError, match="no answer in 0 seconds"):
         read_hdf5(save(tmp_path / "file.mat", rich), WANTED, 1000)
 

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io import jsonfile
-from kcs_torch.io.jsonfile import as_frame_number, as_joints, as_text, entries, outline, read_json
+from kcs_torch.io.containers import jsonfile
+from kcs_torch.io.containers.jsonfile import as_frame_number, as_joints, as_text, entries, outline, read_json
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4),

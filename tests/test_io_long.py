@@ -19,8 +19,8 @@ from kcs_torch.io import (
     load_people,
     load_tracks,
 )
-from kcs_torch.io.long import LongHeader
 from kcs_torch.io.registry import Probe
+from kcs_torch.io.tables.long import LongHeader
 from kcs_torch.skeleton import SKELETONS
 
 LEG = ("hip", "left knee", "Foot")

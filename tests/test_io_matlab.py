@@ -11,8 +11,9 @@ import scipy.sparse
 from scipy.io import loadmat, savemat
 
 from kcs_torch.errors import FormatError, KcsError
-from kcs_torch.io import load_tracks, matlab
-from kcs_torch.io.matlab import read_matlab
+from kcs_torch.io import load_tracks
+from kcs_torch.io.containers import matlab
+from kcs_torch.io.containers.matlab import read_matlab
 from kcs_torch.types import Tracks
 
 RNG = np.random.default_rng(0)

@@ -6,7 +6,7 @@ from samples import mmpose_frames, numbers, person, write_json
 
 from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io import detect_format, load_people, load_tracks
-from kcs_torch.io.layout import names_of
+from kcs_torch.io.contents.layout import names_of
 from kcs_torch.skeleton import SKELETONS
 
 H36M = (

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from samples import walk_result
 
 from kcs_torch.errors import FormatError, KcsError, SkeletonError
-from kcs_torch.io import archive, load_people, load_reconstruction, load_tracks, save
+from kcs_torch.io import load_people, load_reconstruction, load_tracks, save
+from kcs_torch.io.containers import archive
 from kcs_torch.skeleton import SKELETONS, Skeleton
 from kcs_torch.types import Intrinsics
 

@@ -7,10 +7,10 @@ from samples import person
 
 from kcs_torch.data import walking_person
 from kcs_torch.errors import FormatError, ShapeError, SkeletonError
-from kcs_torch.io import people as module
-from kcs_torch.io.frames import as_track_id, by_image, by_number
-from kcs_torch.io.layout import choose_layout, named_layout, names_of
-from kcs_torch.io.people import Sighting, people_tracks
+from kcs_torch.io.contents import people as module
+from kcs_torch.io.contents.frames import as_track_id, by_image, by_number
+from kcs_torch.io.contents.layout import choose_layout, named_layout, names_of
+from kcs_torch.io.contents.people import Sighting, people_tracks
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import SKELETONS
 

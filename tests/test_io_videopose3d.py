@@ -16,7 +16,7 @@ from samples import person, write_videopose3d
 
 from kcs_torch.errors import FormatError, KcsError
 from kcs_torch.io import detect_format, load_people, load_tracks
-from kcs_torch.io.pickles import load_arrays, opened
+from kcs_torch.io.containers.pickles import load_arrays, opened
 
 A, B = person(6, 17)[..., :2], person(9, 17, at=(900.0, 300.0))[..., :2]
 
@@ -152,7 +152,7 @@ def test_a_pickle_cannot_change_the_stand_ins():
     function = b"cnumpy.core.multiarray\n_reconstruct\n"
     build = function + b"}X\x01\x00\x00\x00aK\x01sb."  # sets an attribute of what find_class returned
     load_arrays(io.BytesIO(build), "f")
-    from kcs_torch.io import pickles
+    from kcs_torch.io.containers import pickles
 
     assert not any(hasattr(f, "a") for f in pickles._STAND_INS.values())
     assert np.array_equal(load_arrays(io.BytesIO(raw), "f"), np.zeros(2))

@@ -10,7 +10,7 @@ from samples import walking_motion
 import kcs_torch as kt
 from kcs_torch.errors import OutputError
 from kcs_torch.functional import bone_lengths, minimal_turn
-from kcs_torch.io.rig import fit_rig
+from kcs_torch.io.contents.rig import fit_rig
 
 
 def off(points, rig):

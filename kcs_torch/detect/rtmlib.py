@@ -13,7 +13,7 @@ import numpy as np
 
 from kcs_torch.detect.detector import Detector, Image, People, need_detector, nobody
 from kcs_torch.errors import FormatError, OptionError
-from kcs_torch.io.layout import names_of
+from kcs_torch.io.contents.layout import names_of
 
 __all__ = ["open_detector"]
 

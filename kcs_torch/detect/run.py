@@ -10,7 +10,7 @@ from kcs_torch.detect import mediapipe, rtmlib
 from kcs_torch.detect.detector import Detector
 from kcs_torch.detect.video import open_video
 from kcs_torch.errors import FormatError, OptionError, unknown
-from kcs_torch.io.people import Sighting, people_tracks
+from kcs_torch.io.contents.people import Sighting, people_tracks
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks

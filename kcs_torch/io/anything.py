@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from kcs_torch.errors import FormatError, OptionError, unknown
-from kcs_torch.io.archive import Archive
+from kcs_torch.io.containers.archive import Archive
 from kcs_torch.io.formats.npz import load_reconstruction
 from kcs_torch.io.load import READERS, describe, load_tracks
 from kcs_torch.io.motion import MOTION_READERS, load_motion

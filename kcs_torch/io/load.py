@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from kcs_torch.errors import FormatError, OptionError, listed, unknown
-from kcs_torch.io.hdf5 import read_tree
+from kcs_torch.io.containers.hdf5 import read_tree
 from kcs_torch.io.motion import MOTION_READERS
 from kcs_torch.io.registry import Options, Probe, Reader, brief, check_fps, discover, only_format
 from kcs_torch.io.video import looks_like_video

@@ -24,7 +24,7 @@ from kcs_torch.types import Tracks
 from kcs_torch.types.intake import RATES, as_number
 
 if TYPE_CHECKING:
-    from kcs_torch.io.hdf5 import Tree
+    from kcs_torch.io.containers.hdf5 import Tree
     from kcs_torch.types import Motion, Reconstruction
 
 __all__ = [
@@ -146,7 +146,7 @@ class Probe:
         """What is in an HDF5 file, but its numbers; None of other files, and of those that cannot be read."""
         if not self.head.startswith(b"\x89HDF"):
             return None
-        from kcs_torch.io.hdf5 import read_tree
+        from kcs_torch.io.containers.hdf5 import read_tree
 
         try:
             return read_tree(self.path, ())

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.jsonfile import as_text
-from kcs_torch.io.pickles import load_arrays
+from kcs_torch.io.containers.jsonfile import as_text
+from kcs_torch.io.containers.pickles import load_arrays
 from kcs_torch.io.registry import read_error
 
 __all__ = ["Archive", "array_names"]
@@ -111,7 +111,7 @@ class Archive:
         return [_decode(v) for v in self.array(key, "US", 1)]
 
     def objects(self, key: str) -> Any:
-        """Unpickle one array of objects, a nest of arrays, lists, mappings, numbers and texts: see ``io/pickles.py``.
+        """Unpickle one array of objects, a nest of arrays, lists, mappings, numbers and texts: see ``pickles.py``.
 
         Raises:
             FormatError: it is missing or damaged, holds no objects, or asks for anything else.

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.archive import LARGE, RATIO
+from kcs_torch.io.containers.archive import LARGE, RATIO
 from kcs_torch.io.registry import need
-from kcs_torch.io.worker import ask_worker
+from kcs_torch.io.workers.ask import ask_worker
 
 __all__ = ["LIMIT", "Tree", "read_hdf5", "read_tree"]
 
@@ -80,7 +80,7 @@ def _ask(path: Path, kind: str, **request: Any) -> Tree:
     """Let the worker read."""
     need("h5py", f"{path}: {kind}", FormatError)
     request |= {"path": str(path), "kind": kind, "matlab": kind != "HDF5", "large": LARGE, "ratio": RATIO}
-    answer, data = ask_worker("hdf5_worker.py", json.dumps(request), path, "the HDF5 library")
+    answer, data = ask_worker("hdf5.py", json.dumps(request), path, "the HDF5 library")
     try:
         tree = Tree(
             {_printable(k): tuple(map(int, v)) for k, v in answer["shapes"].items()},

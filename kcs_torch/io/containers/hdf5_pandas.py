@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.hdf5 import Tree, read_tree
-from kcs_torch.io.pickles import load_arrays
+from kcs_torch.io.containers.hdf5 import Tree, read_tree
+from kcs_torch.io.containers.pickles import load_arrays
 
 __all__ = ["Table", "has_column", "pandas_group", "read_pandas"]
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.archive import LARGE, RATIO
+from kcs_torch.io.containers.archive import LARGE, RATIO
 from kcs_torch.io.registry import read_error
 
 __all__ = ["read_matlab"]

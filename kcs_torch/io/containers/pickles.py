@@ -13,7 +13,7 @@ from typing import Any, BinaryIO, ClassVar
 import numpy as np
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.jsonfile import as_text
+from kcs_torch.io.containers.jsonfile import as_text
 
 __all__ = ["load_arrays", "opened"]
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,18 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError, counted, listed
-from kcs_torch.io.build import OVERSHOOT, build_tracks, nothing_seen
+from kcs_torch.io.containers.jsonfile import FARTHEST
+from kcs_torch.io.contents.build_tracks import OVERSHOOT, build_tracks, nothing_seen
+from kcs_torch.io.contents.shares import are_shares, in_pixels
 from kcs_torch.io.folders import frame_numbers
-from kcs_torch.io.header import delimiter
-from kcs_torch.io.jsonfile import FARTHEST
-from kcs_torch.io.registry import Options, brief, read_error
-from kcs_torch.io.shares import are_shares, in_pixels
+from kcs_torch.io.registry import Options, brief
 from kcs_torch.types import Tracks
 
-__all__ = ["LIMIT", "Animal", "bounded_rows", "build_animals", "frames_of", "refuse_3d"]
+__all__ = ["LIMIT", "Animal", "build_animals", "frames_of", "refuse_3d"]
 
 LIMIT = 2**28  # numbers of all animals in all frames
-LINES, LINE = 2**23, 2**23  # of a table of text, and letters of one
 _FRAGMENT = 0.1  # share of the frames, below which an animal that is seen is a piece of somebody's track
 _SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]*\Z")
 _NUMBER = re.compile(r"([0-9]+)\Z")
@@ -80,29 +76,6 @@ def frames_of(rows: Sequence[tuple[str | float, ...]], path: Path, notes: list[s
         order.sort(key=lambda i: numbers[i] or 0)
     frames = frame_numbers([numbers[i] for i in order], notes, names="rows", whole="row")
     return order, frames
-
-
-@contextmanager
-def bounded_rows(path: Path) -> Iterator[Any]:
-    """Open a table of text: a csv reader of its rows.
-
-    Raises:
-        FormatError: it cannot be read; a line is longer, or there are more, than any table of tracks has.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            between = delimiter(file.readline(LINE))
-            file.seek(0)
-            yield csv.reader(_bounded(file, path), delimiter=between)
-    except OSError as error:
-        raise read_error(path, error) from None
-
-
-def _bounded(file: Iterable[str], path: Path) -> Iterator[str]:
-    for number, line in enumerate(file, 1):
-        if len(line) > LINE or number > LINES:
-            raise FormatError(f"{path}: line {number}: expected up to {LINES} lines of {LINE} letters: split the file")
-        yield line
 
 
 def _whole(value: str | float) -> int | None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Hashable, Mapping, Sequence
 
+from kcs_torch.io.containers.jsonfile import as_text
+from kcs_torch.io.contents.people import Sighting
 from kcs_torch.io.folders import frame_numbers, natural_key
-from kcs_torch.io.jsonfile import as_text
-from kcs_torch.io.people import Sighting
 
 __all__ = ["as_track_id", "by_image", "by_number", "last_number"]
 

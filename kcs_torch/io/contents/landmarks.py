@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.jsonfile import FARTHEST, as_frame_number, as_joints, as_text, entries, read_json
-from kcs_torch.io.people import Sighting
+from kcs_torch.io.containers.jsonfile import FARTHEST, as_frame_number, as_joints, as_text, entries, read_json
+from kcs_torch.io.contents.people import Sighting
+from kcs_torch.io.contents.shares import ASK, SIZE_HINT, are_shares
+from kcs_torch.io.contents.times import frames_of_times, rate_of_times, time_unit
 from kcs_torch.io.registry import Options
-from kcs_torch.io.shares import ASK, SIZE_HINT, are_shares
-from kcs_torch.io.times import frames_of_times, rate_of_times, time_unit
 from kcs_torch.skeleton import SKELETONS
 
 __all__ = [

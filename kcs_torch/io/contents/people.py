@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.build import OVERSHOOT, build_tracks, nothing_seen
-from kcs_torch.io.layout import choose_layout
-from kcs_torch.io.link import follow_people, longest_gap
+from kcs_torch.io.contents.build_tracks import OVERSHOOT, build_tracks, nothing_seen
+from kcs_torch.io.contents.layout import choose_layout
+from kcs_torch.io.contents.link import follow_people, longest_gap
+from kcs_torch.io.contents.shares import ASK, are_shares
 from kcs_torch.io.registry import Options, brief
-from kcs_torch.io.shares import ASK, are_shares
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 from kcs_torch.types.intake import at_the_corner

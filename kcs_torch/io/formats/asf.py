@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kcs_torch.errors import FormatError
 from kcs_torch.functional import euler_rotation
-from kcs_torch.io.build_motion import build_motion, numbers, read_lines
+from kcs_torch.io.contents.build_motion import build_motion, numbers, read_lines
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe
 from kcs_torch.types import Motion
 

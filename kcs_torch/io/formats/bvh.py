@@ -23,10 +23,10 @@ from torch import Tensor
 
 from kcs_torch.errors import FormatError, listed
 from kcs_torch.functional import euler_angles, euler_rotation
-from kcs_torch.io.build_motion import build_motion, distinct, numbers, read_lines
+from kcs_torch.io.contents.build_motion import build_motion, distinct, numbers, read_lines
+from kcs_torch.io.contents.rig import Rig, check_tree, fit_rig
+from kcs_torch.io.contents.times import plain_rate
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer
-from kcs_torch.io.rig import Rig, check_tree, fit_rig
-from kcs_torch.io.times import plain_rate
 from kcs_torch.types import Motion
 from kcs_torch.types.arrays import as_array
 from kcs_torch.types.axes import from_y_up

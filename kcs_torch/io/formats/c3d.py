@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from kcs_torch.errors import FormatError, OutputError, listed
-from kcs_torch.io.build_motion import build_motion, distinct
+from kcs_torch.io.contents.build_motion import build_motion, distinct
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer, need
-from kcs_torch.io.worker import ask_worker
+from kcs_torch.io.workers.ask import ask_worker
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion
 from kcs_torch.types.arrays import as_array
@@ -76,7 +76,7 @@ def _ask(path: Path) -> tuple[dict[str, Any], np.ndarray[Any, np.dtype[np.float6
     need("ezc3d", f"{path}: C3D", FormatError)
     if not path.is_file():
         raise FormatError(f"{path}: expected a C3D file, got a folder or the beginning of a name")
-    answer, data = ask_worker("c3d_worker.py", str(path), path, "ezc3d")
+    answer, data = ask_worker("c3d.py", str(path), path, "ezc3d")
     try:
         frames, markers = map(int, answer["shape"])
         return answer, np.frombuffer(data, "<f8", frames * markers * 3).reshape(frames, markers, 3)

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.frames import as_track_id, by_image, by_number
-from kcs_torch.io.jsonfile import as_frame_number, as_joints, as_text, entries, outline, read_json
-from kcs_torch.io.people import Sighting, people_tracks
+from kcs_torch.io.containers.jsonfile import as_frame_number, as_joints, as_text, entries, outline, read_json
+from kcs_torch.io.contents.frames import as_track_id, by_image, by_number
+from kcs_torch.io.contents.people import Sighting, people_tracks
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.types import Tracks
 

@@ -17,11 +17,12 @@ import torch
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.animals import LIMIT, Animal, bounded_rows, build_animals, frames_of, refuse_3d
-from kcs_torch.io.build_motion import build_motion
-from kcs_torch.io.hdf5_pandas import Table, has_column, pandas_group, read_pandas
+from kcs_torch.io.containers.hdf5_pandas import Table, has_column, pandas_group, read_pandas
+from kcs_torch.io.contents.animals import LIMIT, Animal, build_animals, frames_of, refuse_3d
+from kcs_torch.io.contents.build_motion import build_motion
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief
-from kcs_torch.io.wide import as_float, no_numbers
+from kcs_torch.io.tables.bounded import bounded_rows
+from kcs_torch.io.tables.wide import as_float, no_numbers
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]

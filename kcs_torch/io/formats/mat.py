@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.build import build_tracks
-from kcs_torch.io.hdf5 import LIMIT, read_hdf5
-from kcs_torch.io.matlab import read_matlab
+from kcs_torch.io.containers.hdf5 import LIMIT, read_hdf5
+from kcs_torch.io.containers.matlab import read_matlab
+from kcs_torch.io.contents.build_tracks import build_tracks
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.types import Tracks
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.frames import by_number
-from kcs_torch.io.jsonfile import outline
-from kcs_torch.io.landmark_tables import frame_shape, npy_shape, read_csv, read_npy, table_kind
-from kcs_torch.io.landmarks import BODIES, KEYS, read_landmarks_json, settle
-from kcs_torch.io.people import people_tracks
+from kcs_torch.io.containers.jsonfile import outline
+from kcs_torch.io.contents.frames import by_number
+from kcs_torch.io.contents.landmarks import BODIES, KEYS, read_landmarks_json, settle
+from kcs_torch.io.contents.people import people_tracks
 from kcs_torch.io.registry import Options, Probe, Reader
+from kcs_torch.io.tables.landmark_tables import frame_shape, npy_shape, read_csv, read_npy, table_kind
 from kcs_torch.types import Tracks
 
 __all__ = ["READERS"]

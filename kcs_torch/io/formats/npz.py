@@ -31,11 +31,11 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import FormatError, KcsError
-from kcs_torch.io.archive import Archive, array_names
-from kcs_torch.io.build import build_tracks
-from kcs_torch.io.build_motion import build_motion
+from kcs_torch.io.containers.archive import Archive, array_names
+from kcs_torch.io.contents.build_motion import build_motion
+from kcs_torch.io.contents.build_tracks import build_tracks
+from kcs_torch.io.contents.shares import are_shares, in_pixels
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, Saving, Writer
-from kcs_torch.io.shares import are_shares, in_pixels
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Intrinsics, Motion, Reconstruction, Tracks
 from kcs_torch.types.arrays import as_array

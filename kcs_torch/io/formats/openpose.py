@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError, counted
+from kcs_torch.io.containers.jsonfile import FARTHEST, kind, outline, read_json, short
+from kcs_torch.io.contents.layout import BY_COUNT, likeliest
+from kcs_torch.io.contents.people import Sighting, people_tracks
 from kcs_torch.io.folders import frame_numbers
-from kcs_torch.io.jsonfile import FARTHEST, kind, outline, read_json, short
-from kcs_torch.io.layout import BY_COUNT, likeliest
-from kcs_torch.io.people import Sighting, people_tracks
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.skeleton import SKELETONS, get_skeleton
 from kcs_torch.types import Tracks

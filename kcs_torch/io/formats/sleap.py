@@ -12,14 +12,15 @@ import torch
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.animals import LIMIT, Animal, bounded_rows, build_animals, frames_of, refuse_3d
-from kcs_torch.io.build_motion import build_motion
-from kcs_torch.io.hdf5 import Tree, read_tree
-from kcs_torch.io.header import Header, first_line
-from kcs_torch.io.jsonfile import as_frame_number
-from kcs_torch.io.link import link_people, longest_gap
+from kcs_torch.io.containers.hdf5 import Tree, read_tree
+from kcs_torch.io.containers.jsonfile import as_frame_number
+from kcs_torch.io.contents.animals import LIMIT, Animal, build_animals, frames_of, refuse_3d
+from kcs_torch.io.contents.build_motion import build_motion
+from kcs_torch.io.contents.link import link_people, longest_gap
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader, brief
-from kcs_torch.io.wide import as_float, no_numbers
+from kcs_torch.io.tables.bounded import bounded_rows
+from kcs_torch.io.tables.header import Header, first_line
+from kcs_torch.io.tables.wide import as_float, no_numbers
 from kcs_torch.types import Motion, Tracks
 
 __all__ = ["MOTION_READERS", "READERS"]

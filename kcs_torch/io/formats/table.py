@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from kcs_torch.anatomy import places_of_known
 from kcs_torch.errors import FormatError
-from kcs_torch.io.build_motion import build_motion
-from kcs_torch.io.frames import by_number
-from kcs_torch.io.header import Columns, Header, Layout, first_line
-from kcs_torch.io.landmark_tables import some_joints, table_kind
-from kcs_torch.io.landmarks import settle
-from kcs_torch.io.long import MOST, LongHeader, read_long
-from kcs_torch.io.people import people_tracks
+from kcs_torch.io.contents.build_motion import build_motion
+from kcs_torch.io.contents.frames import by_number
+from kcs_torch.io.contents.landmarks import settle
+from kcs_torch.io.contents.people import people_tracks
 from kcs_torch.io.registry import MotionOptions, MotionReader, Options, Probe, Reader
-from kcs_torch.io.wide import read_wide
+from kcs_torch.io.tables.header import Columns, Header, Layout, first_line
+from kcs_torch.io.tables.landmark_tables import some_joints, table_kind
+from kcs_torch.io.tables.long import MOST, LongHeader, read_long
+from kcs_torch.io.tables.wide import read_wide
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.types import Motion, Tracks
 

@@ -19,10 +19,10 @@ import numpy as np
 import torch
 
 from kcs_torch.errors import FormatError, counted
-from kcs_torch.io.build_motion import build_motion, distinct, numbers, read_lines
+from kcs_torch.io.contents.build_motion import build_motion, distinct, numbers, read_lines
+from kcs_torch.io.contents.times import rate_of_times
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe, Saving, Writer
-from kcs_torch.io.times import rate_of_times
 from kcs_torch.types import Motion
 from kcs_torch.types.arrays import as_array
 from kcs_torch.types.axes import from_y_up

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.archive import Archive, array_names
-from kcs_torch.io.build import build_tracks
-from kcs_torch.io.jsonfile import FARTHEST, as_text
-from kcs_torch.io.layout import choose_layout
-from kcs_torch.io.pickles import opened
+from kcs_torch.io.containers.archive import Archive, array_names
+from kcs_torch.io.containers.jsonfile import FARTHEST, as_text
+from kcs_torch.io.containers.pickles import opened
+from kcs_torch.io.contents.build_tracks import build_tracks
+from kcs_torch.io.contents.layout import choose_layout
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.types import Tracks

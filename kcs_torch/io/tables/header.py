@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES
-from kcs_torch.io.times import time_unit
+from kcs_torch.io.contents.landmarks import CONFIDENCES, VISIBILITIES
+from kcs_torch.io.contents.times import time_unit
 
 __all__ = ["WHO", "Columns", "Header", "Layout", "delimiter", "first_line", "plain_name"]
 

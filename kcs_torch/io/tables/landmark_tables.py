@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.header import Columns, Header, Layout, first_line
-from kcs_torch.io.jsonfile import FARTHEST
-from kcs_torch.io.landmarks import BODIES, VISIBILITIES, Landmarks
-from kcs_torch.io.long import LongHeader
-from kcs_torch.io.people import Sighting
+from kcs_torch.io.containers.jsonfile import FARTHEST
+from kcs_torch.io.contents.landmarks import BODIES, VISIBILITIES, Landmarks
+from kcs_torch.io.contents.people import Sighting
 from kcs_torch.io.registry import read_error
-from kcs_torch.io.wide import read_wide
+from kcs_torch.io.tables.header import Columns, Header, Layout, first_line
+from kcs_torch.io.tables.long import LongHeader
+from kcs_torch.io.tables.wide import read_wide
 from kcs_torch.skeleton import SKELETONS, Skeleton, guess_skeleton
 
 __all__ = ["frame_shape", "npy_shape", "read_csv", "read_npy", "some_joints", "table_kind"]

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
+from kcs_torch.io.containers.jsonfile import MOST_JOINTS, as_frame_number, as_text
+from kcs_torch.io.contents.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
 from kcs_torch.io.folders import frame_numbers
-from kcs_torch.io.header import Header, plain_name
-from kcs_torch.io.jsonfile import MOST_JOINTS, as_frame_number, as_text
-from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
-from kcs_torch.io.wide import Row, as_value, opened, place_rows
+from kcs_torch.io.tables.header import Header, plain_name
+from kcs_torch.io.tables.wide import Row, as_value, opened, place_rows
 from kcs_torch.types.intake import FARTHEST
 
 __all__ = ["MOST", "LongHeader", "read_long"]

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.frames import as_track_id
-from kcs_torch.io.header import Columns, Header, Layout, delimiter, first_line
-from kcs_torch.io.jsonfile import as_frame_number, as_text
-from kcs_torch.io.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
-from kcs_torch.io.people import Sighting
+from kcs_torch.io.containers.jsonfile import as_frame_number, as_text
+from kcs_torch.io.contents.frames import as_track_id
+from kcs_torch.io.contents.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
+from kcs_torch.io.contents.people import Sighting
+from kcs_torch.io.contents.times import frames_of_times, rate_of_times
 from kcs_torch.io.registry import brief, read_error
-from kcs_torch.io.times import frames_of_times, rate_of_times
+from kcs_torch.io.tables.header import Columns, Header, Layout, delimiter, first_line
 from kcs_torch.types.intake import FARTHEST
 
 __all__ = ["Row", "as_float", "as_value", "no_numbers", "opened", "place_rows", "read_wide"]

@@ -1,4 +1,4 @@
-"""Libraries in C that crash or loop on damaged files read them in a process of their own."""
+"""Ask a script of this folder what a file holds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Read an HDF5 file in a process of its own; see ``hdf5.py``.
+"""Read an HDF5 file in a process of its own; see ``containers/hdf5.py``.
 
 Run by its path, so that only numpy and h5py are loaded. Its argument is a request in JSON, with the path. It writes one
 line of JSON to its standard output, either ``{"error": text}`` or
@@ -36,7 +36,7 @@ class Refused(Exception):
 
 
 def main(request: dict[str, Any]) -> None:
-    """Write the answer; ``Request`` of ``hdf5.py`` says what may be asked."""
+    """Write the answer; ``_ask`` of ``containers/hdf5.py`` says what may be asked."""
     import h5py
 
     allow(room := ROOM)
