@@ -2,13 +2,22 @@
 
 import csv
 import json
-import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from animal_samples import (
+    deeplabcut_columns,
+    deeplabcut_values,
+    sleap_points,
+    write_deeplabcut_csv,
+    write_deeplabcut_fixed,
+    write_deeplabcut_table,
+    write_sleap_csv,
+    write_sleap_hdf5,
+)
 
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths
@@ -66,6 +75,17 @@ def person(num_frames: int = 4, joints: int = 25, *, at=(200.0, 300.0), confiden
     return np.concatenate([shape + drift, np.full((num_frames, joints, 1), confidence)], -1)
 
 
+def grid(frames=4, joints=17, dtype=torch.float64):
+    """Tracks of different numbers everywhere."""
+    return torch.arange(frames * joints * 2, dtype=dtype).reshape(frames, joints, 2)
+
+
+def with_value(array, index, value):
+    array = array.clone()
+    array[index] = value
+    return array
+
+
 # ---------------------------------------------------------------------- one small file of every format, 4 frames long
 
 
@@ -107,115 +127,6 @@ def write_mat_hdf5(folder: Path) -> Path:
         file["points2d"] = person()[..., :2].T
     with path.open("r+b") as raw:
         raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
-    return path
-
-
-ANIMAL = ("snout", "neck", "tailbase")
-
-
-def deeplabcut_columns(individuals=(), parts=ANIMAL, coords=("x", "y", "likelihood")):
-    """Names of the columns: scorer, (individual,) body part, coordinate."""
-    whose = [(i,) for i in individuals] or [()]
-    return [("resnet", *i, part, c) for i in whose for part in parts for c in coords]
-
-
-def deeplabcut_values(columns, num_frames=4):
-    """Numbers that fit the columns: pixels, and likelihoods of 0.9."""
-    place = np.random.default_rng(len(columns)).uniform(100, 300, len(columns))
-    values = place + 2.0 * np.arange(num_frames)[:, None]
-    values[:, [c[-1] == "likelihood" for c in columns]] = 0.9
-    return values
-
-
-def write_deeplabcut_csv(path: Path, columns, values, rows=None) -> Path:
-    """A CSV as DeepLabCut writes it; ``rows``: what each is called, their numbers if None."""
-    rows = [(i,) for i in range(len(values))] if rows is None else rows
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        levels = ("scorer", "bodyparts", "coords") if len(columns[0]) == 3 else DEEPLABCUT
-        for level, names in zip(levels, zip(*columns, strict=True), strict=True):
-            writer.writerow([level, *[""] * (len(rows[0]) - 1), *names])
-        for row, line in zip(rows, values, strict=True):
-            writer.writerow([*row, *("" if np.isnan(v) else v for v in line)])
-    return path
-
-
-DEEPLABCUT = ("scorer", "individuals", "bodyparts", "coords")
-
-
-def write_deeplabcut_table(path: Path, columns, values, rows=None, pickled=None) -> Path:
-    """HDF5 in pandas' "table" layout; ``pickled``: the names of the columns."""
-    import h5py
-
-    rows = np.arange(len(values)) if rows is None else np.array(rows, "S")
-    table = np.zeros(len(values), [("index", rows.dtype), ("values_block_0", "f8", (len(columns),))])
-    table["index"], table["values_block_0"] = rows, values
-    names = pickle.dumps(columns, 0) if pickled is None else pickled
-    with h5py.File(path, "w") as file:
-        group = file.create_group("df_with_missing")
-        group.attrs["pandas_type"] = np.bytes_("frame_table")
-        group.attrs["info"] = np.bytes_(pickle.dumps({1: {"names": ["scorer", "bodyparts", "coords"]}}, 0))
-        group.create_dataset("table", data=table, chunks=(2,))
-        group["table"].attrs["values_block_0_kind"] = np.bytes_(names)
-    return path
-
-
-def write_deeplabcut_fixed(path: Path, columns, values, rows=None) -> Path:
-    """HDF5 in pandas' "fixed" layout; ``rows`` with several levels, image paths say."""
-    import h5py
-
-    def levels(group, name, labels):
-        for i, column in enumerate(zip(*labels, strict=True)):
-            unique = sorted(set(column))
-            group[f"{name}_level{i}"] = np.array([str(u).encode() for u in unique], "S")
-            group[f"{name}_label{i}"] = np.array([unique.index(c) for c in column], "i1")
-
-    with h5py.File(path, "w") as file:
-        group = file.create_group("df_with_missing")
-        group.attrs["pandas_type"] = np.bytes_("frame")
-        levels(group, "block0_items", columns)
-        group[f"block0_items_level{len(columns[0]) - 2}"].attrs["name"] = np.bytes_("bodyparts")
-        group["block0_values"] = values
-        if rows is None:
-            group["axis1"] = np.arange(len(values))
-        else:
-            levels(group, "axis1", rows)
-    return path
-
-
-def sleap_points(tracks=1, num_frames=4) -> np.ndarray:
-    """(tracks, 2, nodes, frames), as SLEAP has them."""
-    start = np.random.default_rng(1).uniform(50, 250, (tracks, 2, len(ANIMAL), 1))
-    return start + 2.0 * np.arange(num_frames)
-
-
-def write_sleap_hdf5(path: Path, points, dims=None, **others) -> Path:
-    """An analysis file; ``others``: more datasets, None leaves one out; ``dims``: names of the points' dimensions."""
-    import h5py
-
-    datasets = {
-        "tracks": points,
-        "node_names": np.array([n.encode() for n in ANIMAL], "S"),
-        "edge_inds": np.array([[0, 1], [1, 2]], "i4"),
-        **others,
-    }
-    with h5py.File(path, "w") as file:
-        for name, value in datasets.items():
-            if value is not None:
-                file[name] = value
-        if dims is not None:
-            file["tracks"].attrs["dims"] = json.dumps(dims)
-    return path
-
-
-def write_sleap_csv(path: Path, lines, nodes=ANIMAL) -> Path:
-    """An analysis CSV of lines (track, frame, score, x, y, score, x, ...)."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(
-            ["track", "frame_idx", "instance.score", *(f"{n}.{c}" for n in nodes for c in ("x", "y", "score"))]
-        )
-        writer.writerows(lines)
     return path
 
 

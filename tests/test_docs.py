@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from samples import deeplabcut_columns, write_deeplabcut_csv
+from animal_samples import deeplabcut_columns, write_deeplabcut_csv
 from typer.testing import CliRunner
 
 import kcs_torch as kt

@@ -12,21 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from mutants import Canary, canary_pickle, mutate, npz_bytes, trick_npz
-from samples import (
-    MOTION_SAMPLES,
-    SAMPLES,
+from animal_samples import (
     deeplabcut_columns,
     deeplabcut_values,
-    person,
     sleap_points,
     write_deeplabcut_fixed,
     write_deeplabcut_table,
-    write_openpose,
     write_sleap_hdf5,
 )
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mutants import Canary, canary_pickle, mutate, npz_bytes, trick_npz
+from samples import MOTION_SAMPLES, SAMPLES, person, write_openpose
 
 import kcs_torch as kt
 from kcs_torch.errors import FormatError, KcsError
