@@ -3,8 +3,8 @@
 import pytest
 import torch
 from numerics import BODY, CHAIN, FLOATS, finite, gradcheck, normal
-from test_unrolled import KINDS, scene, with_parameters
 from torch.testing import assert_close
+from unrolled_scenes import KINDS, scene, with_parameters
 
 from kcs_torch.errors import ConvergenceWarning, OptionError
 from kcs_torch.nn import UnrolledFPC, UnrolledKCS, UnrolledPKC, UnrolledSfAM

@@ -6,8 +6,8 @@ import warnings
 import pytest
 import torch
 from numerics import BODY, FLOATS, HALVES, finite, leaves_arguments_alone, normal, same_as_loop
-from test_unrolled import KINDS, scene, with_parameters
 from torch.testing import assert_close
+from unrolled_scenes import KINDS, scene, with_parameters
 
 from kcs_torch import KCS
 from kcs_torch.data import walking_person

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 from numerics import BODY, normal
-from test_unrolled import scene
 from torch.nn.utils.rnn import pad_sequence
 from torch.testing import assert_close
+from unrolled_scenes import scene
 
 from kcs_torch import ShapeError
 from kcs_torch.data import walking_person

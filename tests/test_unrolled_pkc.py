@@ -3,8 +3,8 @@
 import pytest
 import torch
 from numerics import BODY, CHAIN, FLOATS, RING, finite, normal, rotations, same_as_loop, turning
-from test_unrolled import KINDS, scene, with_parameters
 from torch.testing import assert_close
+from unrolled_scenes import KINDS, scene, with_parameters
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths, bone_vectors, complete_rotation, rows_to_cameras

@@ -6,9 +6,9 @@ import warnings
 import pytest
 import torch
 from numerics import BODY, normal
-from test_unrolled import scene
 from torch.func import grad, vmap
 from torch.testing import assert_close
+from unrolled_scenes import scene
 
 from kcs_torch.functional import (
     log_det,
