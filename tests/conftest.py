@@ -101,3 +101,23 @@ def openpose_folder(tmp_path_factory) -> Path:
         name = folder / f"clip_{frame:012d}_keypoints.json"
         name.write_text(json.dumps({"version": 1.3, "people": people}), encoding="utf-8")
     return folder
+
+
+@pytest.fixture(scope="session")
+def still():
+    """A walk before a camera that stands still, and its reconstruction by PKC's default settings."""
+    from kcs_torch import PKC
+    from kcs_torch.data import walking_person
+
+    clip = walking_person(40, turn=0.0, yaw=40.0)
+    return clip, PKC()(clip.tracks)
+
+
+@pytest.fixture(scope="session")
+def turning():
+    """The same before a camera that goes half around."""
+    from kcs_torch import PKC
+    from kcs_torch.data import walking_person
+
+    clip = walking_person(50, turn=180.0, yaw=0.0)
+    return clip, PKC()(clip.tracks)

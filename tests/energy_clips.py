@@ -1,10 +1,7 @@
 """Clips that energies are tried on, ordinary and degenerate."""
 
 import torch
-from numerics import (
-    BODY,
-    normal,
-)
+from numerics import BODY, normal
 
 from kcs_torch.nn import (
     BoneLengthEnergy,

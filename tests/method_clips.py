@@ -7,10 +7,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from kcs_torch import (
-    METHODS,
-    Tracks,
-)
+from kcs_torch import METHODS, Tracks
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths, viewpoint_turn
 

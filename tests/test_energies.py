@@ -5,28 +5,12 @@ import math
 import pytest
 import torch
 from energy_clips import BONES, KINDS, RIGID, SMOOTH, clip, confidences, scene
-from numerics import (
-    BODY,
-    CHAIN,
-    FLOATS,
-    HALVES,
-    RING,
-    finite,
-    gradcheck,
-    normal,
-    rotations,
-)
+from numerics import BODY, CHAIN, FLOATS, HALVES, RING, finite, gradcheck, normal, rotations
 from torch.testing import assert_close
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import bone_lengths, project
-from kcs_torch.nn import (
-    BoneLengthEnergy,
-    LowRankEnergy,
-    ReprojectionEnergy,
-    SmoothnessEnergy,
-    SymmetryEnergy,
-)
+from kcs_torch.nn import BoneLengthEnergy, LowRankEnergy, ReprojectionEnergy, SmoothnessEnergy, SymmetryEnergy
 
 # ---------------------------------------------------------------------- bone lengths
 

@@ -3,10 +3,7 @@
 import pytest
 import torch
 from energy_clips import CALLS, POSTURE, TRUNK, scene
-from numerics import (
-    BODY,
-    normal,
-)
+from numerics import BODY, normal
 from torch.testing import assert_close
 
 import kcs_torch as kt

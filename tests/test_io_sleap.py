@@ -3,14 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from animal_samples import (
-    ANIMAL,
-    CELLS,
-    NO_BONES,
-    sleap_points,
-    write_sleap_csv,
-    write_sleap_hdf5,
-)
+from animal_samples import ANIMAL, CELLS, NO_BONES, sleap_points, write_sleap_csv, write_sleap_hdf5
 
 import kcs_torch as kt
 from kcs_torch.errors import FormatError, KcsError

@@ -10,11 +10,7 @@ from hypothesis import strategies as st
 from method_clips import BODY, CASES, CLIP, NAN, WALK, check, half, hidden, image_of, quiet, tracks_of
 from torch.testing import assert_close
 
-from kcs_torch import (
-    METHODS,
-    Tracks,
-    reconstruct,
-)
+from kcs_torch import METHODS, Tracks, reconstruct
 from kcs_torch.data import walking_person
 
 

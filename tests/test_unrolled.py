@@ -5,17 +5,7 @@ import math
 
 import pytest
 import torch
-from numerics import (
-    BODY,
-    CHAIN,
-    FLOATS,
-    HALVES,
-    RING,
-    dense_fit_bones,
-    gradcheck,
-    normal,
-    rotations,
-)
+from numerics import BODY, CHAIN, FLOATS, HALVES, RING, dense_fit_bones, gradcheck, normal, rotations
 from torch.testing import assert_close
 from unrolled_scenes import each_body, scene
 

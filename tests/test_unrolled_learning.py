@@ -6,15 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numerics import (
-    BODY,
-    CHAIN,
-    FLOATS,
-    finite,
-    gradcheck,
-    normal,
-    turning,
-)
+from numerics import BODY, CHAIN, FLOATS, finite, gradcheck, normal, turning
 from torch.testing import assert_close
 from unrolled_scenes import BODIES, KINDS, each_body, scene, with_parameters
 

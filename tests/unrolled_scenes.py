@@ -2,13 +2,7 @@
 
 import pytest
 import torch
-from numerics import (
-    BODY,
-    CHAIN,
-    RING,
-    normal,
-    turning,
-)
+from numerics import BODY, CHAIN, RING, normal, turning
 from torch.func import functional_call
 
 BODIES = {"body": BODY, "chain": CHAIN, "ring": RING}

@@ -1,0 +1,75 @@
+"""PKC with known cameras: depth that they tell, and which mirror image."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from pkc_walks import FLIP, error, robot
+
+from kcs_torch import PKC, Skeleton
+from kcs_torch.data import random_motion, walking_person
+from kcs_torch.functional import complete_rotation
+
+# Many tests take few steps, after which nothing has settled.
+pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")
+
+
+def test_known_cameras_tell_the_mirror_images_apart(turning):
+    clip, _ = turning
+    result = PKC(viewpoint="moving")(clip.tracks, clip.cameras)
+    assert error(result.points, clip.points) < 0.1
+    assert torch.equal(result.cameras, clip.cameras) and result.alternatives == ()
+
+
+def test_known_cameras_are_those_of_every_solution(turning):
+    clip, _ = turning
+    result = PKC()(clip.tracks, clip.cameras)
+    assert result.root_depth is None  # feet that stand still do not do so in the image
+    assert error(result.points, clip.points) < 0.1
+    for one in (result, *result.alternatives):
+        assert torch.equal(one.cameras, clip.cameras)
+        assert error(one.points * FLIP, clip.points) > 1  # none is the mirror image
+
+
+@pytest.mark.parametrize("turn", [15.0, 60.0])
+def test_known_cameras_make_nothing_worse(turn):
+    """A little turn tells the sign of depth, but hardly depth: that still comes from the template."""
+    clip = walking_person(50, turn=turn, yaw=40.0)
+    plain, known = PKC()(clip.tracks), PKC()(clip.tracks, clip.cameras)
+    assert error(known.points, clip.points) < 0.05
+    assert error(known.points, clip.points) < 1.1 * error(plain.points, clip.points)
+
+
+def test_cameras_that_are_known_to_stand_still_tell_nothing(still):
+    clip, plain = still
+    known = PKC()(clip.tracks, clip.cameras)
+    assert torch.equal(known.points, plain.points) and torch.equal(known.cameras, clip.cameras)
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("body", ["hand21", "robot"])
+def test_known_cameras_tell_which_of_two_mirror_images(body, side):
+    """Of a hand that may be the other one, and of a body without a template: the same tracks, cameras the other way."""
+    if body == "robot":
+        clip = robot()
+    else:
+        clip = random_motion(body, 90, turn=120.0, swing=15.0, generator=torch.Generator().manual_seed(3))
+    flip = torch.tensor([1.0, 1.0, side]).double()
+    rotations = flip[:, None] * complete_rotation(clip.cameras) * flip
+    result = PKC(lifts=2)(clip.tracks, rotations[:, :2])
+    assert error(result.points, clip.points * flip) < 0.3
+    assert error(result.points * FLIP, clip.points * flip) > 1
+    if body == "robot":
+        assert result.alternatives == ()
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")  # links that are no tree are pulled on but weakly
+def test_known_cameras_and_markers():
+    clip = robot()
+    arm = clip.tracks.skeleton
+    body = Skeleton(arm.joints, (*arm.bones, (0, 2), (1, 3)), flexible=(4, 5), tree=False)
+    tracks = replace(clip.tracks, skeleton=body)
+    plain, known = PKC()(tracks), PKC()(tracks, clip.cameras)
+    best = min(error(points, clip.points) for points in (plain.points, plain.points * FLIP))
+    assert error(known.points, clip.points) == pytest.approx(best)
