@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,6 +33,27 @@ __all__ = ["KCS"]
 DEEP = 0.3
 """Least extent of the tracks' best rigid shape, over its middle one, from which on it is solid: the viewpoint turns.
 Seen without a turn it is flat."""
+
+CHECK = 5
+"""Steps from one look at whether a clip has settled to the next."""
+
+
+class _Found(NamedTuple):
+    """Cameras and shapes of K clips.
+
+    Attributes:
+        shape: (K, T, N, 3) poses in the world, in the template's size.
+        rotations: (K, T, 3, 3) world to camera.
+        scales: (K, T) of each frame's image.
+        converged: (K,).
+        made: (K,) steps.
+    """
+
+    shape: Tensor
+    rotations: Tensor
+    scales: Tensor
+    converged: Tensor
+    made: Tensor
 
 
 @dataclass(frozen=True)
@@ -112,9 +133,6 @@ class KCS(Method):
         body = tracks[0].skeleton.with_links(self.links) if self.links else tracks[0].skeleton
         body = body.connected()
         clips = Clips.of(tracks)
-        bones = body.bone_index(device=clips.points.device)
-        matrix = incidence(bones, body.num_joints, dtype=clips.points.dtype)
-        inverse = chain_inverse(matrix)
         rests, notes = zip(*(self._template(one, cameras) for one in tracks), strict=True)
         rest = torch.stack(rests)[:, None]  # (K, 1, N, 3)
         scale = padded([clip_scale(one, own) for one, own in zip(tracks, rests, strict=True)])
@@ -126,8 +144,27 @@ class KCS(Method):
             # A template has a frame of its own: turn it into the world, as it is seen over the whole clip.
             seen_from, _ = self._cameras(clips, rest, low, high, None)
             rest = rest @ nearest_rotation((known.mT @ seen_from).sum(1, keepdim=True)).mT
-        count, frames = scale.shape
-        rotations, scales = rest.new_zeros(count, frames, 3, 3), torch.zeros_like(scale)
+        found = self._alternate(clips, body, rest, low, high, known)
+        return self._estimates(clips, body, found, notes, mirror=cameras is None)
+
+    def _alternate(
+        self, clips: Clips, body: Skeleton, rest: Tensor, low: Tensor, high: Tensor, known: Tensor | None
+    ) -> _Found:
+        """Cameras and shape in turns, until each clip's cameras stand still.
+
+        Args:
+            clips: K of them.
+            body: their skeleton, in one piece.
+            rest: (K, 1, N, 3) templates.
+            low: (K, T) least weak-perspective scales.
+            high: (K, T) largest ones.
+            known: (1, T, 3, 3) cameras of a single clip, if they are known.
+        """
+        bones = body.bone_index(device=rest.device)
+        matrix = incidence(bones, body.num_joints, dtype=rest.dtype)
+        inverse = chain_inverse(matrix)
+        count, frames = low.shape
+        rotations, scales = rest.new_zeros(count, frames, 3, 3), torch.zeros_like(low)
         deviation = rest.new_zeros(count, frames, 3, len(bones))
         shape = rest + (deviation @ inverse.mT).mT
         converged = torch.zeros(count, dtype=torch.bool, device=rest.device)
@@ -153,19 +190,25 @@ class KCS(Method):
             live = live[~done]
             if not len(live):
                 break
-        mean = clips.mean(scales)[:, None]
-        points = mean[..., None, None] * shape @ rotations.mT
+        return _Found(shape, rotations, scales, converged, made)
+
+    def _estimates(
+        self, clips: Clips, body: Skeleton, found: _Found, notes: Sequence[tuple[str, ...]], *, mirror: bool
+    ) -> list[Estimate]:
+        """What was found in each clip; ``mirror``: a stand-in for the template may be the mirror image in depth."""
+        mean = clips.mean(found.scales)[:, None]
+        points, rotations = mean[..., None, None] * found.shape @ found.rotations.mT, found.rotations
         if self.bone_steps:
             kept = zip(clips.cut(points), clips.cut(clips.weights > 0), strict=True)
             points = padded([self._constant_bones(one, body, seen) for one, seen in kept])
         points = points - points.mean(-2, keepdim=True)
-        if cameras is None and any(notes):
+        if mirror and any(notes):
             stand_in = torch.tensor([bool(note) for note in notes], device=points.device)  # of either mirror image
             flip = torch.ones_like(points[:, :1, 0])
             flip[..., 2] = torch.where(stand_in, mirror_sign(points, body, clips.inside), 1)[:, None]
             points, rotations = points * flip[:, None], complete_rotation(rotations[..., :2, :] * flip[:, None])
-        each = [clips.cut(x) for x in (points, rotations[..., :2, :], scales / mean)]
-        ends = zip(*each, converged.tolist(), made.tolist(), notes, strict=True)
+        each = [clips.cut(x) for x in (points, rotations[..., :2, :], found.scales / mean)]
+        ends = zip(*each, found.converged.tolist(), found.made.tolist(), notes, strict=True)
         return [Estimate(x, rows, own, good, steps, note) for x, rows, own, good, steps, note in ends]
 
     def _template(self, tracks: Tracks, cameras: Tensor | None) -> tuple[Tensor, tuple[str, ...]]:
@@ -256,7 +299,3 @@ def _same(clips: Clips, before: Tensor, after: Tensor) -> Tensor:
     apart, mirrored = (clips.mean((after - x).square().sum((-2, -1))) for x in (before, before * flip))
     size = clips.mean(after.square().sum((-2, -1)))
     return torch.minimum(apart, mirrored) <= torch.finfo(after.dtype).eps * size
-
-
-CHECK = 5
-"""Steps from one look at whether a clip has settled to the next."""

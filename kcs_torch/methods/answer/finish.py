@@ -180,35 +180,27 @@ def _reconstruction(
     root: Tensor | None,
     remark: str,
 ) -> Reconstruction:
-    """One solution, whose place is known."""
+    """One solution, whose place is known.
+
+    Args:
+        method: that found it.
+        tracks: it was found in.
+        found: in normalised units.
+        size: of a unit of these in the tracks' units.
+        seconds: that it took.
+        points: (T, N, 3) in the tracks' units and place.
+        seen: (T, N, 2) their images.
+        pointlike: whether all joints lie at one point in every frame.
+        root: (T,) the root's path in depth, or None.
+        remark: on that path, for the user; may be empty.
+    """
     body = tracks.skeleton
     bones = bone_lengths(points, body.bone_index(device=points.device))
     variation = bone_variation(bones, body, tracks.seen.any(0))
     turn = float(viewpoint_turn(found.cameras))
-    notes = list(found.notes)
-    if little := little_turn(method, body, turn):
-        notes.append(little)
-    if found.doubt:
-        notes.append(found.doubt)
-    if not found.converged:
-        notes.append(method.unsettled(found.iterations))
-    if variation.median > LOOSE and not method.keeps_lengths:
-        notes.append(f"bone lengths vary by {variation.median:.1f} %: '{method.name}' does not hold them constant")
-    if upside_down(tracks.points[..., 1], tracks.seen, body, NEARLY_ALL):
-        notes.append(HEADSTAND)
-    elif lies_down(tracks.points, tracks.seen, body, NEARLY_ALL):
-        notes.append(LYING)
-    if cuts := cuts_of(tracks):
-        places = ", ".join(map(str, cuts[:SHOWN])) + (f" and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else "")
-        notes.append(f"the view jumps at frame {places}, {BY_SHOTS}")
+    notes = _notes_on_solution(method, tracks, found, turn, variation.median)
     notes += what_is_wrong(method, points, seen, tracks, found.converged, lengths=bones)
-    if not body.rigid:
-        kind = "no bones" if not body.num_bones else "no rigid bones"
-        notes.append(f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown")
-    if tracks.fps is None and method.reckons_in_seconds:
-        notes.append("30 frames a second assumed, as the rate is not known: give fps=... (kcs-torch: --fps)")
-    if pointlike:
-        notes.append("all joints lie at one point in every frame: there is no pose to find")
+    notes += _notes_on_tracks(method, tracks, pointlike)
     if remark:
         notes.append(remark)
     diagnostics = Diagnostics(
@@ -236,6 +228,40 @@ def _reconstruction(
         objective=found.objective,
         root_depth=root,
     )
+
+
+def _notes_on_solution(method: Method, tracks: Tracks, found: Estimate, turn: float, variation: float) -> list[str]:
+    """What is said of a solution: the viewpoint turns by so many degrees, and bones vary by so many per cent."""
+    notes = list(found.notes)
+    if little := little_turn(method, tracks.skeleton, turn):
+        notes.append(little)
+    if found.doubt:
+        notes.append(found.doubt)
+    if not found.converged:
+        notes.append(method.unsettled(found.iterations))
+    if variation > LOOSE and not method.keeps_lengths:
+        notes.append(f"bone lengths vary by {variation:.1f} %: '{method.name}' does not hold them constant")
+    if upside_down(tracks.points[..., 1], tracks.seen, tracks.skeleton, NEARLY_ALL):
+        notes.append(HEADSTAND)
+    elif lies_down(tracks.points, tracks.seen, tracks.skeleton, NEARLY_ALL):
+        notes.append(LYING)
+    if cuts := cuts_of(tracks):
+        places = ", ".join(map(str, cuts[:SHOWN])) + (f" and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else "")
+        notes.append(f"the view jumps at frame {places}, {BY_SHOTS}")
+    return notes
+
+
+def _notes_on_tracks(method: Method, tracks: Tracks, pointlike: bool) -> list[str]:
+    """What is said of tracks that tell a method less than others would."""
+    body, notes = tracks.skeleton, []
+    if not body.rigid:
+        kind = "no bones" if not body.num_bones else "no rigid bones"
+        notes.append(f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown")
+    if tracks.fps is None and method.reckons_in_seconds:
+        notes.append("30 frames a second assumed, as the rate is not known: give fps=... (kcs-torch: --fps)")
+    if pointlike:
+        notes.append("all joints lie at one point in every frame: there is no pose to find")
+    return notes
 
 
 def _guessed(deviation: Tensor, tracks: Tracks) -> Tensor:

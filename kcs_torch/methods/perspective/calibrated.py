@@ -101,13 +101,7 @@ def _reconstruct(
     """:func:`reconstruct_perspective` without autograd, on the tracks' device."""
     rate = tracks.rate
     rays = intrinsics.rays(tracks.points)
-    if bool(tracks.seen.any()) and float(rays[tracks.seen][:, :2].norm(dim=-1).median()) > WIDE:
-        warnings.warn(
-            f"{tracks.source}: half of all joints lie more than {math.degrees(math.atan(WIDE)):.0f} degrees off the "
-            f"optical axis: is the focal length {intrinsics.focal:g} in the tracks' unit ({tracks.units})?",
-            KcsWarning,
-            stacklevel=users_level(),
-        )
+    _warn_of_wide_rays(tracks, rays, intrinsics.focal)
     view = View.of(tracks, intrinsics, rate)
     distance = view.first_distance(tracks, rate)
     depth = torch.zeros_like(view.rays[..., 0])
@@ -153,6 +147,17 @@ def _reconstruct(
     if method.turns_over and exact and not best.flat:
         best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies))
     return _assemble(method, tracks, best)
+
+
+def _warn_of_wide_rays(tracks: Tracks, rays: Tensor, focal: float) -> None:
+    """Tell where a focal length makes rays (T, N, 3) lie so far off the optical axis that its unit seems wrong."""
+    if bool(tracks.seen.any()) and float(rays[tracks.seen][:, :2].norm(dim=-1).median()) > WIDE:
+        warnings.warn(
+            f"{tracks.source}: half of all joints lie more than {math.degrees(math.atan(WIDE)):.0f} degrees off the "
+            f"optical axis: is the focal length {focal:g} in the tracks' unit ({tracks.units})?",
+            KcsWarning,
+            stacklevel=users_level(),
+        )
 
 
 def feet_on_ground(tracks: Tracks, cameras: Tensor | None) -> Tensor | None:

@@ -156,7 +156,7 @@ def expect(now: ProcrusteanNormal, data: Image, level: Tensor, damping: Tensor) 
     pairs = covariance.view(clips, 3, joints, 3, joints).transpose(2, 3).reshape(clips, 9, -1)
     axes = torch.eye(3, dtype=mean.dtype, device=mean.device)
     spin = -torch.linalg.cross(axes[:, None].expand(3, 3, 3), axes[None].expand(3, 3, 3), dim=-1)  # (3, 3, 3)
-    eye, four = (torch.eye(n, dtype=mean.dtype, device=mean.device) for n in (size, 4))
+    eye = torch.eye(size, dtype=mean.dtype, device=mean.device)
     inner = torch.zeros_like(now.covariance)
     aligned, steps = mean.new_zeros(clips, frames, 3, joints), mean.new_zeros(clips, frames, 4)
     likelihood, miss = mean.new_zeros(2, clips, frames)
@@ -170,15 +170,9 @@ def expect(now: ProcrusteanNormal, data: Image, level: Tensor, damping: Tensor) 
         scale, here, damp = (x[some].reshape(chunk, 1, 1) for x in (now.scales, levels, dampings))
         even = bool((soft == soft[:, :1]).all())  # then nothing weighs a frame's image, and S has no translation
         camera = scale * turn[:, :2]  # (t, 2, 3)
-        rows, twice = camera.view(few, -1, 3), camera[:, :, None, :, None] * camera[:, None, :, None, :]
+        rows = camera.view(few, -1, 3)
         across = (rows @ covariance[clip]).view(chunk, size, three)  # P S
-        square = (twice.view(few, -1, 9) @ pairs[clip]).view(chunk, 2, 2, joints, joints)  # P S P^T
-        if even:
-            square = square * soft[:, :1, None, None, None].square()
-        else:
-            for _ in range(2):  # from both sides
-                square = freed(square * soft[:, None, None, None], axis[:, None, None]).mT
-        square = square.transpose(2, 3).reshape(chunk, size, size) + here * eye
+        square = _image_covariance(camera, pairs[clip], soft, axis, even) + here * eye
         factor, info = torch.linalg.cholesky_ex(square)
         whiten = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)  # G = L L^T, this is L^-1
         # Applied to an image as it is: weighed, without its translation, and white.
@@ -196,12 +190,8 @@ def expect(now: ProcrusteanNormal, data: Image, level: Tensor, damping: Tensor) 
         right = gain.view(chunk, size, 3, joints).transpose(1, 2).reshape(chunk, 3, -1)
         slope = pull @ posterior.mT - left @ right.mT
         ways = torch.cat([(scale[:, None] * (spin @ turn[:, None]))[:, :, :2], camera[:, None]], 1)  # (t, 4, 2, 3)
-        gradient = (slope[:, None] * ways).sum((2, 3))
         moves = free @ (ways.view(chunk, 8, 3) @ posterior).view(chunk, 4, size).mT
-        normal = moves.mT @ moves
-        normal = normal + (damp * normal + 1e-9) * four
-        solver, _ = torch.linalg.cholesky_ex(normal)
-        steps[some] = torch.cholesky_solve(gradient[..., None], solver).view(few, span, 4)
+        steps[some] = _gauss_newton((slope[:, None] * ways).sum((2, 3)), moves, damp).view(few, span, 4)
         miss[some] = ((whiten.mT @ white).square().sum((1, 2)) - whiten.square().sum((1, 2))).view(few, span)
         aligned[some] = posterior.view(few, span, 3, joints)
         flat = gain.view(few, -1, three)
@@ -217,6 +207,35 @@ def expect(now: ProcrusteanNormal, data: Image, level: Tensor, damping: Tensor) 
         steps,
         noise / data.count.sum(1).clamp_min(1),
     )
+
+
+def _image_covariance(camera: Tensor, pairs: Tensor, soft: Tensor, axis: Tensor, even: bool) -> Tensor:
+    """P S P^T (t, 2N, 2N) of weighed images without their translation.
+
+    Args:
+        camera: (t, 2, 3) the two rows of c R in each frame.
+        pairs: (k, 9, N N) covariances by pairs of axes, of the k clips that the frames belong to, as many to each.
+        soft: (t, N) square roots of the weights.
+        axis: (t, N) the same, of norm 1.
+        even: whether the weights of each frame are all the same; then S has no translation.
+    """
+    chunk, joints = soft.shape
+    twice = camera[:, :, None, :, None] * camera[:, None, :, None, :]
+    square = (twice.view(len(pairs), -1, 9) @ pairs).view(chunk, 2, 2, joints, joints)
+    if even:
+        square = square * soft[:, :1, None, None, None].square()
+    else:
+        for _ in range(2):  # from both sides
+            square = freed(square * soft[:, None, None, None], axis[:, None, None]).mT
+    return square.transpose(2, 3).reshape(chunk, 2 * joints, 2 * joints)
+
+
+def _gauss_newton(gradient: Tensor, moves: Tensor, damping: Tensor) -> Tensor:
+    """Steps (t, 4, 1) by gradients (t, 4), derivatives (t, 2N, 4) of white images and dampings (t, 1, 1)."""
+    normal = moves.mT @ moves
+    normal = normal + (damping * normal + 1e-9) * torch.eye(4, dtype=normal.dtype, device=normal.device)
+    solver, _ = torch.linalg.cholesky_ex(normal)
+    return torch.cholesky_solve(gradient[..., None], solver)
 
 
 def maximise(now: ProcrusteanNormal, found: Expectation, inside: Tensor) -> ProcrusteanNormal:
