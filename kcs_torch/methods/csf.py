@@ -21,6 +21,9 @@ FAINT = 2e-4
 RIDGE = 1e-9
 """Of the shapes' normal matrix, a share of its mean diagonal: before a camera that stands still it is singular."""
 
+MOST = 128
+"""Cosines, at most: a Gauss-Newton step solves a system of as many times K unknowns."""
+
 
 @dataclass(frozen=True)
 class CSF(Factorised):
@@ -62,7 +65,7 @@ class CSF(Factorised):
         self._expect(self.camera_rank >= 1, "camera_rank", "at least 1")
 
     def find_cameras(self, tracks: Tensor) -> Tensor:
-        """As PTA's."""
+        """Rows (T, 2, 3), found as PTA finds them."""
         return camera_rows(tracks, self.camera_rank)
 
     def find_shape(self, tracks: Tensor, weights: Tensor, cameras: Tensor) -> Solution[Tensor]:
@@ -83,10 +86,6 @@ class CSF(Factorised):
         over_time = basis @ fitted.value
         shapes = fit_basis_shapes(tracks, weights, cameras, over_time, cutoff=self.cutoff)
         return Solution(torch.einsum("tk,knj->tnj", over_time, shapes), fitted.converged, fitted.iterations)
-
-
-MOST = 128
-"""Cosines, at most: a Gauss-Newton step solves a system of as many times K unknowns."""
 
 
 def fit_column_space(

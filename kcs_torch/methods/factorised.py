@@ -30,6 +30,9 @@ EMPTY = 1e-6
 FILLED = 0.1
 """Weight of what completion put in place of an unseen joint, so that no system is singular."""
 
+SETTLED = 1e-3
+"""Share of the shape that the last step may change it by."""
+
 
 @dataclass(frozen=True)
 class Factorised(Method):
@@ -100,10 +103,6 @@ class Factorised(Method):
             Estimate(place_unseen(x, known, body), r, one, *end)
             for x, r, *end in zip(points, shown, settled, steps, strict=True)
         ]
-
-
-SETTLED = 1e-3
-"""Share of the shape that the last step may change it by."""
 
 
 def camera_rows(tracks: Tensor, rank: int, *, evenness: float = 1.0, num_steps: int = 150) -> Tensor:

@@ -26,6 +26,15 @@ __all__ = ["LocalRigidity", "rigid_pairs", "triangulation", "window_cameras"]
 CHUNK = 256
 """Windows that are factorised at once: more would only take memory."""
 
+BONES = 10.0
+"""How much more than staying in place keeping a distance weighs, in a step of the second fit."""
+
+BUMP = 0.3
+"""Added to the relaxation's Q in every direction, a share of its size."""
+
+RIDGE = 1e-3
+"""Of a triangulation, a share of its trace: depth that the window does not show is taken for small."""
+
 
 @dataclass(frozen=True)
 class LocalRigidity(Factorised):
@@ -100,10 +109,6 @@ class LocalRigidity(Factorised):
         )
 
 
-BONES = 10.0
-"""How much more than staying in place keeping a distance weighs, in a step of the second fit."""
-
-
 def window_cameras(tracks: Tensor, window: int) -> Tensor:
     """Return camera rows (T, 2, 3) from windows that are rigid each.
 
@@ -146,10 +151,6 @@ def _factorise(parts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     shapes = _solve((rows.mT @ rows).sum(1), back_project(parts, rows).sum(1))
     miss = (project(shapes[:, None], rows) - parts).square().mean((1, 2, 3))
     return rows, shapes, miss
-
-
-BUMP = 0.3
-"""Added to the relaxation's Q in every direction, a share of its size."""
 
 
 def triangulation(
@@ -207,7 +208,3 @@ def _solve(normal: Tensor, goal: Tensor) -> Tensor:
     if normal.ndim == goal.ndim:
         return torch.cholesky_solve(goal.mT, factor).mT
     return torch.cholesky_solve(goal[..., None], factor)[..., 0]
-
-
-RIDGE = 1e-3
-"""Of a triangulation, a share of its trace: depth that the window does not show is taken for small."""

@@ -34,6 +34,26 @@ from kcs_torch.types import Tracks
 
 __all__ = ["SfAM"]
 
+SEARCH, CHUNK = 32, 8
+"""Windows of a clip whose cameras are searched together; and windows beyond the first ones that are solved together:
+more would only take memory."""
+
+LEAD = 40
+"""Windows of a clip that are solved first, together: they tell the lengths of its bones, which the others take."""
+
+CHOSEN = 24
+"""Frames of a clip below which cameras are chosen by the shapes that come of them."""
+
+GRANTED = 0.005
+"""Variation of bones, a share of their lengths, that all cameras are granted where they are chosen."""
+
+TURNS = 45.0, 90.0
+"""Degrees that a window's viewpoint turns: up to the first the nuclear norm is the plain one, from the second on the
+reweighted."""
+
+SHORT = 10
+"""Frames from which on a constant angular velocity is looked for."""
+
 
 @dataclass(frozen=True)
 class SfAM(Method):
@@ -295,27 +315,6 @@ class SfAM(Method):
             degrees = float(torch.rad2deg(off[k]))
             notes[k] = (f"cameras follow a path of constant angular velocity (median deviation {degrees:.1f} degrees)",)
         return torch.where(even[:, None, None, None], path[..., :2, :], rows), notes
-
-
-SEARCH, CHUNK = 32, 8
-"""Windows of a clip whose cameras are searched together; and windows beyond the first ones that are solved together:
-more would only take memory."""
-
-LEAD = 40
-"""Windows of a clip that are solved first, together: they tell the lengths of its bones, which the others take."""
-
-CHOSEN = 24
-"""Frames of a clip below which cameras are chosen by the shapes that come of them."""
-
-GRANTED = 0.005
-"""Variation of bones, a share of their lengths, that all cameras are granted where they are chosen."""
-
-TURNS = 45.0, 90.0
-"""Degrees that a window's viewpoint turns: up to the first the nuclear norm is the plain one, from the second on the
-reweighted."""
-
-SHORT = 10
-"""Frames from which on a constant angular velocity is looked for."""
 
 
 def _join(

@@ -31,6 +31,9 @@ QUIET = 0.01
 """Root mean square of what an untrained network adds to the tracks, in units of the clip: not 0, as the depth 0 of all
 joints is a point where losses on bone lengths have no gradient."""
 
+LOG_RANGE = 4.0
+"""Largest logarithm of a camera's scale over the clip's."""
+
 
 class _Residual(nn.Module):
     """x + W2 act(W1 norm(x and its neighbours in time))."""
@@ -264,10 +267,6 @@ class CameraHead(_Network):
         rows = answer[..., :6].unflatten(-1, (2, 3)) + torch.eye(3, dtype=answer.dtype, device=answer.device)[:2]
         scale = known.scale[..., 0, 0] * answer[..., 6].clamp(-LOG_RANGE, LOG_RANGE).exp()
         return orthonormal_rows(rows).to(tracks.dtype), narrow(scale, tracks)
-
-
-LOG_RANGE = 4.0
-"""Largest logarithm of a camera's scale over the clip's."""
 
 
 def orthonormal_rows(rows: Tensor) -> Tensor:

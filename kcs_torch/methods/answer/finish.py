@@ -60,6 +60,9 @@ LYING = (
     "columns of an image are y and x), so that the body is mirrored, too; or the video is stored turned: turn them"
 )
 
+HARDLY = "the viewpoint turned by only"
+"""How a note begins that says how little the viewpoint turned."""
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -127,9 +130,6 @@ def finish(
         for i, (one, where) in enumerate(zip(every, placed, strict=True))
     ]
     return replace(results[0], alternatives=tuple(results[1:]))
-
-
-HARDLY = "the viewpoint turned by only"
 
 
 def little_turn(method: Method, body: Skeleton, turn: float) -> str:
