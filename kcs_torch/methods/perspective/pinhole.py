@@ -124,7 +124,18 @@ class PinholeEnergy:
     ) -> None:
         self.slow = 30.0 / rate  # more frames a second tell no more, and move less from one to the next
         self.skeleton, self.rate, self.known = skeleton, rate, lengths is not None
-        tree = self._lay_out(rays)
+        self.rays = rays.permute(2, 1, 0).contiguous()  # (2, N, T)
+        self.bones = skeleton.bone_index(device=rays.device)
+        n = skeleton.num_observed
+        observed = torch.eye(n, dtype=rays.dtype, device=rays.device)
+        complete = skeleton.complete(observed)[0].mT  # (No, N): virtual joints follow their sources
+        ends = incidence(self.bones, skeleton.num_joints, dtype=rays.dtype)  # (N, B)
+        tree = chain_inverse(ends)
+        self.seen = (complete @ ends).mT.contiguous()  # (B, No) bones of observed joints
+        lines = tree[:n].mT @ complete
+        self.lines = (lines - lines.mean(-1, keepdim=True)).mT.contiguous()  # (N, B)
+        self.outer = ends.clamp_min(0)  # (N, B) of bones' far ends
+        self.toward = self.rays[:, self.bones[:, 1]]  # (2, B, T) their rays
         path = distance.expand(len(depth), -1)
         wide = torch.ones_like(depth[:, 0, 0]) if focal is None else 1 / focal[0]
         self.free = None if focal is None else focal[1]
@@ -142,9 +153,9 @@ class PinholeEnergy:
         waves = waves * math.sqrt(len(rays))
         self.waves = waves if self.known else waves[:, 1:]  # (T, K)
         self.rough = (ROOT * self.slow**2) ** -2
-        image = self._imaged(self._far(self.depth, self.path, self.wide)[0])
         self.model: Objective | None = None
         self.body: ObjectiveGradient | PlainBody
+        image = self._imaged(self._far(self.depth, self.path, self.wide)[0])
         if has_trunk(skeleton):
             flat = (tree @ image[0]).permute(2, 1, 0)  # (T, N, 2), centred
             weights = at_pace(Weights(), rate, pace_of(flat, skeleton, rate))
@@ -156,22 +167,6 @@ class PinholeEnergy:
             self.body = PlainBody(skeleton, self.own, slack, self.slow)
         self.shear, self.drift, self.lean, self.scale = coordinates(self, image)
         self.start = torch.zeros_like(self.scale)
-
-    def _lay_out(self, rays: Tensor) -> Tensor:
-        """Bones, their rays of all (T, N, 2), and the maps between joints and bones; returns that from bones (N, B)."""
-        self.rays = rays.permute(2, 1, 0).contiguous()  # (2, N, T)
-        self.bones = self.skeleton.bone_index(device=rays.device)
-        n = self.skeleton.num_observed
-        observed = torch.eye(n, dtype=rays.dtype, device=rays.device)
-        complete = self.skeleton.complete(observed)[0].mT  # (No, N): virtual joints follow their sources
-        ends = incidence(self.bones, self.skeleton.num_joints, dtype=rays.dtype)  # (N, B)
-        tree = chain_inverse(ends)
-        self.seen = (complete @ ends).mT.contiguous()  # (B, No) bones of observed joints
-        lines = tree[:n].mT @ complete
-        self.lines = (lines - lines.mean(-1, keepdim=True)).mT.contiguous()  # (N, B)
-        self.outer = ends.clamp_min(0)  # (N, B) of bones' far ends
-        self.toward = self.rays[:, self.bones[:, 1]]  # (2, B, T) their rays
-        return tree
 
     def rows(self, index: Tensor) -> PinholeEnergy:
         """That of some hypotheses."""
