@@ -35,6 +35,9 @@ TOP, KEEP = 12, 4
 TIMES = 8
 """How often the best changes one bone's path at most."""
 
+ALIGNED = 32
+"""Changes of one bone that are aligned anew: those that cost least as the body lies."""
+
 FEW, MANY = (8, TOP, KEEP), (4, 2, 1)
 """For bodies of few bones and of many: changes that are settled each time, and how many of them go on after the first
 stage and after the second."""
@@ -90,7 +93,8 @@ class Assembly:
             best, depth = self.value(pose)[0], self._changes(pose)
             if not len(depth):
                 break
-            tried = self._placed(depth, pose.rotations[:1], 2)
+            likely = self.value(self._placed(depth, pose.rotations[:1], 0)).argsort()[:ALIGNED]
+            tried = self._placed(depth[likely], pose.rotations[:1], 2)
             tried = yield from self._settled(tried[self.value(tried).argsort()[: kept[0]]], *kept[1:])
             if not bool(self.value(tried)[0] < best - GAIN):
                 break
