@@ -9,7 +9,17 @@ import kcs_torch as kt
 from kcs_torch.data import walking_person
 from kcs_torch.functional.align import similarity
 from kcs_torch.methods.pkc.cleaning import MANY
-from kcs_torch.methods.pkc.gate import HELD, SELDOM, elsewhere, plausible, repeats, without_others, without_repeats
+from kcs_torch.methods.pkc.gate import (
+    HELD,
+    SELDOM,
+    at_border,
+    elsewhere,
+    plausible,
+    repeats,
+    without_border,
+    without_others,
+    without_repeats,
+)
 from kcs_torch.skeleton import SKELETONS
 
 BODY = SKELETONS["h36m17"]
@@ -221,3 +231,48 @@ def test_somebody_elses_frames_do_not_spoil_a_clip():
     result = kt.reconstruct(tracks)
     assert left.notes[-1] in result.tracks.notes
     assert float(kt.metrics.mpjpe(result.points[own], clip.points[own], align="rigid")) < 10
+
+
+def cut_off(points, at=0.1):
+    """Points below a line put onto it, and which those are; the upper body stays."""
+    low = points[..., 1].quantile(1 - at)
+    return torch.cat([points[..., :1], points[..., 1:].clamp_max(low)], -1), points[..., 1] >= low
+
+
+@pytest.mark.parametrize("grid", [0, 1], ids=["fine", "whole pixels"])
+@pytest.mark.parametrize("turn", [False, True])
+def test_joints_on_the_border_are_found(grid, turn):
+    points, seen = walk(60)
+    points = points / 3 + 5 * torch.arange(60)[:, None, None]  # who walks through the image
+    points, out = cut_off(points.round() if grid else points)
+    if turn:
+        points = -points.flip(-1)
+    assert torch.equal(at_border(points, seen), out)
+    seen[:, ANKLE] = False
+    assert torch.equal(at_border(points, seen), out & seen)
+
+
+def test_what_is_no_border():
+    points, seen = walk(60)
+    for some in (points, (points / 3).round(), (points[:1] / 3).round().expand(60, -1, -1), points * 0, points[:0]):
+        assert not at_border(some, seen[: len(some)]).any()
+    assert not at_border(torch.stack([points[..., 0], 0 * points[..., 0]], -1), seen).any()  # all on one line
+    floor = points.clone()
+    floor[:, [ANKLE], 1] = floor[..., 1].max() + 1  # a foot that slides over it
+    assert at_border(floor, seen).any()
+    assert not at_border(floor, seen, [ANKLE]).any()
+
+
+def test_joints_on_the_border_are_as_good_as_unseen():
+    clip = walking_person(60, yaw=20.0, turn=0.0)
+    rising = clip.tracks.points - 600 * torch.linspace(0, 1, 60)[:, None, None] * torch.tensor([0, 1])
+    points, out = cut_off(rising, 0.2)
+    tracks = replace(clip.tracks, points=points)
+    assert without_border(clip.tracks) is clip.tracks
+    nobody = replace(tracks, weights=tracks.weights * out)  # then there is nothing else
+    assert without_border(nobody) is nobody
+    with pytest.warns(kt.KcsWarning, match="never seen.*: right_ankle, left_ankle$"):
+        result = kt.reconstruct(tracks)
+    said = f"{int(out.sum())} of 1020 (20 %) detections lie on the image's border"
+    assert any(note.startswith(said) for note in result.tracks.notes)
+    assert float(kt.metrics.mpjpe(result.points, clip.points, align="rigid")) < 60  # mm; 129 where they count

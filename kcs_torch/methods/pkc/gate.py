@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -11,7 +13,7 @@ from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
-__all__ = ["elsewhere", "plausible", "repeats", "without_others", "without_repeats"]
+__all__ = ["at_border", "elsewhere", "plausible", "repeats", "without_border", "without_others", "without_repeats"]
 
 LONG = 2.0
 """An image longer than so many usual lengths is no bone's."""
@@ -38,6 +40,53 @@ clip at most."""
 OFTEN, HELD, MOVED = 0.12, 6, 0.002
 """Frames that repeat the one before are a slower camera's if this share of all does, no more than so many on end, and
 if most joints move by this share of the body's size where they move: those of somebody who stands still are not."""
+
+CROWDED = 5
+"""An outermost line of the tracks is the image's border where so many times as many places lie on it as on any other:
+of whole pixels some share a line, of finer ones none."""
+
+
+def at_border(points: Tensor, seen: Tensor, feet: Sequence[int] = ()) -> Tensor:
+    """Detections (T, N) that lie on the image's border, where a detector puts joints that are outside.
+
+    The border is not known: it is an outermost row or column on which many places lie that differ. Feet alone may stand
+    on a floor.
+
+    Args:
+        points: (T, N, 2).
+        seen: (T, N) bool.
+        feet: joints that touch the ground.
+    """
+    out = torch.zeros_like(seen)
+    above = seen.new_ones(seen.shape[1])
+    above[list(feet)] = False
+    for axis in (0, 1) if bool(seen.any()) else ():
+        place = points[seen].roll(axis, -1)  # (K, 2), first across the border
+        ends = place[:, 0].aminmax()
+        if max(int((place[:, 0] == end).sum()) for end in ends) < CROWDED:
+            continue
+        lines, crowd = place.unique(dim=0)[:, 0].unique(return_counts=True)
+        if len(lines) < 3:
+            continue
+        for end in (0, -1):
+            on = seen & (points[..., axis] == lines[end])
+            if bool(crowd[end] >= CROWDED * crowd[1:-1].amax()) and bool((on & above).any()):
+                out |= on
+    return out
+
+
+def without_border(tracks: Tracks) -> Tracks:
+    """Tracks in which joints :func:`at_border` are unseen; a note says how many."""
+    count = tracks.skeleton.num_observed
+    seen = tracks.seen[:, :count]
+    on = at_border(tracks.points[:, :count], seen, [joint for joint in tracks.skeleton.contacts if joint < count])
+    if not bool(on.any()) or not bool((seen & ~on).any()):
+        return tracks
+    weights = torch.where(on, 0, tracks.weights[:, :count])
+    which = f"{share(int(on.sum()), int(seen.sum()))} detections lie on the image's border"
+    return rebuilt(
+        tracks, tracks.points[:, :count], weights, f"{which}: taken as unseen, as joints outside are put there"
+    )
 
 
 def repeats(points: Tensor, seen: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ from kcs_torch.methods.pkc.body import Body, Turned
 from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.fixed_answer import from_hypotheses
 from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of, usual_noise
-from kcs_torch.methods.pkc.gate import without_others, without_repeats
+from kcs_torch.methods.pkc.gate import without_border, without_others, without_repeats
 from kcs_torch.methods.pkc.held import with_lengths_held
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.limbs import outward
@@ -76,9 +76,10 @@ class PKC(Method):
     Args:
         viewpoint: "fixed" lifts by the template, "moving" by the viewpoint's turn; "auto" by the template if there is
             one, and by both where the trunk turns. Known cameras tell the sign of depth, and rank solutions.
-        denoise: first leave out frames in which the whole body leaps away, to somebody else, and back; swap left and
-            right back where a detector mistakes them (:func:`kcs_torch.clean.unswap`); smooth noisy tracks, fill gaps
-            and reject outliers (:func:`kcs_torch.solvers.denoise_tracks`).
+        denoise: first leave out joints on the image's border, where some detectors put those outside, and frames in
+            which the whole body leaps away, to somebody else, and back; swap left and right back where a detector
+            mistakes them (:func:`kcs_torch.clean.unswap`); smooth noisy tracks, fill gaps and reject outliers
+            (:func:`kcs_torch.solvers.denoise_tracks`).
         lifts: random starts of the moving viewpoint's solver, for skeletons without a template.
         rounds: of discrete moves of the fixed viewpoint's solver; with 0 gaps stay as each joint's own path fills them,
             too. Nothing without a template.
@@ -119,7 +120,7 @@ class PKC(Method):
         return has_trunk(skeleton)
 
     def prepared(self, tracks: Tracks) -> Tracks:
-        tracks = unswap(without_others(without_repeats(tracks))) if self.denoise else tracks
+        tracks = unswap(without_others(without_repeats(without_border(tracks)))) if self.denoise else tracks
         told = self.detections
         if told is None and self.denoise and not detected(tracks) and found_by_detector(tracks):
             told = True
