@@ -458,7 +458,25 @@ def test_no_angle_is_blamed_where_all_are_small(monkeypatch):
         kt.reconstruct(tracks, intrinsics=LENS)
 
 
+def test_what_settles_is_what_is_found_along_rays(monkeypatch):
+    tracks, _ = filmed(frames=30)
+    given = {"method": "pkc", "intrinsics": LENS, "rounds": 0}
+    found = reconstruct(tracks, steps=3, **given).diagnostics  # three steps of parallel rays never settle
+    assert found.converged and not any("did not settle" in note for note in found.notes)
+    real = perspective.refine
+
+    def moving(*given, **options):
+        found = real(*given, **options)
+        found.bodies.moved[:] = 0.02
+        return found
+
+    monkeypatch.setattr(perspective, "refine", moving)
+    found = reconstruct(tracks, **given).diagnostics
+    assert not found.converged and "pkc did not settle within 60 steps" in found.notes
+
+
 @pytest.mark.filterwarnings("ignore:.*a principal point at .* is the image's corner")
+@pytest.mark.filterwarnings("ignore::kcs_torch.errors.ConvergenceWarning")
 def test_a_focal_length_in_another_unit_is_told():
     with pytest.warns(kt.KcsWarning, match=r"focal length 120 in the tracks' unit \(px\)"):
         kt.reconstruct(filmed(frames=5)[0], method="kcs", intrinsics=(120, 120, 0, 0))

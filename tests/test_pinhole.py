@@ -93,7 +93,7 @@ def test_energy_of_a_person_is_that_of_pkc_for_the_straightened_image():
     ends = skeleton.bone_index()[:, 1]
     deep = bones[..., 2] + (rays[:, ends] * bones[..., :2]).sum(-1)  # along the rays of their outer ends
     terms["foreshortening"] = alike.foreshortening.each(deep[None], lengths, energy.model.clear, alike.noise).sum()
-    far_off = (path[..., None] + z)[0][:, ends] / far.mean()
+    far_off = (path[..., None] + z)[0][:, ends] * energy.size
     near = 2 * (alike.independent * far_off.log()).sum()  # an image at half the distance is four times as likely
     assert_close(energy(state)[0], (sum(terms.values()) + slip + rest - near).reshape(1))
 
@@ -101,10 +101,10 @@ def test_energy_of_a_person_is_that_of_pkc_for_the_straightened_image():
 def test_images_say_nothing_for_a_small_body_near_by():
     """What foreshortening costs is the same for a body of any size whose image is the same."""
     skeleton, rays, depth, far, lengths = walk(20)
-    energy = PinholeEnergy(skeleton, rays, far, depth[None], 30.0, level(rays))
     costs = []
     for size in (1.0, 0.5):
         z, path, own = size * depth[None], size * far[None], size * lengths[None]
+        energy = PinholeEnergy(skeleton, rays, path[0], z, 30.0, level(rays))  # wherever the search starts
         near = (path[..., None] + z).mT
         bones = bone_vectors(depth[None, ..., None], skeleton.bone_index())[..., 0] * size
         costs.append(energy.model.foreshortening.each(bones, own, energy.model.clear).sum((1, 2)))
@@ -121,7 +121,7 @@ def test_images_are_as_likely_as_directions_drawn_evenly_make_them(wide):
     energy.model.foreshortening.eps, bones = 0.0, skeleton.bone_index()
     laid = energy._laid(energy.start + 0.1 * normal(*energy.start.shape))
     wide = laid.wide[0]
-    near = energy._nearness(laid.far, torch.zeros_like(laid.far)) + 2 * (energy.share * far.mean().log()).sum()
+    near = energy._nearness(laid.far, torch.zeros_like(laid.far)) - 2 * (energy.share * energy.size.log()).sum()
     deep = laid.own + (energy.toward * wide * laid.image).sum(1)
     found = energy.model.foreshortening.each(deep.mT, laid.lengths, energy.model.clear).sum() - near
     ahead = laid.path[0] / wide + laid.depth[0]  # (N, T) along the optical axis

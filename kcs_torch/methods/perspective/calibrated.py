@@ -19,7 +19,7 @@ from kcs_torch.methods.answer.root import ABSENT, FOUND, standing_feet
 from kcs_torch.methods.answer.wrong import WHY_LOOSE, what_is_wrong
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.perspective.refining import Found, refine, refine_again, seen_along
-from kcs_torch.methods.perspective.scene import BLOCK, ahead
+from kcs_torch.methods.perspective.scene import BLOCK, GAIN, ahead
 from kcs_torch.methods.perspective.view import View, lens_note, zoomed
 from kcs_torch.methods.pkc.near import SEEMS_NEAR
 from kcs_torch.methods.sfam import SfAM
@@ -135,7 +135,7 @@ def _reconstruct(
             soft = soft - 1 if sound and moved >= SETTLED else 0
             continue
         rounds -= 1
-        better = best is None or bool(bodies.energy[0] < best.bodies.energy[0])
+        better = best is None or bool(bodies.energy[0] < best.bodies.energy[0] - GAIN)
         if better:
             best = found
         if moved < SETTLED or not sound or not better or found.flat:
@@ -226,6 +226,8 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
     facts = replace(
         lifted.diagnostics,
         viewpoint_turn=turn,
+        converged=found.settled(k),
+        iterations=found.steps,
         reprojection_rms=float(off.square().sum(-1).mean().sqrt()),
         notes=tuple(notes),
         doubt="" if k else doubt,
@@ -255,9 +257,9 @@ def _notes_on_best(
     notes = [
         note for note in found.notes if not note.startswith((ABSENT, FOUND)) and not any(part in note for part in stale)
     ]
-    before = found.lifted[int(found.bodies.origin[0])].diagnostics
-    if not before.converged:
-        notes.append(method.unsettled(before.iterations))
+    settled = found.settled(0)
+    if not settled:
+        notes.append(method.unsettled(found.steps))
     if little := little_turn(method, tracks.skeleton, turn):
         notes.append(little)
-    return [*notes, *what_is_wrong(method, points, images, tracks, before.converged)]
+    return [*notes, *what_is_wrong(method, points, images, tracks, settled)]

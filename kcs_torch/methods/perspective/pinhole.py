@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.spectral import dct_basis
 from kcs_torch.methods.perspective.pinhole_coordinates import FIRM, STRAY, USUAL, coordinates
@@ -125,6 +126,8 @@ class PinholeEnergy:
         self.slow = 30.0 / rate  # more frames a second tell no more, and move less from one to the next
         self.skeleton, self.rate, self.known = skeleton, rate, lengths is not None
         self.rays = rays.permute(2, 1, 0).contiguous()  # (2, N, T)
+        spread = (rays - rays.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()
+        self.size = or_one(spread)  # of images, wherever the start is
         self.bones = skeleton.bone_index(device=rays.device)
         n = skeleton.num_observed
         observed = torch.eye(n, dtype=rays.dtype, device=rays.device)
@@ -283,11 +286,12 @@ class PinholeEnergy:
 
         A direction drawn evenly has an image of density 1 / (2 pi L |d|) under parallel rays. With a bone b whose outer
         end is at the distance s along the optical axis, on the ray r = (u, v, 1), it is s^2 / (2 pi L |b . r|): without
-        s^2 a body would cost less for being small, and near to the camera. The slope is taken from ``pull``.
+        s^2 a body would cost less for being small, and near to the camera. Images are measured by the body's, so that
+        energies of other starts, and of other focal lengths, compare. The slope is taken from ``pull``.
         """
         ends = self.outer.mT @ far
         pull -= self.outer @ (2 * self.share / ends)
-        return 2 * (self.share * (ends / self.path.mean(-1)[:, None, None]).log()).sum((1, 2))
+        return 2 * (self.share * (ends * self.size).log()).sum((1, 2))
 
     @property
     def sizes(self) -> list[int]:

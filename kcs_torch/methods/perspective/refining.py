@@ -11,9 +11,10 @@ from torch import Tensor
 from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.inference import undifferentiated
 from kcs_torch.methods.perspective.parallel_image import body_unit, clean_image, image_noise
-from kcs_torch.methods.perspective.scene import Bodies, Scene, ahead
+from kcs_torch.methods.perspective.scene import STEPS, Bodies, Scene, ahead
 from kcs_torch.methods.perspective.view import View, slow_part
 from kcs_torch.methods.pkc.limbs import outward
+from kcs_torch.methods.pkc.moving_answer import STILL
 from kcs_torch.types import Reconstruction, Tracks
 
 __all__ = ["Found", "refine", "refine_again", "seen_along"]
@@ -46,6 +47,17 @@ class Found:
     flat: bool
     notes: tuple[str, ...] = ()
     through: float | None = None
+
+    def settled(self, k: int) -> bool:
+        """Whether solution number ``k`` has settled: along rays, whatever it did before."""
+        if self.flat:
+            return self.lifted[int(self.bodies.origin[k])].diagnostics.converged
+        return bool(self.bodies.moved[k] <= STILL)
+
+    @property
+    def steps(self) -> int:
+        """Steps of the refinement that made the solutions what they are."""
+        return self.lifted[0].diagnostics.iterations if self.flat else STEPS
 
 
 def seen_along(view: View, lifted: Reconstruction, distance: Tensor, straight: Tracks) -> Reconstruction:
@@ -107,7 +119,7 @@ def refine(
         energy = start.new_tensor([o.objective for o in others])
         number = torch.arange(len(start), device=start.device)
         far = (distance / lifted.scales).expand(len(start), -1)
-        bodies = Bodies(start, far, energy, number, torch.ones_like(energy))
+        bodies = Bodies(start, far, energy, number, torch.ones_like(energy), torch.zeros_like(energy))
         return Found(bodies, others, scene, view, True, lifted.diagnostics.notes)
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])

@@ -27,7 +27,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.solvers.lm import fit_bones
 
-__all__ = ["BLOCK", "STEPS", "Bodies", "Scene", "ahead"]
+__all__ = ["BLOCK", "GAIN", "STEPS", "Bodies", "Scene", "ahead"]
 
 BLOCK, OVERLAP = 2000, 100
 """Frames of a long clip that are refined together, at most, and by how many blocks overlap."""
@@ -39,7 +39,7 @@ FLIPS = 8
 """How often flips are tried at most."""
 
 FEW, GAIN = 3, 1.0
-"""How many flips are refined well, and how much cheaper than the best a body must be to be taken."""
+"""How many flips are refined well, and how much cheaper than the best a body must be to be taken, a flip or not."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,7 @@ class Bodies:
         energy: (H,).
         origin: (H,) number of the start that each came from.
         focal: (H,) focal length, over that of the rays: of a longer one rays are narrower.
+        moved: (H,) root mean square change of depths in the last ten steps, for a body of 1.75.
     """
 
     depth: Tensor
@@ -59,6 +60,7 @@ class Bodies:
     energy: Tensor
     origin: Tensor
     focal: Tensor
+    moved: Tensor
 
     def __getitem__(self, index: Tensor | slice) -> Bodies:
         return Bodies(*(value[index] for value in vars(self).values()))
@@ -114,7 +116,7 @@ class Scene:
         lively = image.diff(dim=-1).square().sum((1, 2))
         z = depth.new_empty(len(begins), size, *depth[:, 0].shape)
         far = depth.new_empty(len(begins), size, len(depth))
-        energy, lengths = depth.new_zeros(len(depth)), None
+        energy, moved, lengths = depth.new_zeros(len(depth)), depth.new_zeros(len(depth)), None
         for i in median(lively, -1).argsort(descending=True).tolist() if len(begins) > 1 else [0]:
             some = slice(begins[i], begins[i] + size)
             feet = None if self.standing is None else self.standing[some]
@@ -124,19 +126,20 @@ class Scene:
                 lengths, feet, lens if self.any_focal else None,
             )  # fmt: skip
             solution = lbfgs(pinhole, pinhole.start, num_steps=steps, tolerance=1e-6, slopes=True, part=pinhole.rows)
+            assert solution.energy is not None and solution.before is not None
             with torch.no_grad():
-                body = pinhole.unpack(solution.value)
-            assert solution.energy is not None
+                body, before = pinhole.unpack(solution.value), pinhole.unpack(solution.before)
             if lengths is None:
                 lengths, focal = body.lengths, body.focal
             energy = energy + solution.energy
+            moved = moved + (body.depth - before.depth).square().mean((1, 2)) / len(begins)
             middle = body.depth.mean(-1, keepdim=True)
             z[i] = ((body.depth - middle) * self.unit).transpose(0, 1)
             far[i] = ((body.distance + middle[..., 0]) * self.unit).mT
         z, far = (x[0] if len(begins) == 1 else blend_windows(x, begins, frames) for x in (z, far))
         order = energy.argsort()
         number = torch.arange(len(energy), device=z.device)
-        return Bodies(z.transpose(0, 1), far.mT, energy, number, focal)[order]
+        return Bodies(z.transpose(0, 1), far.mT, energy, number, focal, moved.sqrt())[order]
 
     def turned_over(self, found: Bodies) -> Bodies:
         """Bodies, best first, whose best one no flip of a run of its signs makes better.
