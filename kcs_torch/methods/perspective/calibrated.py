@@ -135,7 +135,8 @@ def _reconstruct(
             soft = soft - 1 if sound and moved >= SETTLED else 0
             continue
         rounds -= 1
-        better = best is None or bool(bodies.energy[0] < best.bodies.energy[0] - GAIN)
+        gain = 0.0 if any_focal else GAIN  # what goes on from the best one is better by whatever it gains
+        better = best is None or bool(bodies.energy[0] < best.bodies.energy[0] - gain)
         if better:
             best = found
         if moved < SETTLED or not sound or not better or found.flat:
