@@ -202,7 +202,7 @@ def test_body_off_the_optical_axis(method):
 def test_a_very_long_focal_length_changes_nothing(method):
     clip = kt.data.walking_person(20, turn=60)
     lens = (1e8, 1e8, 0.0, 0.0)
-    plain = kt.METHODS[method]().following()(clip.tracks)  # a virtual camera follows the body
+    plain = kt.METHODS[method]().following(searched=False)(clip.tracks)  # a virtual camera follows the body
     result = reconstruct(clip.tracks, method=method, intrinsics=lens)
     check_sound(result)
     middle = lambda x: x - x.mean(1, keepdim=True)  # noqa: E731
@@ -456,6 +456,14 @@ def test_no_angle_is_blamed_where_all_are_small(monkeypatch):
     monkeypatch.setattr(sys.modules["kcs_torch.reconstruct"], "reconstruct_perspective", lambda *given: lost)
     with pytest.raises(kt.OptionError, match="no finite motion.*'parallel'"):
         kt.reconstruct(tracks, intrinsics=LENS)
+
+
+def test_the_first_round_searches_in_full(monkeypatch):
+    """Its tracks agree with no depths yet; those of later rounds would confirm what straightened them."""
+    asked, real = [], kt.PKC.following
+    monkeypatch.setattr(kt.PKC, "following", lambda self, searched: asked.append(searched) or real(self, searched))
+    reconstruct(filmed(frames=20)[0], method="pkc", intrinsics=LENS)
+    assert asked[:2] == [False, True] and all(asked[1:])
 
 
 def test_what_settles_is_what_is_found_along_rays(monkeypatch):

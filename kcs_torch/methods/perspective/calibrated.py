@@ -120,8 +120,8 @@ def _reconstruct(
             straight = _straighten(tracks, view.rays, distance, depth)
             if lifted is not None:
                 made = seen_along(view, lifted, distance, straight)
-            else:
-                step = SfAM() if soft else method.following(tracks.num_frames <= BLOCK)
+            else:  # the tracks of the first round agree with no depths yet: there the method may find signs by itself
+                step = SfAM() if soft else method.following(best is not None and tracks.num_frames <= BLOCK)
                 made = _lift(step, straight, view, cameras)
             given = made, view, distance, depth, rate, feet, unit
             flips = method.turns_over and not any_focal  # else a guess is confirmed
