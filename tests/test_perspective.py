@@ -471,14 +471,14 @@ def test_what_settles_is_what_is_found_along_rays(monkeypatch):
     given = {"method": "pkc", "intrinsics": LENS, "rounds": 0}
     found = reconstruct(tracks, steps=3, **given).diagnostics  # three steps of parallel rays never settle
     assert found.converged and not any("did not settle" in note for note in found.notes)
-    real = perspective.refine
+    real = calibrated.refine
 
     def moving(*given, **options):
         found = real(*given, **options)
         found.bodies.moved[:] = 0.02
         return found
 
-    monkeypatch.setattr(perspective, "refine", moving)
+    monkeypatch.setattr(calibrated, "refine", moving)
     found = reconstruct(tracks, **given).diagnostics
     assert not found.converged and "pkc did not settle within 60 steps" in found.notes
 
