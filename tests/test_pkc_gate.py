@@ -258,9 +258,15 @@ def test_what_is_no_border():
         assert not at_border(some, seen[: len(some)]).any()
     assert not at_border(torch.stack([points[..., 0], 0 * points[..., 0]], -1), seen).any()  # all on one line
     floor = points.clone()
-    floor[:, [ANKLE], 1] = floor[..., 1].max() + 1  # a foot that slides over it
+    floor[10:50, ANKLE, 1] = floor[..., 1].max() + 1  # a foot that slides over it
     assert at_border(floor, seen).any()
     assert not at_border(floor, seen, [ANKLE]).any()
+    rail = points.clone()
+    rail[:, WRIST, 1] = rail[..., 1].max() + 1  # on which a hand slides
+    low, high = points.amin(1, keepdim=True), points.amax(1, keepdim=True)
+    boxed = (points - low) / (high - low).amax(-1, keepdim=True)  # each frame scaled to a box
+    for some in (rail, boxed):
+        assert not at_border(some, seen).any()
 
 
 def test_joints_on_the_border_are_as_good_as_unseen():

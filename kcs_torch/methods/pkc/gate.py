@@ -50,7 +50,8 @@ def at_border(points: Tensor, seen: Tensor, feet: Sequence[int] = ()) -> Tensor:
     """Detections (T, N) that lie on the image's border, where a detector puts joints that are outside.
 
     The border is not known: it is an outermost row or column on which many places lie that differ. Feet alone may stand
-    on a floor.
+    on a floor; and a line on which one joint lies in every frame is the box around a body that was scaled to it, or a
+    rail.
 
     Args:
         points: (T, N, 2).
@@ -70,7 +71,8 @@ def at_border(points: Tensor, seen: Tensor, feet: Sequence[int] = ()) -> Tensor:
             continue
         for end in (0, -1):
             on = seen & (points[..., axis] == lines[end])
-            if bool(crowd[end] >= CROWDED * crowd[1:-1].amax()) and bool((on & above).any()):
+            boxed = bool((on.sum(1) == 1)[seen.any(1)].all())
+            if bool(crowd[end] >= CROWDED * crowd[1:-1].amax()) and bool((on & above).any()) and not boxed:
                 out |= on
     return out
 
