@@ -52,6 +52,10 @@ class Counter(TorchDispatchMode):
         self.calls, self.matrix, self.other, self.bytes = 0, 0.0, 0, 0
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        with self:  # in inference mode compositions come whole
+            out = function.decompose(*args, **(kwargs or {}))
+        if out is not NotImplemented:
+            return out
         out = function(*args, **(kwargs or {}))
         name = function.overloadpacket.__name__
         if name in VIEWS:

@@ -124,14 +124,21 @@ def test_folders_that_are_not_there_are_told(root, tmp_path, words, told):
     assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr
 
 
-def test_counts_of_operations(root, tmp_path, capsys):
-    """By hand for one product and one sum; and a row for each method and camera."""
+@pytest.mark.parametrize("inference", [False, True])
+def test_counts_of_one_product_and_one_sum(root, inference):
+    """By hand; in inference mode, in which methods run, too."""
     script = runpy.run_path(str(root / "scripts" / "counts.py"))
-    left, right = normal(4, 3, 5), normal(4, 5, 2)
-    with script["Counter"]() as made:
-        (left @ right).mT.add(1)
+    with torch.inference_mode(inference):
+        left, right = normal(4, 3, 5), normal(4, 5, 2)
+        with script["Counter"]() as made:
+            (left @ right).mT.add(1)
     assert (made.calls, made.matrix, made.other) == (2, 2 * 4 * 3 * 5 * 2, 24)
     assert made.bytes == 8 * (60 + 40 + 24) + 8 * (24 + 24)
+
+
+def test_counts_of_operations(root, tmp_path, capsys):
+    """A row for each method and camera."""
+    script = runpy.run_path(str(root / "scripts" / "counts.py"))
     table = tmp_path / "made" / "counts.csv"
     script["main"](["--methods", "kcs", "sfam", "--frames", "12", "--csv", str(table)])
     with table.open(newline="", encoding="utf-8") as file:
