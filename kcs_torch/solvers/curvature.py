@@ -78,9 +78,6 @@ def whitening(
 ) -> Tensor:
     """Return roots (H, T, D, D) of the inverse of each frame's Hessian, of lengths and log-determinants.
 
-    Where tracks are noisy they come in single precision. Any roots give the same minimum, these are the largest thing
-    that a descent reads, and what they round away is far below the noise.
-
     Args:
         points: (H, T, N, 3).
         rotations: (H, T, 3, 3).
@@ -107,7 +104,7 @@ def whitening(
         spread = off.square().sum(-2) / counts[:, None]
     pull = stiffness * (1 / (spread + slack**2) - 1 / (spread + (REACH * slack) ** 2))
     size = free * joints + 3
-    out = points.new_empty(hypotheses, frames, size, size, dtype=None if precision is None else torch.float32)
+    out = points.new_empty(hypotheses, frames, size, size)
     run = max(1, RUN // (max(hypotheses, 1) * size**2))
     for part in (slice(first, first + run) for first in range(0, frames, run)):
         curvature = frame_curvature(points[:, part], rotations[:, part], bones, inverse, free)

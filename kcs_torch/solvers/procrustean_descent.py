@@ -34,7 +34,7 @@ class Descent:
     Args:
         points: (H, T, N, 3) to start from.
         rotations: (H, T, 3, 3) to start from.
-        roots: (H, T, D, D), also in a precision of their own.
+        roots: (H, T, D, D).
         bones: (B, 2).
         rigid: (P, 2) pairs that keep their distance.
         stiffness: (P,).
@@ -113,8 +113,7 @@ class Descent:
     def _step(self, u: Tensor) -> tuple[Tensor, Turn]:
         """Shifts (H, free, N, T) and turns."""
         count, _, joints, frames = self.points.shape
-        step = u.view(count, frames, 1, -1).to(self.roots) @ self.roots.mT
-        step = step.squeeze(-2).mT.to(u).contiguous()  # (H, D, T)
+        step = (u.view(count, frames, 1, -1) @ self.roots.mT).squeeze(-2).mT.contiguous()  # (H, D, T)
         return step[:, :-3].view(count, self.free, joints, frames), Turn(step[:, -3:], self.cross)
 
     def _placed(self, shift: Tensor) -> Tensor:
@@ -158,7 +157,7 @@ class Descent:
             slope[:, -1] += self.anchor[:, None, None] * off
         spun = turn.slopes((turned[:, :, None] * self.rotations[:, None]).sum(3))
         step = torch.cat([slope.flatten(1, 2), spun], 1).mT.contiguous()  # (H, T, D)
-        return value, (step.unsqueeze(-2).to(self.roots) @ self.roots).view(count, -1).to(u)
+        return value, (step.unsqueeze(-2) @ self.roots).view(count, -1)
 
     def _motion(self, aligned: Tensor) -> tuple[Tensor, Callable[[slice], Tensor]]:
         """The log-determinants (H,) of aligned bones (H, 3 B, T), centred in place, and their slopes in runs of frames.
