@@ -195,9 +195,10 @@ class RunCosts:
         """The posture's energy (K,), from sums and scatters of poses (V, S, T, K) up to each place."""
         posture, base = self.objective.posture, self.base.poses
         frames = poses.shape[2]
-        added = _scatters(poses, runs.places) - _scatters(base, runs.places)
-        scatter = base.mT @ base + _across(added, runs)  # (K, S, K, K)
-        change = (poses - base).transpose(1, 2).flatten(2)  # (V, T, S K)
+        change, twice = poses - base, poses + base
+        added = _products(change, twice, runs)  # what y' y gains is, of its two factors, the symmetric part
+        scatter = base.mT @ base + (added + added.mT) / 2  # (K, S, K, K)
+        change = change.transpose(1, 2).flatten(2)  # (V, T, S K)
         moved = _between(change, runs.part, runs.starts, runs.ends).unflatten(1, base.shape[1::2])
         mean = (base.sum(2) + moved) / frames  # (K, S, K)
         count = frames / posture.correlation
@@ -237,20 +238,21 @@ def _between(values: Tensor, part: Tensor, starts: Tensor, ends: Tensor) -> Tens
     return summed[part, ends] - summed[part, starts]
 
 
-def _scatters(rows: Tensor, places: Tensor) -> Tensor:
-    """Scatters (V, M, S, K, K) of rows (V or 1, S, T, K) in the frames before places (V, M)."""
-    short = BLOCK - rows.shape[2] % BLOCK  # one block more than there are, or less: the last place is T
-    blocks = torch.nn.functional.pad(rows, (0, 0, 0, short)).unflatten(2, (-1, BLOCK)).transpose(1, 2)
-    whole = torch.nn.functional.pad((blocks.mT @ blocks).cumsum(1)[:, :-1], (0, 0) * 3 + (1, 0))  # (V, T', S, K, K)
-    index = torch.arange(len(rows), device=rows.device)[:, None], places // BLOCK
-    within = torch.arange(BLOCK, device=rows.device) < (places % BLOCK)[..., None]
-    last = blocks[index] * within[:, :, None, :, None]
-    return whole[index] + last.mT @ last
-
-
-def _across(values: Tensor, runs: Runs) -> Tensor:
-    """Differences (K, ...) of values (V, M, ...) between the places at which runs end and start."""
-    return values[runs.part, runs.last] - values[runs.part, runs.first]
+def _products(left: Tensor, right: Tensor, runs: Runs) -> Tensor:
+    """Products (K, S, C, C) of columns (V, S, T, C) within runs."""
+    places = runs.places.shape[1]
+    ends = runs.part * places + torch.stack([runs.first, runs.last])
+    needed, index = ends.unique(return_inverse=True)  # of few runs or of many, most begin and end where others do
+    part, place = needed // places, runs.places.flatten()[needed]
+    short = BLOCK - left.shape[2] % BLOCK  # one block more than there are, or less: the last place is T
+    left, right = (
+        torch.nn.functional.pad(x, (0, 0, 0, short)).unflatten(2, (-1, BLOCK)).transpose(1, 2) for x in (left, right)
+    )
+    whole = torch.nn.functional.pad((left.mT @ right).cumsum(1)[:, :-1], (0, 0) * 3 + (1, 0))  # (V, T', S, C, C)
+    within = torch.arange(BLOCK, device=place.device) < (place % BLOCK)[:, None]
+    at = part, place // BLOCK
+    before = whole[at] + (left[at] * within[:, None, :, None]).mT @ right[at]
+    return before[index[1]] - before[index[0]]
 
 
 def _sized(sine: Tensor, points: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
