@@ -129,36 +129,23 @@ class PinholeEnergy:
         spread = (rays - rays.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()
         self.size = or_one(spread)  # of images, wherever the start is
         self.bones = skeleton.bone_index(device=rays.device)
-        n = skeleton.num_observed
-        observed = torch.eye(n, dtype=rays.dtype, device=rays.device)
-        complete = skeleton.complete(observed)[0].mT  # (No, N): virtual joints follow their sources
-        ends = incidence(self.bones, skeleton.num_joints, dtype=rays.dtype)  # (N, B)
-        tree = chain_inverse(ends)
-        self.seen = (complete @ ends).mT.contiguous()  # (B, No) bones of observed joints
-        lines = tree[:n].mT @ complete
-        self.lines = (lines - lines.mean(-1, keepdim=True)).mT.contiguous()  # (N, B)
-        self.outer = ends.clamp_min(0)  # (N, B) of bones' far ends
-        self.toward = self.rays[:, self.bones[:, 1]]  # (2, B, T) their rays
-        path = distance.expand(len(depth), -1)
-        wide = torch.ones_like(depth[:, 0, 0]) if focal is None else 1 / focal[0]
+        tree = self._links(rays)
+        self.toward = self.rays[:, self.bones[:, 1]]  # (2, B, T) bones' rays
+        self.path, self.depth = distance.expand(len(depth), -1), depth.mT.contiguous()
+        self.wide = (torch.ones_like(depth[:, 0, 0]) if focal is None else 1 / focal[0])[:, None]
         self.free = None if focal is None else focal[1]
-        self.path, self.wide, self.depth = path, wide[:, None], depth.mT.contiguous()
         self.own = bone_vectors(depth[..., None], self.bones)[..., 0].mT.contiguous()
-        image = self._imaged(self._far(self.depth, path, self.wide)[0])
-        own = median((self.own.square() + image.square().sum(1)).sqrt(), -1).clamp_min(1e-6)
+        size = (self.own.square() + self._first_image().square().sum(1)).sqrt()
+        self.lengths = median(size, -1).clamp_min(1e-6)
         if lengths is not None:  # the distance that they tell
-            ratio = median(lengths / own, -1, keepdim=True)
-            self.path = path * ratio
+            ratio = median(lengths / self.lengths, -1, keepdim=True)
+            self.path, self.lengths = self.path * ratio, lengths
             self.depth, self.own = self.depth * ratio[..., None], self.own * ratio[..., None]
-        self.lengths = own if lengths is None else lengths
-        most = math.ceil(2 * FASTEST * len(rays) / rate)
-        waves = dct_basis(len(rays), max(1, min(len(rays), most)), dtype=rays.dtype, device=rays.device)
-        waves = waves * math.sqrt(len(rays))
-        self.waves = waves if self.known else waves[:, 1:]  # (T, K)
+        self.waves = _waves(rays, rate)[:, 0 if self.known else 1 :]  # (T, K); unknown lengths make up for the first
         self.rough = (ROOT * self.slow**2) ** -2
         self.model: Objective | None = None
         self.body: ObjectiveGradient | PlainBody
-        image = self._imaged(self._far(self.depth, self.path, self.wide)[0])
+        image = self._first_image()
         if has_trunk(skeleton):
             flat = (tree @ image[0]).permute(2, 1, 0)  # (T, N, 2), centred
             weights = at_pace(Weights(), rate, pace_of(flat, skeleton, rate))
@@ -170,6 +157,22 @@ class PinholeEnergy:
             self.body = PlainBody(skeleton, self.own, slack, self.slow)
         self.shear, self.drift, self.lean, self.scale = coordinates(self, image)
         self.start = torch.zeros_like(self.scale)
+
+    def _links(self, like: Tensor) -> Tensor:
+        """Hold what makes bones of joints and joints of bones; returns the tree (N, B) that does the latter."""
+        skeleton, n = self.skeleton, self.skeleton.num_observed
+        complete = skeleton.complete(torch.eye(n, dtype=like.dtype, device=like.device))[0].mT  # (No, N)
+        ends = incidence(self.bones, skeleton.num_joints, dtype=like.dtype)  # (N, B)
+        tree = chain_inverse(ends)
+        self.seen = (complete @ ends).mT.contiguous()  # (B, No) bones of observed joints: virtual ones follow these
+        lines = tree[:n].mT @ complete
+        self.lines = (lines - lines.mean(-1, keepdim=True)).mT.contiguous()  # (N, B)
+        self.outer = ends.clamp_min(0)  # (N, B) of bones' far ends
+        return tree
+
+    def _first_image(self) -> Tensor:
+        """The image (H, 2, B, T) of the start."""
+        return self._imaged(self._far(self.depth, self.path, self.wide)[0])
 
     def rows(self, index: Tensor) -> PinholeEnergy:
         """That of some hypotheses."""
@@ -298,6 +301,13 @@ class PinholeEnergy:
         """Of bones' depths, lengths, waves and the focal length among the unknowns."""
         frames, bones = self.rays.shape[-1], len(self.bones)
         return [frames * bones, 0 if self.known else bones, self.waves.shape[1], 0 if self.free is None else 1]
+
+
+def _waves(rays: Tensor, rate: float) -> Tensor:
+    """Cosines (T, K) that make up slow changes, the first of them constant, of rays (T, ...)."""
+    frames, most = len(rays), math.ceil(2 * FASTEST * len(rays) / rate)
+    basis = dct_basis(frames, max(1, min(frames, most)), dtype=rays.dtype, device=rays.device)
+    return basis * math.sqrt(frames)
 
 
 def _gathered(pull: Tensor) -> Tensor:
