@@ -99,14 +99,25 @@ def _reconstruct(
     lifted: Reconstruction | None,
 ) -> Reconstruction:
     """:func:`reconstruct_perspective` without autograd, on the tracks' device."""
-    rate = tracks.rate
-    rays = intrinsics.rays(tracks.points)
-    _warn_of_wide_rays(tracks, rays, intrinsics.focal)
-    view = View.of(tracks, intrinsics, rate)
-    distance = view.first_distance(tracks, rate)
-    depth = torch.zeros_like(view.rays[..., 0])
+    _warn_of_wide_rays(tracks, intrinsics)
     if cameras is not None:
         cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
+    best = _best_of_rounds(method, tracks, View.of(tracks, intrinsics, tracks.rate), cameras, lifted)
+    exact = has_trunk(tracks.skeleton) and not detected(tracks)
+    if method.turns_over and exact and not best.flat:
+        best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies))
+    return _assemble(method, tracks, best)
+
+
+def _best_of_rounds(
+    method: Method, tracks: Tracks, view: View, cameras: Tensor | None, lifted: Reconstruction | None
+) -> Found:
+    """What is found until depths settle or nothing gets better, arguments as of :func:`reconstruct_perspective`.
+
+    Without ``lifted`` each round straightens the tracks by the depths and distances of the one before, and lifts them;
+    with it each refines what the one before found, through the lens that this asks for.
+    """
+    distance, depth = view.first_distance(tracks, tracks.rate), torch.zeros_like(view.rays[..., 0])
     feet = feet_on_ground(tracks, cameras)
     best: Found | None = None
     unit: float | None = None
@@ -123,7 +134,7 @@ def _reconstruct(
             else:  # the tracks of the first round agree with no depths yet: there the method may find signs by itself
                 step = SfAM() if soft else method.following(best is not None and tracks.num_frames <= BLOCK)
                 made = _lift(step, straight, view, cameras)
-            given = made, view, distance, depth, rate, feet, unit
+            given = made, view, distance, depth, tracks.rate, feet, unit
             flips = method.turns_over and not any_focal  # else a guess is confirmed
             found = refine(*given, mirror=cameras is None, flips=flips, any_focal=any_focal)
         bodies, unit = found.bodies, None if soft else found.scene.unit
@@ -142,20 +153,18 @@ def _reconstruct(
         if moved < SETTLED or not sound or not better or found.flat:
             break
         if any_focal:
-            view = View.of(tracks, zoomed(view.lens, float(bodies.focal[0])), rate)
+            view = View.of(tracks, zoomed(view.lens, float(bodies.focal[0])), tracks.rate)
     assert best is not None
-    exact = has_trunk(tracks.skeleton) and not detected(tracks)
-    if method.turns_over and exact and not best.flat:
-        best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies))
-    return _assemble(method, tracks, best)
+    return best
 
 
-def _warn_of_wide_rays(tracks: Tracks, rays: Tensor, focal: float) -> None:
-    """Tell where a focal length makes rays (T, N, 3) lie so far off the optical axis that its unit seems wrong."""
+def _warn_of_wide_rays(tracks: Tracks, intrinsics: Intrinsics) -> None:
+    """Tell where a focal length makes rays lie so far off the optical axis that its unit seems wrong."""
+    rays = intrinsics.rays(tracks.points)  # (T, N, 3)
     if bool(tracks.seen.any()) and float(rays[tracks.seen][:, :2].norm(dim=-1).median()) > WIDE:
         warnings.warn(
             f"{tracks.source}: half of all joints lie more than {math.degrees(math.atan(WIDE)):.0f} degrees off the "
-            f"optical axis: is the focal length {focal:g} in the tracks' unit ({tracks.units})?",
+            f"optical axis: is the focal length {intrinsics.focal:g} in the tracks' unit ({tracks.units})?",
             KcsWarning,
             stacklevel=users_level(),
         )
