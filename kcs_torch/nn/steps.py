@@ -17,7 +17,7 @@ from kcs_torch.functional.temporal import interpolate
 from kcs_torch.nn.reprojection import centred_residual
 from kcs_torch.solvers.lm import fit_bones
 
-__all__ = ["continuation", "corner_of", "data_scale", "estimate_lengths", "shape_step", "start_shape", "to_scale"]
+__all__ = ["aimed_lengths", "continuation", "corner_of", "data_scale", "estimate_lengths", "shape_step", "start_shape"]
 
 
 def continuation(num_weights: int, mu: float = 0.5, final: float = 1e-5) -> list[float]:
@@ -101,7 +101,34 @@ def estimate_lengths(
         return lengths, 1 / (1 + ratio.square()).square()
 
 
-def to_scale(proportions: Tensor, lengths: Tensor) -> Tensor:
+def aimed_lengths(
+    shape: Tensor,
+    bones: Tensor,
+    weights: Tensor,
+    given: Tensor | None,
+    *,
+    relative: bool,
+    graded: bool,
+    inside: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """Lengths (..., B) that bones are to have, those ``given`` or else as :func:`estimate_lengths` has them; rigidity.
+
+    Args:
+        shape: as of :func:`estimate_lengths`, and so are bones, weights, ``graded`` and ``inside``.
+        bones: (B, 2).
+        weights: (..., T, N).
+        given: (..., B) lengths, or None.
+        relative: whether these are proportions, to be brought to the scale of the shape.
+        graded: whether links may turn out not to be rigid.
+        inside: (..., T), or None.
+    """
+    measured, rigidity = estimate_lengths(shape, bones, weights, graded=graded, inside=inside)
+    if given is None:
+        return measured, rigidity
+    return _to_scale(given, measured) if relative else given, rigidity
+
+
+def _to_scale(proportions: Tensor, lengths: Tensor) -> Tensor:
     """Relative lengths (..., B), brought to the scale of measured ones (..., B): the median bone of both agrees."""
     there = proportions > 0
     ratio = lengths / torch.where(there, proportions, torch.ones_like(proportions))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -17,7 +17,7 @@ from kcs_torch.functional.weights import known
 from kcs_torch.nn.majorise import majorise_step, turn_onto_mean
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.reprojection import centred_residual
-from kcs_torch.nn.steps import continuation, estimate_lengths, start_shape, to_scale
+from kcs_torch.nn.steps import aimed_lengths, continuation, start_shape
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution
@@ -149,51 +149,28 @@ class UnrolledPKC(Unrolled):
 
         With ``measure`` it tells whether the last step stood still, which waits for the device.
         """
-        joints = self.skeleton.num_joints
         weights = self._check(tracks, cameras, weights, start, self.skeleton, lengths=lengths, inside=inside)
         depends_on = (tracks, cameras, weights, start, lengths)
         with full_precision(tracks):
             # Factorisations of covariances: in double precision, as for singular values.
             wide = torch.float32 if tracks.device.type == "mps" else torch.float64
-            flat, rows = known(tracks, weights).to(wide), cameras.to(wide)
+            rows = cameras.to(wide)
             if inside is not None:  # any rotation will do
                 rows = torch.where(inside[..., None, None], rows, torch.eye(3, dtype=wide, device=rows.device)[:2])
-            share = weights.to(wide).expand(flat.shape[:-1])
-            flat = known(-centred_residual(torch.zeros_like(flat), flat, share), share)
-            size = _root_mean_square(flat, share)[..., None, None, None]
-            flat = flat / size
+            flat, share, size = _normalised(known(tracks, weights).to(wide), weights.to(wide))
             begin = start_shape(flat, rows, share) if start is None else clear_padding(start, inside).to(wide) / size
             begin = clear_padding(begin - begin.mean(-2, keepdim=True), inside)
-            fixed, relative = (None if lengths is None else lengths.to(wide) / size[..., 0, 0]), lengths is None
-            if lengths is None and self.has_lengths:
-                fixed = self._lengths(flat)
-            # Floors far below any useful value: what is learned may run away, the factorisations must not fail.
-            eps, slack, noise = (
-                self._values(name, flat).clamp_min(least)
-                for name, least in (("eps", 1e-7), ("slack", 1e-3), ("noise", 1e-3))
-            )
-            graded = not self.skeleton.tree
-            given = () if lengths is None else lengths.shape[:-1]
-            begin = begin.expand(*broadcast_shapes(begin.shape[:-3], rows.shape[:-3], given), *begin.shape[-3:])
+            step = self._descent(flat, share, None if lengths is None else lengths.to(wide) / size[..., 0, 0], inside)
+            batch = () if lengths is None else lengths.shape[:-1]
+            begin = begin.expand(*broadcast_shapes(begin.shape[:-3], rows.shape[:-3], batch), *begin.shape[-3:])
             world = complete_rotation(rows).expand(*begin.shape[:-2], 3, 3)
 
             # The state: points, and below them the rotations of frames that are turned.
-            turns = self.first < self.num_steps
+            joints, turns = self.skeleton.num_joints, self.first < self.num_steps
             split = lambda state: (state[..., :joints, :], state[..., joints:, :] if turns else world)  # noqa: E731
 
             def advance(state: Tensor, k: int) -> Tensor:
-                points, turned = split(state)
-                measured, rigidity = estimate_lengths(points, self.rigid, share, graded=graded, inside=inside)
-                if fixed is not None:
-                    part = fixed[..., self.indices]
-                    measured = to_scale(part, measured) if relative else part
-                points = majorise_step(
-                    points, flat, turned[..., :2, :], share, measured, bones=self.bones, rigid=self.rigid,
-                    eps=eps[k], slack=slack[k] * rigidity.clamp_min(1e-4).rsqrt()[..., None, :], noise=noise[k],
-                    inside=inside,
-                )  # fmt: skip
-                if k >= self.first:
-                    points, turned = turn_onto_mean(points, turned, self.bones)
+                points, turned = step(*split(state), k)
                 return torch.cat([points, turned], -2) if turns else points
 
             begin = torch.cat([begin, world], -2) if turns else begin
@@ -202,9 +179,41 @@ class UnrolledPKC(Unrolled):
             value = size * (points @ turned.mT @ world)
         return Solution(narrow(value, tracks), solution.converged, solution.iterations)
 
+    def _descent(
+        self, flat: Tensor, weights: Tensor, lengths: Tensor | None, inside: Tensor | None
+    ) -> Callable[[Tensor, Tensor, int], tuple[Tensor, Tensor]]:
+        """What makes step k of points (..., T, N, 3) and rotations (..., T, 3, 3), of normalised tracks and lengths."""
+        own = self._lengths(flat) if lengths is None and self.has_lengths else lengths
+        # Floors far below any useful value: what is learned may run away, the factorisations must not fail.
+        eps, slack, noise = (
+            self._values(name, flat).clamp_min(least)
+            for name, least in (("eps", 1e-7), ("slack", 1e-3), ("noise", 1e-3))
+        )
+        relative, graded = lengths is None, not self.skeleton.tree
 
-def _root_mean_square(values: Tensor, weights: Tensor) -> Tensor:
-    """Of the seen joints' distance from the middle, (...); 1 where it is 0."""
-    seen = (weights > 0).to(values.dtype)
-    square = (values.square().sum(-1) * seen).sum((-2, -1)) / seen.sum((-2, -1)).clamp_min(1)
-    return or_one(square).sqrt()
+        def step(points: Tensor, turned: Tensor, k: int) -> tuple[Tensor, Tensor]:
+            part = None if own is None else own[..., self.indices]
+            aims, rigidity = aimed_lengths(
+                points, self.rigid, weights, part, relative=relative, graded=graded, inside=inside
+            )
+            points = majorise_step(
+                points, flat, turned[..., :2, :], weights, aims, bones=self.bones, rigid=self.rigid,
+                eps=eps[k], slack=slack[k] * rigidity.clamp_min(1e-4).rsqrt()[..., None, :], noise=noise[k],
+                inside=inside,
+            )  # fmt: skip
+            return turn_onto_mean(points, turned, self.bones) if k >= self.first else (points, turned)
+
+        return step
+
+
+def _normalised(tracks: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Tracks (..., T, N, 2) about the seen joints' middle, of root mean square 1; weights; and the unit (..., 1, 1, 1).
+
+    The unit is 1 where all seen joints lie at one point.
+    """
+    weights = weights.expand(tracks.shape[:-1])
+    flat = known(-centred_residual(torch.zeros_like(tracks), tracks, weights), weights)
+    seen = (weights > 0).to(flat.dtype)
+    square = (flat.square().sum(-1) * seen).sum((-2, -1)) / seen.sum((-2, -1)).clamp_min(1)
+    size = or_one(square).sqrt()[..., None, None, None]
+    return flat / size, weights, size

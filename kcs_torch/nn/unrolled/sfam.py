@@ -13,7 +13,7 @@ from kcs_torch.errors import OptionError
 from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.weights import known
 from kcs_torch.nn.masks import clear_padding
-from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape, to_scale
+from kcs_torch.nn.steps import aimed_lengths, continuation, data_scale, shape_step, start_shape
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution
@@ -178,10 +178,7 @@ class UnrolledSfAM(Unrolled):
             if one_body:  # all windows as one clip
                 shape, share = shape.flatten(-4, -3), share.flatten(-3, -2)
                 real = None if real is None else real.flatten(-2)
-            target, rigidity = estimate_lengths(shape, self.bones, share, graded=graded, inside=real)
-            if fixed is not None:
-                target = to_scale(fixed, target) if relative else fixed
-            return target, rigidity
+            return aimed_lengths(shape, self.bones, share, fixed, relative=relative, graded=graded, inside=real)
 
         def advance(shape: Tensor, k: int) -> Tensor:
             if k < self.first:
