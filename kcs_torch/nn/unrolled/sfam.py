@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -168,30 +168,14 @@ class UnrolledSfAM(Unrolled):
             lengths = lengths.to(tracks.dtype)
         elif self.has_lengths:
             lengths = self._lengths(tracks)
-        fixed = None if lengths is None else lengths[..., self.rigid]
-        graded = not self.skeleton.tree
-        earlier = list(held or ())
-
-        def measured(shape: Tensor) -> tuple[Tensor, Tensor]:
-            """Lengths (..., B) to aim at, and rigidity."""
-            share, real = weights, inside
-            if one_body:  # all windows as one clip
-                shape, share = shape.flatten(-4, -3), share.flatten(-3, -2)
-                real = None if real is None else real.flatten(-2)
-            return aimed_lengths(shape, self.bones, share, fixed, relative=relative, graded=graded, inside=real)
+        aims = self._aims(weights, inside, lengths, relative, one_body, held)
 
         def advance(shape: Tensor, k: int) -> Tensor:
-            if k < self.first:
-                return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corners[k])
-            target, rigidity = earlier[k - self.first] if earlier else measured(shape)
-            if held is not None and not earlier:
-                held.append((target, rigidity))
-            if one_body and target.ndim > 1:
-                target, rigidity = target[..., None, :], rigidity[..., None, :]
-            return shape_step(
-                shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corners[k],
-                bones=self.bones, lengths=target, stiffness=stiffness[k] * rigidity,
-            )  # fmt: skip
+            goal: dict[str, Tensor] = {}
+            if k >= self.first:
+                target, rigidity = aims(shape, k - self.first)
+                goal = {"bones": self.bones, "lengths": target, "stiffness": stiffness[k] * rigidity}
+            return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corners[k], **goal)
 
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
@@ -205,3 +189,36 @@ class UnrolledSfAM(Unrolled):
                 depends_on=(tracks, cameras, weights, lengths),
             )
         return replace(solution, value=narrow(solution.value, given))
+
+    def _aims(
+        self,
+        weights: Tensor,
+        inside: Tensor | None,
+        lengths: Tensor | None,
+        relative: bool,
+        one_body: bool,
+        held: list[tuple[Tensor, Tensor]] | None,
+    ) -> Callable[[Tensor, int], tuple[Tensor, Tensor]]:
+        """What tells the rigid bones' lengths and rigidity that an articulated step of a shape aims at, by its number.
+
+        Arguments are as of :meth:`solve`; ``lengths`` may be the module's own, and are proportions if ``relative``.
+        """
+        fixed = None if lengths is None else lengths[..., self.rigid]
+        graded, earlier = not self.skeleton.tree, list(held or ())
+
+        def measured(shape: Tensor) -> tuple[Tensor, Tensor]:
+            share, real = weights, inside
+            if one_body:  # all windows as one clip
+                shape, share = shape.flatten(-4, -3), share.flatten(-3, -2)
+                real = None if real is None else real.flatten(-2)
+            return aimed_lengths(shape, self.bones, share, fixed, relative=relative, graded=graded, inside=real)
+
+        def aims(shape: Tensor, number: int) -> tuple[Tensor, Tensor]:
+            target, rigidity = earlier[number] if earlier else measured(shape)
+            if held is not None and not earlier:
+                held.append((target, rigidity))
+            if one_body and target.ndim > 1:
+                return target[..., None, :], rigidity[..., None, :]
+            return target, rigidity
+
+        return aims
