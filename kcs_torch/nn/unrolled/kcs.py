@@ -108,20 +108,9 @@ class UnrolledKCS(Unrolled):
                 f"got {tau}, {scale_range} and {arrangement!r}"
             )
         self.skeleton = get_skeleton(skeleton)
-        body = self.skeleton.with_links(links) if links else self.skeleton
-        body = body.connected()
+        body = (self.skeleton.with_links(links) if links else self.skeleton).connected()
         self.arrangement, self.scale_range = arrangement, scale_range
-        rest = (
-            self.skeleton.template_points(dtype=torch.float64)
-            if template is None
-            else torch.as_tensor(template, dtype=torch.float64)
-        )
-        if rest.shape != (body.num_joints, 3) or not bool(rest.isfinite().all()):
-            raise ShapeError(
-                f"UnrolledKCS: template: expected {body.num_joints} finite positions (x, y, z) for skeleton "
-                f"'{self.skeleton.name}', got shape {tuple(rest.shape)}"
-            )
-        bones = body.bone_index()
+        rest, bones = self._rest_pose(template), body.bone_index()
         matrix = incidence(bones, body.num_joints, dtype=torch.float64)
         buffers = {
             "rest": rest - rest.mean(0),
@@ -136,6 +125,19 @@ class UnrolledKCS(Unrolled):
         self._positive("step", [tau] * num_steps)
         own = bone_lengths(rest, bones).clamp_min(1e-12).tolist()
         self._hold_lengths(body, own if lengths is None and learnable_lengths else lengths, learnable_lengths)
+
+    def _rest_pose(self, template: Sequence[Sequence[float]] | Tensor | None) -> Tensor:
+        """The template (N, 3) as it is given, or the skeleton's."""
+        if template is None:
+            rest = self.skeleton.template_points(dtype=torch.float64)
+        else:
+            rest = torch.as_tensor(template, dtype=torch.float64)
+        if rest.shape != (self.skeleton.num_joints, 3) or not bool(rest.isfinite().all()):
+            raise ShapeError(
+                f"UnrolledKCS: template: expected {self.skeleton.num_joints} finite positions (x, y, z) for skeleton "
+                f"'{self.skeleton.name}', got shape {tuple(rest.shape)}"
+            )
+        return rest
 
     def template(self, like: Tensor) -> Tensor:
         """The rest pose (N, 3), centred, with the module's bone lengths, in the dtype of ``like``."""
@@ -241,17 +243,7 @@ class UnrolledKCS(Unrolled):
             rows, rest = clear_padding(wide(cameras), inside), self.template(points)
             threshold, step = self._values("threshold", points), self._step_sizes(points)
             matrix, inverse = self.matrix.to(points), self.inverse.to(points)
-            if scales is None:
-                with torch.no_grad():
-                    low, high = self._bounds(points, share, rest, inside)
-                scales = frame_scales(rest, points, rows, share, low, high)
-            scales = scales.to(points.dtype)
-            if inside is None:
-                size = scales.mean(-1)
-            else:
-                scales = clear_padding(scales, inside, 0)
-                size = scales.sum(-1) / inside.sum(-1).clamp_min(1)
-            size = size[..., None, None, None]
+            scales, size = self._scales(scales, points, rows, share, rest, inside)
             given = (deviation_goal(rest, points / or_one(scales)[..., None, None], rows, share), rows, share)
             top = deviation_scale(*given, matrix=matrix, arrangement=self.arrangement)
             if start is None:
@@ -271,6 +263,22 @@ class UnrolledKCS(Unrolled):
             )  # fmt: skip
             value = clear_padding(size * (rest + (solution.value @ inverse.mT).mT), inside)
         return Solution(narrow(value, tracks), solution.converged, solution.iterations)
+
+    def _scales(
+        self, scales: Tensor | None, points: Tensor, rows: Tensor, weights: Tensor, rest: Tensor, inside: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Scales (..., T), those given or the best, and their mean (..., 1, 1, 1)."""
+        if scales is None:
+            with torch.no_grad():
+                low, high = self._bounds(points, weights, rest, inside)
+            scales = frame_scales(rest, points, rows, weights, low, high)
+        scales = scales.to(points.dtype)
+        if inside is None:
+            size = scales.mean(-1)
+        else:
+            scales = clear_padding(scales, inside, 0)
+            size = scales.sum(-1) / inside.sum(-1).clamp_min(1)
+        return scales, size[..., None, None, None]
 
     def _centred(self, tracks: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Tracks about the seen joints' middle, 0 where unseen, and weights (..., T, N)."""
