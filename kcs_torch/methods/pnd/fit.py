@@ -184,14 +184,9 @@ def expect(now: ProcrusteanNormal, data: Image, level: Tensor, damping: Tensor) 
         posterior = ((gain.mT @ white).view(few, span, 3, joints) + mean[clip, None]).flatten(0, 1)
         told = -white.square().sum((1, 2)) / 2 - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         likelihood[some] = torch.where(info == 0, told, -torch.inf).view(few, span)
-        # Gradient in the camera's rows: G^-1 ((w - P M) Y^T - P S), summed over joints.
-        pull = (free.mT @ white).view(chunk, 2, joints)
-        left = free.view(chunk, size, 2, joints).transpose(1, 2).reshape(chunk, 2, -1)
-        right = gain.view(chunk, size, 3, joints).transpose(1, 2).reshape(chunk, 3, -1)
-        slope = pull @ posterior.mT - left @ right.mT
         ways = torch.cat([(scale[:, None] * (spin @ turn[:, None]))[:, :, :2], camera[:, None]], 1)  # (t, 4, 2, 3)
-        moves = free @ (ways.view(chunk, 8, 3) @ posterior).view(chunk, 4, size).mT
-        steps[some] = _gauss_newton((slope[:, None] * ways).sum((2, 3)), moves, damp).view(few, span, 4)
+        gradient, moves = _slopes(ways, free, white, gain, posterior)
+        steps[some] = _gauss_newton(gradient, moves, damp).view(few, span, 4)
         miss[some] = ((whiten.mT @ white).square().sum((1, 2)) - whiten.square().sum((1, 2))).view(few, span)
         aligned[some] = posterior.view(few, span, 3, joints)
         flat = gain.view(few, -1, three)
@@ -228,6 +223,26 @@ def _image_covariance(camera: Tensor, pairs: Tensor, soft: Tensor, axis: Tensor,
         for _ in range(2):  # from both sides
             square = freed(square * soft[:, None, None, None], axis[:, None, None]).mT
     return square.transpose(2, 3).reshape(chunk, 2 * joints, 2 * joints)
+
+
+def _slopes(ways: Tensor, free: Tensor, white: Tensor, gain: Tensor, posterior: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradient (t, 4) of frames' likelihoods, and derivatives (t, 2N, 4) of their white images.
+
+    Args:
+        ways: (t, 4, 2, 3) by which the two rows of c R may move: three turns, and growth.
+        free: L^-1 (t, 2N, 2N), which makes images white; G = L L^T.
+        white: L^-1 (w - P M) (t, 2N, 1).
+        gain: L^-1 P S (t, 2N, 3N).
+        posterior: means Y (t, 3, N).
+    """
+    chunk, _, joints = posterior.shape
+    # In the camera's rows: G^-1 ((w - P M) Y^T - P S), summed over joints.
+    pull = (free.mT @ white).view(chunk, 2, joints)
+    left = free.view(chunk, -1, 2, joints).transpose(1, 2).reshape(chunk, 2, -1)
+    right = gain.view(chunk, -1, 3, joints).transpose(1, 2).reshape(chunk, 3, -1)
+    slope = pull @ posterior.mT - left @ right.mT
+    moves = free @ (ways.view(chunk, 8, 3) @ posterior).view(chunk, 4, -1).mT
+    return (slope[:, None] * ways).sum((2, 3)), moves
 
 
 def _gauss_newton(gradient: Tensor, moves: Tensor, damping: Tensor) -> Tensor:
