@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from kcs_torch.methods.pkc.limbs import SignCosts
 from kcs_torch.nn.lengths import foreshortening
 
 if TYPE_CHECKING:
@@ -20,8 +18,7 @@ __all__ = ["limb_costs"]
 
 def limb_costs(task: Placing, lengths: Tensor) -> tuple[Tensor, Tensor]:
     """Costs (T, C, 2^M, J, K) of each frame's signs, and the depths |dz| (T, M, J, K), of lengths (J, K, M)."""
-    # each weight (J, 1, 1, 1)
-    cost = dict(zip((f.name for f in fields(SignCosts)), task.costs[..., None, None, None].unbind(1), strict=True))
+    cost = {name: weight[:, None, None, None] for name, weight in task.cost().items()}
     size = lengths.mT[:, None]  # (J, 1, M, K)
     square = size.square() - task.image.square().sum(-1)[..., None]  # (J, T, M, K)
     depth = square.clamp_min(0).sqrt()

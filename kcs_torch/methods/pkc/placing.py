@@ -98,6 +98,10 @@ class Placing:
         shapes = self.rotations.shape[1], self.candidates.shape[1:], self.transition is None, self.margins, self.cap
         return *shapes, self.image.dtype, self.image.device
 
+    def cost(self) -> dict[str, Tensor]:
+        """``costs`` by the names of the fields of :class:`SignCosts`, (J,) each."""
+        return dict(zip((field.name for field in fields(SignCosts)), self.costs.unbind(1), strict=True))
+
     def padded(self, frames: int) -> Placing:
         """The same with as many frames."""
         more = frames - self.frames
@@ -216,56 +220,70 @@ def _joined(tasks: list[Placing]) -> Placing:
 
 
 def _place(task: Placing) -> LimbPaths:
-    count, frames, _ = task.noise.shape
-    tried, poses = task.candidates.shape[1], task.rotations.shape[1]
-    size = min(WINDOW, frames)
-    starts = window_starts(frames, size, min(OVERLAP, size - 1))
-    outside = None if task.inside is None else ~task.inside.mT[:, None, :, None]  # (T, 1, J, 1)
-    field = dict(zip((f.name for f in fields(SignCosts)), task.costs.unbind(1), strict=True))  # (J,) each
-
-    def problems(lengths: Tensor, begin: list[int]) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
-        """W windows of J limbs of K lengths: window w of length k of limb j is problem (j K + k) W + w."""
-        few = max(1, TOGETHER // (lengths.shape[1] * frames * poses * 2 ** lengths.shape[2]))
-        parts = [limb_costs(task[i : i + few], lengths[i : i + few]) for i in range(0, count, few)]
-        unary, depth = (torch.cat([part[k] for part in parts], -2) for k in (0, 1))
-        deep = depth / field["acceleration"][:, None]
-        if outside is not None:
-            unary, deep = unary.masked_fill(outside[:, None], 0), deep.masked_fill(outside, FAR)
-        at = torch.tensor(begin, device=unary.device) + torch.arange(size, device=unary.device)[:, None]  # (T_w, W)
-
-        def cut(values: Tensor) -> Tensor:
-            """(T, ..., J, K) as (J K W, T_w, ...), in memory with the problems last."""
-            return values.flatten(-2)[at].movedim(1, -1).flatten(-2).movedim(-1, 0)
-
-        moves = None
-        if task.transition is not None:
-            moves = task.transition.float()[:, None, at[:-1].mT].expand(-1, lengths.shape[1], *[-1] * 4).flatten(0, 2)
-        # Single precision is plenty to compare costs, and twice as fast.
-        return cut(unary.float()), cut(deep.float()), moves, depth.flatten(-2)
-
-    prior = 0.5 * ((task.candidates / task.usual[:, None]).log() / field["proportions"][:, None, None]).square().sum(-1)
-    best = torch.zeros(count, dtype=torch.long, device=prior.device)
-    if tried > 1:
-        sample = starts
-        if len(starts) > SAMPLE:
-            sample = [starts[round(i * (len(starts) - 1) / (SAMPLE - 1))] for i in range(SAMPLE)]
-        unary, deep, moves, _ = problems(task.candidates, sample)
-        cost = sign_costs(unary, deep, cap=task.cap, transition=moves).view(count, tried, -1).sum(-1)
-        best = (cost * (len(starts) / len(sample)) + prior).argmin(-1)
-    lengths = task.candidates[torch.arange(count, device=best.device), best]  # (J, M)
-    unary, deep, moves, depth = problems(lengths[:, None], starts)
+    size = min(WINDOW, task.frames)
+    starts = window_starts(task.frames, size, min(OVERLAP, size - 1))
+    lengths = _likeliest(task, starts, size)
+    unary, deep, moves, depth = _problems(task, lengths[:, None], starts, size)
     path = smooth_signs(unary, deep, cap=task.cap, transition=moves, margins=task.margins)
     depth = depth.movedim(-1, 0)  # (J, T, M)
-    signs = torch.empty_like(depth)
-    windows = path.signs.unflatten(0, (count, len(starts)))
-    spread = depth.new_empty(count, frames, poses) if task.margins else None
+    signs = _stitched(path.signs.to(depth), starts, task.frames)
+    margins = None if path.margins is None else _stitched(path.margins.amin(-1).to(depth), starts, task.frames)
+    return LimbPaths(lengths, signs * depth, margins)
+
+
+def _likeliest(task: Placing, starts: list[int], size: int) -> Tensor:
+    """The lengths (J, M) among the candidates whose signs cost least in some windows of ``size`` frames."""
+    count, tried, _ = task.candidates.shape
+    if tried == 1:
+        return task.candidates[:, 0]
+    sample = starts
+    if len(starts) > SAMPLE:
+        sample = [starts[round(i * (len(starts) - 1) / (SAMPLE - 1))] for i in range(SAMPLE)]
+    unary, deep, moves, _ = _problems(task, task.candidates, sample, size)
+    cost = sign_costs(unary, deep, cap=task.cap, transition=moves).view(count, tried, -1).sum(-1)
+    usual = task.cost()["proportions"][:, None, None]
+    prior = 0.5 * ((task.candidates / task.usual[:, None]).log() / usual).square().sum(-1)
+    best = (cost * (len(starts) / len(sample)) + prior).argmin(-1)
+    return task.candidates[torch.arange(count, device=best.device), best]
+
+
+def _problems(
+    task: Placing, lengths: Tensor, starts: list[int], size: int
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+    """W windows of J limbs of K lengths (J, K, M) as problems of signs; and all depths (T, M, J K).
+
+    Window w of length k of limb j is problem (j K + k) W + w.
+    """
+    count, frames, tried = len(lengths), task.frames, lengths.shape[1]
+    few = max(1, TOGETHER // (tried * frames * task.rotations.shape[1] * 2 ** lengths.shape[2]))
+    parts = [limb_costs(task[i : i + few], lengths[i : i + few]) for i in range(0, count, few)]
+    unary, depth = (torch.cat([part[k] for part in parts], -2) for k in (0, 1))
+    deep = depth / task.cost()["acceleration"][:, None]
+    if task.inside is not None:
+        outside = ~task.inside.mT[:, None, :, None]  # (T, 1, J, 1)
+        unary, deep = unary.masked_fill(outside[:, None], 0), deep.masked_fill(outside, FAR)
+    at = torch.tensor(starts, device=unary.device) + torch.arange(size, device=unary.device)[:, None]  # (T_w, W)
+
+    def cut(values: Tensor) -> Tensor:
+        """(T, ..., J, K) as (J K W, T_w, ...), in memory with the problems last."""
+        return values.flatten(-2)[at].movedim(1, -1).flatten(-2).movedim(-1, 0)
+
+    moves = None
+    if task.transition is not None:
+        moves = task.transition.float()[:, None, at[:-1].mT].expand(-1, tried, *[-1] * 4).flatten(0, 2)
+    # Single precision is plenty to compare costs, and twice as fast.
+    return cut(unary.float()), cut(deep.float()), moves, depth.flatten(-2)
+
+
+def _stitched(windows: Tensor, starts: list[int], frames: int) -> Tensor:
+    """Windows (J W, T_w, ...) as runs (J, T, ...), from one to the next in the middle of what they share."""
+    windows = windows.unflatten(0, (-1, len(starts)))
+    size = windows.shape[2]
+    out = windows.new_empty(len(windows), frames, *windows.shape[3:])
     for i, begin in enumerate(starts):
         first = 0 if i == 0 else (starts[i - 1] + size - begin) // 2
-        signs[:, begin + first : begin + size] = windows[:, i, first:]
-        if spread is not None and path.margins is not None:
-            part = path.margins.unflatten(0, (count, len(starts)))[:, i, first:]
-            spread[:, begin + first : begin + size] = part.amin(-1)
-    return LimbPaths(lengths, signs * depth, spread)
+        out[:, begin + first : begin + size] = windows[:, i, first:]
+    return out
 
 
 def _facts(hinges: Sequence[Hinge | None], posture: PostureEnergy) -> Tensor:
