@@ -15,6 +15,7 @@ from kcs_torch.methods.clips.lockstep import run
 from kcs_torch.methods.pkc import body as body_module
 from kcs_torch.methods.pkc import method as module
 from kcs_torch.methods.pkc.batch import serve
+from kcs_torch.methods.pkc.blocks import search
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.gaps import gaps_of, usual_noise
@@ -170,16 +171,17 @@ def test_what_the_turn_confirms_is_not_searched_further():
 
         return told
 
-    plain = run(body.search(1, 30), serve)
+    plain = run(search(body, 1, 30), serve)
     for other, share in ((depth, 0.6), (-depth, 0.6), (depth.roll(20, 0), 1.0), (0 * depth, 1.0)):
         asked.clear()
-        found = run(body.search(1, 30, turned(other)), serve)
+        found = run(search(body, 1, 30, turned(other)), serve)
         assert found.steps <= share * plain.steps and len(asked) == 1
         assert_close(found.depth[0], plain.depth[0], rtol=0, atol=0.06 if share < 1 else 0)
     still = walking_person(60, turn=0.0, yaw=40.0).tracks
     image = centred(still.points) / centred(still.points).square().mean().sqrt()
     asked.clear()
-    run(Body(still.skeleton, image, 30.0, torch.zeros_like(still.weights)).search(0, 5, turned(depth)), serve)
+    body = Body(still.skeleton, image, 30.0, torch.zeros_like(still.weights))
+    run(search(body, 0, 5, turned(depth)), serve)
     assert not asked
 
 

@@ -17,7 +17,7 @@ from kcs_torch.io import load_reconstruction
 from kcs_torch.methods import PKC
 from kcs_torch.methods.perspective import calibrated, refining, scene, uncalibrated
 from kcs_torch.methods.perspective.uncalibrated import likely_lens, looking, may_be_near
-from kcs_torch.methods.pkc import body
+from kcs_torch.methods.pkc import blocks
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
 from kcs_torch.types import Intrinsics
 
@@ -95,11 +95,11 @@ def test_runs_are_turned_over_once_through_one_lens(monkeypatch):
 @pytest.mark.parametrize(("fps", "block"), [(30.0, 400), (60.0, 400), (30.0, 25)], ids=["one", "strides", "blocks"])
 def test_the_search_ends_where_the_camera_seems_near(monkeypatch, fps, block):
     """Before runs of signs are turned over, asked once of the liveliest block; what is then found has no note of it."""
-    monkeypatch.setattr(body, "BLOCK", block)
+    monkeypatch.setattr(blocks, "BLOCK", block)
     asked, nearness, turned = [], uncalibrated._nearness, []
-    over = body.searching
+    over = blocks.searching
     monkeypatch.setattr(uncalibrated, "_nearness", lambda *given: asked.append(len(given[1])) or nearness(*given))
-    monkeypatch.setattr(body, "searching", lambda *given, **how: turned.append(how["rounds"]) or over(*given, **how))
+    monkeypatch.setattr(blocks, "searching", lambda *given, **how: turned.append(how["rounds"]) or over(*given, **how))
     tracks, _ = filmed(frames=60, fps=fps)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", kt.KcsWarning)

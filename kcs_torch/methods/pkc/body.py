@@ -1,8 +1,7 @@
-"""A body with a template: the search before a fixed camera, and the ranking of all hypotheses."""
+"""A body with a template: how its hypotheses are ranked and polished, and what they tell of the viewpoint."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,14 +10,13 @@ from torch import Tensor
 
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.camera import viewpoint_turn
-from kcs_torch.functional.chain import bone_lengths, bone_vectors
+from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
-from kcs_torch.functional.temporal import blend_windows, fill_between, window_starts
-from kcs_torch.methods.clips.lockstep import Search, together
+from kcs_torch.functional.temporal import blend_windows, window_starts
+from kcs_torch.methods.clips.lockstep import Search
 from kcs_torch.methods.pkc.assembly import TIGHT
 from kcs_torch.methods.pkc.descents import Descent
-from kcs_torch.methods.pkc.fixed_view import searching
 from kcs_torch.methods.pkc.gaps import fill_gaps, gaps_of, usual_noise
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.moving_search import soften
@@ -30,19 +28,7 @@ from kcs_torch.solvers.camera_path import choose_path, view_energy
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.procrustean import COARSE, FINE, Stage, align_rotations
 
-__all__ = ["LONG", "ONE", "POLISH", "TOLD", "Body", "Near", "Turned", "agree"]
-
-Turned = Callable[[bool], Search[Any, Any, Tensor]]
-"""Depths (T, N) that the viewpoint's turn tells, in the template's units; from many starts if so, else from one."""
-
-Near = Callable[[slice, Hypotheses], bool]
-"""Whether the camera seems near by hypotheses of some frames of the clip."""
-
-BLOCK, OVERLAP = 400, 40
-"""Frames of a long clip that are searched together, and by how many blocks overlap."""
-
-ABREAST = 8
-"""Blocks that are searched side by side: what searches of more would hold is for batches no gain."""
+__all__ = ["LONG", "ONE", "POLISH", "TOLD", "TURNING", "Body", "agree"]
 
 HOLD, DAMPING = 10, 2.0
 """Levenberg-Marquardt steps that make bones constant, and their damping: undamped, a bone that is short beside what its
@@ -66,8 +52,8 @@ ONE = 20.0
 LEVEL = 0.0003
 """Least noise, a share of the body's size, of tracks that are not exact throughout."""
 
-LONG = 2000
-"""Frames of a clip that are polished together."""
+LONG, OVERLAP = 2000, 40
+"""Frames of a clip that are polished together, and by how many such blocks overlap."""
 
 TURNING = 60.0
 """Degrees of the trunk's turn, as the template tells it, from which on the viewpoint's turn tells depth better."""
@@ -81,13 +67,6 @@ LEAD, LESS = 10.0, 3.0
 
 TOLD = 3.0
 """By how much a mirror image must be dearer for known cameras to rule it out."""
-
-AGREE = 0.12
-"""Root mean square difference, over the depths', of what the template and the viewpoint's turn tell, up to which each
-confirms the other."""
-
-FAST = 45.0
-"""Frames a second from which on the search leaves frames out."""
 
 
 class Body:
@@ -294,71 +273,6 @@ class Body:
         if gaps:
             image = blend_windows(torch.stack(images), starts, frames).transpose(0, 1).unflatten(2, (-1, 2))
         return depth - depth.mean(-1, keepdim=True), image, value
-
-    def search(
-        self, rounds: int, steps: int, turned: Turned | None = None, near: Near | None = None
-    ) -> Search[Any, Any, Hypotheses]:
-        """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best.
-
-        Where the viewpoint turns, those that agree with what it tells, depths (T, N) of ``turned``, are not looked
-        over. Nor are any if the camera is ``near``, as hypotheses of the liveliest block tell.
-        """
-        stride = max(1, round(self.rate / 30)) if self.rate >= FAST else 1
-        image = self.image[::stride]
-        rate = self.rate / stride
-        frames = len(image)
-        size = min(BLOCK, frames)
-        starts = window_starts(frames, size, min(OVERLAP, size - 1))
-        standing = self.objective.standing
-
-        def lift(some: slice, anchor: Tensor | None = None) -> Search[Any, Any, Hypotheses]:
-            noise, feet = self.noise[::stride][some], None if standing is None else standing[::stride][some]
-
-            def confirmed(found: Hypotheses) -> Search[Any, Any, bool]:
-                nonlocal rounds
-                begin, end, _ = some.indices(frames)
-                if near is not None and anchor is None and near(slice(begin * stride, end * stride, stride), found):
-                    rounds = 0  # of the other blocks
-                    return True
-                if turned is None or self.is_odd(found):
-                    return False
-                depth = found.depth[0]
-                if float(viewpoint_turn(self.frames(depth, image[some])[:, :2])) < TURNING:
-                    return False
-                other = (yield from turned(False))[::stride][some]
-                return agree(other, depth, AGREE)
-
-            return searching(
-                self.skeleton, image[some], rate=rate, noise=noise, rounds=rounds, steps=steps, anchor=anchor,
-                standing=feet, confirmed=confirmed,
-            )  # fmt: skip
-
-        if len(starts) == 1:
-            found = yield from lift(slice(None))
-        else:
-            blocks = torch.stack([image[s : s + size] for s in starts])
-            moved = bone_vectors(blocks, self.objective.bones).diff(dim=1).square().sum((1, 2, 3))
-            order = moved.argsort(descending=True).tolist()  # lengths come from the liveliest block
-            part = lambda i, anchor: lift(slice(starts[i], starts[i] + size), anchor)  # noqa: E731
-            depths = blocks.new_empty(blocks.shape[:3])  # all that is kept of a block
-            first = yield from part(order[0], None)
-            lengths, count = first.lengths[0], first.steps
-            depths[order[0]] = first.depth[0]
-            for begin in range(1, len(order), ABREAST):
-                some = order[begin : begin + ABREAST]
-                for i, one in zip(some, (yield from together([part(i, lengths) for i in some])), strict=True):
-                    depths[i], count = one.depth[0], count + one.steps
-            joined = blend_windows(depths, starts, frames)
-            found = Hypotheses(joined[None], lengths[None], joined.new_zeros(1), count)
-        if stride > 1 or len(starts) > 1:
-            found = yield from self._on_all_frames(found[:4], stride, steps)
-        return found
-
-    def _on_all_frames(self, found: Hypotheses, stride: int, steps: int) -> Search[Any, Any, Hypotheses]:
-        """Hypotheses of every ``stride``-th frame on all frames, refined."""
-        pick = torch.arange(0, len(self.image), stride, device=self.image.device)
-        depth = fill_between(found.depth, pick, len(self.image))
-        return (yield from refined(self.objective, replace(found, depth=depth), steps))
 
 
 def alike(depth: Tensor, other: Tensor) -> Tensor:

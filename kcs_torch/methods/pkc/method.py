@@ -19,7 +19,8 @@ from kcs_torch.methods.clips.lockstep import Search, run, together
 from kcs_torch.methods.clips.size import Size
 from kcs_torch.methods.pkc.around import turned_around
 from kcs_torch.methods.pkc.batch import Sized, serve
-from kcs_torch.methods.pkc.body import Body, Turned
+from kcs_torch.methods.pkc.blocks import Turned, search
+from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.fixed_answer import from_hypotheses
 from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of, usual_noise
@@ -224,7 +225,7 @@ class PKC(Method):
             resizing = many and not changing and size.range >= TRIED and (detections or size.likely)
             compare = turned if compared and many and not resizing else None  # what is compared must be searched alike
             near = Asked(self._seems_near, tracks, points, cameras, body)
-            found = yield from body.search(self._moves, self.steps, compare, near)
+            found = yield from search(body, self._moves, self.steps, compare, near)
             if near.told == SEEMS_NEAR:  # the rest is as under perspective
                 method = self.following()
             if near.told and (near.told != SEEMS_FAR or not body.turns(found)):  # else signs were poor: ask again later
@@ -287,7 +288,7 @@ class PKC(Method):
                 found, rival = replace(found, depth=found.depth * ratio, lengths=found.lengths * ratio), None
             else:
                 rival = None if rival is None else rival * ratio
-                found = yield from body.search(self._moves, self.steps)
+                found = yield from search(body, self._moves, self.steps)
                 if cameras is not None and _turns(cameras):
                     found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
             found = yield from self._polished(body, found, cameras, rival)

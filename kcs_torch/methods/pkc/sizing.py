@@ -11,6 +11,7 @@ from torch import Tensor
 from kcs_torch.methods.base import Estimate
 from kcs_torch.methods.clips.lockstep import Search
 from kcs_torch.methods.clips.size import Size
+from kcs_torch.methods.pkc.blocks import search
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 
@@ -51,7 +52,7 @@ def resized(
         tried = yield from refined(other.objective, start, steps)
         if not bool(tried.energy[0] < before - HOPEFUL):
             return None
-    new = yield from other.search(rounds, steps)
+    new = yield from search(other, rounds, steps)
     return new if bool(new.energy[0] < before - BETTER) else None
 
 
