@@ -13,8 +13,8 @@ from kcs_torch import PKC, ConvergenceWarning, KcsWarning, OptionError, SfAM, Sk
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_vectors, chain_inverse, incidence, points_from_bones
 from kcs_torch.methods.answer.root import standing_feet
-from kcs_torch.methods.pkc import method as module
 from kcs_torch.methods.pkc.body import Body
+from kcs_torch.methods.pkc.clip import LEAST_FRAMES
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.metrics import e3d
 
@@ -189,7 +189,7 @@ def test_fixed_needs_a_template_with_a_trunk():
             PKC(viewpoint="fixed")(replace(clip.tracks, skeleton=body))
 
 
-@pytest.mark.parametrize("frames", [1, module.LEAST_FRAMES - 1])
+@pytest.mark.parametrize("frames", [1, LEAST_FRAMES - 1])
 def test_too_few_frames_leave_no_choice(frames):
     clip = walking_person(frames)
     moving, fixed = (PKC(viewpoint=v, rounds=0, steps=5)(clip.tracks) for v in ("moving", "fixed"))

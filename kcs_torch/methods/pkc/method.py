@@ -12,16 +12,16 @@ from torch import Tensor
 from kcs_torch.clean.detector import detected, found_by_detector
 from kcs_torch.clean.sides import unswap
 from kcs_torch.errors import OptionError
-from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
+from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.methods.answer.root import standing_feet
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.clips.lockstep import Search, run, together
-from kcs_torch.methods.clips.size import Size
 from kcs_torch.methods.pkc.around import turned_around
 from kcs_torch.methods.pkc.batch import Sized, serve
 from kcs_torch.methods.pkc.blocks import Turned, search
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.cleaning import cleaned
+from kcs_torch.methods.pkc.clip import LEAST_JOINTS, Clip
 from kcs_torch.methods.pkc.fixed_answer import from_hypotheses
 from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of, usual_noise
 from kcs_torch.methods.pkc.gate import without_border, without_others, without_repeats
@@ -51,15 +51,8 @@ FILLS = 3
 """How often gaps are filled in space: the first time the search is made once more; then, where the viewpoint sways,
 what was found is polished further."""
 
-TELLING = 2.0
-"""Degrees of the turn of known cameras from which on they tell the sign of depth."""
-
-LEAST_FRAMES, LEAST_JOINTS = 3, 4
-"""Frames and joints from which on the viewpoint's turn may tell depth."""
-
-MANY_FRAMES, FAR = 12, 90.0
-"""In clips of fewer frames than these it does so only if bones link all joints and all are seen, and tells more than a
-template does only where it turns by so many degrees."""
+FAR = 90.0
+"""Degrees of the trunk's turn from which on the viewpoint's turn tells more than a template in clips of few frames."""
 
 TWO_FRAMES = "depth is little more than a guess: two frames fit bodies of any depth, and three that differ are needed"
 
@@ -177,106 +170,94 @@ class PKC(Method):
         if float(image.abs().amax()) <= rounding:  # all joints lie at one point
             image = torch.zeros_like(image)
         (size,) = yield [Sized(replace(tracks, points=image))]
-        found = yield from self._solve(tracks, points, image, noise, standing, cameras, notes, size)
+        found = yield from self._solve(Clip(tracks, points, image, noise, standing, cameras, size, notes))
         every = [replace(one, standing=standing) for one in (found, *found.alternatives)]
         return replace(every[0], alternatives=tuple(every[1:]))
 
-    def _solve(
-        self,
-        tracks: Tracks,
-        points: Tensor,
-        image: Tensor,
-        noise: Tensor,
-        standing: Tensor | None,
-        cameras: Tensor | None,
-        notes: tuple[str, ...],
-        size: Size,
-    ) -> Search[Any, Any, Estimate]:
-        """Solve complete points (T, N, 2) by their image about the middle, in which a body's size may change."""
-        skeleton = tracks.skeleton
-        template = self.knows_template(skeleton)
-        if self.viewpoint == "fixed" and not template:
+    def _solve(self, clip: Clip) -> Search[Any, Any, Estimate]:
+        """Solve a clip in which the body's size may change."""
+        skeleton, size = clip.tracks.skeleton, clip.size
+        if self.knows_template(skeleton):
+            return (yield from self._with_template(clip))
+        if self.viewpoint == "fixed":
             raise OptionError(
                 f"pkc: viewpoint: 'fixed' needs a skeleton with a template and a trunk; '{skeleton.name}' has none"
             )
-        enough = tracks.num_joints >= LEAST_JOINTS and (
-            tracks.num_frames >= MANY_FRAMES or (tracks.num_frames >= LEAST_FRAMES and _is_whole(tracks))
-        )
-        many = enough and tracks.num_frames >= MANY_FRAMES
-        detections = detected(tracks)  # their errors last, would be taken for motion, and hide what a size explains
-        # With a template, solutions with and without a change of size may be compared.
-        changing = size.surely if template and many and self.viewpoint != "moving" else size.sure
-        even = image / size.path[:, None, None]
-        if changing:
-            image = even
-        if not template:
-            made = yield from self._without_template(tracks, image, noise, cameras, notes, enough)
-            return with_size(made, size) if changing else made
-        still = self.contacts and not _turns(cameras) and self.viewpoint != "moving"
-        feet = standing if still else None
-        body = Body(skeleton, image, tracks.rate, noise, feet)
-        polished = enough and body.spanned and not detections
+        made = yield from self._without_template(clip.even() if size.sure else clip)
+        return with_size(made, size) if size.sure else made
+
+    def _with_template(self, clip: Clip) -> Search[Any, Any, Estimate]:
+        """Solve a body with a template: by a search with and without a change of size, and by the viewpoint's turn."""
+        size, even, skeleton, rate = clip.size, clip.even(), clip.tracks.skeleton, clip.tracks.rate
+        # What is not sure by itself is compared with solutions without a change.
+        changing = size.surely if clip.many and self.viewpoint != "moving" else size.sure
+        shown, method = even if changing else clip, self
+        feet = clip.standing if self.contacts and not clip.turns and self.viewpoint != "moving" else None
+        body = Body(skeleton, shown.image, rate, clip.noise, feet)
+        polished = clip.enough and body.spanned and not clip.detections
         compared = polished and self.viewpoint == "auto"
-        turned, method = self._turned(tracks, image, noise, body.factor), self
-        if enough and self.viewpoint == "moving":
-            moving, _ = yield from self._moving(tracks, image, noise)
+        turned = self._turned(shown, body.factor)
+        if clip.enough and self.viewpoint == "moving":
+            moving, _ = yield from self._moving(shown)
             found = yield from self._ranked(body, moving)
         else:
-            resizing = many and not changing and size.range >= TRIED and (detections or size.likely)
-            compare = turned if compared and many and not resizing else None  # what is compared must be searched alike
-            near = Asked(self._seems_near, tracks, points, cameras, body)
+            resizing = clip.many and not changing and size.range >= TRIED and (clip.detections or size.likely)
+            compare = turned if compared and clip.many and not resizing else None  # both must be searched alike
+            near = Asked(self._seems_near, clip.tracks, clip.points, clip.cameras, body)
             found = yield from search(body, self._moves, self.steps, compare, near)
             if near.told == SEEMS_NEAR:  # the rest is as under perspective
                 method = self.following()
             if near.told and (near.told != SEEMS_FAR or not body.turns(found)):  # else signs were poor: ask again later
-                notes = (*notes, near.told)
+                clip = replace(clip, notes=(*clip.notes, near.told))
             led = compared and body.is_odd(found) and body.turns(found)  # by the viewpoint's turn, not by the template
             if resizing and (size.sure or not led):
-                other = Body(skeleton, even, tracks.rate, noise, feet, body.pace)
+                other = Body(skeleton, even.image, rate, clip.noise, feet, body.pace)
                 better = yield from resized(found, body, other, size, method._moves, self.steps)
                 if better is not None:
                     changing, body, found = True, other, better
-                    turned = self._turned(tracks, even, noise, body.factor)
-            if cameras is None and body.seen_from_around(found):
+                    turned = self._turned(even, body.factor)
+            if clip.cameras is None and body.seen_from_around(found):
                 found = body.without_contacts(found)
-        if cameras is not None and _turns(cameras):
-            found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
-        around = polished and body.turns(found, 0.0 if many else FAR)
-        if around or (polished and many and not isinstance(method, _Followed)):
-            rival = (yield from turned(body.is_odd(found))) if compared and around else None
-            found = yield from method._polished(body, found, cameras, rival)
-            if self.rounds and self.viewpoint != "moving":
-                found, body = yield from method._filled(found, body, cameras, rival)
-        made = from_hypotheses(
-            found, body, cameras, notes,
-            alternatives=self.alternatives, detections=detections, still=not _turns(cameras), told=self.steps >= 10,
-        )  # fmt: skip
+        made = yield from method._answered(clip, body, found, polished, turned if compared else None)
         return with_size(made, size) if changing else made
 
-    def _without_template(
-        self,
-        tracks: Tracks,
-        image: Tensor,
-        noise: Tensor,
-        cameras: Tensor | None,
-        notes: tuple[str, ...],
-        enough: bool,
+    def _answered(
+        self, clip: Clip, body: Body, found: Hypotheses, polished: bool, turned: Turned | None
     ) -> Search[Any, Any, Estimate]:
-        """Solve a body of which nothing is known by the viewpoint's turn, if there is ``enough`` of it, or by SfAM."""
-        if enough:
-            moving, first = yield from self._in_space(tracks, image, noise)
-            return from_moving(moving, first, tracks.skeleton, cameras, notes, alternatives=self.alternatives)
-        seen = _complete(tracks, image)
+        """Hypotheses told apart by known cameras, polished if they may be, with gaps filled anew; as an estimate.
+
+        Where the viewpoint turns, what it tells by itself, ``turned``, is a rival.
+        """
+        if clip.cameras is not None and clip.turns:
+            found = yield from body.seen_from(found, complete_rotation(clip.cameras), self.steps)
+        around = polished and body.turns(found, 0.0 if clip.many else FAR)
+        if around or (polished and clip.many and not isinstance(self, _Followed)):
+            rival = (yield from turned(body.is_odd(found))) if turned is not None and around else None
+            found = yield from self._polished(clip, body, found, rival)
+            if self.rounds and self.viewpoint != "moving":
+                found, body = yield from self._filled(clip, body, found, rival)
+        return from_hypotheses(
+            found, body, clip.cameras, clip.notes,
+            alternatives=self.alternatives, detections=clip.detections, still=not clip.turns, told=self.steps >= 10,
+        )  # fmt: skip
+
+    def _without_template(self, clip: Clip) -> Search[Any, Any, Estimate]:
+        """Solve a body of which nothing is known by the viewpoint's turn, if there is enough of it, or by SfAM."""
+        tracks, cameras = clip.tracks, clip.cameras
+        if clip.enough:
+            moving, first = yield from self._in_space(clip)
+            return from_moving(moving, first, tracks.skeleton, cameras, clip.notes, alternatives=self.alternatives)
+        seen = clip.complete()
         (first,) = (yield [seen]) if cameras is None else [SfAM().solve(seen, cameras)]
-        made = replace(first, notes=(*notes, "so few frames or joints are solved by sfam", *first.notes))
+        made = replace(first, notes=(*clip.notes, "so few frames or joints are solved by sfam", *first.notes))
         if cameras is None and tracks.num_frames == 2:
             made = replace(made, doubt=TWO_FRAMES)
         if tracks.num_joints < LEAST_JOINTS:
-            made = replace(made, points=with_lengths_held(image, first.points, tracks.skeleton))
+            made = replace(made, points=with_lengths_held(clip.image, first.points, tracks.skeleton))
         return made
 
     def _filled(
-        self, found: Hypotheses, body: Body, cameras: Tensor | None, rival: Tensor | None
+        self, clip: Clip, body: Body, found: Hypotheses, rival: Tensor | None
     ) -> Search[Any, Any, tuple[Hypotheses, Body]]:
         """Hypotheses anew where joints are unseen here and there, and the body with its gaps filled in space."""
         for again in range(FILLS):
@@ -289,61 +270,61 @@ class PKC(Method):
             else:
                 rival = None if rival is None else rival * ratio
                 found = yield from search(body, self._moves, self.steps)
-                if cameras is not None and _turns(cameras):
-                    found = yield from body.seen_from(found, complete_rotation(cameras), self.steps)
-            found = yield from self._polished(body, found, cameras, rival)
+                if clip.cameras is not None and clip.turns:
+                    found = yield from body.seen_from(found, complete_rotation(clip.cameras), self.steps)
+            found = yield from self._polished(clip, body, found, rival)
         return found, body
 
     def _polished(
-        self, body: Body, found: Hypotheses, cameras: Tensor | None, rival: Tensor | None
+        self, clip: Clip, body: Body, found: Hypotheses, rival: Tensor | None
     ) -> Search[Any, Any, Hypotheses]:
         """Hypotheses, the best polished, and with other signs where the viewpoint's turn, depths (T, N), doubts it.
 
         Cameras that are known tell signs by themselves, also against the template.
         """
         found = yield from body.polished(found, self.steps, rival)
-        if rival is None or not self._moves or _turns(cameras) or not body.turns(found):
+        if rival is None or not self._moves or clip.turns or not body.turns(found):
             return found
         return (yield from turned_around(body, found, rival))
 
-    def _moving(
-        self, tracks: Tracks, image: Tensor, noise: Tensor, count: int = 1
-    ) -> Search[Any, Any, tuple[MovingView, Estimate]]:
+    def _moving(self, clip: Clip, count: int = 1) -> Search[Any, Any, tuple[MovingView, Estimate]]:
         """So many solutions of the moving viewpoint at most; and the first guess, SfAM's."""
-        (first,) = yield [_complete(tracks, image)]
-        start, usual = (first.points, complete_rotation(first.cameras)), usual_noise(noise)
-        weights = relative_weights(noise, usual) if usual > 0 else None
+        (first,) = yield [clip.complete()]
+        start, usual = (first.points, complete_rotation(first.cameras)), usual_noise(clip.noise)
+        weights = relative_weights(clip.noise, usual) if usual > 0 else None
         search = MovingSearch(
-            image, tracks.skeleton, *start, weights=weights, noise=usual, lifts=self.lifts, alternatives=count,
-            exact=usual == 0, seed=self.seed,
+            clip.image, clip.tracks.skeleton, *start, weights=weights, noise=usual, lifts=self.lifts,
+            alternatives=count, exact=usual == 0, seed=self.seed,
         )  # fmt: skip
         moving = yield from search.solve()
         return moving, first
 
-    def _in_space(self, tracks: Tracks, image: Tensor, noise: Tensor) -> Search[Any, Any, tuple[MovingView, Estimate]]:
+    def _in_space(self, clip: Clip) -> Search[Any, Any, tuple[MovingView, Estimate]]:
         """As :meth:`_moving`; where exact tracks have gaps, once more with these filled by the first one."""
-        count, exact = max(1, self.alternatives), usual_noise(noise) == 0
-        moving, first = yield from self._moving(tracks, image, noise, count)
-        if self.rounds and exact and fillable(image) and bool(gaps_of(noise).any()):
+        count, exact = max(1, self.alternatives), usual_noise(clip.noise) == 0
+        moving, first = yield from self._moving(clip, count)
+        if self.rounds and exact and fillable(clip.image) and bool(gaps_of(clip.noise).any()):
+            moving = yield from freed(moving, clip.image, clip.noise)
+            image, noise = fill_gaps(clip.image, moving.pose.points[0, ..., :2], clip.noise)
+            clip = replace(clip, image=image, noise=noise)
+            moving, first = yield from self._moving(clip, count)
             moving = yield from freed(moving, image, noise)
-            image, noise = fill_gaps(image, moving.pose.points[0, ..., :2], noise)
-            moving, first = yield from self._moving(tracks, image, noise, count)
-            moving = yield from freed(moving, image, noise)
-        frame = noise[:, tracks.seen.any(0)].square().mean(1, keepdim=True)  # whose pose they turn
+        noise = clip.noise
+        frame = noise[:, clip.tracks.seen.any(0)].square().mean(1, keepdim=True)  # whose pose they turn
         return replace(moving, noise=(noise.square() + frame).sqrt()), first
 
-    def _turned(self, tracks: Tracks, image: Tensor, noise: Tensor, factor: Tensor) -> Turned:
+    def _turned(self, clip: Clip, factor: Tensor) -> Turned:
         """What the viewpoint's turn tells, from many starts or from SfAM's guess: each worked out when first wanted."""
         known: dict[bool, Tensor] = {}
 
         def turned(far: bool) -> Search[Any, Any, Tensor]:
             if far and True not in known:
-                moving, _ = yield from self._moving(tracks, image, noise)
+                moving, _ = yield from self._moving(clip)
                 known[True] = moving.pose.points[0, ..., 2] * factor
             elif far not in known:
-                (first,) = yield [_complete(tracks, image)]
+                (first,) = yield [clip.complete()]
                 start = first.points, complete_rotation(first.cameras)
-                known[False] = (yield from settled(image, tracks.skeleton, *start)) * factor
+                known[False] = (yield from settled(clip.image, clip.tracks.skeleton, *start)) * factor
             return known[far]
 
         return turned
@@ -361,18 +342,3 @@ class PKC(Method):
 
 class _Followed(PKC):
     """Whose solutions are refined, searched and polished under perspective."""
-
-
-def _complete(tracks: Tracks, image: Tensor) -> Tracks:
-    """The tracks with all joints seen at (T, N, 2)."""
-    return replace(tracks, points=image, weights=torch.ones_like(tracks.weights))
-
-
-def _turns(cameras: Tensor | None) -> bool:
-    """Whether known cameras turn far enough to tell the sign of depth."""
-    return cameras is not None and float(viewpoint_turn(cameras)) >= TELLING
-
-
-def _is_whole(tracks: Tracks) -> bool:
-    """Whether the bones are a tree of all joints, and these are seen in all frames."""
-    return tracks.skeleton.is_tree and bool(tracks.seen.all())
