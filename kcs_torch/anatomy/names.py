@@ -177,11 +177,11 @@ def _side_span(name: str) -> tuple[str, int, int] | None:
         elif i == 0 and len(words) > 1 and word.isupper() and low in _LEG_TWIN:
             found.append(("left" if "l" in low else "right", start, stop))
     if not found and words:
-        found = _glued_side(name, words)
+        found = _glued_side(words)
     return found[0] if len(found) == 1 else None
 
 
-def _glued_side(name: str, words: Sequence[tuple[str, int, int]]) -> list[tuple[str, int, int]]:
+def _glued_side(words: Sequence[tuple[str, int, int]]) -> list[tuple[str, int, int]]:
     """A side written without a break: "lefthip", "hipright", "lhip", "LWRIST"."""
     first, start, stop = words[0]
     low = first.lower()

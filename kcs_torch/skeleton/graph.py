@@ -80,10 +80,10 @@ def find_twins(bones: Sequence[Pair], mirror: Sequence[Pair]) -> list[Pair]:
     return found
 
 
-def find_parts(num_joints: int, bones: Sequence[Pair], least: int = 3) -> list[list[int]]:
+def find_parts(num_joints: int, bones: Sequence[Pair]) -> list[list[int]]:
     """Return the parts of a body, limbs and trunk, as lists of bone indices: what is left when it is cut at its hubs.
 
-    A hub is a joint from which three or more branches lead on for at least ``least`` bones: pelvis and neck, the wrist
+    A hub is a joint from which three or more branches lead on for at least three bones: pelvis and neck, the wrist
     of a hand. Where there is none, shorter branches will do; a body without any is one part. Bones that close a chain
     join the parts that they link.
 
@@ -91,7 +91,7 @@ def find_parts(num_joints: int, bones: Sequence[Pair], least: int = 3) -> list[l
     [[0, 1], [2, 3], [4, 5]]
     """
     reach = _reach(num_joints, bones)
-    for length in range(least, 0, -1):
+    for length in (3, 2, 1):
         hubs = {i for i in range(num_joints) if sum(far >= length for far in reach[i].values()) >= 3}
         if hubs:
             break

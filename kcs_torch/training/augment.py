@@ -21,19 +21,19 @@ def mirrored(batch: Batch, skeleton: Skeleton, share: float = 0.5) -> Batch:
         order[a], order[b] = b, a
     flip = torch.rand(len(batch.tracks), device=batch.tracks.device) < share
 
-    def mix(values: Tensor, joints: int, sign: Tensor | None = None) -> Tensor:
-        """Values with the joints along dimension ``joints``, mirrored where wanted."""
-        other = values.index_select(joints, torch.tensor(order, device=values.device))
+    def mix(values: Tensor, sign: Tensor | None = None) -> Tensor:
+        """Values (K, T, N, ...), mirrored where wanted."""
+        other = values.index_select(2, torch.tensor(order, device=values.device))
         if sign is not None:
             other = other * sign.to(other)
         return torch.where(flip.reshape(-1, *[1] * (values.ndim - 1)), other, values)
 
     left = torch.tensor([-1.0, 1.0, 1.0])
     return batch._replace(
-        tracks=mix(batch.tracks, 2, left[:2]),
-        weights=mix(batch.weights, 2),
-        points=mix(batch.points, 2, left),
-        pseudo=mix(batch.pseudo, 2),
+        tracks=mix(batch.tracks, left[:2]),
+        weights=mix(batch.weights),
+        points=mix(batch.points, left),
+        pseudo=mix(batch.pseudo),
     )
 
 

@@ -24,7 +24,7 @@ from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.nn.lengths import free_bones
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["Hypotheses", "distinct", "fixed_view", "refined", "searching"]
+__all__ = ["fixed_view", "searching"]
 
 COARSE = (1.0, 1.01, 1.03, 1.07, 1.14, 1.25)
 FINE = (1.0, 1.008, 1.02, 1.04, 1.07, 1.12, 1.2)

@@ -31,7 +31,8 @@ from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.long_gaps import first_frame, lengthened, shortened
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
 from kcs_torch.methods.pkc.moving_search import MovingSearch
-from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights, settled
+from kcs_torch.methods.pkc.moving_solutions import MovingView
+from kcs_torch.methods.pkc.moving_view import relative_weights, settled
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR, Asked
 from kcs_torch.methods.pkc.sizing import TRIED, resized, with_size
 from kcs_torch.methods.sfam import SfAM

@@ -41,13 +41,13 @@ class MovingView:
     lead: float = 0.0
     noise: Tensor | None = None
 
-    def cameras(self, index: int = 0, kind: CameraPath = "auto") -> tuple[Tensor, CameraPath]:
+    def cameras(self, index: int = 0) -> tuple[Tensor, CameraPath]:
         """Rotations (T, 3, 3), world to camera, of one solution, and the kind of path they follow.
 
         What aligns poses also turns with the body; a camera moves simply. See
         :func:`kcs_torch.solvers.camera_path.choose_path`.
         """
-        path, kind, _ = choose_path(self.pose.rotations[index], kind)
+        path, kind, _ = choose_path(self.pose.rotations[index])
         if kind == "constant":
             path = settle_path(bone_vectors(self.pose.points[index], self.bones), path)
         return path, kind

@@ -14,7 +14,7 @@ from kcs_torch.methods.pkc.moving_solutions import MovingView
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.procrustean import COARSE, Pose, align_rotations
 
-__all__ = ["MovingView", "moving_view", "relative_weights", "settled"]
+__all__ = ["moving_view", "relative_weights", "settled"]
 
 
 def moving_view(
