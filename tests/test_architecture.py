@@ -162,6 +162,14 @@ def test_folders_of_a_part_import_one_way(name):
                 assert height(words[2]) <= height(own), f"{path.relative_to(ROOT)} imports {other}"
 
 
+@pytest.mark.parametrize("name", ["pkc", "perspective"])
+def test_folders_of_many_files_say_what_each_is_for(name):
+    """In the docstring of the package, which is where a reader begins."""
+    folder = PACKAGE / "methods" / name
+    told = re.findall(r"``(\w+)``", ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))))
+    assert sorted(told) == sorted(path.stem for path in folder.glob("*.py") if path.stem != "__init__")
+
+
 def test_functional_needs_torch_only():
     """And Triton for its one kernel, which is imported where a GPU asks for it."""
     for path in (PACKAGE / "functional").glob("*.py"):

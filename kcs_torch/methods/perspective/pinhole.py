@@ -131,9 +131,9 @@ class PinholeEnergy:
         self.bones = skeleton.bone_index(device=rays.device)
         tree = self._links(rays)
         self.toward = self.rays[:, self.bones[:, 1]]  # (2, B, T) bones' rays
-        self.path, self.depth = distance.expand(len(depth), -1), depth.mT.contiguous()
-        self.wide = (torch.ones_like(depth[:, 0, 0]) if focal is None else 1 / focal[0])[:, None]
-        self.free = None if focal is None else focal[1]
+        self.path, self.depth = distance.expand(len(depth), -1), depth.mT.contiguous()  # P (H, T), z (H, N, T)
+        self.wide = (torch.ones_like(depth[:, 0, 0]) if focal is None else 1 / focal[0])[:, None]  # w (H, 1)
+        self.free = None if focal is None else focal[1]  # (H,) whose w is an unknown
         self.own = bone_vectors(depth[..., None], self.bones)[..., 0].mT.contiguous()
         size = (self.own.square() + self._first_image().square().sum(1)).sqrt()
         self.lengths = median(size, -1).clamp_min(1e-6)

@@ -42,6 +42,9 @@ BETTER, BEST = 6, 4
 FLIPS = 4
 """Flips of runs of signs beside other moves."""
 
+GAIN = 0.5
+"""By how much a round of moves must make the best hypothesis cheaper for another round to be made."""
+
 ALIKE = 0.02
 """Root mean square depth below which hypotheses are one, a person being about 1.75 tall."""
 
@@ -129,13 +132,23 @@ def searching(
         best = found.energy[0]
         moved = yield from search.moves(found)
         found = yield from search.refine(moved, steps)
-        if not bool(found.energy[0] < best - 0.5):
+        if not bool(found.energy[0] < best - GAIN):
             break
     return (yield from turned_over(search.objective, search.parts, found, steps)) if rounds else found
 
 
 @dataclass(frozen=True)
 class _Search:
+    """The search for one clip.
+
+    Attributes:
+        skeleton: with a template, its bones directed outwards.
+        image: (T, N, 2), centred, in units of the template.
+        objective: that refines and ranks hypotheses.
+        costs: by which limbs are placed.
+        turn: usual turn of the trunk from a frame to the next, in radians.
+    """
+
     skeleton: Skeleton
     image: Tensor
     objective: Objective
@@ -144,6 +157,7 @@ class _Search:
 
     @cached_property
     def parts(self) -> list[tuple[int, ...]]:
+        """Bones whose signs are turned over together."""
         return parts_of(self.skeleton, self.limbs)
 
     @cached_property
@@ -170,7 +184,7 @@ class _Search:
         return made
 
     def refine(self, found: Hypotheses, steps: int, loose: float = 1.0) -> Search[Any, Any, Hypotheses]:
-        """All a little, with loose lengths first where the start is rough, then the best few that differ."""
+        """All refined a little, with loose lengths first where the start is rough, then the best few that differ."""
         few = max(steps // 3, 1)
         if loose > 1:
             found = yield from refined(self.objective, found, few, loose)

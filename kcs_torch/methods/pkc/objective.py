@@ -294,7 +294,7 @@ class Objective:
         out.rigid = first.rigid * out.time[..., None]
         spread = torch.stack([part.posture.deviation for part in parts])[each][:, None]
         out.posture = _altered(first.posture, deviation=spread)
-        out.standing = None  # of each clip by itself, see ranked()
+        out.standing = None  # contacts rank the hypotheses of each clip by itself, when all are refined
         out.count, out.noisy = gather(frames), any(part.noisy for part in parts)
         out.share = out.time / gather([part.posture.correlation for part in parts])[:, None]
         ratio = [first.foreshortening.correlation / part.foreshortening.correlation for part in parts]

@@ -209,6 +209,7 @@ def limb_paths(tasks: Sequence[Placing]) -> list[LimbPaths]:
 
 
 def _joined(tasks: list[Placing]) -> Placing:
+    """All limbs of several clips, those of shorter ones padded."""
     if len(tasks) == 1:
         return tasks[0]
     most = max(task.frames for task in tasks)
@@ -220,6 +221,7 @@ def _joined(tasks: list[Placing]) -> Placing:
 
 
 def _place(task: Placing) -> LimbPaths:
+    """Choose lengths by some windows of the clip, then signs in all, which are stitched together."""
     size = min(WINDOW, task.frames)
     starts = window_starts(task.frames, size, min(OVERLAP, size - 1))
     lengths = _likeliest(task, starts, size)
