@@ -35,48 +35,58 @@ class ObjectiveGradient:
         self.noise = _early(obj.noise).square() if obj.noisy else None
         self.rigid = obj.rigid[None, :, None] if obj.rigid.ndim == 1 else _early(obj.rigid)
         self.time = None if obj.time is None else obj.time[:, None]  # (H, 1, T)
-        w, share = obj.weights, 1.0 if self.time is None else self.time
         ends = incidence(obj.bones, body.num_joints, dtype=like.dtype).mT
         mix = ends @ obj.complete.mT @ obj.tree[: body.num_observed]  # virtual joints move bones with others
         eye = torch.eye(len(mix), dtype=like.dtype, device=like.device)
         self.mix = None if bool((mix - eye).abs().amax() < 1e-9) else mix
-        posture = obj.posture
-        affine = posture.affine.to(like)
-        lines = [(affine - affine.mean(-1, keepdim=True)) @ obj.tree[posture.trunk]]  # (2, B): the trunk's long axes
+        self.lines = torch.cat([self._take_posture(like), *self._take_hinges(like)])  # (2 + 3 hinges, B)
+        own = bone_vectors(obj.image, obj.bones).movedim((-1, -2), (-3, -2))  # (..., 2, B, T)
+        self.image = self.imaged(own if own.ndim == 4 else own[None])
+        self._take_lengths(like)
+
+    def _take_posture(self, like: Tensor) -> Tensor:
+        """Hold what posture and stance need; returns the lines (2, B) that make the trunk's long axes of bones."""
+        obj, posture, stance = self.objective, self.objective.posture, self.objective.stance
         self.axes = posture.axes.to(like)
         self.sides = sides = Sides(posture)
-        spread = posture.deviation.to(like).mT[..., sides.order].reshape(-1, 3, body.num_bones)
+        spread = posture.deviation.to(like).mT[..., sides.order].reshape(-1, 3, len(obj.bones))
         self.spread = spread * sides.share.to(like)  # (1 or H, 3, B)
         self.mean = (posture.mean.to(like).mT[:, sides.order] / self.spread).flatten(1)[..., None]  # (1 or H, 3B, 1)
-        hinges, limbs = obj.hinges, obj.adduction
-        # Upper arms and thighs, which must not reach far across the body, are bones above hinges: these come first.
+        self.feet = stance.line.to(like)[sides.order]  # 0 where nothing stands on the ground
+        self.beneath = stance.usual.to(like)[:, None]  # (2, 1)
+        affine = posture.affine.to(like)
+        return (affine - affine.mean(-1, keepdim=True)) @ obj.tree[posture.trunk]
+
+    def _take_hinges(self, like: Tensor) -> list[Tensor]:
+        """Hold what hinges and adduction need; returns the lines (hinges, B) of bones above and below, and of axes.
+
+        Upper arms and thighs, which must not reach far across the body, are bones above hinges: these come first.
+        """
+        obj, w, hinges, limbs = self.objective, self.weights, self.objective.hinges, self.objective.adduction
+        share = 1.0 if self.time is None else self.time
         above = hinges.joints[:, [0, 1, 3, 4]].tolist()
         first = [above.index(limb) for limb in limbs.joints.tolist()]
         order = first + [k for k in range(len(above)) if k not in first]
         self.outer = len(first)
-        parent, joint, child, left, right = hinges.joints[order].unbind(1)
-        lines += [obj.tree[a] - obj.tree[b] for a, b in ((joint, parent), (child, joint), (left, right))]
-        self.lines = torch.cat(lines)  # (2 + 3 hinges, B)
         self.hinged, self.sign, self.side = hinges.limbs[order], hinges.sign.to(like)[order], -limbs.side.to(like)
         self.firm = wide(w.hinge / w.sine**2, 2) * hinges.firm.to(like)[order, None] * share  # (1 or H, hinges, 1 or T)
         self.reach = wide(w.adduction / w.sine**2, 2) * share
-        ends = torch.nn.functional.one_hot(self.hinged, body.num_bones).to(like)  # (hinges, 2, B)
+        ends = torch.nn.functional.one_hot(self.hinged, len(obj.bones)).to(like)  # (hinges, 2, B)
         self.bent, self.reached = -ends.sum(1), -ends[: self.outer, 0]  # whose lengths a hinge's cost depends on
-        stance = obj.stance
-        self.feet = stance.line.to(like)[sides.order]  # 0 where nothing stands on the ground
-        self.beneath = stance.usual.to(like)[:, None]  # (2, 1)
-        own = bone_vectors(obj.image, obj.bones).movedim((-1, -2), (-3, -2))  # (..., 2, B, T)
-        self.image = self.imaged(own if own.ndim == 4 else own[None])
-        free = obj.foreshortening
+        parent, joint, child, left, right = hinges.joints[order].unbind(1)
+        return [obj.tree[a] - obj.tree[b] for a, b in ((joint, parent), (child, joint), (left, right))]
+
+    def _take_lengths(self, like: Tensor) -> None:
+        """Hold what foreshortening and proportions need."""
+        obj, free, sizes = self.objective, self.objective.foreshortening, self.objective.proportions
         self.limbs = free.free.nonzero().flatten()
         clear = _early(obj.clear).index_select(1, self.limbs)
         self.clear = clear * (free.free.to(like)[self.limbs, None] / free.correlation)
         self.held = self.clear.sum(-1)
         least = torch.finfo(like.dtype).tiny ** 0.25  # squares of it are not 0
         self.blur = HIDDEN * _early(obj.noise).index_select(1, self.limbs).clamp_min(least)
-        sizes = obj.proportions
         self.usual = sizes.usual.to(like).clamp_min(torch.finfo(like.dtype).tiny).log()
-        twins = torch.nn.functional.one_hot(sizes.pairs, body.num_bones).to(like)
+        twins = torch.nn.functional.one_hot(sizes.pairs, len(obj.bones)).to(like)
         self.twins = (twins[:, 0] - twins[:, 1]) / sizes.twins  # (pairs, B)
 
     def imaged(self, bones: Tensor, rays: Tensor | None = None) -> Image:
