@@ -1,6 +1,7 @@
 """How joints bend: known angles, their sign, derivatives, deviations, tables, and the command line."""
 
 import csv
+import functools
 import json
 import math
 from dataclasses import replace
@@ -8,16 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from command_line import run as run_any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import DEVICES, FLOATS, finite, gradcheck, leaves_arguments_alone, normal, rotations, same_as_loop
 from samples import walk_result, walking_motion
 from torch.testing import assert_close
-from typer.testing import CliRunner
 
 import kcs_torch as kt
 from kcs_torch.anatomy import Hinge
-from kcs_torch.cli import app
 from kcs_torch.errors import OptionError, OutputError, ShapeError, SkeletonError
 from kcs_torch.functional import angle_between, flexion, joint_angles
 from kcs_torch.types.angles import angles_of
@@ -47,10 +47,7 @@ def legs(knee: float, ankle: float = 90.0) -> torch.Tensor:
     return torch.cat([hip, middle, low, toe])[[0, 1, 2, 3, 4, 5, 6, 7]]
 
 
-def run(*words, code=0):
-    done = CliRunner().invoke(app, ["angles", *map(str, words)])
-    assert done.exit_code == code, done.output
-    return done
+run = functools.partial(run_any, "angles")
 
 
 # ---------------------------------------------------------------------- the functions

@@ -9,26 +9,14 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from command_line import run
 from needs import SUFFIXES
-from typer.testing import CliRunner
 
 import kcs_torch as kt
-from kcs_torch.cli import app
 from kcs_torch.cli.fields import parse_settings
-
-runner = CliRunner()
 
 QUICK = ["--set", "viewpoint=fixed", "--set", "rounds=0", "--set", "steps=3"]
 """The default method in a tenth of its time, for tests of what goes on around it."""
-
-
-def run(*words, code=0):
-    """Run a command in this process; returns what it printed to standard output, or the whole result."""
-    done = runner.invoke(app, [str(w) for w in words])
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    assert done.exit_code == code, done.output
-    return done
 
 
 # ---------------------------------------------------------------------- the whole program

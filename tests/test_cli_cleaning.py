@@ -5,21 +5,12 @@ import json
 import numpy as np
 import pytest
 import torch
+from command_line import run
 from conftest import moving_body
-from typer.testing import CliRunner
 
 import kcs_torch as kt
-from kcs_torch.cli import app
 
 FRAMES = 60
-
-
-def run(*words, code=0):
-    done = CliRunner().invoke(app, [str(w) for w in words])
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    assert done.exit_code == code, done.output
-    return done
 
 
 @pytest.fixture(scope="module")

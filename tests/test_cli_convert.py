@@ -5,22 +5,14 @@ import json
 import numpy as np
 import pytest
 import torch
+from command_line import run
 from samples import walk_result, walking_motion
-from typer.testing import CliRunner
 
 import kcs_torch as kt
-from kcs_torch.cli import app
 from kcs_torch.cli.outputs import parse_scale
 from kcs_torch.errors import OptionError
 from kcs_torch.io import load_motion, load_reconstruction, save
 from kcs_torch.types import Motion
-
-
-def run(*words, code=0):
-    done = CliRunner().invoke(app, [str(w) for w in words])
-    assert done.exit_code == code, done.output
-    return done
-
 
 # ---------------------------------------------------------------------- the whole way
 

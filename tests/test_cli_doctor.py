@@ -1,14 +1,15 @@
 """``kcs-torch doctor``: what it tells, and what it finds wrong."""
 
+import functools
 import json
 import tomllib
 from importlib import metadata
 
 import pytest
-from typer.testing import CliRunner
+from command_line import run as run_any
 
 import kcs_torch as kt
-from kcs_torch.cli import app, doctor
+from kcs_torch.cli import doctor
 
 NEEDS = [
     "numpy>=1.26",
@@ -20,12 +21,7 @@ NEEDS = [
 ]
 
 
-def run(*words, code=0):
-    done = CliRunner().invoke(app, ["doctor", *words])
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    assert done.exit_code == code, done.output
-    return done
+run = functools.partial(run_any, "doctor")
 
 
 @pytest.fixture

@@ -10,11 +10,10 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from command_line import run
 from conftest import moving_body
-from typer.testing import CliRunner
 
 import kcs_torch as kt
-from kcs_torch.cli import app
 from kcs_torch.detect import DETECTORS, detect_video
 from kcs_torch.detect.detector import EXTRAS
 from kcs_torch.io.video import VIDEO_SUFFIXES, is_video, looks_like_video
@@ -499,14 +498,6 @@ def test_reading_a_video_as_tracks_says_what_to_do(video):
 
 
 # ---------------------------------------------------------------------- the command line
-
-
-def run(*words, code=0):
-    done = CliRunner().invoke(app, [str(w) for w in words])
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    assert done.exit_code == code, done.output
-    return done
 
 
 @pytest.fixture
