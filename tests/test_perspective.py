@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from near_cameras import LENS, error, filmed, quietly
 from typer.testing import CliRunner
 
 import kcs_torch as kt
@@ -18,31 +19,6 @@ from kcs_torch.io import load_reconstruction
 from kcs_torch.methods.answer.root import ABSENT, FOUND
 from kcs_torch.methods.perspective import calibrated, scene
 from kcs_torch.types import Intrinsics, Motion
-
-LENS = (1500.0, 1480.0, 960.0, 540.0)
-
-
-def filmed(nearest=2500.0, lens=LENS, frames=60, skeleton="h36m17", noise=0.0, **view):
-    """Tracks in px of a walking person whose nearest joint comes as near as that (mm), and the true points (mm)."""
-    clip = kt.data.walking_person(frames, skeleton=skeleton, **{"turn": 0, "yaw": 30, **view})
-    points = clip.points.clone()
-    points[..., 2] += nearest - float(points[..., 2].min())
-    image = Intrinsics.of(lens).project(points)[:, : clip.skeleton.num_observed]
-    image = image + noise * torch.randn(image.shape, generator=torch.Generator().manual_seed(0), dtype=image.dtype)
-    return kt.Tracks.from_arrays(image, skeleton=clip.skeleton, fps=30.0), points
-
-
-def reconstruct(tracks, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", kt.KcsWarning)
-        return kt.reconstruct(tracks, **options)
-
-
-def error(points, truth):
-    """Mean distance (mm) after the best rotation of each frame and one scale for the clip."""
-    a, b = points - points.mean(1, keepdim=True), truth - truth.mean(1, keepdim=True)
-    a = a @ kt.functional.nearest_rotation((a.mT @ b).mT).mT
-    return float((a * ((a * b).sum() / (a * a).sum()) - b).norm(dim=-1).mean())
 
 
 def check_sound(result, before=True):
@@ -54,88 +30,13 @@ def check_sound(result, before=True):
     torch.testing.assert_close(rows, torch.eye(2).to(rows).expand_as(rows), rtol=0, atol=1e-4)
 
 
-# ---------------------------------------------------------------------- Intrinsics
-
-
-def test_intrinsics_from_numbers_and_from_a_matrix():
-    matrix = [[1500, 0, 960], [0, 1480, 540], [0, 0, 1]]
-    wanted = Intrinsics(*LENS)
-    for value in (
-        LENS,
-        list(LENS),
-        np.array(LENS),
-        torch.tensor(LENS),
-        matrix,
-        np.array(matrix),
-        wanted,
-        np.array(LENS, ">f4"),
-    ):
-        assert Intrinsics.of(value) == wanted
-    assert wanted.focal == pytest.approx(math.sqrt(1500 * 1480))
-
-
-def test_rays_and_projection_are_inverse():
-    lens = Intrinsics(*LENS)
-    points = torch.tensor([[0.3, -0.2, 4.0], [-1.0, 1.0, 2.0]], dtype=torch.float64)
-    image = lens.project(points)
-    assert image[0].tolist() == pytest.approx([1500 * 0.3 / 4 + 960, -1480 * 0.2 / 4 + 540])
-    torch.testing.assert_close(lens.rays(image) * points[:, 2:], points)
-
-
-@pytest.mark.parametrize("lens", [(1e-3, 1e-3, 0, 0), torch.eye(3), (1000, 1000, 1e300, 0), (1e300, 1e-300, 0, 0)])
-@pytest.mark.parametrize("method", ["kcs", "sfam", "pkc"])
-def test_intrinsics_of_another_camera_or_unit_are_refused(lens, method):
-    """As pixels with a camera matrix of normalised coordinates; no NaN comes back."""
-    tracks = filmed(frames=12)[0]
-    with pytest.raises(kt.OptionError, match=r"in the unit of the tracks, whose coordinates are about \d+, got"):
-        kt.reconstruct(tracks, method=method, intrinsics=lens)
-
-
-def test_rays_of_nothing_and_of_what_is_not_known():
-    lens = Intrinsics(*LENS)
-    assert lens.rays(torch.zeros(0, 2)).shape == (0, 3)
-    assert lens.rays(torch.full((4, 2), torch.nan)).isnan()[:, :2].all()
-
-
-@pytest.mark.parametrize(
-    ("value", "kind", "says"),
-    [
-        ((1500, 1500, 960), kt.ShapeError, r"got shape \(3,\)"),
-        ((1500, 1500, 960, 540, -0.2, 0.1), kt.ShapeError, r"got shape \(6,\): a lens that distorts .* undistort the"),
-        ((np.eye(3), np.zeros(5)), kt.ShapeError, r"got two arrays: a lens that distorts .*undistortPoints"),
-        (np.eye(4), kt.ShapeError, r"got shape \(4, 4\)"),
-        ("1500", kt.ShapeError, "got '1500'"),
-        ({"fx": 1}, kt.ShapeError, "fx, fy, cx, cy"),
-        ((-1500, 1500, 0, 0), kt.OptionError, "positive focal lengths, got fx = -1500"),
-        ((0, 1500, 0, 0), kt.OptionError, "positive focal lengths"),
-        ((math.nan, 1500, 0, 0), kt.OptionError, "finite"),
-        ((1500, 1500, math.inf, 0), kt.OptionError, "finite"),
-        ([[1500, 50, 0], [0, 1500, 0], [0, 0, 1]], kt.OptionError, "without skew.*undistort"),
-        ([[1500, 0, 0], [0, 1500, 0], [0, 0, 2]], kt.OptionError, "without skew"),
-        ([[1500, 0, 0], [0, 1500, 0], [0, 0, 2]], kt.OptionError, "divide it by its last number"),
-        (np.full((3, 3), math.nan), kt.OptionError, "give finite numbers"),
-        (np.array([1500, 1500, 960, 540j]), kt.ShapeError, "expected real numbers, got complex128"),
-        ((10**400, 1500, 0, 0), kt.OptionError, "finite numbers"),
-        (((10**400, 0, 0), (0, 1500, 0), (0, 0, 1)), kt.ShapeError, "fx, fy, cx, cy"),
-    ],
-)
-def test_bad_intrinsics_are_told(value, kind, says):
-    with pytest.raises(kind, match=says):
-        kt.reconstruct(filmed(frames=3)[0], intrinsics=value)
-
-
-def test_cameras_that_do_not_fit_are_told():
-    with pytest.raises(kt.ShapeError, match=r"cameras: expected finite \(3, 2, 3\)"):
-        kt.reconstruct(filmed(frames=3)[0], intrinsics=LENS, cameras=torch.zeros(2, 2, 3))
-
-
 # ---------------------------------------------------------------------- what it brings
 
 
 @pytest.mark.parametrize("method", ["kcs", "sfam", "pkc"])
 def test_every_method_projects_onto_the_image_and_gets_better(method):
     tracks, truth = filmed(yaw=60, frames=45)
-    plain, result = (reconstruct(tracks, method=method, intrinsics=lens) for lens in ("parallel", LENS))
+    plain, result = (quietly(tracks, method=method, intrinsics=lens) for lens in ("parallel", LENS))
     check_sound(result)
     image = Intrinsics.of(LENS).project(result.in_space())
     off = (image - tracks.points)[tracks.seen].square().sum(-1).mean().sqrt()
@@ -157,7 +58,7 @@ def test_the_turn_that_the_lens_shows_tells_whether_depth_is_a_guess(turn):
 
 def test_a_person_who_walks_towards_the_camera_comes_nearer_by_the_true_ratio():
     tracks, truth = filmed(yaw=20, frames=90)
-    result = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    result = quietly(tracks, method="kcs", intrinsics=LENS)
     true = truth[..., 2].mean(1)
     assert float(true[0] / true[-1]) > 1.8  # what there is to find
     path = result.distance / true
@@ -168,7 +69,7 @@ def test_a_person_who_walks_towards_the_camera_comes_nearer_by_the_true_ratio():
 
 def test_in_metres_the_person_is_where_they_are():
     tracks, truth = filmed(yaw=60, frames=60)
-    result = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    result = quietly(tracks, method="kcs", intrinsics=LENS)
     factor = float(kt.functional.bone_lengths(truth, result.skeleton.bones).median(0).values.sum() / 1000)
     result = result.scaled(units="m", factor=factor / float(result.lengths.sum()))
     assert float((1000 * result.in_space() - truth).norm(dim=-1).mean()) < 0.06 * float(truth[..., 2].mean())
@@ -176,7 +77,7 @@ def test_in_metres_the_person_is_where_they_are():
 
 
 def test_the_turn_that_is_told_is_that_of_the_cameras():
-    found = reconstruct(filmed(yaw=70)[0], method="kcs", intrinsics=LENS)  # the camera looks after the person
+    found = quietly(filmed(yaw=70)[0], method="kcs", intrinsics=LENS)  # the camera looks after the person
     for one in (found, *found.alternatives):
         turn = float(kt.functional.viewpoint_turn(one.cameras))
         assert one.diagnostics.viewpoint_turn == pytest.approx(turn, abs=1e-6)
@@ -190,10 +91,10 @@ def test_body_off_the_optical_axis(method):
     c, s, o = turn.cos(), turn.sin(), torch.zeros_like(turn)
     aside = truth @ torch.stack([torch.stack([c, o, s]), torch.stack([o, o + 1, o]), torch.stack([-s, o, c])]).mT
     other = kt.Tracks.from_arrays(Intrinsics.of(LENS).project(aside), skeleton=tracks.skeleton, fps=30.0)
-    first, second = (reconstruct(t, method=method, intrinsics=LENS) for t in (tracks, other))
+    first, second = (quietly(t, method=method, intrinsics=LENS) for t in (tracks, other))
     spread = lambda x: (x - x.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()  # noqa: E731
     assert error(second.points, first.points * (spread(truth) / spread(first.points))) < 10.0  # mm
-    plain = reconstruct(other, method=method, intrinsics="parallel")
+    plain = quietly(other, method=method, intrinsics="parallel")
     assert error(second.points, truth) < 0.7 * error(plain.points, truth)
 
 
@@ -203,7 +104,7 @@ def test_a_very_long_focal_length_changes_nothing(method):
     clip = kt.data.walking_person(20, turn=60)
     lens = (1e8, 1e8, 0.0, 0.0)
     plain = kt.METHODS[method]().following(searched=False)(clip.tracks)  # a virtual camera follows the body
-    result = reconstruct(clip.tracks, method=method, intrinsics=lens)
+    result = quietly(clip.tracks, method=method, intrinsics=lens)
     check_sound(result)
     middle = lambda x: x - x.mean(1, keepdim=True)  # noqa: E731
     torch.testing.assert_close(middle(result.points), middle(plain.points), rtol=0, atol=1.0)  # mm
@@ -218,29 +119,29 @@ def test_solutions_are_ranked_by_their_objective():
     ahead = clip.points + clip.points.new_tensor([0.0, 0.0, 10000.0])
     tracks = replace(clip.tracks, points=1500 * ahead[..., :2] / ahead[..., 2:])
     for method in ("sfam", "pkc"):
-        result = reconstruct(tracks, method=method, intrinsics=(1500.0, 1500.0, 0.0, 0.0))
+        result = quietly(tracks, method=method, intrinsics=(1500.0, 1500.0, 0.0, 0.0))
         assert all(result.objective <= other.objective for other in result.alternatives)
 
 
 def test_nobody_seen_is_finite():
     tracks, _ = filmed(frames=15)
-    result = reconstruct(replace(tracks, weights=0 * tracks.weights), intrinsics=LENS)
+    result = quietly(replace(tracks, weights=0 * tracks.weights), intrinsics=LENS)
     assert result.points.isfinite().all() and result.distance.isfinite().all()
 
 
 def test_known_cameras_are_kept():
     tracks, truth = filmed(yaw=30, turn=60, frames=90)
     clip = kt.data.walking_person(90, yaw=30, turn=60)
-    result = reconstruct(tracks, method="sfam", intrinsics=LENS, cameras=clip.cameras)
+    result = quietly(tracks, method="sfam", intrinsics=LENS, cameras=clip.cameras)
     check_sound(result)
     torch.testing.assert_close(result.cameras, clip.cameras, rtol=0, atol=1e-6)
-    plain = reconstruct(tracks, method="sfam", cameras=clip.cameras)
+    plain = quietly(tracks, method="sfam", cameras=clip.cameras)
     assert error(result.points, truth) < 0.5 * error(plain.points, truth)
 
 
 def test_the_mirror_image_has_the_same_image():
     tracks, _ = filmed(frames=20)
-    result = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    result = quietly(tracks, method="kcs", intrinsics=LENS)
     other = result.mirrored()
     project = Intrinsics.of(LENS).project
     torch.testing.assert_close(project(other.in_space()), project(result.in_space()))
@@ -260,18 +161,18 @@ def test_any_skeleton():
     truth = clip.points + torch.tensor([0, 0, 3000.0], dtype=torch.float64)
     tracks = kt.Tracks.from_arrays(Intrinsics.of(LENS).project(truth), skeleton=arm, fps=30.0)
     for method in (kt.SfAM(), kt.PKC(lifts=1)):
-        result = reconstruct(tracks, method=method, intrinsics=LENS)
+        result = quietly(tracks, method=method, intrinsics=LENS)
         check_sound(result)
         assert result.diagnostics.reprojection_rms < 5.0
     free = kt.Tracks.from_arrays(tracks.points, fps=30.0)  # no bones at all
-    check_sound(reconstruct(free, method="sfam", intrinsics=LENS))
+    check_sound(quietly(free, method="sfam", intrinsics=LENS))
 
 
 @pytest.mark.parametrize("yaw", [20, 60])
 def test_walks_before_a_near_camera_are_nearly_as_exact_as_under_parallel_rays(yaw):
     tracks, truth = filmed(nearest=2000.0, yaw=yaw, frames=60)
-    result = reconstruct(tracks, method="pkc", intrinsics=LENS)
-    far = reconstruct(kt.data.walking_person(60, turn=0, yaw=yaw).tracks, method="pkc")
+    result = quietly(tracks, method="pkc", intrinsics=LENS)
+    far = quietly(kt.data.walking_person(60, turn=0, yaw=yaw).tracks, method="pkc")
     assert error(result.points, truth) < error(far.points, truth) + 8
     path = result.distance / truth[..., 2].mean(1)
     assert float((path / path.mean() - 1).abs().max()) < 0.01
@@ -279,7 +180,7 @@ def test_walks_before_a_near_camera_are_nearly_as_exact_as_under_parallel_rays(y
 
 def test_bones_keep_their_length_where_the_image_is_noisy():
     tracks, _ = filmed(nearest=2500.0, frames=30, noise=3.0)
-    result = reconstruct(tracks, intrinsics=LENS)
+    result = quietly(tracks, intrinsics=LENS)
     assert result.diagnostics.bone_variation < 0.4  # per cent; the model's own is .3, and joints are moved in few steps
     assert 2.0 < result.diagnostics.reprojection_rms < 8.0  # the noise, which is not explained
     check_sound(result)
@@ -327,7 +228,7 @@ def test_a_long_clip_is_refined_in_blocks_that_share_lengths(monkeypatch):
     monkeypatch.setattr(scene, "lbfgs", watched)
     monkeypatch.setattr(scene, "BLOCK", 100)
     monkeypatch.setattr(scene, "OVERLAP", 20)
-    result = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    result = quietly(tracks, method="kcs", intrinsics=LENS)
     check_sound(result)
     assert len(seen) in (3, 6, 9) and {energy.rays.shape[-1] for energy in seen} == {100}
     for first, *others in zip(seen[::3], seen[1::3], seen[2::3], strict=True):
@@ -344,9 +245,9 @@ def test_a_long_clip_is_refined_in_blocks_that_share_lengths(monkeypatch):
 
 def test_a_clip_of_one_block_is_one_problem(monkeypatch):
     tracks, _ = filmed(frames=40)
-    whole = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    whole = quietly(tracks, method="kcs", intrinsics=LENS)
     monkeypatch.setattr(scene, "BLOCK", 40)
-    assert torch.equal(reconstruct(tracks, method="kcs", intrinsics=LENS).points, whole.points)
+    assert torch.equal(quietly(tracks, method="kcs", intrinsics=LENS).points, whole.points)
 
 
 def test_blocks_in_which_nobody_is_seen_or_nothing_moves(monkeypatch):
@@ -358,7 +259,7 @@ def test_blocks_in_which_nobody_is_seen_or_nothing_moves(monkeypatch):
     still[20:] = still[20]
     for points in (hidden, still):
         given = kt.Tracks.from_arrays(points, skeleton=tracks.skeleton, fps=30.0)
-        check_sound(reconstruct(given, method="kcs", intrinsics=LENS))
+        check_sound(quietly(given, method="kcs", intrinsics=LENS))
 
 
 # ---------------------------------------------------------------------- autograd
@@ -412,7 +313,7 @@ def test_no_tracks_give_nan(method):
         tracks.frames(0, 2),
         tracks.to(torch.float32),
     ):
-        result = reconstruct(given, method=method, intrinsics=LENS)
+        result = quietly(given, method=method, intrinsics=LENS)
         check_sound(result)
         assert result.points.dtype == given.points.dtype
 
@@ -420,7 +321,7 @@ def test_no_tracks_give_nan(method):
 @pytest.mark.parametrize("focal", [60.0, 1e12])
 def test_an_absurd_focal_length_gives_no_nan(focal):
     tracks, _ = filmed(frames=12)
-    check_sound(reconstruct(tracks, method="kcs", intrinsics=(focal, focal, 0.0, 0.0)))
+    check_sound(quietly(tracks, method="kcs", intrinsics=(focal, focal, 0.0, 0.0)))
 
 
 @pytest.mark.parametrize(("method", "factor"), [("sfam", 1e10), ("kcs", 1e14)])
@@ -431,7 +332,7 @@ def test_a_frame_far_beside_the_camera_is_told(method, factor):
     points = tracks.points.clone()
     points[5] *= factor
     with pytest.raises(kt.OptionError, match="in frame 5 a joint lies .* focal lengths off the optical axis"):
-        reconstruct(replace(tracks, points=points), method=method, intrinsics=(500.0, 500.0, 0.0, 0.0))
+        quietly(replace(tracks, points=points), method=method, intrinsics=(500.0, 500.0, 0.0, 0.0))
 
 
 def test_solutions_that_are_not_finite_are_dropped(monkeypatch):
@@ -444,14 +345,14 @@ def test_solutions_that_are_not_finite_are_dropped(monkeypatch):
 
     tracks, _ = filmed(frames=8)
     given = {"intrinsics": LENS, "method": "pkc", "steps": 3, "rounds": 0, "alternatives": 2}
-    assert reconstruct(tracks, **given).alternatives
+    assert quietly(tracks, **given).alternatives
     monkeypatch.setattr(calibrated, "refine", refined)
-    assert reconstruct(tracks, **given).alternatives == ()
+    assert quietly(tracks, **given).alternatives == ()
 
 
 def test_no_angle_is_blamed_where_all_are_small(monkeypatch):
     tracks, _ = filmed(frames=3)
-    lost = reconstruct(tracks, method="sfam")
+    lost = quietly(tracks, method="sfam")
     lost = replace(lost, points=lost.points * torch.nan)
     monkeypatch.setattr(sys.modules["kcs_torch.reconstruct"], "reconstruct_perspective", lambda *given: lost)
     with pytest.raises(kt.OptionError, match="no finite motion.*'parallel'"):
@@ -462,14 +363,14 @@ def test_the_first_round_searches_in_full(monkeypatch):
     """Its tracks agree with no depths yet; those of later rounds would confirm what straightened them."""
     asked, real = [], kt.PKC.following
     monkeypatch.setattr(kt.PKC, "following", lambda self, searched: asked.append(searched) or real(self, searched))
-    reconstruct(filmed(frames=20)[0], method="pkc", intrinsics=LENS)
+    quietly(filmed(frames=20)[0], method="pkc", intrinsics=LENS)
     assert asked[:2] == [False, True] and all(asked[1:])
 
 
 def test_what_settles_is_what_is_found_along_rays(monkeypatch):
     tracks, _ = filmed(frames=30)
     given = {"method": "pkc", "intrinsics": LENS, "rounds": 0}
-    found = reconstruct(tracks, steps=3, **given).diagnostics  # three steps of parallel rays never settle
+    found = quietly(tracks, steps=3, **given).diagnostics  # three steps of parallel rays never settle
     assert found.converged and not any("did not settle" in note for note in found.notes)
     real = calibrated.refine
 
@@ -479,7 +380,7 @@ def test_what_settles_is_what_is_found_along_rays(monkeypatch):
         return found
 
     monkeypatch.setattr(calibrated, "refine", moving)
-    found = reconstruct(tracks, **given).diagnostics
+    found = quietly(tracks, **given).diagnostics
     assert not found.converged and "pkc did not settle within 60 steps" in found.notes
 
 
@@ -519,7 +420,7 @@ def test_y_up_and_other_corners_are_told_with_intrinsics():
 
 def test_files_keep_the_distance(tmp_path):
     tracks, _ = filmed(frames=10)
-    result = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    result = quietly(tracks, method="kcs", intrinsics=LENS)
     back = load_reconstruction(result.save(tmp_path / "a.npz"))
     assert torch.equal(back.distance, result.distance) and torch.equal(back.root_depth, result.root_depth)
     assert torch.equal(back.in_space(), result.in_space())
@@ -532,7 +433,7 @@ def test_files_keep_the_distance(tmp_path):
 
 
 def test_scaled_scales_the_distance():
-    result = reconstruct(filmed(frames=5)[0], method="kcs", intrinsics=LENS)
+    result = quietly(filmed(frames=5)[0], method="kcs", intrinsics=LENS)
     torch.testing.assert_close(result.scaled(units="m", factor=2.0).distance, 2 * result.distance)
 
 
@@ -544,7 +445,7 @@ def test_command_line(tmp_path):
     words = ["lift", str(source), "-o", str(output), "--method", "kcs", "--skeleton", "h36m17"]
     done = CliRunner().invoke(app, [*words, "--intrinsics", "1500,1480,960,540"])
     assert done.exit_code == 0, done.output
-    wanted = reconstruct(tracks, method="kcs", intrinsics=LENS)
+    wanted = quietly(tracks, method="kcs", intrinsics=LENS)
     torch.testing.assert_close(load_reconstruction(output).distance, wanted.distance)
     for wrong in ("1500", "a,b,c,d", "-1,1,0,0", "nan,1,0,0", ""):
         done = CliRunner().invoke(app, [*words, "--intrinsics", wrong])
@@ -607,6 +508,6 @@ def test_bodies_without_a_template_are_lifted_softly_first(monkeypatch):
     tracks, truth = filmed(nearest=2500.0, turn=180.0, frames=60)
     body = replace(tracks.skeleton, name="free", template=None, proportions=None, spread=None, hinges=())
     tracks = replace(tracks, skeleton=body)
-    off = error(reconstruct(tracks, intrinsics=LENS).observed, truth)
+    off = error(quietly(tracks, intrinsics=LENS).observed, truth)
     monkeypatch.setattr(calibrated, "SOFT", 0)
-    assert off < 20 < error(reconstruct(tracks, intrinsics=LENS).observed, truth) / 2, off
+    assert off < 20 < error(quietly(tracks, intrinsics=LENS).observed, truth) / 2, off

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from near_cameras import error, quietly
 from torch.testing import assert_close
 from typer.testing import CliRunner
 
@@ -31,22 +32,10 @@ def filmed(distance=3500.0, frames=45, yaw=60.0, fps=30.0):
     return kt.Tracks.from_arrays(LENS.project(points), skeleton=clip.skeleton, fps=fps), clip.points
 
 
-def quietly(tracks, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", kt.KcsWarning)
-        return kt.reconstruct(tracks, **options)
-
-
 @functools.cache
 def lifted_near():
     """A near walk of a second, reconstructed once for several tests."""
     return quietly(filmed(frames=30)[0])
-
-
-def error(result, truth):
-    a, b = (x - x.mean(1, keepdim=True) for x in (result.points, truth))
-    a = a @ kt.functional.nearest_rotation((a.mT @ b).mT).mT
-    return float((a * ((a * b).sum() / (a * a).sum()) - b).norm(dim=-1).mean())
 
 
 def same(one, other):
@@ -56,7 +45,7 @@ def same(one, other):
 def test_a_near_camera_is_noticed():
     tracks, truth = filmed()
     found, plain = quietly(tracks), quietly(tracks, intrinsics="parallel")
-    assert error(found, truth) < 0.6 * error(plain, truth) and plain.distance is None
+    assert error(found.points, truth) < 0.6 * error(plain.points, truth) and plain.distance is None
     focal = float(found.distance.log().mean().exp())  # the unit is a pixel there
     assert 0.6 < focal / LENS.focal < 1.6
     assert any(f"focal length of {focal:.0f} px found from the tracks" in note for note in found.diagnostics.notes)
