@@ -3,9 +3,8 @@
 import json
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from command_line import run
 from needs import SUFFIXES
 
 import kcs_torch as kt
-from kcs_torch.cli.fields import parse_settings
 
 QUICK = ["--set", "viewpoint=fixed", "--set", "rounds=0", "--set", "steps=3"]
 """The default method in a tenth of its time, for tests of what goes on around it."""
@@ -456,60 +454,3 @@ def test_demo_beats_the_flat_guess(tmp_path):
     facts = json.loads(run("demo", "-o", tmp_path / "demo", "--json").stdout)
     assert {p.name for p in (tmp_path / "demo").iterdir()} == {"walk.npz", "walk.html", "walk.png"}
     assert facts["error"] < 0.5 * facts["error_flat"]
-
-
-# ---------------------------------------------------------------------- --set
-
-
-@dataclass(frozen=True)
-class Fake:
-    beta: float = 1.5
-    rank: int | None = None
-    smooth: bool = False
-    start: Literal["flat", "template"] = "flat"
-    links: tuple[tuple[str, str], ...] = ()
-    sizes: tuple[float, ...] = ()
-    label: str | None = None
-
-
-@dataclass(frozen=True)
-class Other:
-    beta: int = 1
-    gamma: float = 0.0
-
-
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("beta=2", 2.0),
-        ("beta = 1e-3", 1e-3),
-        ("rank=3", 3),
-        ("rank=none", None),
-        ("smooth=true", True),
-        ("smooth=no", False),
-        ("start=template", "template"),
-        ("links=[[left_wrist, right_wrist]]", (("left_wrist", "right_wrist"),)),
-        ("links=[]", ()),
-        ("sizes=1,2.5,1e-3", (1.0, 2.5, 1e-3)),
-        ("label=a=b", "a=b"),
-        ("label=none", None),
-    ],
-)
-def test_settings_follow_the_fields_types(text, value):
-    (got,) = parse_settings([text], [Fake]).values()
-    assert got == value and type(got) is type(value)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["beta=x", "beta=", "rank=2.5", "smooth=perhaps", "start=other", "links=[[a, b, c]]", "links=[[a", "sizes=a"],
-)
-def test_settings_of_the_wrong_type(text):
-    with pytest.raises(kt.OptionError, match=f"--set {text.partition('=')[0]}: expected "):
-        parse_settings([text], [Fake])
-
-
-def test_settings_of_several_methods():
-    assert parse_settings(["beta=0.5", "gamma=1"], [Fake, Other]) == {"beta": 0.5, "gamma": 1.0}
-    with pytest.raises(kt.OptionError, match="gamma"):
-        parse_settings(["gama=1"], [Fake, Other])
