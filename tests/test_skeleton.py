@@ -1,4 +1,4 @@
-"""Skeletons: construction, checks, the built-in ones, files, changes."""
+"""Skeletons: construction, checks, files, trees, changes."""
 
 import json
 import math

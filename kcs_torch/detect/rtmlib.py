@@ -50,6 +50,21 @@ def open_detector(what: str, models: Sequence[str | Path]) -> Detector:
     package = need_detector("rtmlib", "rtmlib")
     runtime = need_detector("onnxruntime", "rtmlib")
     looked = [_look(runtime, Path(model)) for model in models]
+    pose, people = _told_apart(looked, hands=what == "hands")
+    with contextlib.redirect_stdout(sys.stderr):  # it prints what it loads
+        find, note = _finder(package, pose, people)
+    skeleton = _SKELETONS[pose.joints]
+    return Detector(
+        f"rtmlib ({', '.join(m.path.name for m in looked)})",
+        skeleton,
+        names_of(skeleton, pose.joints),
+        lambda image: _joined(find(image), pose.joints),
+        notes=(note,) if note else (),
+    )
+
+
+def _told_apart(looked: Sequence[_Model], hands: bool) -> tuple[_Model, _Model | None]:
+    """The model of poses, of hands if so, and that of people before it if there is one."""
     pose = [m for m in looked if m.role != "people"]
     people = [m for m in looked if m.role == "people"]
     if len(pose) != 1 or (pose[0].role == "both" and people):
@@ -57,41 +72,29 @@ def open_detector(what: str, models: Sequence[str | Path]) -> Detector:
         raise OptionError(
             f"detector rtmlib: expected one model of poses, and at most one of people before RTMPose, got {roles}"
         )
-    joints = pose[0].joints
+    path, joints = pose[0].path, pose[0].joints
     if joints not in _SKELETONS:
         known = ", ".join(map(str, _SKELETONS))
-        raise OptionError(f"detector rtmlib: {pose[0].path}: expected a model of {known} joints, got {joints}")
-    hands = what == "hands"
+        raise OptionError(f"detector rtmlib: {path}: expected a model of {known} joints, got {joints}")
     if hands != (_SKELETONS[joints] == "hand21"):
         raise OptionError(
-            f"detector rtmlib: {pose[0].path}: finds {joints} joints, those of "
+            f"detector rtmlib: {path}: finds {joints} joints, those of "
             f"{'a body: leave out --what hands' if hands else 'a hand: add --what hands'}"
         )
-    with contextlib.redirect_stdout(sys.stderr):  # it prints what it loads
-        if pose[0].role == "both":
-            both = _load(package.RTMO, pose[0])
-            find: Callable[[Image], Any] = both
-        else:
-            one = _load(package.RTMPose, pose[0])
-            if people:
-                kind = "RTMDet" if "rtmdet" in people[0].path.name.lower() else "YOLOX"
-                boxes = _load(getattr(package, kind), people[0])
-                find = lambda image: _in_boxes(one, boxes(image), image)  # noqa: E731
-            else:
-                find = one  # the whole picture is the box
-    notes = []
-    if people:
-        notes.append(f"people are looked for by {people[0].path.name}, taken for a {kind} model")
-    elif pose[0].role == "pose":
-        notes.append("no model of people was given: each picture is taken to show one person who fills it")
-    skeleton = _SKELETONS[joints]
-    return Detector(
-        f"rtmlib ({', '.join(m.path.name for m in looked)})",
-        skeleton,
-        names_of(skeleton, joints),
-        lambda image: _joined(find(image), joints),
-        notes=tuple(notes),
-    )
+    return pose[0], people[0] if people else None
+
+
+def _finder(package: Any, pose: _Model, people: _Model | None) -> tuple[Callable[[Image], Any], str]:
+    """What finds poses in a picture, and what a user should know of it, if anything."""
+    if pose.role == "both":
+        return _load(package.RTMO, pose), ""
+    one = _load(package.RTMPose, pose)
+    if people is None:  # the whole picture is the box
+        return one, "no model of people was given: each picture is taken to show one person who fills it"
+    kind = "RTMDet" if "rtmdet" in people.path.name.lower() else "YOLOX"
+    boxes = _load(getattr(package, kind), people)
+    note = f"people are looked for by {people.path.name}, taken for a {kind} model"
+    return lambda image: _in_boxes(one, boxes(image), image), note
 
 
 _ROLES = {"people": "finds people", "pose": "finds a pose", "both": "finds people and poses"}

@@ -8,7 +8,7 @@ import shutil
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,15 +111,7 @@ def reconstruct_folder(
         OutputError: the results cannot be written.
         FormatError: the file that says how they were made is damaged, or that of the skeleton.
     """
-    numbers, switches = {"shard": shard, "shards": shards, "batch": batch}, {"everybody": everybody, "retry": retry}
-    for kind, given in ((int, numbers), (bool, switches)):
-        for name, value in given.items():
-            if not is_a(value, kind):
-                raise OptionError(f"{name}: expected {spoken(kind)}, got {value!r}")
-    if not 0 <= shard < shards:
-        raise OptionError(f"shard: expected a number from 0 to {shards - 1} of shards={shards}, got {shard}")
-    if batch < 1:
-        raise OptionError(f"batch: expected at least 1 clip, got {batch}")
+    _check_share(shard, shards, batch, {"everybody": everybody, "retry": retry})
     suffixes = _checked_suffixes(suffixes, up)
     if units not in (None, "px", *METRES):
         raise unknown("unit of length", units, METRES)
@@ -155,6 +147,19 @@ def reconstruct_folder(
     _sweep(Path(output), workplace)
     told_of = tuple(outdated), tuple(doubted), tuple(failed)
     return Outcome(len(clips), done, skipped, *told_of, frames, time.monotonic() - begin)
+
+
+def _check_share(shard: int, shards: int, batch: int, switches: Mapping[str, bool]) -> None:
+    """Make sure that the numbers say a part of the work, and that switches are switches."""
+    numbers = {"shard": shard, "shards": shards, "batch": batch}
+    for kind, given in ((int, numbers), (bool, switches)):
+        for name, value in given.items():
+            if not is_a(value, kind):
+                raise OptionError(f"{name}: expected {spoken(kind)}, got {value!r}")
+    if not 0 <= shard < shards:
+        raise OptionError(f"shard: expected a number from 0 to {shards - 1} of shards={shards}, got {shard}")
+    if batch < 1:
+        raise OptionError(f"batch: expected at least 1 clip, got {batch}")
 
 
 def _checked_suffixes(suffixes: str | Sequence[str], up: str | None) -> list[str]:

@@ -18,6 +18,7 @@ from kcs_torch.io import load_motion
 from kcs_torch.io.folders import natural_key
 from kcs_torch.skeleton import Skeleton, get_skeleton, map_joints
 from kcs_torch.training.seeds import generator_of
+from kcs_torch.types import Motion
 from kcs_torch.types.axes import from_y_up
 from kcs_torch.types.bodies import IN_ORDER, numbered
 from kcs_torch.types.size import unit_ratio
@@ -126,27 +127,7 @@ def file_clips(
                 f"{path}: expected the joints of {files[0]} ({', '.join(body.joints)}), got "
                 f"{', '.join(motion.skeleton.joints)}: give skeleton=..., whose joints are found by name"
             )
-        never = [body.joints[n] for n in (~motion.seen.any(0)).nonzero().flatten().tolist()]
-        if never:
-            raise SkeletonError(
-                f"{path}: no frame has {', '.join(never)} of skeleton '{body.name}': choose a skeleton whose joints "
-                "the file has"
-            )
-        if fps is not None:
-            if motion.fps is None:
-                raise FormatError(
-                    f"{path}: its frame rate is unknown: give fps=None (data.fps=null) to take its frames as they are"
-                )
-            points, known = resampled(motion.points, motion.seen, motion.fps, fps)
-        else:
-            points, known = motion.points, motion.seen
-        ratio = unit_ratio(motion.units, units)
-        if ratio is None:
-            raise FormatError(
-                f"{path}: expected a unit of length that converts to {units}, got {motion.units or 'none'}: give "
-                "file_units=..., one of m, cm, mm"
-            )
-        clip = _placed(from_y_up(points, "-y") * ratio, known, str(path), body)
+        clip = _clip_of(motion, body, path, fps, units)
         if up is None and upside_down(clip.points[..., 1], clip.known, clip.skeleton):
             warnings.warn(
                 f"{path}: the body stands on its head: say which axis points up in the file, up='y' or 'z'",
@@ -155,6 +136,30 @@ def file_clips(
             )
         out.append(clip)
     return out
+
+
+def _clip_of(motion: Motion, body: Skeleton, path: Path, fps: float | None, units: str) -> Clip:
+    """A file's motion at so many frames a second and in a unit of length, if it tells its own."""
+    never = [body.joints[n] for n in (~motion.seen.any(0)).nonzero().flatten().tolist()]
+    if never:
+        raise SkeletonError(
+            f"{path}: no frame has {', '.join(never)} of skeleton '{body.name}': choose a skeleton whose joints "
+            "the file has"
+        )
+    points, known = motion.points, motion.seen
+    if fps is not None:
+        if motion.fps is None:
+            raise FormatError(
+                f"{path}: its frame rate is unknown: give fps=None (data.fps=null) to take its frames as they are"
+            )
+        points, known = resampled(points, known, motion.fps, fps)
+    ratio = unit_ratio(motion.units, units)
+    if ratio is None:
+        raise FormatError(
+            f"{path}: expected a unit of length that converts to {units}, got {motion.units or 'none'}: give "
+            "file_units=..., one of m, cm, mm"
+        )
+    return _placed(from_y_up(points, "-y") * ratio, known, str(path), body)
 
 
 def _check_names(own: Skeleton, body: Skeleton, path: Path) -> None:

@@ -6,6 +6,7 @@ import itertools
 from bisect import bisect
 from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -98,35 +99,37 @@ def people_tracks(
         remarks.append("people are followed by the file's own track ids")
         people = _without_breaks(people, frames, gap, remarks)
     several = len({s.track for frame in frames for s in frame} - {None}) > 1
-    least = max(options.least, 1e-12)
-    visible = [seen for seen in people if any((frames[t][i].joints[:, 2] >= least).any() for t, i in seen)]
-    if not visible:
-        raise nothing_seen(source, options.least, max(float(joints[:, 2].max()) for joints in everybody))
-    if len(visible) < len(people):
-        remarks.append(f"{len(people) - len(visible)} people never reach the confidence threshold: left out")
-    most = max(int(_MOST_NUMBERS / (len(frames) * everybody[0].size)), 1)
-    if len(visible) > most:
-        remarks.append(f"{len(visible) - most} people who are seen least are left out: {most} tracks fill the memory")
+    wrap = partial(build_tracks, source=source, names=names, edges=edges, skeleton=skeleton, fps=fps)
     out = []
-    for seen in visible[:most]:
+    for seen in _shown(people, frames, options.least, source, remarks):
         track = np.zeros((len(frames), *everybody[0].shape))
         for t, i in seen:
             track[t] = frames[t][i].joints
         points = np.where(track[..., 2:] > 0, track[..., :2], np.nan)
-        out.append(
-            build_tracks(
-                points,
-                track[..., 2],
-                options,
-                source=source,
-                names=names,
-                edges=edges,
-                skeleton=skeleton,
-                fps=fps,
-                notes=[*_called(frames, seen), *remarks] if several else remarks,
-            )
-        )
+        told = [*_called(frames, seen), *remarks] if several else remarks
+        out.append(wrap(points, track[..., 2], options, notes=told))
     return out
+
+
+def _shown(
+    people: list[_Seen],
+    frames: Sequence[Sequence[Sighting]],
+    least: float,
+    source: str,
+    remarks: list[str],
+) -> list[_Seen]:
+    """The people who reach the threshold ``least``, no more than memory holds; remarks say who is left out."""
+    joints = [s.joints for frame in frames for s in frame]
+    lowest = max(least, 1e-12)
+    visible = [seen for seen in people if any((frames[t][i].joints[:, 2] >= lowest).any() for t, i in seen)]
+    if not visible:
+        raise nothing_seen(source, least, max(float(one[:, 2].max()) for one in joints))
+    if len(visible) < len(people):
+        remarks.append(f"{len(people) - len(visible)} people never reach the confidence threshold: left out")
+    most = max(int(_MOST_NUMBERS / (len(frames) * joints[0].size)), 1)
+    if len(visible) > most:
+        remarks.append(f"{len(visible) - most} people who are seen least are left out: {most} tracks fill the memory")
+    return visible[:most]
 
 
 def _called(frames: Sequence[Sequence[Sighting]], seen: Sequence[tuple[int, int]]) -> list[str]:
