@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from kcs_torch.clean.detector import detected
-from kcs_torch.functional.camera import viewpoint_turn
+from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.methods.clips.size import Size
 from kcs_torch.types import Tracks
 
@@ -66,10 +67,12 @@ class Clip:
         """Whether joints are a detector's: errors last, would be taken for motion, and hide what a size explains."""
         return detected(self.tracks)
 
-    @property
-    def turns(self) -> bool:
-        """Whether known cameras turn far enough to tell the sign of depth."""
-        return self.cameras is not None and float(viewpoint_turn(self.cameras)) >= TELLING
+    @cached_property
+    def telling(self) -> Tensor | None:
+        """Rotations (T, 3, 3) of known cameras that turn far enough to tell the sign of depth; None if they do not."""
+        if self.cameras is not None and float(viewpoint_turn(self.cameras)) >= TELLING:
+            return complete_rotation(self.cameras)
+        return None
 
     def even(self) -> Clip:
         """The same with an image in which the body's size does not change."""

@@ -193,7 +193,7 @@ class PKC(Method):
         # What is not sure by itself is compared with solutions without a change.
         changing = size.surely if clip.many and self.viewpoint != "moving" else size.sure
         shown, method = even if changing else clip, self
-        feet = clip.standing if self.contacts and not clip.turns and self.viewpoint != "moving" else None
+        feet = clip.standing if self.contacts and clip.telling is None and self.viewpoint != "moving" else None
         body = Body(skeleton, shown.image, rate, clip.noise, feet)
         polished = clip.enough and body.spanned and not clip.detections
         compared = polished and self.viewpoint == "auto"
@@ -229,8 +229,8 @@ class PKC(Method):
 
         Where the viewpoint turns, what it tells by itself, ``turned``, is a rival.
         """
-        if clip.cameras is not None and clip.turns:
-            found = yield from body.seen_from(found, complete_rotation(clip.cameras), self.steps)
+        if clip.telling is not None:
+            found = yield from body.seen_from(found, clip.telling, self.steps)
         around = polished and body.turns(found, 0.0 if clip.many else FAR)
         if around or (polished and clip.many and not isinstance(self, _Followed)):
             rival = (yield from turned(body.is_odd(found))) if turned is not None and around else None
@@ -238,8 +238,8 @@ class PKC(Method):
             if self.rounds and self.viewpoint != "moving":
                 found, body = yield from self._filled(clip, body, found, rival)
         return from_hypotheses(
-            found, body, clip.cameras, clip.notes,
-            alternatives=self.alternatives, detections=clip.detections, still=not clip.turns, told=self.steps >= 10,
+            found, body, clip.cameras, clip.notes, alternatives=self.alternatives, detections=clip.detections,
+            still=clip.telling is None, told=self.steps >= 10,
         )  # fmt: skip
 
     def _without_template(self, clip: Clip) -> Search[Any, Any, Estimate]:
@@ -271,8 +271,8 @@ class PKC(Method):
             else:
                 rival = None if rival is None else rival * ratio
                 found = yield from search(body, self._moves, self.steps)
-                if clip.cameras is not None and clip.turns:
-                    found = yield from body.seen_from(found, complete_rotation(clip.cameras), self.steps)
+                if clip.telling is not None:
+                    found = yield from body.seen_from(found, clip.telling, self.steps)
             found = yield from self._polished(clip, body, found, rival)
         return found, body
 
@@ -284,7 +284,7 @@ class PKC(Method):
         Cameras that are known tell signs by themselves, also against the template.
         """
         found = yield from body.polished(found, self.steps, rival)
-        if rival is None or not self._moves or clip.turns or not body.turns(found):
+        if rival is None or not self._moves or clip.telling is not None or not body.turns(found):
             return found
         return (yield from turned_around(body, found, rival))
 
