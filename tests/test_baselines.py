@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from baseline_clips import error, seen_from
 from numerics import camera_disagreement, normal, rotations, tumbling, turning
 from torch.testing import assert_close
 
@@ -18,23 +19,10 @@ BASELINES = (Rigid, PTA, CSF, BMM)
 quiet = pytest.mark.filterwarnings("ignore::kcs_torch.errors.KcsWarning")
 
 
-def seen_from(world, cameras, **options):
-    """Tracks of points (T, N, 3) in the world, and the points in the camera frame, centred."""
-    world = world - world.mean(1, keepdim=True)
-    return kt.Tracks.from_arrays(project(world, cameras), **options), world @ complete_rotation(cameras).mT
-
-
 def combined(weights, shapes=None, joints=22):
     """Points (T, N, 3) whose basis shapes have the weights (T, K)."""
     shapes = normal(weights.shape[1], joints, 3, seed=1) if shapes is None else shapes
     return torch.einsum("tk,knj->tnj", weights, shapes)
-
-
-def error(found, truth):
-    """Largest deviation of the pose from the truth or its mirror image, a share of the body's size."""
-    found = found - found.mean(1, keepdim=True)
-    flip = torch.tensor([1.0, 1.0, -1.0]).to(found)
-    return float(min((found * sign - truth).abs().max() for sign in (1, flip)) / truth.std())
 
 
 def band_limited(frames=70, cosines=4, joints=22):

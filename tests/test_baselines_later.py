@@ -5,33 +5,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+from baseline_clips import centred, error, seen_from
 from numerics import camera_disagreement, normal, rotations, tumbling
 from torch.testing import assert_close
 
 import kcs_torch as kt
 from kcs_torch.errors import OptionError
-from kcs_torch.functional import back_project, complete_rotation, dct_basis, project
+from kcs_torch.functional import back_project, dct_basis, project
 from kcs_torch.methods import BMM, PND, SMSR, LocalRigidity
 from kcs_torch.methods.local_rigidity import rigid_pairs, triangulation, window_cameras
 
 LATER = (SMSR, LocalRigidity, PND)
 quiet = pytest.mark.filterwarnings("ignore::kcs_torch.errors.KcsWarning")
-
-
-def centre(points):
-    return points - points.mean(1, keepdim=True)
-
-
-def error(found, truth):
-    """Largest deviation of the pose from the truth or its mirror image, a share of the body's size."""
-    found, flip = centre(found), torch.tensor([1.0, 1.0, -1.0]).to(found)
-    return float(min((found * sign - truth).abs().max() for sign in (1, flip)) / truth.std())
-
-
-def seen_from(world, cameras):
-    """Tracks of points (T, N, 3) in the world, and the points in the camera frame, centred."""
-    world = centre(world)
-    return kt.Tracks.from_arrays(project(world, cameras)), world @ complete_rotation(cameras).mT
 
 
 def low_rank(frames=100, joints=26, cosines=6):
@@ -57,7 +42,7 @@ def test_smsr_is_exact_on_smooth_shapes_of_low_rank():
 def test_smsr_without_smoothing_solves_the_problem_of_bmm():
     """Two solvers of one convex problem, at one weight of the nuclear norm."""
     cameras = tumbling(60)
-    tracks = project(centre(low_rank(60, 16)), cameras)
+    tracks = project(centred(low_rank(60, 16)), cameras)
     weights = torch.rand(60, 16, generator=torch.Generator().manual_seed(0)).double() * 0.5 + 0.5
     first = SMSR(cosines=1.0, num_steps=500, mu=0.1, final=0.1).find_shape(tracks, weights, cameras)
     other = BMM(num_steps=500, mu=0.1, final=0.1).find_shape(tracks, weights, cameras)
@@ -66,7 +51,7 @@ def test_smsr_without_smoothing_solves_the_problem_of_bmm():
 
 def test_smsr_keeps_the_slow_cosines_alone():
     cameras = tumbling(60)
-    world = centre(low_rank(60, 16))
+    world = centred(low_rank(60, 16))
     tracks = project(world, cameras)
     one = torch.ones(60, 16).double()
     basis = dct_basis(60, 60, dtype=torch.float64)
@@ -94,14 +79,14 @@ def test_local_rigidity_finds_a_rigid_body(known):
 def test_windows_of_one_rigid_body_are_one_world(window):
     """No window is left in its mirror image, nor in a frame of its own."""
     cameras = tumbling(120, 700.0)
-    tracks = project(centre(normal(1, 10, 3)), cameras)
+    tracks = project(centred(normal(1, 10, 3)), cameras)
     assert camera_disagreement(window_cameras(tracks, window), cameras) < 0.05
 
 
 @quiet
 def test_local_rigidity_follows_slow_deformation_before_a_quick_camera():
     """The less, the less deforms within a window."""
-    rigid, wave = centre(normal(1, 14, 3)), centre(normal(1, 14, 3, seed=4))
+    rigid, wave = centred(normal(1, 14, 3)), centred(normal(1, 14, 3, seed=4))
     errors = []
     for speed in (1.0, 0.5):
         phase = torch.linspace(0, speed * math.pi, 90, dtype=torch.float64)[:, None, None]
@@ -137,7 +122,7 @@ def test_pairs_that_keep_their_distance_are_found_and_hold():
     assert {tuple(b) for b in bones.tolist()} == {(a + k, b + k) for k in (0, 4) for b in range(4) for a in range(b)}
     assert_close(lengths, (world[0, bones[:, 0]] - world[0, bones[:, 1]]).norm(dim=-1))
     cameras = tumbling(80, 250.0)
-    tracks, truth = project(centre(world), cameras), centre(world)
+    tracks, truth = project(centred(world), cameras), centred(world)
     method = LocalRigidity(window=9, stiffness=3.0)
     loose, firm = (
         replace(method, num_steps=k).find_shape(tracks, one[:, None].expand(80, 8), cameras).value for k in (0, 40)
@@ -155,7 +140,7 @@ def test_pairs_that_keep_their_distance_are_found_and_hold():
 def test_bones_are_not_looked_at(kind):
     clip = kt.data.walking_person(40, turn=150.0)
     found, plain = kind()(clip.tracks).points, kind()(kt.Tracks.from_arrays(clip.tracks.points)).points
-    assert error(found, centre(plain)) < 1e-6
+    assert error(found, centred(plain)) < 1e-6
 
 
 @quiet
@@ -164,7 +149,7 @@ def test_single_precision_is_as_good(kind):
     tracks, _ = seen_from(low_rank(60, 20), tumbling(60))
     found = kind()(kt.Tracks.from_arrays(tracks.points.float()))
     assert found.points.dtype == found.cameras.dtype == torch.float32
-    assert error(found.points.double(), centre(kind()(tracks).points)) < 5e-3
+    assert error(found.points.double(), centred(kind()(tracks).points)) < 5e-3
 
 
 @pytest.mark.parametrize(
@@ -238,7 +223,7 @@ def test_local_rigidity_is_far_better_than_flat(protocol, shared, name):
 def test_back_projection_is_where_the_shapes_start():
     """A flat weight: the first step of SMSR from the pseudo-inverse has no residual, so mu alone moves it."""
     cameras = tumbling(30)
-    tracks = project(centre(low_rank(30, 10)), cameras)
+    tracks = project(centred(low_rank(30, 10)), cameras)
     one = torch.ones(30, 10).double()
     found = SMSR(cosines=1.0, num_steps=1, mu=1e-9, final=1e-9).find_shape(tracks, one, cameras)
     assert_close(found.value, back_project(tracks, cameras), rtol=0, atol=1e-6)

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import pytest
 import torch
+from pkc_walks import centred
 from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
@@ -15,10 +16,6 @@ from kcs_torch.methods.pkc.batch import serve
 from kcs_torch.methods.pkc.body import Body, agree
 from kcs_torch.methods.pkc.flips import flipped_runs
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
-
-
-def centred(points):
-    return points - points.mean(1, keepdim=True)
 
 
 @pytest.fixture(scope="module")
