@@ -232,6 +232,17 @@ def test_mirrors_of_many_lengths():
     assert found[0] == -found[1]
 
 
+def test_rounding_of_straight_joints_tells_no_mirror():
+    """In a plane no joint bends: how the body leans decides, whatever is beside it in a batch."""
+    flat = walk(2, turn=0.0).points
+    flat = (flat - flat.mean(1, keepdim=True)) / flat.std()
+    flat = torch.cat([flat, flat @ torch.tensor([[0.5], [0.3]], dtype=flat.dtype)], -1)
+    rough = flat + 1e-15 * normal(40, *flat.shape)
+    body = walk(2).skeleton
+    assert (mirror_sign(rough, body) == 1).all()
+    assert (mirror_sign(rough * torch.tensor([1.0, 1.0, -1.0]), body) == -1).all()
+
+
 @pytest.mark.parametrize("frames", [2, 17, 40, 300])
 def test_best_paths_of_batches(frames):
     cost, transition = normal(3, frames, 4).abs(), normal(3, frames - 1, 4, 4, seed=1).abs()

@@ -30,6 +30,7 @@ def mirror_sign(points: Tensor, skeleton: Skeleton, inside: Tensor | None = None
     wrong = HingeEnergy(skeleton).to(points.device)(torch.stack([points, points * flip]), weights=share).sum(-1)
     lean = (points[..., 2:] * points[..., :2]).sum((-3, -2))
     lean = lean.gather(-1, lean.abs().argmax(-1, keepdim=True)).squeeze(-1)
-    clear = (wrong[0] - wrong[1]).abs() > 1e-3 * wrong.sum(0)
+    rounding = torch.finfo(wrong.dtype).eps  # of straight joints; energies are squared sines
+    clear = (wrong[0] - wrong[1]).abs() > 1e-3 * wrong.sum(0) + rounding
     right = torch.where(clear, wrong[0] < wrong[1], lean >= 0)
     return torch.where(right, 1.0, -1.0).to(points)
