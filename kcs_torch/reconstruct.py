@@ -266,6 +266,10 @@ def method_named(method: str | Method, fields: dict[str, Any]) -> Method:
         raise OptionError(
             f"method: expected a name or a Method, got the file {method!r}: use kcs_torch.training.load_lifter(file)"
         )
+    given: object = method
+    if isinstance(given, type) and issubclass(given, Method):
+        name = given.__name__
+        raise OptionError(f"method: expected a name or a Method, got the class {name}: make one, {name}()")
     if not isinstance(method, str) or method not in METHODS:
         raise unknown("method", method, ["auto", *METHODS])
     return METHODS[method].from_options(**fields)

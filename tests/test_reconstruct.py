@@ -1,6 +1,9 @@
 """The entry call: what it accepts, what it refuses in words, and what its default does."""
 
 import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -10,6 +13,8 @@ from torch.testing import assert_close
 import kcs_torch as kt
 from kcs_torch import KCS, METHODS, PKC, OptionError, SfAM, ShapeError, SkeletonError, reconstruct
 from kcs_torch.data import walking_person
+from kcs_torch.errors import KcsError
+from kcs_torch.methods import Estimate, Method
 from kcs_torch.skeleton import SKELETONS
 
 # Few steps are made here, after which little has settled.
@@ -131,8 +136,64 @@ def test_the_package_exports_it():
 def test_unknown_methods():
     refused(OptionError, "unknown method 'sfma': did you mean 'sfam'?", "choices: auto, ", ", kcs, ", method="sfma")
     refused(OptionError, "unknown method 'KCS'", "kcs", method="KCS")
-    for nonsense in (None, 3, ["kcs"], KCS):
+    for nonsense in (None, 3, ["kcs"]):
         refused(OptionError, "unknown method", "auto, ", ", pkc, ", method=nonsense)
+    refused(OptionError, "method: expected a name or a Method, got the class KCS: make one, KCS()", method=KCS)
+
+
+@dataclass(frozen=True)
+class Own(Method):
+    """A method of a user's own: the flat guess, changed."""
+
+    name = "own"
+    change: Callable
+
+    def solve(self, tracks, cameras):
+        still = torch.eye(3, dtype=torch.float64)[:2].expand(20, 2, 3)
+        flat = torch.nn.functional.pad(tracks.points, (0, 1))
+        return self.change(Estimate(flat, still, flat.new_ones(20), converged=True, iterations=1))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda found: None, "expected an Estimate, got NoneType"),
+        (lambda found: found.points, "expected an Estimate, got Tensor"),
+        (
+            lambda found: replace(found, points=found.points[1:]),
+            "points: expected a tensor (20, 17, 3), got (19, 17, 3)",
+        ),
+        (
+            lambda found: replace(found, points=found.points.numpy()),
+            "points: expected a tensor (20, 17, 3), got ndarray",
+        ),
+        (
+            lambda found: replace(found, points=found.points / 0),
+            "points: expected finite numbers, got NaN or infinity in",
+        ),
+        (lambda found: replace(found, cameras=found.cameras[:, :1]), "cameras: expected a tensor (20, 2, 3), got"),
+        (lambda found: replace(found, cameras=2 * found.cameras), "cameras: expected the first two rows of rotations"),
+        (lambda found: replace(found, scales=0 * found.scales), "scales: expected positive numbers, got 0 in frame 0"),
+        (lambda found: replace(found, deviation=found.scales), "deviation: expected a tensor (20, 17), got (20,)"),
+    ],
+)
+def test_what_is_no_estimate_of_a_method_of_ones_own(change, told):
+    refused(KcsError, f"own: solve: {told}", method=Own(change))
+    with pytest.raises(KcsError, match=re.escape(f"own: solve: {told}")):
+        kt.reconstruct_all([TRACKS], method=Own(change))
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")  # it tells no depth
+def test_a_method_of_ones_own_in_another_precision():
+    rough = reconstruct(TRACKS, method=Own(lambda found: found.to(torch.zeros(()))))
+    assert {x.dtype for x in (rough.points, rough.cameras, rough.scales, rough.lengths)} == {torch.float64}
+    assert_close(rough.points, reconstruct(TRACKS, method=Own(lambda found: found)).points, rtol=1e-5, atol=1e-3)
+
+
+def test_as_many_estimates_as_clips(monkeypatch):
+    monkeypatch.setattr(Own, "solve_all", lambda self, tracks: [], raising=False)
+    with pytest.raises(ShapeError, match="own: solve_all: expected 1 estimate, got 0"):
+        kt.reconstruct_all([TRACKS], method=Own(lambda found: found))
 
 
 def test_unknown_fields():

@@ -18,6 +18,7 @@ from torch import Tensor
 from kcs_torch.errors import (
     ConvergenceWarning,
     KcsWarning,
+    NotFiniteError,
     OptionError,
     ShapeError,
     counted,
@@ -136,6 +137,8 @@ class Method(ABC):
             tracks = [self._mended(one) for one in tracks]
             parts = [self._normalised(one) for one in tracks]
             found = self.solve_all([inner for inner, _, _ in parts])
+        if len(found) != len(tracks):
+            raise ShapeError(f"{self.name}: solve_all: expected {counted(len(tracks), 'estimate')}, got {len(found)}")
         each = (time.perf_counter() - begin) / max(len(tracks), 1)
         rows = zip(tracks, found, parts, strict=True)
         return [self._finished(one, estimate, size, known, each) for one, estimate, (_, size, known) in rows]
@@ -147,13 +150,14 @@ class Method(ABC):
     def _finished(self, tracks: Tracks, found: Estimate, size: Tensor, known: Tensor, seconds: float) -> Reconstruction:
         """What :func:`finish` makes of an estimate, on the processor: its many small steps would hold up a GPU."""
         device = tracks.points.device
+        found = checked_estimate(found, tracks, self.name or type(self).__name__)
         if device.type == "cpu":
             with apart([tracks], self.differentiates):
                 result = finish(self, tracks, found, size, known, seconds)
         else:
             here = tracks.to("cpu")
             with apart([here], self.differentiates):
-                result = finish(self, here, found.to("cpu"), size.cpu(), known.cpu(), seconds)
+                result = finish(self, here, found.to(here.points), size.cpu(), known.cpu(), seconds)
                 result = result.moved(lambda x: x.to(device), tracks)
         result = plain(result, keep=tracks)
         self.warn(result)
@@ -248,18 +252,50 @@ def check_tracks(tracks: Any, what: str) -> None:
         )
 
 
-def check_cameras(cameras: Tensor, frames: int) -> Tensor:
+def checked_estimate(found: Any, tracks: Tracks, name: str) -> Estimate:
+    """What a method found, which may be the user's own, as the tracks are: on their device and in their dtype.
+
+    Raises:
+        OptionError: it is no :class:`Estimate`.
+        ShapeError: a part of it has another shape, or values that it cannot have.
+    """
+    if not isinstance(found, Estimate):
+        raise OptionError(f"{name}: solve: expected an Estimate, got {type(found).__name__}")
+    frames, joints = tracks.num_frames, tracks.num_joints
+    shapes = {"points": (frames, joints, 3), "cameras": (frames, 2, 3), "scales": (frames,)}
+    if found.deviation is not None:
+        shapes["deviation"] = (frames, joints)
+    for part, shape in shapes.items():
+        value = getattr(found, part)
+        if not isinstance(value, Tensor) or value.shape != shape:
+            got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+            raise ShapeError(f"{name}: solve: {part}: expected a tensor {shape}, got {got}")
+        if not bool(value.isfinite().all()):
+            frame = int((~value.isfinite()).nonzero()[0, 0])
+            raise NotFiniteError(
+                f"{name}: solve: {part}: expected finite numbers, got NaN or infinity in frame {frame}"
+            )
+    check_cameras(found.cameras, frames, f"{name}: solve: cameras")
+    if not bool((found.scales > 0).all()):
+        frame = int(found.scales.argmin())
+        raise ShapeError(
+            f"{name}: solve: scales: expected positive numbers, got {found.scales[frame]:g} in frame {frame}"
+        )
+    return found.to(tracks.points)
+
+
+def check_cameras(cameras: Tensor, frames: int, what: str = "cameras") -> Tensor:
     """The cameras themselves, if they are (T, 2, 3) with orthonormal rows."""
     if cameras.shape != (frames, 2, 3):
-        raise ShapeError(f"cameras: expected finite ({frames}, 2, 3), got {tuple(cameras.shape)}")
+        raise ShapeError(f"{what}: expected finite ({frames}, 2, 3), got {tuple(cameras.shape)}")
     lost = (~cameras.isfinite()).any(-1).any(-1).nonzero().flatten()
     if len(lost):
         where = f"{counted(len(lost), 'frame')}, the first of which is {int(lost[0])}"
-        raise ShapeError(f"cameras: expected finite numbers, got NaN or infinity in {where}")
+        raise ShapeError(f"{what}: expected finite numbers, got NaN or infinity in {where}")
     off = (cameras @ cameras.mT - torch.eye(2).to(cameras)).abs().amax((-2, -1))
     if bool((off > 0.01).any()):
         raise ShapeError(
-            f"cameras: expected the first two rows of rotations, got rows that are not orthonormal in frame "
+            f"{what}: expected the first two rows of rotations, got rows that are not orthonormal in frame "
             f"{int(off.argmax())}; a scale belongs to the tracks"
         )
     return cameras

@@ -97,10 +97,10 @@ class Estimate:
     standing: Tensor | None = None
     doubt: str = ""
 
-    def to(self, device: str) -> Estimate:
-        """The same on another device."""
-        held = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **held, alternatives=tuple(other.to(device) for other in self.alternatives))  # type: ignore[arg-type]
+    def to(self, like: Tensor) -> Estimate:
+        """The same on the device of a tensor, and in its dtype."""
+        held = {name: value.to(like) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **held, alternatives=tuple(other.to(like) for other in self.alternatives))  # type: ignore[arg-type]
 
 
 def finish(
