@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import re
 import sys
 import tempfile
 import time
@@ -26,7 +27,7 @@ from collections.abc import Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 try:
     import hydra
@@ -59,6 +60,9 @@ FACTS = (
     *(*MEASURED, "frames", "joints"),
     *("seconds", "cpu_seconds", "ms_per_frame", "converged", "covered"),
 )
+CASES = ("method", "suite", "case", "cameras", "intrinsics", "keep")
+"""What the papers' tables do not read."""
+
 COUNTS = {"clip": 10, "sequences": 1, "paths": 1, "seeds": 1, "walks": 1, "frames": 100}
 """Numbers among the settings of the papers' tables, and the least that each may be."""
 
@@ -237,7 +241,10 @@ def make_papers(paper: DictConfig, shared: Path, folder: Path) -> None:
     chosen = tuple(METHODS) if methods == "all" else tuple([methods] if isinstance(methods, str) else methods)
     if wrong := [name for name in chosen if name not in METHODS]:
         raise OptionError(f"paper.methods={','.join(wrong)}: expected all or some of {', '.join(METHODS)}")
-    make(names, Settings(Bench(shared, frames, sequences), chosen, **options), folder)
+    try:
+        make(names, Settings(Bench(shared, frames, sequences), chosen, **options), folder)
+    except KeyboardInterrupt:
+        raise SystemExit(f"stopped: tables of the parts that were done are in {folder}") from None
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="benchmark")
@@ -253,12 +260,15 @@ def main(config: DictConfig) -> None:
         suites = OmegaConf.to_container(config, resolve=True)["suite"]
         if not is_a(suites, str | Sequence[str]) or not suites:
             raise OptionError(f"suite: expected all, a suite or a list of suites, got {suites!r}")
-        if config.intrinsics not in (None, False, True, "auto", "parallel"):
+        if not is_a(config.intrinsics, bool | Literal["auto", "parallel"] | None):
             raise OptionError(f"intrinsics={config.intrinsics}: expected null, true, auto or parallel")
         torch.set_num_threads(config.threads)
         if not isinstance(config.paper, DictConfig):
             raise OptionError(f"paper: expected its settings, such as paper.parts=all, got {config.paper!r}")
         if config.paper.parts:
+            given = [re.sub(r"[+~]*(\w*).*", r"\1", one) for one in job.overrides.task]
+            if unread := [name for name in CASES if name in given]:
+                raise OptionError(f"{unread[0]}: the papers' tables do not read it: leave it out, or paper.parts")
             make_papers(config.paper, Path(str(config.shared)), folder)
         else:
             measure(config, suites, method_of(config.method), folder)
@@ -319,10 +329,10 @@ def measure(config: DictConfig, suites: str | list[str], method: kt.Method, fold
 
 
 if __name__ == "__main__":
-    try:
-        with command_line("benchmark"):
+    with command_line("benchmark"):
+        try:
             main()
-    except KeyboardInterrupt:  # while others work
-        print("stopped: rows of the cases that were done are in the runs' folders; keep=true goes on", file=sys.stderr)
-        sys.exit(130)
+        except KeyboardInterrupt:  # while others work
+            print("stopped: what was done is in the runs' folders; keep=true goes on with suites", file=sys.stderr)
+            raise
     sys.exit(1 if failed else 0)

@@ -18,7 +18,7 @@ import numpy as np
 from robustness import Bench
 
 from kcs_torch.errors import OptionError
-from kcs_torch.io.atomic import write_table
+from kcs_torch.io.atomic import atomic_path, write_table
 
 Row = dict[str, Any]
 
@@ -168,7 +168,8 @@ def plot(part: Part, rows: list[Row], path: Path) -> None:
     shown.suptitle(part.title, fontsize=10)
     shown.tight_layout()
     shown.legend(lines.values(), lines.keys(), loc="center left", bbox_to_anchor=(1, 0.5), fontsize=7)
-    shown.savefig(path, dpi=80, bbox_inches="tight")
+    with atomic_path(path) as temporary:
+        shown.savefig(temporary, dpi=80, bbox_inches="tight")
     plt.close(shown)
 
 
@@ -183,5 +184,6 @@ def make(names: str | list[str], settings: Settings, folder: Path) -> None:
         tables.append(markdown(part, rows))
         print(tables[-1], flush=True)
         plot(part, rows, folder / f"{name}.png")
-        (folder / "tables.md").write_text("\n".join(tables), encoding="utf-8")
+        with atomic_path(folder / "tables.md") as temporary:
+            temporary.write_text("\n".join(tables), encoding="utf-8")
     print(folder / "tables.md")

@@ -25,6 +25,7 @@ from torch import Tensor
 import kcs_torch as kt
 from kcs_torch.functional import centre, orbit, project
 from kcs_torch.functional.guarded import safe_norm
+from kcs_torch.io.atomic import atomic_path
 from kcs_torch.nn.unrolled import Unrolled
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "cmu"
@@ -187,7 +188,8 @@ def main() -> None:
         shown = f"{errors.mean():.2f} | {errors.max():.1f} | {spent:.3f} | {100 * spent / whole:.1f} %"
         print(f"| {name} | {steps} | {shown} |")
     if options.save:
-        torch.save(layer.state_dict(), options.save)
+        with atomic_path(options.save) as temporary:
+            torch.save(layer.state_dict(), temporary)
 
 
 if __name__ == "__main__":

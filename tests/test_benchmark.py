@@ -119,6 +119,12 @@ def test_a_stopped_run_keeps_what_it_has_and_goes_on(root, folder):
     assert other.returncode == 0 and "is kept" not in other.stdout
 
 
+def test_a_run_that_is_stopped_between_cases_says_so(root, folder):
+    (folder.parent / "shared" / "protocol" / "protocol.py").write_text("raise KeyboardInterrupt", encoding="utf-8")
+    stopped = benchmark(root, folder, "method=rigid", "suite=turn")
+    assert stopped.returncode == 130 and stopped.stderr.startswith("stopped: what was done is in the runs' folders")
+
+
 def test_a_row_is_written_when_its_case_is_done(root, folder):
     """Whatever ends the process then, as a cluster that kills it."""
     text = PROTOCOL.replace(
@@ -194,11 +200,17 @@ def test_wrong_choices(script, folder):
             "expected a kcs_torch.Method, got",
         ),
         (["paper.parts=growth", "paper.frames=few"], "error: paper.frames: expected a whole number within 100.."),
+        (["intrinsics=1"], "error: intrinsics=1: expected null, true, auto or parallel"),
+        (
+            ["paper.parts=growth", "suite=turn"],
+            "error: suite: the papers' tables do not read it: leave it out, or paper.parts",
+        ),
+        (["paper.parts=growth", "+method.beta=0"], "error: method: the papers' tables do not read it"),
         (["paper.parts=growth", "+paper.frame=100"], "error: unknown setting of paper 'frame': did you mean 'frames'"),
     ],
 )
 def test_wrong_settings_are_a_line(root, folder, words, told):
-    done = benchmark(root, folder, "suite=turn", *words)
+    done = benchmark(root, folder, *words)
     assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr
 
 

@@ -159,6 +159,29 @@ def test_plots_over_names_are_points_with_plain_numbers(papers, tmp_path, monkey
     plt.close(made[0])
 
 
+def test_no_plot_is_half_written(papers, tmp_path, monkeypatch):
+    def fail(figure, path, **options):
+        path.write_bytes(b"half")
+        raise RuntimeError("no space")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail)
+    rows = [{"setting": "a", "at": 1, "e3d": 1.0}]
+    with pytest.raises(RuntimeError, match="no space"):
+        papers.plot(papers.Part("title", "at", ("e3d",), None), rows, tmp_path / "plot.png")
+    assert not list(tmp_path.iterdir())
+
+
+def test_tables_that_are_stopped_say_where_they_are(papers, import_script, shared, tmp_path, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    script = import_script("benchmark")
+    monkeypatch.setattr("papers.make", stop)
+    paper = OmegaConf.create({"parts": "all", "methods": "all", "clip": 30, "sequences": 1})
+    with pytest.raises(SystemExit, match=f"stopped: tables of the parts that were done are in {tmp_path}"):
+        script.make_papers(paper, shared, tmp_path)
+
+
 def test_one_command_writes_rows_tables_and_plots(root, shared, tmp_path):
     words = ["paper.parts=[rounds,growth]", "paper.walks=1", "paper.frames=100", "paper.methods=[kcs]"]
     command = [sys.executable, str(root / "scripts" / "benchmark.py"), *words, f"shared={shared}", "hydra.run.dir=out"]
