@@ -292,7 +292,7 @@ def check_cameras(cameras: Tensor, frames: int, what: str = "cameras") -> Tensor
     if len(lost):
         where = f"{counted(len(lost), 'frame')}, the first of which is {int(lost[0])}"
         raise ShapeError(f"{what}: expected finite numbers, got NaN or infinity in {where}")
-    off = (cameras @ cameras.mT - torch.eye(2).to(cameras)).abs().amax((-2, -1))
+    off = (cameras @ cameras.mT - torch.eye(2, dtype=cameras.dtype, device=cameras.device)).abs().amax((-2, -1))
     if bool((off > 0.01).any()):
         raise ShapeError(
             f"{what}: expected the first two rows of rotations, got rows that are not orthonormal in frame "
