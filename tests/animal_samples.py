@@ -1,8 +1,9 @@
-"""Small files of trackers of animals: what DeepLabCut and SLEAP write."""
+"""Small files of trackers of animals: what DeepLabCut and SLEAP write; and an animal whose template is guessed."""
 
 import csv
 import json
 import pickle
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,18 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.bodies import no_bones
 
 ANIMAL = ("snout", "neck", "tailbase")
+
+
+def four_legged() -> Skeleton:
+    """An animal of 17 joints whose template is guessed from their names."""
+    names = ["root", "neck", "head", "tail1", "tail2"]
+    bones = [("root", "neck"), ("neck", "head"), ("root", "tail1"), ("tail1", "tail2")]
+    for side in "lr":
+        limbs = ("root", *(f"{side}_{p}" for p in ("hip", "knee", "hock")))
+        front = ("neck", *(f"{side}_{p}" for p in ("shoulder", "elbow", "wrist")))
+        bones += [*pairwise(limbs), *pairwise(front)]
+        names += [*limbs[1:], *front[1:]]
+    return Skeleton.from_names(names, bones, template="quadruped")
 
 
 def deeplabcut_columns(individuals=(), parts=ANIMAL, coords=("x", "y", "likelihood")):

@@ -2,10 +2,10 @@
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import pytest
 import torch
+from animal_samples import four_legged
 from torch.testing import assert_close
 
 from kcs_torch import KCS, ShapeError, Skeleton, SkeletonError, Tracks
@@ -177,14 +177,7 @@ def test_bad_templates(template, words):
 
 def test_a_guessed_template_of_an_animal_gives_way_to_the_tracks_own_shape():
     """Where the viewpoint turns; one that somebody gave stays, and so does the guess before a camera at rest."""
-    names = ["root", "neck", "head", "tail1", "tail2"]
-    bones = [("root", "neck"), ("neck", "head"), ("root", "tail1"), ("tail1", "tail2")]
-    for side in "lr":
-        limbs = ("root", *(f"{side}_{p}" for p in ("hip", "knee", "hock")))
-        front = ("neck", *(f"{side}_{p}" for p in ("shoulder", "elbow", "wrist")))
-        bones += [*pairwise(limbs), *pairwise(front)]
-        names += [*limbs[1:], *front[1:]]
-    guess = Skeleton.from_names(names, bones, template="quadruped")
+    guess = four_legged()
     given = replace(guess, template=tuple((x, y, 1.2 * z) for x, y, z in guess.template))
     for body, turn, expected in ((guess, 120.0, True), (given, 120.0, False), (guess, 0.0, False)):
         clip = random_motion(body, 60, turn=turn, yaw=60.0, swing=8.0, generator=torch.Generator().manual_seed(0))

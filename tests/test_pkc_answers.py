@@ -1,18 +1,20 @@
 """What is told beside the best solution: which bones the prior decided, and how sure depth is."""
 
 import math
+import warnings
 from dataclasses import replace
 
 import pytest
 import torch
+from animal_samples import four_legged
 from numerics import CHAIN
 from torch.testing import assert_close
 
 from kcs_torch import reconstruct
-from kcs_torch.data import walking_person
+from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.methods.pkc import answers
-from kcs_torch.methods.pkc.answers import angle_doubt, depth_deviation, told_by_prior
+from kcs_torch.methods.pkc.answers import angle_doubt, depth_deviation, guess_variance, told_by_prior
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.weights import Weights
@@ -211,3 +213,44 @@ def test_a_body_at_rest_is_as_unsure_as_a_few_frames_are(swing, noisy):
     assert (long.uncertainty.mean() > 0.7 * short.uncertainty.mean()) == noisy
     same = (long.points[:6] - short.points).norm(dim=-1).mean() / short.points.norm(dim=-1).mean()
     assert not noisy or same < 0.1
+
+
+def test_a_guessed_template_s_directions_are_as_unsure_as_bones_stray():
+    """Half of the square of an angle goes in depth; a turn of 30 degrees tells as much again."""
+    guess = four_legged()
+    lengths = torch.linspace(1.0, 2.0, guess.num_bones).double()
+    still, turned = (guess_variance(guess, lengths, turn) for turn in (0.0, answers.TURN))
+    stray = torch.tensor(guess.spread).double().deg2rad().sin()
+    assert_close(still, (lengths * stray).square() / 2)
+    assert_close(turned, still / 2)
+    people = guess_variance(SKELETONS["h36m17"], torch.ones(16).double(), 0.0)
+    assert not people.any()
+    assert (guess_variance(SKELETONS["ap10k"], torch.ones(16).double(), 0.0) > 0).all()
+    exact = torch.zeros(5, 4).double()
+    more = depth_deviation(hypotheses([BENT], [0.0]), exact, CHAIN, guess=torch.full((3,), 0.2**2).double())
+    usual = depth_deviation(hypotheses([BENT], [0.0]), exact, CHAIN)
+    assert_close((more.square() - usual.square()).sqrt(), spread_over_chain(0.2))
+
+
+@pytest.mark.parametrize("yaw", [60.0, 90.0])
+def test_depth_by_a_guessed_template_is_a_hint(yaw):
+    """An animal whose bones stray from the guess for the whole clip; the template of its own is a measurement's."""
+    guess = four_legged()
+    rest, draw = guess.template_points(dtype=torch.float64), torch.Generator().manual_seed(0)
+    own = rest.clone()
+    for (a, b), degrees in zip(guess.bones, guess.spread, strict=True):
+        stray = math.sin(math.radians(degrees)) / 2**0.5 * torch.randn(3, generator=draw).double()
+        own[b] = own[a] + rest[b] - rest[a] + (rest[b] - rest[a]).norm() * stray
+    known = replace(guess, template=tuple(map(tuple, own.tolist())))
+    clip = random_motion(known, 60, turn=0.0, yaw=yaw, swing=8.0, generator=torch.Generator().manual_seed(0))
+    covered = {}
+    for body in (guess, known):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            result = reconstruct(replace(clip.tracks, skeleton=body), intrinsics="parallel")
+        off = (result.points - clip.points)[..., 2]
+        off = (off - off.mean(-1, keepdim=True)).abs()
+        covered[body is guess] = float((off <= result.uncertainty).double().mean())
+        assert ("a guessed template" in result.diagnostics.doubt) == (body is guess)
+        assert any("a guessed template" in str(one.message) for one in told) == (body is guess)
+    assert min(covered.values()) > 0.65

@@ -10,7 +10,7 @@ from kcs_torch.functional.camera import back_project
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.clips.cameras import orthographic_cameras
 from kcs_torch.nn.deviation import template_scale
-from kcs_torch.skeleton import Skeleton
+from kcs_torch.skeleton import Skeleton, guess_skeleton
 from kcs_torch.types import Tracks
 
 __all__ = ["clip_scale", "guessed", "rigid_shape"]
@@ -49,6 +49,9 @@ def rigid_shape(tracks: Tracks, cameras: Tensor | None = None) -> Tensor:
 
 
 def guessed(body: Skeleton) -> bool:
-    """Whether a body's template is an animal's by the names of its joints, and not one that somebody gave."""
+    """Whether a body's template is an animal's that this library guessed, and not one that somebody gave."""
     names = body.joints
-    return quadruped_places(names) is not None and body.template == template_by_names("quadruped", names)
+    if body.template is None or quadruped_places(names) is None:
+        return False
+    ours = guess_skeleton(names)
+    return body.template in (template_by_names("quadruped", names), None if ours is None else ours.template)

@@ -9,11 +9,12 @@ from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.ranks import kth_smallest
+from kcs_torch.methods.clips.template import guessed
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.objective import Objective, bone_noise
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["APART", "angle_doubt", "depth_deviation", "told_by_prior"]
+__all__ = ["APART", "angle_doubt", "depth_deviation", "guess_variance", "hardly_told", "told_by_prior"]
 
 APART = 0.04
 """Root mean square depth by which solutions must differ to be told apart, a person being about 1.75 tall."""
@@ -84,6 +85,9 @@ HEADING = 0.15
 """Standard deviation, in radians, of the direction from which a detector's joints are seen: without intrinsics nobody
 knows how far from the image's middle that is, and what is nearer looks larger, as if the body leant."""
 
+HINT = 1 / 3
+"""Share of itself that a depth which rests on a guessed template may be off by before it is called a hint."""
+
 
 def told_by_prior(found: Hypotheses, skeleton: Skeleton) -> list[str]:
     """Bones whose depth has another sign in a rival solution, for a good part of the clip."""
@@ -118,8 +122,42 @@ def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: floa
     return short * odd * strange / math.sqrt(told)
 
 
+def guess_variance(skeleton: Skeleton, lengths: Tensor, turn: float) -> Tensor:
+    """Variance of the depths (B,) of bones of these lengths for the template's being a guess; 0 if it is none.
+
+    An animal's build and stance stray from the guess as poses stray from each other, but for the whole clip, and no
+    camera that stands still sees it. Half of the square of a bone's stray goes in depth. The viewpoint's ``turn``, in
+    degrees, tells as it does of angles.
+    """
+    if not guessed(skeleton) or skeleton.spread is None:
+        return torch.zeros_like(lengths)
+    stray = torch.deg2rad(lengths.new_tensor(skeleton.spread)).sin()
+    return (lengths * stray).square() / 2 / (1 + (turn / TURN) ** (2 * POWER))
+
+
+def hardly_told(depth: Tensor, deviation: Tensor, skeleton: Skeleton, turn: float) -> str:
+    """Why depths (T, N) that rest on a guessed template are little more than a hint; empty where they are more.
+
+    They do where the viewpoint turns by less than what tells as much, ``turn`` in degrees.
+    """
+    off, deep = (float(x.square().mean().sqrt()) for x in (deviation, depth - depth.mean(-1, keepdim=True)))
+    if turn >= TURN or off <= HINT * deep or not guessed(skeleton):
+        return ""
+    return (
+        "depth is a hint rather than a measurement: it rests on a guessed template of an animal on four legs, and may "
+        f"well be off by {100 * off / max(off, deep):.0f} % of itself. A viewpoint that turns, or a template of this "
+        "animal, tells more"
+    )
+
+
 def depth_deviation(
-    found: Hypotheses, noise: Tensor, skeleton: Skeleton, *, doubt: float = 1.0, image: Tensor | None = None
+    found: Hypotheses,
+    noise: Tensor,
+    skeleton: Skeleton,
+    *,
+    doubt: float = 1.0,
+    image: Tensor | None = None,
+    guess: Tensor | None = None,
 ) -> Tensor:
     """Standard deviation of the best solution's depths, (T, N).
 
@@ -134,6 +172,7 @@ def depth_deviation(
         skeleton: of the N joints.
         doubt: of angles, see :func:`angle_doubt`.
         image: (T, N, 2) of a detector's joints, or None: these may be off in many ways that their noise does not tell.
+        guess: (B,) variance of the bones' depths besides, see :func:`guess_variance`.
     """
     bones = skeleton.bone_index(device=noise.device)
     dz = bone_vectors(found.depth[0][..., None], bones)[..., 0]  # (T, B)
@@ -147,7 +186,8 @@ def depth_deviation(
     blur = bone_noise(noise, bones).square()
     wrong = length.square() * told + NOISE**2 * blur + LASTING**2 * blur.mean(0)
     tree = chain_inverse(incidence(bones, skeleton.num_joints, dtype=noise.dtype))  # (N, B)
-    variance = (wrong / (steep.square() + FLAT**2)) @ tree.square().mT
+    wrong = wrong / (steep.square() + FLAT**2)
+    variance = (wrong if guess is None else wrong + guess) @ tree.square().mT
     if image is not None:
         variance = variance + HEADING**2 * (image - image.mean(-2, keepdim=True)).square().sum(-1)
     if len(found.energy) > 1:

@@ -9,7 +9,14 @@ from torch import Tensor
 
 from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.methods.answer.finish import Estimate
-from kcs_torch.methods.pkc.answers import APART, angle_doubt, depth_deviation, told_by_prior
+from kcs_torch.methods.pkc.answers import (
+    APART,
+    angle_doubt,
+    depth_deviation,
+    guess_variance,
+    hardly_told,
+    told_by_prior,
+)
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct
 from kcs_torch.methods.pkc.moving_answer import STILL
@@ -54,10 +61,15 @@ def from_hypotheses(
     for k, (depth, points) in enumerate(zip(wanted.depth, body.bodies(wanted), strict=True)):
         one = torch.ones_like(points[:, 0, 0])
         turned = body.frames(depth)[:, :2]
-        doubt = angle_doubt(body.objective, depth, found.lengths[k], float(viewpoint_turn(turned)))
-        spread = depth_deviation(found[k : k + OTHERS + 1], body.noise, body.skeleton, doubt=doubt, image=image)
+        turn = float(viewpoint_turn(turned))
+        spread = depth_deviation(
+            found[k : k + OTHERS + 1], body.noise, body.skeleton, image=image,
+            doubt=angle_doubt(body.objective, depth, found.lengths[k], turn),
+            guess=guess_variance(body.skeleton, found.lengths[k], turn),
+        )  # fmt: skip
+        doubt = "" if k else hardly_told(depth, spread, body.skeleton, turn)
         settled = told and found.moved is not None and bool(found.moved[k] <= STILL)
         path, said, value = turned if cameras is None else cameras, () if k else notes, float(found.energy[k])
         spread = spread / body.factor
-        made.append(Estimate(points, path, one, settled, found.steps, said, spread, value, still=still))
+        made.append(Estimate(points, path, one, settled, found.steps, said, spread, value, doubt=doubt, still=still))
     return replace(made[0], alternatives=tuple(made[1:]))
