@@ -2,11 +2,14 @@
 
 import csv
 import json
+import math
 import pickle
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.bodies import no_bones
@@ -24,6 +27,16 @@ def four_legged() -> Skeleton:
         bones += [*pairwise(limbs), *pairwise(front)]
         names += [*limbs[1:], *front[1:]]
     return Skeleton.from_names(names, bones, template="quadruped")
+
+
+def unlike(guess: Skeleton) -> Skeleton:
+    """The same animal with a template of its own: bones stray from the guessed one as far as poses do."""
+    rest, draw = guess.template_points(dtype=torch.float64), torch.Generator().manual_seed(0)
+    own = rest.clone()
+    for (a, b), degrees in zip(guess.bones, guess.spread or (), strict=True):
+        stray = math.sin(math.radians(degrees)) / 2**0.5 * torch.randn(3, generator=draw).double()
+        own[b] = own[a] + rest[b] - rest[a] + (rest[b] - rest[a]).norm() * stray
+    return replace(guess, template=tuple(map(tuple, own.tolist())))
 
 
 def deeplabcut_columns(individuals=(), parts=ANIMAL, coords=("x", "y", "likelihood")):

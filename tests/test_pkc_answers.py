@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from animal_samples import four_legged
+from animal_samples import four_legged, unlike
 from numerics import CHAIN
 from torch.testing import assert_close
 
@@ -236,12 +236,7 @@ def test_a_guessed_template_s_directions_are_as_unsure_as_bones_stray():
 def test_depth_by_a_guessed_template_is_a_hint(yaw):
     """An animal whose bones stray from the guess for the whole clip; the template of its own is a measurement's."""
     guess = four_legged()
-    rest, draw = guess.template_points(dtype=torch.float64), torch.Generator().manual_seed(0)
-    own = rest.clone()
-    for (a, b), degrees in zip(guess.bones, guess.spread, strict=True):
-        stray = math.sin(math.radians(degrees)) / 2**0.5 * torch.randn(3, generator=draw).double()
-        own[b] = own[a] + rest[b] - rest[a] + (rest[b] - rest[a]).norm() * stray
-    known = replace(guess, template=tuple(map(tuple, own.tolist())))
+    known = unlike(guess)
     clip = random_motion(known, 60, turn=0.0, yaw=yaw, swing=8.0, generator=torch.Generator().manual_seed(0))
     covered = {}
     for body in (guess, known):

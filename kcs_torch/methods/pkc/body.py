@@ -160,14 +160,15 @@ class Body:
         if self.skeleton.mirror:
             other = yield from refined(self.objective, other[:1], steps)
         found = found.joined(other)
-        points = self.joints(found.depth)
-        flip = points.new_tensor([1.0, 1.0, -1.0])
-        frames = self.objective.weights.posture
-        own, mirrored = (view_energy(p, cameras, correlation=frames) for p in (points, points * flip))
+        own, mirrored = (self._seen_by(depth, cameras) for depth in (found.depth, -found.depth))
         found = replace(found, energy=found.energy + own)
         order = found.energy.argsort()
         left = (own - mirrored)[order] <= TOLD
         return found[order[left] if bool(left.any()) else order]
+
+    def _seen_by(self, depth: Tensor, cameras: Tensor) -> Tensor:
+        """What depths (H, T, N) cost before known cameras (T, 3, 3), (H,)."""
+        return view_energy(self.joints(depth), cameras, correlation=self.objective.weights.posture)
 
     @property
     def spanned(self) -> bool:
@@ -200,13 +201,16 @@ class Body:
         path, kind, _ = choose_path(frames)
         return kind != "free" and float(viewpoint_turn(path[:, :2])) >= TURNING
 
-    def polished(self, found: Hypotheses, steps: int, other: Tensor | None = None) -> Search[Any, Any, Hypotheses]:
+    def polished(
+        self, found: Hypotheses, steps: int, other: Tensor | None = None, cameras: Tensor | None = None
+    ) -> Search[Any, Any, Hypotheses]:
         """Hypotheses, the best refined on the log-determinant of aligned bones' changes, and of the bones themselves.
 
         What the objective counts for a few frames only, these count for all. Changes take away what moves each bone by
         itself. Before a viewpoint that turns, aligned bones tell depth better than the template does, and together with
         it which of close rivals is best; ``other`` depths (T, N), or their mirror image, are a rival then, too, if they
-        come as near in ``steps`` on the objective. Energies stay those of the objective before, in their order.
+        come as near in ``steps`` on the objective, and before ``cameras`` (T, 3, 3) that hypotheses were ranked by.
+        Energies stay those before, in their order.
         """
         around = self.turns(found)
         close = (found.energy - found.energy[0] < CLOSE) & ((found.depth * found.depth[0]).sum((1, 2)) > 0)
@@ -216,6 +220,8 @@ class Body:
         if around and other is not None:
             other = alike(other, found.depth[0])[None]
             ranked = yield from self.rank(other, steps)
+            if cameras is not None:
+                ranked = replace(ranked, energy=ranked.energy + self._seen_by(ranked.depth, cameras))
             dearer = ranked.energy - found.energy[0]
             if self.is_odd(found):
                 rivals = rivals.joined(replace(ranked, depth=other, energy=found.energy[0] + LEAD + dearer / LESS))

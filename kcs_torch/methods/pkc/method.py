@@ -283,7 +283,7 @@ class PKC(Method):
 
         Cameras that are known tell signs by themselves, also against the template.
         """
-        found = yield from body.polished(found, self.steps, rival)
+        found = yield from body.polished(found, self.steps, rival, clip.telling)
         if rival is None or not self._moves or clip.telling is not None or not body.turns(found):
             return found
         return (yield from turned_around(body, found, rival))
