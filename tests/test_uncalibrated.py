@@ -4,6 +4,7 @@ import functools
 import math
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -56,18 +57,60 @@ def test_a_near_camera_is_noticed():
     )
 
 
-def test_a_near_camera_takes_one_search(monkeypatch):
-    """What was found under parallel rays is refined, round by round, and not searched for anew."""
+@pytest.mark.parametrize(("detections", "count"), [(False, 2), (True, 1)], ids=["exact", "a detector's"])
+def test_exact_tracks_are_searched_once_more_through_the_lens(monkeypatch, detections, count):
+    """The first search ended where the camera seemed near; what it found is refined, round by round."""
     searched, solve = [], kt.PKC.solve
-    monkeypatch.setattr(kt.PKC, "solve", lambda *given: searched.append(0) or solve(*given))
-    assert quietly(filmed(frames=15)[0]).distance is not None
-    assert len(searched) == 1
+    monkeypatch.setattr(kt.PKC, "solve", lambda *given: searched.append(given[1]) or solve(*given))
+    assert quietly(filmed(frames=15)[0], detections=detections).distance is not None
+    assert len(searched) == count
+    size = [(one.points - one.points.mean(1, keepdim=True)).square().mean((1, 2)) for one in searched]
+    shares = [float((one / one.mean()).log().diff().abs().mean()) for one in size]
+    assert count == 1 or shares[1] < shares[0]  # straightened, a body that comes nearer no longer grows
+
+
+def test_what_is_found_anew_is_taken_if_it_costs_less(monkeypatch):
+    """The first search is made to find legs that are turned over, and nothing else turns them back."""
+    tracks, truth = filmed(frames=30)
+    along, anew = calibrated.seen_along, calibrated._lifted_anew
+    legs = [n for n, name in enumerate(tracks.skeleton.joints) if "knee" in name.lower() or "ankle" in name.lower()]
+    assert len(legs) == 4
+
+    def turned(*given):
+        found = along(*given)
+        sign = torch.ones_like(found.points)
+        sign[:, legs, 2] = -1
+        return replace(found, points=found.points * sign, alternatives=())
+
+    monkeypatch.setattr(calibrated, "seen_along", turned)
+    monkeypatch.setattr(scene.Scene, "turned_over", lambda _, found: found)
+    better = error(quietly(tracks).points, truth)
+    monkeypatch.setattr(calibrated, "_lifted_anew", lambda *given: given[2])
+    assert better < 0.5 * error(quietly(tracks).points, truth)
+    kept = lambda *given: anew(*given[:2], replace(given[2], bodies=cheaper(given[2].bodies)), *given[3:])  # noqa: E731
+    cheaper = lambda bodies: replace(bodies, energy=bodies.energy - 1e6)  # noqa: E731
+    monkeypatch.setattr(calibrated, "_lifted_anew", kept)
+    assert error(quietly(tracks).points, truth) > 2 * better
+
+
+def test_deviations_never_fall_from_round_to_round():
+    """In the unit of each round's body."""
+    tracks, _ = filmed(frames=15)
+    first = quietly(tracks, intrinsics="parallel")
+    later = replace(first, lengths=2 * first.lengths, uncertainty=first.uncertainty / 2)
+    before = SimpleNamespace(lifted=(first,))
+    assert_close(calibrated._as_unsure(later, before).uncertainty, 2 * first.uncertainty)
+    assert_close(calibrated._as_unsure(first, SimpleNamespace(lifted=(later,))).uncertainty, first.uncertainty)
+    unknown = replace(first, uncertainty=None)
+    assert calibrated._as_unsure(first, None) is first and calibrated._as_unsure(unknown, before) is unknown
+    assert calibrated._as_unsure(first, SimpleNamespace(lifted=(unknown,))) is first
 
 
 def test_runs_are_turned_over_once_through_one_lens(monkeypatch):
     """A round whose focal length hardly differs from that of the last flips would find what they found."""
     focals, flips = [], []
     again, over = calibrated.refine_again, scene.Scene.turned_over
+    monkeypatch.setattr(calibrated, "_lifted_anew", lambda *given: given[2])
     monkeypatch.setattr(calibrated, "refine_again", lambda *given: focals.append(given[1].lens.focal) or again(*given))
     monkeypatch.setattr(scene.Scene, "turned_over", lambda *given: flips.append(focals[-1]) or over(*given))
     assert quietly(filmed(3000.0, frames=30)[0]).distance is not None

@@ -18,6 +18,7 @@ from kcs_torch.methods.answer.finish import HARDLY, little_turn, nothing_else
 from kcs_torch.methods.answer.root import ABSENT, FOUND, standing_feet
 from kcs_torch.methods.answer.wrong import WHY_LOOSE, what_is_wrong
 from kcs_torch.methods.base import Method, apart, check_cameras
+from kcs_torch.methods.perspective.parallel_image import body_unit
 from kcs_torch.methods.perspective.refining import Found, refine, refine_again, seen_along
 from kcs_torch.methods.perspective.scene import BLOCK, GAIN, ahead
 from kcs_torch.methods.perspective.view import View, lens_note, zoomed
@@ -72,8 +73,8 @@ def reconstruct_perspective(
         intrinsics: of the camera.
         cameras: (T, 2, 3) known camera rows, world to camera.
         lifted: what the method found in the tracks as if rays were parallel. The focal length is then to be found as
-            well, from that of the intrinsics on, and noted; nothing is lifted anew, but each round refines what the one
-            before found, as its focal length shows it.
+            well, from that of the intrinsics on, and noted; each round refines what the one before found, as its focal
+            length shows it. Exact tracks whose first search ended early are lifted anew once, in the end.
 
     Returns:
         The reconstruction in the camera's frame: ``points + (0, 0, distance)`` projects onto the image. Its unit is one
@@ -105,6 +106,8 @@ def _reconstruct(
     best = _best_of_rounds(method, tracks, View.of(tracks, intrinsics, tracks.rate), cameras, lifted)
     exact = has_trunk(tracks.skeleton) and not detected(tracks)
     if method.turns_over and exact and not best.flat:
+        if lifted is not None and SEEMS_NEAR in lifted.diagnostics.notes:  # where the search ended
+            best = _lifted_anew(method, tracks, best, cameras)
         best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies))
     return _assemble(method, tracks, best)
 
@@ -133,7 +136,7 @@ def _best_of_rounds(
                 made = seen_along(view, lifted, distance, straight)
             else:  # the tracks of the first round agree with no depths yet: there the method may find signs by itself
                 step = SfAM() if soft else method.following(best is not None and tracks.num_frames <= BLOCK)
-                made = _lift(step, straight, view, cameras)
+                made = _as_unsure(_lift(step, straight, view, cameras), best)
             given = made, view, distance, depth, tracks.rate, feet, unit
             flips = method.turns_over and not any_focal  # else a guess is confirmed
             found = refine(*given, mirror=cameras is None, flips=flips, any_focal=any_focal)
@@ -156,6 +159,28 @@ def _best_of_rounds(
             view = View.of(tracks, zoomed(view.lens, float(bodies.focal[0])), tracks.rate)
     assert best is not None
     return best
+
+
+def _lifted_anew(method: Method, tracks: Tracks, best: Found, cameras: Tensor | None) -> Found:
+    """What the method finds in tracks straightened by the best body so far, through its lens, if that is better.
+
+    Under parallel rays the search ended before it looked for signs, and flips of single runs mend only some.
+    """
+    view = View.of(tracks, zoomed(best.view.lens, float(best.bodies.focal[0])), tracks.rate)
+    distance, depth = best.bodies.distance[0], best.bodies.depth[0]
+    made = _as_unsure(_lift(method, _straighten(tracks, view.rays, distance, depth), view, cameras), best)
+    given = made, view, distance, depth, tracks.rate, feet_on_ground(tracks, cameras), best.scene.unit
+    found = refine(*given, mirror=cameras is None, flips=True, any_focal=True)
+    return found if bool(found.bodies.energy[0] < best.bodies.energy[0] - GAIN) else best
+
+
+def _as_unsure(lifted: Reconstruction, before: Found | None) -> Reconstruction:
+    """A solution whose deviations are no less than before: straightened tracks confirm what straightened them."""
+    first = None if before is None else before.lifted[0]
+    if first is None or first.uncertainty is None or lifted.uncertainty is None:
+        return lifted
+    least = first.uncertainty * (body_unit(lifted) / body_unit(first))
+    return replace(lifted, uncertainty=lifted.uncertainty.maximum(least))
 
 
 def _warn_of_wide_rays(tracks: Tracks, intrinsics: Intrinsics) -> None:
