@@ -173,7 +173,7 @@ class Own(Method):
         ),
         (lambda found: replace(found, cameras=found.cameras[:, :1]), "cameras: expected a tensor (20, 2, 3), got"),
         (lambda found: replace(found, cameras=2 * found.cameras), "cameras: expected the first two rows of rotations"),
-        (lambda found: replace(found, scales=0 * found.scales), "scales: expected positive numbers, got 0 in frame 0"),
+        (lambda found: replace(found, scales=-found.scales), "scales: expected numbers >= 0, got -"),
         (lambda found: replace(found, deviation=found.scales), "deviation: expected a tensor (20, 17), got (20,)"),
     ],
 )

@@ -276,11 +276,9 @@ def checked_estimate(found: Any, tracks: Tracks, name: str) -> Estimate:
                 f"{name}: solve: {part}: expected finite numbers, got NaN or infinity in frame {frame}"
             )
     check_cameras(found.cameras, frames, f"{name}: solve: cameras")
-    if not bool((found.scales > 0).all()):
+    if bool((found.scales < 0).any()):  # a body that is a point in a frame has none
         frame = int(found.scales.argmin())
-        raise ShapeError(
-            f"{name}: solve: scales: expected positive numbers, got {found.scales[frame]:g} in frame {frame}"
-        )
+        raise ShapeError(f"{name}: solve: scales: expected numbers >= 0, got {found.scales[frame]:g} in frame {frame}")
     return found.to(tracks.points)
 
 
