@@ -129,7 +129,7 @@ def first_alone(start: Callable[..., Any]) -> Callable[..., Any]:
     return search
 
 
-def as_found(body: Any, found: Any, steps: int, other: Any = None) -> Any:
+def as_found(body: Any, found: Any, *_: Any) -> Any:
     """A polish that leaves all as it is."""
     yield from ()
     return found
