@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 from numerics import count_operations, normal
-from test_pkc_objective import lengths_of, objective, several, walk
+from objective_walks import lengths_of, objective, walk
+from test_pkc_refinement import several
 from torch.testing import assert_close
 
 from kcs_torch.functional import bone_lengths, bone_vectors

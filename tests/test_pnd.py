@@ -5,8 +5,9 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from numerics import camera_disagreement, count_operations, normal, rotations
-from test_baselines_later import centre, error, figures, quiet, tumbling
+from baseline_clips import centred, error
+from numerics import camera_disagreement, count_operations, normal, rotations, tumbling
+from test_baselines_later import figures, quiet
 from torch.testing import assert_close
 
 import kcs_torch as kt
@@ -23,7 +24,7 @@ PND2 = {"pickup": (0.0193, 0.1142), "yoga": (0.0169, 0.1046)}  # the authors' im
 
 def procrustean(frames=120, joints=14, modes=3, size=0.2, seed=0):
     """Shapes drawn from a Procrustean normal distribution of a few modes (T, N, 3), and its mean."""
-    mean = centre(normal(1, joints, 3, seed=seed))[0]
+    mean = centred(normal(1, joints, 3, seed=seed))[0]
     mean = mean / mean.norm()
     ways = procrustean_tangent(mean) @ normal(3 * joints, modes, seed=seed + 1)
     away = normal(frames, modes, seed=seed + 2) @ ways.mT * size / ways.norm(dim=0).mean()
@@ -31,7 +32,7 @@ def procrustean(frames=120, joints=14, modes=3, size=0.2, seed=0):
 
 
 def test_the_tangent_space_has_no_rigid_motion():
-    mean = centre(normal(1, 9, 3))[0]
+    mean = centred(normal(1, 9, 3))[0]
     tangent = procrustean_tangent(mean)
     assert_close(tangent @ tangent, tangent)
     assert tangent.trace().item() == pytest.approx(27 - 7)
@@ -175,7 +176,7 @@ def test_the_likelihood_falls_in_no_step():
     # A poor start: depth is noise, rotations are 10 degrees off.
     rough = torch.cat([tracks, (shapes @ view.mT)[..., 2:] + 0.1 * normal(60, 10, 1, seed=4)], -1)
     wrong = torch.linalg.matrix_exp(0.1 * (lambda x: x - x.mT)(normal(60, 3, 3, seed=6))) @ view
-    start = ProcrusteanNormal.of_shapes(centre(rough), wrong, spread=0.1)
+    start = ProcrusteanNormal.of_shapes(centred(rough), wrong, spread=0.1)
     for fall in (0.3, 0.9):
         _, history, _ = fit(tracks, weights, start, num_steps=60, noise=0.1, final=1e-9, fall=fall)
         assert len(history) == 61 and history[-1] > history[0] + 100
@@ -189,7 +190,7 @@ def test_the_noise_is_that_of_the_tracks():
     tracks = exact[..., :2] + sigma * normal(200, 16, 2, seed=9)
     start = ProcrusteanNormal.of_shapes(exact, view)
     fitted, _, _ = fit(tracks, torch.ones(200, 16).double(), start, num_steps=60, noise=0.05)
-    miss = (centre(tracks) - centre(fitted.shapes())[..., :2]).square().mean().sqrt()
+    miss = (centred(tracks) - centred(fitted.shapes())[..., :2]).square().mean().sqrt()
     assert float(miss) == pytest.approx(sigma, rel=0.15)  # what is left is the noise, neither more nor less
     assert (fitted.shapes() - exact).norm() / exact.norm() < 0.05
 
@@ -201,7 +202,7 @@ def problem(frames, weights=None, depth=0.1, noise=0.003):
     tracks = (shapes @ view.mT)[..., :2] + noise * normal(frames, 10, 2, seed=9)
     rough = torch.cat([tracks, (shapes @ view.mT)[..., 2:] + depth * normal(frames, 10, 1, seed=4)], -1)
     wrong = torch.linalg.matrix_exp(depth * (lambda x: x - x.mT)(normal(frames, 3, 3, seed=6))) @ view
-    start = ProcrusteanNormal.of_shapes(centre(rough), wrong, spread=0.1)
+    start = ProcrusteanNormal.of_shapes(centred(rough), wrong, spread=0.1)
     return tracks, torch.ones(frames, 10).double() if weights is None else weights, start
 
 
@@ -209,7 +210,7 @@ def flat_problem(frames):
     """The same with a start that knows nothing of depth or rotations: some of its steps are undone."""
     tracks, weights, _ = problem(frames, soft(frames))
     flat = torch.nn.functional.pad(tracks, (0, 1)) + 1e-3 * normal(frames, 10, 3)
-    return tracks, weights, ProcrusteanNormal.of_shapes(centre(flat), rotations(frames, seed=5))
+    return tracks, weights, ProcrusteanNormal.of_shapes(centred(flat), rotations(frames, seed=5))
 
 
 def padded_problems(problems):
@@ -309,7 +310,7 @@ def test_pnd_fills_gaps_by_its_e_step():
     points = truth[..., :2].clone()
     gone = torch.rand(150, 20, generator=torch.Generator().manual_seed(0)) < 0.2
     points[gone] = torch.nan
-    found = centre(PND()(kt.Tracks.from_arrays(points)).points)
+    found = centred(PND()(kt.Tracks.from_arrays(points)).points)
     flip = torch.tensor([1.0, 1.0, -1.0]).double()
     off = min((found * sign - truth)[gone].norm() for sign in (1, flip))
     assert off < 0.1 * truth[gone].norm()

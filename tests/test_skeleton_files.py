@@ -6,7 +6,8 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from test_skeleton import BUILT_IN, trees
+from test_skeleton import trees
+from test_skeletons_built_in import BUILT_IN
 
 from kcs_torch.errors import FormatError, KcsError, SkeletonError
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from numerics import BATCHES, CHAIN, FLOATS, HALVES, finite, gradcheck, leaves_arguments_alone, normal, rotations
-from test_pkc_objective import lengths_of, objective, walk
+from objective_walks import lengths_of, objective, walk
 from torch.testing import assert_close
 
 from kcs_torch.data import walking_person
