@@ -258,6 +258,7 @@ def checked_estimate(found: Any, tracks: Tracks, name: str) -> Estimate:
     Raises:
         OptionError: it is no :class:`Estimate`.
         ShapeError: a part of it has another shape, or values that it cannot have.
+        NotFiniteError: a part of it holds NaN or infinity.
     """
     if not isinstance(found, Estimate):
         raise OptionError(f"{name}: solve: expected an Estimate, got {type(found).__name__}")

@@ -192,7 +192,7 @@ class RunCosts:
         return value + bends / (2 * w.acceleration**2) + self._posture(frames.poses, runs)
 
     def _posture(self, poses: Tensor, runs: Runs) -> Tensor:
-        """The posture's energy (K,), from sums and scatters of poses (V, S, T, K) up to each place."""
+        """The posture's energy (K,), from sums and scatters of poses (V, S, T, K) within each run."""
         posture, base = self.objective.posture, self.base.poses
         frames = poses.shape[2]
         change, twice = poses - base, poses + base
