@@ -103,8 +103,37 @@ def test_what_was_swapped_is_swapped_back(frames, joints):
     mended = kt.clean.unswap(swap(tracks, frames, joints))
     same(mended, tracks)
     (note,) = mended.notes
-    whole, limb = (len(frames), "") if joints is None else (0, f", and of limbs alone (from {joints[0]} {len(frames)})")
-    assert f"swapped back in {whole} of 90" in note and note.endswith(f"frames{limb}")
+    alone = f"; of limbs by themselves, from {(joints or [''])[0]} on in {len(frames)}"
+    whole, limb = (len(frames), "") if joints is None else (0, alone)
+    assert f"swapped back in {whole} of 90" in note and note.endswith(f") frames{limb}")
+
+
+def test_legs_that_come_back_slowly_from_a_swap_do_not_cross_before():
+    """A detector that smooths its joints shows legs in between after all of the body was swapped for a moment."""
+    tracks = walk(150, yaw=90)
+    body = tracks.skeleton
+    wrong = swap(tracks, list(range(80, 84)))
+    points = wrong.points[:, :17].clone()
+    for name in ("knee", "ankle"):
+        pair = [body.index(f"{side}_{name}") for side in ("left", "right")]
+        before, after = points[83, pair], points[88, pair]
+        for t in range(84, 88):
+            points[t, pair] = before + (t - 83) / 5 * (after - before)
+    points, weights = body.complete(points, wrong.weights[:, :17])
+    mended = kt.clean.unswap(replace(wrong, points=points, weights=weights))
+    early = slice(0, 84)
+    torch.testing.assert_close(mended.points[early], tracks.points[early])
+    torch.testing.assert_close(mended.points[88:], tracks.points[88:])
+
+
+@pytest.mark.parametrize(("clip", "whole", "knees"), [("mediapipe_dancer", 0, 0), ("mediapipe_sports2d", 4, 28)])
+def test_legs_of_real_people_do_not_cross_for_seconds(shared, clip, whole, knees):
+    """Legs that jump in a turn (the dancer's at 222), or come back slowly from a swap (after 71)."""
+    tracks = kt.load_tracks(shared / "data" / "video2d" / f"{clip}.npz")
+    mended = kt.clean.unswap(tracks)
+    changed = (mended.points != tracks.points).any(-1)
+    knee, hip = (changed[:, tracks.skeleton.index(f"left_{name}")] for name in ("knee", "hip"))
+    assert (int(hip.sum()), int(knee.sum())) == (whole, whole + knees)
 
 
 def test_both_at_once_and_while_nobody_is_seen():

@@ -5,8 +5,9 @@ from __future__ import annotations
 from itertools import pairwise, starmap
 
 import torch
+from torch import Tensor
 
-from kcs_torch.clean.common import body_size, check_tracks, rebuilt, share
+from kcs_torch.clean.common import body_size, check_tracks, rebuilt, runs, share
 from kcs_torch.clean.timing import cuts_of
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
@@ -27,13 +28,18 @@ there is more than this share of such pairs. What is swapped for a moment may be
 _FEWEST = 2
 """Pairs of joints of which a limb consists, at least: one pair by itself may be an outlier."""
 
+_LONG, _RATE = 1.0, 30.0
+"""A limb that points from right to left as the trunk does, for so many seconds more than it does not, is not swapped;
+and the frames a second where tracks do not tell. Legs stay crossed for less."""
+
 
 def unswap(tracks: Tracks) -> Tracks:
     """Swap left and right back where a detector mistakes them for each other; a note says in how many frames.
 
     First all pairs of joints together, then the arms, the legs and other limbs by themselves, without the joints of the
     trunk (:func:`kcs_torch.solvers.swapped_frames`). A pair that is mistaken jumps to the other side, while legs that
-    cross move on evenly. Where a clip is half swapped, the longer part is taken to be right.
+    cross move on evenly. Where a clip is half swapped, the longer part is taken to be right. A limb stays as it is if
+    it would be crossed for a second: it jumped as the body did, in a turn, or comes back slowly from a swap.
 
     Args:
         tracks: of a skeleton that has a left and a right; those of others are returned as they are.
@@ -56,20 +62,19 @@ def unswap(tracks: Tracks) -> Tracks:
         return tracks
     points, weights = tracks.points[:, :count].clone(), tracks.weights[:, :count].clone()
     size = float(body_size(points, weights > 0))
-    counts, cuts = {}, cuts_of(tracks)  # a view from another side is no swap
-    for name, some in (("", pairs), *_limbs(body, pairs)):
+    shots = list(starmap(slice, pairwise([0, *cuts_of(tracks), tracks.num_frames])))  # another view is no swap
+    limbs = _limbs(body, pairs)
+    trunk = [pair for pair in pairs if not any(pair in limb for _, limb in limbs)]
+    long = _LONG * (tracks.fps or _RATE)
+    counts = {}
+    for name, some in (("", pairs), *limbs):
         left, right = torch.tensor(some, device=points.device).T
-        seen = (weights[:, left] > 0) & (weights[:, right] > 0)
-        apart = torch.where(seen[..., None], points[:, left] - points[:, right], torch.nan)
-        near = seen & ~(from_beside(apart, mirrored=True) > _FAR * size)  # NaN is not above
-        if int(near.sum()) < (1 - _MANY) * int(seen.sum()):
-            lone = near.sum(1) < torch.minimum(seen.sum(1), seen.new_tensor(_FEWEST, dtype=torch.long))
-            seen = near & ~lone[:, None]
-        penalty = _LIMB if name else _BODY
-        swapped = [
-            swapped_frames(points[shot, left], points[shot, right], seen[shot], size, penalty)
-            for shot in starmap(slice, pairwise([0, *cuts, tracks.num_frames]))
-        ]
+        seen, penalty = _comparable(points, weights, left, right, size), _LIMB if name else _BODY
+        swapped = [swapped_frames(points[shot, left], points[shot, right], seen[shot], size, penalty) for shot in shots]
+        if name and trunk:
+            across, straight = (_across(points, weights, these) for these in (some[:1], trunk))
+            for shot, found in zip(shots, swapped, strict=True):
+                _keep_straight(found, across[shot], straight[shot], long)
         frames = torch.cat(swapped).nonzero()  # (F, 1)
         for values in (points, weights):
             values[frames, left], values[frames, right] = values[frames, right], values[frames, left]
@@ -77,15 +82,43 @@ def unswap(tracks: Tracks) -> Tracks:
     if not any(counts.values()):
         return tracks
     note = f"unswap: left and right swapped back in {share(counts.pop(''), tracks.num_frames)} frames"
-    limbs = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
-    return rebuilt(tracks, points, weights, note + (f", and of limbs alone (from {limbs})" if limbs else ""))
+    alone = ", ".join(f"from {name} on in {count}" for name, count in counts.items() if count)
+    return rebuilt(tracks, points, weights, note + (f"; of limbs by themselves, {alone}" if alone else ""))
+
+
+def _comparable(points: Tensor, weights: Tensor, left: Tensor, right: Tensor, size: float) -> Tensor:
+    """(T, P), which pairs of joints are seen, less those that jump about in some frames, if there are many."""
+    seen = (weights[:, left] > 0) & (weights[:, right] > 0)
+    apart = torch.where(seen[..., None], points[:, left] - points[:, right], torch.nan)
+    near = seen & ~(from_beside(apart, mirrored=True) > _FAR * size)  # NaN is not above
+    if int(near.sum()) >= (1 - _MANY) * int(seen.sum()):
+        return seen
+    lone = near.sum(1) < torch.minimum(seen.sum(1), seen.new_tensor(_FEWEST, dtype=torch.long))
+    return near & ~lone[:, None]
+
+
+def _across(points: Tensor, weights: Tensor, pairs: list[tuple[int, int]]) -> Tensor:
+    """(T, 2) from right to left in the image, summed over the pairs that are seen; 0 where none is."""
+    left, right = torch.tensor(pairs, device=points.device).T
+    seen = (weights[:, left] > 0) & (weights[:, right] > 0)
+    return torch.where(seen[..., None], points[:, left] - points[:, right], 0.0).sum(1)
+
+
+def _keep_straight(swapped: Tensor, across: Tensor, straight: Tensor, long: float) -> None:
+    """Unset, in place, the runs of (T,) in which a limb points across the image (T, 2) as the trunk does, in sum."""
+    both, most = (across * straight).sum(-1), across.norm(dim=-1) * straight.norm(dim=-1)
+    for start, end in runs(swapped.cpu().numpy()):
+        run = slice(start, end)
+        if bool(both[run].sum() * (end - start) > long * most[run].sum()):  # the mean cosine by the frames
+            swapped[run] = False
 
 
 def _limbs(body: Skeleton, pairs: list[tuple[int, int]]) -> list[tuple[str, list[tuple[int, int]]]]:
-    """Pairs of joints outside the trunk that are connected, by the first joints' names."""
+    """Pairs of joints outside the trunk that are connected, those that hang on it first, by the first joints' names."""
     parent = {b: a for a, b in body.bones}
     trunk = set(trunk_joints(body)) or {a for a, _ in pairs if body.side(parent.get(a, a)) != "left"}
     twin = {a: b for a, b in pairs if a not in trunk}
     pieces = find_pieces(body.num_joints, [bone for bone in body.bones if twin.keys() >= set(bone)])
-    limbs = [[(a, twin[a]) for a in piece if a in twin] for piece in pieces]
+    outer = [sorted(piece, key=lambda a: parent.get(a) in twin) for piece in pieces]
+    limbs = [[(a, twin[a]) for a in piece if a in twin] for piece in outer]
     return [(body.joints[limb[0][0]], limb) for limb in limbs if len(limb) >= _FEWEST]
