@@ -288,6 +288,17 @@ def test_what_does_not_fit_is_refused():
         denoise_tracks(tracks, 1.0)
     with pytest.raises(ShapeError, match="denoise_tracks: tracks: expected floating point, got torch.int64"):
         denoise_tracks(tracks.long(), weights)
+    with pytest.raises(ShapeError, match=r"time: expected shape \(20,\), got \(19,\)"):
+        denoise_tracks(tracks, weights, time=torch.arange(19))
+
+
+def test_frames_that_were_left_out_make_no_leap():
+    """Joints that move on by ten frames' way from one frame to the next are no outliers where ten frames passed."""
+    time = torch.cat([torch.arange(20), torch.arange(30, 50)])
+    tracks = 10.0 * time[:, None, None].double() + normal(1, 8, 2)
+    weights = torch.ones(40, 8)
+    assert bool(denoise_tracks(tracks, weights).outliers.any())
+    assert not bool(denoise_tracks(tracks, weights, time=time).outliers.any())
 
 
 @pytest.mark.parametrize("shape", [(0, 20, 4, 2), (0, 4, 2), (3, 0, 4, 2), (20, 0, 2)])

@@ -49,6 +49,13 @@ def test_long_gap_of_a_synthetic_walk(walk):
     assert_close(result.cameras @ result.cameras.mT, torch.eye(2).double().expand(90, 2, 2), rtol=0, atol=1e-8)
 
 
+def test_no_detection_beside_a_long_gap_is_an_outlier(walk):
+    """Tracks are cleaned by their own time: in a gap made shorter all joints leap."""
+    tracks = hidden(walk.tracks, slice(40, 60))
+    result = kt.reconstruct(tracks, intrinsics="parallel")
+    assert not any("outlier" in note for note in result.diagnostics.notes)
+
+
 def test_cameras_that_are_known_go_with_their_frames():
     clip = walking_person(80, turn=120.0)
     tracks = hidden(clip.tracks, slice(25, 55))

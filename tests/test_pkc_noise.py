@@ -92,7 +92,7 @@ def test_clips_are_cleaned_together_as_alone():
         clip = walking_person(
             frames, noise=5.0 * seed, missing=0.1, generator=torch.Generator().manual_seed(seed)
         ).tracks
-        tasks.append(Noisy(clip.points, clip.weights))
+        tasks.append(Noisy(clip.points, clip.weights, torch.arange(len(clip.points))))
     for task, found in zip(tasks, clean_all(tasks), strict=True):
         (alone,) = clean_all([task])
         assert torch.equal(found.outliers, alone.outliers) and torch.equal(found.weights, alone.weights)

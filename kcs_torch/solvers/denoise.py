@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -51,7 +52,9 @@ class Denoised(NamedTuple):
     left: Tensor
 
 
-def denoise_tracks(tracks: Tensor, weights: Tensor, *, window: int = 64, quick: int = 12) -> Denoised:
+def denoise_tracks(
+    tracks: Tensor, weights: Tensor, *, time: Tensor | None = None, window: int = 64, quick: int = 12
+) -> Denoised:
     r"""Smooth 2D tracks, fill what is unseen and reject outliers; all parameters come from the clip itself.
 
     In windows of L frames, with temporal modes u_i (eigenvectors of the third-difference penalty, polynomials first),
@@ -78,6 +81,8 @@ def denoise_tracks(tracks: Tensor, weights: Tensor, *, window: int = 64, quick: 
     Args:
         tracks: (..., T, N, 2), finite.
         weights: (..., T, N) in [0, 1], 0 where unseen.
+        time: (..., T) of each frame, in frames, where some of a long gap were left out; else 0, 1, 2 ... It tells how
+            far joints may move from frame to frame.
         window: L, frames solved together; windows overlap by half.
         quick: first mode that may tell noise that lasts from motion: mode i has about i / 2 periods in a window. People
             move together from 2 or 3 Hz on, which is mode 12 of 64 frames at 30 a second.
@@ -104,6 +109,8 @@ def denoise_tracks(tracks: Tensor, weights: Tensor, *, window: int = 64, quick: 
     if not isinstance(weights, Tensor) or weights.shape != shape[:-1]:
         got = f"shape {tuple(weights.shape)}" if isinstance(weights, Tensor) else type(weights).__name__
         raise ShapeError(f"denoise_tracks: weights: expected a tensor of shape {tuple(shape[:-1])}, got {got}")
+    if time is not None and time.shape != shape[:-2]:
+        raise ShapeError(f"denoise_tracks: time: expected shape {tuple(shape[:-2])}, got {tuple(time.shape)}")
     weights = weights.detach()
     if not tracks.numel():
         none = tracks.new_zeros(*shape[:-3], shape[-2])
@@ -119,7 +126,8 @@ def denoise_tracks(tracks: Tensor, weights: Tensor, *, window: int = 64, quick: 
     index = torch.tensor(starts, device=tracks.device)[:, None] + torch.arange(length, device=tracks.device)
     model = _Model(length, values, quick)
 
-    outliers = each_joint(stray_from_neighbours, values, given > 0)
+    judge = partial(stray_from_neighbours, time=None if time is None else time.reshape(values.shape[:2]))
+    outliers = each_joint(judge, values, given > 0)
     points = values
     for last, (rounds, steps) in enumerate(_ROUNDS, start=1 - len(_ROUNDS)):
         live = torch.where(outliers, torch.zeros_like(given), given)

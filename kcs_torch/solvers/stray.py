@@ -36,20 +36,21 @@ def each_joint(judge: Callable[[Tensor, Tensor], Tensor], values: Tensor, seen: 
     return torch.cat([judge(*part) for part in parts], 2)
 
 
-def stray_from_neighbours(values: Tensor, seen: Tensor) -> Tensor:
-    """(K, T, N) outliers against the median of straight lines through a joint's nearest seen frames."""
+def stray_from_neighbours(values: Tensor, seen: Tensor, time: Tensor | None = None) -> Tensor:
+    """(K, T, N) outliers against the median of lines through a joint's nearest seen frames; at times (K, T)."""
     frames = values.shape[1]
     if frames < 5:
         return torch.zeros_like(seen)
-    time = torch.arange(frames, device=values.device)[:, None].expand(seen.shape)
-    order = torch.where(seen, time, time + frames).argsort(1)
+    index = torch.arange(frames, device=values.device)[:, None].expand(seen.shape)
+    time = index if time is None else time[..., None].expand(seen.shape)
+    order = torch.where(seen, index, index + frames).argsort(1)
     rank, count = seen.cumsum(1) - 1, seen.sum(1, keepdim=True)
 
     def neighbour(k: int) -> tuple[Tensor, Tensor]:
         at = order.gather(1, (rank + k).clamp(0, frames - 1))
         held = values.gather(1, at[..., None].expand(values.shape))
         there = (rank + k >= 0) & (rank + k < count)
-        return at.to(values.dtype), torch.where(there[..., None], held, torch.full_like(held, math.nan))
+        return time.gather(1, at).to(values.dtype), torch.where(there[..., None], held, torch.full_like(held, math.nan))
 
     near = {k: neighbour(k) for k in (-3, -2, -1, 1, 2, 3)}
     lines = []

@@ -21,10 +21,11 @@ __all__ = ["Noisy", "Sized", "clean_all", "serve"]
 
 
 class Noisy(NamedTuple):
-    """Tracks (T, N, 2) of weights (T, N) that are to be cleaned by :func:`denoise_tracks`, and its settings."""
+    """Tracks (T, N, 2) of weights (T, N), at times (T,), to be cleaned by :func:`denoise_tracks`; and its settings."""
 
     points: Tensor
     weights: Tensor
+    time: Tensor
     window: int = 64
     quick: int = 12
 
@@ -61,14 +62,14 @@ def serve(requests: Sequence[Task | Placing | Facing | Descent | Noisy | Sized |
 def clean_all(tasks: Sequence[Noisy]) -> list[Denoised]:
     """:func:`denoise_tracks` of each task; those of equal size together."""
     groups: dict[object, list[int]] = {}
-    for i, (points, _, *settings) in enumerate(tasks):
+    for i, (points, _, _, *settings) in enumerate(tasks):
         groups.setdefault((points.shape, points.dtype, points.device, *settings), []).append(i)
     out: dict[int, Denoised] = {}
     for group in groups.values():
         few = max(1, TOGETHER // tasks[group[0]].points.shape[0])
         for run in (group[begin : begin + few] for begin in range(0, len(group), few)):
-            points, weights = (torch.stack(part) for part in zip(*(tasks[i][:2] for i in run), strict=True))
+            points, weights, time = (torch.stack(part) for part in zip(*(tasks[i][:3] for i in run), strict=True))
             first = tasks[run[0]]
-            found = denoise_tracks(points, weights, window=first.window, quick=first.quick)
+            found = denoise_tracks(points, weights, time=time, window=first.window, quick=first.quick)
             out |= {i: Denoised(*row) for i, row in zip(run, zip(*found, strict=True), strict=True)}
     return [out[i] for i in range(len(tasks))]

@@ -54,7 +54,7 @@ last seen, and the largest in gaps."""
 
 
 def cleaned(
-    tracks: Tracks, denoise: bool, template: bool = True
+    tracks: Tracks, denoise: bool, template: bool = True, time: Tensor | None = None
 ) -> Search[Any, Any, tuple[Tensor, Tensor, tuple[str, ...]]]:
     """Smooth noisy tracks, reject outliers and fill gaps; each shot by itself where a film has cuts.
 
@@ -62,26 +62,31 @@ def cleaned(
         tracks: of root mean square 1.
         denoise: whether to smooth and reject; else gaps are filled linearly.
         template: whether a template tells the body's lengths.
+        time: (T,) of each frame, in frames, where some of long gaps were left out.
 
     Returns:
         Complete tracks (T, N, 2), the standard deviation (T, N) of the noise that is left in them, and what was done.
     """
-    ends = [0, *cuts_of(tracks), tracks.num_frames]
-    shots = [tracks.frames(*some) for some in pairwise(ends)]
+    parts = list(pairwise([0, *cuts_of(tracks), tracks.num_frames]))
+    shots = [tracks.frames(*some) for some in parts]
     if not denoise:
-        parts = [_complete(shot, interpolate(shot.points, shot.seen), shot.seen, 0.0) for shot in shots]
+        made = [_complete(shot, interpolate(shot.points, shot.seen), shot.seen, 0.0) for shot in shots]
     else:
         rate = tracks.rate
         window = window_at(rate)
         quick = math.ceil(2 * QUICK * window / rate)
         kept = [_likely(shot) for shot in shots]
         asked = [torch.where(keep, shot.weights, 0) for shot, keep in zip(shots, kept, strict=True)]
-        found = yield [Noisy(shot.points, w, window, quick) for shot, w in zip(shots, asked, strict=True)]
+        time = torch.arange(tracks.num_frames, device=tracks.points.device) if time is None else time
+        found = yield [
+            Noisy(shot.points, w, time[slice(*some)], window, quick)
+            for shot, w, some in zip(shots, asked, parts, strict=True)
+        ]
         levels = [one.noise.median().expand(shot.num_frames) for one, shot in zip(found, shots, strict=True)]
         level = float(torch.cat(levels).median())  # one for all shots, or the sharper ones would fill the others
         clean = level <= (CLEAN * min(1.0, 30 / rate) if template else PLAIN)
-        parts = [_smoothed(*one, None if clean else level, template) for one in zip(shots, kept, found, strict=True)]
-    points, noise, notes = zip(*parts, strict=True)
+        made = [_smoothed(*one, None if clean else level, template) for one in zip(shots, kept, found, strict=True)]
+    points, noise, notes = zip(*made, strict=True)
     return torch.cat(points), torch.cat(noise), tuple(dict.fromkeys(note for some in notes for note in some))
 
 

@@ -151,7 +151,7 @@ class PKC(Method):
         if kept is None:
             return (yield from self._whole(tracks, cameras))
         some = replace(tracks, points=tracks.points[kept], weights=tracks.weights[kept])
-        found = yield from self._whole(some, None if cameras is None else cameras[kept])
+        found = yield from self._whole(some, None if cameras is None else cameras[kept], kept)
         return lengthened(found, kept, tracks, cameras)
 
     def _image(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
@@ -161,10 +161,10 @@ class PKC(Method):
         found = yield from self._whole(both, None if cameras is None else cameras.expand(2, 2, 3))
         return first_frame(found)
 
-    def _whole(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
-        """Solve tracks without long gaps."""
+    def _whole(self, tracks: Tracks, cameras: Tensor | None, time: Tensor | None = None) -> Search[Any, Any, Estimate]:
+        """Solve tracks without long gaps, of which each frame has its time (T,)."""
         tracks = replace(tracks, skeleton=outward(tracks.skeleton))
-        points, noise, notes = yield from cleaned(tracks, self.denoise, self.knows_template(tracks.skeleton))
+        points, noise, notes = yield from cleaned(tracks, self.denoise, self.knows_template(tracks.skeleton), time)
         standing = standing_feet(replace(tracks, points=points))
         image = points - points.mean(-2, keepdim=True)
         rounding = ROUNDING * torch.finfo(points.dtype).eps * float(points.abs().amax())
