@@ -1,14 +1,16 @@
 """PKC with known cameras: depth that they tell, and which mirror image."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from pkc_walks import FLIP, error, robot
 
-from kcs_torch import PKC, Skeleton
+from kcs_torch import PKC, KcsWarning, Skeleton
 from kcs_torch.data import random_motion, walking_person
-from kcs_torch.functional import complete_rotation
+from kcs_torch.functional import complete_rotation, orbit
+from kcs_torch.functional.rotation import rotation_matrix
 
 # Many tests take few steps, after which nothing has settled.
 pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")
@@ -73,6 +75,21 @@ def test_known_cameras_tell_which_of_two_mirror_images(body, side):
     assert error(result.points * FLIP, clip.points * flip) > 1
     if body == "robot":
         assert result.alternatives == ()
+
+
+def test_a_hand_that_itself_turns_farther_than_known_cameras_is_the_templates():
+    """By chance its swings look like a camera's turn, here as its mirror image has it, which is offered beside it."""
+    frames = 60
+    time = torch.linspace(0, 1, frames).double()[:, None]
+    swings = math.radians(50) * (5 * time + 2).sin() * torch.tensor([0.3, 1.0, 0.0]).double()
+    cameras = orbit(30 * time[:, 0])
+    clip = random_motion("hand21", frames, turn=0.0, swing=15.0, generator=torch.Generator().manual_seed(3))
+    points = clip.points @ rotation_matrix(swings).mT @ cameras.mT
+    points = points - points.mean(1, keepdim=True)
+    with pytest.warns(KcsWarning, match="depth may be mirrored: the known cameras turn too little"):
+        result = PKC()(replace(clip.tracks, points=points[..., :2]), cameras[:, :2])
+    assert error(result.points, points) < error(result.points * FLIP, points) / 2
+    assert min(error(one.points * FLIP, result.points) for one in result.alternatives) < 0.01
 
 
 @pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")  # links that are no tree are pulled on but weakly

@@ -204,16 +204,16 @@ def settle_path(vectors: Tensor, path: Tensor) -> Tensor:
     return found @ nearest_rotation((found.mT @ path).sum(0))
 
 
-def view_energy(points: Tensor, path: Tensor, *, correlation: float = 6.0) -> Tensor:
-    """How much poses vary in the world of known cameras: n/2 log det of their scatter there, n = T / correlation.
+def view_energy(points: Tensor, path: Tensor) -> Tensor:
+    """How much poses vary in the world of known cameras: n/2 log det of their scatter there, of n independent poses.
 
     Depths of the wrong sign seem to turn with the camera, twice as fast: of a pose and its mirror image the right one
-    varies less, whatever the body itself does, unless it turns in time with the camera.
+    varies less, whatever the body itself does, unless it turns in time with the camera. A turn of its own that takes
+    all clip long does so by chance, so that frames count as one for as long as images resemble each other.
 
     Args:
         points: (..., T, N, 3) in the camera frame; the middle of each frame's joints does not count.
         path: (T, 3, 3) world to camera.
-        correlation: frames that count as one.
 
     Returns:
         (...). Only differences mean something, between points of the same clip.
@@ -221,7 +221,21 @@ def view_energy(points: Tensor, path: Tensor, *, correlation: float = 6.0) -> Te
     points = points - points.mean(-2, keepdim=True)
     size = points[..., :2].square().mean((-3, -2, -1), keepdim=True).sqrt()
     world = (points / size.clamp_min(torch.finfo(size.dtype).tiny) @ path).flatten(-2)
-    return scatter_log_det(world - world.mean(-2, keepdim=True), LEAST) / correlation
+    energy = scatter_log_det(world - world.mean(-2, keepdim=True), LEAST)
+    return energy / _lasting(points[..., :2].flatten(-2))
+
+
+def _lasting(values: Tensor) -> Tensor:
+    """How many frames of values (..., T, D) count as one, (...): twice the sum of their autocorrelation up to its end.
+
+    Twice, as the mean that is taken away shortens it.
+    """
+    values = values - values.mean(-2, keepdim=True)
+    frames = values.shape[-2]
+    power = torch.fft.rfft(values, 2 * frames, dim=-2).abs().square().sum(-1)
+    alike = torch.fft.irfft(power, 2 * frames)[..., :frames]
+    kept = (alike > 0).cumprod(-1)
+    return 2 * (2 * (alike * kept).sum(-1) / or_one(alike[..., 0]) - 1).clamp_min(1.0)
 
 
 def _sum_unturned(rotations: Tensor, factors: Tensor, time: Tensor, turn: Tensor) -> Tensor:

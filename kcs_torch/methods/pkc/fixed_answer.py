@@ -23,6 +23,13 @@ from kcs_torch.methods.pkc.moving_answer import STILL
 
 __all__ = ["from_hypotheses"]
 
+UNSIDED = (
+    "depth may be mirrored: the known cameras turn too little, beside how the body itself turns, to tell which of two "
+    "mirror images is right, so that it is the one like the template. Of a body that is the template's mirror image, "
+    "as a left hand is a right one's, take the alternative that is"
+)
+"""What is said of a body that only its template tells from its mirror image."""
+
 OTHERS = 4
 """Further solutions that tell how sure depths are, whether they are returned or not."""
 
@@ -33,9 +40,9 @@ def from_hypotheses(
     cameras: Tensor | None,
     notes: tuple[str, ...],
     *,
+    telling: Tensor | None,
     alternatives: int,
     detections: bool,
-    still: bool,
     told: bool,
 ) -> Estimate:
     """Return the best estimate in the tracks' units, with so many distinct alternatives at most.
@@ -45,12 +52,15 @@ def from_hypotheses(
         body: that they are of.
         cameras: (T, 2, 3) that are known, or None: then the trunk's.
         notes: on the clip so far.
+        telling: (T, 3, 3) those that are known and turn, by which hypotheses were told apart, or None.
         alternatives: further solutions, at most.
         detections: whether joints are a detector's.
-        still: whether the camera may be taken to stand still.
         told: whether enough steps were made to tell from the last ones that a solution has settled.
     """
     image = body.image if detections else None
+    other = None if telling is None else body.unsided(found, telling)
+    if other is not None:
+        found = found.joined(other)
     found = distinct(found, max(alternatives, OTHERS) + 1, APART)
     doubtful = told_by_prior(found, body.skeleton)
     if doubtful:
@@ -67,9 +77,9 @@ def from_hypotheses(
             doubt=angle_doubt(body.objective, depth, found.lengths[k], turn),
             guess=guess_variance(body.skeleton, found.lengths[k], turn),
         )  # fmt: skip
-        doubt = "" if k else hardly_told(depth, spread, body.skeleton, turn)
+        doubt = "" if k else hardly_told(depth, spread, body.skeleton, turn) or ("" if other is None else UNSIDED)
         settled = told and found.moved is not None and bool(found.moved[k] <= STILL)
         path, said, value = turned if cameras is None else cameras, () if k else notes, float(found.energy[k])
-        spread = spread / body.factor
-        made.append(Estimate(points, path, one, settled, found.steps, said, spread, value, doubt=doubt, still=still))
+        facts = (settled, found.steps, said, spread / body.factor, value)
+        made.append(Estimate(points, path, one, *facts, doubt=doubt, still=telling is None))
     return replace(made[0], alternatives=tuple(made[1:]))

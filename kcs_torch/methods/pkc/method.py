@@ -238,8 +238,8 @@ class PKC(Method):
             if self.rounds and self.viewpoint != "moving":
                 found, body = yield from self._filled(clip, body, found, rival)
         return from_hypotheses(
-            found, body, clip.cameras, clip.notes, alternatives=self.alternatives, detections=clip.detections,
-            still=clip.telling is None, told=self.steps >= 10,
+            found, body, clip.cameras, clip.notes, telling=clip.telling, alternatives=self.alternatives,
+            detections=clip.detections, told=self.steps >= 10,
         )  # fmt: skip
 
     def _without_template(self, clip: Clip) -> Search[Any, Any, Estimate]:
