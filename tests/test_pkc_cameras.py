@@ -7,6 +7,7 @@ import pytest
 import torch
 from pkc_walks import FLIP, error, robot
 
+import kcs_torch as kt
 from kcs_torch import PKC, KcsWarning, Skeleton
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import complete_rotation, orbit
@@ -77,19 +78,33 @@ def test_known_cameras_tell_which_of_two_mirror_images(body, side):
         assert result.alternatives == ()
 
 
-def test_a_hand_that_itself_turns_farther_than_known_cameras_is_the_templates():
-    """By chance its swings look like a camera's turn, here as its mirror image has it, which is offered beside it."""
-    frames = 60
+def swinging_hand(frames=60):
+    """A hand that itself turns farther than the cameras, by more than 30 degrees: its skeleton, points and cameras."""
     time = torch.linspace(0, 1, frames).double()[:, None]
     swings = math.radians(50) * (5 * time + 2).sin() * torch.tensor([0.3, 1.0, 0.0]).double()
     cameras = orbit(30 * time[:, 0])
     clip = random_motion("hand21", frames, turn=0.0, swing=15.0, generator=torch.Generator().manual_seed(3))
     points = clip.points @ rotation_matrix(swings).mT @ cameras.mT
-    points = points - points.mean(1, keepdim=True)
+    return clip.tracks, points - points.mean(1, keepdim=True), cameras[:, :2]
+
+
+def test_a_hand_that_itself_turns_farther_than_known_cameras_is_the_templates():
+    """By chance its swings look like a camera's turn, here as its mirror image has it, which is offered beside it."""
+    tracks, points, cameras = swinging_hand()
     with pytest.warns(KcsWarning, match="depth may be mirrored: the known cameras turn too little"):
-        result = PKC()(replace(clip.tracks, points=points[..., :2]), cameras[:, :2])
+        result = PKC()(replace(tracks, points=points[..., :2]), cameras)
     assert error(result.points, points) < error(result.points * FLIP, points) / 2
     assert min(error(one.points * FLIP, result.points) for one in result.alternatives) < 0.01
+
+
+def test_lengths_along_rays_tell_such_a_hand_from_its_mirror_image(recwarn):
+    tracks, points, cameras = swinging_hand()
+    rays = points + torch.tensor([0.0, 0.0, 1500.0]).double()
+    image = 1000 * rays[..., :2] / rays[..., 2:]
+    result = kt.reconstruct(replace(tracks, points=image), cameras=cameras, intrinsics=(1000, 1000, 0, 0))
+    assert not [w for w in recwarn if "mirrored" in str(w.message)] and "mirrored" not in result.diagnostics.doubt
+    found = 1.5 * result.points  # a pixel at the hand's distance is 1.5 mm
+    assert error(found, points) < error(found * FLIP, points) / 2
 
 
 @pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")  # links that are no tree are pulled on but weakly

@@ -20,8 +20,10 @@ from kcs_torch.methods.answer.wrong import WHY_LOOSE, what_is_wrong
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.perspective.parallel_image import body_unit
 from kcs_torch.methods.perspective.refining import Found, refine, refine_again, seen_along
-from kcs_torch.methods.perspective.scene import BLOCK, GAIN, ahead
+from kcs_torch.methods.perspective.scene import BLOCK, GAIN, Bodies, ahead
 from kcs_torch.methods.perspective.view import View, lens_note, zoomed
+from kcs_torch.methods.pkc.answers import CLOSE
+from kcs_torch.methods.pkc.fixed_answer import UNSIDED
 from kcs_torch.methods.pkc.near import SEEMS_NEAR
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.nn.posture import has_trunk
@@ -258,6 +260,8 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
     doubt = first.doubt
     if doubt == nothing_else(method, body, first.viewpoint_turn):  # by the turn before the lens was known
         doubt = nothing_else(method, body, turn)
+    if doubt == UNSIDED and not found.flat and _one_side(bodies):
+        doubt = ""
     facts = replace(
         lifted.diagnostics,
         viewpoint_turn=turn,
@@ -281,6 +285,12 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
         intrinsics=intrinsics,
         alternatives=(),
     ).remeasured()
+
+
+def _one_side(bodies: Bodies) -> bool:
+    """Whether lengths, seen along the rays, tell the best body from mirror images as known cameras do not."""
+    turned = (bodies.depth * bodies.depth[0]).sum((1, 2)) < 0
+    return not bool((turned & (bodies.energy < bodies.energy[0] + CLOSE)).any())
 
 
 def _notes_on_best(

@@ -14,7 +14,7 @@ from kcs_torch.methods.pkc.hypotheses import Hypotheses
 from kcs_torch.methods.pkc.objective import Objective, bone_noise
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["APART", "angle_doubt", "depth_deviation", "guess_variance", "hardly_told", "told_by_prior"]
+__all__ = ["APART", "CLOSE", "angle_doubt", "depth_deviation", "guess_variance", "hardly_told", "told_by_prior"]
 
 APART = 0.04
 """Root mean square depth by which solutions must differ to be told apart, a person being about 1.75 tall."""

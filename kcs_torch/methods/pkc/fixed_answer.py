@@ -21,7 +21,7 @@ from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct
 from kcs_torch.methods.pkc.moving_answer import STILL
 
-__all__ = ["from_hypotheses"]
+__all__ = ["UNSIDED", "from_hypotheses"]
 
 UNSIDED = (
     "depth may be mirrored: the known cameras turn too little, beside how the body itself turns, to tell which of two "
