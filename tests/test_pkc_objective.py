@@ -285,6 +285,14 @@ def test_pace_of_a_clip_that_does_not_move():
     assert pace_of(still[..., :2], named, 60.0) == 2 and pace_of(still[:12, :, :2], named, 60.0) == 12 / four
 
 
+def test_pace_of_a_body_that_trembles_about_a_pose():
+    """However quickly it does, its frames show one pose, and count as four."""
+    pose, lively = walk(120)[:1], walk(120)
+    assert pace(lively) == 1
+    assert pace(pose + 0.05 * (lively - pose)) == pytest.approx(120 / (4 * Weights().posture))
+    assert 2 < pace(pose + 0.25 * (lively - pose)) < 5
+
+
 def test_images_of_any_size_compare():
     """Foreshortening is the logarithm of a density in the image, which falls with its area."""
     points = walking_person(20).points[:, :17] / 1000

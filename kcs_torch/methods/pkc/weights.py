@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.methods.pkc.trunk import image_scale
 from kcs_torch.nn.lengths import free_bones
 from kcs_torch.skeleton import Skeleton
 
@@ -24,6 +26,11 @@ ANCHOR = 0.01
 
 WALK = 4.3
 """Frames in which a walking person's bones change in the image by as much as they stray, at 30 frames a second."""
+
+STRAY = 0.1
+"""How far bones' images stray within a clip, a share of their length, where it shows poses that have nothing to do with
+each other: as of a person who walks towards the camera. Of n frames that are alike, as they stray by a share s of that,
+n s^2 are independent."""
 
 LEAST = 4.0
 """Independent frames that any clip counts as, at least."""
@@ -120,10 +127,16 @@ def slowness(image: Tensor, skeleton: Skeleton, rate: float) -> float:
     usual = skeleton.relative_lengths(dtype=image.dtype, device=image.device)
     if len(image) < 3 or usual is None:
         return least
-    vectors = bone_vectors(image, skeleton.bone_index(device=image.device))
-    vectors = (vectors / usual.to(image).clamp_min(1e-3)[:, None])[:, free_bones(skeleton).to(image.device) > 0]
+    bones, usual = skeleton.bone_index(device=image.device), usual.to(image).clamp_min(1e-3)
+    vectors = bone_vectors(image, bones)
+    rigid = skeleton.rigid_mask(device=image.device)
+    scale = image_scale(image, usual, bones, rigid, torch.zeros_like(vectors[..., 0]))
+    vectors = (vectors / usual[:, None])[:, free_bones(skeleton).to(image.device) > 0]
     moved = float(vectors.diff(dim=0).square().sum((1, 2)).mean().sqrt())
     spread = float((vectors - vectors.mean(0)).square().sum((1, 2)).mean().sqrt())
+    several = STRAY * float(scale) * math.sqrt(vectors.shape[1])  # the spread of several poses
+    if 0 < spread < several:
+        spread = several**2 / spread
     time = spread / moved if moved > spread / len(image) else float(len(image))
     return max(least, time / WALK)
 
