@@ -10,11 +10,13 @@ import kcs_torch as kt
 from kcs_torch import KcsWarning
 from kcs_torch.data.synthetic import random_motion, walking_person
 from kcs_torch.functional import bone_lengths, complete_rotation, viewpoint_turn
+from kcs_torch.methods.base import Estimate
 from kcs_torch.methods.pkc import moving_answer
 from kcs_torch.methods.pkc.descents import Descent, descend_all
+from kcs_torch.methods.pkc.moving_solutions import MovingView
 from kcs_torch.methods.pkc.moving_view import moving_view
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.solvers.procrustean import Stage, align_rotations
+from kcs_torch.solvers.procrustean import Pose, Stage, align_rotations
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +49,26 @@ def test_finds_depths_and_the_turning_camera_from_a_flat_start(film):
     assert float(viewpoint_turn(path[:, :2])) == pytest.approx(180, abs=25)
     deviation = found.deviation(path)
     assert deviation.shape == (70, 17) and bool((deviation > 0).all())
+
+
+@pytest.mark.parametrize(("agree", "told"), [(0.9, False), (0.75, False), (0.65, True)])
+def test_depths_are_as_unsure_as_another_method_finds_others(film, agree, told):
+    """What correlates by 1 less a share is off by sqrt(2) of that share of the body's depth."""
+    points, clip = film
+    depth, zero, bones = points[..., 2], points.new_zeros(1), clip.skeleton.bone_index()
+    pose = Pose(points[None], complete_rotation(clip.cameras)[None], zero, zero)
+    moving = MovingView(pose, zero, bones, bones, 1.0)
+    other = torch.randn(depth.shape, generator=torch.Generator().manual_seed(0), dtype=depth.dtype)
+    other = other - other.mean(1, keepdim=True)
+    other = other - depth * (other * depth).sum() / depth.square().sum()
+    other = agree * depth / depth.norm() + (1 - agree**2) ** 0.5 * other / other.norm()
+    seen = torch.cat([points[..., :2], other[..., None]], -1)
+    first = Estimate(seen, clip.cameras, torch.ones_like(depth[:, 0]), True, 0)
+    found = moving_answer.from_moving(moving, first, clip.skeleton, None, (), alternatives=0)
+    own = moving.deviation(moving.cameras()[0])
+    lack = 2**0.5 * (1 - agree) * depth.square().mean().sqrt()
+    torch.testing.assert_close(found.deviation, torch.hypot(own, lack))
+    assert ("hardly agree" in found.doubt) == told
 
 
 def test_same_seed_same_answer(film):

@@ -27,10 +27,14 @@ STILL = 0.01
 """A solution has settled where the last ten steps (fewer tell nothing) moved depths by no more than so much, root mean
 square: a share of the body's size."""
 
-SURE, DOUBT = 0.8, 0.6
-"""Correlation with SfAM's depths from which on those of the moving viewpoint are sure, and below which they are a
-guess. Before cameras that turn by 180 degrees it is above .95 for people, dogs and hands, by 60 about .8, by none
-.3 and less; of robots, whose joints turn about fixed axes, it says little."""
+DOUBT = 0.7
+"""Correlation with SfAM's depths below which those of the moving viewpoint are a guess. Before cameras that turn by 180
+degrees it is above .95 for people, dogs and hands, by 60 about .8, by none .3 and less; of robots, whose joints turn
+about fixed axes, it says little."""
+
+APART = math.sqrt(2)
+"""How far depths are off that have nothing to do with the true ones, over their size. They are taken to be off by the
+share of this that the correlation lacks: of what agrees by .9, joints are off by a seventh of the body's depth."""
 
 LEAD = 6.0
 """Lead of a solution whose bones are held to their lengths (see :class:`MovingView`) that is as sure as full agreement:
@@ -40,7 +44,7 @@ CLOSE = 1.0
 """Lead below which a solution is doubted whatever else agrees with it: of 16 views of robot arms and random chains with
 less, 15 had more than a fifth of a flat guess's error, and 6 of these no other doubt."""
 
-BROKEN = 0.5
+BROKEN = 0.65
 """How sure a solution is at most, 1 being full agreement, that does not keep the lengths of rigid bones, whose
 viewpoint turns by less than it should, or that another one rivals."""
 
@@ -74,15 +78,15 @@ def from_moving(
     depth = best.points[..., 2]
     shown = math.inf if cameras is not None else float(viewpoint_turn(best.cameras))
     agree = _agreement(depth, first.points[..., 2])
-    sure = witnessed = max(agree / SURE, moving.lead / LEAD)
+    sure = witnessed = max(agree, moving.lead / LEAD)
     rivalled = 0 < moving.lead < CLOSE
     leaps = leaps_of(depth[None])[0].nonzero().flatten().tolist()
     if loose_bones(best.points, skeleton) or shown < TURN or rivalled or leaps:  # another warning tells of the first
         sure = min(sure, BROKEN)
-    lack = depth.square().mean().sqrt() * max(0.0, 1 - sure)
+    lack = APART * max(0.0, 1 - sure) * depth.square().mean().sqrt()
     needed = NEEDED if shown < TURN else "More joints, a longer clip or a skeleton with a template would decide"
     doubt = ""
-    if witnessed < DOUBT / SURE:
+    if witnessed < DOUBT:
         doubt = (
             "depth is little more than a guess: two methods find depths that hardly agree "
             f"(correlation {agree:.2f}). {needed}"
