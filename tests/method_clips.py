@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from kcs_torch import METHODS, Tracks
+from kcs_torch import METHODS, Tracks, reconstruct
 from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths, viewpoint_turn
 
@@ -20,6 +20,11 @@ BODY = CLIP.tracks.skeleton
 
 def tracks_of(points, **options):
     return Tracks.from_arrays(points, **({"skeleton": BODY} | options))
+
+
+def notes(tracks, method, **fields):
+    """All that is said of a result."""
+    return " | ".join(reconstruct(tracks, method=method, **fields).diagnostics.notes)
 
 
 def hidden(*index):

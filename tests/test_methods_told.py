@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from method_clips import BODY, CLIP, NAN, WALK, check, hidden, quiet, tracks_of
+from method_clips import BODY, CLIP, NAN, WALK, check, hidden, notes, quiet, tracks_of
 
 from kcs_torch import (
     METHODS,
@@ -187,10 +187,6 @@ def test_skeleton_without_template_or_bones_still_names_itself():
     assert any("'dots' has no template" in n for n in result.diagnostics.notes)
 
 
-def notes(tracks, method, **fields):
-    return " | ".join(reconstruct(tracks, method=method, **fields).diagnostics.notes)
-
-
 # ---------------------------------------------------------------------- what the user is told
 
 
@@ -216,31 +212,6 @@ def test_joints_that_coincide_are_told(method, place):
     drift = drift.clone()
     drift[0] = math.nan
     assert "all joints lie at one point in every frame" in notes(tracks_of(drift), method)
-
-
-@quiet
-def test_a_body_on_its_head_is_told():
-    """y may point up; a body that lies, or shows its feet now and then, is not meant."""
-    with pytest.warns(KcsWarning, match="feet are above the rest of the body in nearly all frames. If y points up"):
-        result = reconstruct(tracks_of(WALK * torch.tensor([1.0, -1.0])), method="kcs")
-    assert any("feet are above" in note for note in result.diagnostics.notes)
-    turned = WALK.clone()
-    turned[: len(WALK) // 2, :, 1] *= -1
-    for right in (WALK, turned, WALK.flip(-1)):
-        with warnings.catch_warnings(record=True) as told:
-            warnings.simplefilter("always")
-            reconstruct(tracks_of(right), method="kcs")
-        assert not any("feet are above" in str(one.message) for one in told)
-
-
-@quiet
-def test_a_body_on_its_side_is_told():
-    """x and y are easily swapped; one that gets up is not meant."""
-    told = "x and y are swapped in these tracks"
-    assert told in notes(tracks_of(WALK.flip(-1)), "kcs")
-    rises = torch.cat([WALK.flip(-1)[: len(WALK) // 2], WALK[len(WALK) // 2 :]])
-    for right in (WALK, rises):
-        assert told not in notes(tracks_of(right), "kcs")
 
 
 @quiet

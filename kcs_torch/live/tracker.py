@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError, SkeletonError
+from kcs_torch.errors import KcsWarning, OptionError, ShapeError, SkeletonError, users_level
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.live.filter import BodyFilter, ChainFilter, Shape, Told
 from kcs_torch.live.frame import FASTEST, Sight, take_frame
@@ -26,6 +27,7 @@ from kcs_torch.types import Reconstruction, Tracks
 from kcs_torch.types.hints import is_a
 from kcs_torch.types.intake import RATES, as_number
 from kcs_torch.types.size import short_unit
+from kcs_torch.types.upright import ABOVE, how_it_stands
 
 __all__ = ["Tracker"]
 
@@ -147,7 +149,7 @@ class Tracker:
         self._rigid = list(self._body.rigid)
         self._chain = Chain(self._body, self._filter.body, rate)
         self._thread = ThreadPoolExecutor(1, "kcs_torch.live")
-        self._closed = False
+        self._closed = self._told_up = False
         self._frame = -1
         self.reset()
 
@@ -188,6 +190,9 @@ class Tracker:
         Raises:
             ShapeError: the shape is wrong or a value infinite or out of range; the frame is then not taken.
             OptionError: the tracker is closed.
+
+        Warns:
+            KcsWarning: once, when a window shows the feet above the rest of the body, as where y points up.
         """
         if self._closed:
             raise OptionError("Tracker: closed: it takes no frames any more; make another one")
@@ -310,9 +315,16 @@ class Tracker:
             if not self._due:
                 self._due.append(self._frame + self.period)
             image, weights = torch.stack(list(self._image)), torch.stack(list(self._weights))
+            self._tell_up(how_it_stands(image, weights > 0, self.skeleton))
             self._solving = self._thread.submit(solve_window, self.method, self._body, image, weights, self.fps)
             self._asked = self._frame
             self._ready = self._frame + max(1, round(self._delay * len(image)))
+
+    def _tell_up(self, stands: str) -> None:
+        """Warn, once, where a window shows that y may point up."""
+        if stands.startswith(ABOVE) and not self._told_up:
+            self._told_up = True
+            warnings.warn(f"Tracker: {stands}", KcsWarning, stacklevel=users_level())
 
     def _adopt(self, found: Solved) -> None:
         """Take over the body that was found, and let the filter take the window's last frames again."""

@@ -29,12 +29,13 @@ from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.inference import plain
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.functional.weights import rms
-from kcs_torch.methods.answer.finish import BY_SHOTS, HEADSTAND, Estimate, finish
+from kcs_torch.methods.answer.finish import BY_SHOTS, Estimate, finish
 from kcs_torch.methods.answer.wrong import WHY_LOOSE
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
 from kcs_torch.types.hints import is_a, spoken
 from kcs_torch.types.tracks import never_seen
+from kcs_torch.types.upright import ABOVE
 
 __all__ = ["Estimate", "Method", "apart"]
 
@@ -192,10 +193,8 @@ class Method(ABC):
             warnings.warn(message, ConvergenceWarning, stacklevel=users_level())
         for gone in never_seen(tracks.weights, tracks.skeleton):
             warnings.warn(f"{tracks.source}: {gone}", KcsWarning, stacklevel=users_level())
-        if HEADSTAND in found.notes:
-            warnings.warn(f"{tracks.source}: {HEADSTAND}", KcsWarning, stacklevel=users_level())
         for note in found.notes:
-            if note.endswith((WHY_LOOSE, BY_SHOTS)):
+            if note.startswith(ABOVE) or note.endswith((WHY_LOOSE, BY_SHOTS)):
                 warnings.warn(f"{tracks.source}: {note}", KcsWarning, stacklevel=users_level())
 
     def unsettled(self, steps: int) -> str:

@@ -1,4 +1,4 @@
-"""Whether a body stands on its feet, in an image whose y points down."""
+"""Whether a body stands on its feet, in an image whose y points down, and what to say where it does not."""
 
 from __future__ import annotations
 
@@ -6,13 +6,55 @@ from torch import Tensor
 
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["lies_down", "upside_down"]
+__all__ = ["ABOVE", "how_it_stands", "lies_down", "upside_down"]
 
 CLEARLY = 0.3
 """How far feet are above the rest, over the joints' root mean square distance from their mean height."""
 
 FLAT = 3.0
 """How much farther to the side of the rest feet are than below it if the body lies."""
+
+NEARLY_ALL = 0.9
+"""Share of the frames in which feet are above the rest of the body, or beside it, where axes may well be others."""
+
+ABOVE = "the feet are above the rest of the body"
+"""How the sentences begin that say so."""
+
+_Y_UP = "y points up in these tracks, give -y instead (with intrinsics the image's height - y)"
+
+_SWAPPED = "x and y are swapped in these tracks (rows and columns of an image are y and x)"
+
+_HEADSTAND = (
+    f"{ABOVE}{{often}}. If {_Y_UP}: it has to point down, as in images, or the body is upside down and mirrored. If it "
+    "does point down, joints may be in another order"
+)
+
+_ASIDE = (
+    f"{ABOVE} and beside it{{often}}, as if it bent. If {_Y_UP}. If it does not, either {_SWAPPED}, or the video is "
+    "stored turned: turn them. A picture tells which (kcs-torch info FILE -o joints.png)"
+)
+
+_LYING = (
+    f"the body lies on its side{{often}}. If it does not, {_SWAPPED}, so that the body is mirrored, too; or the video "
+    "is stored turned: turn them"
+)
+
+
+def how_it_stands(points: Tensor, seen: Tensor, skeleton: Skeleton) -> str:
+    """What to say of a body that does not stand on its feet in nearly all frames, for the user; else empty.
+
+    Args:
+        points: (T, N, 2).
+        seen: (T, N).
+        skeleton: one without contacts stands.
+    """
+    if lies_down(points, seen, skeleton, NEARLY_ALL):
+        said = _LYING
+    elif upside_down(points[..., 1], seen, skeleton, NEARLY_ALL):
+        said = _ASIDE if _leans(points, seen, skeleton, NEARLY_ALL) else _HEADSTAND
+    else:
+        said = ""
+    return said.format(often=" in nearly all frames" if len(points) > 1 else "")
 
 
 def upside_down(heights: Tensor, seen: Tensor, skeleton: Skeleton, share: float = 0.5) -> bool:
@@ -40,6 +82,23 @@ def lies_down(points: Tensor, seen: Tensor, skeleton: Skeleton, share: float) ->
     away, size, shown = _feet(points, seen, skeleton)
     aside, below = away.abs().unbind(-1)
     return bool(shown.any()) and _share((aside > CLEARLY * size) & (aside > FLAT * below), shown) > share
+
+
+def _leans(points: Tensor, seen: Tensor, skeleton: Skeleton, share: float) -> bool:
+    """Whether those joints are to one side of the others as they are below them in a body that bends, or leans.
+
+    Swapped axes put such a body's feet there, and above it or below.
+
+    Args:
+        points: (T, N, 2).
+        seen: (T, N).
+        skeleton: with contacts.
+        share: of the frames that show joints of both kinds.
+    """
+    away, size, shown = _feet(points, seen, skeleton)
+    aside, below = away.unbind(-1)
+    far = (aside.abs() > CLEARLY * size) & (FLAT * aside.abs() > below.abs())
+    return max(_share(far & (aside > 0), shown), _share(far & (aside < 0), shown)) > share
 
 
 def _feet(points: Tensor, seen: Tensor, skeleton: Skeleton) -> tuple[Tensor, Tensor, Tensor]:

@@ -21,14 +21,14 @@ from kcs_torch.methods.answer.root import root_depth
 from kcs_torch.methods.answer.wrong import LOOSE, what_is_wrong
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Reconstruction, Tracks
-from kcs_torch.types.upright import lies_down, upside_down
+from kcs_torch.types.upright import how_it_stands
 from kcs_torch.types.variation import bone_variation
 
 if TYPE_CHECKING:
     from kcs_torch.methods.base import Method
 
 __all__ = [
-    *("BY_SHOTS", "HARDLY", "HEADSTAND", "WEAK_TURN", "Estimate"),
+    *("BY_SHOTS", "HARDLY", "WEAK_TURN", "Estimate"),
     *("extent", "finish", "little_turn", "nothing_else"),
 ]
 
@@ -41,23 +41,9 @@ FAR_STEPS = 2
 SHOWN = 5
 """Cuts that are named at most."""
 
-NEARLY_ALL = 0.9
-"""Share of the frames in which feet are above the rest of the body where y may well point up."""
-
-HEADSTAND = (
-    "the feet are above the rest of the body in nearly all frames. If y points up in these tracks, give -y instead "
-    "(with intrinsics the image's height - y): it has to point down, as in images, or the body is upside down and "
-    "mirrored. If it does point down, joints may be in another order"
-)
-
 BY_SHOTS = (
     "as at a cut of a film. Shots of one body tell 'pkc' each other's depth; those of others, or for other methods, "
     "should be solved by themselves: kt.reconstruct_all(kt.clean.split(tracks)), or part by part with --frames"
-)
-
-LYING = (
-    "the body lies on its side in nearly all frames. If it does not, x and y are swapped in these tracks (rows and "
-    "columns of an image are y and x), so that the body is mirrored, too; or the video is stored turned: turn them"
 )
 
 HARDLY = "the viewpoint turned by only"
@@ -241,10 +227,8 @@ def _notes_on_solution(method: Method, tracks: Tracks, found: Estimate, turn: fl
         notes.append(method.unsettled(found.iterations))
     if variation > LOOSE and not method.keeps_lengths:
         notes.append(f"bone lengths vary by {variation:.1f} %: '{method.name}' does not hold them constant")
-    if upside_down(tracks.points[..., 1], tracks.seen, tracks.skeleton, NEARLY_ALL):
-        notes.append(HEADSTAND)
-    elif lies_down(tracks.points, tracks.seen, tracks.skeleton, NEARLY_ALL):
-        notes.append(LYING)
+    if stands := how_it_stands(tracks.points, tracks.seen, tracks.skeleton):
+        notes.append(stands)
     if cuts := cuts_of(tracks):
         places = ", ".join(map(str, cuts[:SHOWN])) + (f" and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else "")
         notes.append(f"the view jumps at frame {places}, {BY_SHOTS}")
