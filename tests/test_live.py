@@ -280,12 +280,21 @@ def test_never_waits_if_so_told(clip):
 
 def test_bodies_that_show_nothing(clip):
     still = observed(clip)[:1].expand(45, -1, -1)
-    nothing = torch.full((45, 17, 2), 7.0)
     line = torch.stack([torch.zeros(17), torch.arange(17.0)], -1).expand(45, -1, -1)
-    for frames in (nothing, line, still):
+    for frames in (line, still):
         found = follow(kt.Tracker("coco17", fps=30, window=24), frames)
         assert all(bool(torch.isfinite(p.points).all()) for p in found)
     assert float((found[-1].points - found[-2].points).abs().max()) < 1e-6
+
+
+def test_a_frame_whose_joints_lie_at_one_point_is_one_without_the_person(clip):
+    """About a middle that is 0 detectors' zeros are no corner."""
+    frames = observed(clip)[:60] - observed(clip).mean((0, 1))
+    blank, zero = frames.clone(), frames.clone()
+    blank[20:30], zero[20:30] = math.nan, 0.0
+    for one, other in zip(follow(kt.Tracker("coco17"), zero), follow(kt.Tracker("coco17"), blank), strict=True):
+        assert torch.equal(one.points, other.points) and torch.equal(one.seen, other.seen)
+    assert follow(kt.Tracker("coco17"), torch.full((3, 17, 2), 7.0))[-1].points.isnan().all()
 
 
 def test_a_jump_in_the_image_changes_nothing_and_a_bad_detection_little(clip, poses):

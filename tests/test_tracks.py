@@ -9,7 +9,7 @@ import yaml
 from samples import grid, with_value
 from torch.testing import assert_close
 
-from kcs_torch import OptionError, SkeletonError, Tracks
+from kcs_torch import Motion, OptionError, SkeletonError, Tracks
 from kcs_torch.data import walking_person
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.types.size import check_size, size_factor
@@ -98,6 +98,24 @@ def test_joints_at_the_corner_are_unseen(place):
     confident = Tracks.from_arrays(zeros, torch.ones(6, 17), skeleton="coco17")
     for kept in (Tracks.from_arrays(centred, skeleton="coco17"), confident):
         assert kept.seen.all() and not any("exactly at" in note for note in kept.notes)
+
+
+@pytest.mark.parametrize(("make", "dims"), [(Tracks.from_arrays, 2), (Motion.from_arrays, 3)])
+def test_frames_whose_joints_all_lie_at_one_point_are_unseen(make, dims):
+    """Wherever that point is, and whatever confidences say; where no frame shows more there is nothing to choose."""
+    points = torch.randn(6, 17, dims, generator=torch.Generator().manual_seed(2))
+    points[1], points[4] = 0.0, torch.randn(dims)
+    points[4, 3] = math.nan
+    for sure in (None, torch.ones(6, 17)):
+        told = make(points, sure, skeleton="h36m17")
+        assert told.seen.any(1).tolist() == [True, False, True, True, False, True]
+        assert told.seen[[0, 2, 3, 5]].all() and (told.points[[1, 4]] == 0).all()
+        assert "2 frames whose joints all lie at one point are taken as unseen" in told.notes
+    alike = points[:1, :1].expand(6, 17, dims)
+    few = points.clone()
+    few[2:4, 2:], few[2:4, 1] = math.nan, few[2:4, 0]  # a bone that points at the camera
+    assert make(alike, skeleton="h36m17").seen.all()
+    assert make(few, skeleton="h36m17").seen[2:4, :2].all()
 
 
 def test_confidence_zero_and_nan_are_the_same_as_nan_points():

@@ -13,7 +13,7 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.ranks import median
 from kcs_torch.methods.clips.unseen import place_unseen
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types.intake import as_floats, as_weights, at_the_corner, check_places
+from kcs_torch.types.intake import as_floats, as_weights, at_one_point, at_the_corner, check_places
 
 __all__ = ["Sight", "take_frame"]
 
@@ -34,7 +34,8 @@ def take_frame(
         body: the skeleton.
         number: of the frame, for messages.
         xy: (num_observed, 2); NaN where unseen. Without confidences, joints exactly at (0, 0) or (-1, -1) are unseen,
-            too, if others lie to the right of (0, 0) and below it (one in ten may not), or if there are none.
+            too, if others lie to the right of (0, 0) and below it (one in ten may not), or if there are none. Three
+            or more joints that all lie at one point are unseen.
         confidence: (num_observed,) in 0..1; 1 where None.
         threshold: a joint with less confidence counts as unseen.
 
@@ -61,6 +62,7 @@ def take_frame(
     else:
         told = as_floats(confidence, f"{where}: confidence", 1).detach().to("cpu", torch.float64)
         weights = as_weights(told, seen, threshold, f"{where}: confidence", body.joints)
+    weights = weights.masked_fill(at_one_point(points, weights > 0), 0.0)
     points = torch.where(weights[:, None] > 0, points, 0.0)
     return *body.complete(points, weights), given
 

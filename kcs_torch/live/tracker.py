@@ -183,8 +183,8 @@ class Tracker:
         Args:
             xy: (num_observed, 2) array or tensor; NaN where unseen. Without confidences, joints exactly at (0, 0)
                 or (-1, -1) are unseen, too, if nine of ten others lie right of (0, 0) and below it. A frame of NaN, or
-                of zeros, is one without the person; after a whole window of them the tracker starts anew. A joint
-                that jumps too far for a body, from one frame to the next, counts as unseen there.
+                whose joints all lie at one point, is one without the person; after a whole window of them the tracker
+                starts anew. A joint that jumps too far for a body, from one frame to the next, counts as unseen there.
             confidence: (num_observed,) in 0..1; 1 where None.
 
         Raises:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError
+from kcs_torch.errors import OptionError, ShapeError, counted
 from kcs_torch.skeleton import Skeleton, get_skeleton, guess_skeleton
 from kcs_torch.types.bodies import choose_skeleton, joint_order
 
@@ -23,6 +23,7 @@ __all__ = [
     "as_floats",
     "as_number",
     "as_weights",
+    "at_one_point",
     "at_the_corner",
     "check_places",
     "take_in",
@@ -95,6 +96,16 @@ def at_the_corner(points: Tensor, seen: Tensor, notes: list[str], *, alone: bool
             are = f"joint that lies exactly at {place} is" if count == 1 else f"joints that lie exactly at {place} are"
             notes.append(f"{count} {are} taken as unseen: NaN, or a confidence of 0, says so more clearly")
     return corner
+
+
+def at_one_point(points: Tensor, seen: Tensor) -> Tensor:
+    """Which frames (...) of points (..., N, D) show three joints or more, and all of them at exactly the same place.
+
+    No body looks so: unseen frames are written so about a middle that is 0, or filled.
+    """
+    far = torch.full_like(points, math.inf)
+    low, high = torch.where(seen[..., None], points, far).amin(-2), torch.where(seen[..., None], points, -far).amax(-2)
+    return (low == high).all(-1) & (seen.sum(-1) > 2)
 
 
 class Intake(NamedTuple):
@@ -200,6 +211,7 @@ def take_in(
         weights = seen.to(xy.dtype)
     else:
         weights = as_weights(confidence.to(xy), seen, threshold, f"{source}: confidence", body.joints)
+    weights = _without_points(xy, weights, remarks)
     seen = weights > 0
     if not seen.any():
         raise ShapeError(
@@ -208,6 +220,18 @@ def take_in(
     _check_near(xy, seen, body, source)
     xy = torch.where(seen[..., None], xy, torch.zeros_like(xy))
     return Intake(xy, weights, body, rate, remarks)
+
+
+def _without_points(points: Tensor, weights: Tensor, notes: list[str]) -> Tensor:
+    """Weights (T, N) that are 0 in frames whose joints all lie at one point, where other frames show a body."""
+    seen = weights > 0
+    blank = at_one_point(points, seen)
+    if not bool(blank.any()) or not bool((~blank & (seen.sum(1) > 2)).any()):
+        return weights
+    count = int(blank.sum())
+    are = "is" if count == 1 else "are"
+    notes.append(f"{counted(count, 'frame')} whose joints all lie at one point {are} taken as unseen")
+    return weights.masked_fill(blank[:, None], 0.0)
 
 
 def _shaped(points: Any, confidence: Any, dims: int, source: str) -> tuple[Tensor, Tensor | None]:

@@ -61,7 +61,8 @@ class Tracks(Trajectories):
         """Check arrays of one body's tracks and wrap them.
 
         Args:
-            points: (T, N, 2) array or tensor; NaN where unseen.
+            points: (T, N, 2) array or tensor; NaN where unseen. Frames whose joints, three or more, lie at one point
+                are unseen, too, where others show a body.
             confidence: (T, N), non-negative; 1 where None. Used as a soft weight.
             skeleton: a :class:`Skeleton`, a built-in name or a YAML/JSON file. If None it is built from
                 ``edges`` and ``joint_names``; names that are exactly a built-in skeleton's select it where
