@@ -145,6 +145,9 @@ def test_the_mirror_image_has_the_same_image():
     assert other.diagnostics.variation[:2] == pytest.approx(measured[:2])
     bones = kt.functional.bone_lengths(other.points, other.skeleton.bone_index())
     torch.testing.assert_close(other.lengths, bones.median(0).values)
+    said = "in the mirror image before this camera bones do not keep their length (they vary by"
+    assert said in " ".join(other.diagnostics.notes)
+    assert not any(said in " ".join(one.diagnostics.notes) for one in (result, other.mirrored()))
 
 
 def test_any_skeleton():

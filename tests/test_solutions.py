@@ -137,6 +137,30 @@ def test_lift_lists_the_solutions_and_writes_any(tmp_path):
     assert not (tmp_path / "ninth.npz").exists()
 
 
+@pytest.mark.filterwarnings("ignore::kcs_torch.errors.KcsWarning")
+@pytest.mark.parametrize("lens", ["parallel", (1500.0, 1500.0, 960.0, 540.0)])
+@pytest.mark.parametrize("template", [True, False])
+def test_what_is_said_of_the_tracks_is_said_of_every_solution(lens, template):
+    if lens == "parallel":
+        noise = torch.Generator().manual_seed(0)
+        clip = kt.data.walking_person(40, turn=0.0 if template else 90.0, noise=5.0, generator=noise)
+        tracks = clip.tracks
+    else:
+        clip = kt.data.walking_person(40, turn=0.0 if template else 90.0)
+        ahead = clip.points + torch.tensor([0.0, 0.0, 4000.0]).double()
+        noise = 2 * torch.randn(40, 17, 2, generator=torch.Generator().manual_seed(0)).double()
+        tracks = replace(clip.tracks, points=kt.types.Intrinsics.of(lens).project(ahead) + noise, units="px")
+    if not template:
+        tracks = replace(tracks, skeleton=replace(tracks.skeleton, template=None, hinges=(), spread=None))
+    result = kt.reconstruct(tracks, intrinsics=lens)
+    assert result.alternatives
+    for one in (result, *result.alternatives):
+        notes = one.diagnostics.notes
+        assert sum(note.startswith("tracks smoothed: noise of") for note in notes) == 1
+        assert ("pkc did not settle" in " ".join(notes)) != one.diagnostics.converged
+    assert not any("see the alternatives" in note for other in result.alternatives for note in other.diagnostics.notes)
+
+
 def test_points_are_no_solutions():
     points = torch.zeros(5, 17, 3)
     with pytest.raises(OptionError, match="difference: best: expected a Reconstruction, got Tensor: mpjpe compares"):

@@ -120,7 +120,12 @@ def lift(
         ),
     ] = None,
     mirror: Annotated[
-        bool, typer.Option("--mirror", help="Write the mirror image in depth, which fits the tracks equally well.")
+        bool,
+        typer.Option(
+            "--mirror",
+            help="Write the mirror image in depth, which fits the tracks equally well; before a near camera, or with "
+            "--intrinsics, its bones vary: there --solution writes another one.",
+        ),
     ] = False,
     solution: Annotated[
         int,

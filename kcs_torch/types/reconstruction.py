@@ -24,6 +24,9 @@ from kcs_torch.types.variation import BoneVariation, bone_variation
 
 __all__ = ["Diagnostics", "Reconstruction"]
 
+LOOSE_MIRROR = "in the mirror image before this camera bones do not keep their length"
+"""How the note begins that says so."""
+
 
 @dataclass(frozen=True)
 class Diagnostics:
@@ -83,7 +86,8 @@ class Reconstruction:
         tracks: what it was made from.
         method: the method's name.
         diagnostics: see :class:`Diagnostics`.
-        uncertainty: (T, N) standard deviation of depth, or None where the method has none.
+        uncertainty: (T, N) standard deviation of depth alone, or None where the method has none. x and y of joints that
+            are unseen may be off by more.
         units: of the 3D.
         objective: by which the method ranks solutions of this clip, lower is better; NaN where it has none.
         root_depth: (T,) depth of the body relative to the first frame, or None where nothing tells it.
@@ -148,7 +152,8 @@ class Reconstruction:
         """The other solution that parallel rays admit: depth with the opposite sign.
 
         Before a camera of known intrinsics each joint moves along its ray: the mirror image has the same image, but its
-        bones do not keep their length. The alternatives are turned over as well, and no objective is known.
+        bones do not keep their length, which a note tells. The alternatives are turned over as well, and no objective
+        is known.
         """
         flip = torch.tensor([1.0, 1.0, -1.0]).to(self.points)
         others = tuple(other.mirrored() for other in self.alternatives)
@@ -158,9 +163,20 @@ class Reconstruction:
             near = torch.maximum(far - depth, 0.01 * far)
             points = self.points * (near / (far + depth))[..., None]
             points = torch.cat([points[..., :2], (near - far)[..., None]], -1)
-            return replace(turned, points=points).remeasured()
+            return replace(turned, points=points).remeasured()._told_of_bones(self.diagnostics.bone_variation)
         root = None if self.root_depth is None else -self.root_depth
         return replace(turned, points=self.points * flip, root_depth=root)
+
+    def _told_of_bones(self, before: float) -> Reconstruction:
+        """A mirror image before a camera, with the note on its bones if they vary by more than before, else without."""
+        facts = self.diagnostics
+        notes = [note for note in facts.notes if not note.startswith(LOOSE_MIRROR)]
+        if facts.bone_variation > before:
+            notes.append(
+                f"{LOOSE_MIRROR} (they vary by {facts.bone_variation:.1f} %): choose among the alternatives "
+                "(kcs-torch: --solution), or mirror what parallel rays show (intrinsics='parallel')"
+            )
+        return replace(self, diagnostics=replace(facts, notes=tuple(notes)))
 
     def remeasured(self) -> Reconstruction:
         """The same with the lengths that the bones of its points have, and with how much these vary."""

@@ -23,7 +23,7 @@ from kcs_torch.methods.perspective.refining import Found, refine, refine_again, 
 from kcs_torch.methods.perspective.scene import BLOCK, GAIN, Bodies, ahead
 from kcs_torch.methods.perspective.view import View, lens_note, zoomed
 from kcs_torch.methods.pkc.answers import CLOSE
-from kcs_torch.methods.pkc.fixed_answer import UNSIDED
+from kcs_torch.methods.pkc.fixed_answer import SEE_OTHERS, UNSIDED
 from kcs_torch.methods.pkc.near import SEEMS_NEAR
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.nn.posture import has_trunk
@@ -252,7 +252,7 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
     points = torch.cat([points[..., :2], points[..., 2:] - root[:, None, None]], -1)
     cameras = (found.view.look.mT @ complete_rotation(lifted.cameras))[:, :2]
     turn = float(viewpoint_turn(cameras))
-    notes = [] if k else _notes_on_best(method, tracks, found, points, images, turn)
+    notes = _notes_on_solution(method, tracks, found, k, points, images, turn)
     notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
     if scene.any_focal:
         notes.append(lens_note(intrinsics, tracks.units))
@@ -293,16 +293,18 @@ def _one_side(bodies: Bodies) -> bool:
     return not bool((turned & (bodies.energy < bodies.energy[0] + CLOSE)).any())
 
 
-def _notes_on_best(
-    method: Method, tracks: Tracks, found: Found, points: Tensor, images: Tensor, turn: float
+def _notes_on_solution(
+    method: Method, tracks: Tracks, found: Found, k: int, points: Tensor, images: Tensor, turn: float
 ) -> list[str]:
-    """What is said of the best solution alone; "the mirror image", say, is true of none of the others any more."""
+    """What is said of solution number ``k``: what the method said of the tracks, and what is true of this one."""
     # True of what was lifted, perhaps not of this.
-    stale = (WHY_LOOSE, HARDLY, SEEMS_NEAR, "weak perspective", "did not settle")
+    stale = [WHY_LOOSE, HARDLY, SEEMS_NEAR, "weak perspective", "did not settle"]
+    if k:
+        stale += [SEE_OTHERS, found.lifted[0].diagnostics.doubt or SEE_OTHERS]
     notes = [
         note for note in found.notes if not note.startswith((ABSENT, FOUND)) and not any(part in note for part in stale)
     ]
-    settled = found.settled(0)
+    settled = found.settled(k)
     if not settled:
         notes.append(method.unsettled(found.steps))
     if little := little_turn(method, tracks.skeleton, turn):

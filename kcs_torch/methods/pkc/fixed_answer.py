@@ -21,7 +21,10 @@ from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, distinct
 from kcs_torch.methods.pkc.moving_answer import STILL
 
-__all__ = ["UNSIDED", "from_hypotheses"]
+__all__ = ["SEE_OTHERS", "UNSIDED", "from_hypotheses"]
+
+SEE_OTHERS = "see the alternatives"
+"""How notes end that are true of the best solution alone."""
 
 UNSIDED = (
     "depth may be mirrored: the known cameras turn too little, beside how the body itself turns, to tell which of two "
@@ -62,10 +65,10 @@ def from_hypotheses(
     if other is not None:
         found = found.joined(other)
     found = distinct(found, max(alternatives, OTHERS) + 1, APART)
-    doubtful = told_by_prior(found, body.skeleton)
+    doubtful, decided = told_by_prior(found, body.skeleton), notes
     if doubtful:
         note = f"forward or backward is uncertain for {', '.join(doubtful)}, decided by usual postures"
-        notes = (*notes, f"{note}: see the alternatives")
+        decided = (*notes, f"{note}: {SEE_OTHERS}")
     made = []
     wanted = found[: alternatives + 1]
     for k, (depth, points) in enumerate(zip(wanted.depth, body.bodies(wanted), strict=True)):
@@ -79,7 +82,7 @@ def from_hypotheses(
         )  # fmt: skip
         doubt = "" if k else hardly_told(depth, spread, body.skeleton, turn) or ("" if other is None else UNSIDED)
         settled = told and found.moved is not None and bool(found.moved[k] <= STILL)
-        path, said, value = turned if cameras is None else cameras, () if k else notes, float(found.energy[k])
+        path, said, value = turned if cameras is None else cameras, notes if k else decided, float(found.energy[k])
         facts = (settled, found.steps, said, spread / body.factor, value)
         made.append(Estimate(points, path, one, *facts, doubt=doubt, still=telling is None))
     return replace(made[0], alternatives=tuple(made[1:]))

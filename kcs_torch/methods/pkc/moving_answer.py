@@ -104,9 +104,10 @@ def from_moving(
     if not told and alternatives > 0:
         flip = best.points.new_tensor([1.0, 1.0, -1.0])
         seen = best.cameras if cameras is not None else best.cameras * flip
-        said = ("the mirror image in depth",)
+        said = ("the mirror image in depth", *notes)
         others.append(replace(best, points=best.points * flip, cameras=seen, notes=said, doubt=""))
-    others += [replace(other, notes=("another body that fits the tracks nearly as well",)) for other in rivals]
+    said = ("another body that fits the tracks nearly as well", *notes)
+    others += [replace(other, notes=said) for other in rivals]
     return replace(best, alternatives=tuple(others[:alternatives]))
 
 

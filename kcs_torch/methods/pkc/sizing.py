@@ -58,10 +58,10 @@ def resized(
 
 def with_size(found: Estimate, size: Size) -> Estimate:
     """An estimate of tracks that were divided by the size over time."""
-    others = tuple(_scaled(other, size.path) for other in found.alternatives)
     note = f"weak perspective: the body's size in the image varies by a factor of {size.range:.2f}"
-    return replace(_scaled(found, size.path), alternatives=others, notes=(*found.notes, note))
+    others = tuple(_scaled(other, size.path, note) for other in found.alternatives)
+    return replace(_scaled(found, size.path, note), alternatives=others)
 
 
-def _scaled(found: Estimate, size: Tensor) -> Estimate:
-    return replace(found, scales=found.scales * size)
+def _scaled(found: Estimate, size: Tensor, note: str) -> Estimate:
+    return replace(found, scales=found.scales * size, notes=(*found.notes, note))
