@@ -142,6 +142,8 @@ def test_a_method_of_ones_own_has_its_own_name(root, folder):
     alone = benchmark(root, folder, "suite=turn", target)
     assert alone.returncode == 2 and f"{target}: cannot be imported: No module named 'mine'" in alone.stderr
     assert "PYTHONPATH" in alone.stderr and "Traceback" not in alone.stderr
+    other = benchmark(root, folder, "suite=turn", "method._target_=mine.Mien", path=folder)
+    assert other.returncode == 2 and "mine.Mien: module 'mine' has no 'Mien': did you mean Mine?" in other.stderr
     done = benchmark(root, folder, "suite=turn", target, "hydra.run.dir=out", path=folder)
     assert done.returncode == 0, done.stderr
     assert {row["method"] for row in rows(folder / "out" / "results.csv")} == {"mine"}

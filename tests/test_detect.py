@@ -561,7 +561,7 @@ COMMAND_MISTAKES = {
         "a number from 0, or all",
     ),
     "frames": (["detect", "VIDEO", "-o", "OUT.npz", "--frames", "9"], "OptionError", "such as 100:400"),
-    "no video": (["detect", "absent.mp4", "-o", "OUT.npz"], "FormatError", "expected a video file, got none"),
+    "no video": (["detect", "absent.mp4", "-o", "OUT.npz"], "FormatError", "there is no such file"),
     "lift": (["lift", "VIDEO", "-o", "OUT.npz", "--detector", "yolo"], "OptionError", "choices are"),
     "lift's person": (["lift", "VIDEO", "-o", "OUT.npz", "--person", "2"], "FormatError", "as there are 2 people"),
 }

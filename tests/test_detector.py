@@ -104,6 +104,9 @@ def test_noise_that_cannot_be_measured():
     points, weights = parts(spoilt(8 * normal()))
     for frames in (0, 1, 11):
         assert measure_noise(points[:frames], weights[:frames]) is None
+    for wrong in ((torch.tensor(1.0), weights), (points, weights[0]), (points[None], weights[None]), (None, None)):
+        with pytest.raises(kt.ShapeError, match="measure_noise: .*expected"):
+            measure_noise(*wrong)
     for frames in (12, 20, 30):
         short = measure_noise(points[:frames], weights[:frames])
         assert short is not None and short.white > 0.005 and short.restless == 0

@@ -75,6 +75,11 @@ def files(tmp_path):
     return tmp_path
 
 
+def test_a_rate_that_the_file_does_not_tell_is_asked_for(files):
+    motion = load_motion(files / "s_01.amc")
+    assert motion.fps is None and any("give fps=... (kcs-torch: --fps)" in note for note in motion.notes)
+
+
 def test_by_hand(files):
     motion = load_motion(files / "s_01.amc", fps=120)
     assert motion.skeleton.joints == ("root", "thigh", "shank", "fixed")

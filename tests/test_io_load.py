@@ -67,7 +67,8 @@ def test_a_new_format_is_one_new_file(tmp_path, monkeypatch):
     ("name", "content", "message"),
     [
         ("a.json", b"{", "got text that is not JSON"),
-        ("a.json", b"{}", "got JSON with other content"),
+        ("a.json", b'{"a": 1}', "got JSON with other content"),
+        *[("a.json", nothing, "got JSON with nothing in it") for nothing in (b"{}", b"[]", b" \n")],
         ("a.json", b"[" * 100_000, "nested too deeply"),
         ("a.csv", b"x,y\n1,2\n", "a table that begins with 'x,y'"),
         ("a.h5", b"\x89HDF\r\n\x1a\n" + bytes(50), r"an HDF5 file that cannot be read \(damaged"),

@@ -7,9 +7,12 @@ import torch
 from pkc_walks import FLIP, NAN, QUICK, centred, error, of
 from torch.testing import assert_close
 
+import kcs_torch as kt
 from kcs_torch import PKC, KcsWarning, Skeleton
+from kcs_torch.cli.report import describe, summary
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.functional import bone_lengths
+from kcs_torch.metrics import difference
 
 # Many tests take few steps, after which nothing has settled.
 pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")
@@ -122,3 +125,19 @@ def test_bodies_of_two_or_three_joints_keep_their_lengths(joints, frames):
     lengths = bone_lengths(found.points, body.bone_index())
     assert_close(lengths, lengths.mean(0).expand_as(lengths), rtol=1e-6, atol=0)
     assert_close(found.points[..., :2], tracks.points, rtol=0, atol=1e-6 * float(tracks.points.abs().max()))
+
+
+@pytest.mark.parametrize("lens", ["parallel", (1500.0, 1500.0, 960.0, 540.0)])
+def test_of_a_single_image_nothing_is_told_of_time(lens):
+    points = random_motion("coco17", 1, generator=torch.Generator().manual_seed(0)).tracks.points[:, :17] / 5 + 500
+    found = kt.reconstruct(
+        points, confidence=0.7 * torch.ones(1, 17), skeleton="coco17", intrinsics=lens, detections=True
+    )
+    told = " | ".join(found.diagnostics.notes)
+    assert "a single image shows one viewpoint" in told and "taken for a detector's joints" in told
+    for wrong in ("turned by", "frames", "root depth", "varies by a factor"):
+        assert wrong not in told
+    words = " | ".join(describe(summary(found)).splitlines())
+    assert "1 frame, 17 joints" in words and "100 %" not in words
+    assert "viewpoint turn" not in words and "bone variation" not in words
+    assert all("%" not in str(difference(found, other)) for other in found.alternatives)

@@ -72,6 +72,10 @@ class TestCommandLine:
                 "model._target_=mine.Net",
                 "network._target_=mine.Net: cannot be imported: No module .*'mine'.* PYTHONPATH",
             ),
+            (
+                "model._target_=kcs_torch.nn.MLPLiftr",
+                "_target_=kcs_torch.nn.MLPLiftr: module 'kcs_torch.nn' has no 'MLPLiftr': did you mean MLPLifter",
+            ),
             ("skeleton=dragon loss=bones", "unknown skeleton 'dragon'"),
         ],
     )
@@ -96,13 +100,20 @@ class TestCommandLine:
             assert files() == before
 
     @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-    @pytest.mark.parametrize("sweep", [(), ("-m",)])
-    def test_a_signal_is_told_as_shells_tell_it(self, tmp_path, capsys, monkeypatch, number, code, sweep):
+    @pytest.mark.parametrize(
+        ("sweep", "at", "told"),
+        [
+            ((), 5, ": resume={}"),
+            (("-m",), 5, ": resume={}/0"),
+            ((), 1, " before the first checkpoint: a new run begins anew"),
+        ],
+    )
+    def test_a_signal_is_told_as_shells_tell_it(self, tmp_path, capsys, monkeypatch, number, code, sweep, at, told):
         step = LiftingModule.training_step
 
         def stopped(self, batch, batch_idx):
             step(self, batch, batch_idx)
-            if int(self.step) == 5:
+            if int(self.step) == at:
                 os.kill(os.getpid(), number)
 
         monkeypatch.setattr(LiftingModule, "training_step", stopped)
@@ -112,7 +123,7 @@ class TestCommandLine:
             got, _, err = called(capsys, *sweep, *SMALL, *folders, "trainer.max_epochs=5", "seed=3")
         finally:
             signal.signal(signal.SIGINT, before)
-        assert got == code and f"stopped: resume={tmp_path / '0' if sweep else tmp_path} goes on" in err
+        assert got == code and f"stopped{told.format(tmp_path)}" in err
 
     def test_settings_of_ones_own_may_be_added(self, capsys):
         code, out, err = called(capsys, "--cfg=job", "--resolve", SMALL[0], "+wide=9", "+model.channels=${wide}")

@@ -136,6 +136,8 @@ def describe(facts: dict[str, Any], leave_out: Container[str] = ()) -> str:
         "bone variation": varied,
         "reprojection": f"{facts['reprojection_rms']:.3g} {facts['track_units']} (root mean square)",
     }
+    if facts["frames"] == 1:  # of which neither is told
+        rows = {name: text for name, text in rows.items() if name not in ("viewpoint turn", "bone variation")}
     frames = counted(facts["frames"], "frame")
     head = f"{facts['source']}: {frames}, {facts['joints']} joints ({facts['skeleton']}){rate}"
     lines = [head, *(f"  {name:<15} {text}" for name, text in rows.items())]

@@ -63,7 +63,8 @@ def open_video(path: str | Path, detector: str) -> Iterator[Video]:
     except (OSError, ValueError):
         there = False
     if not there:
-        raise FormatError(f"{path}: expected a video file, got {'a folder' if path.is_dir() else 'none'}")
+        wrong = "expected a video file, got a folder" if path.is_dir() else "there is no such file"
+        raise FormatError(f"{path}: {wrong}")
     if not is_video(path):
         raise FormatError(f"{path}: expected a video (such as .mp4, .mov, .avi, .mkv or .webm), got something else")
     cv2 = need_detector("cv2", detector)

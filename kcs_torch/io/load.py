@@ -224,12 +224,13 @@ def describe(probe: Probe) -> str:
         return f"{kind} ({len(probe.files)} files: {listed(suffixes, 5)})"
     if probe.suffix == ".json":
         try:
-            json.loads(probe.path.read_bytes())
+            text = probe.path.read_bytes()
+            held = json.loads(text) if text.strip() else None
         except RecursionError:
             return "JSON that is nested too deeply"
         except (OSError, ValueError) as error:
             return f"text that is not JSON ({error})"
-        return "JSON with other content"
+        return "JSON with other content" if held else "JSON with nothing in it"
     if looks_like_video(probe.head):
         return "a video: find the joints in it first, with `kcs-torch detect VIDEO -o tracks.npz`"
     if probe.head.startswith(b"\x89HDF"):

@@ -50,9 +50,12 @@ class Difference:
             return f"nearly the mirror image in depth, {f'{self.beside_mirror:.3g} {self.units}'.rstrip()} from it"
         if not self.flipped:
             return "depths differ, no bone tips the other way"
-        some = [f"{bone} in {100 * share:.0f} %" for bone, share in list(self.flipped.items())[:4]]
+        some = dict(list(self.flipped.items())[:4])
         more = f", and {counted(len(self.flipped) - 4, 'more bone')}" if len(self.flipped) > 4 else ""
-        return f"other sign of depth: {', '.join(some)} of the frames{more}"
+        if min(some.values()) == 1:  # all the time, as in a single image
+            return f"other sign of depth: {', '.join(some)}{more}"
+        named = ", ".join(f"{bone} in {100 * share:.0f} %" for bone, share in some.items())
+        return f"other sign of depth: {named} of the frames{more}"
 
 
 def difference(best: Reconstruction, other: Reconstruction) -> Difference:

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcs_torch.errors import ShapeError
+from kcs_torch.functional.shapes import check_core
 from kcs_torch.functional.temporal import interpolate, window_starts
 from kcs_torch.solvers.spectrum import TINY, temporal_modes, unshared, white_power
 from kcs_torch.solvers.stray import body_size, each_joint, stray_from_neighbours
@@ -50,11 +52,19 @@ def measure_noise(tracks: Tensor, weights: Tensor, *, window: int = 64) -> Noise
         weights: (T, N), 0 where unseen.
         window: frames taken together, two seconds say.
 
+    Raises:
+        ShapeError: they are not of these shapes.
+
     Returns:
         The noise of the joints that are seen in nearly all frames with any, outliers apart, its slower part 0 in clips
         of fewer than about 45 frames; or None where these joints are fewer than four, frames fewer than twelve, or more
         than half of them empty.
     """
+    check_core(tracks, "measure_noise: tracks", "T", "N", 2)
+    check_core(weights, "measure_noise: weights", *tracks.shape[-3:-1])
+    if tracks.ndim > 3 or weights.ndim > 2:
+        got = f"{tuple(tracks.shape)} and {tuple(weights.shape)}"
+        raise ShapeError(f"measure_noise: expected tracks (T, N, 2) and weights (T, N) of one clip, got {got}")
     if len(tracks) < SHORT:
         return None
     values = tracks.detach().double()[None]

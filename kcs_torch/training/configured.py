@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import importlib
 import inspect
 import math
 import os
@@ -235,7 +237,7 @@ def method_of(config: DictConfig) -> Method:
     try:
         kind = get_object(target)
     except Exception as error:  # whatever a module of the user's comes to
-        raise OptionError(_not_imported(f"method._target_={target}", error)) from None
+        raise OptionError(_not_imported("method.", target, error)) from None
     if isinstance(kind, type) and issubclass(kind, Method):
         return kind.from_options(**options)
     found = instantiate(config, _convert_="all")
@@ -266,10 +268,31 @@ def _fields(target: str) -> list[str] | None:
     )
 
 
-def _not_imported(what: str, error: BaseException) -> str:
-    """Why a target is not found, from what Hydra raises of it."""
-    cause = error.__cause__ or error
-    return f"{what}: cannot be imported: {cause}: a module of your own needs its folder in PYTHONPATH"
+def _not_imported(where: str, target: str, error: BaseException) -> str:
+    """Why a target is not found, from what Hydra raises of it; ``where`` is its place in the configuration."""
+    lacks = _lacking(target)
+    cause = f"cannot be imported: {error.__cause__ or error}: a module of your own needs its folder in PYTHONPATH"
+    return f"{where}_target_={target}: {lacks or cause}"
+
+
+def _lacking(target: str) -> str:
+    """What the innermost module of a dotted name lacks; empty where no module is found, or has an error of its own."""
+    parts = target.split(".")
+    for count in range(len(parts) - 1, 0, -1):
+        name, part = ".".join(parts[:count]), parts[count]
+        try:
+            module = importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if name.startswith(error.name or ":"):  # it is this one that is not there
+                continue
+            return ""
+        except Exception:  # whatever a module of the user's comes to
+            return ""
+        if hasattr(module, part):
+            return ""
+        close = difflib.get_close_matches(part, dir(module), 2)
+        return f"module '{name}' has no '{part}'" + (f": did you mean {' or '.join(close)}?" if close else "")
+    return ""
 
 
 def _told(error: Exception, also: tuple[type[Exception], ...]) -> str | None:
@@ -284,5 +307,5 @@ def _told(error: Exception, also: tuple[type[Exception], ...]) -> str | None:
         if cause is not None:
             located = re.search(r"Error locating target '(\S+)'", str(error))
             where = "" if place is None else f"{place.group(1)}."
-            return None if located is None else _not_imported(f"{where}_target_={located.group(1)}", cause)
+            return None if located is None else _not_imported(where, located.group(1), cause)
     return str(error) if isinstance(error, told) else None

@@ -117,8 +117,10 @@ def train(config: DictConfig, folder: Path) -> Outcome:
                 raise
             raise OptionError(f"resume={resumed}: does not fit this configuration: {error}") from None
         except SystemExit as end:
-            if trainer.interrupted and (last.best_model_path or goes_on):
-                print(f"stopped: resume={folder} goes on", file=sys.stderr)
+            if trainer.interrupted:
+                kept = last.best_model_path or goes_on
+                how = f": resume={folder} goes on" if kept else " before the first checkpoint: a new run begins anew"
+                print(f"stopped{how}", file=sys.stderr)
             raise SystemExit(_exit_code(end)) from None
         if trainer.fast_dev_run and config.optimise in trainer.callback_metrics:  # which keeps no checkpoints to test
             return Outcome(float(trainer.callback_metrics[config.optimise]), {}, None, diverged)

@@ -72,7 +72,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
     rest = MotionOptions(None if named else options.skeleton, options.fps, options.up, options.units)
     notes = [f"skeleton of {asf.name}"]
     if options.fps is None:
-        notes.append("the file does not tell the frame rate (CMU's are mostly 120): give fps=...")
+        notes.append("the file does not tell the frame rate (CMU's are mostly 120): give fps=... (kcs-torch: --fps)")
     return build_motion(
         points * (_INCH / body.unit if body.unit != 1 else 1),
         rest,

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from kcs_torch.methods.base import Method
 
 __all__ = [
-    *("BY_SHOTS", "HARDLY", "WEAK_TURN", "Estimate"),
+    *("BY_SHOTS", "HARDLY", "SINGLE", "WEAK_TURN", "Estimate"),
     *("extent", "finish", "little_turn", "nothing_else"),
 ]
 
@@ -46,8 +46,8 @@ BY_SHOTS = (
     "should be solved by themselves: kt.reconstruct_all(kt.clean.split(tracks)), or part by part with --frames"
 )
 
-HARDLY = "the viewpoint turned by only"
-"""How a note begins that says how little the viewpoint turned."""
+HARDLY, SINGLE = "the viewpoint turned by only", "a single image shows one viewpoint"
+"""How a note begins that says how little the viewpoint turned, and of one frame."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def finish(
     placed = [_placed(tracks, one, size, known) for one in every]
     still, roots, remark = [i for i, one in enumerate(every) if one.still], None, ""
     pointlike = not bool(extent(tracks) > 0)
-    if still and not pointlike:
+    if still and not pointlike and tracks.num_frames > 1:
         roots, remark = root_depth(torch.stack([placed[i][0] for i in still]), tracks, found.standing)
     paths = {} if roots is None else dict(zip(still, roots, strict=True))
     results = [
@@ -118,22 +118,27 @@ def finish(
     return replace(results[0], alternatives=tuple(results[1:]))
 
 
-def little_turn(method: Method, body: Skeleton, turn: float) -> str:
+def little_turn(method: Method, tracks: Tracks, turn: float) -> str:
     """What depth rests on where the viewpoint hardly turns, by so many degrees, for the user; else empty."""
     if turn >= WEAK_TURN or method.learned:
         return ""
-    return f"{HARDLY} {counted(round(turn), 'degree')}: depth rests on {_rest(method, body)}"
+    return f"{_how_little(tracks, turn)}: depth rests on {_rest(method, tracks.skeleton)}"
 
 
-def nothing_else(method: Method, body: Skeleton, turn: float) -> str:
+def _how_little(tracks: Tracks, turn: float) -> str:
+    return SINGLE if tracks.num_frames == 1 else f"{HARDLY} {counted(round(turn), 'degree')}"
+
+
+def nothing_else(method: Method, tracks: Tracks, turn: float) -> str:
     """Why depth is little more than a guess where the viewpoint hardly turns, by so many degrees; else empty."""
+    body = tracks.skeleton
     if turn >= WEAK_TURN or method.learned or method.knows_template(body):
         return ""
     told = body.template is not None and method.name not in ("pkc", "kcs")
     others = ", while 'pkc' and 'kcs' use the skeleton's template" if told else ""
     return (
-        f"depth is little more than a guess: {HARDLY} {counted(round(turn), 'degree')}, and '{method.name}' has "
-        f"nothing else that tells depth{others}"
+        f"depth is little more than a guess: {_how_little(tracks, turn)}, and '{method.name}' has nothing else that "
+        f"tells depth{others}"
     )
 
 
@@ -198,7 +203,7 @@ def _reconstruction(
         iterations=found.iterations,
         seconds=seconds,
         notes=tuple(notes),
-        doubt=found.doubt or nothing_else(method, body, turn),
+        doubt=found.doubt or nothing_else(method, tracks, turn),
         largest_bone_variation=variation.largest,
         loosest_bone=variation.bone,
     )
@@ -219,7 +224,7 @@ def _reconstruction(
 def _notes_on_solution(method: Method, tracks: Tracks, found: Estimate, turn: float, variation: float) -> list[str]:
     """What is said of a solution: the viewpoint turns by so many degrees, and bones vary by so many per cent."""
     notes = list(found.notes)
-    if little := little_turn(method, tracks.skeleton, turn):
+    if little := little_turn(method, tracks, turn):
         notes.append(little)
     if found.doubt:
         notes.append(found.doubt)
@@ -241,7 +246,7 @@ def _notes_on_tracks(method: Method, tracks: Tracks, pointlike: bool) -> list[st
     if not body.rigid:
         kind = "no bones" if not body.num_bones else "no rigid bones"
         notes.append(f"the skeleton has {kind}: no lengths hold the joints together, and their variation is unknown")
-    if tracks.fps is None and method.reckons_in_seconds:
+    if tracks.fps is None and tracks.num_frames > 1 and method.reckons_in_seconds:
         notes.append("30 frames a second assumed, as the rate is not known: give fps=... (kcs-torch: --fps)")
     if pointlike:
         notes.append("all joints lie at one point in every frame: there is no pose to find")

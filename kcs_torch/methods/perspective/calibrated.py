@@ -14,7 +14,7 @@ from kcs_torch.clean.detector import detected
 from kcs_torch.errors import KcsWarning, users_level
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.inference import undifferentiated
-from kcs_torch.methods.answer.finish import HARDLY, little_turn, nothing_else
+from kcs_torch.methods.answer.finish import HARDLY, SINGLE, little_turn, nothing_else
 from kcs_torch.methods.answer.root import ABSENT, FOUND, standing_feet
 from kcs_torch.methods.answer.wrong import WHY_LOOSE, what_is_wrong
 from kcs_torch.methods.base import Method, apart, check_cameras
@@ -253,13 +253,14 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
     cameras = (found.view.look.mT @ complete_rotation(lifted.cameras))[:, :2]
     turn = float(viewpoint_turn(cameras))
     notes = _notes_on_solution(method, tracks, found, k, points, images, turn)
-    notes.append(f"full perspective: the body's distance varies by a factor of {root.amax() / root.amin():.2f}")
+    varies = f": the body's distance varies by a factor of {root.amax() / root.amin():.2f}" if len(root) > 1 else ""
+    notes.append(f"full perspective{varies}")
     if scene.any_focal:
         notes.append(lens_note(intrinsics, tracks.units))
     first = found.lifted[0].diagnostics
     doubt = first.doubt
-    if doubt == nothing_else(method, body, first.viewpoint_turn):  # by the turn before the lens was known
-        doubt = nothing_else(method, body, turn)
+    if doubt == nothing_else(method, tracks, first.viewpoint_turn):  # by the turn before the lens was known
+        doubt = nothing_else(method, tracks, turn)
     if doubt == UNSIDED and not found.flat and _one_side(bodies):
         doubt = ""
     facts = replace(
@@ -298,7 +299,7 @@ def _notes_on_solution(
 ) -> list[str]:
     """What is said of solution number ``k``: what the method said of the tracks, and what is true of this one."""
     # True of what was lifted, perhaps not of this.
-    stale = [WHY_LOOSE, HARDLY, SEEMS_NEAR, "weak perspective", "did not settle"]
+    stale = [WHY_LOOSE, HARDLY, SINGLE, SEEMS_NEAR, "weak perspective", "did not settle"]
     if k:
         stale += [SEE_OTHERS, found.lifted[0].diagnostics.doubt or SEE_OTHERS]
     notes = [
@@ -307,6 +308,6 @@ def _notes_on_solution(
     settled = found.settled(k)
     if not settled:
         notes.append(method.unsettled(found.steps))
-    if little := little_turn(method, tracks.skeleton, turn):
+    if little := little_turn(method, tracks, turn):
         notes.append(little)
     return [*notes, *what_is_wrong(method, points, images, tracks, settled)]

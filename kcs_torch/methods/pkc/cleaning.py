@@ -134,7 +134,7 @@ def _complete(tracks: Tracks, points: Tensor, keep: Tensor, left: float) -> tupl
     noise = (gap_deviation(points, keep, tracks.rate, HELD).square() + left**2).sqrt()
     if detected(tracks):
         noise = noise.maximum(detector_deviation(tracks))
-        notes.append("taken for a detector's joints: they may be off by 3 % of the body's size or more, frames on end")
+        notes.append("taken for a detector's joints: they may be off by 3 % of the body's size or more")
     if len(points) / _alike(tracks, points) < SHORT:
         noise = noise.clamp_min(UNTOLD)
     held = _nearest_shown(keep)
