@@ -434,9 +434,9 @@ def test_things_that_are_no_video(tmp_path):
         detect_video(tmp_path / "a.json")
     with pytest.raises(kt.FormatError, match="got a folder"):
         detect_video(tmp_path)
-    with pytest.raises(kt.FormatError, match="got none"):
+    with pytest.raises(kt.FormatError, match="there is no such file"):
         detect_video("http://localhost/a.mp4")
-    with pytest.raises(kt.FormatError, match="got none"):
+    with pytest.raises(kt.FormatError, match="there is no such file"):
         detect_video("a\0.mp4")
 
 

@@ -98,6 +98,16 @@ def test_both_pictures_show_both_sides(page, result, width, height, mobile):
     assert min(charts) > 0
 
 
+def test_headings_show_their_figures_in_full_beside_the_picture(page):
+    walk = walk_result(40, skeleton="coco17")
+    walk.points[:, 10, 0] += torch.linspace(-90, 90, 40)  # of the right wrist, whose bone has the longest name
+    browser = page(walk, width=1200, height=900)
+    told = browser.run("[...document.querySelectorAll('h2 output')].map(o => o.textContent).filter(text => text)")
+    cut = browser.run("[...document.querySelectorAll('h2 *')].filter(o => o.scrollWidth > o.clientWidth).length")
+    assert len(told) == 2 and all(text.startswith("most: ") for text in told)
+    assert "right_elbow-right_wrist" in told[0] and cut == 0
+
+
 def test_a_long_solution_menu_stays_within_a_phone(page, result):
     browser = page(result, width=400, height=844, mobile=True)
     browser.run("document.getElementById('solution').options[1].textContent = '2 other depth of '.repeat(6)")

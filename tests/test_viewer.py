@@ -459,6 +459,11 @@ def test_summary_leaves_out_what_is_unknown(result):
     assert words.endswith("not converged after 80 iterations")
 
 
+def test_summary_tells_nothing_of_time_of_a_single_image():
+    words = summarise(walk_result(1))
+    assert words.startswith("1 frame") and "turn" not in words and "variation" not in words
+
+
 def test_sides_are_told_apart_by_the_colour_blind():
     """Under a simulation of the two common red-green deficiencies the two colours stay far apart."""
     rgb = np.array([[int(COLOURS[s][i : i + 2], 16) / 255 for i in (1, 3, 5)] for s in ("left", "right")]) ** 2.2

@@ -15,12 +15,13 @@ def summarise(result: Reconstruction) -> str:
     """Say how long a motion is and what its diagnostics are; what is unknown is left out."""
     d = result.diagnostics
     fps = f" at {result.fps:g} a second" if result.fps else ""
+    several = len(result.points) > 1
     facts = [
         f"{counted(len(result.points), 'frame')}{fps}",
         f"skeleton {result.skeleton.name}",
-        _fact("viewpoint turn {:.0f}°", d.viewpoint_turn),
+        _fact("viewpoint turn {:.0f}°", d.viewpoint_turn) if several else "",
         _fact("unseen {:.1f} %", 100 * d.unseen_share),
-        f"bone variation {d.variation}" if math.isfinite(d.bone_variation) else "",
+        f"bone variation {d.variation}" if several and math.isfinite(d.bone_variation) else "",
         _fact(f"reprojection {{:.3g}} {result.tracks.units}", d.reprojection_rms),
         ("converged" if d.iterations else "") if d.converged else f"not converged after {d.iterations} iterations",
     ]
