@@ -6,6 +6,7 @@ import random
 import numpy as np
 import pytest
 import torch
+from command_line import run
 
 import kcs_torch as kt
 from kcs_torch.errors import FormatError
@@ -78,6 +79,10 @@ def files(tmp_path):
 def test_a_rate_that_the_file_does_not_tell_is_asked_for(files):
     motion = load_motion(files / "s_01.amc")
     assert motion.fps is None and any("give fps=... (kcs-torch: --fps)" in note for note in motion.notes)
+    told = run("score", files / "s_01.amc", files / "s_01.amc").output
+    assert "(kcs-torch: --truth-fps)" in told and "(kcs-torch: --pred-up)" in told and "--fps" not in told
+    told = run("angles", files / "s_01.amc", "--joint", "root,thigh,shank").output
+    assert "(kcs-torch: --fps)" in told and "point up" not in told  # which angles do not depend on
 
 
 def test_by_hand(files):

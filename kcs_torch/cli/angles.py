@@ -85,6 +85,7 @@ def angles(
                 found.save(output)
         facts = _facts(found)
         notes = list(data.diagnostics.notes if isinstance(data, Reconstruction) else data.notes)
+        notes = [note for note in notes if "--from-up" not in note]  # to angles no axis matters
         if as_json:
             print_json({"source": source, "fps": found.fps, "angles": facts, "notes": notes})
             return

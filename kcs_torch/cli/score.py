@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -83,7 +84,7 @@ def score(
             theirs = load_motion(truth, format=truth_format, up=truth_up, fps=truth_fps, units=from_units)
             theirs = _cut(theirs, truth_frames, "--truth-frames")
         found = compare(ours, theirs, align=align or None, root=root, mirror=mirror, within=within)
-        read = [*_notes(ours, pred, "--pred-up"), *_notes(theirs, truth, "--truth-up")]
+        read = [*_notes(ours, pred, "--pred"), *_notes(theirs, truth, "--truth")]
         found = dataclasses.replace(found, notes=(*found.notes, *read))
         if as_json:
             print_json(dataclasses.asdict(found))
@@ -104,9 +105,12 @@ def _motion(path: str, size: dict[str, Any] | None, *, format: str | None, **opt
     return sized(load_motion(path, format=format, **options), size)
 
 
-def _notes(motion: Motion, path: str, up: str) -> list[str]:
-    """What was assumed when a file was read; its axes matter where bodies are compared without turning them."""
-    return [f"{path}: {note.replace('--from-up', up)}" for note in motion.notes]
+def _notes(motion: Motion, path: str, own: str) -> list[str]:
+    """What was assumed when a file was read, whose options begin with its ``own`` word here.
+
+    Its axes matter where bodies are compared without turning them.
+    """
+    return [f"{path}: {re.sub(r'--(from-)?(?=up|fps)', f'{own}-', note)}" for note in motion.notes]
 
 
 def _cut(motion: Motion, frames: str | None, option: str) -> Motion:
