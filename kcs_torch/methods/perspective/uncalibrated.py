@@ -174,6 +174,9 @@ class _Looking(PKC):
         asked = tracks.num_frames <= BLOCK and may_be_near(tracks)
         return super()._steps(tracks, cameras) if asked else _as(PKC, self)._steps(tracks, cameras)
 
+    def _for_hands(self) -> PKC:
+        return _as(PKC, self)  # whether the camera is near the body tells
+
 
 def looking(method: Method) -> Method:
     """The method for tracks of a camera that may be near; only PKC itself is another one."""

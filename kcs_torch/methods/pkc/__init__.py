@@ -1,6 +1,7 @@
 """PKC: Procrustean kinematic chains; every stage is a function of its own, and ``docs/pkc.md`` derives them.
 
-- The recipe: ``method``, for a ``clip``; ``batch`` answers what the searches of several clips ask for at once.
+- The recipe: ``method``, for a ``clip``, and for ``hands`` by themselves; ``batch`` answers what searches of several
+  clips ask for at once.
 - What goes in: ``gate`` leaves out what is no detection of the body, ``cleaning`` smooths and completes, ``long_gaps``
   are shortened and ``gaps`` filled in space; ``sizing`` takes out a size that changes, ``near`` asks for a near camera.
 - A body with a template: ``fixed_view`` makes hypotheses, of a ``trunk`` and its ``limbs``, by ``placing`` these where

@@ -25,6 +25,7 @@ from kcs_torch.methods.pkc.clip import LEAST_JOINTS, Clip
 from kcs_torch.methods.pkc.fixed_answer import from_hypotheses
 from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of, usual_noise
 from kcs_torch.methods.pkc.gate import without_border, without_others, without_repeats
+from kcs_torch.methods.pkc.hands import Part, joined, part_of, parts_of
 from kcs_torch.methods.pkc.held import with_lengths_held
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.limbs import outward
@@ -145,6 +146,9 @@ class PKC(Method):
         return run(together([self._steps(one, None) for one in tracks]), serve)
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
+        parts = parts_of(tracks)
+        if parts:
+            return (yield from self._by_parts(tracks, cameras, parts))
         if tracks.num_frames == 1 and self.knows_template(tracks.skeleton):
             return (yield from self._image(tracks, cameras))
         kept = shortened(tracks)
@@ -153,6 +157,18 @@ class PKC(Method):
         some = replace(tracks, points=tracks.points[kept], weights=tracks.weights[kept])
         found = yield from self._whole(some, None if cameras is None else cameras[kept], kept)
         return lengthened(found, kept, tracks, cameras)
+
+    def _by_parts(self, tracks: Tracks, cameras: Tensor | None, parts: Sequence[Part]) -> Search[Any, Any, Estimate]:
+        """Solve the body, and each hand by itself."""
+        shown = [self._normalised(part_of(tracks, part)) for part in parts]
+        methods = [self, *(self._for_hands() for _ in parts[1:])]
+        steps = [one._steps(some, cameras) for one, (some, _, _) in zip(methods, shown, strict=True)]
+        found = joined(parts, (yield from together(steps)), [size for _, size, _ in shown], tracks.num_joints)
+        return replace(found, alternatives=found.alternatives[: self.alternatives])
+
+    def _for_hands(self) -> PKC:
+        """What solves hands: the same."""
+        return self
 
     def _image(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
         """Solve a single image as two of the same: as one its bones would rather be of usual lengths than as seen."""
