@@ -6,6 +6,7 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.data import walking_person
+from kcs_torch.methods.pkc.hands import parts_of
 from kcs_torch.skeleton import SKELETONS, has_middle, person_by_names
 
 LIMBS = ["shoulder", "elbow", "wrist", "hip", "knee", "ankle"]
@@ -27,7 +28,7 @@ def test_names_alone_give_the_built_in_tree(name):
     assert {found.bone_names[i] for i in found.flexible} == {body.bone_names[i] for i in body.flexible}
 
 
-@pytest.mark.parametrize("name", [n for n in SKELETONS if n not in ("ap10k", "hand21", "wholebody63")])
+@pytest.mark.parametrize("name", [n for n in SKELETONS if n not in ("ap10k", "hand21")])
 def test_every_person_is_one_tree(name):
     found = person_by_names(SKELETONS[name].joints[: SKELETONS[name].num_observed])
     assert found is not None and found.is_tree
@@ -53,6 +54,36 @@ def test_an_arm_needs_no_middle():
     arm = person_by_names(["LShoulder", "LElbow", "LWrist"])
     assert arm.bone_names == ("LShoulder-LElbow", "LElbow-LWrist") and not arm.virtual
     assert not has_middle(arm.joints)
+
+
+SIDES, HAND = ("left", "right"), SKELETONS["hand21"].joints
+FINGERS = ["Thumb", "Index", "Middle", "Ring", "Pinky"]
+MOCAP = ["Hips", "Spine", "Neck", "Head", *(f"{s}{p}" for s in ("Left", "Right") for p in ("Arm", "ForeArm", "Hand"))]
+
+
+@pytest.mark.parametrize(
+    ("names", "tip"),
+    [
+        ([*SKELETONS["coco17"].joints[:17], *(f"{s}_{j}" for s in SIDES for j in HAND[1:])], "index_finger"),
+        ([*SKELETONS["mediapipe33"].joints[:33], *(f"{s}_{j}" for s in SIDES for j in HAND[1:])], "index_finger"),
+        (
+            [*SKELETONS["coco17"].joints[:17], *(f"{s}_{f}{k}" for s in SIDES for f in FINGERS for k in (1, 2, 3))],
+            "Index",
+        ),
+        ([*MOCAP, *(f"{s}Hand{f}{k}" for s in ("Left", "Right") for f in FINGERS for k in (1, 2, 3, 4))], "HandIndex"),
+    ],
+    ids=["mediapipe's hands on COCO's body", "mediapipe's hands and body", "numbered", "motion capture"],
+)
+def test_fingers_hang_on_hands(names, tip):
+    """These had no bones at all."""
+    body = person_by_names(names)
+    assert body is not None and body.is_tree and body.template is not None
+    upper = {body.joints[b]: body.joints[a] for a, b in body.bones}
+    chain = [name for name in names if tip.lower() in name.lower() and name.lower().startswith("left")]
+    assert [upper[name] for name in chain[1:]] == chain[:-1] and len(chain) >= 3
+    assert "wrist" in upper[chain[0]].lower() or "hand" in upper[chain[0]].lower()
+    tracks = kt.Tracks.from_arrays(torch.rand(20, len(names), 2), joint_names=names, fps=30)
+    assert [part.skeleton.joints[0] for part in parts_of(tracks)[1:]] == ["left_wrist", "right_wrist"]
 
 
 def clip(names):

@@ -8,7 +8,7 @@ from collections.abc import Hashable, Sequence
 from kcs_torch.anatomy import places_of_known, side_of
 from kcs_torch.anatomy.names import part_of
 
-__all__ = ["map_joints"]
+__all__ = ["map_joints", "places_with_fingers"]
 
 _NEARLY = {"thorax": "neck"}  # places so near each other that detectors mean the same by them
 
@@ -31,7 +31,7 @@ def map_joints(names: Sequence[str], wanted: Sequence[str]) -> list[int | None]:
     """
     out: list[int | None] = [None] * len(wanted)
     taken: set[int] = set()
-    places, places_wanted = _places(names), _places(wanted)
+    places, places_wanted = places_with_fingers(names), places_with_fingers(wanted)
     for ours, theirs in (
         (list(zip(names, places, strict=True)), list(zip(wanted, places_wanted, strict=True))),
         (places, places_wanted),
@@ -59,7 +59,7 @@ def _plain(name: str) -> str:
     return "".join(c for c in name.lower() if c.isalnum())
 
 
-def _places(names: Sequence[str]) -> list[tuple[str, str] | None]:
+def places_with_fingers(names: Sequence[str]) -> list[tuple[str, str] | None]:
     """Side and place of each joint of a person or of a hand; None of others."""
     parts = [
         part_of(name, "hand") if place is None else place[1]

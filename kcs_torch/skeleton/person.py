@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from kcs_torch.anatomy import places_of_known
+from kcs_torch.anatomy.names import FINGER_JOINTS
 from kcs_torch.skeleton.core import Skeleton
+from kcs_torch.skeleton.mapping import places_with_fingers
 
 __all__ = ["has_middle", "person_by_names"]
 
@@ -15,6 +17,7 @@ _COLUMN = (*_SPINE, "neck", "neck1", "upperneck", "neck2", "head", "headtop")
 
 _NECK = ("neck2", "upperneck", "neck1", "neck", "thorax")
 _SHIN, _PALM, _FACE = ("ankle", "knee", "hip"), ("hand", "wrist", "elbow"), ("nose", "head", *_NECK)
+_WRIST = ("wrist", "hand", "elbow")
 _ABOVE: dict[str, tuple[str, ...]] = {
     "nose": _NECK,
     "mouth": _FACE,
@@ -30,7 +33,13 @@ _ABOVE: dict[str, tuple[str, ...]] = {
     "wrist": ("radius", "elbow", "shoulder"),
     "hand": ("wrist", "radius", "elbow"),
     "fingers": _PALM,
-    **dict.fromkeys(("fingerbase", "thumb", "index", "pinky"), ("wrist", "hand", "elbow")),
+    **dict.fromkeys(("fingerbase", "thumb", "index", "pinky"), _WRIST),
+    **{
+        f"{finger}_{joint}": (*(f"{finger}_{lower}" for lower in joints[:k][::-1]), *_WRIST)
+        for finger, joints in FINGER_JOINTS.items()
+        for k, joint in enumerate(joints)
+    },
+    "thumb_cmc2": ("thumb_cmc", *_WRIST),
     "hip_inner": ("midhip", "sacrum"),
     "hip": ("hip_inner", "midhip", "sacrum"),
     "knee": ("hip",),
@@ -40,6 +49,9 @@ _ABOVE: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("bigtoe", "smalltoe", "toetip"), ("ball", *_SHIN)),
 }
 """What each place may hang on, the first that there is; of the same side, or of the middle."""
+
+_ABOVE["index_pip"] = ("index_mcp", "fingerbase", *_WRIST)  # motion capture calls a knuckle the hand's
+_ABOVE["thumb_mcp"] = ("thumb_cmc2", "thumb_cmc", *_WRIST)
 
 _MIDDLES = (("pelvis", "hip", ("midhip", "sacrum")), ("neck", "shoulder", ("neck", "thorax", "spine3")))
 """What is made, between which joints, unless there is one of these."""
@@ -82,7 +94,10 @@ def person_by_names(names: Sequence[str], name: str = "person") -> Skeleton | No
     if len(set(everyone)) < len(everyone):
         return None
     at: dict[tuple[str, str], str] = {}
-    for joint, place in zip(everyone, places_of_known(everyone), strict=True):
+    places = places_of_known(everyone)
+    if any(place is not None and place[1] == "elbow" for place in places):
+        places = places_with_fingers(everyone)
+    for joint, place in zip(everyone, places, strict=True):
         if place is None or place in at:
             return None
         at[place] = joint

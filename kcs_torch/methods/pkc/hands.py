@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcs_torch.anatomy import side_of
 from kcs_torch.clean.detector import detected
 from kcs_torch.errors import SkeletonError
 from kcs_torch.methods.base import Estimate
@@ -124,14 +125,17 @@ def _hands(skeleton: Skeleton) -> tuple[Part, ...]:
 
     hands = []
     for wrist, branches in children.items():
-        fingers = [below(child) for child in branches]
+        fingers = [finger for child in branches if len(finger := below(child)) >= JOINTS]
         joints = [wrist, *sorted(chain.from_iterable(fingers))]
-        if sum(len(finger) >= JOINTS for finger in fingers) < FINGERS or joints[-1] >= skeleton.num_observed:
+        if len(fingers) < FINGERS or joints[-1] >= skeleton.num_observed:
             continue
-        names = [skeleton.joints[joint] for joint in joints]
-        bones = [(skeleton.joints[a], skeleton.joints[b]) for a, b in skeleton.bones if {a, b} <= set(joints)]
+        side = side_of(skeleton.joints[wrist])
+        name = "wrist" if side == "centre" else f"{side}_wrist"  # the skeleton may call it a hand
+        names = [name, *(skeleton.joints[joint] for joint in joints[1:])]
+        new = {joint: k for k, joint in enumerate(joints)}
+        bones = [(names[new[a]], names[new[b]]) for a, b in skeleton.bones if a in new and b in new]
         try:
-            hand = Skeleton.from_names(names, bones, name=f"{skeleton.name}: {names[0]}", template="hand")
+            hand = Skeleton.from_names(names, bones, name=f"{skeleton.name}: {name}", template="hand")
         except SkeletonError:  # something else that branches
             continue
         if has_trunk(hand) and len(joints) < skeleton.num_joints:
