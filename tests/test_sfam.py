@@ -301,9 +301,15 @@ def test_auto_keeps_a_camera_that_sways_free():
     assert torch.equal(auto, free)
 
 
-@pytest.mark.parametrize("points", [SHORT.tracks.points[:1], SHORT.tracks.points[:, :3]])
-def test_too_little_to_tell_gives_a_camera_that_stands(points):
-    with pytest.warns(KcsWarning, match=r"turned by only 0 degrees, and 'sfam' has nothing else that tells depth"):
+@pytest.mark.parametrize(
+    ("points", "shown"),
+    [
+        (SHORT.tracks.points[:1], "a single image shows one viewpoint"),
+        (SHORT.tracks.points[:, :3], "by only 0 degrees"),
+    ],
+)
+def test_too_little_to_tell_gives_a_camera_that_stands(points, shown):
+    with pytest.warns(KcsWarning, match=f"{shown}, and 'sfam' has nothing else that tells depth"):
         result = SfAM()(Tracks.from_arrays(points))
     assert_close(result.cameras, torch.eye(3, dtype=torch.float64)[:2].expand_as(result.cameras))
     assert result.diagnostics.viewpoint_turn == 0
