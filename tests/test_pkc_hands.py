@@ -118,6 +118,16 @@ def test_alternatives_are_of_one_part_each(solved):
         assert other.points.shape == solved.points.shape and float(off.amax()) > 0
 
 
+def test_notes_on_a_hand_name_its_wrist_and_are_not_the_bodys():
+    tracks = person_with_hands(30)[1]
+    noise = 4 * torch.randn(tracks.points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = kt.PKC()(replace(tracks, points=tracks.points + noise * tracks.seen[..., None], detector=True))
+    told = [note for note in found.diagnostics.notes if note.startswith(("left_wrist: ", "right_wrist: "))]
+    assert any("noise of" in note and "% of its size" in note for note in told)
+    assert not any("the body's" in note for note in told)
+    assert sum("taken for a detector's" in note for note in found.diagnostics.notes) == 1
+
+
 def test_clips_together_are_as_alone(solved, person):
     other = person_with_hands(30, seed=1, yaw=30.0)[1]
     first, second = kt.reconstruct_all([person[1], other], method="pkc", intrinsics="parallel")

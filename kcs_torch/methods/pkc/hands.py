@@ -88,7 +88,7 @@ def _whole(parts: Sequence[Part], found: Sequence[Estimate], sizes: Sequence[Ten
             place = place - place[:, :1] + points[:, wrist, None]
             spread = torch.cat([0 * spread[:, :1], spread[:, 1:]], 1) + variance[:, wrist, None]
         points[:, joints], variance[:, joints] = place, spread
-    notes = chain(body.notes, *(_of_hand(part, one) for part, one in zip(parts[1:], found[1:], strict=True)))
+    notes = chain(body.notes, *(_of_hand(part, one, body) for part, one in zip(parts[1:], found[1:], strict=True)))
     return replace(
         body,
         points=points - points.mean(1, keepdim=True),
@@ -101,9 +101,10 @@ def _whole(parts: Sequence[Part], found: Sequence[Estimate], sizes: Sequence[Ten
     )
 
 
-def _of_hand(part: Part, one: Estimate) -> list[str]:
-    """What is said of a hand, under the wrist's name."""
-    return [f"{part.skeleton.joints[0]}: {note}" for note in (*one.notes, *filter(None, [one.doubt]))]
+def _of_hand(part: Part, one: Estimate, body: Estimate) -> list[str]:
+    """What is said of a hand, under the wrist's name, and not of the body as well."""
+    said = [note.replace("the body's", "its") for note in (*one.notes, one.doubt) if note and note not in body.notes]
+    return [f"{part.skeleton.joints[0]}: {note}" for note in said]
 
 
 def _often(tracks: Tracks, joints: Sequence[int]) -> bool:
