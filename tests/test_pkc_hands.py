@@ -101,12 +101,12 @@ def test_each_hand_is_as_if_it_were_alone(person, solved):
 
 
 def test_body_and_hands_are_right(person, solved):
-    """Hands within a tenth of the length of one, and the body as well."""
+    """13 mm; as one body, from whose trunk fingers are seen, they were off by 17."""
     points = person[0]
     shown = ~points[0, :, 0].isnan()
     off = solved.observed[:, shown] - points[:, shown]
     off = (off - off.mean(1, keepdim=True)).norm(dim=-1)
-    assert float(off.mean()) < 18
+    assert float(off.mean()) < 15
     assert bool(solved.points.isfinite().all()) and bool(solved.uncertainty.isfinite().all())
 
 

@@ -45,7 +45,9 @@ def parts_of(tracks: Tracks) -> list[Part]:
     hands = [hand for hand in _hands(tracks.skeleton) if _often(tracks, hand.joints)]
     fingers = {joint for hand in hands for joint in hand.joints[1:]}
     body = [joint for joint in range(tracks.num_joints) if joint not in fingers]
-    return [Part(tuple(body), _only(tracks.skeleton, body)), *hands] if hands and _often(tracks, body) else []
+    if not hands or not _often(tracks, body):
+        return []
+    return [Part(tuple(body), _only(tracks.skeleton, body)), *hands]
 
 
 def part_of(tracks: Tracks, part: Part) -> Tracks:
@@ -77,6 +79,7 @@ def joined(parts: Sequence[Part], found: Sequence[Estimate], sizes: Sequence[Ten
 
 
 def _whole(parts: Sequence[Part], found: Sequence[Estimate], sizes: Sequence[Tensor], count: int) -> Estimate:
+    """One solution of each part as one of all, without alternatives."""
     body = found[0]
     points = body.points.new_zeros(len(body.points), count, 3)
     variance = points.new_zeros(points.shape[:2])
@@ -108,6 +111,7 @@ def _of_hand(part: Part, one: Estimate, body: Estimate) -> list[str]:
 
 
 def _often(tracks: Tracks, joints: Sequence[int]) -> bool:
+    """Whether enough frames show enough of some joints for a clip of their own."""
     frames = (tracks.seen[:, list(joints)].sum(1) >= SHOWN).sum()
     return int(frames) >= min(FRAMES, tracks.num_frames)
 
