@@ -22,14 +22,14 @@ APART = 0.04
 CLOSE = 10.0
 """Objective by which another solution may be worse and still be a rival."""
 
-ANGLE = 0.15
+ANGLE = 0.1
 """Standard deviation, in radians, of a bone's angle to the image plane where it is nearest to it: what postures, hinges
 and proportions tell of a length that no crossing of the plane tells."""
 
-FRONT, SIDE, ASIDE = 2.4, 0.45, 0.1
+FRONT, SIDE, ASIDE, BLURRED = 2.6, 0.5, 0.1, 0.75
 """How uncertain angles are, in ``ANGLE``, of a body that is seen exactly from the front or from behind, what is left of
 that from the side, and the sine of the direction from which on it falls: a body that leans moves in the image only if
-it is seen from aside."""
+it is seen from aside. The square of that sine grows by so much of the image's noise, as a share of bones' lengths."""
 
 TILT = 1.2
 """How uncertain angles are, in ``ANGLE``, for each unit of the slope at which the template's upright axis comes towards
@@ -38,10 +38,10 @@ the camera, as one that looks down sees it: all bones along it are foreshortened
 USUAL = 0.12
 """Standard deviation of a length of which the image tells nothing, as a share: bodies differ by so much."""
 
-LEAST = 0.028
-"""Standard deviation of any length, as a share; with what else moves a bone's depth as a wrong length does."""
+LEAST = 0.05
+"""Slope at which a bone counts that passes through the image plane: more moves its depth than what its length does."""
 
-FLAT = 0.4
+FLAT = 0.11
 """Share of its length below which a bone's depth is no better known for being small."""
 
 STEEP = 0.98
@@ -50,38 +50,36 @@ STEEP = 0.98
 NEAREST = 0.02
 """Share of the frames in which a bone may be nearer to the image plane than where it counts as nearest."""
 
-NOISE, LASTING = 0.6, 1.0
-"""What a bone's depth takes on of its image's noise in a frame, which its neighbours make good in part, and of the
-noise of all frames, which its length takes on."""
+LEVEL = 0.4
+"""Share of noise and length whose geometric mean noise takes the depth of a bone in the image plane for: the square of
+its image is off by twice its length times the noise, and that is the square of a depth. Neighbours make good most."""
 
 POSTURE, STRANGE = 0.167, 1.5
 """Energy of usual postures, for each bone and frame that counts, and the power of a larger one that deviations go with:
-the further postures stray, the less the template tells of them. Those with a smaller one go with it as it is."""
+the further postures stray, the less the template tells of them."""
 
 ODDITY = 0.09
 """By how much a usual body's lengths stray from the template's. One of twice that is told by it half as well, and so
 the viewpoint's turn tells as much where it is half as far."""
 
-TURN, POWER = 30.0, 1.25
+TURN, POWER = 48.0, 1.25
 """Degrees of the viewpoint's turn that tell as much as the template, and the power of the turn that deviations fall
 with."""
 
-SHORT, LEAST_FRAMES, AROUND = 10.0, 12, 240.0
+SHORT, LEAST_FRAMES, AROUND = 8.0, 12, 240.0
 """Independent frames up to which angles are the less sure the fewer there are, up to three times; frames from which on,
 as shorter clips are taken to be noisy, which says as much; and degrees of a turn that make good for it."""
 
-RIVAL, COLD = 0.15, 6.0
-"""Odds of another solution that is no worse, and objective by which they fall to a third."""
-
-HOT_RIVAL, HOT = 0.55, 35.0
-"""The same of a detector's joints, whose errors last, so that frames tell less than the objective takes them to: of
-200 such solutions of simulated detections every third was nearer to the truth, be it worse by 2 or by 20."""
+RIVAL, COLD, HOT = 0.5, 6.0, 35.0
+"""Odds of another solution that is no worse, objective by which they fall to a third, and the same of a detector's
+joints, whose errors last, so that frames tell less than the objective takes them to: of 200 such solutions of simulated
+detections every third was nearer to the truth, be it worse by 2 or by 20."""
 
 NEAR = 0.016
 """Standard deviation of a detector's joint, a standing person being about 1.75 tall, beyond what the objective allows
 for: the camera is a few metres away, and joints are defined in another way than bones are."""
 
-HEADING = 0.15
+HEADING = 0.18
 """Standard deviation, in radians, of the direction from which a detector's joints are seen: without intrinsics nobody
 knows how far from the image's middle that is, and what is nearer looks larger, as if the body leant."""
 
@@ -104,22 +102,22 @@ def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: floa
     """How uncertain angles of a solution (T, N), (B,) are, over those of usual postures before a camera at rest.
 
     More where postures stray from the template, the body is seen from the front, from above or in a short clip, and
-    less where it is seen from aside or the viewpoint turned by ``turn`` degrees.
+    less where it is seen from aside, the more so the less noise there is, or the viewpoint turned by ``turn`` degrees.
     """
     posture = objective.posture
     points = torch.cat([objective.image, depth[..., None]], -1)
     counted = (len(depth) / posture.correlation + posture.strength) * len(lengths)
     strange = float(posture(points[None], lengths[None])) / counted / POSTURE
     odd = max(1.0, objective.oddity(lengths) / ODDITY)
-    strange = max(strange, strange**STRANGE)
     trunk = posture.frame(points).square().mean(0)
     aside, tilt = float(trunk[0, 2]), float(trunk[2, 1])  # of forward across, of upright towards
-    view = FRONT**2 / (1 + aside / ASIDE**2) + SIDE**2 + TILT**2 * tilt / max(1 - tilt, 1 - STEEP**2)
+    blur = float(objective.noise.median() / lengths.mean().clamp_min(1e-9))
+    view = FRONT**2 / (1 + aside / (ASIDE**2 + BLURRED * blur)) + SIDE**2 + TILT**2 * tilt / max(1 - tilt, 1 - STEEP**2)
     told = 1 / view + (odd * turn / TURN) ** (2 * POWER)
     frames = len(depth)
     few = SHORT * posture.correlation / frames if frames >= LEAST_FRAMES else 1.0
     short = 1 + (min(max(few, 1.0), 3.0) - 1) * max(0.0, 1 - turn / AROUND)
-    return short * odd * strange / math.sqrt(told)
+    return short * odd * max(1.0, strange) ** STRANGE / math.sqrt(told)
 
 
 def guess_variance(skeleton: Skeleton, lengths: Tensor, turn: float) -> Tensor:
@@ -179,20 +177,19 @@ def depth_deviation(
     length = found.lengths[0].clamp_min(1e-9)
     steep = (dz.abs() / length).clamp_max(STEEP)
     nearest = kth_smallest(steep, 1 + int(NEAREST * (len(steep) - 1)), 0).square()
-    told = (nearest / (1 - nearest)) * (doubt * ANGLE) ** 2  # tan(a)^2 da^2
-    told = told * USUAL**2 / (told + USUAL**2) + (doubt * LEAST) ** 2
+    told = (nearest / (1 - nearest) + LEAST**2) * (doubt * ANGLE) ** 2  # tan(a)^2 da^2
+    told = told * USUAL**2 / (told + USUAL**2)
     if image is not None:
         noise = noise.square().add(NEAR**2).sqrt()
-    blur = bone_noise(noise, bones).square()
-    wrong = length.square() * told + NOISE**2 * blur + LASTING**2 * blur.mean(0)
+    blur, level = bone_noise(noise, bones), LEVEL * length
+    wrong = length.square() * told / (steep.square() + FLAT**2)
+    wrong = wrong + level * blur.square() / (level * steep.square() + blur).clamp_min(1e-12)
     tree = chain_inverse(incidence(bones, skeleton.num_joints, dtype=noise.dtype))  # (N, B)
-    wrong = wrong / (steep.square() + FLAT**2)
     variance = (wrong if guess is None else wrong + guess) @ tree.square().mT
     if image is not None:
         variance = variance + HEADING**2 * (image - image.mean(-2, keepdim=True)).square().sum(-1)
     if len(found.energy) > 1:
-        most, cold = (RIVAL, COLD) if image is None else (HOT_RIVAL, HOT)
-        odds = most * torch.exp(-(found.energy - found.energy[0]) / cold)
+        odds = RIVAL * torch.exp(-(found.energy - found.energy[0]) / (COLD if image is None else HOT))
         odds = torch.cat([torch.ones_like(odds[:1]), odds[1:]])
         variance = variance + torch.einsum("h,htn->tn", odds / odds.sum(), (found.depth - found.depth[0]).square())
     return variance.sqrt()
