@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -12,11 +13,16 @@ from kcs_torch.errors import KcsWarning, OptionError, ShapeError, users_level
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
+from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.skeleton.core import FOUND
 from kcs_torch.types import Reconstruction, Tracks
 
 __all__ = ["find_skeleton"]
+
+LINKS = 2
+"""Pairs of joints that are pulled to one distance before bones are chosen, as many times the number of joints."""
 
 
 def find_skeleton(
@@ -32,7 +38,8 @@ def find_skeleton(
     not be good for that; its mirror image or a wrong turn of the whole changes no distance.
 
     Args:
-        source: tracks (which are lifted first, by :class:`SfAM`), a reconstruction, or points (T, N, 3).
+        source: tracks (which are lifted first: by :class:`SfAM`, then by :class:`PKC` with links between the steadiest
+            joints there), a reconstruction, or points (T, N, 3).
         weights: (T, N), 0 where unseen; those of the tracks if None.
         joints: their names, for points; those of the tracks' skeleton otherwise.
         rigid_below: a bone whose length varies by more than this share (standard deviation over mean) is flexible, and
@@ -59,25 +66,19 @@ def find_skeleton(
     if not rigid_below >= 0:
         raise OptionError(f"find_skeleton: rigid_below: expected a share >= 0, got {rigid_below}")
     points, weights, joints = _given(source, weights, joints)
-    mean, spread = distance_spread(points, weights)
-    # Between equally rigid pairs, those of a body at rest say, the shorter is the likelier bone.
-    cost = spread + 1e-3 * mean
-    apart = torch.zeros_like(cost, dtype=torch.bool)
-    if weights is not None:  # what was never seen together is joined last, and nobody knows how far apart it is
-        apart = torch.minimum(weights[:, :, None], weights[:, None, :]).sum(0) == 0
-        cost = torch.where(apart, 1e3 * (1 + cost.amax()) + mean, cost)
+    cost, ratio, apart = _variation(points, weights)
     bones = rigid_tree(cost)
     size = bone_lengths(points, bones)
-    ratio = spread[bones[:, 0], bones[:, 1]] / mean[bones[:, 0], bones[:, 1]].clamp_min(torch.finfo(mean.dtype).tiny)
     lengths = median(size, 0)
-    loose = (ratio > rigid_below) | apart[bones[:, 0], bones[:, 1]]
+    ends = bones.unbind(-1)
+    loose = (ratio[ends] > rigid_below) | apart[ends]
     flexible = tuple(loose.nonzero().flatten().tolist())
     sway = bone_vectors(points, bones).std(0, correction=0).norm(dim=-1)
     _warn(len(flexible) == len(bones), len(bones) > 1 and bool((sway <= rigid_below * lengths).all()), rigid_below)
     return Skeleton(
         joints=tuple(joints) if joints is not None else tuple(f"joint{i}" for i in range(points.shape[1])),
         bones=tuple((int(a), int(b)) for a, b in bones.tolist()),
-        name="found",
+        name=FOUND,
         proportions=tuple(lengths.tolist()) if bool((lengths > 0).all()) else None,
         flexible=flexible,
     )
@@ -90,7 +91,7 @@ def _given(
     if isinstance(source, Tracks):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)  # of depths that nobody sees
-            source = SfAM()(source)
+            source = _lifted(source)
     if isinstance(source, Reconstruction):
         weights = source.tracks.weights if weights is None else weights
         joints = source.tracks.skeleton.joints if joints is None else joints
@@ -108,6 +109,35 @@ def _given(
     if weights is not None and weights.shape != source.shape[:2]:
         raise ShapeError(f"find_skeleton: expected weights {tuple(source.shape[:2])}, got {tuple(weights.shape)}")
     return source, weights, joints
+
+
+def _lifted(tracks: Tracks) -> Reconstruction:
+    """Tracks in space, of a body of which nothing is known.
+
+    SfAM alone is off by so much that a good part of the bones in its depths are wrong. PKC corrects it by links between
+    many pairs, which are pulled weakly: what varies nonetheless is no bone.
+    """
+    cost, *_ = _variation(SfAM()(tracks).points, tracks.weights)
+    pairs = torch.triu_indices(len(cost), len(cost), 1, device=cost.device)
+    least = pairs[:, cost[tuple(pairs)].argsort(stable=True)[: LINKS * len(cost)]]
+    links = torch.cat([rigid_tree(cost).sort(-1).values, least.mT]).unique(dim=0)
+    joints = tracks.skeleton.joints
+    body = Skeleton(joints=joints, bones=tuple((int(a), int(b)) for a, b in links), name="links", tree=False)
+    return PKC()(replace(tracks, skeleton=body))
+
+
+def _variation(points: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """What each pair of joints costs as a bone, by what share its length varies, and whether it is never seen, (N, N).
+
+    Between equally rigid pairs, those of a body at rest say, the shorter is the likelier bone. What was never seen
+    together is joined last, and nobody knows how far apart it is.
+    """
+    mean, spread = distance_spread(points, weights)
+    cost, ratio = spread + 1e-3 * mean, spread / mean.clamp_min(torch.finfo(mean.dtype).tiny)
+    if weights is None:
+        return cost, ratio, torch.zeros_like(cost, dtype=torch.bool)
+    apart = torch.minimum(weights[:, :, None], weights[:, None, :]).sum(0) == 0
+    return torch.where(apart, 1e3 * (1 + cost.amax()) + mean, cost), ratio, apart
 
 
 def _warn(loose: bool, resting: bool, rigid_below: float) -> None:

@@ -24,6 +24,9 @@ __all__ = ["Skeleton"]
 Pair = tuple[int, int]
 Point = tuple[float, float, float]
 
+FOUND = "found"
+"""Name of skeletons whose bones were found from motion: who gives one another name takes it at its word."""
+
 
 @dataclass(frozen=True)
 class Skeleton:
@@ -298,6 +301,11 @@ class Skeleton:
     @property
     def is_tree(self) -> bool:
         return len(self.pieces()) == 1 and len(self.bones) == self.num_joints - 1
+
+    @property
+    def found(self) -> bool:
+        """Whether bones are not known, but were chosen for keeping their length: by :func:`kcs_torch.find_skeleton`."""
+        return self.name == FOUND
 
     # ------------------------------------------------------------------ changes
 

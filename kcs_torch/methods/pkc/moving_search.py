@@ -92,6 +92,7 @@ class MovingSearch:
         rigid: (P, 2) pairs that keep their distance.
         fixed: these, and the outer ends of bones whose angles may be kept.
         held: whether bones keep their length exactly.
+        found: whether they were chosen for keeping it.
         small: whether there are so few joints that much is left undecided.
         pick: frames on which starts are compared.
     """
@@ -114,7 +115,7 @@ class MovingSearch:
     ) -> None:
         frames, joints, _ = image.shape
         tree = skeleton.bone_index(device=image.device)
-        self.is_tree = skeleton.is_tree
+        self.is_tree, self.found = skeleton.is_tree, skeleton.found
         self.held = self.is_tree and exact and noise == 0 and not skeleton.flexible
         self.small = joints <= ROBOT
         if too_long(image):
@@ -145,7 +146,7 @@ class MovingSearch:
         pose = yield from self._on_all_frames(pose[best], own[best])
         pose, ranks = yield from self._without_leaps(pose)
         best = _distinct(pose, ranks, self.alternatives)
-        return MovingView(pose[best], ranks[best], self.bones, self.rigid, self.loose, lead)
+        return MovingView(pose[best], ranks[best], self.bones, self.rigid, self.loose, lead, found=self.found)
 
     def _compared(self) -> Search[Descent, Pose, tuple[Pose, Tensor]]:
         """The best of all starts on a few frames, and which of them (H,) come from the first guess."""

@@ -31,6 +31,7 @@ class MovingView:
         lead: by how much the next solution is dearer, for each frame compared, where paths of bones were combined; 0
             where they were not, or no solution was left to compare.
         noise: (T, N) deviations of the image, a joint's own and those of its frame, or None where it is exact.
+        found: whether the pairs were chosen for keeping their distance, so that it tells nothing that they do.
     """
 
     pose: Pose
@@ -40,6 +41,7 @@ class MovingView:
     stiffness: float
     lead: float = 0.0
     noise: Tensor | None = None
+    found: bool = False
 
     def cameras(self, index: int = 0) -> tuple[Tensor, CameraPath]:
         """Rotations (T, 3, 3), world to camera, of one solution, and the kind of path they follow.
@@ -55,7 +57,8 @@ class MovingView:
     def deviation(self, cameras: Tensor, index: int = 0) -> Tensor:
         """Standard deviation (T, N) of the depths of one solution, for camera rotations (T, 3, 3)."""
         pose, views = self.pose[index : index + 1], cameras[None, :, 2]
+        telling = self.rigid[:0] if self.found else self.rigid
         own = depth_deviation(
-            pose.points, pose.rotations, self.bones, views=views, rigid=self.rigid, stiffness=self.stiffness
+            pose.points, pose.rotations, self.bones, views=views, rigid=telling, stiffness=self.stiffness
         )[0]
         return own if self.noise is None else torch.hypot(own, FARTHER * self.noise)
