@@ -66,13 +66,20 @@ MOCAP = ["Hips", "Spine", "Neck", "Head", *(f"{s}{p}" for s in ("Left", "Right")
     [
         ([*SKELETONS["coco17"].joints[:17], *(f"{s}_{j}" for s in SIDES for j in HAND[1:])], "index_finger"),
         ([*SKELETONS["mediapipe33"].joints[:33], *(f"{s}_{j}" for s in SIDES for j in HAND[1:])], "index_finger"),
+        ([*SKELETONS["mediapipe33"].joints[:33], *(f"{s}_hand_{j}" for s in SIDES for j in HAND)], "hand_index_finger"),
         (
             [*SKELETONS["coco17"].joints[:17], *(f"{s}_{f}{k}" for s in SIDES for f in FINGERS for k in (1, 2, 3))],
             "Index",
         ),
         ([*MOCAP, *(f"{s}Hand{f}{k}" for s in ("Left", "Right") for f in FINGERS for k in (1, 2, 3, 4))], "HandIndex"),
     ],
-    ids=["mediapipe's hands on COCO's body", "mediapipe's hands and body", "numbered", "motion capture"],
+    ids=[
+        "mediapipe's hands on COCO's body",
+        "and on its own",
+        "with wrists of their own",
+        "numbered",
+        "motion capture",
+    ],
 )
 def test_fingers_hang_on_hands(names, tip):
     """These had no bones at all."""
@@ -84,6 +91,17 @@ def test_fingers_hang_on_hands(names, tip):
     assert "wrist" in upper[chain[0]].lower() or "hand" in upper[chain[0]].lower()
     tracks = kt.Tracks.from_arrays(torch.rand(20, len(names), 2), joint_names=names, fps=30)
     assert [part.skeleton.joints[0] for part in parts_of(tracks)[1:]] == ["left_wrist", "right_wrist"]
+
+
+def test_a_hands_own_wrist_is_where_the_bodys_is():
+    """Two names of nearly one place: which of them is right, or how far they are apart, nobody knows."""
+    names = [*SKELETONS["coco17"].joints[:17], *(f"{s}_hand_{j}" for s in SIDES for j in HAND)]
+    body = person_by_names(names)
+    bone = body.bone_names.index("left_wrist-left_hand_wrist")
+    assert bone in body.flexible and "left_hand_wrist-left_hand_pinky_mcp" in body.bone_names
+    assert 0 < float(body.relative_lengths()[bone]) < 0.2
+    alone = person_by_names([name for name in names if name not in ("left_wrist", "right_wrist")])
+    assert "left_elbow-left_hand_wrist" in alone.bone_names  # it is the body's where that has none
 
 
 def clip(names):

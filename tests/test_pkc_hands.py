@@ -135,6 +135,21 @@ def test_clips_together_are_as_alone(solved, person):
     assert second.points.shape == (30, BODY.num_joints, 3)
 
 
+def test_hands_may_have_wrists_of_their_own(person):
+    """As right as with the body's wrists alone."""
+    points = person[0]
+    shown = [joint for joint in range(BODY.num_observed) if bool(points[0, joint].isfinite().all())]
+    names = [BODY.joints[joint] for joint in shown]
+    own = points[:, [BODY.index(f"{side}_wrist") for side in ("left", "right")]]
+    both = torch.cat([points[:, shown], own], 1)
+    tracks = kt.Tracks.from_arrays(both[..., :2], joint_names=[*names, "left_hand_wrist", "right_hand_wrist"], fps=30)
+    _, left, right = parts_of(tracks)
+    assert [tracks.skeleton.joints[part.joints[0]] for part in (left, right)] == ["left_hand_wrist", "right_hand_wrist"]
+    assert len(left.joints) == len(right.joints) == 21
+    off = kt.PKC()(tracks).observed - both
+    assert float((off - off.mean(1, keepdim=True)).norm(dim=-1).mean()) < 15
+
+
 def test_a_hand_that_is_hardly_seen_is_the_bodys(person):
     tracks = person[1]
     weights = tracks.weights.clone()

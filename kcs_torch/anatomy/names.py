@@ -64,6 +64,7 @@ _SIDED_NAMES = _spellings(
         "elbow": "elbow forearm lowerarm",
         "wrist": "wrist",
         "hand": "hand palm",
+        "handwrist": "handwrist handroot palmbase",
         "fingers": "fingers handtip handend fingertips",
         "fingerbase": "fingerbase handindex1",
         "thumb": "thumb handthumb",

@@ -42,6 +42,7 @@ _PERSON: dict[str, float] = {
     "elbow": 50.0,
     "radius": 60.0,
     "wrist": 60.0,
+    "handwrist": 60.0,
     **dict.fromkeys(("hand", "fingerbase", "index", "pinky", "thumb", "fingers"), 60.0),  # as the forearm, and more
 }
 _HAND: dict[str, float] = {

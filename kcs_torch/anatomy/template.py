@@ -63,6 +63,7 @@ _LEFT: dict[str, Point] = {
     "elbow": (0.225, 1.1405, -0.02),
     "radius": (0.2317, 0.9715, 0.0267),
     "wrist": (0.235, 0.887, 0.05),
+    "handwrist": (0.235, 0.877, 0.053),  # a hand's own, beside the body's
     "hand": (0.236, 0.806, 0.075),
     "fingers": (0.236, 0.715, 0.095),
     "fingerbase": (0.236, 0.780, 0.082),
@@ -233,6 +234,7 @@ def _resolve(part: str, side: str, present: set[str]) -> str:
         "shoulder": "clavicle" if "arm" in present else "shoulder",
         "arm": "shoulder",
         "hand": "hand" if "wrist" in present else "wrist",
+        "handwrist": "handwrist" if "wrist" in present else "wrist",
     }.get(part, part)
 
 

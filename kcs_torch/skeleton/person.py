@@ -17,7 +17,7 @@ _COLUMN = (*_SPINE, "neck", "neck1", "upperneck", "neck2", "head", "headtop")
 
 _NECK = ("neck2", "upperneck", "neck1", "neck", "thorax")
 _SHIN, _PALM, _FACE = ("ankle", "knee", "hip"), ("hand", "wrist", "elbow"), ("nose", "head", *_NECK)
-_WRIST = ("wrist", "hand", "elbow")
+_WRIST = ("handwrist", "wrist", "hand", "elbow")
 _ABOVE: dict[str, tuple[str, ...]] = {
     "nose": _NECK,
     "mouth": _FACE,
@@ -31,6 +31,7 @@ _ABOVE: dict[str, tuple[str, ...]] = {
     "elbow": ("shoulder",),
     "radius": ("elbow", "shoulder"),
     "wrist": ("radius", "elbow", "shoulder"),
+    "handwrist": ("wrist",),
     "hand": ("wrist", "radius", "elbow"),
     "fingers": _PALM,
     **dict.fromkeys(("fingerbase", "thumb", "index", "pinky"), _WRIST),
@@ -74,7 +75,8 @@ def person_by_names(names: Sequence[str], name: str = "person") -> Skeleton | No
     """The tree of a person's joints, in any usual spelling and order; None where these are others, or too few to link.
 
     Where no joint lies between the hips, or between the shoulders, a virtual pelvis or neck does. A face moves against
-    the neck: the bone that links them is flexible.
+    the neck: the bone that links them is flexible. So is that between a body's wrist and a hand's own, which two models
+    of a detector see in nearly the same place.
 
     Args:
         names: N joint names.
@@ -112,7 +114,7 @@ def person_by_names(names: Sequence[str], name: str = "person") -> Skeleton | No
             roots += 1
             continue
         bones.append((at[upper], joint))
-        if part in _HEAD and upper[1] in _NECK:
+        if (part in _HEAD and upper[1] in _NECK) or part == "handwrist":
             flexible.append(bones[-1])
     if roots != 1 or len(bones) < 2:
         return None
