@@ -83,6 +83,15 @@ def test_view_says_how_motion_was_read(tmp_path):
     assert first != second
 
 
+def test_view_plays_at_the_rate_that_is_given(tmp_path):
+    """Notes on files that do not tell theirs name this option."""
+    save(walking_motion(4), tmp_path / "m.npz")
+    run("view", tmp_path / "m.npz", "--fps", 120, "-o", tmp_path / "m.html")
+    assert '"fps": 120' in (tmp_path / "m.html").read_text(encoding="utf-8")
+    done = run("view", tmp_path / "m.npz", "--fps", 0, code=2)
+    assert "fps (--fps): expected a positive number" in done.stderr
+
+
 def test_view_shows_several_results_together(tmp_path):
     for name in ("a.npz", "b.npz"):
         save(walk_result(4, name=name), tmp_path / name)

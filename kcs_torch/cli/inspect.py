@@ -14,6 +14,7 @@ from kcs_torch.cli.options import (
     AsJson,
     FormatName,
     ImageSize,
+    Rate,
     Threshold,
     TracksPath,
     Trust,
@@ -162,6 +163,7 @@ def view(
     scale: Scale = None,
     units: Units = None,
     from_up: FromUp = None,
+    fps: Rate = None,
 ) -> None:
     """Show results, and 3D motion: write a page with a 3D player, a sheet of key frames, a film."""
     with answer():
@@ -182,7 +184,7 @@ def view(
         people, notes = [], []
         for result in results:
             with progress(f"reading {result}"):
-                motion = _moving(result, mirror, from_up)
+                motion = _moving(result, mirror, from_up, fps)
             if isinstance(motion, Motion):
                 notes += [f"{result}: {note}" for note in motion.notes]
             people.append(motion if size is None else motion.scaled(**size))
@@ -196,13 +198,13 @@ def view(
         written.tell(notes)
 
 
-def _moving(path: Path, mirror: bool, up: str | None) -> Reconstruction | Motion:
+def _moving(path: Path, mirror: bool, up: str | None, fps: float | None) -> Reconstruction | Motion:
     """A result, or its mirror image; or motion, which has none."""
     from kcs_torch.errors import FormatError, OptionError
     from kcs_torch.io import load_any
     from kcs_torch.types import Reconstruction, Tracks
 
-    data = load_any(path, up=up)
+    data = load_any(path, up=up, fps=fps)
     if isinstance(data, Tracks):
         raise FormatError(f"{path}: expected a result or 3D motion, got 2D tracks: lift them first (kcs-torch lift)")
     if not mirror:

@@ -37,7 +37,7 @@ TracksPath = Annotated[
         show_default=False,
     ),
 ]
-Rate = Annotated[float | None, typer.Option(metavar="NUMBER", help="Frames a second; those of IN if not given.")]
+Rate = Annotated[float | None, typer.Option(metavar="NUMBER", help="Frames a second; those of the file if not given.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 FormatName = Annotated[
     str | None,

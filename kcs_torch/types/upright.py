@@ -31,7 +31,7 @@ _HEADSTAND = (
 
 _ASIDE = (
     f"{ABOVE} and beside it{{often}}, as if it bent. If {_Y_UP}. If it does not, either {_SWAPPED}, or the video is "
-    "stored turned: turn them. A picture tells which (kcs-torch info FILE -o joints.png)"
+    "stored turned: turn them. A picture tells which (kcs_torch.viewer.draw_tracks; kcs-torch info FILE -o joints.png)"
 )
 
 _LYING = (
