@@ -30,7 +30,7 @@ TIGHT, SLACK = 10.0, 0.003
 deviation where solutions are compared."""
 
 TOP, KEEP = 12, 4
-"""Starts that go on after the first stage and after the second."""
+"""Starts that go on after the first stages and after those that follow."""
 
 TIMES = 8
 """How often the best changes one bone's path at most."""
@@ -38,9 +38,8 @@ TIMES = 8
 ALIGNED = 32
 """Changes of one bone that are aligned anew: those that cost least as the body lies."""
 
-FEW, MANY = (8, TOP, KEEP), (4, 2, 1)
-"""For bodies of few bones and of many: changes that are settled each time, and how many of them go on after the first
-stage and after the second."""
+FEW, MANY = 8, 4
+"""Changes that are settled each time, for bodies of few bones and of many."""
 
 GAIN = 1.0
 """How much cheaper a solution has to be to count as better."""
@@ -61,7 +60,8 @@ class Assembly:
         bones: (B, 2), a tree of the joints.
         paths: of the bones, at these frames.
         corners: where bones meet whose angle may be kept.
-        stages: that settle starts whose bones are as good as constant.
+        stages: that settle starts whose bones are as good as constant: fewer starts go on after each of them. Coarse
+            ones lose that, and more so the more bones there are.
         value: (H,) of solutions; the lowest is best.
         descend: a search that settles starts by some of the stages.
     """
@@ -70,7 +70,7 @@ class Assembly:
     bones: Tensor
     paths: BonePaths
     corners: Corners
-    stages: tuple[Stage, ...]
+    stages: tuple[tuple[Stage, ...], ...]
     value: Callable[[Pose], Tensor]
     descend: Callable[[Pose, tuple[Stage, ...]], Search[Any, Any, Pose]]
 
@@ -83,11 +83,11 @@ class Assembly:
         """As :meth:`near`, with the combinations of paths that keep most angles beside it; for few bones."""
         pose = yield from self._settled(_joined(found, self._nearest(found)))
         exact = self._agreeing()
-        exact = yield from self.descend(exact[self.value(exact).argsort()[:TOP]], self.stages[-1:])
+        exact = yield from self.descend(exact[self.value(exact).argsort()[:TOP]], self.stages[-1][-1:])
         pose = _joined(pose, exact)
         return (yield from self._changed(pose[self.value(pose).argsort()[:KEEP]], FEW))
 
-    def _changed(self, pose: Pose, kept: tuple[int, int, int]) -> Search[Any, Any, Pose]:
+    def _changed(self, pose: Pose, count: int) -> Search[Any, Any, Pose]:
         """Solutions, best first, of which the best takes other paths of single bones while that makes it better."""
         for _ in range(TIMES):
             best, depth = self.value(pose)[0], self._changes(pose)
@@ -95,16 +95,16 @@ class Assembly:
                 break
             likely = self.value(self._placed(depth, pose.rotations[:1], 0)).argsort()[:ALIGNED]
             tried = self._placed(depth[likely], pose.rotations[:1], 2)
-            tried = yield from self._settled(tried[self.value(tried).argsort()[: kept[0]]], *kept[1:])
+            tried = yield from self._settled(tried[self.value(tried).argsort()[:count]])
             if not bool(self.value(tried)[0] < best - GAIN):
                 break
             pose = _joined(tried[:1], pose)
         return pose
 
-    def _settled(self, pose: Pose, top: int = TOP, keep: int = KEEP) -> Search[Any, Any, Pose]:
-        for stages, kept in ((self.stages[:1], top), (self.stages[1:2], keep), (self.stages[2:], keep)):
+    def _settled(self, pose: Pose) -> Search[Any, Any, Pose]:
+        for k, stages in enumerate(self.stages):
             pose = yield from self.descend(pose, stages)
-            pose = pose[self.value(pose).argsort()[:kept]]
+            pose = pose[self.value(pose).argsort()[: KEEP if k else TOP]]
         return pose
 
     def _placed(self, depth: Tensor, rotations: Tensor, num_steps: int = 10) -> Pose:

@@ -167,8 +167,9 @@ class MovingSearch:
     def _assembled(self, paths: BonePaths, pose: Pose, own: Tensor) -> Search[Descent, Pose, tuple[Pose, Tensor]]:
         """Solutions put together from paths that single bones can take, and which are the first guess's still."""
         mine, pose = pose.points[own], pose[self._value(pose).argsort()[:GIVEN]]
+        stages = (self.coarse[-1:], self.fine[:1], self.fine[1:]) if self.small else (self.fine[-1:],)
         assembly = Assembly(
-            self.few, self.bones, paths.at(self.pick), self.corners, (*self.coarse[-1:], *self.fine), self._value,
+            self.few, self.bones, paths.at(self.pick), self.corners, stages, self._value,
             lambda pose, stages: self._descended(pose, TIGHT, stages),
         )  # fmt: skip
         pose = yield from (assembly.searched(pose) if self.small else assembly.near(pose))
