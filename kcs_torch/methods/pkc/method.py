@@ -219,17 +219,19 @@ class PKC(Method):
             found = yield from self._ranked(body, moving)
         else:
             resizing = clip.many and not changing and size.range >= TRIED and (clip.detections or size.likely)
+            again = polished and clip.many and self._fills(body)  # signs are then looked over the second time
+            moves = 0 if again else self._moves
             compare = turned if compared and clip.many and not resizing else None  # both must be searched alike
             near = Asked(self._seems_near, clip.tracks, clip.points, clip.cameras, body)
-            found = yield from search(body, self._moves, self.steps, compare, near)
+            found = yield from search(body, moves, self.steps, compare, near)
             if near.told == SEEMS_NEAR:  # the rest is as under perspective
-                method = self.following()
+                method, moves = self.following(), 0
             if near.told and (near.told != SEEMS_FAR or not body.turns(found)):  # else signs were poor: ask again later
                 clip = replace(clip, notes=(*clip.notes, near.told))
             led = compared and body.is_odd(found) and body.turns(found)  # by the viewpoint's turn, not by the template
             if resizing and (size.sure or not led):
                 other = Body(skeleton, even.image, rate, clip.noise, feet, body.pace)
-                better = yield from resized(found, body, other, size, method._moves, self.steps)
+                better = yield from resized(found, body, other, size, moves, self.steps)
                 if better is not None:
                     changing, body, found = True, other, better
                     turned = self._turned(even, body.factor)
@@ -250,9 +252,10 @@ class PKC(Method):
         around = polished and body.turns(found, 0.0 if clip.many else FAR)
         if around or (polished and clip.many and not isinstance(self, _Followed)):
             rival = (yield from turned(body.is_odd(found))) if turned is not None and around else None
-            found = yield from self._polished(clip, body, found, rival)
-            if self.rounds and self.viewpoint != "moving":
+            if self._fills(body):
                 found, body = yield from self._filled(clip, body, found, rival)
+            else:
+                found = yield from self._polished(clip, body, found, rival)
         return from_hypotheses(
             found, body, clip.cameras, clip.notes, telling=clip.telling, alternatives=self.alternatives,
             detections=clip.detections, told=self.steps >= 10,
@@ -273,10 +276,15 @@ class PKC(Method):
             made = replace(made, points=with_lengths_held(clip.image, first.points, tracks.skeleton))
         return made
 
+    def _fills(self, body: Body) -> bool:
+        """Whether gaps are filled by a first solution, of which only the image is then used."""
+        return self.rounds > 0 and self.viewpoint != "moving" and bool(gaps_of(body.noise).any())
+
     def _filled(
         self, clip: Clip, body: Body, found: Hypotheses, rival: Tensor | None
     ) -> Search[Any, Any, tuple[Hypotheses, Body]]:
         """Hypotheses anew where joints are unseen here and there, and the body with its gaps filled in space."""
+        found = yield from body.polished(found, self.steps, rival, clip.telling)
         for again in range(FILLS):
             if found.image is None or (again and not body.sways(found)):
                 break
