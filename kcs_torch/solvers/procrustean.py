@@ -128,6 +128,7 @@ def procrustean(
     stages: Sequence[Stage] = COARSE + FINE,
     counts: Tensor | None = None,
     anchor: Tensor | float = 0.0,
+    held: Tensor | None = None,
 ) -> Pose:
     """Descend F from H starts at once, by L-BFGS in coordinates that whiten each frame's curvature.
 
@@ -143,7 +144,8 @@ def procrustean(
             leaves one unknown a joint; else there are three.
         stages: scales and weights, in order.
         counts: (H,) frames of each start, of clips that are padded with zeros to T; not with ``noise``. All if None.
-        anchor: (H,) or a number, weight of half the squared distance of each depth from its start.
+        anchor: (H,) or a number, weight of half the squared distance of each depth from its start, or from ``held``.
+        held: (H, T, N) depths, where those that are held are not the starts'.
 
     Returns:
         The :class:`Pose` of each start; of tracks in half precision, in single.
@@ -162,7 +164,7 @@ def procrustean(
     zero = points.new_zeros(hypotheses)
     pose = Pose(points, rotations, zero, zero)
     weight = torch.as_tensor(anchor, dtype=points.dtype, device=points.device).expand(hypotheses)
-    pull = (points[..., 2], weight) if isinstance(anchor, Tensor) or anchor > 0 else None
+    pull = (points[..., 2] if held is None else held, weight) if isinstance(anchor, Tensor) or anchor > 0 else None
     for stage in stages:
         pose = _descend(pose, tracks, bones, rigid, stiff, stage, share, noise, counts, pull)
     return pose

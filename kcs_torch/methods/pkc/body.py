@@ -26,7 +26,7 @@ from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.camera_path import choose_path, view_energy
 from kcs_torch.solvers.lm import fit_bones
-from kcs_torch.solvers.procrustean import COARSE, FINE, Stage, align_rotations
+from kcs_torch.solvers.procrustean import COARSE, FINE, Pose, Stage, align_rotations
 
 __all__ = ["LONG", "ONE", "POLISH", "TOLD", "TURNING", "Body", "agree"]
 
@@ -42,6 +42,9 @@ POLISH = (FINE[0], Stage(1e-5, 100, 0.01, 1.0, 0.003))
 
 CLOSE, RIVALS = 10.0, 3
 """By how much solutions may be dearer than the best to be polished as well, and how many of its own kind are."""
+
+BEHIND = 3.0
+"""By how much a rival is dearer before the last stage if it is to go no further: rivals seldom come nearer by 1."""
 
 HELD = 0.08
 """Standard deviation by which polishing may move a depth, for a body of 1.75, each joint in each frame by itself."""
@@ -246,7 +249,8 @@ class Body:
                 rivals = rivals.joined(replace(ranked, depth=other, energy=found.energy[0] + LEAD + dearer / LESS))
             elif bool(dearer[0] < CLOSE):
                 rivals = rivals.joined(replace(ranked, depth=other))
-        depth, image, value = yield from self.descended(rivals.depth, (COARSE[-1], *POLISH) if around else POLISH)
+        stages = (COARSE[-1], *POLISH) if around else POLISH
+        depth, image, value = yield from self.descended(rivals.depth, stages, rivals.energy)
         lengths = self.lengths(depth)
         best = (rivals.energy + value / ONE).argsort()[: len(pick)]
         return replace(
@@ -262,11 +266,12 @@ class Body:
         return Body(self.skeleton, image / self.factor, self.rate, noise / self.factor, self.objective.standing)
 
     def descended(
-        self, depth: Tensor, stages: tuple[Stage, ...]
+        self, depth: Tensor, stages: tuple[Stage, ...], energy: Tensor | None = None
     ) -> Search[Any, Any, tuple[Tensor, Tensor | None, Tensor]]:
         """Depths (H, T, N) after stages of the moving viewpoint's descent, in blocks of long clips, and its values.
 
-        Where joints are unseen here and there, their images (H, T, N, 2) as well.
+        Where joints are unseen here and there, their images (H, T, N, 2) as well. Rivals, which have an ``energy`` (H,)
+        beside these values, go through the last stage only if they still may win.
         """
         skeleton, bones, frames = self.skeleton, self.objective.bones, len(self.image)
         size = self.image.square().mean().sqrt()
@@ -287,7 +292,7 @@ class Body:
                 self.image[some] / size, points[:, some], turned[:, some], bones, weights, rigid,
                 TIGHT, level, soft, anchor,
             )  # fmt: skip
-            (pose,) = yield [one]
+            pose = yield from _raced(one, energy if len(starts) == 1 else None)
             depths.append(pose.points[..., 2].transpose(0, 1) * size)  # (T, H, N)
             if gaps:
                 images.append(pose.points[..., :2].transpose(0, 1).flatten(2) * size)
@@ -298,6 +303,22 @@ class Body:
         if gaps:
             image = blend_windows(torch.stack(images), starts, frames).transpose(0, 1).unflatten(2, (-1, 2))
         return depth - depth.mean(-1, keepdim=True), image, value
+
+
+def _raced(task: Descent, energy: Tensor | None) -> Search[Any, Any, Pose]:
+    """Starts after all stages, of rivals those that are dearer by far, by energy (H,) and value, without the last."""
+    if energy is None or len(energy) == 1:
+        (pose,) = yield [task]
+        return pose
+    (pose,) = yield [replace(task, stages=task.stages[:-1])]
+    cost = energy + pose.objective / ONE
+    near = (cost < cost.amin() + BEHIND).nonzero().flatten()
+    last = replace(task, points=pose.points[near], rotations=pose.rotations[near], held=task.points[near, ..., 2])
+    (best,) = yield [replace(last, stages=task.stages[-1:])]
+    more = (best.objective - pose.objective[near]).amax()  # with it the others stay behind
+    pose = replace(pose, objective=pose.objective + more)
+    parts = zip(vars(pose).values(), vars(best).values(), strict=True)
+    return Pose(*(values.index_copy(0, near, some) for values, some in parts))
 
 
 def alike(depth: Tensor, other: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ class Descent:
     noise: float
     stages: tuple[Stage, ...]
     anchor: float = 0.0
+    held: Tensor | None = None
 
     @property
     def kind(self) -> object:
@@ -72,12 +73,14 @@ def _descend(tasks: list[Descent]) -> list[Pose]:
         within = torch.tensor(frames).repeat_interleave(torch.tensor(counts)).to(last.points)
     anchor = torch.cat([task.points.new_full((len(task.points),), task.anchor) for task in tasks])
     held = torch.arange(frames[-1], device=last.points.device)
+    pulled = [task.points[..., 2] if task.held is None else task.held for task in tasks]
     padded = [torch.nn.functional.pad(task.points, (0, 0, 0, 0, 0, frames[-1] - len(task.tracks))) for task in tasks]
     turned = [task.rotations[:, held.clamp_max(len(task.tracks) - 1)] for task in tasks]
     pose = procrustean(
         last.tracks, torch.cat(padded), torch.cat(turned), last.bones, weights=last.weights, rigid=last.rigid,
         stiffness=last.stiffness, noise=last.noise, stages=last.stages, counts=within,
         anchor=anchor if last.anchor > 0 else 0.0,
+        held=torch.cat([torch.nn.functional.pad(z, (0, 0, 0, frames[-1] - z.shape[1])) for z in pulled]),
     )  # fmt: skip
     parts = (x.split(counts) for x in (pose.points, pose.rotations, pose.objective, pose.moved))
     return [
