@@ -44,7 +44,12 @@ KEPT = 4
 
 
 def search(
-    body: Body, rounds: int, steps: int, turned: Turned | None = None, near: Near | None = None
+    body: Body,
+    rounds: int,
+    steps: int,
+    turned: Turned | None = None,
+    near: Near | None = None,
+    again: bool = False,
 ) -> Search[Any, Any, Hypotheses]:
     """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best.
 
@@ -54,8 +59,10 @@ def search(
         steps: of each refinement.
         turned: tells depths where the viewpoint turns; hypotheses that agree with these are not looked over.
         near: asked of hypotheses of the liveliest block; where the camera is near none are looked over.
+        again: whether the search is made once more; then none are looked over but where the viewpoint turns, so that
+            its turn tells more by what signs are right.
     """
-    blocks = _Blocks(body, rounds, steps, turned, near)
+    blocks = _Blocks(body, rounds, steps, turned, near, again)
     whole = len(blocks.starts) == 1
     found = yield from (blocks.lifted(slice(None)) if whole else blocks.joined())
     if whole and blocks.stride == 1:
@@ -69,8 +76,11 @@ def search(
 class _Blocks:
     """The frames of a clip that are searched, and the blocks that they are divided into."""
 
-    def __init__(self, body: Body, rounds: int, steps: int, turned: Turned | None, near: Near | None) -> None:
+    def __init__(
+        self, body: Body, rounds: int, steps: int, turned: Turned | None, near: Near | None, again: bool
+    ) -> None:
         self.body, self.rounds, self.steps, self.turned, self.near = body, rounds, steps, turned, near
+        self.again = again
         self.stride = max(1, round(body.rate / 30)) if body.rate >= FAST else 1
         self.image = body.image[:: self.stride]
         self.size = min(BLOCK, len(self.image))
@@ -116,10 +126,11 @@ class _Blocks:
         if self.near is not None and first and self.near(frames, found):
             self.rounds = 0  # of the other blocks
             return True
-        if self.turned is None or self.body.is_odd(found):
-            return False
         depth = found.depth[0]
-        if float(viewpoint_turn(self.body.frames(depth, self.image[some])[:, :2])) < TURNING:
+        turn = float(viewpoint_turn(self.body.frames(depth, self.image[some])[:, :2]))
+        if self.again and turn < TURNING:
+            return True
+        if self.turned is None or self.body.is_odd(found) or turn < TURNING:
             return False
         other = (yield from self.turned(False))[:: self.stride][some]
         return agree(other, depth, AGREE)

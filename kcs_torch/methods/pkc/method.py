@@ -220,18 +220,17 @@ class PKC(Method):
         else:
             resizing = clip.many and not changing and size.range >= TRIED and (clip.detections or size.likely)
             again = polished and clip.many and self._fills(body)  # signs are then looked over the second time
-            moves = 0 if again else self._moves
             compare = turned if compared and clip.many and not resizing else None  # both must be searched alike
             near = Asked(self._seems_near, clip.tracks, clip.points, clip.cameras, body)
-            found = yield from search(body, moves, self.steps, compare, near)
+            found = yield from search(body, self._moves, self.steps, compare, near, again)
             if near.told == SEEMS_NEAR:  # the rest is as under perspective
-                method, moves = self.following(), 0
+                method = self.following()
             if near.told and (near.told != SEEMS_FAR or not body.turns(found)):  # else signs were poor: ask again later
                 clip = replace(clip, notes=(*clip.notes, near.told))
             led = compared and body.is_odd(found) and body.turns(found)  # by the viewpoint's turn, not by the template
             if resizing and (size.sure or not led):
                 other = Body(skeleton, even.image, rate, clip.noise, feet, body.pace)
-                better = yield from resized(found, body, other, size, moves, self.steps)
+                better = yield from resized(found, body, other, size, method._moves, self.steps, again)
                 if better is not None:
                     changing, body, found = True, other, better
                     turned = self._turned(even, body.factor)

@@ -27,7 +27,7 @@ it, for a new search to be made; and how many are."""
 
 
 def resized(
-    found: Hypotheses, body: Body, other: Body, size: Size, rounds: int, steps: int
+    found: Hypotheses, body: Body, other: Body, size: Size, rounds: int, steps: int, again: bool = False
 ) -> Search[Any, Any, Hypotheses | None]:
     """Hypotheses of a body whose size in the image changes, if they explain the tracks better; else None.
 
@@ -40,6 +40,7 @@ def resized(
         size: over time.
         rounds: of discrete moves of a new search.
         steps: of each refinement.
+        again: whether the new search, as the one before, is made once more.
     """
     even = torch.ones_like(size.path)
     # Energies compare as those of the tracks themselves, in which both images have one size.
@@ -52,7 +53,7 @@ def resized(
         tried = yield from refined(other.objective, start, steps)
         if not bool(tried.energy[0] < before - HOPEFUL):
             return None
-    new = yield from search(other, rounds, steps)
+    new = yield from search(other, rounds, steps, again=again)
     return new if bool(new.energy[0] < before - BETTER) else None
 
 
