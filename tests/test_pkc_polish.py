@@ -208,8 +208,41 @@ def test_polish_takes_nothing_that_the_template_rules_out(turning, monkeypatch):
     for other, count in ((near, 2), (-near, 2), (wrong, 1), (None, 1)):
         asked.clear()
         polished = run(body.polished(found, 30, other), answer)
-        assert [len(one.points) for one in asked] == [count]
+        assert len(asked[0].points) == count
         assert_close(polished.depth[0], depth, rtol=0, atol=0.05)
+
+
+def test_rivals_that_are_dearer_by_far_go_no_further(turning):
+    """And what goes on is as it was when all went through the last stage."""
+    clip, _ = turning
+    points = centred(clip.tracks.points) / centred(clip.tracks.points).square().mean().sqrt()
+    body = Body(clip.skeleton, points, 30.0, torch.zeros_like(clip.tracks.weights))
+    depth = centred(clip.points)[..., 2] / centred(clip.points)[..., :2].square().mean().sqrt() * body.factor
+    wrong = depth + 0.1 * torch.sin(torch.arange(len(depth)).double() / 5)[:, None] * normal(depth.shape[1])
+    rows = []
+
+    def answer(requests):
+        rows.append(len(requests[0].points))
+        return serve(requests)
+
+    for other, dearer, counts in ((depth, 0.0, [2, 2]), (wrong, 100.0, [2, 1])):
+        rows.clear()
+        both = torch.stack([depth, other])
+        found, _, value = run(body.descended(both, body_module.POLISH, torch.tensor([0.0, dearer])), answer)
+        whole, _, last = run(body.descended(both, body_module.POLISH), serve)
+        assert rows == counts
+        assert_close(found[0], whole[0], rtol=0, atol=1e-6)
+        assert_close(value[0], last[0], rtol=1e-6, atol=0)
+        assert value[1] >= value[0]
+
+
+@pytest.mark.parametrize(("turn", "less"), [(0.0, True), (120.0, False)])
+def test_a_first_search_for_gaps_looks_over_no_signs_but_where_the_viewpoint_turns(turn, less):
+    clip = walking_person(60, turn=turn, yaw=40.0)
+    image = centred(clip.tracks.points) / centred(clip.tracks.points).square().mean().sqrt()
+    body = Body(clip.skeleton, image, 30.0, torch.zeros_like(clip.tracks.weights))
+    first, whole = (run(search(body, 1, 10, again=again), serve) for again in (True, False))
+    assert (first.steps < whole.steps) == less
 
 
 def test_a_template_of_another_body_rules_little_out(turning):

@@ -14,7 +14,7 @@ from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import blend_windows, fill_between, window_starts
 from kcs_torch.methods.clips.lockstep import Search, together
-from kcs_torch.methods.pkc.body import TURNING, Body, agree
+from kcs_torch.methods.pkc.body import LITTLE, TURNING, Body, agree
 from kcs_torch.methods.pkc.fixed_view import searching
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 
@@ -59,8 +59,8 @@ def search(
         steps: of each refinement.
         turned: tells depths where the viewpoint turns; hypotheses that agree with these are not looked over.
         near: asked of hypotheses of the liveliest block; where the camera is near none are looked over.
-        again: whether the search is made once more; then none are looked over but where the viewpoint turns, so that
-            its turn tells more by what signs are right.
+        again: whether the search is made once more, of an image whose gaps what is found fills. Signs hardly matter to
+            that but where the viewpoint turns: elsewhere none are looked over.
     """
     blocks = _Blocks(body, rounds, steps, turned, near, again)
     whole = len(blocks.starts) == 1
@@ -128,7 +128,7 @@ class _Blocks:
             return True
         depth = found.depth[0]
         turn = float(viewpoint_turn(self.body.frames(depth, self.image[some])[:, :2]))
-        if self.again and turn < TURNING:
+        if self.again and turn < LITTLE:
             return True
         if self.turned is None or self.body.is_odd(found) or turn < TURNING:
             return False

@@ -28,7 +28,7 @@ from kcs_torch.solvers.camera_path import choose_path, view_energy
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.procrustean import COARSE, FINE, Pose, Stage, align_rotations
 
-__all__ = ["LONG", "ONE", "POLISH", "TOLD", "TURNING", "Body", "agree"]
+__all__ = ["LITTLE", "LONG", "ONE", "POLISH", "TOLD", "TURNING", "Body", "agree"]
 
 HOLD, DAMPING = 10, 2.0
 """Levenberg-Marquardt steps that make bones constant, and their damping: undamped, a bone that is short beside what its
