@@ -44,6 +44,21 @@ def test_takes_tracks_and_results():
     assert body.joints == tuple("abcdef") and body.num_bones == 5
 
 
+@pytest.mark.parametrize("joints", [2, 3, 6, 12])
+def test_points_that_are_no_body_have_no_bones(joints):
+    """Links pull them together, as any depths can be; SfAM's depths show that nothing keeps its distance."""
+    draw = torch.Generator().manual_seed(0)
+    speed, width = (
+        1 + 3 * torch.rand(joints, 2, 4, generator=draw).double(),
+        torch.randn(joints, 2, 4, generator=draw).double(),
+    )
+    time = torch.linspace(0, 6.0, 80).double()[:, None, None, None]
+    tracks = Tracks.from_arrays((width * (speed * time + 3 * width).sin()).sum(-1))
+    with pytest.warns(KcsWarning, match="no two joints keep their distance"):
+        body = find_skeleton(tracks)
+    assert len(body.flexible) == joints - 1
+
+
 def test_noisy_tracks_show_their_bones():
     """Those that SfAM's depths show are half of them wrong, and depths three times as far off."""
     clip = walking_person(60, turn=150.0)

@@ -75,7 +75,7 @@ MOCAP = ["Hips", "Spine", "Neck", "Head", *(f"{s}{p}" for s in ("Left", "Right")
     ],
     ids=[
         "mediapipe's hands on COCO's body",
-        "and on its own",
+        "mediapipe's hands on its own body",
         "with wrists of their own",
         "numbered",
         "motion capture",

@@ -1,10 +1,11 @@
 """PKC: solutions that are polished, gaps that are filled in space, and joints never seen."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
-from numerics import normal
+from numerics import CHAIN, normal
 from pkc_walks import NAN, centred, error
 from torch.testing import assert_close
 
@@ -20,6 +21,7 @@ from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.gaps import gaps_of, usual_noise
 from kcs_torch.methods.pkc.hypotheses import Hypotheses
+from kcs_torch.solvers.procrustean import Pose
 
 # Many tests take few steps, after which nothing has settled.
 pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")
@@ -234,6 +236,29 @@ def test_rivals_that_are_dearer_by_far_go_no_further(turning):
         assert_close(found[0], whole[0], rtol=0, atol=1e-6)
         assert_close(value[0], last[0], rtol=1e-6, atol=0)
         assert value[1] >= value[0]
+
+
+def test_rivals_that_stay_behind_stay_so():
+    """By the value, too, of which the last stage's scales make more: nor do costs that are not finite stop it."""
+    points, behind = normal(5, 4, 3), 2 * body_module.BEHIND * body_module.ONE
+    asked = []
+
+    def answer(requests):
+        (one,) = requests
+        asked.append(len(one.points))
+        value = torch.tensor([100.0, 100.0 + behind] if len(asked) == 1 else [500.0] * asked[-1]).double()
+        return [Pose(one.points, one.rotations, value, torch.zeros_like(value))]
+
+    task = Descent(
+        points[..., :2], points.expand(2, -1, -1, -1), torch.eye(3).double().expand(2, 5, 3, 3), CHAIN.bone_index(),
+        None, CHAIN.bone_index(), 1.0, 0.0, body_module.POLISH,
+    )  # fmt: skip
+    for energy in ([0.0, 0.0], [math.inf, math.inf], [math.nan, 0.0]):
+        asked.clear()
+        pose = run(body_module._raced(task, torch.tensor(energy).double()), answer)
+        assert asked == [2, 1]
+        if energy == [0.0, 0.0]:
+            assert pose.objective.tolist() == [500.0, 500.0 + behind]
 
 
 @pytest.mark.parametrize(("turn", "less"), [(0.0, True), (120.0, False)])

@@ -131,6 +131,7 @@ def _resolve(part: str, side: str, present: set[str]) -> str:
         "arm": "shoulder",
         "humerus": "elbow",  # bones named by their far end
         "radius": "wrist",
+        "handwrist": "handwrist" if present & {"wrist", "radius"} else "wrist",
         "hand": "wrist" if present & {"fingers", "forepaw"} else "forepaw",
         "fingers": "forepaw",
         "hipjoint": "hip",

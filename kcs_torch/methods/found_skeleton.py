@@ -14,6 +14,7 @@ from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.methods.pkc import PKC
+from kcs_torch.methods.pkc.clip import LEAST_JOINTS
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.core import FOUND
@@ -40,13 +41,15 @@ def find_skeleton(
     Args:
         source: tracks (which are lifted first: by :class:`SfAM`, then by :class:`PKC` with links between the steadiest
             joints there), a reconstruction, or points (T, N, 3).
-        weights: (T, N), 0 where unseen; those of the tracks if None.
+        weights: (T, N), 0 where unseen; those of the tracks if None. Tracks are lifted by their own.
         joints: their names, for points; those of the tracks' skeleton otherwise.
         rigid_below: a bone whose length varies by more than this share (standard deviation over mean) is flexible, and
             so is one whose ends are never seen together.
 
     Returns:
         A skeleton named "found" with ``proportions``, the median lengths; its bones run away from the first joint.
+        Bones of that name count as chosen from the very tracks that they are used for, so that their constant length
+        makes no depth surer: give the skeleton another name if they were found elsewhere, in motion capture say.
 
     Raises:
         ShapeError: there are no two joints, points that are not finite (T, N, 3), or no tensor of them.
@@ -65,13 +68,18 @@ def find_skeleton(
     """
     if not rigid_below >= 0:
         raise OptionError(f"find_skeleton: rigid_below: expected a share >= 0, got {rigid_below}")
+    unsure = False
+    if isinstance(source, Tracks):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", KcsWarning)  # of depths that nobody sees
+            source, unsure = _lifted(source, rigid_below)
     points, weights, joints = _given(source, weights, joints)
     cost, ratio, apart = _variation(points, weights)
     bones = rigid_tree(cost)
     size = bone_lengths(points, bones)
     lengths = median(size, 0)
     ends = bones.unbind(-1)
-    loose = (ratio[ends] > rigid_below) | apart[ends]
+    loose = (ratio[ends] > rigid_below) | apart[ends] | unsure
     flexible = tuple(loose.nonzero().flatten().tolist())
     sway = bone_vectors(points, bones).std(0, correction=0).norm(dim=-1)
     _warn(len(flexible) == len(bones), len(bones) > 1 and bool((sway <= rigid_below * lengths).all()), rigid_below)
@@ -85,13 +93,9 @@ def find_skeleton(
 
 
 def _given(
-    source: Tracks | Reconstruction | Tensor, weights: Tensor | None, joints: Sequence[str] | None
+    source: Reconstruction | Tensor, weights: Tensor | None, joints: Sequence[str] | None
 ) -> tuple[Tensor, Tensor | None, Sequence[str] | None]:
     """Points (T, N, 3), weights (T, N) and the joints' names, checked."""
-    if isinstance(source, Tracks):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", KcsWarning)  # of depths that nobody sees
-            source = _lifted(source)
     if isinstance(source, Reconstruction):
         weights = source.tracks.weights if weights is None else weights
         joints = source.tracks.skeleton.joints if joints is None else joints
@@ -111,23 +115,28 @@ def _given(
     return source, weights, joints
 
 
-def _lifted(tracks: Tracks) -> Reconstruction:
-    """Tracks in space, of a body of which nothing is known.
+def _lifted(tracks: Tracks, rigid_below: float) -> tuple[Reconstruction, bool]:
+    """Tracks in space, of a body of which nothing is known, and whether nothing says that joints keep their distance.
 
     SfAM alone is off by so much that a good part of the bones in its depths are wrong. PKC corrects it by links between
-    many pairs, which are pulled weakly: what varies nonetheless is no bone.
+    many pairs, which are pulled weakly: what varies nonetheless is no bone. Links pull together what is no body, too:
+    then no joints keep their distance in SfAM's depths, and PKC's are in doubt.
     """
-    cost, *_ = _variation(SfAM()(tracks).points, tracks.weights)
+    first = SfAM()(tracks)
+    if tracks.num_joints < LEAST_JOINTS:  # links would hold any depths
+        return first, False
+    cost, ratio, _ = _variation(first.points, tracks.weights)
     pairs = torch.triu_indices(len(cost), len(cost), 1, device=cost.device)
     least = pairs[:, cost[tuple(pairs)].argsort(stable=True)[: LINKS * len(cost)]]
     links = torch.cat([rigid_tree(cost).sort(-1).values, least.mT]).unique(dim=0)
     joints = tracks.skeleton.joints
     body = Skeleton(joints=joints, bones=tuple((int(a), int(b)) for a, b in links), name="links", tree=False)
-    return PKC()(replace(tracks, skeleton=body))
+    found = PKC()(replace(tracks, skeleton=body))
+    return found, bool(found.diagnostics.doubt) and bool((ratio[tuple(pairs)] > rigid_below).all())
 
 
 def _variation(points: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """What each pair of joints costs as a bone, by what share its length varies, and whether it is never seen, (N, N).
+    """What pairs of joints cost as bones, by what share their lengths vary, and which are never seen together, (N, N).
 
     Between equally rigid pairs, those of a body at rest say, the shorter is the likelier bone. What was never seen
     together is joined last, and nobody knows how far apart it is.

@@ -16,7 +16,7 @@ _COLUMN = (*_SPINE, "neck", "neck1", "upperneck", "neck2", "head", "headtop")
 """From below; each hangs on the next lower one that there is."""
 
 _NECK = ("neck2", "upperneck", "neck1", "neck", "thorax")
-_SHIN, _PALM, _FACE = ("ankle", "knee", "hip"), ("hand", "wrist", "elbow"), ("nose", "head", *_NECK)
+_SHIN, _PALM, _FACE = ("ankle", "knee", "hip"), ("hand", "handwrist", "wrist", "elbow"), ("nose", "head", *_NECK)
 _WRIST = ("handwrist", "wrist", "hand", "elbow")
 _ABOVE: dict[str, tuple[str, ...]] = {
     "nose": _NECK,

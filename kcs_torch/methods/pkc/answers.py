@@ -51,8 +51,8 @@ NEAREST = 0.02
 """Share of the frames in which a bone may be nearer to the image plane than where it counts as nearest."""
 
 LEVEL = 0.4
-"""Share of noise and length whose geometric mean noise takes the depth of a bone in the image plane for: the square of
-its image is off by twice its length times the noise, and that is the square of a depth. Neighbours make good most."""
+"""A bone in the image plane is as unsure in depth as the root of this share of noise times length: noise adds twice
+that product at most to the square of its depth, of which neighbours make good the most."""
 
 POSTURE, STRANGE = 0.167, 1.5
 """Energy of usual postures, for each bone and frame that counts, and the power of a larger one that deviations go with:
@@ -72,8 +72,7 @@ as shorter clips are taken to be noisy, which says as much; and degrees of a tur
 
 RIVAL, COLD, HOT = 0.5, 6.0, 35.0
 """Odds of another solution that is no worse, objective by which they fall to a third, and the same of a detector's
-joints, whose errors last, so that frames tell less than the objective takes them to: of 200 such solutions of simulated
-detections every third was nearer to the truth, be it worse by 2 or by 20."""
+joints, whose errors last, so that frames tell less than the objective takes them to."""
 
 NEAR = 0.016
 """Standard deviation of a detector's joint, a standing person being about 1.75 tall, beyond what the objective allows
@@ -111,7 +110,7 @@ def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: floa
     odd = max(1.0, objective.oddity(lengths) / ODDITY)
     trunk = posture.frame(points).square().mean(0)
     aside, tilt = float(trunk[0, 2]), float(trunk[2, 1])  # of forward across, of upright towards
-    blur = float(objective.noise.median() / lengths.mean().clamp_min(1e-9))
+    blur = objective.usual_noise / max(float(lengths.mean()), 1e-9)
     view = FRONT**2 / (1 + aside / (ASIDE**2 + BLURRED * blur)) + SIDE**2 + TILT**2 * tilt / max(1 - tilt, 1 - STEEP**2)
     told = 1 / view + (odd * turn / TURN) ** (2 * POWER)
     frames = len(depth)

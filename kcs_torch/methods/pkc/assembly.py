@@ -30,7 +30,7 @@ TIGHT, SLACK = 10.0, 0.003
 deviation where solutions are compared."""
 
 TOP, KEEP = 12, 4
-"""Starts that go on after the first stages and after those that follow."""
+"""Starts that are kept after the first group of stages and after those that follow."""
 
 TIMES = 8
 """How often the best changes one bone's path at most."""
@@ -60,8 +60,8 @@ class Assembly:
         bones: (B, 2), a tree of the joints.
         paths: of the bones, at these frames.
         corners: where bones meet whose angle may be kept.
-        stages: that settle starts whose bones are as good as constant: fewer starts go on after each of them. Coarse
-            ones lose that, and more so the more bones there are.
+        stages: groups of stages that settle starts whose bones are as good as constant; only the best go on after each.
+            Coarse ones lose that, and more so the more bones there are.
         value: (H,) of solutions; the lowest is best.
         descend: a search that settles starts by some of the stages.
     """

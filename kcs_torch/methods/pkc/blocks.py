@@ -60,7 +60,7 @@ def search(
         turned: tells depths where the viewpoint turns; hypotheses that agree with these are not looked over.
         near: asked of hypotheses of the liveliest block; where the camera is near none are looked over.
         again: whether the search is made once more, of an image whose gaps what is found fills. Signs hardly matter to
-            that but where the viewpoint turns: elsewhere none are looked over.
+            that but where the viewpoint turns: in clips of one block that turn little none are looked over.
     """
     blocks = _Blocks(body, rounds, steps, turned, near, again)
     whole = len(blocks.starts) == 1
@@ -128,7 +128,7 @@ class _Blocks:
             return True
         depth = found.depth[0]
         turn = float(viewpoint_turn(self.body.frames(depth, self.image[some])[:, :2]))
-        if self.again and turn < LITTLE:
+        if self.again and len(self.starts) == 1 and turn < LITTLE:
             return True
         if self.turned is None or self.body.is_odd(found) or turn < TURNING:
             return False

@@ -63,7 +63,8 @@ TURNING = 60.0
 
 ODD, LITTLE = 0.115, 30.0
 """Root mean square, of the logarithm, by which lengths stray from the template's where it is of another body: people
-stray by .07 to .11. The viewpoint's turn tells depth better than such a template from so many degrees on."""
+stray by .07 to .11. The viewpoint's turn tells depth better than such a template from so many degrees on; below, signs
+hardly change where an unseen joint is in the image."""
 
 LEAD, LESS = 10.0, 3.0
 """By how much what was found without a template of another body must be better, and how much less that one counts."""
@@ -232,7 +233,8 @@ class Body:
         itself. Before a viewpoint that turns, aligned bones tell depth better than the template does, and together with
         it which of close rivals is best; ``other`` depths (T, N), or their mirror image, are a rival then, too, if they
         come as near in ``steps`` on the objective, and before ``cameras`` (T, 3, 3) that hypotheses were ranked by.
-        Energies stay those before, in their order.
+        Those that are dearer by far before the last stage are not refined by it. Energies stay those before, in their
+        order.
         """
         around = self.turns(found)
         close = (found.energy - found.energy[0] < CLOSE) & ((found.depth * found.depth[0]).sum((1, 2)) > 0)
@@ -306,13 +308,15 @@ class Body:
 
 
 def _raced(task: Descent, energy: Tensor | None) -> Search[Any, Any, Pose]:
-    """Starts after all stages, of rivals those that are dearer by far, by energy (H,) and value, without the last."""
+    """Starts after all stages; rivals that are dearer by far, by energy (H,) and value, go without the last."""
     if energy is None or len(energy) == 1:
         (pose,) = yield [task]
         return pose
     (pose,) = yield [replace(task, stages=task.stages[:-1])]
     cost = energy + pose.objective / ONE
-    near = (cost < cost.amin() + BEHIND).nonzero().flatten()
+    near = cost < cost.amin() + BEHIND
+    near[cost.argmin()] = True  # also of costs that are not finite
+    near = near.nonzero().flatten()
     last = replace(task, points=pose.points[near], rotations=pose.rotations[near], held=task.points[near, ..., 2])
     (best,) = yield [replace(last, stages=task.stages[-1:])]
     more = (best.objective - pose.objective[near]).amax()  # with it the others stay behind

@@ -88,7 +88,8 @@ class Objective:
         quiet = self.noise.amin(0)
         usual = quiet.amin()
         never = quiet > NEVER * usual  # bones of joints that no frame shows
-        self.weights = in_noise(weights, float(self.noise[:, ~never].median())) if self.noisy else weights
+        self.usual_noise = float(self.noise[:, ~never].median())
+        self.weights = in_noise(weights, self.usual_noise) if self.noisy else weights
         make = lambda module: module.to(image)  # noqa: E731
         plain = usual_posture(skeleton, image.dtype, image.device)
         blur = BLUR * median(self.noise, 0) / plain.rest_lengths.clamp_min(SHORT)
