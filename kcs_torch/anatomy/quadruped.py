@@ -131,7 +131,6 @@ def _resolve(part: str, side: str, present: set[str]) -> str:
         "arm": "shoulder",
         "humerus": "elbow",  # bones named by their far end
         "radius": "wrist",
-        "handwrist": "handwrist" if present & {"wrist", "radius"} else "wrist",
         "hand": "wrist" if present & {"fingers", "forepaw"} else "forepaw",
         "fingers": "forepaw",
         "hipjoint": "hip",

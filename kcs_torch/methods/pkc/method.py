@@ -282,7 +282,10 @@ class PKC(Method):
     def _filled(
         self, clip: Clip, body: Body, found: Hypotheses, rival: Tensor | None
     ) -> Search[Any, Any, tuple[Hypotheses, Body]]:
-        """Hypotheses anew where joints are unseen here and there, and the body with its gaps filled in space."""
+        """Hypotheses anew where joints are unseen here and there, and the body with its gaps filled in space.
+
+        The first time they are only polished: what the viewpoint's turn tells of signs is left to the second.
+        """
         found = yield from body.polished(found, self.steps, rival, clip.telling)
         for again in range(FILLS):
             if found.image is None or (again and not body.sways(found)):
