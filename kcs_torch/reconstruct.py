@@ -52,6 +52,7 @@ def reconstruct(
     confidence: Any = None,
     fps: float | None = None,
     units: str | None = None,
+    image_size: tuple[int, int] | None = None,
     cameras: Any = None,
     intrinsics: Any = None,
     **fields: Any,
@@ -66,6 +67,8 @@ def reconstruct(
         confidence: for arrays: (T, N) in 0..1.
         fps: for arrays: frames per second.
         units: for arrays; px if None.
+        image_size: for arrays: width and height of the image in pixels, by which the lens of a near camera is known
+            roughly.
         cameras: (T, 2, 3) camera rows, world to camera, where they are known.
         intrinsics: (fx, fy, cx, cy) or a matrix K (3, 3) in the unit of the tracks, where it is known. Perspective is
             then taken into account, and ``result.in_space()`` lies before the camera and projects onto the tracks.
@@ -104,13 +107,15 @@ def reconstruct(
     if find:
         skeleton = None
     if isinstance(tracks, Tracks):
-        if any(option is not None for option in (skeleton, confidence, fps, units)):
+        if any(option is not None for option in (skeleton, confidence, fps, units, image_size)):
             raise OptionError(
-                "reconstruct: skeleton, confidence, fps and units belong to arrays; these tracks already have them: "
-                "give them where tracks are made (load_tracks, Tracks.from_arrays)"
+                "reconstruct: skeleton, confidence, fps, units and image_size belong to arrays; these tracks already "
+                "have them: give them where tracks are made (load_tracks, Tracks.from_arrays)"
             )
     else:
-        tracks = Tracks.from_arrays(tracks, confidence, skeleton=skeleton, fps=fps, units=units or "px")
+        tracks = Tracks.from_arrays(
+            tracks, confidence, skeleton=skeleton, fps=fps, units=units or "px", image_size=image_size
+        )
         if units is None and not isinstance(lens, Intrinsics) and _within_one(tracks):
             warnings.warn(f"{tracks.source}: {MAY_BE_SHARES}", KcsWarning, stacklevel=users_level())
     if find:

@@ -14,7 +14,7 @@ from kcs_torch.io.registry import Options, Probe, Reader, brief, check_fps, disc
 from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
-from kcs_torch.types.intake import as_number
+from kcs_torch.types.intake import as_image_size, as_number
 from kcs_torch.types.people import tell_apart
 
 __all__ = [
@@ -157,8 +157,8 @@ def check_reading(
     if least is None or not 0 <= least <= 1:
         raise OptionError(f"threshold: expected a number from 0 to 1, got {threshold!r}")
     check_fps(fps)
-    size = None if image_size is None else _size(image_size)
-    return Options(None if skeleton is None else get_skeleton(skeleton), fps, threshold, size, trust)
+    body = None if skeleton is None else get_skeleton(skeleton)
+    return Options(body, fps, threshold, as_image_size(image_size), trust)
 
 
 def check_person(path: str | Path, person: int, count: int) -> int:
@@ -171,19 +171,6 @@ def check_person(path: str | Path, person: int, count: int) -> int:
         return person
     there = "0, as there is one person" if count == 1 else f"0 to {count - 1}, as there are {count} people"
     raise FormatError(f"{path}: person: expected {there}, got {person}")
-
-
-def _size(size: tuple[int, int]) -> tuple[int, int]:
-    """Width and height, checked."""
-    try:
-        width, height = (int(side) for side in size)
-        if (width, height) == tuple(size) and min(width, height) > 0 and max(width, height) <= 10**6:
-            return width, height
-    except (TypeError, ValueError, OverflowError):
-        pass
-    raise OptionError(
-        f"image_size: expected width and height of the video in pixels, such as (1920, 1080), got {size!r}"
-    )
 
 
 def _amount_seen(tracks: Tracks) -> float:

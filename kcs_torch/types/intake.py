@@ -21,6 +21,7 @@ __all__ = [
     "RATES",
     "Intake",
     "as_floats",
+    "as_image_size",
     "as_number",
     "as_weights",
     "at_one_point",
@@ -36,6 +37,9 @@ STRAY = 1e12
 
 WITHIN = 0.9
 """Share of the joints beyond (0, 0) from which on this is the image's corner."""
+
+LARGEST = 10**6
+"""Pixels of an image's side, at most."""
 
 RATES = 1e-6, 1e6
 """Frames a second, lowest and highest: a frame in eleven days, and a million a second."""
@@ -76,6 +80,25 @@ def as_number(value: Any) -> float | None:
         return float(value) if isinstance(value, Real) else None
     except OverflowError:
         return None
+
+
+def as_image_size(value: Any) -> tuple[int, int] | None:
+    """Width and height of an image in pixels, checked; None is unknown.
+
+    Raises:
+        OptionError: it is something else.
+    """
+    if value is None:
+        return None
+    try:
+        width, height = (int(side) for side in value)
+        if (width, height) == tuple(value) and min(width, height) > 0 and max(width, height) <= LARGEST:
+            return width, height
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise OptionError(
+        f"image_size: expected width and height of the video in pixels, such as (1920, 1080), got {value!r}"
+    )
 
 
 def at_the_corner(points: Tensor, seen: Tensor, notes: list[str], *, alone: bool = False) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcs_torch.errors import counted
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.bodies import no_bones
-from kcs_torch.types.intake import take_in
+from kcs_torch.types.intake import as_image_size, take_in
 from kcs_torch.types.size import short_unit
 from kcs_torch.types.trajectories import Trajectories
 
@@ -32,11 +32,14 @@ class Tracks(Trajectories):
         source: where the tracks come from (a file name), for messages.
         notes: what was changed or assumed on the way in, one sentence each.
         detector: whether a detector found the joints, so that errors last for many frames; None where nobody said so.
+        image_size: width and height of the image in pixels, or None where unknown. A camera that nobody has calibrated
+            looks at its middle, and its focal length is likely to be about as long as its longer side.
     """
 
     units: str = "px"
     source: str = "tracks"
     detector: bool | None = None
+    image_size: tuple[int, int] | None = None
 
     @property
     def rate(self) -> float:
@@ -55,6 +58,7 @@ class Tracks(Trajectories):
         fps: float | None = None,
         units: str = "px",
         threshold: float = 0.3,
+        image_size: tuple[int, int] | None = None,
         source: str = "tracks",
         notes: Sequence[str] = (),
     ) -> Tracks:
@@ -77,12 +81,13 @@ class Tracks(Trajectories):
             fps: frames per second; NaN and None mean unknown.
             units: of the points.
             threshold: a joint with less confidence counts as unseen.
+            image_size: width and height of the image in pixels, where points are pixels of it.
             source: for messages.
             notes: sentences to carry along.
 
         Raises:
             ShapeError: wrong shapes, infinite values, negative confidences, nothing seen at all.
-            OptionError: the threshold is no confidence.
+            OptionError: the threshold is no confidence, or the image's size is none.
             SkeletonError: the joint count does not fit the skeleton (the message says which one it fits).
         """
         taken = take_in(
@@ -102,7 +107,8 @@ class Tracks(Trajectories):
             remarks.append(no_bones(body))
         xy, weights = body.complete(taken.points, taken.weights)
         remarks += unseen_notes(weights, body)
-        return cls(xy, weights, body, taken.fps, short_unit(units), source, tuple(remarks))
+        size = as_image_size(image_size)
+        return cls(xy, weights, body, taken.fps, short_unit(units), source, tuple(remarks), image_size=size)
 
     def frames(self, start: int, stop: int, step: int = 1) -> Self:
         """A run of frames, with notes on what they do not show; with a step, every so many, at the slower rate."""
