@@ -53,6 +53,26 @@ def test_dtypes(given, kept):
     assert tracks.to(torch.float32).points.dtype == tracks.to(torch.float32).weights.dtype == torch.float32
 
 
+def test_the_image_has_a_size_where_somebody_says_it():
+    assert Tracks.from_arrays(grid(), skeleton="h36m17").image_size is None
+    for size in ((1920, 1080), [1920.0, 1080], np.array([1920, 1080]), torch.tensor([1920, 1080])):
+        tracks = Tracks.from_arrays(grid(), skeleton="h36m17", image_size=size)
+        assert tracks.image_size == (1920, 1080) == tracks.frames(1, 3).to(torch.float32).image_size
+        assert all(type(side) is int for side in tracks.image_size)
+
+
+def test_an_image_that_most_joints_lie_outside_is_none():
+    points = torch.rand(4, 17, 2, generator=torch.manual_seed(1)) * torch.tensor([1000, 500])
+    for shift, size in ((0, (1000, 500)), (-200, (1000, 500)), (-800, None), (800, None)):
+        moved = points + torch.tensor([shift, 0])
+        tracks = Tracks.from_arrays(moved, skeleton="h36m17", image_size=(1000, 500))
+        assert tracks.image_size == size
+        assert any("most joints lie outside an image of 1000 x 500" in note for note in tracks.notes) == (size is None)
+    far = torch.where(torch.arange(17)[:, None] < 5, points, 4000.0)
+    unseen = (torch.arange(17) < 5).float().expand(4, 17)  # and so they do not count
+    assert Tracks.from_arrays(far, unseen, skeleton="h36m17", image_size=(1000, 500)).image_size == (1000, 500)
+
+
 def test_arguments_are_left_alone():
     points, confidence = with_value(grid(), (1, 2), NAN), torch.full((4, 17), 0.2, dtype=torch.float64)
     confidence[0] = 1

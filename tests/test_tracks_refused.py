@@ -109,6 +109,19 @@ def test_bad_threshold(threshold):
         Tracks.from_arrays(grid(), ONES, threshold=threshold)
 
 
+@pytest.mark.parametrize(
+    "size", [(0, 1080), (-1920, 1080), (1920.5, 1080), (True, True), "1920x1080", (1920,), (1, 2, 3), (NAN, INF), 1920]
+)
+def test_bad_image_size(size):
+    with pytest.raises(OptionError, match=r"image_size: expected width and height .*such as \(1920, 1080\), got"):
+        Tracks.from_arrays(grid(), image_size=size)
+
+
+def test_millimetres_are_of_no_image():
+    with pytest.raises(OptionError, match=r"image_size: expected tracks in pixels of the image, got units 'mm'"):
+        Tracks.from_arrays(grid(), units="mm", image_size=(1920, 1080))
+
+
 def test_joint_count_that_fits_another_skeleton_says_which():
     with pytest.raises(SkeletonError) as caught:
         Tracks.from_arrays(grid(), skeleton="body25", source="clip")

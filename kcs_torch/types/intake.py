@@ -27,7 +27,9 @@ __all__ = [
     "at_one_point",
     "at_the_corner",
     "check_places",
+    "mostly_outside",
     "take_in",
+    "told_image_size",
 ]
 
 FARTHEST = 1e30  # of coordinates: their sums are finite in single precision, in which pages are written
@@ -88,17 +90,32 @@ def as_image_size(value: Any) -> tuple[int, int] | None:
     Raises:
         OptionError: it is something else.
     """
-    if value is None:
-        return None
+    size = told_image_size(value)
+    if value is not None and size is None:
+        raise OptionError(
+            f"image_size: expected width and height of the video in pixels, such as (1920, 1080), got {value!r}"
+        )
+    return size
+
+
+def told_image_size(value: Any) -> tuple[int, int] | None:
+    """Width and height of an image in pixels, as a file tells them; None where they are none.
+
+    >>> told_image_size([1920.0, 1080]), told_image_size([0, 1080]), told_image_size("large")
+    ((1920, 1080), None, None)
+    """
     try:
-        width, height = (int(side) for side in value)
-        if (width, height) == tuple(value) and min(width, height) > 0 and max(width, height) <= LARGEST:
-            return width, height
+        sides = tuple(value)
+        width, height = (int(side) for side in sides)
     except (TypeError, ValueError, OverflowError):
-        pass
-    raise OptionError(
-        f"image_size: expected width and height of the video in pixels, such as (1920, 1080), got {value!r}"
-    )
+        return None
+    whole = (width, height) == sides and not any(isinstance(side, bool) for side in sides)
+    return (width, height) if whole and min(sides) > 0 and max(sides) <= LARGEST else None
+
+
+def mostly_outside(points: Tensor, size: tuple[int, int]) -> bool:
+    """Whether fewer than half of points (P, 2) lie within an image of this width and height."""
+    return float(((points >= 0) & (points <= points.new_tensor(size))).all(-1).double().mean()) < 0.5
 
 
 def at_the_corner(points: Tensor, seen: Tensor, notes: list[str], *, alone: bool = False) -> Tensor:

@@ -9,10 +9,10 @@ from typing import Any, Self
 
 from torch import Tensor
 
-from kcs_torch.errors import counted
+from kcs_torch.errors import OptionError, counted
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.bodies import no_bones
-from kcs_torch.types.intake import as_image_size, take_in
+from kcs_torch.types.intake import as_image_size, mostly_outside, take_in
 from kcs_torch.types.size import short_unit
 from kcs_torch.types.trajectories import Trajectories
 
@@ -81,13 +81,14 @@ class Tracks(Trajectories):
             fps: frames per second; NaN and None mean unknown.
             units: of the points.
             threshold: a joint with less confidence counts as unseen.
-            image_size: width and height of the image in pixels, where points are pixels of it.
+            image_size: width and height of the image in pixels, where points are pixels of it; left out, which a note
+                tells, where most of them lie elsewhere.
             source: for messages.
             notes: sentences to carry along.
 
         Raises:
             ShapeError: wrong shapes, infinite values, negative confidences, nothing seen at all.
-            OptionError: the threshold is no confidence, or the image's size is none.
+            OptionError: the threshold is no confidence; the image's size is none, or the tracks are not in pixels.
             SkeletonError: the joint count does not fit the skeleton (the message says which one it fits).
         """
         taken = take_in(
@@ -107,8 +108,16 @@ class Tracks(Trajectories):
             remarks.append(no_bones(body))
         xy, weights = body.complete(taken.points, taken.weights)
         remarks += unseen_notes(weights, body)
-        size = as_image_size(image_size)
-        return cls(xy, weights, body, taken.fps, short_unit(units), source, tuple(remarks), image_size=size)
+        unit, size = short_unit(units), as_image_size(image_size)
+        if size is not None and unit != "px":
+            raise OptionError(f"{source}: image_size: expected tracks in pixels of the image, got units {units!r}")
+        if size is not None and mostly_outside(xy[weights > 0], size):
+            remarks.append(
+                f"most joints lie outside an image of {size[0]} x {size[1]} pixels: its size (image_size, "
+                "--image-size) is left out"
+            )
+            size = None
+        return cls(xy, weights, body, taken.fps, unit, source, tuple(remarks), image_size=size)
 
     def frames(self, start: int, stop: int, step: int = 1) -> Self:
         """A run of frames, with notes on what they do not show; with a step, every so many, at the slower rate."""
