@@ -40,6 +40,24 @@ def test_content_decides_and_not_the_name(samples, tmp_path):
         assert load_tracks(other, trust=True).num_frames == 4
 
 
+def test_every_format_takes_the_size_of_the_image(samples):
+    """Also where the coordinates are pixels, which it left alone."""
+    units = set()
+    for name, path in samples.items():
+        assert all(tracks.image_size is None for tracks in load_people(path, trust=True)), name
+        for tracks in load_people(path, trust=True, image_size=(1920, 1080)):
+            assert tracks.image_size == ((1920, 1080) if tracks.units == "px" else None), name
+            assert not any("pixels already" in note or "lie outside" in note for note in tracks.notes), name
+            units.add(tracks.units)
+    assert "px" in units
+
+
+def test_an_image_that_most_joints_lie_outside_is_none(samples):
+    (tracks,) = load_people(samples["openpose"], image_size=(100, 200))
+    told = "most joints lie outside an image of 100 x 200 pixels: its size (image_size, --image-size) is left out"
+    assert tracks.image_size is None and any(note.startswith(told) for note in tracks.notes)
+
+
 def test_lists_of_formats():
     assert all(isinstance(r, Reader) and r.name == name for name, r in READERS.items())
     assert all(isinstance(w, Writer) and w.suffix == suffix for suffix, w in WRITERS.items())

@@ -76,6 +76,15 @@ def test_reads_points_confidence_and_edges_from_one(tmp_path):
     assert load_tracks(tmp_path / "zero.mat").skeleton.bones == tracks.skeleton.bones
 
 
+def test_shares_of_the_image_become_pixels(tmp_path):
+    """--image-size went unheard."""
+    shares = np.random.default_rng(0).uniform(0.2, 0.8, (20, 6, 2))
+    savemat(tmp_path / "p.mat", {"points2d": shares})
+    assert np.allclose(load_tracks(tmp_path / "p.mat").points, shares)
+    tracks = load_tracks(tmp_path / "p.mat", image_size=(1280, 720))
+    assert np.allclose(tracks.points, shares * [1280, 720]) and tracks.image_size == (1280, 720)
+
+
 def test_what_is_not_finite_is_unseen(tmp_path):
     points = motion()
     points[3, 1] = np.nan

@@ -55,17 +55,22 @@ def test_the_file_may_tell_the_size_and_the_rate(tmp_path):
         path = write_json(tmp_path / "a.json", {**sides, "fps": 25, "frames": mediapipe_frames()})
         tracks = load_tracks(path)
         assert np.allclose(tracks.points[:, :33], POSE[..., :2] * [1, 0.5])
-        assert tracks.fps == 25
+        assert (tracks.fps, tracks.image_size) == (25, (1000, 500))
     assert same(load_tracks(path, image_size=SIZE, fps=50), POSE)
     path = write_json(tmp_path / "a.json", {"width": -3, "height": "x", "fps": True, "frames": mediapipe_frames()})
-    assert load_tracks(path, image_size=SIZE).fps is None
+    tracks = load_tracks(path, image_size=SIZE)
+    assert (tracks.fps, tracks.image_size) == (None, SIZE)
+    pixels = {"width": 1000, "height": 800, "frames": mediapipe_frames(size=1000)}
+    assert load_tracks(write_json(tmp_path / "b.json", pixels)).image_size == (1000, 800)
+    assert load_tracks(write_json(tmp_path / "b.json", pixels | {"width": True})).image_size is None
 
 
 def test_pixels_stay_pixels(tmp_path):
-    for options in ({}, {"image_size": (640, 480)}):
-        tracks = load_tracks(write_json(tmp_path / "a.json", mediapipe_frames(size=1000)), **options)
+    for size in (None, (640, 480)):
+        tracks = load_tracks(write_json(tmp_path / "a.json", mediapipe_frames(size=1000)), image_size=size)
         assert same(tracks, POSE)
-        assert "the coordinates are pixels already" in tracks.notes
+        assert tracks.image_size == size
+        assert ("the coordinates are pixels already" in tracks.notes) == (size is None)
 
 
 def test_what_is_hidden_is_not_unseen_unless_out_of_the_image(tmp_path):

@@ -92,7 +92,25 @@ def test_shares_of_the_image_become_pixels(tmp_path):
     path = written(tmp_path / "b.npz", points2d=points * 1000, units="px")
     tracks = load_tracks(path, image_size=(1280, 720))
     assert tracks.points[tracks.seen].unique(dim=0).tolist() == [[250, 500]]
-    assert "the coordinates are pixels already" in tracks.notes
+    assert tracks.image_size == (1280, 720) and not tracks.notes
+
+
+def test_the_file_may_tell_the_size_of_the_image(tmp_path):
+    points = arrays()["points2d"] * 0 + [0.25, 0.5]
+    told = {"units": "px", "image_size": np.array([1280, 720])}
+    for scale in ([1280, 720], 1):
+        tracks = load_tracks(path := written(tmp_path / "a.npz", points2d=points * scale, **told))
+        assert tracks.image_size == (1280, 720)
+        assert tracks.points[tracks.seen].unique(dim=0).tolist() == [[320, 360]]
+    assert load_tracks(path, image_size=(640, 480)).image_size == (640, 480)  # the caller goes before the file
+    assert load_tracks(path, image_size=(640, 480)).points[0, 0].tolist() == [160, 240]
+    assert load_tracks(written(tmp_path / "mm.npz", image_size=np.array([1280, 720]))).image_size is None
+
+
+@pytest.mark.parametrize("size", [(0, 720), (-1280, 720), (1280.5, 720), (1280,), "large", (True, True), (np.nan, 1)])
+def test_a_size_that_is_none_is_unknown(tmp_path, size):
+    tracks = load_tracks(written(tmp_path / "a.npz", units="px", image_size=np.array(size)))
+    assert tracks.image_size is None and not tracks.notes
 
 
 def test_letters_that_there_are_none_of(tmp_path):
@@ -429,16 +447,18 @@ def test_every_file_of_the_data_folder_loads_or_says_why(shared):
 def test_tracks_come_back_as_sure_as_they_were(tmp_path):
     """Also joints that cleaning filled, whose confidence is low, and what is known of a detector."""
     tracks = walk_result().tracks
-    for detector in (None, False, True):
+    for detector, size in ((None, None), (False, (1280, 720)), (True, None)):
         weights = tracks.weights.clone()
         weights[3, 4] = 0.1
-        mine = replace(tracks, weights=weights, detector=detector)
+        points = tracks.points / 10 + tracks.points.new_tensor([640, 360])  # within the image
+        mine = replace(tracks, points=points, weights=weights, detector=detector, units="px", image_size=size)
         back = load_tracks(save(mine, tmp_path / "t.npz"))
-        assert back.detector is detector
+        assert (back.detector, back.image_size) == (detector, size)
         assert float(back.weights[3, 4]) == pytest.approx(0.1)
         assert not load_tracks(tmp_path / "t.npz", threshold=0.3).seen[3, 4]
         whole = save(replace(walk_result(), tracks=mine), tmp_path / "r.npz")
-        assert load_reconstruction(whole).tracks.detector is detector
+        back = load_reconstruction(whole).tracks
+        assert (back.detector, back.image_size) == (detector, size)
 
 
 def test_files_of_others_go_through_a_threshold(tmp_path):

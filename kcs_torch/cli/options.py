@@ -69,7 +69,8 @@ ImageSize = Annotated[
     typer.Option(
         "--image-size",
         metavar="WIDTHxHEIGHT",
-        help="Size of the video in pixels, where coordinates are relative to it (as MediaPipe's are).",
+        help="Size of the video in pixels: turns coordinates that are relative to it (as MediaPipe's are) into pixels, "
+        "and tells the lens of a near camera roughly. That of TRACKS if not given.",
     ),
 ]
 Trust = Annotated[

@@ -62,7 +62,8 @@ def load_people(
         fps: frames per second; as the file says if None.
         threshold: a joint with less confidence counts as unseen, 0..1. None: .3, or 0 for tracks that this library
             wrote, whose joints have been through one.
-        image_size: width and height of the video in pixels, where coordinates are shares of it (as MediaPipe's are).
+        image_size: width and height of the video in pixels; as the file says if None. It turns coordinates that are
+            shares of the image (as MediaPipe's are) into pixels, and tells the lens of a near camera roughly.
         trust: read a file although it is a pickle (VideoPose3D's .npz): arrays and numbers are taken from it, no code.
 
     Returns:
@@ -103,7 +104,8 @@ def load_tracks(
         fps: frames per second; as the file says if None.
         threshold: a joint with less confidence counts as unseen, 0..1. None: .3, or 0 for tracks that this library
             wrote, whose joints have been through one.
-        image_size: width and height of the video in pixels, where coordinates are shares of it (as MediaPipe's are).
+        image_size: width and height of the video in pixels; as the file says if None. It turns coordinates that are
+            shares of the image (as MediaPipe's are) into pixels, and tells the lens of a near camera roughly.
         trust: read a file although it is a pickle (VideoPose3D's .npz): arrays and numbers are taken from it, no code.
 
     Returns:

@@ -21,7 +21,7 @@ from kcs_torch.errors import FormatError, KcsError, OptionError, listed
 from kcs_torch.io.folders import natural_key, sibling_files
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
-from kcs_torch.types.intake import RATES, as_number
+from kcs_torch.types.intake import RATES, as_number, told_image_size
 
 if TYPE_CHECKING:
     from kcs_torch.io.containers.hdf5 import Tree
@@ -57,7 +57,7 @@ class Options:
         skeleton: a :class:`Skeleton`, a built-in name, or a YAML/JSON file; None: as the file says.
         fps: frames per second; None: as the file says.
         threshold: a joint with less confidence counts as unseen; None: as the file says.
-        image_size: width and height of the video in pixels, where coordinates are shares of it.
+        image_size: width and height of the video in pixels; None: as the file says.
         trust: whether a pickle (VideoPose3D's .npz) may be read; arrays, lists and numbers are taken from it, no code.
     """
 
@@ -71,6 +71,10 @@ class Options:
     def least(self) -> float:
         """The threshold of files that say nothing of it."""
         return THRESHOLD if self.threshold is None else self.threshold
+
+    def size_of(self, told: Any) -> tuple[int, int] | None:
+        """Width and height of the image where a file tells something of them, or nothing; None where unknown."""
+        return self.image_size or told_image_size(told)
 
 
 @dataclass(frozen=True)

@@ -94,6 +94,7 @@ def build_animals(
     notes: Sequence[str],
     *,
     edges: Any = None,
+    size: Any = None,
 ) -> list[Tracks]:
     """Wrap the animals of a file; those that say nothing are left out, which the notes tell.
 
@@ -113,7 +114,7 @@ def build_animals(
     for animal in whole:
         _check(animal, path)
     if are_shares(np.concatenate([a.points.ravel() for a in whole])):
-        whole = [a._replace(points=in_pixels(a.points, options.image_size, shared)) for a in whole]
+        whole = [a._replace(points=in_pixels(a.points, options.size_of(size), shared)) for a in whole]
     seen = [a for a in whole if _seen(a, options.least).any()]
     if not seen:
         faint = [a.confidence[_seen(a, 0.0)] for a in whole if a.confidence is not None]
@@ -139,6 +140,7 @@ def build_animals(
             names=animal.joints,
             edges=edges,
             notes=[*shared, *own],
+            size=size,
         )
         people.append(tracks)
     return people

@@ -9,9 +9,11 @@ from typing import Any
 from numpy.typing import NDArray
 
 from kcs_torch.errors import ShapeError
+from kcs_torch.io.contents.shares import are_shares
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
+from kcs_torch.types.size import short_unit
 
 __all__ = ["OVERSHOOT", "build_tracks", "nothing_seen"]
 
@@ -31,6 +33,7 @@ def build_tracks(
     units: str = "px",
     notes: Sequence[str] = (),
     detector: bool | None = None,
+    size: Any = None,
 ) -> Tracks:
     """Wrap what a reader found in a file, as the caller's ``options`` want it.
 
@@ -46,6 +49,7 @@ def build_tracks(
         units: the file's units.
         notes: sentences for the user.
         detector: whether the file says that a detector made them.
+        size: width and height of the image, as the file tells them.
 
     Raises:
         ShapeError: the numbers are no tracks.
@@ -61,6 +65,7 @@ def build_tracks(
         if names is not None and len(names) != points.shape[1]:
             names = None
         chosen, edges = body, None
+    pixels = short_unit(units) == "px" and not are_shares(points)
     tracks = Tracks.from_arrays(
         points,
         confidence,
@@ -70,6 +75,7 @@ def build_tracks(
         fps=options.fps if options.fps is not None else fps,
         units=units,
         threshold=options.least,
+        image_size=options.size_of(size) if pixels else None,
         source=source,
         notes=remarks,
     )

@@ -18,6 +18,7 @@ from kcs_torch.io.contents.shares import ASK, SIZE_HINT, are_shares
 from kcs_torch.io.contents.times import frames_of_times, rate_of_times, time_unit
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import SKELETONS
+from kcs_torch.types.intake import told_image_size
 
 __all__ = [
     "BODIES",
@@ -61,7 +62,7 @@ class Landmarks:
     times: dict[int, float] = field(default_factory=dict)  # of frames; NaN where unknown
     names: tuple[str, ...] | None = None  # None: the usual 33 or 21
     seen: set[str] = field(default_factory=set)  # what the joints' third number is called
-    size: tuple[float, float] | None = None
+    size: tuple[int, int] | None = None  # of the image
     fps: float | None = None
     unit: str = ""  # of the coordinates, where the file tells
     who: str = ""  # the column of a table that tells people apart
@@ -73,11 +74,8 @@ def read_landmarks_json(path: Path) -> Landmarks:
     data = read_json(path)
     out = Landmarks()
     if isinstance(data, dict):
-        sides = [_positive(data, k) for k in ("width", "height")]
-        sides = sides if all(sides) else [_positive(data, k) for k in ("image_width", "image_height")]
-        if isinstance(sizes := data.get("image_size"), list) and len(sizes) == 2:
-            sides = [_positive({"": v}, "") for v in sizes]
-        out.size = (sides[0], sides[1]) if sides[0] and sides[1] else None
+        sizes = [data.get("image_size"), *([data.get(k + s) for s in ("width", "height")] for k in ("", "image_"))]
+        out.size = next(filter(None, map(told_image_size, sizes)), None)
         out.fps = _positive(data, "fps")
     poses: dict[int, list[Sighting]] = {}
     hands: dict[int, list[Sighting]] = {}
@@ -243,16 +241,14 @@ def settle(found: Landmarks, path: Path, options: Options, *, shares: bool) -> N
     if not np.isfinite(everything[:, :2]).any():
         raise FormatError(f"{path}: expected landmarks in at least one of {len(found.frames)} frames, got none")
     small = are_shares(everything[:, :2])
-    size = options.image_size or found.size
-    if shares and not small:
-        found.notes.append("the coordinates are pixels already")
-    elif shares and size is None:
+    size = options.size_of(found.size)
+    if size is None and small and shares:
         raise FormatError(
             f"{path}: its coordinates are shares of the image, which needs the video's size: give {SIZE_HINT}; if they "
             "are metres, say, in a table, name its format: csv"
         )
-    elif small and size is None:
-        found.notes.append(ASK)
+    if size is None and (small or shares):
+        found.notes.append(ASK if small else "the coordinates are pixels already")
     small = small and size is not None
     visible = not found.seen & set(CONFIDENCES)
     seen = everything[:, 2]

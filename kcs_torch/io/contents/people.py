@@ -57,6 +57,7 @@ def people_tracks(
     fps: float | None = None,
     notes: Sequence[str] = (),
     measured: bool = False,
+    size: Any = None,
 ) -> list[Tracks]:
     """Follow the people of T frames and wrap each as :class:`Tracks`.
 
@@ -75,6 +76,7 @@ def people_tracks(
         fps: the file's frames per second.
         notes: sentences for the user.
         measured: no detector made them: only joints at (0, 0) or (-1, -1) with all others beyond are unseen.
+        size: width and height of the image, as the file tells them.
 
     Raises:
         FormatError: nobody is in any frame, or people have different numbers of joints.
@@ -85,7 +87,7 @@ def people_tracks(
     listed = any(frames)
     frames = _without_zeros(_checked(frames, source, measured, remarks), measured, remarks)
     if not measured:
-        frames = _in_pixels(frames, options.image_size, remarks)
+        frames = _in_pixels(frames, options.size_of(size), remarks)
     everybody = [s.joints for frame in frames for s in frame]
     if not everybody:
         why = " with a joint that is seen: every confidence is 0, or every place missing" if listed else ""
@@ -99,7 +101,7 @@ def people_tracks(
         remarks.append("people are followed by the file's own track ids")
         people = _without_breaks(people, frames, gap, remarks)
     several = len({s.track for frame in frames for s in frame} - {None}) > 1
-    wrap = partial(build_tracks, source=source, names=names, edges=edges, skeleton=skeleton, fps=fps)
+    wrap = partial(build_tracks, source=source, names=names, edges=edges, skeleton=skeleton, fps=fps, size=size)
     out = []
     for seen in _shown(people, frames, options.least, source, remarks):
         track = np.zeros((len(frames), *everybody[0].shape))

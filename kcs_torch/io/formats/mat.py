@@ -12,6 +12,7 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.containers.hdf5 import LIMIT, read_hdf5
 from kcs_torch.io.containers.matlab import read_matlab
 from kcs_torch.io.contents.build_tracks import build_tracks
+from kcs_torch.io.contents.shares import are_shares, in_pixels
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.types import Tracks
 
@@ -40,6 +41,8 @@ def read(path: Path, options: Options) -> list[Tracks]:
             raise FormatError(f"{path}: expected {_SHAPES}; got {found}")
     else:
         raise FormatError(f"{path}: expected {_SHAPES}; got {found}")
+    if options.image_size is not None and are_shares(points):
+        points = in_pixels(points, options.image_size, notes)
     confidence = _real(values["confidence"], "confidence", path) if "confidence" in values else None
     fps = values.get("fps")
     return [

@@ -56,6 +56,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
         skeleton=skeleton,
         fps=found.fps,
         notes=found.notes,
+        size=found.size,
     )
 
 

@@ -2,9 +2,9 @@
 
 Tracks are ``points2d`` (T, N, 2) with NaN where unseen, ``confidence`` (T, N), ``edges`` (B, 2), ``joint_names``
 (N,), ``fps`` (NaN: unknown) and ``units``; all but the first may be absent. What this library writes has ``skeleton``
-and ``notes`` as JSON text, too, and ``detector``, whether a detector made the tracks, where that is known; confidences
-have then been through a threshold and count as they are. A result adds, for the same N joints,
-``points3d`` (T, N, 3), and
+and ``notes`` as JSON text, too, and, where they are known, ``detector``, whether a detector made the tracks, and
+``image_size``, width and height in pixels; confidences have then been through a threshold and count as they are. A
+result adds, for the same N joints, ``points3d`` (T, N, 3), and
 
 - ``points3d_all`` (T, M, 3) and ``joint_names_all`` (M,): with the virtual joints, which come last; ``bones`` (B, 2)
   are (parent, child) indices into them and ``lengths`` (B,) their lengths;
@@ -40,6 +40,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Intrinsics, Motion, Reconstruction, Tracks
 from kcs_torch.types.arrays import as_array
 from kcs_torch.types.axes import AXES, from_y_up
+from kcs_torch.types.intake import told_image_size
 
 __all__ = ["MOTION_READERS", "READERS", "WRITERS", "load_reconstruction"]
 
@@ -61,11 +62,9 @@ def read(path: Path, options: Options) -> list[Tracks]:
     points = file.array("points2d", "fiu", 3)
     units = file.text("units") if "units" in file else "px"
     notes = _json(file, "notes", list) if "notes" in file else []
-    if units == "px" and points.shape[-1] == 2:
-        if are_shares(points):
-            points = in_pixels(points, options.image_size, notes)
-        elif options.image_size is not None:
-            notes.append("the coordinates are pixels already")
+    size = _size_in(file)
+    if units == "px" and points.shape[-1] == 2 and are_shares(points):
+        points = in_pixels(points, options.size_of(size), notes)
     written = "skeleton" in file  # by this library
     return [
         build_tracks(
@@ -80,6 +79,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
             units=units,
             notes=notes,
             detector=_detector_in(file),
+            size=size,
         )
     ]
 
@@ -127,6 +127,8 @@ def _tracks_out(tracks: Tracks) -> dict[str, Any]:
     }
     if tracks.detector is not None:
         arrays["detector"] = np.bool_(tracks.detector)
+    if tracks.image_size is not None:
+        arrays["image_size"] = np.array(tracks.image_size, np.int64)
     if body.virtual:
         arrays |= {"points2d_virtual": points[:, n:], "confidence_virtual": weights[:, n:]}
     return arrays
@@ -135,6 +137,11 @@ def _tracks_out(tracks: Tracks) -> dict[str, Any]:
 def _detector_in(file: Archive) -> bool | None:
     """Whether a detector made the tracks, where the file says so."""
     return bool(file.array("detector", "b", 0)) if "detector" in file else None
+
+
+def _size_in(file: Archive) -> tuple[int, int] | None:
+    """Width and height of the image, where the file tells them."""
+    return told_image_size(file.array("image_size", "fiubUS").tolist()) if "image_size" in file else None
 
 
 def _save(arrays: dict[str, Any], path: Path) -> None:
@@ -239,6 +246,7 @@ def _tracks_in(file: Archive) -> Tracks:
         file.text("source") if "source" in file else str(file.path),
         tuple(map(str, _json(file, "notes", list))) if "notes" in file else (),
         _detector_in(file),
+        _size_in(file),
     )
 
 
