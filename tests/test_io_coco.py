@@ -27,6 +27,30 @@ def test_results_of_two_people(tmp_path):
     assert a.skeleton.name == "coco17"
 
 
+def test_images_that_are_all_alike_tell_their_size(tmp_path):
+    data = coco_annotations()
+    for image in data["images"]:
+        image |= {"width": 1280, "height": 720}
+    path = write_json(tmp_path / "a.json", data)
+    assert load_tracks(path).image_size == (1280, 720)
+    assert load_tracks(path, image_size=(640, 480)).image_size == (640, 480)  # the caller goes before the file
+    pixels = load_tracks(path).points
+    for one in data["annotations"]:
+        one["keypoints"] = (np.reshape(one["keypoints"], (-1, 3)) / [1280, 720, 1]).ravel().tolist()
+    assert np.allclose(load_tracks(write_json(tmp_path / "b.json", data)).points, pixels)  # shares of it
+
+
+@pytest.mark.parametrize("side", [0, -720, 720.5, "high", None, True, [720]])
+def test_images_that_are_not_alike_or_of_no_size_tell_none(tmp_path, side):
+    data = coco_annotations()
+    for image in data["images"]:
+        image |= {"width": 1280, "height": side}
+    assert load_tracks(write_json(tmp_path / "a.json", data)).image_size is None
+    for t, image in enumerate(data["images"]):
+        image["height"] = 720 if t else 960
+    assert load_tracks(write_json(tmp_path / "a.json", data)).image_size is None
+
+
 def test_results_are_in_the_order_of_the_images(tmp_path):
     tracks = load_tracks(write_json(tmp_path / "a.json", [result(t + 500, A[t]) for t in (3, 0, 5, 1, 2)]))
     assert np.allclose(numbers(tracks)[[0, 1, 2, 3, 5]], A[[0, 1, 2, 3, 5]])

@@ -13,6 +13,7 @@ from kcs_torch.io.contents.frames import as_track_id, by_image, by_number
 from kcs_torch.io.contents.people import Sighting, people_tracks
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.types import Tracks
+from kcs_torch.types.intake import told_image_size
 
 __all__ = ["READERS"]
 
@@ -73,6 +74,7 @@ def _annotations(data: dict[str, Any], path: Path, options: Options) -> list[Tra
         names=names,
         edges=None if names is None or options.skeleton is not None else _bones(category, names, path),
         notes=notes,
+        size=_size(data),
     )
 
 
@@ -150,6 +152,12 @@ def _in_order(
     if len(named) == len(images):
         return by_image({name: people.get(n, []) for name, n in named.items()}, notes)
     return by_number({n: people.get(n, []) for n in images}, notes)
+
+
+def _size(data: dict[str, Any]) -> tuple[int, int] | None:
+    """Width and height of the images, where they are all alike."""
+    sizes = {told_image_size([image.get("width"), image.get("height")]) for image in data.get("images", [])}
+    return sizes.pop() if len(sizes) == 1 else None
 
 
 def _number(value: Any, where: str) -> int:
