@@ -16,6 +16,29 @@ pytest.importorskip("h5py")
 # ---------------------------------------------------------------------- SLEAP
 
 
+@pytest.mark.parametrize(
+    ("told", "size"),
+    [
+        ('{"shape": [100, 720, 1280, 3]}', (1280, 720)),
+        ('{"shape": [100, 0, 1280, 3]}', None),
+        ('{"shape": [100, "high", 1280, 3]}', None),
+        ('{"shape": [720, 1280]}', None),
+        ('{"shape": null}', None),
+        ("[1]", None),
+        ("{", None),
+    ],
+)
+def test_the_video_tells_the_size_of_the_image(tmp_path, told, size):
+    """As sleap-io writes it."""
+    import h5py
+
+    with h5py.File(path := write_sleap_hdf5(tmp_path / "a.h5", sleap_points(2)), "a") as file:
+        file.attrs["video_backend_metadata"] = told
+    assert [tracks.image_size for tracks in load_people(path)] == [size, size]
+    assert load_tracks(path, image_size=(640, 480)).image_size == (640, 480)  # the caller goes before the file
+    assert load_tracks(write_sleap_hdf5(tmp_path / "b.h5", sleap_points())).image_size is None
+
+
 @pytest.mark.parametrize("dims", [None, ["track", "xy", "node", "frame"], ["frame", "track", "node", "xy"]])
 @pytest.mark.parametrize("told", [True, False])
 def test_sleap_dimensions(tmp_path, dims, told):

@@ -6,6 +6,7 @@ import csv
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,10 +47,10 @@ def read(path: Path, options: Options) -> list[Tracks]:
     """Read every track as one animal."""
     notes: list[str] = []
     if Probe(path).head.startswith(b"\x89HDF"):
-        animals, edges = _read_hdf5(path, notes)
+        animals, edges, size = _read_hdf5(path, notes)
     else:
-        animals, edges = _read_csv(path, options, notes), None
-    return build_animals(animals, options, path, notes, edges=edges)
+        animals, edges, size = _read_csv(path, options, notes), None, None
+    return build_animals(animals, options, path, notes, edges=edges, size=size)
 
 
 def recognises_motion(probe: Probe) -> bool:
@@ -86,7 +87,8 @@ def _is_project(tree: Tree) -> bool:
     return {"frames", "instances", "pred_points"} <= set(tree.shapes) and "metadata" in tree.attributes
 
 
-def _read_hdf5(path: Path, notes: list[str]) -> tuple[list[Animal], NDArray[np.int64] | None]:
+def _read_hdf5(path: Path, notes: list[str]) -> tuple[list[Animal], NDArray[np.int64] | None, list[Any] | None]:
+    """The animals, the skeleton's links, and width and height of the image."""
     tree = read_tree(path, _WANTED)
     if _is_project(tree):
         raise FormatError(
@@ -116,7 +118,17 @@ def _read_hdf5(path: Path, notes: list[str]) -> tuple[list[Animal], NDArray[np.i
     if len(called) != tracks:
         called = [f"track {i}" for i in range(tracks)]
     animals = [Animal(called[i] if tracks > 1 else "", names, points[i], scores[i]) for i in range(tracks)]
-    return animals, _edges(tree, nodes, path)
+    return animals, _edges(tree, nodes, path), _size(tree)
+
+
+def _size(tree: Tree) -> list[Any] | None:
+    """Width and height, of the video's shape (frames, height, width, channels), which sleap-io writes where known."""
+    try:
+        told = json.loads(tree.attributes.get("", {}).get("video_backend_metadata", ""))
+    except (ValueError, RecursionError):
+        return None
+    shape = told.get("shape") if isinstance(told, dict) else None
+    return shape[2:0:-1] if isinstance(shape, list) and len(shape) == 4 else None
 
 
 def _in_order(tree: Tree, key: str, names: list[str] | None, path: Path) -> NDArray[np.float64]:
