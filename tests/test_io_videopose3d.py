@@ -79,6 +79,20 @@ def test_the_twins_tell_the_skeleton(tmp_path, metadata, name):
     assert np.allclose(tracks.points[:, :17], A)
 
 
+def test_a_video_tells_the_size_of_its_image(tmp_path):
+    positions = {"a.mp4": {"custom": [A]}, "b.mp4": {"custom": [B]}, "c.mp4": {"custom": [A[:3]]}}
+    videos = {"a.mp4": {"w": 1280, "h": 720}, "b.mp4": {"w": np.int64(1920), "h": np.float64(1080)}, "c.mp4": {"w": 0}}
+    path = write_videopose3d(tmp_path / "a.npz", positions, metadata={"video_metadata": videos})
+    assert [p.image_size for p in load_people(path, trust=True)] == [(1920, 1080), (1280, 720), None]
+    assert load_tracks(path, trust=True, image_size=(1600, 900)).image_size == (1600, 900)
+    for videos in (None, "none", {"a.mp4": "large"}, {"a.mp4": {"w": "x", "h": [1]}}, {3: {"w": 1280, "h": 720}}):
+        path = write_videopose3d(tmp_path / "b.npz", positions, metadata={"video_metadata": videos})
+        assert [p.image_size for p in load_people(path, trust=True)] == [None] * 3
+    shares = {"S1": {"Walk": [A / 1000]}}  # taken as they are
+    path = write_videopose3d(tmp_path / "c.npz", shares)
+    assert load_tracks(path, trust=True, image_size=(1600, 900)).image_size is None
+
+
 def test_scores_are_confidences(tmp_path):
     path = write_videopose3d(tmp_path / "a.npz", {"S1": {"Walk": [person(4, 17)]}})
     assert np.allclose(load_tracks(path, trust=True).weights, 0.8)

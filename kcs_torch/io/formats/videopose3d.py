@@ -45,41 +45,41 @@ def read(path: Path, options: Options) -> list[Tracks]:
     sequences = list(_sequences(file.objects(_KEY), str(path)))
     if not sequences:
         raise FormatError(f"{path}: '{_KEY}': expected [subject][action][camera] arrays (frames, joints, 2), got none")
-    size = sum(array.nbytes for _, array in sequences)
+    size = sum(array.nbytes for *_, array in sequences)
     if size > file.members[_KEY].file_size:  # one array many times, or one whose numbers are not in the file
         raise FormatError(f"{path}: '{_KEY}' claims {size} bytes of arrays, more than it holds: refused")
     try:
         meta = file.objects("metadata")
-    except FormatError:  # it only helps to tell the skeleton
+    except FormatError:  # it only helps to tell the skeleton and the image's size
         meta = None
-    return [_tracks(array, where, meta, path, options) for where, array in sequences]
+    return [_tracks(array, where, meta, _size(meta, keys), path, options) for keys, where, array in sequences]
 
 
-def _sequences(nest: Any, where: str) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Every array of a nest, with its keys, in their order."""
-    inside: list[tuple[int, str, Any]] = [(0, where, nest)]
+def _sequences(nest: Any, where: str) -> Iterator[tuple[tuple[Any, ...], str, NDArray[Any]]]:
+    """Every array of a nest, with its keys and their words, in their order."""
+    inside: list[tuple[tuple[Any, ...], str, Any]] = [((), where, nest)]
     for _ in range(_MOST):
         if not inside:
             return
-        depth, here, value = inside.pop()
+        keys, here, value = inside.pop()
         value = opened(value)
         if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
             if value.ndim != 3 or value.shape[-1] not in (2, 3):
                 raise FormatError(f"{here}: expected an array of shape (frames, joints, 2), got {value.shape}")
             if len(value):
-                yield here, value
-        elif depth > 4:
+                yield keys, here, value
+        elif len(keys) > 4:
             raise FormatError(f"{here}: expected [subject][action][camera], got a deeper nest")
         elif isinstance(value, dict):
-            inside += [(depth + 1, f"{here}: {as_text(k)}", v) for k, v in reversed(value.items())]
+            inside += [((*keys, k), f"{here}: {as_text(k)}", v) for k, v in reversed(value.items())]
         elif isinstance(value, (list, tuple)):
-            inside += [(depth + 1, f"{here}: camera {i}", value[i]) for i in reversed(range(len(value)))]
+            inside += [((*keys, i), f"{here}: camera {i}", value[i]) for i in reversed(range(len(value)))]
         else:
             raise FormatError(f"{here}: expected [subject][action][camera] arrays, got {type(value).__name__}")
     raise FormatError(f"{where}: expected fewer than {_MOST} arrays: refused")
 
 
-def _tracks(array: NDArray[Any], where: str, meta: Any, path: Path, options: Options) -> Tracks:
+def _tracks(array: NDArray[Any], where: str, meta: Any, size: Any, path: Path, options: Options) -> Tracks:
     points = array[..., :2].astype(np.float64)
     if (np.abs(points) > FARTHEST).any():
         raise FormatError(f"{where}: expected pixels, got numbers beyond {FARTHEST:g}")
@@ -93,8 +93,15 @@ def _tracks(array: NDArray[Any], where: str, meta: Any, path: Path, options: Opt
         people = np.concatenate([points, np.ones((*points.shape[:2], 1))], -1)
         skeleton, names = choose_layout(list(people), options, str(path), notes)
     return build_tracks(
-        points, confidence, options, source=where, names=names, skeleton=skeleton, units="px", notes=notes
+        points, confidence, options, source=where, names=names, skeleton=skeleton, units="px", notes=notes, size=size
     )
+
+
+def _size(meta: Any, keys: tuple[Any, ...]) -> Any:
+    """Width and height of the video that is called as the subject, where the data's description has them."""
+    videos = opened(meta.get("video_metadata")) if isinstance(meta, dict) else None
+    video = opened(videos.get(keys[0])) if isinstance(videos, dict) and keys else None
+    return [opened(video.get(side)) for side in "wh"] if isinstance(video, dict) else None
 
 
 def _by_symmetry(meta: Any, num_joints: int) -> str | None:
