@@ -133,6 +133,7 @@ def test_pose_comes_in_pixels_with_its_visibility(video, mediapipe):
     done = []
     (tracks,) = detect_video(video.path, progress=lambda k, total: done.append((k, total)))
     assert tracks.skeleton.name == "mediapipe33" and tracks.fps == 25 and tracks.units == "px"
+    assert tracks.image_size == (WIDTH, HEIGHT)
     expected = np.where(visibility >= 0.3, visibility, 0)
     np.testing.assert_allclose(tracks.weights[:, :33], np.broadcast_to(expected, (FRAMES, 33)))
     seen = expected > 0

@@ -99,6 +99,7 @@ def detect_video(
         skeleton=finder.skeleton,
         fps=video.fps,
         notes=(told, *finder.notes),
+        size=(video.width, video.height),
     )
     people.sort(key=lambda one: float(one.weights[:, : one.skeleton.num_observed].sum()), reverse=True)
     return tell_apart(replace(one, notes=(*one.notes, *_remarks(one, start))) for one in people)
