@@ -206,6 +206,14 @@ def test_nothing_given_is_changed(walk):
     assert not [n for n in walk.notes if n.startswith(("gate", "smooth", "fill", "resample"))]
 
 
+def test_the_image_stays(walk):
+    filmed = replace(walk, units="px", image_size=(1280, 720))
+    clean = kt.clean
+    cleaned = [clean.smooth(filmed), clean.gate(filmed), clean.resample(filmed, 20), clean.fill(filmed, 2)]
+    for one in (*cleaned, clean.trim(filmed, 10, 60), clean.unswap(filmed), *clean.split(filmed)):
+        assert one.image_size == (1280, 720)
+
+
 def test_single_precision_stays(walk):
     half = walk.to(torch.float32)
     for cleaned in (kt.clean.smooth(half), kt.clean.gate(half), kt.clean.resample(half, 20), kt.clean.fill(half, 2)):

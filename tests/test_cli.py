@@ -383,6 +383,18 @@ def test_info_in_words(openpose_folder):
     assert "format openpose, 40 frames" in text and "body25" in text and "52.0 %" in text
 
 
+def test_info_tells_the_size_of_the_image(openpose_folder):
+    assert json.loads(run("info", openpose_folder, "--json").stdout)["image_size"] is None
+    size = ["--image-size", "1920x1080"]
+    assert json.loads(run("info", openpose_folder, *size, "--json").stdout)["image_size"] == [1920, 1080]
+    assert "in px of an image of 1920 x 1080\n" in run("info", openpose_folder, *size).stdout
+
+
+def test_lift_takes_the_size_of_the_image_of_pixels(openpose_folder, tmp_path):
+    run("lift", openpose_folder, "-o", tmp_path / "walk.npz", *QUICK, "--fps", 25, "--image-size", "1920x1080")
+    assert kt.io.load_reconstruction(tmp_path / "walk.npz").tracks.image_size == (1920, 1080)
+
+
 def test_info_reads_a_result(lifted):
     facts = json.loads(run("info", lifted[0] / "walk.npz", "--json").stdout)
     assert facts["frames"] == 40 and facts["fps"] == 25 and facts["skeleton"] == "body25"

@@ -108,6 +108,7 @@ def _facts(path: str, format: str, people: list[Tracks]) -> dict[str, Any]:
         "frames": first.num_frames,
         "fps": first.fps,
         "units": first.units,
+        "image_size": first.image_size,
         "skeleton": body.name,
         "joints": list(body.joints[: body.num_observed]),
         "virtual_joints": list(body.joints[body.num_observed :]),
@@ -121,9 +122,11 @@ def _facts(path: str, format: str, people: list[Tracks]) -> dict[str, Any]:
 def _spoken(facts: dict[str, Any]) -> str:
     rate = f"{facts['fps']:g} frames a second" if facts["fps"] else "frames a second unknown"
     shape = "a tree" if facts["tree"] else "not a tree"
+    image = f" of an image of {' x '.join(map(str, facts['image_size']))}" if facts["image_size"] else ""
     virtual = f" and virtual {', '.join(facts['virtual_joints'])}" if facts["virtual_joints"] else ""
     lines = [
-        f"{facts['path']}: format {facts['format']}, {counted(facts['frames'], 'frame')}, {rate}, in {facts['units']}",
+        f"{facts['path']}: format {facts['format']}, {counted(facts['frames'], 'frame')}, {rate}, "
+        f"in {facts['units']}{image}",
         f"skeleton {facts['skeleton']}: {len(facts['joints'])} joints, {len(facts['bones'])} bones, {shape}",
         f"joints: {', '.join(facts['joints'])}{virtual}",
         "person  frames seen  mean confidence  joints unseen",
