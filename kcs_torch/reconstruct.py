@@ -13,7 +13,12 @@ from kcs_torch.methods import METHODS
 from kcs_torch.methods.base import Method, check_tracks
 from kcs_torch.methods.found_skeleton import find_skeleton
 from kcs_torch.methods.perspective.calibrated import WIDE, reconstruct_perspective
-from kcs_torch.methods.perspective.uncalibrated import looking, may_be_near, reconstruct_uncalibrated
+from kcs_torch.methods.perspective.uncalibrated import (
+    lens_of_image,
+    looking,
+    may_be_near,
+    reconstruct_uncalibrated,
+)
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.bodies import no_bones
@@ -173,15 +178,19 @@ def reconstruct_all(
         return _told_of_lenses([_before(lens, chosen, one) for one in people])
     if lens == "parallel" or not chosen.turns_over:
         return chosen.many(people)
+    near = [may_be_near(one) for one in people]
+    found = {i: _before("auto", chosen, one) for i, one in enumerate(people) if near[i] and lens_of_image(one)}
+    rest = [i for i in range(len(people)) if i not in found]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
-        found = looking(chosen).many(people)
-    for i, (one, lifted) in enumerate(zip(people, found, strict=True)):
-        if may_be_near(one):
-            found[i] = reconstruct_uncalibrated(chosen, one, lifted=lifted)
+        lifted = looking(chosen).many([people[i] for i in rest])
+    for i, result in zip(rest, lifted, strict=True):
+        if near[i]:
+            result = reconstruct_uncalibrated(chosen, people[i], lifted=result)
         else:
-            chosen.warn(lifted)
-    return _told_of_lenses(found)
+            chosen.warn(result)
+        found[i] = result
+    return _told_of_lenses([found[i] for i in range(len(people))])
 
 
 def _told_of_lenses(found: list[Reconstruction]) -> list[Reconstruction]:

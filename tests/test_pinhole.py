@@ -11,6 +11,7 @@ from kcs_torch.data import walking_person
 from kcs_torch.functional import bone_lengths, bone_vectors
 from kcs_torch.methods.perspective import pinhole, plain_body
 from kcs_torch.methods.perspective.pinhole import PinholeEnergy
+from kcs_torch.methods.perspective.pinhole_coordinates import FIRM, USUAL
 from kcs_torch.methods.pkc.objective import Objective
 from kcs_torch.methods.pkc.weights import Weights, at_pace, pace_of
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -142,7 +143,7 @@ def test_images_are_as_likely_as_directions_drawn_evenly_make_them(wide):
     assert_close(found, expected, rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.parametrize("focal", [False, True], ids=["calibrated", "any focal length"])
+@pytest.mark.parametrize("focal", [False, True, 1.4], ids=["calibrated", "any focal length", "a usual focal length"])
 @pytest.mark.parametrize("known", [False, True], ids=["free", "known lengths"])
 @pytest.mark.parametrize("frames", [1, 2, 6])
 @pytest.mark.parametrize("skeleton", ["h36m17", "coco17", CHAIN])
@@ -157,7 +158,8 @@ def test_slope(skeleton, frames, known, focal):
     given = lengths.double().expand(2, -1) if known else None
     start = torch.stack([depth, -depth])
     lens = (torch.tensor([1.0, 3.0]).double(), torch.tensor([True, True])) if focal else None
-    energy = PinholeEnergy(skeleton, rays, far, start, 30.0, level(rays), given, feet, lens)
+    usual = focal if isinstance(focal, float) else None
+    energy = PinholeEnergy(skeleton, rays, far, start, 30.0, level(rays), given, feet, lens, usual)
     state = energy.start + 0.1 * normal(*energy.start.shape)
     value, slope = energy(state)
     for seed in range(5):
@@ -223,3 +225,20 @@ def test_standing_feet_cost_what_they_slide():
         )
         costs.append(float(stood(stood.start)[0] - plain(plain.start)[0]))
     assert abs(costs[0]) < 1e-9 and costs[1] > 20
+
+
+def test_usual_lenses_cost_least():
+    """A focal length costs what it is off by from that of usual lenses; else the distance costs, as it is unusual."""
+    skeleton, rays, depth, far, _ = walk()
+    focal = torch.tensor([1.0, 2.0, 2.0]).double()
+    given = skeleton, rays, far, depth.expand(3, -1, -1), 30.0, level(rays), None, None
+
+    def cost(usual):
+        found = PinholeEnergy(*given, (focal, focal > 0), usual)
+        free = PinholeEnergy(*given, (focal, focal < 0), usual)
+        return found(found.start)[0] - free(free.start)[0]
+
+    off = (focal / 2.0).log().square() / 2 * FIRM
+    assert_close(cost(2.0), off)
+    away = (far.mean() * focal / USUAL).log().square() / 2 * FIRM
+    assert_close(cost(None), away)

@@ -23,7 +23,7 @@ from kcs_torch.methods.pkc import blocks
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
 from kcs_torch.types import Intrinsics
 
-LENS = Intrinsics(1500.0, 1500.0, 960.0, 540.0)
+LENS = Intrinsics(1500.0, 1500.0, 0.0, 0.0)  # pixels from the middle on, so that no image of usual size holds them
 
 
 def filmed(distance=3500.0, frames=45, yaw=60.0, fps=30.0):

@@ -31,7 +31,7 @@ from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
 __all__ = ["WIDE", "feet_on_ground", "reconstruct_perspective"]
 
-ROUNDS, FOCAL_ROUNDS = 3, 5
+ROUNDS, FOCAL_ROUNDS = 3, 4
 """Rounds, at most, of lifting and refining; and of refining alone, where the focal length is found."""
 
 SETTLED = 0.01
@@ -58,6 +58,7 @@ def reconstruct_perspective(
     cameras: Tensor | None = None,
     *,
     lifted: Reconstruction | None = None,
+    guessed: bool = False,
 ) -> Reconstruction:
     """Reconstruct a body before a pinhole camera by a method made for parallel rays.
 
@@ -77,6 +78,8 @@ def reconstruct_perspective(
         lifted: what the method found in the tracks as if rays were parallel. The focal length is then to be found as
             well, from that of the intrinsics on, and noted; each round refines what the one before found, as its focal
             length shows it. Exact tracks whose first search ended early are lifted anew once, in the end.
+        guessed: whether the focal length is that of usual lenses. Tracks are then lifted through such a lens, and the
+            focal length is found together with what was found through it, and noted.
 
     Returns:
         The reconstruction in the camera's frame: ``points + (0, 0, distance)`` projects onto the image. Its unit is one
@@ -88,7 +91,7 @@ def reconstruct_perspective(
     begin = time.perf_counter()
     with apart([tracks]):
         tracks = method.prepared(tracks)
-        result = _reconstruct(method, tracks, intrinsics, cameras, lifted)
+        result = _reconstruct(method, tracks, intrinsics, cameras, lifted, guessed)
     result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
     method.warn(result)
     return result
@@ -100,12 +103,19 @@ def _reconstruct(
     intrinsics: Intrinsics,
     cameras: Tensor | None,
     lifted: Reconstruction | None,
+    guessed: bool,
 ) -> Reconstruction:
     """:func:`reconstruct_perspective` without autograd, on the tracks' device."""
     _warn_of_wide_rays(tracks, intrinsics)
     if cameras is not None:
         cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
-    best = _best_of_rounds(method, tracks, View.of(tracks, intrinsics, tracks.rate), cameras, lifted)
+    view = View.of(tracks, intrinsics, tracks.rate)
+    if lifted is None:
+        best = _best_of_rounds(method, tracks, view, cameras, 1.0 if guessed else None)
+    else:
+        best = _along(method, tracks, view, cameras, lifted)
+    if (guessed or lifted is not None) and not best.flat:
+        best = _with_focal(method, tracks, best, cameras)
     exact = has_trunk(tracks.skeleton) and not detected(tracks)
     if method.turns_over and exact and not best.flat:
         if lifted is not None and SEEMS_NEAR in lifted.diagnostics.notes:  # where the search ended
@@ -114,34 +124,27 @@ def _reconstruct(
     return _assemble(method, tracks, best)
 
 
-def _best_of_rounds(
-    method: Method, tracks: Tracks, view: View, cameras: Tensor | None, lifted: Reconstruction | None
-) -> Found:
+def _best_of_rounds(method: Method, tracks: Tracks, view: View, cameras: Tensor | None, usual: float | None) -> Found:
     """What is found until depths settle or nothing gets better, arguments as of :func:`reconstruct_perspective`.
 
-    Without ``lifted`` each round straightens the tracks by the depths and distances of the one before, and lifts them;
-    with it each refines what the one before found, through the lens that this asks for.
+    Each round straightens the tracks by the depths and distances of the one before, and lifts them. A ``usual`` focal
+    length is as of :func:`refine`.
     """
     distance, depth = view.first_distance(tracks, tracks.rate), torch.zeros_like(view.rays[..., 0])
     feet = feet_on_ground(tracks, cameras)
     best: Found | None = None
     unit: float | None = None
-    any_focal = lifted is not None
-    soft = SOFT if method.turns_over and not any_focal and not has_trunk(tracks.skeleton) else 0
-    rounds = FOCAL_ROUNDS if any_focal else ROUNDS
+    soft = SOFT if method.turns_over and not has_trunk(tracks.skeleton) else 0
+    rounds = ROUNDS
     while rounds > 0:
-        if best is not None and any_focal:
-            found = refine_again(best, view, feet, method.turns_over)
-        else:
-            straight = _straighten(tracks, view.rays, distance, depth)
-            if lifted is not None:
-                made = seen_along(view, lifted, distance, straight)
-            else:  # the tracks of the first round agree with no depths yet: there the method may find signs by itself
-                step = SfAM() if soft else method.following(best is not None and tracks.num_frames <= BLOCK)
-                made = _as_unsure(_lift(step, straight, view, cameras), best)
-            given = made, view, distance, depth, tracks.rate, feet, unit
-            flips = method.turns_over and not any_focal  # else a guess is confirmed
-            found = refine(*given, mirror=cameras is None, flips=flips, any_focal=any_focal)
+        straight = _straighten(tracks, view.rays, distance, depth)
+        # The tracks of the first round agree with no depths yet: there the method may find signs by itself.
+        step = SfAM() if soft else method.following(best is not None and tracks.num_frames <= BLOCK)
+        made = _as_unsure(_lift(step, straight, view, cameras), best)
+        found = refine(
+            made, view, distance, depth, tracks.rate, feet, unit,
+            mirror=cameras is None, flips=method.turns_over, any_focal=False, usual=usual,
+        )  # fmt: skip
         bodies, unit = found.bodies, None if soft else found.scene.unit
         moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
         sound = bool(bodies.energy.isfinite().any())
@@ -151,15 +154,39 @@ def _best_of_rounds(
             soft = soft - 1 if sound and moved >= SETTLED else 0
             continue
         rounds -= 1
-        gain = 0.0 if any_focal else GAIN  # what goes on from the best one is better by whatever it gains
-        better = best is None or bool(bodies.energy[0] < best.bodies.energy[0] - gain)
+        better = best is None or bool(bodies.energy[0] < best.bodies.energy[0] - GAIN)
         if better:
             best = found
         if moved < SETTLED or not sound or not better or found.flat:
             break
-        if any_focal:
-            view = View.of(tracks, zoomed(view.lens, float(bodies.focal[0])), tracks.rate)
     assert best is not None
+    return best
+
+
+def _along(method: Method, tracks: Tracks, view: View, cameras: Tensor | None, lifted: Reconstruction) -> Found:
+    """What was lifted under parallel rays, refined along those of a lens together with its focal length."""
+    distance, depth = view.first_distance(tracks, tracks.rate), torch.zeros_like(view.rays[..., 0])
+    made = seen_along(view, lifted, distance, _straighten(tracks, view.rays, distance, depth))
+    given = made, view, distance, depth, tracks.rate, feet_on_ground(tracks, cameras), None
+    return refine(*given, mirror=cameras is None, flips=False, any_focal=True)  # signs later: else a guess is confirmed
+
+
+def _with_focal(method: Method, tracks: Tracks, best: Found, cameras: Tensor | None) -> Found:
+    """What is found with its focal length, through the lens that each round asks for, until nothing gets better."""
+    feet = feet_on_ground(tracks, cameras)
+    for _ in range(FOCAL_ROUNDS):
+        before = best.bodies
+        view = View.of(tracks, zoomed(best.view.lens, float(before.focal[0])), tracks.rate)
+        found = refine_again(best, view, feet, method.turns_over)
+        bodies = found.bodies
+        # Energies with and without a focal length to be found do not compare.
+        if not bool(bodies.energy.isfinite().any()) or (
+            best.scene.any_focal and not bool(bodies.energy[0] < before.energy[0])
+        ):
+            break
+        best = found
+        if float((bodies.depth[0] - before.depth[0]).square().mean().sqrt()) < SETTLED * found.scene.unit:
+            break
     return best
 
 

@@ -89,7 +89,7 @@ class PinholeEnergy:
 
     Where the focal length is not known, rays are (u, v, 1 / w), of a focal length w times as short: then D = P / w with
     a path P that the size in the image tells, and points lie at (u (P + w z), v (P + w z), P / w + z). To w = 0 belong
-    parallel rays.
+    parallel rays. It is likely to be as long as lenses usually are, or else to make the camera's distance a usual one.
 
     Unknowns are the bones' depths, the logarithms of lengths, and cosines of the distance's logarithm, and that of w,
     in coordinates about the start in which the energy is nearly a sphere. What a length, a distance or w changes in the
@@ -106,6 +106,7 @@ class PinholeEnergy:
         standing: (T, C) how surely the skeleton's contact points stand still, or None where nothing tells.
         focal: (H,) where the search for a focal length starts, over that of the rays' camera, and which are free (H,);
             None where it is known.
+        usual: focal length of usual lenses, over that of the rays' camera; None where nothing tells.
 
     Attributes:
         start: (H, D) the unknowns of the start.
@@ -122,6 +123,7 @@ class PinholeEnergy:
         lengths: Tensor | None = None,
         standing: Tensor | None = None,
         focal: tuple[Tensor, Tensor] | None = None,
+        usual: float | None = None,
     ) -> None:
         self.slow = 30.0 / rate  # more frames a second tell no more, and move less from one to the next
         self.skeleton, self.rate, self.known = skeleton, rate, lengths is not None
@@ -134,6 +136,7 @@ class PinholeEnergy:
         self.path, self.depth = distance.expand(len(depth), -1), depth.mT.contiguous()  # P (H, T), z (H, N, T)
         self.wide = (torch.ones_like(depth[:, 0, 0]) if focal is None else 1 / focal[0])[:, None]  # w (H, 1)
         self.free = None if focal is None else focal[1]  # (H,) whose w is an unknown
+        self.usual = usual
         self.own = bone_vectors(depth[..., None], self.bones)[..., 0].mT.contiguous()
         size = (self.own.square() + self._first_image().square().sum(1)).sqrt()
         self.lengths = median(size, -1).clamp_min(1e-6)
@@ -198,7 +201,8 @@ class PinholeEnergy:
         distance = path / wide
         value, along = self._steady(distance)
         firm = 0.0 if self.free is None else FIRM * self.free.to(value)
-        usual = (wide * USUAL / self.path.mean(-1, keepdim=True)).log()  # (H, 1)
+        lens = USUAL / self.path.mean(-1, keepdim=True) if self.usual is None else self.usual  # of usual focal length
+        usual = (wide * lens).log()  # (H, 1)
         value = value + firm * usual[:, 0].square() / 2
         value = value + change.square().mean(-1) / (2 * STRAY**2)
         rays = self.toward * wide[..., None, None]

@@ -89,6 +89,7 @@ def refine(
     mirror: bool,
     flips: bool,
     any_focal: bool,
+    usual: float | None = None,
 ) -> Found:
     """Refine all solutions of the method under perspective, and the best one's mirror image.
 
@@ -103,6 +104,7 @@ def refine(
         mirror: whether depth may have the other sign.
         flips: whether runs of depths may have.
         any_focal: whether the view's focal length is to be found.
+        usual: focal length of usual lenses, over the view's; None where nothing tells.
     """
     others = (lifted, *lifted.alternatives)
     flat = clean_image(lifted)
@@ -113,7 +115,7 @@ def refine(
     unit = unit or own
     scales = slow_part(lifted.scales.clamp_min(1e-9).log()[:, None], rate)[:, 0].exp()  # a method's own may jump
     noise = image_noise(lifted.tracks, flat, own)
-    scene = Scene(outward(lifted.skeleton), rays, noise, rate, unit, standing)
+    scene = Scene(outward(lifted.skeleton), rays, noise, rate, unit, standing, usual=usual)
     parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / own
     if parallax < FLAT or not lifted.skeleton.num_bones:
         energy = start.new_tensor([o.objective for o in others])
@@ -138,7 +140,8 @@ def refine_again(found: Found, view: View, standing: Tensor | None, flips: bool)
     flips = flips and (before is None or abs(math.log(focal / before)) > SAME)
     bodies = found.bodies[found.bodies.energy.isfinite()]
     rays = view.seen_from(found.view, found.scene.rays)
-    scene = replace(found.scene, rays=rays, standing=standing, any_focal=False)
+    usual = None if found.scene.usual is None else found.scene.usual * found.view.lens.focal / focal
+    scene = replace(found.scene, rays=rays, standing=standing, any_focal=False, usual=usual)
     origin = bodies.origin
     scene, bodies = _settled(scene, bodies.distance[0], bodies.depth, flips, any_focal=True)
     bodies = replace(bodies, origin=origin[bodies.origin])

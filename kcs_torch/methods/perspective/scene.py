@@ -84,6 +84,7 @@ class Scene:
         unit: the length that 1 stands for in a body of 1.75, in units of the distance.
         standing: (T, C) how surely the skeleton's contact points stand still, or None where nothing tells.
         any_focal: whether the focal length is to be found, too.
+        usual: focal length of usual lenses, over that of the rays; None where nothing tells.
     """
 
     skeleton: Skeleton
@@ -93,6 +94,7 @@ class Scene:
     unit: float
     standing: Tensor | None
     any_focal: bool = False
+    usual: float | None = None
 
     def refined(self, distance: Tensor, depth: Tensor, focal: Tensor | None = None, *, steps: int = STEPS) -> Bodies:
         """Bodies of least :class:`PinholeEnergy`, each from its own start, best first.
@@ -123,7 +125,7 @@ class Scene:
             lens = focal, torch.full_like(focal, self.any_focal and lengths is None, dtype=torch.bool)
             pinhole = PinholeEnergy(
                 self.skeleton, self.rays[some], path[some], depth[:, some] / self.unit, self.rate, self.noise[some],
-                lengths, feet, lens if self.any_focal else None,
+                lengths, feet, lens if self.any_focal else None, self.usual,
             )  # fmt: skip
             solution = lbfgs(pinhole, pinhole.start, num_steps=steps, tolerance=1e-6, slopes=True, part=pinhole.rows)
             assert solution.energy is not None and solution.before is not None

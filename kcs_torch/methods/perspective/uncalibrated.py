@@ -14,9 +14,11 @@ from torch import Tensor
 from kcs_torch.clean.detector import detected
 from kcs_torch.clean.timing import cuts_of
 from kcs_torch.errors import KcsWarning, OptionError
+from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.methods.answer.finish import Estimate, extent
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.clips.lockstep import Search
+from kcs_torch.methods.clips.template import clip_scale
 from kcs_torch.methods.perspective.calibrated import WIDE, feet_on_ground, reconstruct_perspective
 from kcs_torch.methods.perspective.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.perspective.pinhole import PinholeEnergy
@@ -26,11 +28,12 @@ from kcs_torch.methods.perspective.view import View, lens_note
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
+from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.nn.posture import has_trunk, trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
-__all__ = ["likely_lens", "looking", "may_be_near", "reconstruct_uncalibrated"]
+__all__ = ["lens_of_image", "likely_lens", "looking", "may_be_near", "reconstruct_uncalibrated"]
 
 NARROW = 0.15
 """Width of a trunk, over its length, from which on it is more than a line."""
@@ -58,6 +61,23 @@ DEARER = 6.0
 """By how much a near body must be dearer in the end for the camera to be far: what seemed nearer than that may yet be
 near, once signs are right."""
 
+FOCAL = 0.85
+"""Usual focal length over the image's longer side, that of phones, web and action cameras."""
+
+SIZES: tuple[tuple[int, int], ...] = (
+    (640, 360),
+    (640, 480),
+    (854, 480),
+    (1280, 720),
+    (1920, 1080),
+    (2704, 1520),
+    (3840, 2160),
+)
+"""Usual sizes of images, whichever side is up."""
+
+INSIDE = 0.99
+"""Share of the joints that an image of usual size holds: detectors place some a little beside it."""
+
 EVERY, HOPELESS, AWAY = 20, 10.0, 6.5
 """Every so many steps it may be hopeless: if a near body is dearer by so much, and has gone as far away."""
 
@@ -75,23 +95,71 @@ def may_be_near(tracks: Tracks) -> bool:
     return wide > NARROW * long
 
 
+def lens_of_image(tracks: Tracks) -> tuple[Intrinsics, str] | None:
+    """The usual lens of a camera that made an image of such a size, and what to say of it.
+
+    Where nobody says how large the image is, it is taken to be the smallest of usual size that holds the tracks.
+
+    Args:
+        tracks: of a body with a template. A detector's are in pixels, whatever they say: files often tell the unit of
+            the motion.
+
+    Returns:
+        A lens that looks at the image's middle, and a sentence; or None where the tracks are not in pixels, no image of
+        usual size holds them, they show a point, or a body so small that rays might as well be parallel.
+    """
+    points = tracks.points[tracks.seen]
+    if not bool(extent(tracks) > 0) or not (tracks.units == "px" or detected(tracks)):
+        return None
+    size = tracks.image_size or _usual_size(points)
+    if size is None:
+        return None
+    width, height = size
+    focal, body = FOCAL * max(width, height), tracks.skeleton
+    rest = body.template_points(dtype=points.dtype, device=points.device)
+    lengths = bone_lengths(rest, body.bone_index(device=points.device))
+    own = usual_posture(body, points.dtype, points.device).rest_lengths
+    unit = float(clip_scale(tracks, rest).median() * (lengths / own).median())
+    if not focal < NEAR * unit:
+        return None
+    said = (
+        f"the image is taken to be {width} x {height} pixels, the smallest of usual size that holds the tracks: if it "
+        "is not, give image_size=(width, height) (kcs-torch: --image-size), or the camera's intrinsics"
+    )
+    return Intrinsics(focal, focal, width / 2, height / 2), "" if tracks.image_size else said
+
+
+def _usual_size(points: Tensor) -> tuple[int, int] | None:
+    """The smallest image of usual size that holds points (n, 2), if one does."""
+    usual = (size for wide, high in SIZES for size in ((wide, high), (high, wide)))
+    return min((size for size in usual if _holds(points, size)), key=math.prod, default=None)
+
+
+def _holds(points: Tensor, size: tuple[int, int]) -> bool:
+    """Whether an image of such a size holds nearly all of points (n, 2)."""
+    inside = ((points >= 0) & (points <= points.new_tensor(size))).all(-1)
+    return float(inside.to(points.dtype).mean()) >= INSIDE
+
+
 def reconstruct_uncalibrated(
     method: Method, tracks: Tracks, cameras: Tensor | None = None, lifted: Reconstruction | None = None
 ) -> Reconstruction:
     """Reconstruct a body before a camera of which nothing is known.
 
     The nearer a camera is, the more the size of a limb in the image changes with its depth: bones of constant length,
-    the template's posture and feet that stand still tell how much. PKC solves the tracks as if rays were parallel, but
-    ends where it has found a body whose camera seems near (:func:`likely_lens`), before it turns runs of signs over.
-    The focal length is then found together with depths, lengths, distances and signs by
-    :func:`kcs_torch.methods.perspective.reconstruct_perspective`. The principal point is taken to be the tracks'
-    middle.
+    the template's posture and feet that stand still tell how much. Where the image's size is known, or can be guessed,
+    the tracks are lifted through the lens that such a camera usually has (:func:`lens_of_image`). Elsewhere PKC solves
+    them as if rays were parallel, but ends where it has found a body whose camera seems near (:func:`likely_lens`),
+    before it turns runs of signs over; the principal point is then taken to be the tracks' middle. Either way the focal
+    length is found together with depths, lengths, distances and signs by
+    :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
 
     Args:
         method: any.
         tracks: of a body with a template.
         cameras: as of :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
-        lifted: what PKC, :func:`looking` for a near camera, found under parallel rays, if it was asked before.
+        lifted: what PKC, :func:`looking` for a near camera, found under parallel rays, if it was asked before: where
+            :func:`lens_of_image` tells nothing.
 
     Returns:
         As :func:`kcs_torch.methods.perspective.reconstruct_perspective`; a note tells the intrinsics. Where the tracks
@@ -108,14 +176,20 @@ def reconstruct_uncalibrated(
     begin = time.perf_counter()
     judge = method if isinstance(method, PKC) else PKC()
     before = 0.0 if lifted is None else lifted.diagnostics.seconds
+    usual = None if lifted is not None else lens_of_image(tracks)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
-        result = looking(judge)(tracks, cameras) if lifted is None else lifted
-        ended = SEEMS_NEAR in result.diagnostics.notes
-        lens = None if SEEMS_FAR in result.diagnostics.notes else likely_lens(result, cameras)
+        result, ended, said = lifted, True, ""
+        lens: Intrinsics | None
+        if usual is None:
+            result = looking(judge)(tracks, cameras) if lifted is None else lifted
+            ended = SEEMS_NEAR in result.diagnostics.notes
+            lens = None if SEEMS_FAR in result.diagnostics.notes else likely_lens(result, cameras)
+        else:
+            lens, said = usual
         near: Reconstruction | None = None
         if lens is not None:
-            near = reconstruct_perspective(judge, tracks, lens, cameras, lifted=result)
+            near = reconstruct_perspective(judge, tracks, lens, cameras, lifted=result, guessed=usual is not None)
             if judge is not method:
                 assert near.distance is not None
                 focal = float(near.distance.log().mean().exp())  # the unit is a pixel there
@@ -125,10 +199,10 @@ def reconstruct_uncalibrated(
                 near = replace(near, diagnostics=replace(near.diagnostics, notes=notes))
         if near is not None and bool(near.points.isfinite().all()):
             result = near
-        elif judge is not method or ended:
-            result = method(tracks, cameras)
+        elif result is None or judge is not method or ended:
+            result, said = method(tracks, cameras), ""
     method.warn(result)
-    notes = tuple(note for note in result.diagnostics.notes if note != SEEMS_FAR)
+    notes = (*(note for note in result.diagnostics.notes if note != SEEMS_FAR), *([said] if said else []))
     spent = before + time.perf_counter() - begin
     return replace(result, diagnostics=replace(result.diagnostics, seconds=spent, notes=notes))
 

@@ -1,0 +1,114 @@
+"""Cameras that nobody has calibrated, whose image's size is known or guessed: a usual lens looks at its middle."""
+
+import warnings
+from dataclasses import replace
+
+import pytest
+import torch
+from near_cameras import error, quietly
+
+import kcs_torch as kt
+from kcs_torch.methods.perspective import calibrated, uncalibrated
+from kcs_torch.methods.perspective.uncalibrated import lens_of_image
+from kcs_torch.types import Intrinsics
+
+IMAGE = Intrinsics(1500.0, 1500.0, 960.0, 540.0)
+
+
+def aside(distance=3500.0, frames=45, yaw=60.0, x=-1000.0, lens=IMAGE):
+    """Tracks of a person who walks so many mm beside the middle of an image of 1920 x 1080, and the true points."""
+    clip = kt.data.walking_person(frames, turn=0.0, yaw=yaw, fps=30.0)
+    points = clip.points + clip.points.new_tensor([x, 0.0, distance])
+    return kt.Tracks.from_arrays(lens.project(points), skeleton=clip.skeleton, fps=30.0), points
+
+
+def beyond(tracks):
+    """The same tracks where no image of usual size holds them, so that the camera is taken to look at their middle."""
+    return replace(tracks, points=tracks.points - 2000)
+
+
+def same(one, other):
+    return torch.equal(one.points, other.points) and (one.distance is None) == (other.distance is None)
+
+
+def test_a_person_beside_the_middle_of_an_image():
+    """Whose size is guessed by what holds the tracks. About their own middle the lens would be another."""
+    tracks, truth = aside()
+    found, told = quietly(tracks), quietly(replace(tracks, image_size=(1920, 1080)))
+    elsewhere = quietly(beyond(tracks))
+    assert same(found, told) and error(found.points, truth) < 0.6 * error(elsewhere.points, truth)
+    assert (found.intrinsics.cx, found.intrinsics.cy) == (960, 540)
+    assert 0.75 < found.intrinsics.fx / IMAGE.fx < 1.33
+    said = "image is taken to be 1920 x 1080 pixels, the smallest of usual size that holds the tracks"
+    assert [sum(said in note for note in one.diagnostics.notes) for one in (found, told, elsewhere)] == [1, 0, 0]
+    assert any("principal point taken to be (960, 540)" in note for note in found.diagnostics.notes)
+
+
+def test_the_focal_length_is_found_from_usual_ones_on(monkeypatch):
+    """Through lenses that are shorter and longer than it; without looking for it the motion is worse."""
+    tracks, truth = aside(lens=Intrinsics(2200.0, 2200.0, 960.0, 540.0), distance=4000.0, x=900.0)
+    found = quietly(tracks)
+    assert found.intrinsics.fx > 1.1 * uncalibrated.FOCAL * 1920
+    monkeypatch.setattr(calibrated, "_with_focal", lambda *given: given[2])
+    assert error(found.points, truth) < error(quietly(tracks).points, truth)
+
+
+@pytest.mark.parametrize(
+    ("corner", "size", "factor", "expected"),
+    [
+        ((100, 50), None, 1.0, (1920, 1080)),
+        ((100, 500), None, 1.0, (1080, 1920)),
+        ((100, 50), (2000, 1500), 1.0, (2000, 1500)),
+        ((40, 20), None, 0.4, (640, 480)),
+        ((-300, 50), None, 1.0, None),  # a tenth of the joints and more beside it
+        ((3000, 2900), None, 1.0, None),
+        ((100, 50), None, 0.1, None),  # so small that the camera may as well be far away
+    ],
+)
+def test_which_lens_an_image_has(corner, size, factor, expected):
+    flat = kt.data.walking_person(30, turn=0.0, yaw=60.0).tracks
+    points = flat.points - flat.points.amin((0, 1))
+    points = points * (factor * 900 / float(points[..., 1].max())) + points.new_tensor(corner)
+    tracks = replace(flat, points=points, units="px", image_size=size)
+    lens = lens_of_image(tracks)
+    if expected is None:
+        assert lens is None
+        return
+    assert (2 * lens[0].cx, 2 * lens[0].cy) == expected and lens[0].fx == lens[0].fy == 0.85 * max(expected)
+    assert (size is None) == (f"{expected[0]} x {expected[1]}" in lens[1])
+    assert lens_of_image(replace(tracks, units="mm")) is None
+    assert lens_of_image(replace(tracks, units="mm", detector=True)) is not None
+    assert lens_of_image(replace(tracks, weights=0 * tracks.weights)) is None
+
+
+def test_a_joint_or_two_beside_the_image_do_not_matter():
+    tracks, _ = aside(frames=20)
+    tracks.points[3, 2, 0] = -5.0
+    assert lens_of_image(tracks)[0].cx == 960
+
+
+@pytest.mark.parametrize("method", ["kcs", "sfam"])
+def test_other_methods_before_an_image(method):
+    """PKC finds the lens, through which they lift."""
+    tracks, truth = aside(frames=30)
+    found = quietly(tracks, method=method, intrinsics="auto")
+    assert found.method == method and found.intrinsics.cx == 960 and 0.7 < found.intrinsics.fx / IMAGE.fx < 1.4
+    assert error(found.points, truth) < error(quietly(tracks, method=method, intrinsics="parallel").points, truth)
+
+
+def test_several_people_before_an_image():
+    people = [aside(frames=15)[0], beyond(aside(frames=15)[0]), aside(frames=12, x=900.0)[0]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", kt.KcsWarning)
+        together = kt.reconstruct_all(people)
+    assert all(same(one, quietly(tracks)) for one, tracks in zip(together, people, strict=True))
+    assert [one.intrinsics.cx == 960 for one in together] == [True, False, True]
+
+
+def test_what_no_lens_explains_is_lifted_as_by_parallel_rays(monkeypatch):
+    tracks, _ = aside(frames=12)
+    spoilt = lambda *given, **more: replace(given[0].many([tracks])[0], points=torch.full((12, 17, 3), torch.nan))  # noqa: E731
+    monkeypatch.setattr(uncalibrated, "reconstruct_perspective", spoilt)
+    found = quietly(tracks)
+    assert found.points.isfinite().all() and found.distance is None
+    assert not any("image is taken to be" in note for note in found.diagnostics.notes)
