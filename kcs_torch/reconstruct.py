@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,8 @@ from kcs_torch.methods import METHODS
 from kcs_torch.methods.base import Method, check_tracks
 from kcs_torch.methods.found_skeleton import find_skeleton
 from kcs_torch.methods.perspective.calibrated import WIDE, reconstruct_perspective
-from kcs_torch.methods.perspective.uncalibrated import (
-    lens_of_image,
-    looking,
-    may_be_near,
-    reconstruct_uncalibrated,
-)
+from kcs_torch.methods.perspective.one_lens import by_one_lens, of_one_image
+from kcs_torch.methods.perspective.uncalibrated import looking, may_be_near, reconstruct_uncalibrated
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.bodies import no_bones
@@ -149,9 +145,10 @@ def reconstruct_all(
         **fields: of the method.
 
     Returns:
-        A :class:`Reconstruction` of each, in their order. People before a near camera that nobody has calibrated get a
-        lens of their own each, and x and y from its principal point: their places compare with ``intrinsics`` given, or
-        with "parallel", which leaves everybody where the image has them.
+        A :class:`Reconstruction` of each, in their order. People of one file before a camera that nobody has calibrated
+        get one lens where the image's size is known or can be guessed. Else they get one of their own each, and x and y
+        from its principal point: their places compare with ``intrinsics`` given, or with "parallel", which leaves
+        everybody where the image has them.
 
     Raises:
         OptionError: as :func:`reconstruct`; or something is not :class:`Tracks`.
@@ -174,23 +171,31 @@ def reconstruct_all(
     lens = _lens(intrinsics)
     if isinstance(lens, Intrinsics):
         return [_before(lens, chosen, one) for one in people]
-    if lens == "auto":
-        return _told_of_lenses([_before(lens, chosen, one) for one in people])
-    if lens == "parallel" or not chosen.turns_over:
+    if lens == "parallel" or (lens is None and not chosen.turns_over):
         return chosen.many(people)
-    near = [may_be_near(one) for one in people]
-    found = {i: _before("auto", chosen, one) for i, one in enumerate(people) if near[i] and lens_of_image(one)}
+    found: dict[int, Reconstruction] = {}
+    for group in of_one_image(people):
+        made = by_one_lens(chosen, [people[i] for i in group])
+        found |= zip(group, made or (), strict=made is not None)
     rest = [i for i in range(len(people)) if i not in found]
+    if lens == "auto":
+        found |= {i: _before(lens, chosen, people[i]) for i in rest}
+    else:
+        found |= zip(rest, _unless_near(chosen, [people[i] for i in rest]), strict=True)
+    return _told_of_lenses([found[i] for i in range(len(people))])
+
+
+def _unless_near(chosen: Method, people: Sequence[Tracks]) -> Iterator[Reconstruction]:
+    """Bodies reconstructed as one batch under parallel rays, and one by one where the camera seems near."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
-        lifted = looking(chosen).many([people[i] for i in rest])
-    for i, result in zip(rest, lifted, strict=True):
-        if near[i]:
-            result = reconstruct_uncalibrated(chosen, people[i], lifted=result)
+        lifted = looking(chosen).many(people)
+    for one, result in zip(people, lifted, strict=True):
+        if may_be_near(one):
+            yield reconstruct_uncalibrated(chosen, one, lifted=result)
         else:
             chosen.warn(result)
-        found[i] = result
-    return _told_of_lenses([found[i] for i in range(len(people))])
+            yield result
 
 
 def _told_of_lenses(found: list[Reconstruction]) -> list[Reconstruction]:
@@ -202,7 +207,7 @@ def _told_of_lenses(found: list[Reconstruction]) -> list[Reconstruction]:
             clips.setdefault(file.removesuffix(f", {person}"), []).append(one)
     for file, people in clips.items():
         near = sum(one.distance is not None for one in people)
-        if near and len(people) > 1:
+        if len({one.intrinsics for one in people}) > 1:
             each = "got a lens and an origin of their own each" if near > 1 else "got a lens and an origin of its own"
             message = (
                 f"{file}: {near} of {len(people)} people {each}, as the camera seems near: their places and sizes do "

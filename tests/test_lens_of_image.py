@@ -8,7 +8,8 @@ import torch
 from near_cameras import error, quietly
 
 import kcs_torch as kt
-from kcs_torch.methods.perspective import calibrated, uncalibrated
+from kcs_torch.methods.perspective import calibrated, one_lens, uncalibrated
+from kcs_torch.methods.perspective.one_lens import by_one_lens, of_one_image
 from kcs_torch.methods.perspective.uncalibrated import lens_of_image
 from kcs_torch.types import Intrinsics
 
@@ -97,7 +98,7 @@ def test_other_methods_before_an_image(method):
 
 
 def test_several_people_before_an_image():
-    people = [aside(frames=15)[0], beyond(aside(frames=15)[0]), aside(frames=12, x=900.0)[0]]
+    people = [aside(frames=8)[0], beyond(aside(frames=8)[0]), aside(frames=7, x=900.0)[0]]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", kt.KcsWarning)
         together = kt.reconstruct_all(people)
@@ -112,3 +113,46 @@ def test_what_no_lens_explains_is_lifted_as_by_parallel_rays(monkeypatch):
     found = quietly(tracks)
     assert found.points.isfinite().all() and found.distance is None
     assert not any("image is taken to be" in note for note in found.diagnostics.notes)
+
+
+def test_people_of_one_file_have_one_lens():
+    """That of the one who fills most of the image; also who is so small that rays might as well be parallel."""
+    cases = [(4500.0, 900.0), (3000.0, -600.0), (25000.0, 3000.0)]
+    clips = [aside(far, 20, x=x) for far, x in cases]
+    people = [replace(tracks, source=f"walk.json, person {k}") for k, (tracks, _) in enumerate(clips)]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        together = kt.reconstruct_all(people)
+    assert not any("origin" in str(one.message) for one in caught)
+    lens = together[1].intrinsics
+    assert [one.intrinsics for one in together] == [lens] * 3 and lens.cx == 960
+    alone = quietly(people[1])
+    assert same(together[1], alone) and lens == alone.intrinsics
+    told = [note for one in together for note in one.diagnostics.notes if "found from the tracks" in note]
+    assert [who in note for note, who in zip(told, ("of person 1,", "tracks, a", "of person 1,"), strict=True)] == [
+        True
+    ] * 3
+    for (far, _), one, (_, truth) in zip(cases, together, clips, strict=True):
+        assert error(one.points, truth) < 50  # flat: 100 and more
+        distance = float(one.scaled(units="mm", height=1750).distance.mean()) / lens.fx * IMAGE.fx
+        assert 0.85 < distance / far < 1.15
+    several = [*people, replace(people[0], source="other.json"), replace(people[0], source="other.json")]
+    assert of_one_image(several) == [[0, 1, 2], [3], [4]]
+    assert of_one_image([replace(people[0], image_size=(1920, 1080)), *people[1:]]) == [[0], [1, 2]]
+
+
+def test_whose_lens_is_not_found_has_none_to_share(monkeypatch):
+    people = [replace(aside(frames=12)[0], source=f"walk.json, person {k}") for k in range(2)]
+    monkeypatch.setattr(one_lens, "reconstruct_uncalibrated", lambda method, tracks, **_: method(tracks))
+    assert by_one_lens(kt.PKC(), people) is None
+    monkeypatch.setattr(one_lens, "lens_of_image", lambda *_: None)
+    assert by_one_lens(kt.PKC(), people) is None
+
+
+def test_who_cannot_be_lifted_through_the_lens_of_others_is_lifted_without(monkeypatch):
+    people = [replace(aside(frames=12, x=x)[0], source=f"walk.json, person {k}") for k, x in enumerate((-900, 900))]
+    spoilt = lambda method, tracks, lens: replace(method(tracks), points=torch.full((12, 17, 3), torch.nan))  # noqa: E731
+    monkeypatch.setattr(one_lens, "reconstruct_perspective", spoilt)
+    found = by_one_lens(kt.PKC(), people)
+    assert sorted(one.distance is None for one in found) == [False, True]
+    assert all(one.points.isfinite().all() for one in found)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -95,7 +96,7 @@ def may_be_near(tracks: Tracks) -> bool:
     return wide > NARROW * long
 
 
-def lens_of_image(tracks: Tracks) -> tuple[Intrinsics, str] | None:
+def lens_of_image(tracks: Tracks, beside: Sequence[Tracks] = ()) -> tuple[Intrinsics, str] | None:
     """The usual lens of a camera that made an image of such a size, and what to say of it.
 
     Where nobody says how large the image is, it is taken to be the smallest of usual size that holds the tracks.
@@ -103,6 +104,7 @@ def lens_of_image(tracks: Tracks) -> tuple[Intrinsics, str] | None:
     Args:
         tracks: of a body with a template. A detector's are in pixels, whatever they say: files often tell the unit of
             the motion.
+        beside: others in the same image, which holds them, too.
 
     Returns:
         A lens that looks at the image's middle, and a sentence; or None where the tracks are not in pixels, no image of
@@ -111,7 +113,7 @@ def lens_of_image(tracks: Tracks) -> tuple[Intrinsics, str] | None:
     points = tracks.points[tracks.seen]
     if not bool(extent(tracks) > 0) or not (tracks.units == "px" or detected(tracks)):
         return None
-    size = tracks.image_size or _usual_size(points)
+    size = tracks.image_size or _usual_size(torch.cat([points, *(one.points[one.seen] for one in beside)]))
     if size is None:
         return None
     width, height = size
@@ -142,7 +144,12 @@ def _holds(points: Tensor, size: tuple[int, int]) -> bool:
 
 
 def reconstruct_uncalibrated(
-    method: Method, tracks: Tracks, cameras: Tensor | None = None, lifted: Reconstruction | None = None
+    method: Method,
+    tracks: Tracks,
+    cameras: Tensor | None = None,
+    lifted: Reconstruction | None = None,
+    *,
+    beside: Sequence[Tracks] = (),
 ) -> Reconstruction:
     """Reconstruct a body before a camera of which nothing is known.
 
@@ -160,6 +167,7 @@ def reconstruct_uncalibrated(
         cameras: as of :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
         lifted: what PKC, :func:`looking` for a near camera, found under parallel rays, if it was asked before: where
             :func:`lens_of_image` tells nothing.
+        beside: as of :func:`lens_of_image`.
 
     Returns:
         As :func:`kcs_torch.methods.perspective.reconstruct_perspective`; a note tells the intrinsics. Where the tracks
@@ -176,7 +184,7 @@ def reconstruct_uncalibrated(
     begin = time.perf_counter()
     judge = method if isinstance(method, PKC) else PKC()
     before = 0.0 if lifted is None else lifted.diagnostics.seconds
-    usual = None if lifted is not None else lens_of_image(tracks)
+    usual = None if lifted is not None else lens_of_image(tracks, beside)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
         result, ended, said = lifted, True, ""
