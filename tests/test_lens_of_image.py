@@ -6,11 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 from near_cameras import error, quietly
+from torch.testing import assert_close
 
 import kcs_torch as kt
-from kcs_torch.methods.perspective import calibrated, one_lens, uncalibrated
+from kcs_torch.methods.perspective import calibrated, image_lens, one_lens, uncalibrated
+from kcs_torch.methods.perspective.image_lens import lens_of_image
 from kcs_torch.methods.perspective.one_lens import by_one_lens, of_one_image
-from kcs_torch.methods.perspective.uncalibrated import lens_of_image
 from kcs_torch.types import Intrinsics
 
 IMAGE = Intrinsics(1500.0, 1500.0, 960.0, 540.0)
@@ -49,7 +50,7 @@ def test_the_focal_length_is_found_from_usual_ones_on(monkeypatch):
     """Through lenses that are shorter and longer than it; without looking for it the motion is worse."""
     tracks, truth = aside(lens=Intrinsics(2200.0, 2200.0, 960.0, 540.0), distance=4000.0, x=900.0)
     found = quietly(tracks)
-    assert found.intrinsics.fx > 1.1 * uncalibrated.FOCAL * 1920
+    assert found.intrinsics.fx > 1.1 * image_lens.FOCAL * 1920
     monkeypatch.setattr(calibrated, "_with_focal", lambda *given: given[2])
     assert error(found.points, truth) < error(quietly(tracks).points, truth)
 
@@ -156,3 +157,18 @@ def test_who_cannot_be_lifted_through_the_lens_of_others_is_lifted_without(monke
     found = by_one_lens(kt.PKC(), people)
     assert sorted(one.distance is None for one in found) == [False, True]
     assert all(one.points.isfinite().all() for one in found)
+
+
+def test_deviations_allow_for_a_lens_that_was_found(monkeypatch):
+    """And for a detector's tracks the method does so by itself."""
+    tracks, _ = aside(frames=8)
+    told = replace(tracks, image_size=(1920, 1080))
+    cases = [(told, "LEAN"), (tracks, "ASIDE"), (beyond(tracks), "HEADING"), (replace(told, detector=True), "")]
+    found = [quietly(one) for one, _ in cases]
+    angles = [getattr(calibrated, name, 0.0) for _, name in cases]
+    assert angles == sorted(angles[:3]) + [0.0] and angles[0] > 0
+    for name in ("LEAN", "ASIDE", "HEADING"):
+        monkeypatch.setattr(calibrated, name, 0.0)
+    for (one, _), result, angle in zip(cases, found, angles, strict=True):
+        off = (result.points - result.points.mean(1, keepdim=True))[..., :2].norm(dim=-1)
+        assert_close(result.uncertainty, quietly(one).uncertainty.hypot(angle * off))

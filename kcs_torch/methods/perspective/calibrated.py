@@ -22,7 +22,7 @@ from kcs_torch.methods.perspective.parallel_image import body_unit
 from kcs_torch.methods.perspective.refining import Found, refine, refine_again, seen_along
 from kcs_torch.methods.perspective.scene import BLOCK, GAIN, Bodies, ahead
 from kcs_torch.methods.perspective.view import View, lens_note, zoomed
-from kcs_torch.methods.pkc.answers import CLOSE
+from kcs_torch.methods.pkc.answers import CLOSE, HEADING
 from kcs_torch.methods.pkc.fixed_answer import SEE_OTHERS, UNSIDED
 from kcs_torch.methods.pkc.near import SEEMS_NEAR
 from kcs_torch.methods.sfam import SfAM
@@ -46,6 +46,10 @@ STILL = 2.0
 SOFT = 8
 """Rounds of SfAM, at most, that come first where no template helps: straightened by wrong depths, tracks do not fit
 bones of constant length, which PKC insists on."""
+
+LEAN, ASIDE = 0.05, 0.1
+"""Standard deviation, in radians, of the direction from which a body is seen if the focal length was found: a shorter
+lens and a body that leans explain much the same image; and if the image's size is a guess as well."""
 
 WIDE = 3.0
 """Tangent of the angle off the optical axis from which on the focal length is hardly true."""
@@ -136,6 +140,7 @@ def _best_of_rounds(method: Method, tracks: Tracks, view: View, cameras: Tensor 
     unit: float | None = None
     soft = SOFT if method.turns_over and not has_trunk(tracks.skeleton) else 0
     rounds = ROUNDS
+    flips = method.turns_over and usual is None  # else once the focal length is looked for: a guess is confirmed
     while rounds > 0:
         straight = _straighten(tracks, view.rays, distance, depth)
         # The tracks of the first round agree with no depths yet: there the method may find signs by itself.
@@ -143,7 +148,7 @@ def _best_of_rounds(method: Method, tracks: Tracks, view: View, cameras: Tensor 
         made = _as_unsure(_lift(step, straight, view, cameras), best)
         found = refine(
             made, view, distance, depth, tracks.rate, feet, unit,
-            mirror=cameras is None, flips=method.turns_over, any_focal=False, usual=usual,
+            mirror=cameras is None, flips=flips, any_focal=False, usual=usual,
         )  # fmt: skip
         bodies, unit = found.bodies, None if soft else found.scene.unit
         moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
@@ -299,6 +304,9 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
         notes=tuple(notes),
         doubt="" if k else doubt,
     )
+    unsure = None if lifted.uncertainty is None else lifted.uncertainty * factor
+    if unsure is not None and scene.any_focal and not detected(tracks):
+        unsure = unsure.hypot(_leaning(points, tracks, scene.usual is not None))
     return replace(
         lifted,
         points=points,
@@ -306,13 +314,24 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
         scales=intrinsics.focal / root,
         tracks=tracks,
         diagnostics=facts,
-        uncertainty=None if lifted.uncertainty is None else lifted.uncertainty * factor,
+        uncertainty=unsure,
         objective=float(bodies.energy[k]),
         root_depth=root - root[0],
         distance=root,
         intrinsics=intrinsics,
         alternatives=(),
     ).remeasured()
+
+
+def _leaning(points: Tensor, tracks: Tracks, imaged: bool) -> Tensor:
+    """Standard deviation (T, N) of depths for the direction from which points (T, N, 3) are seen, the lens being found.
+
+    Where nothing is known of the image, the camera is taken to look at the tracks' middle. Of a detector's tracks the
+    method allows for as much by itself.
+    """
+    angle = HEADING if not imaged else ASIDE if tracks.image_size is None else LEAN
+    flat = points[..., :2]
+    return angle * (flat - flat.mean(-2, keepdim=True)).norm(dim=-1)
 
 
 def _one_side(bodies: Bodies) -> bool:

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 from kcs_torch.methods.base import Method
 from kcs_torch.methods.perspective.calibrated import reconstruct_perspective
-from kcs_torch.methods.perspective.uncalibrated import lens_of_image, may_be_near, reconstruct_uncalibrated
+from kcs_torch.methods.perspective.image_lens import lens_of_image
+from kcs_torch.methods.perspective.uncalibrated import may_be_near, reconstruct_uncalibrated
 from kcs_torch.methods.perspective.view import lens_note
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.people import file_and_person

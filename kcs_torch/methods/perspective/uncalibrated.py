@@ -15,12 +15,11 @@ from torch import Tensor
 from kcs_torch.clean.detector import detected
 from kcs_torch.clean.timing import cuts_of
 from kcs_torch.errors import KcsWarning, OptionError
-from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.methods.answer.finish import Estimate, extent
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.clips.lockstep import Search
-from kcs_torch.methods.clips.template import clip_scale
 from kcs_torch.methods.perspective.calibrated import WIDE, feet_on_ground, reconstruct_perspective
+from kcs_torch.methods.perspective.image_lens import NEAR, lens_of_image
 from kcs_torch.methods.perspective.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.perspective.pinhole import PinholeEnergy
 from kcs_torch.methods.perspective.pinhole_coordinates import FIRM, USUAL
@@ -29,12 +28,11 @@ from kcs_torch.methods.perspective.view import View, lens_note
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
-from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.nn.posture import has_trunk, trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
-__all__ = ["lens_of_image", "likely_lens", "looking", "may_be_near", "reconstruct_uncalibrated"]
+__all__ = ["likely_lens", "looking", "may_be_near", "reconstruct_uncalibrated"]
 
 NARROW = 0.15
 """Width of a trunk, over its length, from which on it is more than a line."""
@@ -44,9 +42,6 @@ FAR = 34.0
 
 UNUSUAL = FIRM * math.log(FAR / USUAL) ** 2 / 2
 """What it costs to be as far away, where the focal length is not known."""
-
-NEAR = 10.0
-"""Distance up to which a camera is near: from there on a wrong focal length does more harm than parallel rays."""
 
 CLOSE = 5.0
 """Distance up to which the search under parallel rays ends: what is farther away it finds signs of better."""
@@ -61,23 +56,6 @@ SECONDS, RATE = 5.0, 30.0
 DEARER = 6.0
 """By how much a near body must be dearer in the end for the camera to be far: what seemed nearer than that may yet be
 near, once signs are right."""
-
-FOCAL = 0.85
-"""Usual focal length over the image's longer side, that of phones, web and action cameras."""
-
-SIZES: tuple[tuple[int, int], ...] = (
-    (640, 360),
-    (640, 480),
-    (854, 480),
-    (1280, 720),
-    (1920, 1080),
-    (2704, 1520),
-    (3840, 2160),
-)
-"""Usual sizes of images, whichever side is up."""
-
-INSIDE = 0.99
-"""Share of the joints that an image of usual size holds: detectors place some a little beside it."""
 
 EVERY, HOPELESS, AWAY = 20, 10.0, 6.5
 """Every so many steps it may be hopeless: if a near body is dearer by so much, and has gone as far away."""
@@ -94,53 +72,6 @@ def may_be_near(tracks: Tracks) -> bool:
     trunk = body.template_points(dtype=torch.float64)[trunk_joints(body)]
     long, wide, _ = torch.linalg.svdvals(trunk - trunk.mean(0)).tolist()
     return wide > NARROW * long
-
-
-def lens_of_image(tracks: Tracks, beside: Sequence[Tracks] = ()) -> tuple[Intrinsics, str] | None:
-    """The usual lens of a camera that made an image of such a size, and what to say of it.
-
-    Where nobody says how large the image is, it is taken to be the smallest of usual size that holds the tracks.
-
-    Args:
-        tracks: of a body with a template. A detector's are in pixels, whatever they say: files often tell the unit of
-            the motion.
-        beside: others in the same image, which holds them, too.
-
-    Returns:
-        A lens that looks at the image's middle, and a sentence; or None where the tracks are not in pixels, no image of
-        usual size holds them, they show a point, or a body so small that rays might as well be parallel.
-    """
-    points = tracks.points[tracks.seen]
-    if not bool(extent(tracks) > 0) or not (tracks.units == "px" or detected(tracks)):
-        return None
-    size = tracks.image_size or _usual_size(torch.cat([points, *(one.points[one.seen] for one in beside)]))
-    if size is None:
-        return None
-    width, height = size
-    focal, body = FOCAL * max(width, height), tracks.skeleton
-    rest = body.template_points(dtype=points.dtype, device=points.device)
-    lengths = bone_lengths(rest, body.bone_index(device=points.device))
-    own = usual_posture(body, points.dtype, points.device).rest_lengths
-    unit = float(clip_scale(tracks, rest).median() * (lengths / own).median())
-    if not focal < NEAR * unit:
-        return None
-    said = (
-        f"the image is taken to be {width} x {height} pixels, the smallest of usual size that holds the tracks: if it "
-        "is not, give image_size=(width, height) (kcs-torch: --image-size), or the camera's intrinsics"
-    )
-    return Intrinsics(focal, focal, width / 2, height / 2), "" if tracks.image_size else said
-
-
-def _usual_size(points: Tensor) -> tuple[int, int] | None:
-    """The smallest image of usual size that holds points (n, 2), if one does."""
-    usual = (size for wide, high in SIZES for size in ((wide, high), (high, wide)))
-    return min((size for size in usual if _holds(points, size)), key=math.prod, default=None)
-
-
-def _holds(points: Tensor, size: tuple[int, int]) -> bool:
-    """Whether an image of such a size holds nearly all of points (n, 2)."""
-    inside = ((points >= 0) & (points <= points.new_tensor(size))).all(-1)
-    return float(inside.to(points.dtype).mean()) >= INSIDE
 
 
 def reconstruct_uncalibrated(
