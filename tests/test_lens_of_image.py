@@ -99,7 +99,8 @@ def test_other_methods_before_an_image(method):
 
 
 def test_several_people_before_an_image():
-    people = [aside(frames=8)[0], beyond(aside(frames=8)[0]), aside(frames=7, x=900.0)[0]]
+    shown, other = (replace(aside(frames=8, x=x)[0], image_size=(1920, 1080)) for x in (-1000.0, 900.0))
+    people = [shown, beyond(replace(shown, image_size=None)), other]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", kt.KcsWarning)
         together = kt.reconstruct_all(people)
@@ -166,7 +167,7 @@ def test_deviations_allow_for_a_lens_that_was_found(monkeypatch):
     cases = [(told, "LEAN"), (tracks, "ASIDE"), (beyond(tracks), "HEADING"), (replace(told, detector=True), "")]
     found = [quietly(one) for one, _ in cases]
     angles = [getattr(calibrated, name, 0.0) for _, name in cases]
-    assert angles == sorted(angles[:3]) + [0.0] and angles[0] > 0
+    assert angles == [*sorted(angles[:3]), 0.0] and angles[0] > 0
     for name in ("LEAN", "ASIDE", "HEADING"):
         monkeypatch.setattr(calibrated, name, 0.0)
     for (one, _), result, angle in zip(cases, found, angles, strict=True):
