@@ -140,7 +140,6 @@ def _best_of_rounds(method: Method, tracks: Tracks, view: View, cameras: Tensor 
     unit: float | None = None
     soft = SOFT if method.turns_over and not has_trunk(tracks.skeleton) else 0
     rounds = ROUNDS
-    flips = method.turns_over and usual is None  # else once the focal length is looked for: a guess is confirmed
     while rounds > 0:
         straight = _straighten(tracks, view.rays, distance, depth)
         # The tracks of the first round agree with no depths yet: there the method may find signs by itself.
@@ -148,7 +147,7 @@ def _best_of_rounds(method: Method, tracks: Tracks, view: View, cameras: Tensor 
         made = _as_unsure(_lift(step, straight, view, cameras), best)
         found = refine(
             made, view, distance, depth, tracks.rate, feet, unit,
-            mirror=cameras is None, flips=flips, any_focal=False, usual=usual,
+            mirror=cameras is None, flips=method.turns_over, any_focal=False, usual=usual,
         )  # fmt: skip
         bodies, unit = found.bodies, None if soft else found.scene.unit
         moved = float((bodies.depth[0] - depth).square().mean().sqrt()) / found.scene.unit
