@@ -18,7 +18,7 @@ from kcs_torch.methods.perspective.uncalibrated import looking, may_be_near, rec
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.bodies import no_bones
-from kcs_torch.types.people import file_and_person
+from kcs_torch.types.people import file_and_person, file_of
 
 __all__ = ["method_named", "reconstruct", "reconstruct_all", "with_found_bones"]
 
@@ -73,9 +73,10 @@ def reconstruct(
         cameras: (T, 2, 3) camera rows, world to camera, where they are known.
         intrinsics: (fx, fy, cx, cy) or a matrix K (3, 3) in the unit of the tracks, where it is known. Perspective is
             then taken into account, and ``result.in_space()`` lies before the camera and projects onto the tracks.
-            "auto" finds the focal length from the tracks of a body with a template, if the camera is near; "parallel"
-            takes rays to be parallel. None is "auto" for "pkc", bodies with a template and unknown cameras, else
-            "parallel".
+            "auto" finds the focal length from the tracks of a body with a template, unless the camera is far away, from
+            that of usual cameras with such an image on; an image whose size nobody says is taken to be the smallest of
+            usual size that holds the tracks. "parallel" takes rays to be parallel. None is "auto" for "pkc", bodies
+            with a template and unknown cameras, else "parallel".
         **fields: of the method, such as ``beta=2.0``.
 
     Returns:
@@ -176,7 +177,7 @@ def reconstruct_all(
     found: dict[int, Reconstruction] = {}
     for group in of_one_image(people):
         made = by_one_lens(chosen, [people[i] for i in group])
-        found |= zip(group, made or (), strict=made is not None)
+        found |= {group[k]: one for k, one in made.items()}
     rest = [i for i in range(len(people)) if i not in found]
     if lens == "auto":
         found |= {i: _before(lens, chosen, people[i]) for i in rest}
@@ -202,13 +203,12 @@ def _told_of_lenses(found: list[Reconstruction]) -> list[Reconstruction]:
     """The same; the user is told where people of one file got lenses of their own."""
     clips: dict[str, list[Reconstruction]] = {}
     for one in found:
-        file, person = one.tracks.source, file_and_person(one.tracks.source)[1]
-        if person:
-            clips.setdefault(file.removesuffix(f", {person}"), []).append(one)
+        if file_and_person(one.tracks.source)[1]:
+            clips.setdefault(file_of(one.tracks), []).append(one)
     for file, people in clips.items():
-        near = sum(one.distance is not None for one in people)
-        if len({one.intrinsics for one in people}) > 1:
-            each = "got a lens and an origin of their own each" if near > 1 else "got a lens and an origin of its own"
+        near, lenses = sum(one.distance is not None for one in people), {one.intrinsics for one in people}
+        if len(lenses) > 1:
+            each = "got lenses and origins of their own" if near > 1 else "got a lens and an origin of its own"
             message = (
                 f"{file}: {near} of {len(people)} people {each}, as the camera seems near: their places and sizes do "
                 "not compare. Give the camera's intrinsics (kcs-torch: --intrinsics FX,FY,CX,CY), or 'parallel', which "

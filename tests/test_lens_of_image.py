@@ -12,6 +12,7 @@ import kcs_torch as kt
 from kcs_torch.methods.perspective import calibrated, image_lens, one_lens, uncalibrated
 from kcs_torch.methods.perspective.image_lens import lens_of_image
 from kcs_torch.methods.perspective.one_lens import by_one_lens, of_one_image
+from kcs_torch.methods.perspective.uncalibrated import may_be_near
 from kcs_torch.types import Intrinsics
 
 IMAGE = Intrinsics(1500.0, 1500.0, 960.0, 540.0)
@@ -143,12 +144,46 @@ def test_people_of_one_file_have_one_lens():
     assert of_one_image([replace(people[0], image_size=(1920, 1080)), *people[1:]]) == [[0], [1, 2]]
 
 
-def test_whose_lens_is_not_found_has_none_to_share(monkeypatch):
+def test_a_far_camera_tells_no_lens_for_others(monkeypatch):
     people = [replace(aside(frames=12)[0], source=f"walk.json, person {k}") for k in range(2)]
     monkeypatch.setattr(one_lens, "reconstruct_uncalibrated", lambda method, tracks, **_: method(tracks))
-    assert by_one_lens(kt.PKC(), people) is None
+    assert [*by_one_lens(kt.PKC(), people)] == [0]
     monkeypatch.setattr(one_lens, "lens_of_image", lambda *_: None)
-    assert by_one_lens(kt.PKC(), people) is None
+    assert by_one_lens(kt.PKC(), people) == {}
+
+
+def test_who_may_not_be_near_has_no_lens_of_others():
+    """A person whom two cameras show, one after the other, and joints without a template."""
+    shown, other = (aside(frames=24, x=x)[0] for x in (-900.0, 900.0))
+    cut = replace(other, points=torch.cat([other.points[:12], other.points[12:] * 0.6 + 300.0]))
+    bare = replace(other, skeleton=kt.Skeleton(other.skeleton.joints, other.skeleton.bones, name="bare"))
+    people = [replace(one, source=f"a.json, person {k}") for k, one in enumerate((shown, cut, bare))]
+    assert [may_be_near(one) for one in people] == [True, False, False]
+    assert [*by_one_lens(kt.PKC(), people)] == [0]
+
+
+def test_shots_of_one_person_may_have_several_cameras():
+    shots = [replace(aside(frames=8)[0], source="film.json, person 0")] * 2
+    assert of_one_image([*shots, replace(shots[0], source="film.json, person 1")]) == [[0], [1], [2]]
+
+
+@pytest.mark.parametrize(("yaw", "turn"), [(20.0, 0.0), (100.0, 120.0)])
+def test_parallel_rays_are_told_from_a_usual_lens(yaw, turn):
+    """As a long lens makes them; the near body explains the tracks worse."""
+    clip = kt.data.walking_person(60, turn=turn, yaw=yaw)
+    flat = clip.points[..., :2] - clip.points[..., :2].amin((0, 1))
+    points = flat * (700 / float(flat[..., 1].max())) + flat.new_tensor([300.0, 100.0])
+    tracks = kt.Tracks.from_arrays(points, skeleton=clip.skeleton, fps=30.0, image_size=(1920, 1080))
+    assert lens_of_image(tracks) is not None
+    found = quietly(tracks)
+    assert found.distance is None and torch.equal(found.points, quietly(tracks, intrinsics="parallel").points)
+
+
+def test_no_gradient_is_warned_of():
+    tracks, _ = aside(frames=8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        assert lens_of_image(replace(tracks, points=tracks.points.requires_grad_())) is not None
 
 
 def test_who_cannot_be_lifted_through_the_lens_of_others_is_lifted_without(monkeypatch):
@@ -156,8 +191,8 @@ def test_who_cannot_be_lifted_through_the_lens_of_others_is_lifted_without(monke
     spoilt = lambda method, tracks, lens: replace(method(tracks), points=torch.full((12, 17, 3), torch.nan))  # noqa: E731
     monkeypatch.setattr(one_lens, "reconstruct_perspective", spoilt)
     found = by_one_lens(kt.PKC(), people)
-    assert sorted(one.distance is None for one in found) == [False, True]
-    assert all(one.points.isfinite().all() for one in found)
+    assert sorted(one.distance is None for one in found.values()) == [False, True]
+    assert all(one.points.isfinite().all() for one in found.values())
 
 
 def test_deviations_allow_for_a_lens_that_was_found(monkeypatch):

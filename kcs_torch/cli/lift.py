@@ -100,7 +100,7 @@ def lift(
             metavar="NUMBER|all",
             help="Which person, counted from 0, the most visible first; or all: each in a separate file (OUT_0, "
             "OUT_1), and pages, films and recordings also of all together (OUT). Their places in the files compare if "
-            "--intrinsics are given, or parallel.",
+            "they have one lens: by --intrinsics, or by --image-size, which is guessed if nobody says it; or parallel.",
         ),
     ] = None,
     fps: Annotated[
@@ -114,8 +114,9 @@ def lift(
         typer.Option(
             metavar="FX,FY,CX,CY|auto|parallel",
             help="Focal lengths and principal point of the camera in pixels; auto: the focal length is found from the "
-            "tracks, if the camera is near (what pkc does unless told otherwise), for each person separately; "
-            "parallel: the camera is far away, and people are where the image has them.",
+            "tracks, from that of usual cameras with such an image (--image-size) on, unless the camera is far away "
+            "(what pkc does unless told otherwise); parallel: the camera is far away, and people are where the image has "
+            "them.",
             show_default=False,
         ),
     ] = None,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from kcs_torch.types.tracks import Tracks
 
-__all__ = ["file_and_person", "files_named", "shared", "tell_apart"]
+__all__ = ["file_and_person", "file_of", "files_named", "shared", "tell_apart"]
 
 
 def tell_apart(people: Iterable[Tracks]) -> list[Tracks]:
@@ -34,6 +34,11 @@ def file_and_person(source: str) -> tuple[str, str]:
     if comma and re.fullmatch(r"person \d+", person):
         return Path(file).name, person
     return Path(source).name, ""
+
+
+def file_of(tracks: Tracks) -> str:
+    """The source without the person, whom it may name."""
+    return tracks.source.removesuffix(f", {file_and_person(tracks.source)[1]}")
 
 
 def files_named(people: Iterable[Tracks]) -> str:

@@ -29,7 +29,7 @@ from kcs_torch.methods.sfam import SfAM
 from kcs_torch.nn.posture import has_trunk
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 
-__all__ = ["WIDE", "feet_on_ground", "reconstruct_perspective"]
+__all__ = ["WIDE", "feet_on_ground", "leaning", "reconstruct_perspective"]
 
 ROUNDS, FOCAL_ROUNDS = 3, 4
 """Rounds, at most, of lifting and refining; and of refining alone, where the focal length is found."""
@@ -305,7 +305,7 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
     )
     unsure = None if lifted.uncertainty is None else lifted.uncertainty * factor
     if unsure is not None and scene.any_focal and not detected(tracks):
-        unsure = unsure.hypot(_leaning(points, tracks, scene.usual is not None))
+        unsure = unsure.hypot(leaning(points, tracks, imaged=scene.usual is not None))
     return replace(
         lifted,
         points=points,
@@ -322,7 +322,7 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
     ).remeasured()
 
 
-def _leaning(points: Tensor, tracks: Tracks, imaged: bool) -> Tensor:
+def leaning(points: Tensor, tracks: Tracks, *, imaged: bool) -> Tensor:
     """Standard deviation (T, N) of depths for the direction from which points (T, N, 3) are seen, the lens being found.
 
     Where nothing is known of the image, the camera is taken to look at the tracks' middle. Of a detector's tracks the

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -52,10 +53,13 @@ def lens_of_image(tracks: Tracks, beside: Sequence[Tracks] = ()) -> tuple[Intrin
         A lens that looks at the image's middle, and a sentence; or None where the tracks are not in pixels, no image of
         usual size holds them, they show a point, or a body so small that rays might as well be parallel.
     """
+    tracks = replace(tracks, points=tracks.points.detach())
     points = tracks.points[tracks.seen]
     if not bool(extent(tracks) > 0) or not (tracks.units == "px" or detected(tracks)):
         return None
-    size = tracks.image_size or _usual_size(torch.cat([points, *(one.points[one.seen] for one in beside)]))
+    size = tracks.image_size or _usual_size(
+        torch.cat([points, *(one.points[one.seen].detach().to(points) for one in beside)])
+    )
     if size is None:
         return None
     width, height = size

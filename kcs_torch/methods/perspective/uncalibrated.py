@@ -113,37 +113,57 @@ def reconstruct_uncalibrated(
             "expected (fx, fy, cx, cy) or a matrix K (3, 3)"
         )
     begin = time.perf_counter()
-    judge = method if isinstance(method, PKC) else PKC()
     before = 0.0 if lifted is None else lifted.diagnostics.seconds
     usual = None if lifted is not None else lens_of_image(tracks, beside)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
-        result, ended, said = lifted, True, ""
-        lens: Intrinsics | None
         if usual is None:
-            result = looking(judge)(tracks, cameras) if lifted is None else lifted
-            ended = SEEMS_NEAR in result.diagnostics.notes
-            lens = None if SEEMS_FAR in result.diagnostics.notes else likely_lens(result, cameras)
+            result = _by_tracks(method, tracks, cameras, lifted)
         else:
-            lens, said = usual
-        near: Reconstruction | None = None
-        if lens is not None:
-            near = reconstruct_perspective(judge, tracks, lens, cameras, lifted=result, guessed=usual is not None)
-            if judge is not method:
-                assert near.distance is not None
-                focal = float(near.distance.log().mean().exp())  # the unit is a pixel there
-                lens = replace(lens, fx=focal, fy=focal)
-                near = reconstruct_perspective(method, tracks, lens, cameras)
-                notes = (*near.diagnostics.notes, lens_note(lens, tracks.units))
-                near = replace(near, diagnostics=replace(near.diagnostics, notes=notes))
-        if near is not None and bool(near.points.isfinite().all()):
-            result = near
-        elif result is None or judge is not method or ended:
-            result, said = method(tracks, cameras), ""
+            result = _by_image(method, tracks, cameras, *usual)
     method.warn(result)
-    notes = (*(note for note in result.diagnostics.notes if note != SEEMS_FAR), *([said] if said else []))
+    notes = tuple(note for note in result.diagnostics.notes if note != SEEMS_FAR)
     spent = before + time.perf_counter() - begin
     return replace(result, diagnostics=replace(result.diagnostics, seconds=spent, notes=notes))
+
+
+def _by_tracks(method: Method, tracks: Tracks, cameras: Tensor | None, lifted: Reconstruction | None) -> Reconstruction:
+    """A body before a camera of which the tracks tell whether it is near."""
+    judge = method if isinstance(method, PKC) else PKC()
+    result = looking(judge)(tracks, cameras) if lifted is None else lifted
+    lens = None if SEEMS_FAR in result.diagnostics.notes else likely_lens(result, cameras)
+    if lens is not None:
+        near = _through(method, tracks, cameras, reconstruct_perspective(judge, tracks, lens, cameras, lifted=result))
+        if bool(near.points.isfinite().all()):
+            return near
+    return method(tracks, cameras) if judge is not method or SEEMS_NEAR in result.diagnostics.notes else result
+
+
+def _by_image(method: Method, tracks: Tracks, cameras: Tensor | None, lens: Intrinsics, said: str) -> Reconstruction:
+    """A body before a camera with a usual lens, unless it is found so far away that parallel rays explain it better."""
+    judge = method if isinstance(method, PKC) else PKC()
+    near = reconstruct_perspective(judge, tracks, lens, cameras, guessed=True)
+    if not bool(near.points.isfinite().all()):
+        return method(tracks, cameras)
+    assert near.intrinsics is not None
+    if near.intrinsics.focal > CLOSE * body_unit(near):
+        lifted = judge(tracks, cameras)
+        if _is_far(near, lifted):
+            return lifted if judge is method else method(tracks, cameras)
+    near = _through(method, tracks, cameras, near)
+    return replace(
+        near, diagnostics=replace(near.diagnostics, notes=(*near.diagnostics.notes, *([said] if said else [])))
+    )
+
+
+def _through(method: Method, tracks: Tracks, cameras: Tensor | None, near: Reconstruction) -> Reconstruction:
+    """What a method finds through the lens that PKC found: the same if the method is PKC."""
+    lens = near.intrinsics
+    if isinstance(method, PKC) or lens is None:
+        return near
+    found = reconstruct_perspective(method, tracks, lens, cameras)
+    notes = (*found.diagnostics.notes, lens_note(lens, tracks.units))
+    return replace(found, diagnostics=replace(found.diagnostics, notes=notes))
 
 
 def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrinsics | None:
@@ -219,20 +239,9 @@ def _nearness(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras:
         return math.inf
     if not (bool(depth.isfinite().all()) and bool(depth.any())):
         return math.inf
-    every = max(1, round(tracks.rate / RATE))
-    some = _liveliest(flat[::every], round(SECONDS * RATE)) * every
-    rate = tracks.rate / every
-    noise, feet = image_noise(tracks, flat, unit), feet_on_ground(tracks, cameras)
-    flat, depth = flat[some], depth[some]
-    ones = torch.ones_like(depth)
-    clean = replace(tracks, points=flat, weights=ones, fps=rate)
-    view = View.of(clean, Intrinsics(FAR * unit, FAR * unit, *middle.tolist()), rate)
-    path = view.first_distance(clean, rate) / unit
-    lens = ones.new_tensor([1.0, USUAL / FAR]), torch.tensor([False, True], device=ones.device)
-    depth = (depth - depth.mean(-1, keepdim=True)).expand(2, -1, -1)
-    standing = None if feet is None else feet[some]
-    energy = PinholeEnergy(
-        outward(tracks.skeleton), view.rays, path, depth, rate, noise[some], standing=standing, focal=lens
+    lens, free = flat.new_tensor([1.0, USUAL / FAR]), torch.tensor([False, True], device=flat.device)
+    energy = _seen_by_two(
+        tracks, flat, depth.expand(2, -1, -1), unit, middle, (lens, free), feet_on_ground(tracks, cameras)
     )
 
     def distance(state: Tensor) -> float:
@@ -257,6 +266,60 @@ def _nearness(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras:
     if gain < -DEARER:
         return math.inf
     return found_at if gain > (SEEN if detected(tracks) else BETTER) and found_at < NEAR else None
+
+
+def _is_far(near: Reconstruction, lifted: Reconstruction) -> bool:
+    """Whether a camera that is far away explains the tracks better than a near one, each by what was found through it.
+
+    Args:
+        near: through a lens, at a usual distance.
+        lifted: under parallel rays.
+    """
+    lens = near.intrinsics
+    assert lens is not None
+    flat, unit = clean_image(lifted), body_unit(lifted)
+    depth = torch.stack([lifted.points[..., 2] / unit, near.points[..., 2] / body_unit(near)])
+    if not bool(depth.isfinite().all()):
+        return False
+    focal = flat.new_tensor([1.0, lens.focal / (FAR * unit)])
+    middle = flat.new_tensor([lens.cx, lens.cy])
+    energy = _seen_by_two(lifted.tracks, flat, depth, unit, middle, (focal, focal < 0), None)
+    found = lbfgs(energy, energy.start, num_steps=2 * STEPS, tolerance=1e-6, slopes=True, part=energy.rows)
+    assert found.energy is not None
+    return bool(found.energy[0] < found.energy[1])
+
+
+def _seen_by_two(
+    tracks: Tracks,
+    flat: Tensor,
+    depth: Tensor,
+    unit: float,
+    middle: Tensor,
+    focal: tuple[Tensor, Tensor],
+    feet: Tensor | None,
+) -> PinholeEnergy:
+    """The energy of a body before two cameras, by the five seconds in which it moves most.
+
+    Args:
+        tracks: of the body.
+        flat: (T, N, 2) their image without noise.
+        depth: (2, T, N) starts, for a body of 1.75.
+        unit: of such a body, in the tracks' unit.
+        middle: (2,) the principal point of both cameras.
+        focal: (2,) focal lengths, over that of a camera at the distance FAR, and which are free (2,).
+        feet: (T, C) how surely contact points stand still, or None.
+    """
+    every = max(1, round(tracks.rate / RATE))
+    some = _liveliest(flat[::every], round(SECONDS * RATE)) * every
+    rate, noise = tracks.rate / every, image_noise(tracks, flat, unit)
+    depth = depth[:, some] - depth[:, some].mean(-1, keepdim=True)
+    clean = replace(tracks, points=flat[some], weights=torch.ones_like(depth[0]), fps=rate)
+    view = View.of(clean, Intrinsics(FAR * unit, FAR * unit, *middle.tolist()), rate)
+    path = view.first_distance(clean, rate) / unit
+    standing = None if feet is None else feet[some]
+    return PinholeEnergy(
+        outward(tracks.skeleton), view.rays, path, depth, rate, noise[some], standing=standing, focal=focal
+    )
 
 
 def _liveliest(image: Tensor, count: int) -> Tensor:

@@ -63,12 +63,13 @@ def zoomed(lens: Intrinsics, by: float) -> Intrinsics:
     return replace(lens, fx=lens.fx * by, fy=lens.fy * by)
 
 
-def lens_note(lens: Intrinsics, units: str) -> str:
-    """What is told of a lens that was found."""
+def lens_note(lens: Intrinsics, units: str, whose: str = "") -> str:
+    """What is told of a lens that was found, from the tracks of somebody else if it says ``whose``."""
+    of = f" of {whose}" if whose else ""
     focal, x, y = (f"{v:.0f}" if lens.focal > 100 else f"{v:.4g}" for v in (lens.focal, lens.cx, lens.cy))
     return (
-        f"focal length of {focal} {units} found from the tracks, a guess: the true one may be half or twice as long; "
-        f"principal point taken to be ({x}, {y}), from which x and y are measured"
+        f"focal length of {focal} {units} found from the tracks{of}, a guess: the true one may be half or twice as "
+        f"long; principal point taken to be ({x}, {y}), from which x and y are measured"
     )
 
 
