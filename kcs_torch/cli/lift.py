@@ -115,8 +115,8 @@ def lift(
             metavar="FX,FY,CX,CY|auto|parallel",
             help="Focal lengths and principal point of the camera in pixels; auto: the focal length is found from the "
             "tracks, from that of usual cameras with such an image (--image-size) on, unless the camera is far away "
-            "(what pkc does unless told otherwise); parallel: the camera is far away, and people are where the image has "
-            "them.",
+            "(what pkc does unless told otherwise); parallel: the camera is far away, and people are where the image "
+            "has them.",
             show_default=False,
         ),
     ] = None,

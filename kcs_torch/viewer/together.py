@@ -19,7 +19,8 @@ def beside(results: Sequence[Reconstruction]) -> list[Array]:
     """What to add to each one's points, (3,), so that people stand beside one another as in the image.
 
     Through one lens, or parallel rays, they do. Those before a near camera of whose image nothing is known got a lens
-    each, from whose principal point x and y are measured: it lies so far from the image's corner as at the mean distance.
+    each, from whose principal point x and y are measured: it lies so far from the image's corner as at the mean
+    distance.
     """
     shifts = [np.zeros(3) for _ in results]
     if len({result.intrinsics for result in results}) > 1:
