@@ -77,8 +77,10 @@ def test_which_lens_an_image_has(corner, size, factor, expected):
     if expected is None:
         assert lens is None
         return
-    assert (2 * lens[0].cx, 2 * lens[0].cy) == expected and lens[0].fx == lens[0].fy == 0.85 * max(expected)
-    assert (size is None) == (f"{expected[0]} x {expected[1]}" in lens[1])
+    assert (2 * lens[0].cx, 2 * lens[0].cy) == expected and lens[1] == 0.85 * max(expected)
+    usual = lens[0].fx ** 2 / lens[1]  # makes the person of about 1.75 be 4.5 away
+    assert lens[0].fx == lens[0].fy and 0.85 < usual / (4.5 / 1.75 * factor * 850) < 1.15
+    assert (size is None) == (f"{expected[0]} x {expected[1]}" in lens[2])
     assert lens_of_image(replace(tracks, units="mm")) is None
     assert lens_of_image(replace(tracks, units="mm", detector=True)) is not None
     assert lens_of_image(replace(tracks, weights=0 * tracks.weights)) is None

@@ -228,7 +228,7 @@ def test_standing_feet_cost_what_they_slide():
 
 
 def test_usual_lenses_cost_least():
-    """A focal length costs what it is off by from that of usual lenses; else the distance costs, as it is unusual."""
+    """A focal length costs what makes the distance unusual, and what it is off by from that of usual lenses."""
     skeleton, rays, depth, far, _ = walk()
     focal = torch.tensor([1.0, 2.0, 2.0]).double()
     given = skeleton, rays, far, depth.expand(3, -1, -1), 30.0, level(rays), None, None
@@ -239,6 +239,6 @@ def test_usual_lenses_cost_least():
         return found(found.start)[0] - free(free.start)[0]
 
     off = (focal / 2.0).log().square() / 2 * FIRM
-    assert_close(cost(2.0), off)
     away = (far.mean() * focal / USUAL).log().square() / 2 * FIRM
     assert_close(cost(None), away)
+    assert_close(cost(2.0), away + off)

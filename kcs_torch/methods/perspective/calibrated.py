@@ -62,7 +62,7 @@ def reconstruct_perspective(
     cameras: Tensor | None = None,
     *,
     lifted: Reconstruction | None = None,
-    guessed: bool = False,
+    guessed: float | None = None,
 ) -> Reconstruction:
     """Reconstruct a body before a pinhole camera by a method made for parallel rays.
 
@@ -82,8 +82,8 @@ def reconstruct_perspective(
         lifted: what the method found in the tracks as if rays were parallel. The focal length is then to be found as
             well, from that of the intrinsics on, and noted; each round refines what the one before found, as its focal
             length shows it. Exact tracks whose first search ended early are lifted anew once, in the end.
-        guessed: whether the focal length is that of usual lenses. Tracks are then lifted through such a lens, and the
-            focal length is found together with what was found through it, and noted.
+        guessed: focal length of usual lenses, if that of the intrinsics is a guess. Tracks are then lifted through such
+            a lens, and the focal length is found together with what was found through it, and noted.
 
     Returns:
         The reconstruction in the camera's frame: ``points + (0, 0, distance)`` projects onto the image. Its unit is one
@@ -107,7 +107,7 @@ def _reconstruct(
     intrinsics: Intrinsics,
     cameras: Tensor | None,
     lifted: Reconstruction | None,
-    guessed: bool,
+    guessed: float | None,
 ) -> Reconstruction:
     """:func:`reconstruct_perspective` without autograd, on the tracks' device."""
     _warn_of_wide_rays(tracks, intrinsics)
@@ -115,10 +115,10 @@ def _reconstruct(
         cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
     view = View.of(tracks, intrinsics, tracks.rate)
     if lifted is None:
-        best = _best_of_rounds(method, tracks, view, cameras, 1.0 if guessed else None)
+        best = _best_of_rounds(method, tracks, view, cameras, None if guessed is None else guessed / intrinsics.focal)
     else:
         best = _along(method, tracks, view, cameras, lifted)
-    if (guessed or lifted is not None) and not best.flat:
+    if (guessed is not None or lifted is not None) and not best.flat:
         best = _with_focal(method, tracks, best, cameras)
     exact = has_trunk(tracks.skeleton) and not detected(tracks)
     if method.turns_over and exact and not best.flat:

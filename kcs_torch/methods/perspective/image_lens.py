@@ -13,6 +13,7 @@ from kcs_torch.clean.detector import detected
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.methods.answer.finish import extent
 from kcs_torch.methods.clips.template import clip_scale
+from kcs_torch.methods.perspective.pinhole_coordinates import USUAL
 from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.types import Intrinsics, Tracks
 
@@ -39,8 +40,8 @@ INSIDE = 0.99
 """Share of the joints that an image of usual size holds: detectors place some a little beside it."""
 
 
-def lens_of_image(tracks: Tracks, beside: Sequence[Tracks] = ()) -> tuple[Intrinsics, str] | None:
-    """The usual lens of a camera that made an image of such a size, and what to say of it.
+def lens_of_image(tracks: Tracks, beside: Sequence[Tracks] = ()) -> tuple[Intrinsics, float, str] | None:
+    """A likely lens of a camera that made an image of such a size, and what to say of it.
 
     Where nobody says how large the image is, it is taken to be the smallest of usual size that holds the tracks.
 
@@ -50,8 +51,10 @@ def lens_of_image(tracks: Tracks, beside: Sequence[Tracks] = ()) -> tuple[Intrin
         beside: others in the same image, which holds them, too.
 
     Returns:
-        A lens that looks at the image's middle, and a sentence; or None where the tracks are not in pixels, no image of
-        usual size holds them, they show a point, or a body so small that rays might as well be parallel.
+        A lens that looks at the image's middle, of a focal length between that of usual lenses, as images are cropped,
+        and one that makes the camera's distance a usual one; the former; and a sentence. Or None where the tracks are
+        not in pixels, no image of usual size holds them, they show a point, or a body so small that rays might as well
+        be parallel.
     """
     tracks = replace(tracks, points=tracks.points.detach())
     points = tracks.points[tracks.seen]
@@ -74,7 +77,8 @@ def lens_of_image(tracks: Tracks, beside: Sequence[Tracks] = ()) -> tuple[Intrin
         f"the image is taken to be {width} x {height} pixels, the smallest of usual size that holds the tracks: if it "
         "is not, give image_size=(width, height) (kcs-torch: --image-size), or the camera's intrinsics"
     )
-    return Intrinsics(focal, focal, width / 2, height / 2), "" if tracks.image_size else said
+    likely = math.sqrt(focal * USUAL * unit)
+    return Intrinsics(likely, likely, width / 2, height / 2), focal, "" if tracks.image_size else said
 
 
 def _usual_size(points: Tensor) -> tuple[int, int] | None:

@@ -53,7 +53,7 @@ def by_one_lens(method: Method, people: Sequence[Tracks]) -> dict[int, Reconstru
     told = reconstruct_uncalibrated(method, people[first], beside=people)
     if told.intrinsics is None:
         return {first: told}
-    who, said = file_and_person(people[first].source)[1], lenses[first][1]
+    who, said = file_and_person(people[first].source)[1], lenses[first][2]
     others = (i for i in able if i != first)
     return {first: told} | {i: _through(method, people[i], told.intrinsics, who, said) for i in others}
 

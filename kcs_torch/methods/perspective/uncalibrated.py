@@ -114,13 +114,13 @@ def reconstruct_uncalibrated(
         )
     begin = time.perf_counter()
     before = 0.0 if lifted is None else lifted.diagnostics.seconds
-    usual = None if lifted is not None else lens_of_image(tracks, beside)
+    likely = None if lifted is not None else lens_of_image(tracks, beside)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
-        if usual is None:
+        if likely is None:
             result = _by_tracks(method, tracks, cameras, lifted)
         else:
-            result = _by_image(method, tracks, cameras, *usual)
+            result = _by_image(method, tracks, cameras, *likely)
     method.warn(result)
     notes = tuple(note for note in result.diagnostics.notes if note != SEEMS_FAR)
     spent = before + time.perf_counter() - begin
@@ -139,10 +139,12 @@ def _by_tracks(method: Method, tracks: Tracks, cameras: Tensor | None, lifted: R
     return method(tracks, cameras) if judge is not method or SEEMS_NEAR in result.diagnostics.notes else result
 
 
-def _by_image(method: Method, tracks: Tracks, cameras: Tensor | None, lens: Intrinsics, said: str) -> Reconstruction:
-    """A body before a camera with a usual lens, unless it is found so far away that parallel rays explain it better."""
+def _by_image(
+    method: Method, tracks: Tracks, cameras: Tensor | None, lens: Intrinsics, usual: float, said: str
+) -> Reconstruction:
+    """A body before a camera with a likely lens, unless it comes out far away and parallel rays explain it better."""
     judge = method if isinstance(method, PKC) else PKC()
-    near = reconstruct_perspective(judge, tracks, lens, cameras, guessed=True)
+    near = reconstruct_perspective(judge, tracks, lens, cameras, guessed=usual)
     if not bool(near.points.isfinite().all()):
         return method(tracks, cameras)
     assert near.intrinsics is not None
