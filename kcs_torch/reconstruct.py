@@ -206,9 +206,9 @@ def _told_of_lenses(found: list[Reconstruction]) -> list[Reconstruction]:
         if file_and_person(one.tracks.source)[1]:
             clips.setdefault(file_of(one.tracks), []).append(one)
     for file, people in clips.items():
-        near, lenses = sum(one.distance is not None for one in people), {one.intrinsics for one in people}
-        if len(lenses) > 1:
-            each = "got lenses and origins of their own" if near > 1 else "got a lens and an origin of its own"
+        near = sum(one.distance is not None for one in people)
+        if len({one.intrinsics for one in people}) > 1:
+            each = "got lenses and origins that not all have" if near > 1 else "got a lens and an origin of its own"
             message = (
                 f"{file}: {near} of {len(people)} people {each}, as the camera seems near: their places and sizes do "
                 "not compare. Give the camera's intrinsics (kcs-torch: --intrinsics FX,FY,CX,CY), or 'parallel', which "

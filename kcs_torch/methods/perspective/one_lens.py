@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -22,14 +23,14 @@ def of_one_image(people: Sequence[Tracks]) -> list[list[int]]:
 
     Who is there twice is there in several shots, each of which may have a camera of its own.
     """
+    times = Counter(one.source for one in people)
+    shots = {file_of(one) for one in people if times[one.source] > 1}
     groups: dict[tuple[object, ...], list[int]] = {}
     for i, one in enumerate(people):
-        person = file_and_person(one.source)[1]
-        image = (file_of(one), one.units, one.image_size) if person else (i,)
+        file, person = file_of(one), file_and_person(one.source)[1]
+        image = (file, one.units, one.image_size) if person and file not in shots else (i,)
         groups.setdefault(image, []).append(i)
-    shots = [group for group in groups.values() if len({people[i].source for i in group}) < len(group)]
-    alone = [[i] for group in shots for i in group]
-    return sorted([*(group for group in groups.values() if group not in shots), *alone])
+    return list(groups.values())
 
 
 def by_one_lens(method: Method, people: Sequence[Tracks]) -> dict[int, Reconstruction]:
