@@ -13,12 +13,12 @@ from kcs_torch.methods import METHODS
 from kcs_torch.methods.base import Method, check_tracks
 from kcs_torch.methods.found_skeleton import find_skeleton
 from kcs_torch.methods.perspective.calibrated import WIDE, reconstruct_perspective
-from kcs_torch.methods.perspective.one_lens import by_one_lens, of_one_image
+from kcs_torch.methods.perspective.one_lens import by_one_lens
 from kcs_torch.methods.perspective.uncalibrated import looking, may_be_near, reconstruct_uncalibrated
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.bodies import no_bones
-from kcs_torch.types.people import file_and_person, file_of
+from kcs_torch.types.people import file_and_person, file_of, guess_images, of_one_image
 
 __all__ = ["method_named", "reconstruct", "reconstruct_all", "with_found_bones"]
 
@@ -75,8 +75,8 @@ def reconstruct(
             then taken into account, and ``result.in_space()`` lies before the camera and projects onto the tracks.
             "auto" finds the focal length from the tracks of a body with a template, unless the camera is far away, from
             that of usual cameras with such an image on; an image whose size nobody says is taken to be the smallest of
-            usual size that holds the tracks. "parallel" takes rays to be parallel. None is "auto" for "pkc", bodies
-            with a template and unknown cameras, else "parallel".
+            usual size that holds the tracks of its file. "parallel" takes rays to be parallel. None is "auto" for
+            "pkc", bodies with a template and unknown cameras, else "parallel".
         **fields: of the method, such as ``beta=2.0``.
 
     Returns:
@@ -174,7 +174,7 @@ def reconstruct_all(
         return [_before(lens, chosen, one) for one in people]
     if lens == "parallel" or (lens is None and not chosen.turns_over):
         return chosen.many(people)
-    found: dict[int, Reconstruction] = {}
+    people, found = guess_images(people), dict[int, Reconstruction]()
     for group in of_one_image(people):
         made = by_one_lens(chosen, [people[i] for i in group])
         found |= {group[k]: one for k, one in made.items()}

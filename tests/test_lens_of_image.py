@@ -1,19 +1,23 @@
 """Cameras that nobody has calibrated, whose image's size is known or guessed: a usual lens looks at its middle."""
 
+import sys
 import warnings
 from dataclasses import replace
 
 import pytest
 import torch
 from near_cameras import error, quietly
+from samples import write_json
 from torch.testing import assert_close
 
 import kcs_torch as kt
+from kcs_torch.many import folder, reconstruct_folder
 from kcs_torch.methods.perspective import calibrated, image_lens, one_lens, uncalibrated
 from kcs_torch.methods.perspective.image_lens import lens_of_image
-from kcs_torch.methods.perspective.one_lens import by_one_lens, of_one_image
+from kcs_torch.methods.perspective.one_lens import by_one_lens
 from kcs_torch.methods.perspective.uncalibrated import may_be_near
 from kcs_torch.types import Intrinsics
+from kcs_torch.types.people import guess_images, of_one_image
 
 IMAGE = Intrinsics(1500.0, 1500.0, 960.0, 540.0)
 
@@ -151,6 +155,70 @@ def test_people_of_one_file_have_one_lens():
     several = [*people, replace(people[0], source="other.json"), replace(people[0], source="other.json")]
     assert of_one_image(several) == [[0, 1, 2], [3], [4]]
     assert of_one_image([replace(people[0], image_size=(1920, 1080)), *people[1:]]) == [[0], [1, 2]]
+
+
+def two_people(folder):
+    """A file whose first person fills a corner of an image that the other one tells to be larger."""
+    frames = torch.arange(8)[:, None, None]
+    shape = kt.data.walking_person(1, skeleton="coco17", turn=0.0).tracks.points[0, :17]
+    shape = (shape - shape.amin(0)) / (shape[:, 1].max() - shape[:, 1].min())
+    near, far = 400 * shape + torch.tensor([60.0, 40.0]) + frames, 500 * shape + torch.tensor([1500.0, 520.0]) - frames
+    detections = [
+        {
+            "image_id": t,
+            "category_id": 1,
+            "score": 1.0,
+            "keypoints": torch.nn.functional.pad(one[t], (0, 1), value=sure),
+        }
+        for t in range(8)
+        for one, sure in ((near, 0.9), (far, 0.6))
+    ]
+    for one in detections:
+        one["keypoints"] = one["keypoints"].flatten().tolist()
+    return write_json(folder / "two.json", detections)
+
+
+def test_whom_a_file_shows_tell_the_image_of_the_one_that_is_read(tmp_path):
+    path = two_people(tmp_path)
+    kept, other = kt.load_tracks(path), kt.load_tracks(path, person=1)
+    assert kept.image_guess == other.image_guess == (1920, 1080) and kept.image_size is None
+    assert image_lens.usual_size(kept.points[kept.seen]) == (360, 640)
+    lens = lens_of_image(kept)
+    assert (lens[0].cx, lens[0].cy) == (960, 540) and "of all people in the file" in lens[2]
+    assert lens_of_image(replace(kept, image_guess=None))[0].cx == 180
+    assert kt.load_tracks(path, image_size=(1280, 1024)).image_guess is None
+    back = kt.load_tracks(kt.save(kept, tmp_path / "kept.npz"))
+    assert back.image_guess == (1920, 1080) and back.image_size is None
+    assert kt.load_tracks(kt.save(replace(kept, image_guess=(0, 0)), tmp_path / "kept.npz")).image_guess == (0, 0)
+
+
+def test_people_whom_no_usual_image_holds_tell_so(tmp_path):
+    """A person in its corner alone would be taken to fill a smaller one."""
+    people = kt.io.load_people(two_people(tmp_path))
+    large = [replace(people[0], image_guess=None), replace(people[1], image_guess=None, points=3 * people[1].points)]
+    found = guess_images(large)
+    assert [one.image_guess for one in found] == [(0, 0)] * 2 and lens_of_image(found[0]) is None
+    assert guess_images(found[:1]) == found[:1]
+    assert guess_images(large[:1])[0].image_guess is None  # who is alone is left to the tracks
+    apart = [replace(large[0], source="a.json"), replace(large[1], source="b.json")]
+    assert [one.image_guess for one in guess_images(apart)] == [None, None]
+
+
+def test_people_who_are_given_together_share_a_guess(tmp_path, monkeypatch):
+    people = [replace(one, image_guess=None) for one in kt.io.load_people(two_people(tmp_path))]
+    stand_in = lambda method, group: {k: kt.KCS()(one) for k, one in enumerate(group)}  # noqa: E731
+    monkeypatch.setattr(sys.modules["kcs_torch.reconstruct"], "by_one_lens", stand_in)
+    assert [one.tracks.image_guess for one in kt.reconstruct_all(people)] == [(1920, 1080)] * 2
+
+
+def test_a_folder_s_clips_are_lifted_by_all_whom_they_show(tmp_path, monkeypatch):
+    (tmp_path / "in").mkdir()
+    two_people(tmp_path / "in")
+    lifted = []
+    keep = lambda people, **_: lifted.extend(people) or [kt.KCS()(one) for one in people]  # noqa: E731
+    monkeypatch.setattr(folder, "reconstruct_all", keep)
+    reconstruct_folder(tmp_path / "in", tmp_path / "out")
+    assert [one.image_guess for one in lifted] == [(1920, 1080)]
 
 
 def test_a_far_camera_tells_no_lens_for_others(monkeypatch):

@@ -73,6 +73,28 @@ def test_an_image_that_most_joints_lie_outside_is_none():
     assert Tracks.from_arrays(far, unseen, skeleton="h36m17", image_size=(1000, 500)).image_size == (1000, 500)
 
 
+@pytest.mark.parametrize(
+    ("size", "low", "high", "word", "kept"),
+    [
+        ((1080, 1920), (20, 20), (1900, 1000), "many joints lie far outside an image of 1080 x 1920", True),
+        ((1080, 1920), (800, 20), (1900, 1000), "most joints lie outside an image of 1080 x 1920", False),
+        ((1920, 1080), (20, 20), (1900, 1000), "", True),
+        ((1920, 1080), (20, 20), (1000, 1170), "", True),  # cut by the image's edge
+        ((1080, 1920), (20, 20), (1140, 1000), "", True),  # few far outside
+        ((1080, 1920), (20, 20), (2100, 1000), "", True),  # the other way round they are outside, too
+        ((1200, 1200), (20, 20), (1900, 1000), "", True),
+    ],
+)
+def test_sides_of_an_image_that_are_swapped_are_told(size, low, high, word, kept):
+    low, high = torch.tensor(low), torch.tensor(high)
+    points = low + torch.rand(40, 17, 2, generator=torch.manual_seed(1)) * (high - low)
+    tracks = Tracks.from_arrays(points, skeleton="h36m17", image_size=size)
+    told = [note for note in tracks.notes if "image_size" in note]
+    fix = "If width and height are swapped, give image_size=(1920, 1080) (kcs-torch: --image-size 1920x1080)"
+    assert [note.startswith(word) and note.endswith(fix) for note in told] == [True] * bool(word)
+    assert tracks.image_size == (size if kept else None)
+
+
 def test_arguments_are_left_alone():
     points, confidence = with_value(grid(), (1, 2), NAN), torch.full((4, 17), 0.2, dtype=torch.float64)
     confidence[0] = 1

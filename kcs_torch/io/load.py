@@ -14,8 +14,9 @@ from kcs_torch.io.registry import Options, Probe, Reader, brief, check_fps, disc
 from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
-from kcs_torch.types.intake import as_image_size, as_number
-from kcs_torch.types.people import tell_apart
+from kcs_torch.types.image_size import as_image_size
+from kcs_torch.types.intake import as_number
+from kcs_torch.types.people import guess_images, tell_apart
 
 __all__ = [
     *("READERS", "WRITERS"),
@@ -68,7 +69,7 @@ def load_people(
 
     Returns:
         At least one :class:`Tracks`; those of one video have the same number of frames. The ``source`` of several names
-        the person: ``walk.json, person 1``.
+        the person: ``walk.json, person 1``. Where nobody says how large their image is, they carry a guess.
 
     Raises:
         FormatError: the path cannot be read as tracks.
@@ -80,7 +81,7 @@ def load_people(
     probe = Probe(path)
     reader: Reader = READERS[detect_format(path) if format is None else format]
     people = reader.read(probe.path, options)
-    return tell_apart(sorted(people, key=_amount_seen, reverse=True))
+    return guess_images(tell_apart(sorted(people, key=_amount_seen, reverse=True)))
 
 
 def load_tracks(

@@ -21,7 +21,8 @@ from kcs_torch.errors import FormatError, KcsError, OptionError, listed
 from kcs_torch.io.folders import natural_key, sibling_files
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
-from kcs_torch.types.intake import RATES, as_number, told_image_size
+from kcs_torch.types.image_size import told_image_size
+from kcs_torch.types.intake import RATES, as_number
 
 if TYPE_CHECKING:
     from kcs_torch.io.containers.hdf5 import Tree

@@ -21,15 +21,12 @@ __all__ = [
     "RATES",
     "Intake",
     "as_floats",
-    "as_image_size",
     "as_number",
     "as_weights",
     "at_one_point",
     "at_the_corner",
     "check_places",
-    "mostly_outside",
     "take_in",
-    "told_image_size",
 ]
 
 FARTHEST = 1e30  # of coordinates: their sums are finite in single precision, in which pages are written
@@ -39,9 +36,6 @@ STRAY = 1e12
 
 WITHIN = 0.9
 """Share of the joints beyond (0, 0) from which on this is the image's corner."""
-
-LARGEST = 10**6
-"""Pixels of an image's side, at most."""
 
 RATES = 1e-6, 1e6
 """Frames a second, lowest and highest: a frame in eleven days, and a million a second."""
@@ -82,40 +76,6 @@ def as_number(value: Any) -> float | None:
         return float(value) if isinstance(value, Real) else None
     except OverflowError:
         return None
-
-
-def as_image_size(value: Any) -> tuple[int, int] | None:
-    """Width and height of an image in pixels, checked; None is unknown.
-
-    Raises:
-        OptionError: it is something else.
-    """
-    size = told_image_size(value)
-    if value is not None and size is None:
-        raise OptionError(
-            f"image_size: expected width and height of the video in pixels, such as (1920, 1080), got {value!r}"
-        )
-    return size
-
-
-def told_image_size(value: Any) -> tuple[int, int] | None:
-    """Width and height of an image in pixels, as a file tells them; None where they are none.
-
-    >>> told_image_size([1920.0, 1080]), told_image_size([0, 1080]), told_image_size("large")
-    ((1920, 1080), None, None)
-    """
-    try:
-        sides = tuple(value)
-        width, height = (int(side) for side in sides)
-    except (TypeError, ValueError, OverflowError):
-        return None
-    whole = (width, height) == sides and not any(isinstance(side, bool) for side in sides)
-    return (width, height) if whole and min(sides) > 0 and max(sides) <= LARGEST else None
-
-
-def mostly_outside(points: Tensor, size: tuple[int, int]) -> bool:
-    """Whether fewer than half of points (P, 2) lie within an image of this width and height."""
-    return float(((points >= 0) & (points <= points.new_tensor(size))).all(-1).double().mean()) < 0.5
 
 
 def at_the_corner(points: Tensor, seen: Tensor, notes: list[str], *, alone: bool = False) -> Tensor:

@@ -9,10 +9,11 @@ from typing import Any, Self
 
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, counted
+from kcs_torch.errors import counted
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.bodies import no_bones
-from kcs_torch.types.intake import as_image_size, mostly_outside, take_in
+from kcs_torch.types.image_size import as_image_size, fitting_size
+from kcs_torch.types.intake import take_in
 from kcs_torch.types.size import short_unit
 from kcs_torch.types.trajectories import Trajectories
 
@@ -34,12 +35,15 @@ class Tracks(Trajectories):
         detector: whether a detector found the joints, so that errors last for many frames; None where nobody said so.
         image_size: width and height of the image in pixels, or None where unknown. A camera that nobody has calibrated
             looks at its middle, and its focal length is likely to be about as long as its longer side.
+        image_guess: width and height that the image is taken to have where nobody says them, as everybody in it tells:
+            the smallest usual ones that hold them all, (0, 0) if none do. None where these tracks alone tell.
     """
 
     units: str = "px"
     source: str = "tracks"
     detector: bool | None = None
     image_size: tuple[int, int] | None = None
+    image_guess: tuple[int, int] | None = None
 
     @property
     def rate(self) -> float:
@@ -82,7 +86,7 @@ class Tracks(Trajectories):
             units: of the points.
             threshold: a joint with less confidence counts as unseen.
             image_size: width and height of the image in pixels, where points are pixels of it; left out, which a note
-                tells, where most of them lie elsewhere.
+                tells, where most of them lie elsewhere. A note also tells where they seem to be the wrong way round.
             source: for messages.
             notes: sentences to carry along.
 
@@ -108,15 +112,10 @@ class Tracks(Trajectories):
             remarks.append(no_bones(body))
         xy, weights = body.complete(taken.points, taken.weights)
         remarks += unseen_notes(weights, body)
-        unit, size = short_unit(units), as_image_size(image_size)
-        if size is not None and unit != "px":
-            raise OptionError(f"{source}: image_size: expected tracks in pixels of the image, got units {units!r}")
-        if size is not None and mostly_outside(xy[weights > 0], size):
-            remarks.append(
-                f"most joints lie outside an image of {size[0]} x {size[1]} pixels: its size (image_size, "
-                "--image-size) is left out"
-            )
-            size = None
+        unit = short_unit(units)
+        size = as_image_size(image_size, unit, source)
+        if size is not None:
+            size = fitting_size(xy[weights > 0], size, remarks)
         return cls(xy, weights, body, taken.fps, unit, source, tuple(remarks), image_size=size)
 
     def frames(self, start: int, stop: int, step: int = 1) -> Self:

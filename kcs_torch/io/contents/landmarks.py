@@ -18,7 +18,7 @@ from kcs_torch.io.contents.shares import ASK, SIZE_HINT, are_shares
 from kcs_torch.io.contents.times import frames_of_times, rate_of_times, time_unit
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import SKELETONS
-from kcs_torch.types.intake import told_image_size
+from kcs_torch.types.image_size import told_image_size
 
 __all__ = [
     "BODIES",

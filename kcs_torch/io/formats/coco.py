@@ -13,7 +13,7 @@ from kcs_torch.io.contents.frames import as_track_id, by_image, by_number
 from kcs_torch.io.contents.people import Sighting, people_tracks
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.types import Tracks
-from kcs_torch.types.intake import told_image_size
+from kcs_torch.types.image_size import told_image_size
 
 __all__ = ["READERS"]
 

@@ -2,9 +2,9 @@
 
 Tracks are ``points2d`` (T, N, 2) with NaN where unseen, ``confidence`` (T, N), ``edges`` (B, 2), ``joint_names``
 (N,), ``fps`` (NaN: unknown) and ``units``; all but the first may be absent. What this library writes has ``skeleton``
-and ``notes`` as JSON text, too, and, where they are known, ``detector``, whether a detector made the tracks, and
-``image_size``, width and height in pixels; confidences have then been through a threshold and count as they are. A
-result adds, for the same N joints, ``points3d`` (T, N, 3), and
+and ``notes`` as JSON text, too, and, where they are known, ``detector``, whether a detector made the tracks,
+``image_size``, width and height in pixels, and ``image_guess``, what these are taken to be; confidences have then been
+through a threshold and count as they are. A result adds, for the same N joints, ``points3d`` (T, N, 3), and
 
 - ``points3d_all`` (T, M, 3) and ``joint_names_all`` (M,): with the virtual joints, which come last; ``bones`` (B, 2)
   are (parent, child) indices into them and ``lengths`` (B,) their lengths;
@@ -40,7 +40,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Intrinsics, Motion, Reconstruction, Tracks
 from kcs_torch.types.arrays import as_array
 from kcs_torch.types.axes import AXES, from_y_up
-from kcs_torch.types.intake import told_image_size
+from kcs_torch.types.image_size import told_image_size
 
 __all__ = ["MOTION_READERS", "READERS", "WRITERS", "load_reconstruction"]
 
@@ -66,22 +66,21 @@ def read(path: Path, options: Options) -> list[Tracks]:
     if units == "px" and points.shape[-1] == 2 and are_shares(points):
         points = in_pixels(points, options.size_of(size), notes)
     written = "skeleton" in file  # by this library
-    return [
-        build_tracks(
-            points,
-            file.array("confidence", "fiub", 2) if "confidence" in file else None,
-            dataclasses.replace(options, threshold=0.0) if written and options.threshold is None else options,
-            source=str(path),
-            names=file.texts("joint_names") if "joint_names" in file else None,
-            edges=file.array("edges", "iu") if "edges" in file else None,
-            skeleton=_skeleton(file) if written else None,
-            fps=file.number("fps") if "fps" in file else None,
-            units=units,
-            notes=notes,
-            detector=_detector_in(file),
-            size=size,
-        )
-    ]
+    tracks = build_tracks(
+        points,
+        file.array("confidence", "fiub", 2) if "confidence" in file else None,
+        dataclasses.replace(options, threshold=0.0) if written and options.threshold is None else options,
+        source=str(path),
+        names=file.texts("joint_names") if "joint_names" in file else None,
+        edges=file.array("edges", "iu") if "edges" in file else None,
+        skeleton=_skeleton(file) if written else None,
+        fps=file.number("fps") if "fps" in file else None,
+        units=units,
+        notes=notes,
+        detector=_detector_in(file),
+        size=size,
+    )
+    return [dataclasses.replace(tracks, image_guess=_size_in(file, "image_guess", 0))]
 
 
 def write_tracks(tracks: Tracks, path: Path) -> None:
@@ -125,10 +124,8 @@ def _tracks_out(tracks: Tracks) -> dict[str, Any]:
         "confidence": weights[:, :n],
         **_facts_out(tracks, n),
     }
-    if tracks.detector is not None:
-        arrays["detector"] = np.bool_(tracks.detector)
-    if tracks.image_size is not None:
-        arrays["image_size"] = np.array(tracks.image_size, np.int64)
+    maybe = {"detector": tracks.detector, "image_size": tracks.image_size, "image_guess": tracks.image_guess}
+    arrays |= {key: np.array(value) for key, value in maybe.items() if value is not None}
     if body.virtual:
         arrays |= {"points2d_virtual": points[:, n:], "confidence_virtual": weights[:, n:]}
     return arrays
@@ -139,9 +136,9 @@ def _detector_in(file: Archive) -> bool | None:
     return bool(file.array("detector", "b", 0)) if "detector" in file else None
 
 
-def _size_in(file: Archive) -> tuple[int, int] | None:
+def _size_in(file: Archive, key: str = "image_size", least: int = 1) -> tuple[int, int] | None:
     """Width and height of the image, where the file tells them."""
-    return told_image_size(file.array("image_size", "fiubUS").tolist()) if "image_size" in file else None
+    return told_image_size(file.array(key, "fiubUS").tolist(), least) if key in file else None
 
 
 def _save(arrays: dict[str, Any], path: Path) -> None:
@@ -247,6 +244,7 @@ def _tracks_in(file: Archive) -> Tracks:
         tuple(map(str, _json(file, "notes", list))) if "notes" in file else (),
         _detector_in(file),
         _size_in(file),
+        _size_in(file, "image_guess", 0),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,24 +12,9 @@ from kcs_torch.methods.perspective.image_lens import lens_of_image
 from kcs_torch.methods.perspective.uncalibrated import may_be_near, reconstruct_uncalibrated
 from kcs_torch.methods.perspective.view import lens_note
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
-from kcs_torch.types.people import file_and_person, file_of
+from kcs_torch.types.people import file_and_person
 
-__all__ = ["by_one_lens", "of_one_image"]
-
-
-def of_one_image(people: Sequence[Tracks]) -> list[list[int]]:
-    """The numbers of those who are in one image: people of one file, which tells them apart; others by themselves.
-
-    Who is there twice is there in several shots, each of which may have a camera of its own.
-    """
-    times = Counter(one.source for one in people)
-    shots = {file_of(one) for one in people if times[one.source] > 1}
-    groups: dict[tuple[object, ...], list[int]] = {}
-    for i, one in enumerate(people):
-        file, person = file_of(one), file_and_person(one.source)[1]
-        image = (file, one.units, one.image_size) if person and file not in shots else (i,)
-        groups.setdefault(image, []).append(i)
-    return list(groups.values())
+__all__ = ["by_one_lens"]
 
 
 def by_one_lens(method: Method, people: Sequence[Tracks]) -> dict[int, Reconstruction]:
@@ -40,18 +24,18 @@ def by_one_lens(method: Method, people: Sequence[Tracks]) -> dict[int, Reconstru
 
     Args:
         method: any.
-        people: in one image.
+        people: in one image, with one guess of its size where nobody says it (:func:`.guess_images`).
 
     Returns:
         The reconstructions of those whom :func:`.may_be_near` lets be near, by their numbers: of that one alone if the
         camera is far away after all, and of nobody if nobody tells a lens.
     """
     able = [i for i, one in enumerate(people) if may_be_near(one)]
-    lenses = {i: lens for i in able if (lens := lens_of_image(people[i], people)) is not None}
+    lenses = {i: lens for i in able if (lens := lens_of_image(people[i])) is not None}
     if not lenses:
         return {}
     first = max(lenses, key=lambda i: _filled(people[i]))
-    told = reconstruct_uncalibrated(method, people[first], beside=people)
+    told = reconstruct_uncalibrated(method, people[first])
     if told.intrinsics is None:
         return {first: told}
     who, said = file_and_person(people[first].source)[1], lenses[first][2]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -79,8 +78,6 @@ def reconstruct_uncalibrated(
     tracks: Tracks,
     cameras: Tensor | None = None,
     lifted: Reconstruction | None = None,
-    *,
-    beside: Sequence[Tracks] = (),
 ) -> Reconstruction:
     """Reconstruct a body before a camera of which nothing is known.
 
@@ -98,7 +95,6 @@ def reconstruct_uncalibrated(
         cameras: as of :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
         lifted: what PKC, :func:`looking` for a near camera, found under parallel rays, if it was asked before: where
             :func:`lens_of_image` tells nothing.
-        beside: as of :func:`lens_of_image`.
 
     Returns:
         As :func:`kcs_torch.methods.perspective.reconstruct_perspective`; a note tells the intrinsics. Where the tracks
@@ -114,7 +110,7 @@ def reconstruct_uncalibrated(
         )
     begin = time.perf_counter()
     before = 0.0 if lifted is None else lifted.diagnostics.seconds
-    likely = None if lifted is not None else lens_of_image(tracks, beside)
+    likely = None if lifted is not None else lens_of_image(tracks)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
         if likely is None:
