@@ -56,7 +56,7 @@ def files(inputs: Path, truth: Path) -> Iterator[tuple[str, kt.Tracks, Tensor]]:
 def measure(name: str, tracks: kt.Tracks, truth: Tensor, paced: bool) -> str:
     count, fps = tracks.skeleton.num_observed, tracks.rate
     frames = torch.where(tracks.seen[..., None], tracks.points, torch.nan)[:, :count]
-    tracker = kt.Tracker(tracks.skeleton, fps=fps, units=tracks.units, wait=not paced)
+    tracker = kt.Tracker(tracks.skeleton, fps=fps, units=tracks.units, wait=not paced, image_size=tracks.image_size)
     poses, waits = [], []
     begin, clock = time.process_time(), time.perf_counter()
     for i, (xy, weights) in enumerate(zip(frames, tracks.weights[:, :count], strict=True)):

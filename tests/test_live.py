@@ -13,6 +13,8 @@ import kcs_torch as kt
 from kcs_torch.data import walking_person
 from kcs_torch.functional.align import similarity
 from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.live import tracker as live
+from kcs_torch.types import Intrinsics
 
 FRAMES = 120
 
@@ -368,3 +370,21 @@ def test_bones_that_have_not_been_seen_leave_no_nan():
     assert bool(first.uncertainty.isinf().all()) and bool(first.points.isfinite().all())
     for pose in (two, all_seen):
         assert bool(pose.uncertainty.isfinite().all()) and bool((pose.uncertainty > 0).all())
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning", "ignore::kcs_torch.ConvergenceWarning")
+def test_by_the_size_of_the_image_the_result_is_before_a_near_camera(monkeypatch):
+    """Else rays are parallel. Live poses are the same."""
+    walk = walking_person(12, skeleton="coco17", yaw=60, turn=0)
+    seen = Intrinsics(1500.0, 1500.0, 960.0, 540.0).project(walk.points[:, :17] + torch.tensor([900.0, 0.0, 3500.0]))
+    sizes, method = ((1920, 1080), None, (1080, 1920)), kt.PKC(viewpoint="fixed", steps=3, lifts=1)
+    trackers = [kt.Tracker("coco17", window=12, image_size=size, method=method) for size in sizes]
+    poses = [follow(one, seen.double()) for one in trackers]
+    assert all(torch.equal(a.points, b.points) for a, b in zip(*poses[:2], strict=True))
+    tracks = [one.tracks() for one in trackers]
+    assert [one.image_size for one in tracks] == [(1920, 1080), None, None]
+    assert ["image_size=(1920, 1080)" in "".join(one.notes) for one in tracks] == [False, False, True]
+    monkeypatch.setattr(live, "reconstruct_uncalibrated", lambda *given: given)
+    (used, shown), *others = [one.result() for one in trackers]
+    assert used is method and shown.image_size == (1920, 1080)
+    assert all(one.distance is None for one in others)

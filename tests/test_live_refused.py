@@ -6,6 +6,7 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.data import walking_person
+from kcs_torch.live.options import Options
 
 FRAMES = walking_person(2, skeleton="coco17").tracks.points[:, :17]
 
@@ -69,16 +70,18 @@ def test_bad_options():
 
 def test_options_cannot_change():
     with kt.Tracker("coco17") as tracker:
-        for name in ("skeleton", "fps", "window", "period", "units", "threshold", "wait", "method"):
+        for name in Options._fields:
             before = getattr(tracker, name)
             with pytest.raises(AttributeError, match=rf"Tracker: {name} cannot change: make a new one.*{name}=15"):
                 setattr(tracker, name, 15)
             assert getattr(tracker, name) == before
 
 
-@pytest.mark.parametrize("option", [{"units": 5}, {"wait": "no"}])
+@pytest.mark.parametrize(
+    "option", [{"units": 5}, {"wait": "no"}, {"image_size": "large"}, {"image_size": (1920, 1080), "units": "mm"}]
+)
 def test_odd_options_are_told(option):
-    with pytest.raises(kt.OptionError, match=next(iter(option))):
+    with pytest.raises(kt.OptionError, match=f"(Tracker: )?{next(iter(option))}"):
         kt.Tracker("coco17", **option)
 
 

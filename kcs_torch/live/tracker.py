@@ -12,30 +12,24 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import KcsWarning, OptionError, ShapeError, SkeletonError, users_level
+from kcs_torch.errors import KcsWarning, OptionError, ShapeError, users_level
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.live.filter import BodyFilter, ChainFilter, Shape, Told
 from kcs_torch.live.frame import FASTEST, Sight, take_frame
+from kcs_torch.live.options import LEAST, Options, check_options
 from kcs_torch.live.pose import Chain, LivePose
 from kcs_torch.live.size import SizeFilter, longest_image
 from kcs_torch.live.solve import Solved, solve_window
+from kcs_torch.methods.perspective.uncalibrated import may_be_near, reconstruct_uncalibrated
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.nn.posture import has_trunk
-from kcs_torch.skeleton import Skeleton, get_skeleton
+from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks
-from kcs_torch.types.hints import is_a
-from kcs_torch.types.intake import RATES, as_number
-from kcs_torch.types.size import short_unit
+from kcs_torch.types.image_size import fitting_size
 from kcs_torch.types.upright import ABOVE, how_it_stands
 
 __all__ = ["Tracker"]
-
-LEAST = 12
-"""Frames that a window has at least."""
-
-LENGTH, AGAIN = 3.0, 10.0
-"""Seconds of a window, and after which it is solved again."""
 
 EARLY: tuple[float, ...] = (1 / 3, 1.0)
 """Shares of the window that are solved as it fills."""
@@ -51,9 +45,6 @@ REPLAYED = 15
 
 LOST = 0.5
 """Seconds without the body after which the filter starts anew from many headings."""
-
-OPTIONS = ("skeleton", "fps", "window", "period", "units", "threshold", "wait", "method")
-"""Arguments of a tracker, and its attributes; all that it holds is made for them."""
 
 
 class Tracker:
@@ -88,10 +79,12 @@ class Tracker:
         wait: whether an update waits for a solve that should have ended. True gives the same poses for the same frames;
             False, for a camera, takes what a solve finds over when it has ended.
         method: whose fields :meth:`result` takes, and the solves, with fewer steps; ``PKC()`` if None.
+        image_size: width and height of the image in pixels, which :meth:`tracks` have: by it :meth:`result` knows the
+            lens of a near camera roughly. Live poses are as before a far one.
 
     Raises:
         SkeletonError: the skeleton is unknown, or its bones are no tree.
-        OptionError: a number is out of range.
+        OptionError: a number is out of range; or an image's size is given for tracks that are not in pixels.
 
     >>> from kcs_torch.data import walking_person
     >>> clip = walking_person(45, skeleton="coco17").tracks
@@ -113,48 +106,27 @@ class Tracker:
         threshold: float = 0.3,
         wait: bool = True,
         method: PKC | None = None,
+        image_size: tuple[int, int] | None = None,
     ) -> None:
-        body = None if skeleton == "auto" else get_skeleton(skeleton)
-        if body is None or not body.is_tree:
-            raise SkeletonError(
-                f"Tracker: expected a skeleton whose bones form one tree, got '{body.name if body else skeleton}'; "
-                "kcs_torch.find_skeleton finds one from a clip"
-            )
-        rate, least = as_number(fps), as_number(threshold)
-        if rate is None or not RATES[0] <= rate <= RATES[1]:
-            raise OptionError(
-                f"Tracker: fps: expected a positive number, {RATES[0]:g} to {RATES[1]:g} frames a second, got {fps!r}"
-            )
-        if least is None or not 0 <= least <= 1:
-            raise OptionError(f"Tracker: threshold: expected a confidence within 0..1, got {threshold!r}")
-        if not is_a(wait, bool):
-            raise OptionError(f"Tracker: wait: expected true or false, got {wait!r}")
-        if method is not None and not isinstance(method, PKC):
-            raise OptionError(f"Tracker: method: expected a kcs_torch.PKC, or None for its defaults, got {method!r}")
-        window = max(2 * LEAST, round(LENGTH * rate)) if window is None else window
-        period = max(window, round(AGAIN * rate)) if period is None else period
-        for name, value in (("window", window), ("period", period)):
-            if not is_a(value, int) or value < LEAST:
-                raise OptionError(f"Tracker: {name}: expected at least {LEAST} frames, a whole number, got {value!r}")
-        self.skeleton, self.fps, self.window, self.period = body, rate, int(window), int(period)
-        self.units, self.threshold, self.wait = short_unit(units), least, wait
-        self.method = PKC() if method is None else method
+        given = check_options(skeleton, fps, window, period, units, threshold, wait, method, image_size)
+        self.skeleton, self.fps, self.window, self.period, self.units, self.threshold, *_ = given
+        self.wait, self.method, self.image_size = given.wait, given.method, given.image_size
         self._filter: BodyFilter | ChainFilter
-        self._body, early = outward(body), EARLY
-        if has_trunk(body):
-            self._filter, self._delay = BodyFilter(self._body, rate), DELAY
+        self._body, early = outward(self.skeleton), EARLY
+        if has_trunk(self.skeleton):
+            self._filter, self._delay = BodyFilter(self._body, self.fps), DELAY
         else:
-            self._filter, early, self._delay = ChainFilter(self._body, rate), EARLY[-1:], 1.0
-        self._early = [min(max(LEAST, round(share * window)), window) for share in early]
+            self._filter, early, self._delay = ChainFilter(self._body, self.fps), EARLY[-1:], 1.0
+        self._early = [min(max(LEAST, round(share * self.window)), self.window) for share in early]
         self._rigid = list(self._body.rigid)
-        self._chain = Chain(self._body, self._filter.body, rate)
+        self._chain = Chain(self._body, self._filter.body, self.fps)
         self._thread = ThreadPoolExecutor(1, "kcs_torch.live")
         self._closed = self._told_up = False
         self._frame = -1
         self.reset()
 
     def __setattr__(self, name: str, value: object) -> None:
-        if name in OPTIONS and name in vars(self):
+        if name in Options._fields and name in vars(self):
             raise AttributeError(f"Tracker: {name} cannot change: make a new one, Tracker(..., {name}={value!r})")
         super().__setattr__(name, value)
 
@@ -253,16 +225,22 @@ class Tracker:
             raise ShapeError("Tracker: no joint has been seen yet: there is nothing to reconstruct")
         weights = torch.stack(list(self._weights))
         points = torch.where(weights[..., None] > 0, torch.stack(list(self._image)), 0.0)
-        first = self._frame + 1 - len(self._image)
-        return Tracks(points, weights, self.skeleton, self.fps, self.units, f"live from frame {first}")
+        source = f"live from frame {self._frame + 1 - len(self._image)}"
+        notes: list[str] = []
+        size = None if self.image_size is None else fitting_size(points[weights > 0], self.image_size, notes)
+        return Tracks(points, weights, self.skeleton, self.fps, self.units, source, tuple(notes), image_size=size)
 
     def result(self) -> Reconstruction:
         """Reconstruct the frames in the window anew by the method, at leisure: more accurate than the live poses.
 
+        Rays are taken to be parallel, unless ``image_size`` is known and the camera is near.
+
         Raises:
             ShapeError: no joint has been seen.
         """
-        return self.method(self.tracks())
+        tracks = self.tracks()
+        near = tracks.image_size is not None and may_be_near(tracks)
+        return reconstruct_uncalibrated(self.method, tracks) if near else self.method(tracks)
 
     # ------------------------------------------------------------------ the newest frame
 
