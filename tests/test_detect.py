@@ -564,6 +564,7 @@ COMMAND_MISTAKES = {
     "frames": (["detect", "VIDEO", "-o", "OUT.npz", "--frames", "9"], "OptionError", "such as 100:400"),
     "no video": (["detect", "absent.mp4", "-o", "OUT.npz"], "FormatError", "there is no such file"),
     "lift": (["lift", "VIDEO", "-o", "OUT.npz", "--detector", "yolo"], "OptionError", "choices are"),
+    "lift's size": (["lift", "VIDEO", "-o", "OUT.npz", "--image-size", "9x9"], "OptionError", "which tells its own"),
     "lift's person": (["lift", "VIDEO", "-o", "OUT.npz", "--person", "2"], "FormatError", "as there are 2 people"),
 }
 

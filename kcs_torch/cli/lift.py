@@ -155,6 +155,8 @@ def lift(
 ) -> None:
     """Turn 2D joint tracks, or a video where a detector is installed, into 3D motion."""
     with answer(as_json) as said:
+        from kcs_torch.errors import OptionError
+
         output = check_outputs(output, source=tracks)
         learned = _learned(method, settings) if method.endswith((LEARNED, ".ckpt")) else None
         fields = {} if learned is not None else method_fields(method, settings)
@@ -169,6 +171,8 @@ def lift(
         if format is None and _is_video(tracks):
             clean = cleaner(SEEN if frames == SEEN else None, unswap, gate, fill, smooth, resample)
             check_units(units, "px", size_of)
+            if size is not None:
+                raise OptionError(f"--image-size: {tracks} is a video, which tells its own: leave it out")
             people = people_of(
                 tracks,
                 person,

@@ -16,6 +16,8 @@ from kcs_torch.types import Motion, Reconstruction, Tracks
 
 __all__ = ["kind_of", "load_any"]
 
+_SPOKEN = {"result": "a result, which has its own", "motion": "3D motion"}
+
 
 def load_any(
     path: str | Path,
@@ -52,6 +54,10 @@ def load_any(
         raise unknown("format", format, {*READERS, *MOTION_READERS})
     check_fps(fps)
     kind = kind_of(path, format)
+    if kind != "tracks" and image_size is not None:
+        raise OptionError(
+            f"{path}: image_size (kcs-torch: --image-size) belongs to 2D tracks, got {_SPOKEN[kind]}: leave it out"
+        )
     if kind == "result":
         if skeleton is not None or up is not None or units is not None or person is not None:
             raise OptionError(f"{path}: a result has its own skeleton, axes, units and person; save it as motion first")

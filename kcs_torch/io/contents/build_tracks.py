@@ -52,6 +52,7 @@ def build_tracks(
         size: width and height of the image, as the file tells them.
 
     Raises:
+        OptionError: the caller says the size of an image that the tracks, by their units, do not lie in.
         ShapeError: the numbers are no tracks.
         SkeletonError: the joints do not fit the skeleton that the caller wants.
     """
@@ -65,7 +66,7 @@ def build_tracks(
         if names is not None and len(names) != points.shape[1]:
             names = None
         chosen, edges = body, None
-    pixels = short_unit(units) == "px" and not are_shares(points)
+    pixels = short_unit(units) == "px"
     tracks = Tracks.from_arrays(
         points,
         confidence,
@@ -75,7 +76,7 @@ def build_tracks(
         fps=options.fps if options.fps is not None else fps,
         units=units,
         threshold=options.least,
-        image_size=options.size_of(size) if pixels else None,
+        image_size=None if pixels and are_shares(points) else options.size_of(size if pixels else None),
         source=source,
         notes=remarks,
     )
