@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from samples import walk_result
 
-from kcs_torch.errors import FormatError, KcsError, SkeletonError
+from kcs_torch.errors import FormatError, KcsError, OptionError, SkeletonError
 from kcs_torch.io import load_people, load_reconstruction, load_tracks, save
 from kcs_torch.io.containers import archive
 from kcs_torch.skeleton import SKELETONS, Skeleton
@@ -104,7 +104,23 @@ def test_the_file_may_tell_the_size_of_the_image(tmp_path):
         assert tracks.points[tracks.seen].unique(dim=0).tolist() == [[320, 360]]
     assert load_tracks(path, image_size=(640, 480)).image_size == (640, 480)  # the caller goes before the file
     assert load_tracks(path, image_size=(640, 480)).points[0, 0].tolist() == [160, 240]
-    assert load_tracks(written(tmp_path / "mm.npz", image_size=np.array([1280, 720]))).image_size is None
+    path = written(tmp_path / "mm.npz", image_size=np.array([1280, 720]))
+    assert load_tracks(path).image_size is None
+    with pytest.raises(OptionError, match=r"mm.npz: image_size: expected tracks in pixels .* got units 'mm': leave it"):
+        load_tracks(path, image_size=(1280, 720))  # it went unheard
+
+
+def test_none_is_as_good_as_no_array(tmp_path):
+    """np.savez pickles it."""
+    keys = ("confidence", "edges", "fps", "units", "image_size", "skeleton", "notes", "detector")
+    tracks = load_tracks(written(tmp_path / "a.npz", **dict.fromkeys(keys, np.array(None))))
+    assert (tracks.fps, tracks.units, tracks.image_size, tracks.detector) == (None, "px", None, None)
+    with pytest.raises(FormatError, match="'points2d' holds pickled objects"):
+        load_tracks(written(tmp_path / "b.npz", points2d=np.array(None)))
+    for size in ([1920, None], {"width": 1920}):
+        path = written(tmp_path / "c.npz", image_size=np.array(size, object))
+        with pytest.raises(FormatError, match="'image_size' holds pickled .* write it as an array of numbers, .* None"):
+            load_tracks(path)
 
 
 @pytest.mark.parametrize("size", [(0, 720), (-1280, 720), (1280.5, 720), (1280,), "large", (True, True), (np.nan, 1)])
@@ -448,17 +464,18 @@ def test_tracks_come_back_as_sure_as_they_were(tmp_path):
     """Also joints that cleaning filled, whose confidence is low, and what is known of a detector."""
     tracks = walk_result().tracks
     for detector, size in ((None, None), (False, (1280, 720)), (True, None)):
-        weights = tracks.weights.clone()
+        weights, guess = tracks.weights.clone(), None if size else (0, 0)
         weights[3, 4] = 0.1
         points = tracks.points / 10 + tracks.points.new_tensor([640, 360])  # within the image
         mine = replace(tracks, points=points, weights=weights, detector=detector, units="px", image_size=size)
+        mine = replace(mine, image_guess=guess)
         back = load_tracks(save(mine, tmp_path / "t.npz"))
-        assert (back.detector, back.image_size) == (detector, size)
+        assert (back.detector, back.image_size, back.image_guess) == (detector, size, guess)
         assert float(back.weights[3, 4]) == pytest.approx(0.1)
         assert not load_tracks(tmp_path / "t.npz", threshold=0.3).seen[3, 4]
         whole = save(replace(walk_result(), tracks=mine), tmp_path / "r.npz")
         back = load_reconstruction(whole).tracks
-        assert (back.detector, back.image_size) == (detector, size)
+        assert (back.detector, back.image_size, back.image_guess) == (detector, size, guess)
 
 
 def test_files_of_others_go_through_a_threshold(tmp_path):

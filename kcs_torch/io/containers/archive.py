@@ -21,6 +21,7 @@ __all__ = ["Archive", "array_names"]
 LIMIT = 4 * 2**30  # bytes of one file's arrays, unpacked
 RATIO = 200  # unpacked over packed bytes, above which a large array is no measurement
 LARGE = 256 * 2**20
+NONE = 512  # bytes of a pickled None, with the header that numpy writes, at most
 
 
 def array_names(path: Path) -> set[str]:
@@ -62,7 +63,8 @@ class Archive:
             raise FormatError(f"{path}: its arrays unpack to more than {LIMIT // 2**30} GiB: refused; split the file")
 
     def __contains__(self, key: str) -> bool:
-        return key in self.members
+        """Whether there is such an array: None, which numpy writes as a pickle, is none."""
+        return key in self.members and not (self.members[key].file_size <= NONE and self._is_none(key))
 
     @property
     def keys(self) -> list[str]:
@@ -134,6 +136,12 @@ class Archive:
             raise FormatError(f"{what} is damaged or truncated: {as_text(error)}") from None
         return found
 
+    def _is_none(self, key: str) -> bool:
+        try:
+            return self.objects(key) is None
+        except FormatError:  # no objects, or damaged ones
+            return False
+
     def _single(self, key: str, kinds: str) -> Any:
         array = self.array(key, kinds)
         if array.size != 1:
@@ -148,7 +156,10 @@ class Archive:
                 shape, dtype = _header(file)
                 start = stream.tell()
             if dtype.hasobject:
-                raise FormatError(f"{self.path}: '{key}' holds pickled objects, which could run code: refused")
+                raise FormatError(
+                    f"{self.path}: '{key}' holds pickled objects, which could run code: refused; write it as an array "
+                    "of numbers, or of text, without None in it"
+                )
             # Before numpy reserves what the header claims.
             if math.prod(shape) * dtype.itemsize != member.file_size - start:
                 raise FormatError(f"{self.path}: '{key}': its size does not fit its shape {shape} of {dtype}")
