@@ -99,6 +99,33 @@ def test_a_gap_between_shots_is_left_to_it():
     assert cuts_of(replace(tracks, weights=weights)) == []
 
 
+def leaping(frames=60, away=slice(20, 40), by=(900.0, 300.0)):
+    """A walk whose tracks leap, as those of a tracker that takes another person for the same."""
+    tracks = walking_person(frames, yaw=30.0, turn=0.0).tracks
+    points = tracks.points.clone()
+    points[away] += points.new_tensor(by)
+    return replace(tracks, points=points)
+
+
+def test_a_body_that_leaps_is_a_cut():
+    assert cuts_of(leaping()) == [20, 40]
+    assert cuts_of(leaping(by=(60.0, 0.0))) == []
+    gap = leaping(by=(1800.0, 300.0))
+    gap.weights[18:20] = 0  # over a gap it moves as far in three frames
+    assert cuts_of(gap) == [20, 40]
+    gap.weights[10:20] = 0
+    assert cuts_of(gap) == [40]
+
+
+def test_frames_of_a_body_that_leaps_are_kept_under_perspective():
+    """The virtual camera looks after it; what is left out of the image is told of, and nothing but that."""
+    flat = leaping().points / 4 + 500
+    tracks = kt.Tracks.from_arrays(flat, skeleton="h36m17", fps=30)
+    with pytest.warns(kt.KcsWarning, match="the view jumps at frame 20, 40"):
+        found = kt.reconstruct(tracks, intrinsics=(1000, 1000, 500, 500))
+    assert found.diagnostics.unseen_share == 0 and found.diagnostics.reprojection_rms < 2
+
+
 def test_a_cut_is_told_and_shots_of_one_body_tell_more_together():
     tracks, clips = film(0.0, 100.0, frames=30)
     with pytest.warns(kt.KcsWarning, match=r"the view jumps at frame 30, as at a cut of a film.*kt\.clean\.split"):

@@ -113,6 +113,11 @@ class Method(ABC):
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         with apart([tracks], self.differentiates):
             tracks = self._mended(tracks)
+        return self.of_prepared(tracks, cameras, begin)
+
+    def of_prepared(self, tracks: Tracks, cameras: Tensor | None, begin: float) -> Reconstruction:
+        """Reconstruct tracks that are :meth:`prepared`, as a call does, which ``begin`` at that time."""
+        with apart([tracks], self.differentiates):
             inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
         return self._finished(tracks, found, size, known, time.perf_counter() - begin)

@@ -1,4 +1,4 @@
-"""Cuts of a film: frames from which on the body is seen from another side."""
+"""Cuts of a film: frames from which on the body is seen from another side, or another one is seen."""
 
 from __future__ import annotations
 
@@ -15,8 +15,11 @@ AWAY = 0.12
 """From the frame before to that after a cut half of the joints move, against the body's middle, by more than this share
 of its size, the median distance of joints from there."""
 
+LEAP = 1.0
+"""Or else the body as a whole moves by more than so many times its size in a frame."""
+
 SUDDEN, BESIDE = 5.0, 8
-"""And by more than so many times what they move between any two of so many frames before and after."""
+"""Either way by more than so many times what they move between any two of so many frames before and after."""
 
 FAR = 0.5
 """A joint that lies farther from where it was just before, and from where it is just after, is at a wrong place."""
@@ -26,7 +29,7 @@ LEAST, JOINTS = 4, 6
 
 
 def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
-    """Find the first frame of each shot but the first: there the pose jumps as it does nowhere near.
+    """Find the first frame of each shot but the first: there the pose jumps, or the body, as it does nowhere near.
 
     Frames in which half of the joints are seen are compared with the next such one, if that follows at once. Sides that
     a detector takes for each other are no cut, nor is a single wrong frame, which jumps back; nor are joints at wrong
@@ -58,12 +61,19 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
     before, after = known[:-1], known[1:]
     own, swapped = _moved(before, after), _moved(before, after[:, twins])
     step = torch.minimum(own, swapped.nan_to_num(torch.inf))
-    step = (step / torch.minimum(size[1:], size[:-1])).nan_to_num(0.0, 0.0)  # a body at one point has no pose
-    beside = torch.nn.functional.pad(step, (BESIDE, BESIDE)).unfold(0, 2 * BESIDE + 1, 1).clone()
-    beside[:, BESIDE] = 0
-    leaps = (step > AWAY) & (step > SUDDEN * beside.amax(1)) & (shown.diff() == 1)
+    pace = torch.where(seen[..., None], points, torch.nan)[shown].diff(dim=0)
+    pace = nanmedian(pace, 1).norm(dim=-1) / shown.diff()
+    step, pace = ((x / torch.minimum(size[1:], size[:-1])).nan_to_num(0.0, 0.0) for x in (step, pace))  # 0 / 0: a point
+    leaps = (_sudden(step, AWAY) & (shown.diff() == 1)) | _sudden(pace, LEAP)
     leaps[: LEAST - 1] = leaps[len(leaps) - LEAST + 1 :] = False
     return (shown[1:][leaps]).tolist()
+
+
+def _sudden(steps: Tensor, least: float) -> Tensor:
+    """Which steps (K,) are larger than ``least``, and than those beside by far."""
+    beside = torch.nn.functional.pad(steps, (BESIDE, BESIDE)).unfold(0, 2 * BESIDE + 1, 1).clone()
+    beside[:, BESIDE] = 0
+    return (steps > least) & (steps > SUDDEN * beside.amax(1))
 
 
 def _moved(before: Tensor, after: Tensor) -> Tensor:

@@ -42,8 +42,9 @@ SHOWN = 5
 """Cuts that are named at most."""
 
 BY_SHOTS = (
-    "as at a cut of a film. Shots of one body tell 'pkc' each other's depth; those of others, or for other methods, "
-    "should be solved by themselves: kt.reconstruct_all(kt.clean.split(tracks)), or part by part with --frames"
+    "as at a cut of a film, or where another body is followed. Shots of one body tell 'pkc' each other's depth; those "
+    "of others, or for other methods, should be solved by themselves: kt.reconstruct_all(kt.clean.split(tracks)), or "
+    "part by part with --frames"
 )
 
 HARDLY, SINGLE = "the viewpoint turned by only", "a single image shows one viewpoint"

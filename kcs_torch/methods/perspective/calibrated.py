@@ -242,11 +242,14 @@ def _straighten(tracks: Tracks, rays: Tensor, distance: Tensor, depth: Tensor) -
 
 
 def _lift(method: Method, straight: Tracks, view: View, cameras: Tensor | None) -> Reconstruction:
-    """A method's solution of straightened tracks, about which nothing is warned of yet."""
+    """A method's solution of straightened tracks, about which nothing is warned of yet.
+
+    They are prepared: what a method leaves out of the image says nothing here, and would be told of to nobody.
+    """
     known = None if cameras is None else (view.look @ complete_rotation(cameras))[:, :2]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)
-        return method(straight, known)
+        return method.of_prepared(straight, known, time.perf_counter())
 
 
 def _assemble(method: Method, tracks: Tracks, found: Found) -> Reconstruction:
