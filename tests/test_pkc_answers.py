@@ -75,6 +75,12 @@ def test_noise_makes_a_bone_in_the_image_plane_as_deep_as_its_square_tells():
         assert math.log(found[1] / found[0]) / math.log(1e2) == pytest.approx(power, abs=0.01)
 
 
+def test_what_noise_leaves_open_a_turning_viewpoint_tells():
+    for noise, less in ((torch.full((5, 4), 0.01).double(), True), (torch.zeros(5, 4).double(), False)):
+        still, turned = (depth_deviation(hypotheses([BENT], [0.0]), noise, CHAIN, doubt=1e-6, turn=t) for t in (0, 150))
+        assert bool((turned < 0.9 * still).all()) if less else torch.equal(turned, still)
+
+
 def test_lengths_are_told_by_bones_that_pass_through_the_image_plane():
     exact = torch.zeros(5, 4).double()
     passing = BENT.clone()

@@ -52,7 +52,8 @@ NEAREST = 0.02
 
 LEVEL = 0.4
 """A bone in the image plane is as unsure in depth as the root of this share of noise times length: noise adds twice
-that product at most to the square of its depth, of which neighbours make good the most."""
+that product at most to the square of its depth, of which neighbours make good the most, and other frames where the
+viewpoint turns."""
 
 POSTURE, STRANGE = 0.167, 1.5
 """Energy of usual postures, for each bone and frame that counts, and the power of a larger one that deviations go with:
@@ -64,7 +65,7 @@ the viewpoint's turn tells as much where it is half as far."""
 
 TURN, POWER = 48.0, 1.25
 """Degrees of the viewpoint's turn that tell as much as the template, and the power of the turn that deviations fall
-with."""
+with; those that noise leaves open in the image plane with half of it."""
 
 SHORT, LEAST_FRAMES, AROUND = 8.0, 12, 240.0
 """Independent frames up to which angles are the less sure the fewer there are, up to three times; frames from which on,
@@ -153,6 +154,7 @@ def depth_deviation(
     skeleton: Skeleton,
     *,
     doubt: float = 1.0,
+    turn: float = 0.0,
     image: Tensor | None = None,
     guess: Tensor | None = None,
 ) -> Tensor:
@@ -168,6 +170,7 @@ def depth_deviation(
         noise: (T, N) standard deviation of the joints' images.
         skeleton: of the N joints.
         doubt: of angles, see :func:`angle_doubt`.
+        turn: degrees by which the viewpoint turned.
         image: (T, N, 2) of a detector's joints, or None: these may be off in many ways that their noise does not tell.
         guess: (B,) variance of the bones' depths besides, see :func:`guess_variance`.
     """
@@ -180,7 +183,7 @@ def depth_deviation(
     told = told * USUAL**2 / (told + USUAL**2)
     if image is not None:
         noise = noise.square().add(NEAR**2).sqrt()
-    blur, level = bone_noise(noise, bones), LEVEL * length
+    blur, level = bone_noise(noise, bones), LEVEL * length / (1 + (turn / TURN) ** POWER)
     wrong = length.square() * told / (steep.square() + FLAT**2)
     wrong = wrong + level * blur.square() / (level * steep.square() + blur).clamp_min(1e-12)
     tree = chain_inverse(incidence(bones, skeleton.num_joints, dtype=noise.dtype))  # (N, B)

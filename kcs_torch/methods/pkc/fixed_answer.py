@@ -76,7 +76,7 @@ def from_hypotheses(
         turned = body.frames(depth)[:, :2]
         turn = float(viewpoint_turn(turned))
         spread = depth_deviation(
-            found[k : k + OTHERS + 1], body.noise, body.skeleton, image=image,
+            found[k : k + OTHERS + 1], body.noise, body.skeleton, image=image, turn=turn,
             doubt=angle_doubt(body.objective, depth, found.lengths[k], turn),
             guess=guess_variance(body.skeleton, found.lengths[k], turn),
         )  # fmt: skip
