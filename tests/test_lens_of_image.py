@@ -76,7 +76,7 @@ def test_the_focal_length_is_found_from_usual_ones_on(monkeypatch):
         ((40, 20), None, 0.4, (640, 480)),
         ((-300, 50), None, 1.0, None),  # a tenth of the joints and more beside it
         ((3000, 2900), None, 1.0, None),
-        ((100, 50), None, 0.1, None),  # so small that the camera may as well be far away
+        ((100, 50), None, 0.1, (640, 360)),  # so small that the camera is far away
     ],
 )
 def test_which_lens_an_image_has(corner, size, factor, expected):
@@ -84,23 +84,39 @@ def test_which_lens_an_image_has(corner, size, factor, expected):
     points = flat.points - flat.points.amin((0, 1))
     points = points * (factor * 900 / float(points[..., 1].max())) + points.new_tensor(corner)
     tracks = replace(flat, points=points, units="px", image_size=size)
-    lens = lens_of_image(tracks)
+    found = lens_of_image(tracks)
     if expected is None:
-        assert lens is None
+        assert found is None
         return
-    assert (2 * lens[0].cx, 2 * lens[0].cy) == expected and lens[1] == 0.85 * max(expected)
-    usual = lens[0].fx ** 2 / lens[1]  # makes the person of about 1.75 be 4.5 away
-    assert lens[0].fx == lens[0].fy and 0.85 < usual / (4.5 / 1.75 * factor * 850) < 1.15
-    assert (size is None) == (f"{expected[0]} x {expected[1]}" in lens[2])
+    assert (2 * found.lens.cx, 2 * found.lens.cy) == expected and found.usual == 0.85 * max(expected)
+    usual = found.lens.fx ** 2 / found.usual  # makes the person of about 1.75 be 4.5 away
+    assert found.far == (factor == 0.1)
+    assert found.lens.fx == found.lens.fy and 0.85 < usual / (4.5 / 1.75 * factor * 850) < 1.15
+    assert (size is None) == (f"{expected[0]} x {expected[1]}" in found.said)
     assert lens_of_image(replace(tracks, units="mm")) is None
     assert lens_of_image(replace(tracks, units="mm", detector=True)) is not None
     assert lens_of_image(replace(tracks, weights=0 * tracks.weights)) is None
 
 
+def test_a_body_that_is_small_in_its_image(monkeypatch):
+    """The tracks tell whether its camera is near all the same, which then looks at the image's middle as any other."""
+    tracks, truth = aside(distance=4500.0, frames=30, x=-800.0, lens=Intrinsics(500.0, 500.0, 960.0, 540.0))
+    small = replace(tracks, image_size=(1920, 1080))
+    assert lens_of_image(small).far
+    monkeypatch.setattr(uncalibrated, "likely_lens", lambda *_: None)
+    flat = quietly(small)
+    assert flat.distance is None
+    monkeypatch.setattr(uncalibrated, "likely_lens", lambda *_: IMAGE)
+    monkeypatch.setattr(uncalibrated, "_is_far", lambda *_: False)
+    near = quietly(small)
+    assert (near.intrinsics.cx, near.intrinsics.cy) == (960, 540)
+    assert error(near.points, truth) < 100
+
+
 def test_a_joint_or_two_beside_the_image_do_not_matter():
     tracks, _ = aside(frames=20)
     tracks.points[3, 2, 0] = -5.0
-    assert lens_of_image(tracks)[0].cx == 960
+    assert lens_of_image(tracks).lens.cx == 960
 
 
 @pytest.mark.parametrize("method", ["kcs", "sfam"])
@@ -183,9 +199,9 @@ def test_whom_a_file_shows_tell_the_image_of_the_one_that_is_read(tmp_path):
     kept, other = kt.load_tracks(path), kt.load_tracks(path, person=1)
     assert kept.image_guess == other.image_guess == (1920, 1080) and kept.image_size is None
     assert image_lens.usual_size(kept.points[kept.seen]) == (360, 640)
-    lens = lens_of_image(kept)
-    assert (lens[0].cx, lens[0].cy) == (960, 540) and "of all people in the file" in lens[2]
-    assert lens_of_image(replace(kept, image_guess=None))[0].cx == 180
+    found = lens_of_image(kept)
+    assert (found.lens.cx, found.lens.cy) == (960, 540) and "of all people in the file" in found.said
+    assert lens_of_image(replace(kept, image_guess=None)).lens.cx == 180
     assert kt.load_tracks(path, image_size=(1280, 1024)).image_guess is None
     back = kt.load_tracks(kt.save(kept, tmp_path / "kept.npz"))
     assert back.image_guess == (1920, 1080) and back.image_size is None

@@ -1,9 +1,10 @@
-"""What the size of its image tells of a camera that nobody has calibrated: :func:`lens_of_image`."""
+"""What the size of its image tells of a camera that nobody has calibrated: how far away it is, and its likely lens."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 from kcs_torch.clean.detector import detected
 from kcs_torch.functional.chain import bone_lengths
@@ -14,7 +15,7 @@ from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.types import Intrinsics, Tracks
 from kcs_torch.types.image_size import usual_size
 
-__all__ = ["NEAR", "lens_of_image"]
+__all__ = ["NEAR", "LikelyLens", "lens_of_image"]
 
 NEAR = 10.0
 """Distance up to which a camera is near: from there on a wrong focal length does more harm than parallel rays."""
@@ -23,8 +24,25 @@ FOCAL = 0.85
 """Usual focal length over the image's longer side, that of phones, web and action cameras."""
 
 
-def lens_of_image(tracks: Tracks) -> tuple[Intrinsics, float, str] | None:
-    """A likely lens of a camera that made an image of such a size, and what to say of it.
+class LikelyLens(NamedTuple):
+    """What the size of an image tells of the camera.
+
+    Attributes:
+        lens: looks at the image's middle, of a focal length between the usual one, as images are cropped, and one that
+            makes the camera's distance a usual one.
+        usual: focal length of usual cameras with such an image.
+        far: whether the body is so small in it that rays of a usual camera might as well be parallel.
+        said: what to say of it; empty where somebody said how large the image is.
+    """
+
+    lens: Intrinsics
+    usual: float
+    far: bool
+    said: str
+
+
+def lens_of_image(tracks: Tracks) -> LikelyLens | None:
+    """A likely lens of a camera that made an image of such a size.
 
     Where nobody says how large the image is, it is taken to be the smallest of usual size that holds the tracks, and
     those of all others in it who are known (:attr:`Tracks.image_guess`).
@@ -34,10 +52,7 @@ def lens_of_image(tracks: Tracks) -> tuple[Intrinsics, float, str] | None:
             the motion.
 
     Returns:
-        A lens that looks at the image's middle, of a focal length between that of usual lenses, as images are cropped,
-        and one that makes the camera's distance a usual one; the former; and a sentence. Or None where the tracks are
-        not in pixels, no image of usual size holds them, they show a point, or a body so small that rays might as well
-        be parallel.
+        The lens; or None where the tracks are not in pixels, no image of usual size holds them, or they show a point.
     """
     tracks = replace(tracks, points=tracks.points.detach())
     points = tracks.points[tracks.seen]
@@ -46,17 +61,16 @@ def lens_of_image(tracks: Tracks) -> tuple[Intrinsics, float, str] | None:
     width, height = tracks.image_size or tracks.image_guess or usual_size(points)
     if not width:
         return None
-    focal, body = FOCAL * max(width, height), tracks.skeleton
+    usual, body = FOCAL * max(width, height), tracks.skeleton
     rest = body.template_points(dtype=points.dtype, device=points.device)
     lengths = bone_lengths(rest, body.bone_index(device=points.device))
     own = usual_posture(body, points.dtype, points.device).rest_lengths
     unit = float(clip_scale(tracks, rest).median() * (lengths / own).median())
-    if not focal < NEAR * unit:
-        return None
     whose = " of all people in the file" if tracks.image_guess else ""
     said = (
         f"the image is taken to be {width} x {height} pixels, the smallest of usual size that holds the tracks{whose}: "
         "if it is not, give image_size=(width, height) (kcs-torch: --image-size), or the camera's intrinsics"
     )
-    likely = math.sqrt(focal * USUAL * unit)
-    return Intrinsics(likely, likely, width / 2, height / 2), focal, "" if tracks.image_size else said
+    likely = math.sqrt(usual * USUAL * unit)
+    lens = Intrinsics(likely, likely, width / 2, height / 2)
+    return LikelyLens(lens, usual, not usual < NEAR * unit, "" if tracks.image_size else said)

@@ -31,14 +31,14 @@ def by_one_lens(method: Method, people: Sequence[Tracks]) -> dict[int, Reconstru
         camera is far away after all, and of nobody if nobody tells a lens.
     """
     able = [i for i, one in enumerate(people) if may_be_near(one)]
-    lenses = {i: lens for i in able if (lens := lens_of_image(people[i])) is not None}
+    lenses = {i: lens for i in able if (lens := lens_of_image(people[i])) is not None and not lens.far}
     if not lenses:
         return {}
     first = max(lenses, key=lambda i: _filled(people[i]))
     told = reconstruct_uncalibrated(method, people[first])
     if told.intrinsics is None:
         return {first: told}
-    who, said = file_and_person(people[first].source)[1], lenses[first][2]
+    who, said = file_and_person(people[first].source)[1], lenses[first].said
     others = (i for i in able if i != first)
     return {first: told} | {i: _through(method, people[i], told.intrinsics, who, said) for i in others}
 

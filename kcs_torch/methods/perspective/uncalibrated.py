@@ -18,7 +18,7 @@ from kcs_torch.methods.answer.finish import Estimate, extent
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.clips.lockstep import Search
 from kcs_torch.methods.perspective.calibrated import WIDE, feet_on_ground, reconstruct_perspective
-from kcs_torch.methods.perspective.image_lens import NEAR, lens_of_image
+from kcs_torch.methods.perspective.image_lens import NEAR, LikelyLens, lens_of_image
 from kcs_torch.methods.perspective.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.perspective.pinhole import PinholeEnergy
 from kcs_torch.methods.perspective.pinhole_coordinates import FIRM, USUAL
@@ -83,10 +83,11 @@ def reconstruct_uncalibrated(
 
     The nearer a camera is, the more the size of a limb in the image changes with its depth: bones of constant length,
     the template's posture and feet that stand still tell how much. Where the image's size is known, or can be guessed,
-    the tracks are lifted through the lens that such a camera usually has (:func:`lens_of_image`). Elsewhere PKC solves
-    them as if rays were parallel, but ends where it has found a body whose camera seems near (:func:`likely_lens`),
-    before it turns runs of signs over; the principal point is then taken to be the tracks' middle. Either way the focal
-    length is found together with depths, lengths, distances and signs by
+    the tracks are lifted through the lens that such a camera usually has (:func:`lens_of_image`). Where it is not, or
+    the body is so small in it that such a camera is far away, PKC solves them as if rays were parallel, but ends where
+    it has found a body whose camera seems near all the same (:func:`likely_lens`), before it turns runs of signs over;
+    if nothing tells of the image, the principal point is taken to be the tracks' middle. Either way the focal length is
+    found together with depths, lengths, distances and signs by
     :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
 
     Args:
@@ -94,7 +95,7 @@ def reconstruct_uncalibrated(
         tracks: of a body with a template.
         cameras: as of :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
         lifted: what PKC, :func:`looking` for a near camera, found under parallel rays, if it was asked before: where
-            :func:`lens_of_image` tells nothing.
+            :func:`lens_of_image` tells nothing, or that the camera is far away.
 
     Returns:
         As :func:`kcs_torch.methods.perspective.reconstruct_perspective`; a note tells the intrinsics. Where the tracks
@@ -110,24 +111,28 @@ def reconstruct_uncalibrated(
         )
     begin = time.perf_counter()
     before = 0.0 if lifted is None else lifted.diagnostics.seconds
-    likely = None if lifted is not None else lens_of_image(tracks)
+    likely = lens_of_image(tracks)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
-        if likely is None:
-            result = _by_tracks(method, tracks, cameras, lifted)
+        if likely is not None and not likely.far and lifted is None:
+            result = _by_image(method, tracks, cameras, likely)
         else:
-            result = _by_image(method, tracks, cameras, *likely)
+            result = _by_tracks(method, tracks, cameras, likely, lifted)
     method.warn(result)
     notes = tuple(note for note in result.diagnostics.notes if note != SEEMS_FAR)
     spent = before + time.perf_counter() - begin
     return replace(result, diagnostics=replace(result.diagnostics, seconds=spent, notes=notes))
 
 
-def _by_tracks(method: Method, tracks: Tracks, cameras: Tensor | None, lifted: Reconstruction | None) -> Reconstruction:
+def _by_tracks(
+    method: Method, tracks: Tracks, cameras: Tensor | None, likely: LikelyLens | None, lifted: Reconstruction | None
+) -> Reconstruction:
     """A body before a camera of which the tracks tell whether it is near."""
     judge = method if isinstance(method, PKC) else PKC()
     result = looking(judge)(tracks, cameras) if lifted is None else lifted
     lens = None if SEEMS_FAR in result.diagnostics.notes else likely_lens(result, cameras)
+    if lens is not None and likely is not None:
+        return _by_image(method, tracks, cameras, likely)
     if lens is not None:
         near = _through(method, tracks, cameras, reconstruct_perspective(judge, tracks, lens, cameras, lifted=result))
         if bool(near.points.isfinite().all()):
@@ -135,12 +140,10 @@ def _by_tracks(method: Method, tracks: Tracks, cameras: Tensor | None, lifted: R
     return method(tracks, cameras) if judge is not method or SEEMS_NEAR in result.diagnostics.notes else result
 
 
-def _by_image(
-    method: Method, tracks: Tracks, cameras: Tensor | None, lens: Intrinsics, usual: float, said: str
-) -> Reconstruction:
+def _by_image(method: Method, tracks: Tracks, cameras: Tensor | None, likely: LikelyLens) -> Reconstruction:
     """A body before a camera with a likely lens, unless it comes out far away and parallel rays explain it better."""
     judge = method if isinstance(method, PKC) else PKC()
-    near = reconstruct_perspective(judge, tracks, lens, cameras, guessed=usual)
+    near = reconstruct_perspective(judge, tracks, likely.lens, cameras, guessed=likely.usual)
     if not bool(near.points.isfinite().all()):
         return method(tracks, cameras)
     assert near.intrinsics is not None
@@ -149,9 +152,8 @@ def _by_image(
         if _is_far(near, lifted):
             return lifted if judge is method else method(tracks, cameras)
     near = _through(method, tracks, cameras, near)
-    return replace(
-        near, diagnostics=replace(near.diagnostics, notes=(*near.diagnostics.notes, *([said] if said else [])))
-    )
+    notes = (*near.diagnostics.notes, likely.said) if likely.said else near.diagnostics.notes
+    return replace(near, diagnostics=replace(near.diagnostics, notes=notes))
 
 
 def _through(method: Method, tracks: Tracks, cameras: Tensor | None, near: Reconstruction) -> Reconstruction:
