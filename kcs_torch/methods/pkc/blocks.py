@@ -14,7 +14,7 @@ from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.temporal import blend_windows, fill_between, window_starts
 from kcs_torch.methods.clips.lockstep import Search, together
-from kcs_torch.methods.pkc.body import LITTLE, TURNING, Body, agree
+from kcs_torch.methods.pkc.body import TURNING, Body, agree
 from kcs_torch.methods.pkc.fixed_view import searching
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 
@@ -49,7 +49,6 @@ def search(
     steps: int,
     turned: Turned | None = None,
     near: Near | None = None,
-    again: bool = False,
 ) -> Search[Any, Any, Hypotheses]:
     """Hypotheses of :func:`fixed_view` over all frames, best first; of a clip of several blocks only the best.
 
@@ -59,10 +58,8 @@ def search(
         steps: of each refinement.
         turned: tells depths where the viewpoint turns; hypotheses that agree with these are not looked over.
         near: asked of hypotheses of the liveliest block; where the camera is near none are looked over.
-        again: whether the search is made once more, of an image whose gaps what is found fills. Signs hardly matter to
-            that but where the viewpoint turns: in clips of one block that turn little none are looked over.
     """
-    blocks = _Blocks(body, rounds, steps, turned, near, again)
+    blocks = _Blocks(body, rounds, steps, turned, near)
     whole = len(blocks.starts) == 1
     found = yield from (blocks.lifted(slice(None)) if whole else blocks.joined())
     if whole and blocks.stride == 1:
@@ -76,11 +73,8 @@ def search(
 class _Blocks:
     """The frames of a clip that are searched, and the blocks that they are divided into."""
 
-    def __init__(
-        self, body: Body, rounds: int, steps: int, turned: Turned | None, near: Near | None, again: bool
-    ) -> None:
+    def __init__(self, body: Body, rounds: int, steps: int, turned: Turned | None, near: Near | None) -> None:
         self.body, self.rounds, self.steps, self.turned, self.near = body, rounds, steps, turned, near
-        self.again = again
         self.stride = max(1, round(body.rate / 30)) if body.rate >= FAST else 1
         self.image = body.image[:: self.stride]
         self.size = min(BLOCK, len(self.image))
@@ -128,8 +122,6 @@ class _Blocks:
             return True
         depth = found.depth[0]
         turn = float(viewpoint_turn(self.body.frames(depth, self.image[some])[:, :2]))
-        if self.again and len(self.starts) == 1 and turn < LITTLE:
-            return True
         if self.turned is None or self.body.is_odd(found) or turn < TURNING:
             return False
         other = (yield from self.turned(False))[:: self.stride][some]

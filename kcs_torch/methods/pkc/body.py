@@ -28,7 +28,7 @@ from kcs_torch.solvers.camera_path import choose_path, view_energy
 from kcs_torch.solvers.lm import fit_bones
 from kcs_torch.solvers.procrustean import COARSE, FINE, Pose, Stage, align_rotations
 
-__all__ = ["LITTLE", "LONG", "ONE", "POLISH", "TOLD", "TURNING", "Body", "agree"]
+__all__ = ["LONG", "ONE", "POLISH", "TOLD", "TURNING", "Body", "agree"]
 
 HOLD, DAMPING = 10, 2.0
 """Levenberg-Marquardt steps that make bones constant, and their damping: undamped, a bone that is short beside what its
@@ -63,8 +63,7 @@ TURNING = 60.0
 
 ODD, LITTLE = 0.115, 30.0
 """Root mean square, of the logarithm, by which lengths stray from the template's where it is of another body: people
-stray by .07 to .11. The viewpoint's turn tells depth better than such a template from so many degrees on; below, signs
-hardly change where an unseen joint is in the image."""
+stray by .07 to .11. The viewpoint's turn tells depth better than such a template from so many degrees on."""
 
 LEAD, LESS = 10.0, 3.0
 """By how much what was found without a template of another body must be better, and how much less that one counts."""
@@ -204,6 +203,10 @@ class Body:
         That is by 60 degrees, or 30 of a body unlike its template, and by no less than ``least``.
         """
         return self._turn(found) >= max(LITTLE if self.is_odd(found) else TURNING, least)
+
+    def stays(self, found: Hypotheses) -> bool:
+        """Whether it hardly turns, so that signs hardly change where an unseen joint is in the image."""
+        return self._turn(found) < LITTLE
 
     def sways(self, found: Hypotheses) -> bool:
         """Whether it turns far enough for aligned bones to tell depth as well as the template does, not better."""

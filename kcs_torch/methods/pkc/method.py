@@ -50,8 +50,8 @@ AGAIN = 3
 """How often depths of the moving viewpoint are refined anew until they settle."""
 
 FILLS = 3
-"""How often gaps are filled in space: the first time the search is made once more; then, where the viewpoint sways,
-what was found is polished further."""
+"""How often gaps are filled in space: the first time the search is made once more, if the viewpoint turns; then, where
+it sways, what was found is polished further."""
 
 FAR = 90.0
 """Degrees of the trunk's turn from which on the viewpoint's turn tells more than a template in clips of few frames."""
@@ -219,10 +219,9 @@ class PKC(Method):
             found = yield from self._ranked(body, moving)
         else:
             resizing = clip.many and not changing and size.range >= TRIED and (clip.detections or size.likely)
-            again = polished and clip.many and self._fills(body)  # signs are then looked over the second time
             compare = turned if compared and clip.many and not resizing else None  # both must be searched alike
             near = Asked(self._seems_near, clip.tracks, clip.points, clip.cameras, body)
-            found = yield from search(body, self._moves, self.steps, compare, near, again)
+            found = yield from search(body, self._moves, self.steps, compare, near)
             if near.told == SEEMS_NEAR:  # the rest is as under perspective
                 method = self.following()
             if near.told and (near.told != SEEMS_FAR or not body.turns(found)):  # else signs were poor: ask again later
@@ -230,7 +229,7 @@ class PKC(Method):
             led = compared and body.is_odd(found) and body.turns(found)  # by the viewpoint's turn, not by the template
             if resizing and (size.sure or not led):
                 other = Body(skeleton, even.image, rate, clip.noise, feet, body.pace)
-                better = yield from resized(found, body, other, size, method._moves, self.steps, again)
+                better = yield from resized(found, body, other, size, method._moves, self.steps)
                 if better is not None:
                     changing, body, found = True, other, better
                     turned = self._turned(even, body.factor)
@@ -284,21 +283,24 @@ class PKC(Method):
     ) -> Search[Any, Any, tuple[Hypotheses, Body]]:
         """Hypotheses anew where joints are unseen here and there, and the body with its gaps filled in space.
 
-        The first time they are only polished: what the viewpoint's turn tells of signs is left to the second.
+        The first time they are only polished: what the viewpoint's turn tells of signs is left to the second. Where it
+        hardly turns there is no second time: gaps filled so hold what was found.
         """
         found = yield from body.polished(found, self.steps, rival, clip.telling)
         for again in range(FILLS):
             if found.image is None or (again and not body.sways(found)):
                 break
-            before, body = body.factor, body.filled(found.image)
+            before, stays, body = body.factor, body.stays(found), body.filled(found.image)
             ratio = body.factor / before
-            if again:
+            if again or stays:
                 found, rival = replace(found, depth=found.depth * ratio, lengths=found.lengths * ratio), None
             else:
                 rival = None if rival is None else rival * ratio
                 found = yield from search(body, self._moves, self.steps)
                 if clip.telling is not None:
                     found = yield from body.seen_from(found, clip.telling, self.steps)
+            if stays:
+                break
             found = yield from self._polished(clip, body, found, rival)
         return found, body
 

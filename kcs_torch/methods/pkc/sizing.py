@@ -27,7 +27,7 @@ it, for a new search to be made; and how many are."""
 
 
 def resized(
-    found: Hypotheses, body: Body, other: Body, size: Size, rounds: int, steps: int, again: bool = False
+    found: Hypotheses, body: Body, other: Body, size: Size, rounds: int, steps: int
 ) -> Search[Any, Any, Hypotheses | None]:
     """Hypotheses of a body whose size in the image changes, if they explain the tracks better; else None.
 
@@ -40,7 +40,6 @@ def resized(
         size: over time.
         rounds: of discrete moves of a new search.
         steps: of each refinement.
-        again: whether the new search, as the one before, is made once more.
     """
     even = torch.ones_like(size.path)
     # Energies compare as those of the tracks themselves, in which both images have one size.
@@ -53,7 +52,7 @@ def resized(
         tried = yield from refined(other.objective, start, steps)
         if not bool(tried.energy[0] < before - HOPEFUL):
             return None
-    new = yield from search(other, rounds, steps, again=again)
+    new = yield from search(other, rounds, steps)
     return new if bool(new.energy[0] < before - BETTER) else None
 
 
