@@ -110,6 +110,7 @@ def leaping(frames=60, away=slice(20, 40), by=(900.0, 300.0)):
 def test_a_body_that_leaps_is_a_cut():
     assert cuts_of(leaping()) == [20, 40]
     assert cuts_of(leaping(by=(60.0, 0.0))) == []
+    assert cuts_of(leaping(away=slice(20, 22), by=(1800.0, 300.0))) == []  # frames of somebody else, and back
     gap = leaping(by=(1800.0, 300.0))
     gap.weights[18:20] = 0  # over a gap it moves as far in three frames
     assert cuts_of(gap) == [20, 40]

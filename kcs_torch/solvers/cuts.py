@@ -33,7 +33,8 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
 
     Frames in which half of the joints are seen are compared with the next such one, if that follows at once. Sides that
     a detector takes for each other are no cut, nor is a single wrong frame, which jumps back; nor are joints at wrong
-    places, however many, as these are not where their joint is before or after.
+    places, however many, or all of them, as these are not where their joint is before or after. Over frames that show
+    less only the body's own leap tells: nobody knows how its pose changes meanwhile.
 
     Args:
         points: (T, N, 2).
@@ -63,8 +64,9 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
     step = torch.minimum(own, swapped.nan_to_num(torch.inf))
     pace = torch.where(seen[..., None], points, torch.nan)[shown].diff(dim=0)
     pace = nanmedian(pace, 1).norm(dim=-1) / shown.diff()
+    lost = (from_beside(middle) > LEAP * size[:, None])[:, 0]  # frames that are at a wrong place
     step, pace = ((x / torch.minimum(size[1:], size[:-1])).nan_to_num(0.0, 0.0) for x in (step, pace))  # 0 / 0: a point
-    leaps = (_sudden(step, AWAY) & (shown.diff() == 1)) | _sudden(pace, LEAP)
+    leaps = (_sudden(step, AWAY) & (shown.diff() == 1)) | (_sudden(pace, LEAP) & ~lost[1:] & ~lost[:-1])
     leaps[: LEAST - 1] = leaps[len(leaps) - LEAST + 1 :] = False
     return (shown[1:][leaps]).tolist()
 
