@@ -313,6 +313,18 @@ def test_so_are_joints_that_other_joints_explain(body, joints, told):
     assert any(told in note for note in result.diagnostics.notes)
 
 
+def test_frames_that_show_nobody_are_warned_of():
+    tracks = walking_person(60, turn=0.0, yaw=40.0).tracks
+    points = tracks.points.clone()
+    draw = torch.Generator().manual_seed(0)
+    points[20:28] = 1500 * torch.randn(8, 17, 2, generator=draw, dtype=points.dtype)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        METHODS["pkc"]()(replace(tracks, points=points))
+    told = "in 8 of 60 frames, from frame 20 on, most joints are away from their tracks, by up to"
+    assert any(told in str(one.message) for one in caught)
+
+
 @pytest.mark.parametrize(("method", "rests"), [("pkc", "the template and lengths"), ("sfam", "constant lengths alone")])
 def test_what_depth_rests_on_before_a_camera_that_stands_still(method, rests):
     """SfAM knows no template: the user is warned, and told of methods that do."""

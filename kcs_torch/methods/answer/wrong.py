@@ -40,7 +40,8 @@ OTHER = 0.6
 
 AWAY, OFTEN = 0.25, 0.1
 """Share of the body's size by which a joint is away from its tracks in most of the frames that show it, and the share
-of frames that have to show it, from which on it is another joint. Noise of 40 mm comes to .1 of the size."""
+of frames that have to show it, from which on it is another joint; or most joints in this share of the frames, which are
+another body's. Noise of 40 mm comes to .1 of the size."""
 
 POINT = 1e-6
 """Size in the image, over the depth, up to which a body is a point."""
@@ -70,20 +71,30 @@ def what_is_wrong(
 
 
 def far_joints(images: Tensor, tracks: Tracks) -> str:
-    """Which joints' images (T, N, 2) are away from their tracks in most frames, for the user; empty where none is."""
+    """Which joints' images (T, N, 2) are away from their tracks in most frames, or most joints' in which frames.
+
+    A sentence for the user; empty where none is.
+    """
     seen = tracks.seen
     joints = (seen.to(images.dtype).mean(0) >= OFTEN).nonzero().flatten().tolist() if len(seen) else []
     size = float(rms(centre(tracks.points, tracks.weights)[0], seen.to(images.dtype))) if joints else 0.0
     if not size > 0:
         return ""
-    off = ((images - tracks.points) / size).norm(dim=-1)
-    off = nanmedian(torch.where(seen, off, torch.nan)[:, joints], 0)
-    found = (off > AWAY).nonzero().flatten().tolist()
-    named = [f"{tracks.skeleton.joints[joints[i]]} by {100 * float(off[i]):.0f} %" for i in found]
-    if not named:
+    away = torch.where(seen, ((images - tracks.points) / size).norm(dim=-1), torch.nan)[:, joints]
+    off = nanmedian(away, 0)
+    found = (off > AWAY).nonzero().flatten()
+    named = [f"{tracks.skeleton.joints[joints[i]]} by {100 * float(off[i]):.0f} %" for i in found.tolist()]
+    if named:
+        by = _the_worst(named, off[found])
+        return f"joints are away from their tracks in most frames that show them, {by} of the body's size"
+    off = nanmedian(away, 1)
+    frames = (off > AWAY).nonzero().flatten()
+    if len(frames) < OFTEN * len(seen):
         return ""
-    by = _the_worst(named, off[found])
-    return f"joints are away from their tracks in most frames that show them, {by} of the body's size"
+    return (
+        f"in {len(frames)} of {counted(len(seen), 'frame')}, from frame {int(frames[0])} on, most joints are away from "
+        f"their tracks, by up to {100 * float(off[frames].amax()):.0f} % of the body's size"
+    )
 
 
 def _the_worst(named: Sequence[str], by: Tensor, kind: str = "joint") -> str:
