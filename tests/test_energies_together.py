@@ -1,5 +1,6 @@
 """What every energy keeps to: batches, precision, weights of zero, NaN, any scale."""
 
+import math
 import warnings
 from copy import deepcopy
 
@@ -25,8 +26,11 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.nn import (
     AdductionEnergy,
     BoneLengthEnergy,
+    ContactEnergy,
+    ForeshorteningEnergy,
     HingeEnergy,
     LowRankEnergy,
+    PerspectiveEnergy,
     PostureEnergy,
     ProcrusteanEnergy,
     ReprojectionEnergy,
@@ -212,6 +216,59 @@ def test_nothing_is_nan_at_any_scale(seed, power, dtype, kind):
     for huber in (None, 0.1 * scale):
         energy = ReprojectionEnergy(huber=huber)
         finite(lambda x, y, r, e=energy: e(x, y, r, weights), points, tracks, cameras)
+
+
+HINGE, ADDUCTION, STANCE, POSTURE = (
+    kind(TRUNK) for kind in (HingeEnergy, AdductionEnergy, StanceEnergy, PostureEnergy)
+)
+FORESHORTENING, PROCRUSTEAN = ForeshorteningEnergy(TRUNK), ProcrusteanEnergy(TRUNK)
+LENS, IMAGE, STANDS = (1000, 1000, 0, 0), 300 * normal(6, 17, 2, dtype=torch.float32), torch.ones(6, 2)
+WITHOUT_UNIT = {
+    "hinge": lambda x, ell, s, w: HINGE(x, None, w),
+    "hinge, lengths": lambda x, ell, s, w: HINGE(x, ell, w),
+    "adduction": lambda x, ell, s, w: ADDUCTION(x, None, w),
+    "adduction, lengths": lambda x, ell, s, w: ADDUCTION(x, ell, w),
+    "stance": lambda x, ell, s, w: STANCE(x, None, w),
+    "stance, size": lambda x, ell, s, w: STANCE(x, s, w),
+    "posture": lambda x, ell, s, w: POSTURE(x, None, w),
+    "posture, lengths": lambda x, ell, s, w: POSTURE(x, ell, w),
+    "procrustean": lambda x, ell, s, w: PROCRUSTEAN(x, None, w),
+    "perspective": lambda x, ell, s, w: PerspectiveEnergy()(x, IMAGE, LENS, w),
+    "perspective, no shift": lambda x, ell, s, w: PerspectiveEnergy(translation=False)(x, IMAGE, LENS, w),
+    "contact": lambda x, ell, s, w: ContactEnergy(TRUNK, slip=0.006 * s, change=0.004 * s)(x, None, STANDS, w),
+}
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("name", WITHOUT_UNIT)
+def test_what_has_no_unit_is_the_same_at_any_scale(name, weighted):
+    """Squares in single precision reach from 1e-19 to 1e19; what is below 1e-9 may count as a point."""
+    points, lengths, energy = normal(6, 17, 3).float(), normal(16).float().abs() + 0.3, WITHOUT_UNIT[name]
+    weights = confidences(points) if weighted else None
+    expected = energy(points, lengths, 1.0, weights)
+    for power in (-30, -25, -21, -20, -17, -12, -8, -3, 3, 12, 17, 18, 20, 25, 30):
+        scale = 10.0**power
+        finite(lambda x, ell, s=scale: energy(x, ell, s, weights), scale * points, scale * lengths)
+        if power >= -8:
+            assert_close(energy(scale * points, scale * lengths, scale, weights), expected, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("noise", [None, 0.1])
+@pytest.mark.parametrize("given", [False, True])
+def test_foreshortening_of_any_scale_differs_by_its_logarithm(given, noise):
+    points, lengths = normal(6, 17, 3).float(), normal(16).float().abs() + 0.3
+
+    def energy(x, ell, scale):
+        noises = None if noise is None else torch.full((6, 16), scale * noise)
+        return FORESHORTENING(x, ell if given else None, bone_noise=noises)
+
+    expected = energy(points, lengths, 1.0)
+    for power in (-30, -20, -15, -8, 8, 17, 20, 30):
+        scale = 10.0**power
+        finite(lambda x, ell, s=scale: energy(x, ell, s), scale * points, scale * lengths)
+        if power >= -15:
+            shift = 2 * math.log(scale) * 6 * FORESHORTENING.free.sum() / FORESHORTENING.correlation
+            assert_close(energy(scale * points, scale * lengths, scale), expected + shift, rtol=1e-3, atol=1e-2)
 
 
 @each_energy

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.functional.guarded import or_one
+from kcs_torch.functional.guarded import or_one, unit_size
 from kcs_torch.functional.precision import narrow, wide
 from kcs_torch.functional.weights import known
 from kcs_torch.nn.checks import check_lengths
@@ -79,13 +79,13 @@ class _JointEnergy(SkeletonModule):
         full = wide(known_points(points, weights, self))
         ends = full.index_select(-2, self.joints.mT.reshape(-1)).unflatten(-2, self.joints.mT.shape)
         *chain, left, right = ends.unbind(-3)  # each (..., T, H, 3)
-        edges = [b - a for a, b in pairwise(chain)]
+        edges = [known(b - a, share) for a, b in pairwise(chain)]
         if lengths is None:
             edges = [_to_size(edge, share) for edge in edges]
         else:
             sizes = lengths.to(full.dtype)[..., None, self.limbs].unbind(-1)  # each (..., 1, H)
             edges = [_divide(edge, size[..., None]) for edge, size in zip(edges, sizes, strict=True)]
-        return tuple(known(vectors, share) for vectors in (*edges, _to_size(left - right, share)))
+        return *edges, _to_size(known(left - right, share), share)
 
     def _share(self, points: Tensor, weights: Tensor) -> Tensor:
         """Weights of the joints' terms, (..., T, H), or of all alike, (..., T, 1)."""
@@ -195,6 +195,7 @@ def _to_size(vectors: Tensor, weights: Tensor | None) -> Tensor:
 
     Weights are (..., T, H) or (..., T, 1).
     """
+    vectors = unit_size(vectors.transpose(-3, -2), 2).transpose(-3, -2)  # of each joint by itself
     square = vectors.square().sum(-1, keepdim=True)
     if weights is None:
         square = square.mean(-3, keepdim=True)
@@ -205,6 +206,5 @@ def _to_size(vectors: Tensor, weights: Tensor | None) -> Tensor:
 
 
 def _divide(vectors: Tensor, lengths: Tensor) -> Tensor:
-    """Vectors over lengths; 0 where a length is."""
-    known = lengths > 0
-    return vectors * torch.where(known, 1 / torch.where(known, lengths, torch.ones_like(lengths)), 0)
+    """Vectors over lengths; 0 where a length is none."""
+    return torch.where(lengths > 0, vectors / or_one(lengths), 0)

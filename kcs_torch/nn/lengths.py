@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.functional.guarded import or_one, safe_root
+from kcs_torch.functional.guarded import largest, or_one, safe_root
 from kcs_torch.functional.precision import narrow, wide
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.weights import known
@@ -103,7 +103,7 @@ class ForeshorteningEnergy(SkeletonModule):
                 bone_noise = known(bone_noise[..., None], bone_weights)[..., 0]
         vectors = known(bone_vectors(wide(points), self.bones), bone_weights)
         if lengths is None:
-            lengths = usual_size(vectors.square().sum(-1), bone_weights, LEAST)
+            lengths = usual_size(vectors, bone_weights, LEAST)
             lengths = lengths.clamp_min(torch.finfo(lengths.dtype).tiny ** 0.5)
         each = self.each(vectors[..., 2], wide(lengths), bone_weights, bone_noise)
         return narrow(each.sum((-2, -1)), points)
@@ -187,10 +187,12 @@ def foreshortening(depth: Tensor, length: Tensor, eps: float, noise: Tensor | No
     With noise n of the image, sqrt(dz^4 + (2.7 n L)^2) takes the place of dz^2.
     """
     tiny = torch.finfo(depth.dtype).tiny
-    square = depth.square()
+    size = torch.maximum(depth.abs(), length).detach()
+    unit = torch.where(size > tiny**0.5, size, 1)  # in which no square overflows
+    square, own = (depth / unit).square(), length / unit
     if noise is not None:
-        square = torch.hypot(square, (HIDDEN * noise * length).clamp_min(tiny**0.5))
-    return length.clamp_min(tiny).log() + 0.5 * (square + (eps * length).square()).clamp_min(tiny).log()
+        square = torch.hypot(square, (HIDDEN * (noise / unit) * own).clamp_min(tiny**0.5))
+    return length.clamp_min(tiny).log() + unit.log() + 0.5 * (square + (eps * own).square()).clamp_min(tiny).log()
 
 
 def free_bones(skeleton: Skeleton) -> Tensor:
@@ -200,17 +202,19 @@ def free_bones(skeleton: Skeleton) -> Tensor:
     return torch.tensor([float(s > LIMB_SPREAD) for s in skeleton.spread])
 
 
-def usual_size(square: Tensor, share: Tensor | None, least: float = 0.0) -> Tensor:
-    """Root mean square (..., B) over the frames of squared lengths (..., T, B) that have a share (..., T, B or 1).
+def usual_size(vectors: Tensor, share: Tensor | None, least: float = 0.0) -> Tensor:
+    """Root mean square length (..., B) of bones (..., T, B, D) over frames in which they have a share (..., T, B or 1).
 
     Nothing is shorter than ``least`` times the root mean square over the bones; 0 where all are.
     """
+    unit = or_one(largest(vectors, 3))  # no square of a large clip overflows
+    square = (vectors / unit).square().sum(-1)
     if share is None:
         square = square.sum(-2) / max(square.shape[-2], 1)
     else:
         seen = (share > 0).to(square)
         square = (square * seen).sum(-2) / seen.sum(-2).clamp_min(1)
-    return safe_root(square + least**2 * square.mean(-1, keepdim=True))
+    return safe_root(square + least**2 * square.mean(-1, keepdim=True)) * unit[..., 0, 0]
 
 
 def oddity(lengths: Tensor, usual: Tensor) -> float:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.camera import perspective, pinhole_translation
-from kcs_torch.functional.guarded import LOST, or_one, safe_root
+from kcs_torch.functional.guarded import LOST, or_one, safe_root, unit_size
 from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.weights import known, seen_weights
@@ -93,12 +93,11 @@ class PerspectiveEnergy(nn.Module):
             check_one(lens, 1, "intrinsics (4,)", points, self)
             lens = lens[..., None, None, :]  # (..., 1, 1, 4)
             weights = seen_weights(tracks, weights)
-            at, seen = wide(known(points, weights)), known(wide(tracks), weights)
+            at, seen = unit_size(wide(known(points, weights)), 2), known(wide(tracks), weights)
             share = weights.to(at.dtype).expand(at.shape[:-1])
-            rounding = torch.finfo(at.dtype).eps * at.detach().abs().amax((-2, -1))
             if self.translation:
                 at = at + pinhole_translation(at, (seen - lens[..., 2:]) / lens[..., :2], share)[..., None, :]
-            near = self.nearest * _reach(at, share, rounding)[..., None]
+            near = self.nearest * _reach(at, share)[..., None]
             behind = (near - at[..., 2]).clamp_min(0) / near
             ahead = torch.cat([at[..., :2], torch.maximum(at[..., 2], near)[..., None]], -1)
             square = huber_square((perspective(ahead, lens) - seen).square().sum(-1), self.huber)
@@ -139,10 +138,10 @@ def _any(flags: Tensor) -> bool:
         return False
 
 
-def _reach(points: Tensor, share: Tensor, rounding: Tensor) -> Tensor:
+def _reach(points: Tensor, share: Tensor) -> Tensor:
     """Distance of a body (..., N, 3) before the camera along z, or its size, where that is more, (...).
 
-    1 where neither is more than rounding: what is divided by it has bounds.
+    1 where neither is more than rounding of points of size 1: what is divided by it has bounds.
 
     Were the distance behind the camera to count like that before it, what lies behind would cost the same however far:
     nothing would push it ahead.
@@ -152,4 +151,4 @@ def _reach(points: Tensor, share: Tensor, rounding: Tensor) -> Tensor:
     size = safe_root((share[..., None] * (points - middle).square() / total).sum((-2, -1)))
     far = middle[..., 0, 2]
     reach = torch.maximum(torch.maximum(far, -BEHIND * far), size)
-    return torch.where(reach > LOST * rounding, reach, torch.ones_like(reach))
+    return torch.where(reach > LOST * torch.finfo(reach.dtype).eps, reach, torch.ones_like(reach))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.functional.guarded import or_one, safe_root
+from kcs_torch.functional.guarded import or_one, safe_root, unit_size
 from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.nn.checks import check_beside, check_lengths, check_positive
 from kcs_torch.nn.layers import SkeletonModule
@@ -130,7 +130,7 @@ class PostureEnergy(SkeletonModule):
         """
         self._check(points)
         part = points.index_select(-2, self.trunk)
-        part = part - part.mean(-2, keepdim=True)
+        part = unit_size(part - part.mean(-2, keepdim=True), 3)
         with full_precision(part):
             first, second = (self.affine.to(part) @ part).unbind(-2)  # images of the trunk's two long axes
             first = _unit(first)
@@ -153,7 +153,7 @@ class PostureEnergy(SkeletonModule):
                 share = None
                 if weights is not None:
                     share = bone_share(weights, self.bones) if joints else weights[..., None]
-                lengths = usual_size(vectors.square().sum(-1), share, LEAST)
+                lengths = usual_size(vectors, share, LEAST)
             lengths = lengths.to(vectors.dtype)[..., None, :, None]
             return vectors @ self.frame(points) / torch.where(lengths <= 0, torch.inf, lengths)
 

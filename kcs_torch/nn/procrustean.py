@@ -11,7 +11,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.align import nearest_rotation
 from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.functional.guarded import or_one, safe_root
+from kcs_torch.functional.guarded import or_one, safe_root, unit_size
 from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.scatter import scatter_log_det
 from kcs_torch.functional.weights import known
@@ -82,6 +82,7 @@ class ProcrusteanEnergy(SkeletonModule):
             if weights is not None:
                 share = bone_share(weights, self.bones).to(vectors.dtype)
                 vectors, share = known(vectors, share), share[..., None]
+            vectors = unit_size(vectors, 3)
             if rotations is None:
                 rotations = _align(vectors, self.num_steps, share)
             aligned = (vectors @ rotations.to(vectors.dtype)).flatten(-2)

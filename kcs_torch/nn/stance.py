@@ -117,10 +117,9 @@ class StanceEnergy(SkeletonModule):
                 share = None
                 if weights is not None:
                     share = bone_share(weights, self.bones) if joints else weights[..., None]
-                square = vectors.square().sum(-1)
-                known = square.new_ones(square.shape[-1]) if share is None else (share > 0).any(-2).to(square)
-                size = (known * usual_size(square, share)).sum(-1)
-                size = size / or_one((known * self.posture.rest_lengths.to(square)).sum(-1))
+                each = usual_size(vectors, share)
+                known = torch.ones_like(each) if share is None else (share > 0).any(-2).to(each)
+                size = (known * each).sum(-1) / or_one((known * self.posture.rest_lengths.to(each)).sum(-1))
             size = torch.where(size > 0, size, torch.inf).to(vectors)[..., None, None]
             way = (self.line.to(vectors) @ vectors)[..., None, :] @ self.posture.frame(points)  # (..., T, 1, 3)
             off = way[..., 0, ::2] / size - self.usual.to(vectors)

@@ -47,11 +47,11 @@ def root_velocity(
     if inside is not None:
         check_core(inside, "root_velocity: inside", move.shape[-2])
     velocity = torch.zeros_like(move[..., 0])
-    tie = torch.full_like(velocity[..., 1:], -1 / change**2)  # of each to the next
+    tie = torch.full_like(velocity[..., 1:], -((slip / change) ** 2))  # of each to the next, over a standing foot's
     if inside is not None:
         tie = tie * inside[..., 1:]
-    own = RIDGE / slip**2 + torch.nn.functional.pad(-tie, (0, 1)) + torch.nn.functional.pad(-tie, (1, 0))
+    own = RIDGE + torch.nn.functional.pad(-tie, (0, 1)) + torch.nn.functional.pad(-tie, (1, 0))
     for _ in range(num_steps):
-        pull = weight / (1 + ((move + velocity[..., None]) / slip).square()) / slip**2
+        pull = weight / (1 + ((move + velocity[..., None]) / slip).square())
         velocity = solve_tridiagonal(own + pull.sum(-1), tie, -(pull * move).sum(-1))
     return velocity
