@@ -1,5 +1,6 @@
 """Energies: values by hand, gradients with degenerate inputs, and the prox and gradient that solvers use."""
 
+import dataclasses
 import math
 
 import pytest
@@ -89,6 +90,26 @@ def test_prox_and_gradient_take_other_precisions_as_the_energy_does():
     found = fit.grad(points, tracks, cameras)
     assert_close(found, fit.grad(points.double(), tracks, cameras))
     assert_close(fit.grad(points, tracks.float(), cameras), found.float(), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("none", [math.nan, -0.5, -math.inf])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_bone_without_a_target_length_does_not_count(none, weighted):
+    """NaN in a target is not labelled, and no bone has a length below 0."""
+    points, lengths = clip("any", 2), normal(2, 6, seed=1).abs()
+    weights = confidences(points) if weighted else None
+    energy, rest = BoneLengthEnergy(BODY), BoneLengthEnergy(dataclasses.replace(BODY, flexible=(*BODY.flexible, 3)))
+    gone = lengths.clone()
+    gone[:, 3] = none
+    assert_close(energy(points, gone, weights), rest(points, lengths, weights))
+    slopes = finite(lambda x, ell: energy(x, ell, weights), points, gone)
+    assert_close(slopes[0], finite(lambda x: rest(x, lengths, weights), points)[0])
+    assert not slopes[1][:, 3].any() and slopes[1].any()
+    assert not energy(points, torch.full_like(lengths, none), weights).any()
+    best = energy.prox(points, gone, num_steps=20)
+    assert_close(best, rest.prox(points, lengths, num_steps=20), rtol=0, atol=1e-6)
+    finite(energy.prox, points, gone)
+    finite(energy.prox, points, torch.full_like(lengths, none))
 
 
 @pytest.mark.parametrize("dtype", FLOATS)

@@ -58,9 +58,10 @@ class BoneLengthEnergy(SkeletonModule):
 
         Args:
             points: (..., T, N, 3).
-            lengths: (..., B) target lengths; None takes each bone's own (weighted) mean over the T frames, which
-                makes this half the bone's variance: 0 for clips of one frame. A batch of single poses is (..., 1, N, 3)
-                and needs lengths; as (T, N, 3) it would pass for one clip of one body.
+            lengths: (..., B) target lengths; a bone of which it is NaN or negative does not count. None takes each
+                bone's own (weighted) mean over the T frames, which makes this half the bone's variance: 0 for clips of
+                one frame. A batch of single poses is (..., 1, N, 3) and needs lengths; as (T, N, 3) it would pass for
+                one clip of one body.
             weights: (..., T, N) of the joints; a bone weighs as much as the lesser of its two ends.
 
         Returns:
@@ -74,12 +75,13 @@ class BoneLengthEnergy(SkeletonModule):
         check_lengths(lengths, points, self)
         size = bone_lengths(known(wide(points), weights), self.bones)  # (..., T, B)
         share = self.rigid.to(size.dtype).expand_as(size)
+        if lengths is not None:
+            lengths, asked = _targets(lengths)
+            share = share * asked
         if weights is not None:
             share = share * bone_share(weights, self.bones)
         if lengths is None:
             lengths = (size * share).sum(-2, keepdim=True) / or_one(share.sum(-2, keepdim=True))
-        else:
-            lengths = lengths[..., None, :]
         return narrow(0.5 * (share * (size - lengths).square()).sum(-1), points)
 
     def prox(self, points: Tensor, lengths: Tensor, stiffness: Tensor | float = 1.5, *, num_steps: int = 3) -> Tensor:
@@ -87,7 +89,7 @@ class BoneLengthEnergy(SkeletonModule):
 
         Args:
             points: (..., T, N, 3).
-            lengths: (..., B).
+            lengths: (..., B), as in :meth:`forward`.
             stiffness: the paper's beta, not negative; a tensor broadcasts against (..., T, B).
             num_steps: Levenberg-Marquardt steps.
 
@@ -108,9 +110,16 @@ class BoneLengthEnergy(SkeletonModule):
         if beta.ndim > len(full) or not fit_together(beta.shape, full):
             got = tuple(beta.shape)
             raise ShapeError(f"BoneLengthEnergy: stiffness: expected a shape that broadcasts to {full}, got {got}")
-        beta, lengths = beta * self.rigid.to(points.dtype), lengths.to(points.dtype)
+        lengths, asked = _targets(lengths.to(points.dtype))
+        beta = beta * self.rigid.to(points.dtype)
         with full_precision(points):
-            return fit_bones(points, lengths[..., None, :], self.bones, stiffness=beta, num_steps=num_steps)
+            return fit_bones(points, lengths, self.bones, stiffness=beta * asked, num_steps=num_steps)
+
+
+def _targets(lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Target lengths (..., 1, B) of all frames, 0 where NaN or negative, and which bones (..., 1, B) have one."""
+    asked = lengths[..., None, :] >= 0
+    return torch.where(asked, lengths[..., None, :], 0), asked
 
 
 class LowRankEnergy(nn.Module):
