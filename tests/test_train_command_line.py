@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from training_runs import SMALL, called, logged, rows
 
 from kcs_torch.training import LiftingModule, load_lifter
-from kcs_torch.training.run import configs
+from kcs_torch.training.run import Outcome, configs
 from kcs_torch.training.sweep import RESULT, tabulate
 
 
@@ -200,7 +200,7 @@ class TestSweeps:
         assert [row["run"] for row in rows(tmp_path / "sweep" / "results.csv")] == ["0", "2"]
 
     def test_what_had_ended_is_kept(self, tmp_path, monkeypatch, capsys):
-        """A sweep that was stopped goes on: runs without a result are made again, and runs of other settings."""
+        """A sweep that was stopped goes on: runs without a result are made again."""
         monkeypatch.chdir(tmp_path)
         assert called(capsys, *SWEEP, "seed=0,1", "+module.lr=1e-3")[0] == 0
         before = swept(tmp_path)
@@ -211,9 +211,33 @@ class TestSweeps:
         changed = [(tmp_path / "sweep" / k / "lifter.safetensors").stat().st_mtime_ns != times[k] for k in "01"]
         assert changed == [False, True]
         assert [row["val/mpjpe"] for row in swept(tmp_path)] == [row["val/mpjpe"] for row in before]
-        code, out, err = called(capsys, *SWEEP, "seed=0,1", "+module.lr=1e-4", "keep=true")
-        assert code == 0 and "is kept" not in out
-        assert err.count("had ended with other settings, and is replaced") == 2
+
+    def test_what_had_ended_is_kept_under_whatever_number(self, tmp_path, monkeypatch, capsys):
+        """An option that is extended moves the numbers of the runs: none of those that ended is made again, or lost."""
+        made = []
+
+        def trained(config, folder):
+            made.append(folder.name)
+            return Outcome(config.seed + config.module.lr, {}, None)
+
+        monkeypatch.setattr("kcs_torch.training.run.train", trained)
+        monkeypatch.chdir(tmp_path)
+        assert called(capsys, *SWEEP, "+module.lr=1,2", "seed=10,20")[0] == 0
+        assert made == ["0", "1", "2", "3"]
+        results = {path: path.read_bytes() for path in (tmp_path / "sweep").glob(f"*/{RESULT}")}
+        code, out, err = called(capsys, *SWEEP, "+module.lr=1,2", "seed=10,20,30", "keep=true")
+        assert code == 0 and out.count("had ended, and is kept") == 4, err
+        assert made[4:] == ["2_1", "5"]
+        assert len(results) == 4 and all(path.read_bytes() == result for path, result in results.items())
+        table = [
+            (r["run"], r["module.lr"], r["seed"], r["val/mpjpe"]) for r in rows(tmp_path / "sweep" / "results.csv")
+        ]
+        assert table == [
+            *(("0", "1", "10", "11"), ("1", "1", "20", "21"), ("2", "2", "10", "12")),
+            *(("2_1", "1", "30", "31"), ("3", "2", "20", "22"), ("5", "2", "30", "32")),
+        ]
+        code, out, err = called(capsys, *SWEEP, "+module.lr=2,1", "seed=30,10", "keep=true")
+        assert code == 0 and out.count("had ended, and is kept") == 4 and len(made) == 6, err
 
     def test_figures_of_other_settings_are_not_kept(self, tmp_path, capsys):
         """A debugging run leaves the checkpoints of the run before, but the figures are its own."""
@@ -224,7 +248,9 @@ class TestSweeps:
         assert json.loads((tmp_path / RESULT).read_text()) != before
         assert (tmp_path / "lifter.safetensors").is_file() and len(list(tmp_path.rglob("*.ckpt"))) == 2
         code, out, err = called(capsys, *words, "keep=true")
-        assert code == 0 and "is kept" not in out and "is replaced" in err
+        assert code == 2 and "a run of other settings had ended here" in err and "Traceback" not in err
+        assert json.loads((tmp_path / RESULT).read_text()) != before
+        assert called(capsys, *words)[0] == 0
         assert json.loads((tmp_path / RESULT).read_text()) == before
         code, out, err = called(capsys, *words, "keep=true")
         assert code == 0 and "had ended, and is kept" in out, err

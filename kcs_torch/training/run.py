@@ -10,7 +10,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ from kcs_torch.training.configured import (
     for_json,
     in_one_line,
 )
-from kcs_torch.training.sweep import RESULT, SETTINGS, tabulate
+from kcs_torch.training.sweep import RESULT, SETTINGS, ended, tabulate
 
 __all__ = ["Outcome", "configs", "job", "main", "train"]
 
@@ -226,15 +226,6 @@ def _checkpoint(path: Path, config: Mapping[str, Any]) -> tuple[Path, int]:
     return found.resolve(), epoch
 
 
-def _ended(config: DictConfig, folder: Path) -> dict[str, float | None] | None:
-    """The figures of a run of the same settings that ended in this folder before; None where there is none."""
-    with suppress(Exception):  # whatever is wrong with its files, it did not end
-        result, then = (json.loads((folder / name).read_text(encoding="utf-8")) for name in (RESULT, SETTINGS))
-        if not changes(then, for_json(OmegaConf.to_container(config, resolve=True))):
-            return dict(result)
-    return None
-
-
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep packages from saying what nobody has to know."""
@@ -261,17 +252,20 @@ def job(config: DictConfig) -> float:
     folder = Path(settings.runtime.output_dir)
     with in_one_line():
         check_switch("keep", config.keep)
-    ended = _ended(config, folder) if config.keep else None
-    if ended is not None:
+        before = ended(config, folder) if config.keep else None
+        if config.keep and before is None and (folder / RESULT).is_file():
+            raise OptionError(
+                f"{folder}: a run of other settings had ended here, which keep=true leaves as it is: choose another "
+                "folder, hydra.run.dir=... or hydra.sweep.dir=..., or keep=false, which replaces it"
+            )
+    if before is not None:
         print(f"{folder}: had ended, and is kept")
         if settings.mode == RunMode.MULTIRUN:
             tabulate(Path(settings.sweep.dir))
-        value = ended.get(config.optimise)
+        value = before.get(config.optimise)
         if value is None and settings.mode != RunMode.MULTIRUN:
             raise SystemExit(1)  # as when it diverged
         return (math.inf if config.mode == "min" else -math.inf) if value is None else value
-    if config.keep and (folder / RESULT).is_file():
-        print(f"{folder}: had ended with other settings, and is replaced: runs go by their number", file=sys.stderr)
     with in_one_line(MisconfigurationException), warnings_told(_to_stderr):
         outcome = train(config, folder)
     figures = {config.optimise: outcome.value} | dict(outcome.metrics)

@@ -1,19 +1,21 @@
-"""What the runs of a sweep came to, in one table."""
+"""The folders of a sweep's runs, and what the runs came to, in one table."""
 
 from __future__ import annotations
 
+import copy
+import itertools
 import json
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from kcs_torch.io.atomic import write_table
 from kcs_torch.training.configured import changes, for_json
 
-__all__ = ["Table", "tabulate"]
+__all__ = ["Table", "ended", "run_folder", "tabulate"]
 
 RESULT = "result.json"
 """What every run leaves in its folder."""
@@ -23,6 +25,37 @@ SETTINGS = "settings.json"
 
 CALLED = Path(".hydra", "config.yaml")
 """The file of the settings of the last call, which Hydra writes before anything is looked at."""
+
+
+def ended(config: DictConfig, folder: Path) -> dict[str, float | None] | None:
+    """The figures of a run of the same settings that ended in this folder before; None where there is none."""
+    with suppress(Exception):  # whatever is wrong with its files, it did not end
+        result, then = (json.loads((folder / name).read_text(encoding="utf-8")) for name in (RESULT, SETTINGS))
+        if not changes(then, for_json(OmegaConf.to_container(config, resolve=True))):
+            return dict(result)
+    return None
+
+
+def run_folder(number: int, *, _root_: DictConfig) -> str:
+    """The name of a run's folder in that of its sweep: its number.
+
+    With ``keep=true`` it is the folder in which a run of the same settings ended before, whatever its number was. If
+    there is none, and another run ended in that of this number, it is NUMBER_1, NUMBER_2 or so: no other run of the
+    sweep takes it, though all may start at once.
+    """
+    if _root_.get("keep") is not True:
+        return str(number)
+    config, sweep = copy.deepcopy(_root_), Path(_root_.hydra.sweep.dir)
+    with read_write(config), open_dict(config):
+        del config["hydra"]
+    for path in sorted(sweep.glob(f"*/{RESULT}"), key=_number):
+        if ended(config, path.parent) is not None:
+            return path.parent.name
+    names = itertools.chain([str(number)], (f"{number}_{k}" for k in itertools.count(1)))
+    return next(name for name in names if not (sweep / name / RESULT).exists())
+
+
+OmegaConf.register_new_resolver("kcs_torch.run_folder", run_folder, replace=True)  # of configs/train.yaml
 
 
 def tabulate(folder: Path) -> list[dict[str, Any]]:
@@ -51,10 +84,10 @@ def _of_last_call(run: Path) -> bool:
     return True
 
 
-def _number(path: Path) -> tuple[int, str]:
+def _number(path: Path) -> tuple[list[int], str]:
     """Runs in the order in which they were started: their folders are numbers."""
-    name = path.parent.name
-    return int(name) if name.isdecimal() else -1, str(path)
+    number, _, other = path.parent.name.partition("_")
+    return [int(part) if part.isdecimal() else -1 for part in (number, other)], str(path)
 
 
 def _row(folder: Path, path: Path) -> dict[str, Any]:
