@@ -12,7 +12,7 @@ import kcs_torch as kt
 pytest.importorskip("lightning", reason="training needs the extra: pip install -e '.[train]'")
 hydra = pytest.importorskip("hydra")
 
-from training_runs import SMALL, composed, logged, rows, same, weights  # noqa: E402
+from training_runs import SMALL, called, composed, logged, rows, same, weights  # noqa: E402
 
 from kcs_torch.training import LiftingModule, load_lifter  # noqa: E402
 from kcs_torch.training.run import configs, train  # noqa: E402
@@ -254,6 +254,20 @@ class TestResuming:
     def test_a_network_of_another_size_is_told(self, run, tmp_path):
         with pytest.warns(kt.KcsWarning), pytest.raises(kt.OptionError, match="resume=.*does not fit"):
             train(composed(f"resume={run[1]}", "model.channels=4"), tmp_path)
+
+    def test_another_network_is_told_in_a_line(self, run, tmp_path, capsys):
+        """And what differs once, although the module has a copy of it."""
+        words = ("experiment=smoke", "model=mlp", f"resume={run[1]}", f"hydra.run.dir={tmp_path}")
+        code, _, err = called(capsys, *words, "trainer.max_epochs=4")
+        assert code == 2
+        told = [line for line in err.splitlines() if line.startswith(("warning: ", "error: "))]
+        assert told == [
+            "warning: resume: model._target_ was kcs_torch.nn.TemporalLifter, is kcs_torch.nn.MLPLifter",
+            "warning: resume: model.channels was 8, is None",
+            f"error: resume={run[1]}/checkpoints/last.ckpt: does not fit this configuration: it is of another network "
+            "or solver: set model and solver as they were, or leave resume out",
+        ]
+        assert len(err.strip().splitlines()) <= 6
 
 
 class Broken(torch.nn.Module):

@@ -47,6 +47,9 @@ __all__ = ["Outcome", "configs", "job", "main", "train"]
 LIFTER = "lifter.safetensors"
 """The file of a run's network."""
 
+GROUPS = {"network": "model", "losses": "loss", "refine": "solver"}
+"""The groups that fields of the module are, as a rule."""
+
 QUIET = (
     r".*does not have many workers.*",  # batches are made faster than they are used
     r".*number of training batches .* is smaller than the logging interval.*",
@@ -115,7 +118,11 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         except (RuntimeError, ValueError) as error:  # of a module's state, of an optimiser's
             if resumed is None or not re.search("state.dict", str(error)):
                 raise
-            raise OptionError(f"resume={resumed}: does not fit this configuration: {error}") from None
+            why = "it is of another network or solver" if isinstance(error, RuntimeError) else error  # of many lines
+            raise OptionError(
+                f"resume={resumed}: does not fit this configuration: {why}: set model and solver as they were, or "
+                "leave resume out"
+            ) from None
         except SystemExit as end:
             if trainer.interrupted:
                 kept = last.best_model_path or goes_on
@@ -221,8 +228,11 @@ def _checkpoint(path: Path, config: Mapping[str, Any]) -> tuple[Path, int]:
         differing, epoch = changes(held["config"], config), int(held["epoch"])
     except Exception:  # whatever torch, zipfile and pickle make of a file that is something else
         raise OptionError(f"resume={found}: expected a checkpoint of a training run, got something else") from None
+    told = {key for key, _, _ in differing}
     for key, before, now in differing:
-        warnings.warn(f"resume: {key} was {before}, is {now}", KcsWarning, stacklevel=2)
+        own = re.sub(r"module\.(network|losses|refine)(?=\.|$)", lambda found: GROUPS[found[1]], key)
+        if own == key or own not in told:
+            warnings.warn(f"resume: {key} was {before}, is {now}", KcsWarning, stacklevel=2)
     return found.resolve(), epoch
 
 
