@@ -2,7 +2,7 @@ r"""Reconstruct a folder of thousands of track files; stop it whenever you like,
 
     python scripts/reconstruct_many.py input=tracks output=motion
     python scripts/reconstruct_many.py input=videos output=motion pattern='*_json' 'suffixes=[.npz,.bvh]' \
-        scale=\'height=1.75m\'
+        scale=height=1.75m
     python scripts/reconstruct_many.py -m input=tracks output=motion shards=8 'shard=range(0,8)' hydra/launcher=joblib
     python scripts/reconstruct_many.py -m input=tracks output=motion shards=200 'shard=range(0,200)' \
         hydra/launcher=submitit_slurm hydra.launcher.cpus_per_task=1 hydra.launcher.timeout_min=240

@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 import kcs_torch as kt
-from kcs_torch.training.configured import check_values
+from kcs_torch.training.configured import _for_hydra, check_values
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 PROGRAMS = sorted(path.stem for path in CONFIGS.glob("*.yaml"))
@@ -146,6 +147,27 @@ def test_fields_can_be_set_on_the_command_line(name):
 def test_help_names_the_methods_and_no_groups_that_are_not_used(program):
     text = composed(program, return_hydra_config=True).hydra.help.template
     assert f"a method: {', '.join(sorted(kt.METHODS))}\n" in text and "$APP_CONFIG_GROUPS" not in text
+
+
+@pytest.mark.parametrize(
+    ("word", "value"),
+    [
+        ("scale=height=1.75m", "height=1.75m"),
+        ("scale=left_knee-left_ankle=430mm", "left_knee-left_ankle=430mm"),
+        ("scale='height=1.75m'", "height=1.75m"),
+        ("reading.joints=a=b", "a=b"),
+        ("suffixes=[.npz,'a=b']", [".npz", "a=b"]),
+        ("batch=16", 16),
+        ("data={fps: 30}", {"fps": 30}),
+    ],
+)
+def test_a_value_that_holds_an_equals_sign_needs_no_quotes(word, value):
+    assert OverridesParser.create().parse_override(_for_hydra(word)).value() == value
+
+
+def test_what_hydra_reads_itself_is_left_to_it():
+    for word in ("shard=range(start=0,stop=8)", "seed=1,2", "--config-dir=a=b", "output=${now:%Y=%m}"):
+        assert _for_hydra(word) == word
 
 
 @pytest.mark.parametrize("program", ["benchmark", "train"])

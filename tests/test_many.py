@@ -371,6 +371,7 @@ def test_a_multirun_says_that_clips_failed(clips, tmp_path, root):
     [
         (["output=out"], "error: input: expected a value, got none: add input=..."),
         (["input=nowhere", "output=out"], "error: nowhere: expected a folder of tracks"),
+        (["input=in", "output=out", "scale=height=2miles"], "error: scale: expected height=1.75m, a bone"),
         (["input=in", "output=out", "+reading.fsp=25"], "error: unknown reading option 'fsp': did you mean 'fps'"),
         (["input=in", "output=out", "method=sfam", "+method.foo=3"], "error: unknown option of method 'sfam' 'foo'"),
     ],

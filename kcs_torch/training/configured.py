@@ -76,7 +76,7 @@ def command_line(program: str, arguments: Sequence[str] | None = None, start: st
         raise SystemExit(2) from None
     # Hydra looks nowhere else, and takes flags before overrides only.
     ordered = sorted(given, key=lambda one: re.match(r"~|[^-][^=]*=", one) is not None)
-    sys.argv = [start or before[0], *map(_or_added, ordered)]
+    sys.argv = [start or before[0], *map(_for_hydra, ordered)]
     try:
         yield
     except SystemExit as end:  # Hydra leaves with 1 whatever it was; what it was is the context
@@ -90,8 +90,13 @@ def command_line(program: str, arguments: Sequence[str] | None = None, start: st
         sys.argv = before
 
 
-def _or_added(argument: str) -> str:
-    """An override that may also add a field: of a name that is not shown Hydra says to add it, be it right or wrong."""
+def _for_hydra(argument: str) -> str:
+    """An override as Hydra takes it.
+
+    It may also add a field: of a name that is not shown Hydra says to add it, be it right or wrong. A value that holds
+    an = is quoted, as in scale=height=1.75m.
+    """
+    argument = re.sub(r"^([^-=][^=]*=)([^='\"()\[\]{},\\]+=[^='\"()\[\]{},\\]*)$", r"\1'\2'", argument)
     return f"++{argument}" if re.match(r"(?!hydra\.)[A-Za-z_]\w*\.[^=]*=", argument) else argument
 
 
