@@ -9,15 +9,16 @@
 Writes SUITE/CASE.npz (the prediction) and results.csv (a row a case) to the run's folder under ``outputs/``, and
 prints the means of each suite; "covered" is the share of depths that are off by no more than the standard deviation
 that the method gives, after one scale for a clip. A sweep has one results.csv more, of all its runs. Each row is
-written when its case is done: with keep=true a sweep that was stopped goes on in its folder. Inputs, truth and figures
-are the protocol's own. A case that fails is a row with its error, and makes the exit code 1; it
-is 2 where the call is wrong.
+written when its case is done: with keep=true a sweep that was stopped, or is extended, goes on in its folder. Inputs,
+truth and figures are the protocol's own. A case that fails is a row with its error, and makes the exit code 1; it is 2
+where the call is wrong.
 """
 
 from __future__ import annotations
 
 import csv
 import importlib.util
+import itertools
 import re
 import sys
 import tempfile
@@ -210,6 +211,25 @@ def measured(row: dict[str, Any]) -> tuple[str, ...]:
     return tuple(str(row[name]) for name in MEASURED)
 
 
+def predicted(folder: Path) -> dict[tuple[str, str], dict[str, Any]]:
+    """The row of each (suite, case) of which there is a prediction beside a results.csv: what was measured last."""
+    last = {(row["suite"], row["case"]): row for row in read_rows(folder / "results.csv") if not row["error"]}
+    return {(suite, case): row for (suite, case), row in last.items() if (folder / suite / f"{case}.npz").is_file()}
+
+
+def done_rows(folder: Path) -> dict[tuple[str, ...], dict[str, Any]]:
+    """The rows below the folder of a sweep, or a run, that need not be measured again, whatever their run's number."""
+    found = (predicted(path.parent) for path in sorted(folder.glob("**/results.csv")))
+    return {measured(row): row for rows in found for row in rows.values()}
+
+
+def free_place(folder: Path, row: dict[str, Any]) -> Path:
+    """Where a row and its prediction replace none of other settings: a run's folder, or FOLDER/1, FOLDER/2, ..."""
+    case = (row["suite"], row["case"])
+    places = itertools.chain([folder], (folder / str(k) for k in itertools.count(1)))
+    return next(place for place in places if measured(predicted(place).get(case, row)) == measured(row))
+
+
 def tabulate(folder: Path, columns: tuple[str, ...]) -> list[dict[str, Any]]:
     """Write the rows of all runs below a sweep's folder to one file, and return what is in it.
 
@@ -279,20 +299,20 @@ def measure(config: DictConfig, suites: str | list[str], method: kt.Method, fold
     global failed
     job, shared = HydraConfig.get(), Path(str(config.shared))
     protocol = load_protocol(shared)
-    data, own, columns = shared / "data", folder / "results.csv", (*FACTS, *protocol.FIGURES, "error")
+    data, columns = shared / "data", (*FACTS, *protocol.FIGURES, "error")
     options = OmegaConf.to_container(config.method, resolve=True)
     text = " ".join(f"{name}={value}" for name, value in options.items() if name != "_target_")
     name = job.runtime.choices.method
     if name in METHODS and type(method) is not METHODS[name]:  # another one was put in its place
         name = method.name or type(method).__name__
-    kept = {measured(row): row for row in read_rows(own) if not row["error"]} if config.keep else {}
+    multirun = job.mode == RunMode.MULTIRUN
+    kept = done_rows(Path(job.sweep.dir) if multirun else folder) if config.keep else {}
     rows: list[dict[str, Any]] = []
     stopped = False
     wrong = 0
     try:
         for suite, case in chosen(protocol, suites, str(config.case)):
-            label = protocol.case_name(case)
-            target = folder / suite / f"{label}.npz"
+            label, place = protocol.case_name(case), folder
             row: dict[str, Any] = {"suite": suite, "case": label, "method": name, "options": text}
             row |= {"cameras": "estimated", "intrinsics": "none"}
             try:
@@ -300,11 +320,12 @@ def measure(config: DictConfig, suites: str | list[str], method: kt.Method, fold
                 lens = lens_of(protocol, data, case, config.intrinsics)
                 row["cameras"] = "estimated" if cameras is None else "true"
                 row["intrinsics"] = "none" if lens is None else lens if isinstance(lens, str) else "true"
-                if measured(row) in kept and target.is_file():
+                if measured(row) in kept:
                     rows.append(kept[measured(row)])
                     print(f"{suite}/{label}  was done, and is kept", flush=True)
                     continue
-                row |= run_case(protocol, data, case, method, target, cameras, lens)
+                place = free_place(folder, row) if config.keep else folder
+                row |= run_case(protocol, data, case, method, place / suite / f"{label}.npz", cameras, lens)
                 shown = "  ".join(f"{f} {row[f]:.4f}" for f in (*protocol.FIGURES, "covered") if f in row)
                 print(f"{suite}/{label}  {shown}  {row['ms_per_frame']:.2f} ms a frame", flush=True)
             except (Exception, SystemExit) as error:  # the protocol leaves by SystemExit where a prediction is no good
@@ -312,16 +333,15 @@ def measure(config: DictConfig, suites: str | list[str], method: kt.Method, fold
                 wrong += 1
                 print(f"{suite}/{label}  {row['error']}", flush=True)
             rows.append(row)
-            write_rows(own, read_rows(own) + rows, columns)
+            write_rows(place / "results.csv", [*read_rows(place / "results.csv"), row], columns)
     except KeyboardInterrupt:
         stopped = True
     if not rows and not stopped:
         raise OptionError(f"case={config.case}: matches no case of suite={config.suite}")
     failed += wrong
-    multirun = job.mode == RunMode.MULTIRUN
     shown = tabulate(Path(job.sweep.dir), columns) if multirun else rows
     if shown:
-        print(f"\n{table(shown, protocol.FIGURES)}\n{(Path(job.sweep.dir) if multirun else folder) / 'results.csv'}")
+        print(f"\n{table(shown, protocol.FIGURES)}\n{(Path(job.sweep.dir) if multirun else place) / 'results.csv'}")
     if stopped:
         raise SystemExit("stopped: these are the cases that were done; keep=true goes on in the same folder")
     if wrong and multirun:

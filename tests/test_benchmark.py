@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import subprocess
 import sys
 
@@ -115,8 +116,25 @@ def test_a_stopped_run_keeps_what_it_has_and_goes_on(root, folder):
     both = rows(folder / "out" / "results.csv")
     assert [row["case"] for row in both] == ["case_a", "case_b"] and both[0] == first[0]
     assert "2/2" in done.stdout
-    other = benchmark(root, folder, *words, "keep=true", "+method.num_steps=3")
+    prediction = (folder / "out" / "turn" / "case_a.npz").read_bytes()
+    other = benchmark(root, folder, *words, "keep=true", "intrinsics=parallel")
     assert other.returncode == 0 and "is kept" not in other.stdout
+    assert rows(folder / "out" / "results.csv") == both
+    assert (folder / "out" / "turn" / "case_a.npz").read_bytes() == prediction
+    assert [row["case"] for row in rows(folder / "out" / "1" / "results.csv")] == ["case_a", "case_b"]
+    assert (folder / "out" / "1" / "turn" / "case_a.npz").is_file()
+
+
+def test_a_sweep_that_is_extended_keeps_what_was_done_under_any_number(root, folder):
+    words = ("-m", "method=rigid", "suite=turn", "case=case_a", "hydra.sweep.dir=out")
+    assert benchmark(root, folder, *words, "method.num_steps=2,3").returncode == 0
+    before = {path: path.read_bytes() for path in (folder / "out").glob("*/turn/*.npz")}
+    done = benchmark(root, folder, *words, "method.num_steps=1,2,3", "keep=true")
+    assert done.returncode == 0 and done.stdout.count("was done, and is kept") == 2, done.stderr
+    assert len(before) == 2 and all(path.read_bytes() == text for path, text in before.items())
+    steps = [re.search(r"num_steps=(\d)", row["options"])[1] for row in rows(folder / "out" / "results.csv")]
+    assert sorted(steps) == ["1", "2", "3"]
+    assert (folder / "out" / "0_rigid" / "1" / "turn" / "case_a.npz").is_file()
 
 
 def test_a_run_that_is_stopped_between_cases_says_so(root, folder):
