@@ -28,8 +28,7 @@ def unit_size(values: Tensor, dimensions: int, counts: Tensor | None = None, los
     derivative is bounded; NaN stays NaN.
     """
     top, least = largest(values, dimensions, counts), torch.finfo(values.dtype).tiny ** 0.25
-    tiny = top <= (least if lost is None else lost.clamp_min(least))
-    return torch.where(tiny, torch.zeros_like(values), values / torch.where(tiny, torch.ones_like(top), top))
+    return values / torch.where(top <= (least if lost is None else lost.clamp_min(least)), torch.inf, top)
 
 
 def largest(values: Tensor, dimensions: int, counts: Tensor | None = None) -> Tensor:

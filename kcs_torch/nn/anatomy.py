@@ -83,8 +83,8 @@ class _JointEnergy(SkeletonModule):
         if lengths is None:
             edges = [_to_size(edge, share) for edge in edges]
         else:
-            sizes = lengths.to(full.dtype)[..., None, self.limbs].unbind(-1)  # each (..., 1, H)
-            edges = [_divide(edge, size[..., None]) for edge, size in zip(edges, sizes, strict=True)]
+            sizes = lengths.to(full.dtype)[..., None, self.limbs, None].unbind(-2)  # each (..., 1, H, 1)
+            edges = [edge / torch.where(size > 0, size, torch.inf) for edge, size in zip(edges, sizes, strict=True)]
         return *edges, _to_size(known(left - right, share), share)
 
     def _share(self, points: Tensor, weights: Tensor) -> Tensor:
@@ -202,9 +202,4 @@ def _to_size(vectors: Tensor, weights: Tensor | None) -> Tensor:
     else:
         share = weights.to(square)[..., None]
         square = (share * square).sum(-3, keepdim=True) / or_one(share.sum(-3, keepdim=True))
-    return _divide(vectors, or_one(square).sqrt())
-
-
-def _divide(vectors: Tensor, lengths: Tensor) -> Tensor:
-    """Vectors over lengths; 0 where a length is none."""
-    return torch.where(lengths > 0, vectors / or_one(lengths), 0)
+    return vectors / or_one(square).sqrt()
