@@ -148,8 +148,10 @@ def reconstruct_all(
     Returns:
         A :class:`Reconstruction` of each, in their order. People of one file before a camera that nobody has calibrated
         get one lens where the image's size is known or can be guessed. Else they get one of their own each, and x and y
-        from its principal point: their places compare with ``intrinsics`` given, or with "parallel", which leaves
-        everybody where the image has them.
+        from its principal point. Through one lens, given or found, the directions in which people stand compare
+        (``result.in_space()``). Their distances compare once each has a size (``result.scaled(units="m",
+        height=1.75)``): until then a person's unit is one pixel at their own mean distance, so that all seem equally
+        far. "parallel" leaves everybody where the image has them, at no depth that compares.
 
     Raises:
         OptionError: as :func:`reconstruct`; or something is not :class:`Tracks`.

@@ -164,8 +164,11 @@ def test_people_of_one_file_have_one_lens():
     assert [who in note for note, who in zip(told, ("of person 1,", "tracks, a", "of person 1,"), strict=True)] == [
         True
     ] * 3
-    for (far, _), one, (_, truth) in zip(cases, together, clips, strict=True):
+    for (far, x), one, (_, truth) in zip(cases, together, clips, strict=True):
         assert error(one.points, truth) < 50  # flat: 100 and more
+        middle = one.in_space().mean((0, 1))
+        assert abs(float(middle[0] / middle[2]) * lens.fx / IMAGE.fx - x / far) < 0.02  # directions compare at once
+        assert abs(float(one.distance.mean()) / lens.fx - 1) < 0.01  # distances do not: the unit is each one's own
         distance = float(one.scaled(units="mm", height=1750).distance.mean()) / lens.fx * IMAGE.fx
         assert 0.85 < distance / far < 1.15
     several = [*people, replace(people[0], source="other.json"), replace(people[0], source="other.json")]

@@ -214,7 +214,9 @@ class Reconstruction:
     def in_space(self) -> Tensor:
         """(T, N, 3): the points with the root's depth path added, so that a walking body moves through space.
 
-        The path begins at depth 0; where intrinsics were given it is the distance, and the camera is the origin.
+        The path begins at depth 0; where intrinsics were given or found it is the distance, and the camera is the
+        origin. The unit of a result that has not been :meth:`scaled` is one pixel at its own mean distance, which is
+        then the focal length: of several people before one camera only the directions compare, until each has a size.
 
         Raises:
             OptionError: the root's depth is not known.
