@@ -34,6 +34,12 @@ MAY_BE_SHARES = (
 )
 """What is told of arrays that may be shares of an image."""
 
+SAY_SIZE = (
+    "the image's size, by which all get one lens, to what reads or makes their tracks: image_size=(width, height) "
+    "(kcs-torch: --image-size 1920x1080); or "
+)
+"""What is asked for first where nobody said it, and people of one file got lenses of their own."""
+
 INSIDE = 0.9
 """Share of the coordinates within 0 and 1 from which on they may be."""
 
@@ -211,10 +217,11 @@ def _told_of_lenses(found: list[Reconstruction]) -> list[Reconstruction]:
         near = sum(one.distance is not None for one in people)
         if len({one.intrinsics for one in people}) > 1:
             each = "got lenses and origins that not all have" if near > 1 else "got a lens and an origin of its own"
+            unsized = all(one.tracks.image_size is None and one.tracks.units == "px" for one in people)
             message = (
                 f"{file}: {near} of {len(people)} people {each}, as the camera seems near: their places and sizes do "
-                "not compare. Give the camera's intrinsics (kcs-torch: --intrinsics FX,FY,CX,CY), or 'parallel', which "
-                "leaves everybody where the image has them"
+                f"not compare. Give {SAY_SIZE if unsized else ''}the camera's intrinsics (kcs-torch: --intrinsics "
+                "FX,FY,CX,CY), or 'parallel', which leaves everybody where the image has them"
             )
             warnings.warn(message, KcsWarning, stacklevel=users_level())
     return found

@@ -298,6 +298,10 @@ def test_people_of_one_file_with_lenses_of_their_own_are_warned_of():
     (message,) = told([near, *together])
     assert message.startswith("shots/a, b.json: 1 of 2 people got a lens and an origin of its own")
     assert "--intrinsics FX,FY,CX,CY" in message and "'parallel'" in message
+    assert "--image-size" not in message  # as some of the tracks are in mm
+    unsized = [replace(one, units="px", points=one.points - 2000) for one in together]  # no usual image holds them
+    (message,) = told(unsized)
+    assert message.index("image_size=(width, height) (kcs-torch: --image-size") < message.index("--intrinsics")
     assert told([near, far]) == told(together, intrinsics="parallel") == told(together[:1]) == []
     assert len(told(together, intrinsics="auto", method="kcs")) == 1
     assert told(together, intrinsics=(1500, 1500, 500, 500), method="kcs") == []

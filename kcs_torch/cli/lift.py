@@ -100,8 +100,8 @@ def lift(
             metavar="NUMBER|all",
             help="Which person, counted from 0, the most visible first; or all: each in a separate file (OUT_0, "
             "OUT_1), and pages, films and recordings also of all together (OUT). They have one lens by "
-            "--intrinsics, or by --image-size, which is guessed if nobody says it: the directions in which they stand then "
-            "compare, and with --scale their distances.",
+            "--intrinsics, or by --image-size, which is guessed if nobody says it: the directions in which they stand "
+            "then compare, and with --scale their distances.",
         ),
     ] = None,
     fps: Annotated[
