@@ -192,6 +192,19 @@ def test_view_writes_in_true_size(tmp_path):
     assert json.loads((tmp_path / "r.json").read_text())["units"] == "m"
 
 
+def test_results_are_levelled(tmp_path, openpose_folder):
+    """The files that hold the camera's axes are not."""
+    words = ["lift", openpose_folder, "-o", tmp_path / "r.npz", "-o", tmp_path / "a.trc", "--method", "kcs"]
+    run(*words, "--pitch", 20, "--scale", "height=1.75m")
+    run("convert", tmp_path / "r.npz", tmp_path / "b.trc", "--pitch", 20)
+    run("view", tmp_path / "r.npz", "-o", tmp_path / "c.trc", "--pitch", 20)
+    expected = Motion.of(load_reconstruction(tmp_path / "r.npz"), pitch=20).points
+    assert all(torch.allclose(load_motion(tmp_path / f"{k}.trc").points, expected, atol=1e-6) for k in "abc")
+    told = run(*words[:4], "--pitch", 20, code=2).stderr
+    assert "--pitch: expected a .bvh, .c3d, .csv or .trc file to write" in told
+    assert "--pitch: expected -90 to 90 degrees, got 91" in run(*words, "--pitch", 91, code=2).stderr
+
+
 # ---------------------------------------------------------------------- score
 
 

@@ -11,6 +11,7 @@ from samples import walking_motion as walk
 
 import kcs_torch as kt
 from kcs_torch.errors import FormatError, OptionError, OutputError, ShapeError, SkeletonError
+from kcs_torch.functional import orbit
 from kcs_torch.io import MOTION_READERS, detect_motion_format, load_any, load_motion, save
 from kcs_torch.io.formats.pages import as_result
 from kcs_torch.types import Motion
@@ -65,6 +66,45 @@ def test_a_result_walks_through_space_where_its_path_is_known():
     assert torch.allclose(apart[..., 2] - apart[:1, :, 2], path[:, None].expand(-1, 19))  # z is towards the viewer
     seen = replace(result, distance=path + 5000)
     assert torch.equal(from_y_up(Motion.of(seen).points, "-y"), seen.in_space())  # the camera is the origin
+
+
+@pytest.mark.parametrize("pitch", [25, -30.0])
+def test_a_camera_that_looks_down_is_levelled(pitch, tmp_path):
+    """With its path as without, and a note tells of a body that leans so much."""
+    level = walk_result().scaled(units="m", factor=1e-3)
+    tilt = orbit(torch.zeros((), dtype=torch.float64), pitch)
+    seen = replace(level, points=level.points @ tilt.mT)
+    expected = Motion.of(level).points
+    assert torch.allclose(Motion.of(seen, pitch=pitch).points, expected)
+    assert not torch.allclose(Motion.of(seen).points, expected, atol=0.2)
+    there = torch.full((12,), 5.0, dtype=torch.float64)
+    before = Motion.of(replace(level, distance=there)).points  # the camera is the origin
+    far = replace(seen, points=from_y_up(before, "-y") @ tilt.mT, distance=0 * there)
+    assert torch.allclose(Motion.of(far, pitch=pitch).points, before)
+    notes: list[str] = []
+    for suffix in (".trc", ".csv"):  # results in .csv are in the camera's axes otherwise
+        save(seen, tmp_path / f"w{suffix}", pitch=pitch, notes=notes)
+        assert torch.allclose(load_motion(tmp_path / f"w{suffix}").points, expected)
+    assert not any("leans" in note for note in notes)
+    save(seen, tmp_path / "w.trc", notes=notes)
+    (said,) = (note for note in notes if "leans" in note)
+    told = round(pitch + 10.7)  # the walk itself is seen from above
+    assert f"leans {abs(told)} degrees {'towards' if told > 0 else 'away from'} it" in said and f"pitch {told})" in said
+    save(level, tmp_path / "w.trc", notes=(level_notes := []))
+    assert not any("leans" in note for note in level_notes)
+
+
+def test_pitches_that_no_camera_has_and_files_that_are_not_levelled(tmp_path):
+    result = walk_result(4).scaled(units="m", factor=1e-3)
+    for wrong in (91, float("nan"), "5"):
+        with pytest.raises(OptionError, match="pitch: expected the degrees by which the camera looked down"):
+            Motion.of(result, pitch=wrong)
+    with pytest.raises(OptionError, match=r"w\.npz: pitch is for \.bvh, \.c3d, \.csv, \.trc; this one"):
+        save(result, tmp_path / "w.npz", pitch=5)
+    with pytest.raises(OptionError, match="pitch is for results, .* got motion"):
+        save(Motion.of(result), tmp_path / "w.trc", pitch=5)
+    with pytest.raises(OptionError, match="are for 3D motion, got 2D tracks"):
+        save(result.tracks, tmp_path / "w.npz", pitch=5)
 
 
 def test_arrays_are_checked_like_tracks():

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from kcs_torch.cli.options import ImageSize, InFormat, Rate, Threshold, Trust, check_outputs, image_size, person_number
-from kcs_torch.cli.outputs import Scale, Units, Up, parse_scale, write_files
+from kcs_torch.cli.outputs import Pitch, Scale, Units, Up, parse_scale, write_files
 from kcs_torch.cli.report import answer, progress
 
 __all__ = ["FromUnits", "FromUp", "convert"]
@@ -44,6 +44,7 @@ def convert(
         ),
     ],
     up: Up = None,
+    pitch: Pitch = None,
     scale: Scale = None,
     units: Units = None,
     from_up: FromUp = None,
@@ -101,5 +102,5 @@ def convert(
             if isinstance(data, Tracks):
                 raise OptionError("--scale: 2D tracks have no true size: lift them first")
             data = data.scaled(**true_size)
-        written = write_files(data, output, up, units)
+        written = write_files(data, output, up, units, pitch)
         written.tell(known)

@@ -22,7 +22,7 @@ from kcs_torch.cli.options import (
     check_outputs,
     image_size,
 )
-from kcs_torch.cli.outputs import Scale, Units, Up, Written, check_up, parse_scale, write_files
+from kcs_torch.cli.outputs import Pitch, Scale, Units, Up, Written, check_up, parse_scale, write_files
 from kcs_torch.cli.pictures import check_picture, write_picture
 from kcs_torch.cli.report import answer, one_line, print_json, progress
 from kcs_torch.errors import counted
@@ -163,6 +163,7 @@ def view(
     ] = [],  # noqa: B006 (typer reads it and never changes it)
     mirror: Annotated[bool, typer.Option("--mirror", help="Show the mirror image in depth.")] = False,
     up: Up = None,
+    pitch: Pitch = None,
     scale: Scale = None,
     units: Units = None,
     from_up: FromUp = None,
@@ -177,7 +178,7 @@ def view(
 
         outputs = output or [results[0].with_suffix(".html")]
         size = parse_scale(scale)
-        check_up(up, outputs)
+        check_up(up, pitch, outputs)
         if len(results) > 1 and units is not None:
             raise OptionError(
                 "--units: expected one RESULT; several are shown in their own unit, or in that of --scale"
@@ -192,7 +193,7 @@ def view(
                 notes += [f"{result}: {note}" for note in motion.notes]
             people.append(motion if size is None else motion.scaled(**size))
         if len(people) == 1:
-            written = write_files(people[0], outputs, up, units)
+            written = write_files(people[0], outputs, up, units, pitch)
         else:
             written = Written()
             for path in outputs:

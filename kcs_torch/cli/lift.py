@@ -35,7 +35,7 @@ from kcs_torch.cli.options import (
     person_number,
     use_one_thread,
 )
-from kcs_torch.cli.outputs import Scale, Units, Up, check_units, check_up, parse_scale, sized
+from kcs_torch.cli.outputs import Pitch, Scale, Units, Up, check_units, check_up, parse_scale, sized
 from kcs_torch.cli.report import answer, one_line, print_json, progress
 from kcs_torch.cli.results import Lifted, Results
 
@@ -147,6 +147,7 @@ def lift(
     resample: Resample = None,
     smooth_3d: Smooth3D = None,
     up: Up = None,
+    pitch: Pitch = None,
     scale: Scale = None,
     units: Units = None,
     detector: DetectorName = "auto",
@@ -166,8 +167,8 @@ def lift(
         person_number(person)
         finish = finisher(smooth_3d)
         size_of = parse_scale(scale)
-        check_up(up, output)
-        results = Results(output, person == "all", frames, up, units, size_of, quiet=as_json)
+        check_up(up, pitch, output)
+        results = Results(output, person == "all", frames, up, units, pitch, size_of, quiet=as_json)
         find, skeleton = skeleton == "auto", None if skeleton == "auto" else skeleton
         if format is None and _is_video(tracks):
             clean = cleaner(SEEN if frames == SEEN else None, unswap, gate, fill, smooth, resample)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _Sized = TypeVar("_Sized", "Motion", "Reconstruction")
 
-__all__ = ["Scale", "Units", "Up", "Written", "check_units", "check_up", "parse_scale", "sized", "write_files"]
+__all__ = ["Pitch", "Scale", "Units", "Up", "Written", "check_units", "check_up", "parse_scale", "sized", "write_files"]
 
 Up = Annotated[
     str | None,
@@ -26,6 +26,16 @@ Up = Annotated[
         metavar="y|z",
         help="The axis that points up in .bvh, .c3d, .csv and .trc files; y if not given. Other files hold results in "
         "the camera's axes (y down), and so does .csv if this is not given.",
+        show_default=False,
+    ),
+]
+Pitch = Annotated[
+    float | None,
+    typer.Option(
+        "--pitch",
+        metavar="DEGREES",
+        help="How far the camera looked down (below 0: up): levels results in .bvh, .c3d, .csv and .trc files, whose "
+        "up is the camera's if this is not given.",
         show_default=False,
     ),
 ]
@@ -68,8 +78,8 @@ def sized(data: _Sized, scale: dict[str, Any] | None) -> _Sized:
     return data if scale is None else data.scaled(**scale)
 
 
-def check_up(up: str | None, paths: Sequence[Path]) -> None:
-    """Make sure that the axis that shall point up is one, and that a file holds it.
+def check_up(up: str | None, pitch: float | None, paths: Sequence[Path]) -> None:
+    """Make sure that the axis that shall point up is one, the camera's pitch is possible, and that a file holds them.
 
     Raises:
         OptionError: it is none, or results do not go so to any of the files.
@@ -77,12 +87,15 @@ def check_up(up: str | None, paths: Sequence[Path]) -> None:
     from kcs_torch.errors import OptionError, unknown
     from kcs_torch.io.write import UP, takes_up
 
-    if up is None:
-        return
-    if up not in UP:
+    if up is not None and up not in UP:
         raise unknown("axis for --up", up, UP)
-    if not any(map(takes_up, paths)):
-        raise OptionError(f"--up: expected a .bvh, .c3d, .csv or .trc file to write, got {', '.join(map(str, paths))}")
+    if pitch is not None and not abs(pitch) <= 90:
+        raise OptionError(f"--pitch: expected -90 to 90 degrees, got {pitch:g}")
+    asked = [name for name, value in (("--up", up), ("--pitch", pitch)) if value is not None]
+    if asked and not any(map(takes_up, paths)):
+        raise OptionError(
+            f"{asked[0]}: expected a .bvh, .c3d, .csv or .trc file to write, got {', '.join(map(str, paths))}"
+        )
 
 
 def check_units(units: str | None, own: str, scale: dict[str, Any] | None) -> None:
@@ -156,23 +169,28 @@ class Written:
 
 
 def write_files(
-    data: Reconstruction | Motion | Tracks, paths: Sequence[Path], up: str | None = None, units: str | None = None
+    data: Reconstruction | Motion | Tracks,
+    paths: Sequence[Path],
+    up: str | None = None,
+    units: str | None = None,
+    pitch: float | None = None,
 ) -> Written:
     """Write all files that can be written.
 
     Raises:
-        OptionError: an axis is asked for, but no file is of a kind that takes it.
+        OptionError: an axis or a level is asked for, but no file is of a kind that takes it.
     """
     from kcs_torch.io import save
     from kcs_torch.io.write import takes_up
     from kcs_torch.types import Reconstruction
 
     if isinstance(data, Reconstruction):
-        check_up(up, paths)
+        check_up(up, pitch, paths)
     written = Written()
     for path in paths:
         notes: list[str] = []
-        turned = up if not isinstance(data, Reconstruction) or takes_up(path) else None
-        written.attempt(path, partial(save, data, path, up=turned, units=units, notes=notes))
+        turns = not isinstance(data, Reconstruction) or takes_up(path)
+        where = (up, pitch) if turns else (None, None)
+        written.attempt(path, partial(save, data, path, up=where[0], pitch=where[1], units=units, notes=notes))
         written.notes.extend(f"{path}: {note}" for note in notes)
     return written

@@ -45,6 +45,7 @@ class Results:
         frames: as ``--frames`` has them.
         up: axis that points up, if any.
         units: of length in the files, or those of the motion.
+        pitch: degrees by which the camera looked down, if any.
         scale: as of :func:`kcs_torch.cli.outputs.parse_scale`.
         quiet: whether nothing is said of what is written.
         written: of files that hold everybody, and what became of all others.
@@ -55,6 +56,7 @@ class Results:
     frames: str | None
     up: str | None
     units: str | None
+    pitch: float | None
     scale: dict[str, Any] | None
     quiet: bool
     written: Written = field(default_factory=Written)
@@ -120,7 +122,7 @@ class Results:
 
         names = self._names(one.number)
         made = new_folders(names)
-        written = write_files(one.motion, names, self.up, self.units)
+        written = write_files(one.motion, names, self.up, self.units, self.pitch)
         made = [folder for folder in made if folder.exists()]
         self.written.errors.extend(written.errors)
         report = summary(one.motion, solution)

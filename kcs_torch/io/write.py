@@ -15,10 +15,14 @@ from kcs_torch.io.registry import Saving, Writer
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion, Reconstruction, Tracks
 from kcs_torch.types.size import METRES, size_hint, unit_ratio
+from kcs_torch.types.upright import lean
 
 __all__ = ["check_skeleton", "ready_writer", "save", "save_people", "takes_up", "units_ratio", "writer_for"]
 
 UP = ("y", "z")
+
+LEANING = (12, 60)
+"""Degrees by which a body leans in the mean if the camera may have looked down, or up, by so much."""
 
 _NO_UNIT = (
     "got motion in an unknown one: give it where the motion is made, with units=... (kcs-torch convert: --from-units "
@@ -32,22 +36,24 @@ def save(
     *,
     up: str | None = None,
     units: str | None = None,
+    pitch: float | None = None,
     notes: list[str] | None = None,
 ) -> Path:
     """Write to a file in the format of its suffix (see ``kcs_torch.io.WRITERS``).
 
     Missing parent folders are created. The file appears whole or not at all; one that was there is replaced.
 
-    Results stay in the camera's axes (x right, y down, z away) in .npz, .json, .html, .png and, unless ``up`` is given,
-    in .csv. Files for other tools (.bvh, .trc, .c3d) hold motion with y or z up (:meth:`Motion.of`), in the unit that
-    is usual there: BVH centimetres, TRC metres, C3D millimetres. Where the size of the body is not known, numbers stay
-    as they are and a warning says so: :meth:`Reconstruction.scaled` sets the size.
+    Results stay in the camera's axes (x right, y down, z away) in .npz, .json, .html, .png and, unless ``up`` or
+    ``pitch`` is given, in .csv. Files for other tools (.bvh, .trc, .c3d) hold motion with y or z up
+    (:meth:`Motion.of`), in the unit that is usual there: BVH centimetres, TRC metres, C3D millimetres. Where the size
+    of the body is not known, numbers stay as they are and a warning says so: :meth:`Reconstruction.scaled` sets it.
 
     Args:
         data: a :class:`Reconstruction`, a :class:`Motion` or, to .npz only, :class:`Tracks`.
         path: where to.
         up: the axis that points up in the file: y or z.
         units: of length in the file: m, cm, mm, in or ft.
+        pitch: degrees by which the camera looked down (below 0: up), to level a result, whose up is the camera's.
         notes: sentences on how it was written are added to it; where None, those that matter are warnings.
 
     Returns:
@@ -55,7 +61,7 @@ def save(
 
     Raises:
         OutputError: the suffix is unknown or does not suit, or the file cannot be written; nothing is left behind.
-        OptionError: ``up`` or ``units`` is unknown or cannot be met.
+        OptionError: ``up``, ``units`` or ``pitch`` is unknown or cannot be met.
     """
     writer = writer_for(path)
     saving = Saving(up or "y", Path(path).name)
@@ -67,14 +73,18 @@ def save(
                 f"{path}: expected 3D motion, got 2D tracks, which go to {_suffixes('write_tracks')}: reconstruct() or "
                 "`kcs-torch lift` makes motion of them"
             )
-        if up is not None or units is not None:
-            raise OptionError("up and units are for 3D motion, got 2D tracks")
+        if up is not None or units is not None or pitch is not None:
+            raise OptionError("up, units and pitch are for 3D motion, got 2D tracks")
         with atomic_path(path) as temporary:
             writer.write_tracks(data, temporary)
         return Path(path)
-    if isinstance(data, Reconstruction) and writer.write is not None and (up is None or not writer.turns):
-        if up is not None:
-            raise OptionError(f"{path}: up is for {_suffixes('turns')}; this one holds results in the camera's axes")
+    if pitch is not None and isinstance(data, Motion):
+        raise OptionError(f"{path}: pitch is for results, which are as the camera saw them, got motion: leave it out")
+    asked = [name for name, value in (("up", up), ("pitch", pitch)) if value is not None]
+    if isinstance(data, Reconstruction) and writer.write is not None and not (asked and writer.turns):
+        if asked:
+            those = ", ".join(suffix for suffix in WRITERS if takes_up(f"x{suffix}"))
+            raise OptionError(f"{path}: {asked[0]} is for {those}; this one holds results in the camera's axes")
         if units is not None:
             data = data.scaled(units=units, factor=units_ratio(data.units, units))
         with atomic_path(path) as temporary:
@@ -83,7 +93,7 @@ def save(
     if writer.write_motion is None:
         raise OutputError(f"{path}: expected a result, got motion, which goes to {_suffixes('write_motion')}")
     check_skeleton(path, data.skeleton)
-    motion = _as_motion(data, writer, units, path, saving)
+    motion = _as_motion(data, pitch, writer, units, path, saving)
     with atomic_path(path) as temporary:
         writer.write_motion(motion, temporary, saving)
     if notes is not None:
@@ -95,10 +105,15 @@ def save(
 
 
 def _as_motion(
-    data: Reconstruction | Motion, writer: Writer, units: str | None, path: str | Path, saving: Saving
+    data: Reconstruction | Motion,
+    pitch: float | None,
+    writer: Writer,
+    units: str | None,
+    path: str | Path,
+    saving: Saving,
 ) -> Motion:
     """Motion in the unit that the file is to have; what there is to say of it goes to ``saving``."""
-    motion = Motion.of(data) if isinstance(data, Reconstruction) else data
+    motion = Motion.of(data, pitch=0.0 if pitch is None else pitch) if isinstance(data, Reconstruction) else data
     motion = replace(motion, points=motion.points.detach())
     if isinstance(data, Reconstruction):
         known = data.distance is not None or data.root_depth is not None
@@ -107,6 +122,8 @@ def _as_motion(
             if known
             else "the body stays at one depth: how far it walks towards or away from the camera is not known"
         )
+        if pitch is None and (said := _leaning(motion)):
+            saving.notes.append(said)
     wanted = units or writer.unit
     if units is not None or (wanted and motion.units in METRES):
         motion = motion.scaled(units=wanted, factor=units_ratio(motion.units, wanted))
@@ -118,6 +135,18 @@ def _as_motion(
             f"{size_hint(motion.skeleton)}"
         )
     return motion
+
+
+def _leaning(motion: Motion) -> str:
+    """What to say of a result whose body leans as far as if the camera was not level; else empty."""
+    by = round(lean(motion.points, motion.seen, motion.skeleton))
+    if not LEANING[0] <= abs(by) <= LEANING[1]:
+        return ""
+    side, way = ("towards", "down") if by > 0 else ("away from", "up")
+    return (
+        f"up is the camera's, and the body leans {abs(by)} degrees {side} it in the mean: if the camera looked {way} "
+        f"by so much, level the motion with pitch={by} (kcs-torch: --pitch {by})"
+    )
 
 
 def takes_up(path: str | Path) -> bool:

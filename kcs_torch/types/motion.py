@@ -119,18 +119,29 @@ class Motion(Trajectories):
         )
 
     @classmethod
-    def of(cls, result: Reconstruction) -> Motion:
-        """Turn a result so that the camera's up is y, and let the body move through space where that is known.
+    def of(cls, result: Reconstruction, *, pitch: float = 0.0) -> Motion:
+        """Turn a result so that y points up, and let the body move through space where that is known.
 
-        Where the distance to the camera is known, the camera is the origin. Elsewhere the origin lies at the lowest
-        point of the clip, below the middle of the first frame.
+        Up is the camera's up, so that before a camera that looks down bodies lean towards it, unless ``pitch`` levels
+        them. Where the distance to the camera is known, the camera is the origin. Elsewhere the origin lies at the
+        lowest point of the clip, below the middle of the first frame.
 
         Args:
             result: of a method; ``scaled()`` before if sizes matter. Joints that are NaN are unseen.
+            pitch: degrees by which the camera looked down; below 0 where it looked up.
+
+        Raises:
+            OptionError: the pitch is not within -90 to 90.
         """
+        degrees = as_number(pitch)
+        if degrees is None or not abs(degrees) <= 90:
+            raise OptionError(f"pitch: expected the degrees by which the camera looked down, -90 to 90, got {pitch!r}")
         notes = [*result.tracks.notes, *result.diagnostics.notes]
         known = result.distance is not None or result.root_depth is not None
-        points = to_y_up(result.in_space() if known else result.points, "-y")
+        points = result.in_space() if known else result.points
+        if degrees:
+            points = points @ orbit(points.new_zeros(()), degrees)
+        points = to_y_up(points, "-y")
         if not known:
             notes.append("how far the body walks towards or away from the camera is not known: it stays at one depth")
         there = torch.isfinite(points).all(-1)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 from torch import Tensor
 
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["ABOVE", "how_it_stands", "lies_down", "upside_down"]
+__all__ = ["ABOVE", "how_it_stands", "lean", "lies_down", "upside_down"]
 
 CLEARLY = 0.3
 """How far feet are above the rest, over the joints' root mean square distance from their mean height."""
@@ -55,6 +57,19 @@ def how_it_stands(points: Tensor, seen: Tensor, skeleton: Skeleton) -> str:
     else:
         said = ""
     return said.format(often=" in nearly all frames" if len(points) > 1 else "")
+
+
+def lean(points: Tensor, seen: Tensor, skeleton: Skeleton) -> float:
+    """Degrees by which a body leans along z in the mean over time: what is above its feet is on the side of larger z.
+
+    Args:
+        points: (T, N, 3), y pointing up.
+        seen: (T, N).
+        skeleton: one without contacts does not lean.
+    """
+    away, _, shown = _feet(points, seen, skeleton)
+    _, y, z = away[shown].double().mean(0).tolist() if bool(shown.any()) else (0.0, -1.0, 0.0)
+    return math.degrees(math.atan2(-z, -y))
 
 
 def upside_down(heights: Tensor, seen: Tensor, skeleton: Skeleton, share: float = 0.5) -> bool:
