@@ -18,6 +18,7 @@ from kcs_torch.methods.perspective.uncalibrated import looking, may_be_near, rec
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.bodies import no_bones
+from kcs_torch.types.image_size import may_be_shares
 from kcs_torch.types.people import file_and_person, file_of, guess_images, of_one_image
 
 __all__ = ["method_named", "reconstruct", "reconstruct_all", "with_found_bones"]
@@ -39,9 +40,6 @@ SAY_SIZE = (
     "(kcs-torch: --image-size 1920x1080); or "
 )
 """What is asked for first where nobody said it, and people of one file got lenses of their own."""
-
-INSIDE = 0.9
-"""Share of the coordinates within 0 and 1 from which on they may be."""
 
 OF_TRACKS = ("joint_names", "edges", "threshold")
 """What tracks are made with, no field of any method."""
@@ -124,7 +122,7 @@ def reconstruct(
         tracks = Tracks.from_arrays(
             tracks, confidence, skeleton=skeleton, fps=fps, units=units or "px", image_size=image_size
         )
-        if units is None and not isinstance(lens, Intrinsics) and _within_one(tracks):
+        if units is None and not isinstance(lens, Intrinsics) and may_be_shares(tracks.points[tracks.seen]):
             warnings.warn(f"{tracks.source}: {MAY_BE_SHARES}", KcsWarning, stacklevel=users_level())
     if find:
         tracks = with_found_bones(tracks)
@@ -132,12 +130,6 @@ def reconstruct(
     if chosen.knows_bones and not tracks.skeleton.bones and (lacking := no_bones(tracks.skeleton)) in tracks.notes:
         warnings.warn(f"{tracks.source}: {lacking}", KcsWarning, stacklevel=users_level())
     return _before(lens, chosen, tracks, cameras)
-
-
-def _within_one(tracks: Tracks) -> bool:
-    """Whether hardly any coordinate that is seen lies outside of 0 to 1: a hand may leave the image."""
-    seen = tracks.points[tracks.seen]
-    return bool(seen.any()) and float(((seen >= 0) & (seen <= 1)).to(seen).mean()) >= INSIDE
 
 
 def reconstruct_all(

@@ -14,7 +14,7 @@ from animal_samples import (
 )
 
 import kcs_torch as kt
-from kcs_torch.errors import FormatError
+from kcs_torch.errors import FormatError, KcsWarning
 from kcs_torch.io import detect_format, load_people, load_tracks
 from kcs_torch.io.containers import hdf5
 from kcs_torch.io.contents import animals
@@ -181,7 +181,9 @@ def test_shares_of_the_image(tmp_path):
     places = [c[-1] != "likelihood" for c in columns]
     values[:, places] /= 1000
     path = write_deeplabcut_csv(tmp_path / "a.csv", columns, values)
-    assert all(any("image_size=" in note for note in tracks.notes) for tracks in load_people(path))
+    with pytest.warns(KcsWarning, match=r"a\.csv: .*if they are shares of the image, give image_size="):
+        people = load_people(path)
+    assert all(any("image_size=" in note for note in tracks.notes) for tracks in people)
     values[:, places] *= 1000
     whole = load_people(write_deeplabcut_csv(tmp_path / "b.csv", columns, values), image_size=(1000, 1000))
     for tracks, expected in zip(load_people(path, image_size=(1000, 1000)), whole, strict=True):

@@ -92,7 +92,7 @@ def test_what_has_no_row_is_unseen(tmp_path):
 
 
 def test_times_place_frames(tmp_path):
-    rows = [f"{t},{name},{t},{at}" for t in (0, 0.04, 0.12) for at, name in enumerate("ab")]
+    rows = [f"{t},{name},{t},{7 + at}" for t in (0, 0.04, 0.12) for at, name in enumerate("ab")]
     tracks = load_tracks(lines(tmp_path / "a.csv", "time,joint,x,y", *rows))
     assert tracks.seen.all(1).tolist() == [True, True, False, True]
     assert tracks.fps == pytest.approx(25)
@@ -234,7 +234,7 @@ def test_tables_of_others_stay_theirs(tmp_path):
     "header", ["frame,joint,x,y,a_x,a_y,b_x,b_y", "track,frame_idx,instance.score,node,x,y", "joint,x,y", "frame,x,y"]
 )
 def test_what_is_no_long_table(tmp_path, header):
-    probe = Probe(lines(tmp_path / "a.csv", header, ",".join("1" for _ in header.split(","))))
+    probe = Probe(lines(tmp_path / "a.csv", header, ",".join("3" for _ in header.split(","))))
     found = {name for name, reader in READERS.items() if reader.recognises(probe)}
     assert found == {"csv"} if "a_x" in header else found <= {"sleap"}
     assert not any(reader.recognises(probe) for reader in MOTION_READERS.values())

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from samples import walk_result
 
-from kcs_torch.errors import FormatError, KcsError, OptionError, SkeletonError
+from kcs_torch.errors import FormatError, KcsError, KcsWarning, OptionError, SkeletonError
 from kcs_torch.io import load_people, load_reconstruction, load_tracks, save
 from kcs_torch.io.containers import archive
 from kcs_torch.skeleton import SKELETONS, Skeleton
@@ -141,12 +141,13 @@ def test_letters_that_there_are_none_of(tmp_path):
 
 def test_what_may_be_shares_of_the_image_is_told(tmp_path):
     points = arrays()["points2d"] * 0 + [0.25, 0.5]
-    notes = load_tracks(written(tmp_path / "a.npz", points2d=points, units="px")).notes
+    with pytest.warns(KcsWarning, match="if they are shares of the image"):
+        notes = load_tracks(written(tmp_path / "a.npz", points2d=points, units="px")).notes
     told = [note for note in notes if "image_size=" in note]
     assert len(told) == 1
-    again = load_tracks(
-        written(tmp_path / "a.npz", points2d=points, units="px", notes=np.array(json.dumps(told)))
-    ).notes
+    path = written(tmp_path / "a.npz", points2d=points, units="px", notes=np.array(json.dumps(told)))
+    with pytest.warns(KcsWarning, match="if they are shares of the image"):
+        again = load_tracks(path).notes
     assert [note for note in again if "image_size=" in note] == told  # once, in a file that was saved with it
     metres = load_tracks(written(tmp_path / "b.npz", points2d=points, units="m")).notes
     assert not any("image_size=" in note for note in metres)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import kcs_torch as kt
 from kcs_torch.cli import app
-from kcs_torch.errors import FormatError, KcsError
+from kcs_torch.errors import FormatError, KcsError, KcsWarning
 from kcs_torch.io import (
     READERS,
     detect_format,
@@ -172,8 +172,12 @@ def test_frames_go_before_times_and_their_steps_are_frames(tmp_path):
 
 def test_shares_of_the_image_are_told_and_scaled_by_its_size(tmp_path):
     path = lines(tmp_path / "a.csv", "a_x,a_y,b_x,b_y", ".1,.2,.3,.4", ".1,.2,.3,.5")
-    assert "if they are shares of the image, give image_size" in notes_of(path)
-    assert load_tracks(path).points[0].tolist() == [[0.1, 0.2], [0.3, 0.4]]
+    with pytest.warns(KcsWarning, match=r"a\.csv: .*if they are shares .*--image-size 1920x1080\); else the"):
+        tracks = load_tracks(path)
+    assert any("if they are shares of the image, give image_size" in note for note in tracks.notes)
+    assert tracks.points[0].tolist() == [[0.1, 0.2], [0.3, 0.4]]
+    beside = lines(tmp_path / "b.csv", "a_x,a_y,b_x,b_y", "-.1,.2,.3,1.4", "-.1,.2,.3,1.5")
+    assert "if they are shares" in notes_of(beside)  # metres, rather: no warning, which would be an error here
     assert load_tracks(path, image_size=(100, 50)).points[0].numpy() == pytest.approx(np.array([[10, 10], [30, 20]]))
 
 
@@ -218,7 +222,8 @@ def test_mediapipes_tables_stay_mediapipes(tmp_path):
             detect_motion_format(table)
     assert load_motion(deep, format="csv").skeleton.name == "mediapipe33"
     assert isinstance(load_any(deep, format="csv"), kt.Motion)
-    assert isinstance(load_any(path, format="csv"), kt.Tracks)
+    with pytest.warns(KcsWarning, match="if they are shares of the image"):
+        assert isinstance(load_any(path, format="csv"), kt.Tracks)
 
 
 # ---------------------------------------------------------------------- motion
@@ -411,10 +416,10 @@ def test_names_that_others_have_too_are_no_landmarks(tmp_path, name):
     names = SKELETONS[name].joints[: SKELETONS[name].num_observed]
     path = write_table(tmp_path / "a.csv", names, ("x", "y"))
     header, *rows = path.read_text().splitlines()
-    small = [",".join([row.split(",")[0], *(str(float(x) / 1000) for x in row.split(",")[1:])]) for row in rows]
+    small = [",".join([row.split(",")[0], *(str(float(x) / 200) for x in row.split(",")[1:])]) for row in rows]
     tracks = load_tracks(lines(path, header, *small))
     assert detect_format(path) == "csv" and tracks.skeleton.name == name
-    assert np.allclose(tracks.points[:, : len(names)], person(4, len(names))[..., :2] / 1000)
+    assert np.allclose(tracks.points[:, : len(names)], person(4, len(names))[..., :2] / 200)
     if name == "coco17":
         lines(path, header.replace("left_", "Left ").replace("right_", "Right "), *small)
         assert load_tracks(path).skeleton.name == name

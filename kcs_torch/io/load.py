@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
-from kcs_torch.errors import FormatError, OptionError, listed, unknown
+import torch
+
+from kcs_torch.errors import FormatError, KcsWarning, OptionError, listed, unknown, users_level
 from kcs_torch.io.containers.hdf5 import read_tree
+from kcs_torch.io.contents.shares import ASK
 from kcs_torch.io.motion import MOTION_READERS
 from kcs_torch.io.registry import Options, Probe, Reader, brief, check_fps, discover, only_format
 from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
-from kcs_torch.types.image_size import as_image_size
+from kcs_torch.types.image_size import as_image_size, may_be_shares
 from kcs_torch.types.intake import as_number
 from kcs_torch.types.people import guess_images, tell_apart
 
@@ -76,11 +80,17 @@ def load_people(
         ShapeError: its numbers are no tracks (infinite, negative confidence, nothing seen).
         SkeletonError: the joints do not fit the skeleton.
         OptionError: an option is unknown or out of range.
+
+    Warns:
+        KcsWarning: coordinates lie within 0 and 1, so that they may be shares of an image whose size is not known.
     """
     options = check_reading(format, skeleton, fps, threshold, image_size, trust)
     probe = Probe(path)
     reader: Reader = READERS[detect_format(path) if format is None else format]
     people = reader.read(probe.path, options)
+    if any(ASK in one.notes for one in people) and may_be_shares(torch.cat([one.points[one.seen] for one in people])):
+        doubt = f"{path}: {ASK}; else the body is as distorted as the image is not square"
+        warnings.warn(doubt, KcsWarning, stacklevel=users_level())
     return guess_images(tell_apart(sorted(people, key=_amount_seen, reverse=True)))
 
 
@@ -117,6 +127,9 @@ def load_tracks(
         ShapeError: its numbers are no tracks (infinite, negative confidence, nothing seen).
         SkeletonError: the joints do not fit the skeleton.
         OptionError: an option is unknown or out of range.
+
+    Warns:
+        KcsWarning: as :func:`~kcs_torch.io.load_people`.
     """
     if person is not None and (isinstance(person, bool) or not isinstance(person, int) or person < 0):
         raise OptionError(f"person: expected None or a number from 0, got {person!r}")

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError
 
-__all__ = ["as_image_size", "fitting_size", "told_image_size", "usual_size"]
+__all__ = ["as_image_size", "fitting_size", "may_be_shares", "told_image_size", "usual_size"]
 
 LARGEST = 10**6
 """Pixels of an image's side, at most."""
@@ -26,6 +26,9 @@ SIZES: tuple[tuple[int, int], ...] = (
 
 INSIDE = 0.99
 """Share of the joints that an image of usual size holds: detectors place some a little beside it."""
+
+SHARES = 0.9
+"""Share of the joints within 0 and 1 from which on they may be shares of the image: a hand may leave it."""
 
 MOST = 0.5
 """Share of the joints that an image holds at least, or its size is wrong."""
@@ -85,6 +88,11 @@ def fitting_size(points: Tensor, size: tuple[int, int], notes: list[str]) -> tup
     if fix and _held(points, size, BESIDE) < 1 - CLEAR:
         notes.append(f"many joints lie far outside {image}{fix}")
     return size
+
+
+def may_be_shares(points: Tensor) -> bool:
+    """Whether points (P, 2) of joints that are seen may be shares of an image, as hardly any lies outside of 0 to 1."""
+    return _held(points, (1, 1)) >= SHARES
 
 
 def usual_size(points: Tensor) -> tuple[int, int]:
