@@ -1,6 +1,7 @@
 """``kcs-torch convert`` and ``score``: raw detections to files of other tools and back, and what they say."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -310,6 +311,17 @@ def test_score_of_a_result_takes_its_format(scored):
     words = ["score", scored / "pred.npz", scored / "truth.trc", "--align", "root", "--scale", "height=1.6m"]
     assert run(*words, "--pred-format", "npz", "--truth-format", "trc").output == run(*words).output
     assert "expected" in run(*words, "--truth-format", "bvh", code=2).stderr
+
+
+def test_how_results_were_made_is_no_matter_of_their_score(scored):
+    """Their notes name options that only lift has; angles says so."""
+    result = walk_result(20).scaled(units="m", factor=1e-3)
+    made = replace(result.diagnostics, notes=("give image_size=(width, height) (kcs-torch: --image-size)",))
+    save(replace(result, diagnostics=made), scored / "pred.npz")
+    save(replace(result, diagnostics=made), scored / "other.npz")
+    for pair in (("pred.npz", "other.npz"), ("pred.npz", "truth.trc"), ("other.npz", "pred.npz")):
+        assert "image-size" not in run("score", *(scored / name for name in pair)).output
+    assert "(kcs-torch lift: --image-size)" in run("angles", scored / "pred.npz").output
 
 
 def test_score_takes_the_unit_of_files_without_one(scored):

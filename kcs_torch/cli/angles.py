@@ -86,6 +86,8 @@ def angles(
         facts = _facts(found)
         notes = list(data.diagnostics.notes if isinstance(data, Reconstruction) else data.notes)
         notes = [note for note in notes if "--from-up" not in note]  # to angles no axis matters
+        if isinstance(data, Reconstruction):  # their options are not those of this command
+            notes = [note.replace("(kcs-torch: --", "(kcs-torch lift: --") for note in notes]
         if as_json:
             print_json({"source": source, "fps": found.fps, "angles": facts, "notes": notes})
             return

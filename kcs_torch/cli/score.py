@@ -84,7 +84,7 @@ def score(
             theirs = load_motion(truth, format=truth_format, up=truth_up, fps=truth_fps, units=from_units)
             theirs = _cut(theirs, truth_frames, "--truth-frames")
         found = compare(ours, theirs, align=align or None, root=root, mirror=mirror, within=within)
-        read = [*_notes(ours, pred, "--pred"), *_notes(theirs, truth, "--truth")]
+        read = [*_notes(ours, pred, pred_format, "--pred"), *_notes(theirs, truth, truth_format, "--truth")]
         found = dataclasses.replace(found, notes=(*found.notes, *read))
         if as_json:
             print_json(dataclasses.asdict(found))
@@ -101,15 +101,20 @@ def _motion(path: str, size: dict[str, Any] | None, *, format: str | None, **opt
     if kind_of(path, format) == "result":
         data = load_any(path, format=format, **options)
         assert isinstance(data, Reconstruction)
-        return dataclasses.replace(Motion.of(sized(data, size)), source=path, notes=())
+        return dataclasses.replace(Motion.of(sized(data, size)), source=path)
     return sized(load_motion(path, format=format, **options), size)
 
 
-def _notes(motion: Motion, path: str, own: str) -> list[str]:
-    """What was assumed when a file was read, whose options begin with its ``own`` word here.
+def _notes(motion: Motion, path: str, format: str | None, own: str) -> list[str]:
+    """What was assumed when a file was read, whose options begin with its ``own`` word here; nothing of a result.
 
-    Its axes matter where bodies are compared without turning them.
+    Its axes matter where bodies are compared without turning them. What a result has to say is how it was made, and
+    with which options of ``lift`` it is made otherwise.
     """
+    from kcs_torch.io.anything import kind_of
+
+    if kind_of(path, format) == "result":
+        return []
     return [f"{path}: {re.sub(r'--(from-)?(?=up|fps)', f'{own}-', note)}" for note in motion.notes]
 
 
