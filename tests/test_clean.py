@@ -417,13 +417,17 @@ def test_resample_takes_a_rate_where_the_tracks_have_none():
     assert kt.clean.resample(tracks, 25, source_fps=50).fps == 25
 
 
+COUNTED = "; in the result and other notes the first of them is frame 0"
+
+
 def test_trim():
     tracks = tracks_of(sine(1.0))
     cut = kt.clean.trim(tracks, 10, 60)
     np.testing.assert_array_equal(cut.points, tracks.points[10:60])
-    assert cut.notes[-1] == "trim: frames 10 to 59 of 400"
+    assert cut.notes[-1] == f"trim: frames 10 to 59 of 400{COUNTED}"
     assert kt.clean.trim(tracks, 390, 1000).num_frames == 10  # the end may lie beyond
     assert kt.clean.trim(tracks).num_frames == FRAMES
+    assert kt.clean.trim(tracks, stop=9).notes[-1] == "trim: frames 0 to 8 of 400"  # whose numbers are as before
 
 
 def test_notes_on_what_is_unseen_are_those_of_the_tracks_that_are_left():
@@ -440,10 +444,10 @@ def test_notes_on_what_is_unseen_are_those_of_the_tracks_that_are_left():
     assert kt.clean.trim(tracks, 10, 60).notes[-3:] == (
         f"{told}{joints[1]}",
         "1 frame without any seen joint (frame 10): filled from its neighbours",
-        "trim: frames 10 to 59 of 400",
+        f"trim: frames 10 to 59 of 400{COUNTED}",
     )
     late = kt.clean.trim(tracks, 100, 200)
-    assert late.notes[-2:] == (f"{told}{joints[0]}, {joints[1]}", "trim: frames 100 to 199 of 400")
+    assert late.notes[-2:] == (f"{told}{joints[0]}, {joints[1]}", f"trim: frames 100 to 199 of 400{COUNTED}")
     assert not any("without any seen" in note for note in (*late.notes, *kt.clean.fill(tracks, 3).notes))
 
 

@@ -541,7 +541,9 @@ def test_lift_of_the_frames_in_which_somebody_is_in_sight(video, two_people):
     out = video.folder / "walk.npz"
     words = ["--person", 1, "--frames", "seen", "-m", "sfam", "--json"]
     (person,) = json.loads(run("lift", video.path, "-o", out, *words).stdout)["people"]
-    assert person["cleaning"] == ["trim: frames 25 to 39 of 40"]
+    assert person["cleaning"] == [
+        "trim: frames 25 to 39 of 40; in the result and other notes the first of them is frame 0"
+    ]
     np.testing.assert_allclose(kt.load_tracks(out).points[:, :33], two_people[25:], atol=1e-6)
 
 

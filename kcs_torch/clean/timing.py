@@ -25,6 +25,8 @@ _EPS = 1e-6  # of a frame: rounding of times must not make a seen frame unseen
 def trim(tracks: Tracks, start: int | None = None, stop: int | None = None) -> Tracks:
     """Take the frames from ``start`` to ``stop``, which is not included; counted from 0, as Python's slices are.
 
+    The frames of the new clip are counted from 0, too, in the result and its notes.
+
     Args:
         tracks: what to take them of.
         start: first frame; the clip's first if None.
@@ -36,7 +38,7 @@ def trim(tracks: Tracks, start: int | None = None, stop: int | None = None) -> T
 
     >>> from kcs_torch.data.synthetic import walking_person
     >>> trim(walking_person(60).tracks, 10, 30).notes[-1]
-    'trim: frames 10 to 29 of 60'
+    'trim: frames 10 to 29 of 60; in the result and other notes the first of them is frame 0'
     """
     check_tracks(tracks, "trim")
     frames = tracks.num_frames
@@ -51,6 +53,7 @@ def trim(tracks: Tracks, start: int | None = None, stop: int | None = None) -> T
     if not bool(cut.seen.any()):
         raise ShapeError(f"{tracks.source}: no joint is seen in frames {first} to {end - 1}")
     note = f"trim: frames {first} to {end - 1} of {frames}"
+    note += "; in the result and other notes the first of them is frame 0" if first else ""
     return replace(cut, points=cut.points.clone(), weights=cut.weights.clone(), notes=(*cut.notes, note))
 
 
