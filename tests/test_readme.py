@@ -8,6 +8,7 @@ import warnings
 from pathlib import Path
 
 import pytest
+import torch
 from typer.testing import CliRunner
 
 import kcs_torch as kt
@@ -52,6 +53,15 @@ def test_python_runs_from_top_to_bottom(users_folder):
 
 def test_four_lines_reconstruct_a_users_file():
     assert len([line for line in blocks("python")[0].splitlines() if line]) == 4
+
+
+def test_the_lizard_has_depth():
+    """No warning calls it a guess: one would be an error here."""
+    (block,) = (block for block in blocks("python") if "lizard = " in block)
+    torch.manual_seed(3)
+    names = {"kt": kt}
+    exec(compile(block, "README.md", "exec"), names)
+    assert not names["result"].diagnostics.doubt
 
 
 def test_commands_run(users_folder):
