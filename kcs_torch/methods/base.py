@@ -29,7 +29,7 @@ from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.inference import plain
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.functional.weights import rms
-from kcs_torch.methods.answer.finish import BY_SHOTS, Estimate, finish
+from kcs_torch.methods.answer.finish import BY_SHOTS, NO_POSE, Estimate, finish
 from kcs_torch.methods.answer.wrong import WHY_LOOSE
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
@@ -104,7 +104,7 @@ class Method(ABC):
             ShapeError: the cameras do not fit the tracks; these have no frames, or half precision.
 
         Warns:
-            KcsWarning: depth is weakly determined, or joints were never seen.
+            KcsWarning: depth is weakly determined, joints were never seen, or all of them lie at one point.
             ConvergenceWarning: the iteration stopped at its limit.
         """
         begin = time.perf_counter()
@@ -199,7 +199,7 @@ class Method(ABC):
         for gone in never_seen(tracks.weights, tracks.skeleton):
             warnings.warn(f"{tracks.source}: {gone}", KcsWarning, stacklevel=users_level())
         for note in found.notes:
-            if note.startswith(ABOVE) or note.endswith((WHY_LOOSE, BY_SHOTS)):
+            if note.startswith(ABOVE) or note.endswith((WHY_LOOSE, BY_SHOTS, NO_POSE)):
                 warnings.warn(f"{tracks.source}: {note}", KcsWarning, stacklevel=users_level())
 
     def unsettled(self, steps: int) -> str:

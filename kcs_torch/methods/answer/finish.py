@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from kcs_torch.methods.base import Method
 
 __all__ = [
-    *("BY_SHOTS", "HARDLY", "SINGLE", "WEAK_TURN", "Estimate"),
+    *("BY_SHOTS", "HARDLY", "NO_POSE", "SINGLE", "WEAK_TURN", "Estimate"),
     *("extent", "finish", "little_turn", "nothing_else"),
 ]
 
@@ -46,6 +46,8 @@ BY_SHOTS = (
     "of others, or for other methods, should be solved by themselves: kt.reconstruct_all(kt.clean.split(tracks)), or "
     "part by part with --frames"
 )
+
+NO_POSE = "all joints lie at one point in every frame: there is no pose to find"
 
 HARDLY, SINGLE = "the viewpoint turned by only", "a single image shows one viewpoint"
 """How a note begins that says how little the viewpoint turned, and of one frame."""
@@ -250,7 +252,7 @@ def _notes_on_tracks(method: Method, tracks: Tracks, pointlike: bool) -> list[st
     if tracks.fps is None and tracks.num_frames > 1 and method.reckons_in_seconds:
         notes.append("30 frames a second assumed, as the rate is not known: give fps=... (kcs-torch: --fps)")
     if pointlike:
-        notes.append("all joints lie at one point in every frame: there is no pose to find")
+        notes.append(NO_POSE)
     return notes
 
 
