@@ -176,6 +176,8 @@ def test_shares_of_the_image_are_told_and_scaled_by_its_size(tmp_path):
         tracks = load_tracks(path)
     assert any("if they are shares of the image, give image_size" in note for note in tracks.notes)
     assert tracks.points[0].tolist() == [[0.1, 0.2], [0.3, 0.4]]
+    told = CliRunner().invoke(app, ["info", str(path)])
+    assert "if they are shares" in told.stderr and "if they are shares" not in told.stdout
     beside = lines(tmp_path / "b.csv", "a_x,a_y,b_x,b_y", "-.1,.2,.3,1.4", "-.1,.2,.3,1.5")
     assert "if they are shares" in notes_of(beside)  # metres, rather: no warning, which would be an error here
     assert load_tracks(path, image_size=(100, 50)).points[0].numpy() == pytest.approx(np.array([[10, 10], [30, 20]]))

@@ -24,7 +24,7 @@ from kcs_torch.cli.options import (
 )
 from kcs_torch.cli.outputs import Pitch, Scale, Units, Up, Written, check_up, parse_scale, write_files
 from kcs_torch.cli.pictures import check_picture, write_picture
-from kcs_torch.cli.report import answer, one_line, print_json, progress
+from kcs_torch.cli.report import answer, one_line, print_json, progress, unsaid
 from kcs_torch.errors import counted
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def _spoken(facts: dict[str, Any]) -> str:
         f"{p['person']:>6}  {p['frames_seen']:>11}  {p['mean_confidence']:>15.2f}  {100 * p['unseen_share']:>11.1f} %"
         for p in rows
     ]
-    lines += [f"note: {one_line(note)}" for note in facts["notes"]]
+    lines += [f"note: {one_line(note)}" for note in unsaid(facts["notes"], facts["path"])]
     return "\n".join([*lines, *(f"person {p['person']}: {one_line(note)}" for p in rows for note in p["notes"])])
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -16,7 +18,11 @@ from kcs_torch.errors import KcsError, counted, warnings_told
 if TYPE_CHECKING:
     from kcs_torch.types import Reconstruction
 
-__all__ = ["answer", "describe", "one_line", "print_json", "progress", "summary"]
+__all__ = ["answer", "describe", "one_line", "print_json", "progress", "summary", "unsaid"]
+
+
+_warned: ContextVar[list[str]] = ContextVar("warned")
+"""What the command that runs has warned of."""
 
 
 def one_line(text: object) -> str:
@@ -31,7 +37,8 @@ def answer(as_json: bool = False) -> Iterator[dict[str, Any]]:
     What the body puts into the dictionary that it gets is printed as JSON together with the error.
     """
     found: dict[str, Any] = {}
-    with warnings_told(lambda text: typer.echo(f"warning: {one_line(text)}", err=True)):
+    _warned.set([])
+    with warnings_told(_warn):
         try:
             yield found
         except KcsError as error:
@@ -39,6 +46,18 @@ def answer(as_json: bool = False) -> Iterator[dict[str, Any]]:
             if as_json:
                 print_json({**found, "error": one_line(error), "type": type(error).__name__})
             raise typer.Exit(2) from None
+
+
+def _warn(text: str) -> None:
+    _warned.get().append(text)
+    typer.echo(f"warning: {one_line(text)}", err=True)
+
+
+def unsaid(notes: Iterable[str], source: str) -> list[str]:
+    """Those notes on what comes from a source, a file or one person in it, of which no warning has told."""
+    whose = {f"{name}: " for name in (source, re.sub(r", person \d+$", "", source))}
+    told = [text.removeprefix(name) for text in _warned.get([]) for name in whose if text.startswith(name)]
+    return [note for note in notes if not any(text.startswith(note) for text in told)]
 
 
 @contextmanager
@@ -120,7 +139,7 @@ def summary(result: Reconstruction, solution: int = 1) -> dict[str, Any]:
 
 
 def describe(facts: dict[str, Any], leave_out: Container[str] = ()) -> str:
-    """The same for a reader: a heading and a line a fact; without those notes that are told elsewhere."""
+    """The same for a reader: a heading and a line a fact; without those notes that are told elsewhere, or warned of."""
     from kcs_torch.types.variation import BoneVariation
 
     rate = f", {facts['fps']:g} frames a second" if facts["fps"] else ""
@@ -146,4 +165,5 @@ def describe(facts: dict[str, Any], leave_out: Container[str] = ()) -> str:
         value = "" if math.isnan(other["objective"]) else f"objective {other['objective']:.1f}{best}, "
         apart = f"{other['rms_difference']:.3g} {facts['units']} away (root mean square)"
         lines.append(f"  solution {other['solution']:<6} {value}{apart}: {other['differs']}")
-    return "\n".join([*lines, *(f"  note: {one_line(note)}" for note in facts["notes"] if note not in leave_out)])
+    notes = [note for note in unsaid(facts["notes"], facts["source"]) if note not in leave_out]
+    return "\n".join([*lines, *(f"  note: {one_line(note)}" for note in notes)])

@@ -14,7 +14,7 @@ from kcs_torch.cli.cleaning import SEEN
 from kcs_torch.cli.detect import numbered
 from kcs_torch.cli.options import check_outputs, new_folders
 from kcs_torch.cli.outputs import Written, check_units, write_files
-from kcs_torch.cli.report import describe, one_line, summary
+from kcs_torch.cli.report import describe, one_line, summary, unsaid
 
 if TYPE_CHECKING:
     from kcs_torch.types import Reconstruction, Tracks
@@ -108,8 +108,8 @@ class Results:
 
         common = shared([(*one.motion.tracks.notes, *one.motion.diagnostics.notes) for one in people])
         reports = [self._write_one(one, solution, common) for one in people]
-        if common:
-            self._say("\n".join(["everybody:", *(f"  note: {one_line(note)}" for note in common)]))
+        if rest := [note for note in common if any(unsaid([note], one.tracks.source) for one in people)]:
+            self._say("\n".join(["everybody:", *(f"  note: {one_line(note)}" for note in rest)]))
         self._write_together(people, together)
         return {"people": reports, **({"together": self.written.files} if together else {})}
 
