@@ -99,3 +99,6 @@ def test_view_shows_several_results_together(tmp_path):
     assert [p["name"] for p in people(tmp_path / "a.html")] == ["a.npz", "b.npz"]
     done = run("view", tmp_path / "a.npz", tmp_path / "b.npz", "-o", tmp_path / "c.csv", code=2)
     assert "several people in one file go to" in done.stderr
+    words = ["-o", tmp_path / "c.html", "-o", tmp_path / "c.png"]
+    done = run("view", tmp_path / "a.npz", tmp_path / "b.npz", *words, code=2)
+    assert "c.png: several people in one file go to" in done.stderr and not (tmp_path / "c.html").exists()

@@ -174,6 +174,7 @@ def view(
         from kcs_torch.errors import OptionError
         from kcs_torch.io import save_people
         from kcs_torch.io.formats.pages import as_result
+        from kcs_torch.io.write import people_writer
         from kcs_torch.types import Motion
 
         outputs = output or [results[0].with_suffix(".html")]
@@ -185,6 +186,8 @@ def view(
             )
         for result in results:
             outputs = check_outputs(outputs, source=str(result))
+        for path in outputs if len(results) > 1 else ():
+            people_writer(path)
         people, notes = [], []
         for result in results:
             with progress(f"reading {result}"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,10 @@ from kcs_torch.types import Motion, Reconstruction, Tracks
 from kcs_torch.types.size import METRES, size_hint, unit_ratio
 from kcs_torch.types.upright import lean
 
-__all__ = ["check_skeleton", "ready_writer", "save", "save_people", "takes_up", "units_ratio", "writer_for"]
+__all__ = [
+    *("check_skeleton", "people_writer", "ready_writer", "save", "save_people", "takes_up", "units_ratio"),
+    "writer_for",
+]
 
 UP = ("y", "z")
 
@@ -169,9 +172,7 @@ def save_people(results: Sequence[Reconstruction], path: str | Path) -> Path:
     Warns:
         KcsWarning: the clips are not equally long, so that they may begin at different frames.
     """
-    writer = writer_for(path)
-    if writer.write_people is None:
-        raise OutputError(f"{path}: several people in one file go to {_suffixes('write_people')}")
+    write_people = people_writer(path)
     frames = [len(result.points) for result in results]
     if len(set(frames)) > 1:
         warnings.warn(
@@ -181,8 +182,20 @@ def save_people(results: Sequence[Reconstruction], path: str | Path) -> Path:
             stacklevel=users_level(),
         )
     with atomic_path(path) as temporary:
-        writer.write_people(results, temporary)
+        write_people(results, temporary)
     return Path(path)
+
+
+def people_writer(path: str | Path) -> Callable[[Sequence[Reconstruction], Path], None]:
+    """Return what writes several people to one file of such a suffix.
+
+    Raises:
+        OutputError: files of this suffix hold one person, or it is unknown.
+    """
+    write_people = writer_for(path).write_people
+    if write_people is None:
+        raise OutputError(f"{path}: several people in one file go to {_suffixes('write_people')}")
+    return write_people
 
 
 def writer_for(path: str | Path) -> Writer:
