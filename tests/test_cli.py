@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from command_line import run
 from needs import SUFFIXES
 
@@ -176,6 +177,24 @@ def test_lift_everybody_who_is_in_these_frames(openpose_folder, tmp_path):
     assert "left out" not in run(*words, "0:2").stderr
     assert {p.name for p in tmp_path.iterdir()} == {"a_0.npz", "a_1.npz"}
     assert "expected frames within 0:40" in run(*words, "90:", code=2).stderr
+
+
+def test_lift_leaves_out_who_is_hardly_seen(openpose_folder, tmp_path):
+    words = ("lift", openpose_folder, "-o", tmp_path / "a.npz", "--person", "all", "-m", "sfam", "--least-seen")
+    done = run(*words, 0.6)  # the second person is seen in every other frame
+    assert f"note: {openpose_folder}, person 1: seen in 50 % of the frames: left out\n" in done.stderr
+    assert {p.name for p in tmp_path.iterdir()} == {"a_0.npz"}
+    assert "left out" not in run(*words, 0.6, "--frames", "1:4").stderr  # in two of these
+    assert "left out" not in run(*words, 0.5).stderr
+    assert {p.name for p in tmp_path.iterdir()} == {"a_0.npz", "a_1.npz"}
+    points = kt.data.walking_person(8, skeleton="h36m17").tracks.points.clone()
+    points[::2] = torch.nan
+    np.savez(tmp_path / "one.npz", points2d=points.numpy())
+    told = run("lift", tmp_path / "one.npz", *words[2:], 0.6, code=2).stderr
+    assert "--least-seen: nobody is seen in a share of 0.6 of the frames, but 0.5" in told
+    assert "expected frames within 0:40" in run(*words, 0.9, "--frames", "90:", code=2).stderr
+    for wrong in ((1.5,), (0.5, "--person", 1)):
+        assert "--least-seen: expected a share from 0 to 1, with --person all" in run(*words, *wrong, code=2).stderr
 
 
 def test_lift_one_of_several(openpose_folder, tmp_path):

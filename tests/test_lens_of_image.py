@@ -89,7 +89,7 @@ def test_which_lens_an_image_has(corner, size, factor, expected):
         assert found is None
         return
     assert (2 * found.lens.cx, 2 * found.lens.cy) == expected and found.usual == 0.85 * max(expected)
-    usual = found.lens.fx ** 2 / found.usual  # makes the person of about 1.75 be 4.5 away
+    usual = found.lens.fx**2 / found.usual  # makes the person of about 1.75 be 4.5 away
     assert found.far == (factor == 0.1)
     assert found.lens.fx == found.lens.fy and 0.85 < usual / (4.5 / 1.75 * factor * 850) < 1.15
     assert (size is None) == (f"{expected[0]} x {expected[1]}" in found.said)

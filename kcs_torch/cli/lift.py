@@ -104,6 +104,15 @@ def lift(
             "then compare, and with --scale their distances.",
         ),
     ] = None,
+    least_seen: Annotated[
+        float | None,
+        typer.Option(
+            "--least-seen",
+            metavar="0..1",
+            help="With --person all: leave out those who are seen in a smaller share of the frames.",
+            show_default=False,
+        ),
+    ] = None,
     fps: Annotated[
         float | None, typer.Option(metavar="NUMBER", help="Frames a second; those of TRACKS if not given.")
     ] = None,
@@ -165,6 +174,8 @@ def lift(
         if intrinsics is not None:
             fields["intrinsics"] = _lens(intrinsics)
         person_number(person)
+        if least_seen is not None and not (person == "all" and 0 <= least_seen <= 1):
+            raise OptionError(f"--least-seen: expected a share from 0 to 1, with --person all, got {least_seen:g}")
         finish = finisher(smooth_3d)
         size_of = parse_scale(scale)
         check_up(up, pitch, output)
@@ -201,6 +212,8 @@ def lift(
                 )
             if person == "all" and frames is not None:
                 people = _in_sight(people, frames)
+        if least_seen is not None:
+            people = _often_seen(people, least_seen, None if _is_video(tracks) else frames)
         use_one_thread()
         together = results.together()
         for number, one in people:
@@ -277,6 +290,28 @@ def _in_sight(people: list[tuple[int, Tracks]], frames: str) -> list[tuple[int, 
         if not seen:
             typer.echo(f"note: {one_line(one.source)}: not seen in frames {frames}: left out", err=True)
     return list(compress(people, there))
+
+
+def _often_seen(people: list[tuple[int, Tracks]], least: float, frames: str | None) -> list[tuple[int, Tracks]]:
+    """Those who are seen in a share of the frames, or of a part of them, and a word on the others.
+
+    All where nobody is seen in that part, as that is an error.
+
+    Raises:
+        OptionError: all are seen in less.
+    """
+    from kcs_torch.errors import OptionError
+
+    start, stop = frame_range(frames)
+    shares = [float(one.seen[start:stop].any(1).double().mean()) for _, one in people]
+    if not any(share > 0 for share in shares):
+        return people
+    if max(shares) < least:
+        raise OptionError(f"--least-seen: nobody is seen in a share of {least:g} of the frames, but {max(shares):.2g}")
+    for (_, one), share in zip(people, shares, strict=True):
+        if share < least:
+            typer.echo(f"note: {one_line(one.source)}: seen in {100 * share:.0f} % of the frames: left out", err=True)
+    return [one for one, share in zip(people, shares, strict=True) if share >= least]
 
 
 def _is_video(path: str) -> bool:
