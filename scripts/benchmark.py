@@ -213,7 +213,8 @@ def measured(row: dict[str, Any]) -> tuple[str, ...]:
 
 def predicted(folder: Path) -> dict[tuple[str, str], dict[str, Any]]:
     """The row of each (suite, case) of which there is a prediction beside a results.csv: what was measured last."""
-    last = {(row["suite"], row["case"]): row for row in read_rows(folder / "results.csv") if not row["error"]}
+    rows = [row for row in read_rows(folder / "results.csv") if {*MEASURED, "error"} <= row.keys()]  # not another's
+    last = {(row["suite"], row["case"]): row for row in rows if not row["error"]}
     return {(suite, case): row for (suite, case), row in last.items() if (folder / suite / f"{case}.npz").is_file()}
 
 

@@ -165,6 +165,11 @@ def test_a_value_that_holds_an_equals_sign_needs_no_quotes(word, value):
     assert OverridesParser.create().parse_override(_for_hydra(word)).value() == value
 
 
+def test_a_sweep_over_values_that_hold_an_equals_sign():
+    parsed = OverridesParser.create().parse_override(_for_hydra("scale=height=1.75m,height=1.8m"))
+    assert [*parsed.sweep_string_iterator()] == ["'height=1.75m'", "'height=1.8m'"]
+
+
 def test_what_hydra_reads_itself_is_left_to_it():
     for word in ("shard=range(start=0,stop=8)", "seed=1,2", "--config-dir=a=b", "output=${now:%Y=%m}"):
         assert _for_hydra(word) == word

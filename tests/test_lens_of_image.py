@@ -244,6 +244,9 @@ def test_a_far_camera_tells_no_lens_for_others(monkeypatch):
     people = [replace(aside(frames=12)[0], source=f"walk.json, person {k}") for k in range(2)]
     monkeypatch.setattr(one_lens, "reconstruct_uncalibrated", lambda method, tracks, **_: method(tracks))
     assert [*by_one_lens(kt.PKC(), people)] == [0]
+    small = [replace(one, points=one.points * 0.1 + 400, image_size=(1920, 1080)) for one in people]
+    assert all(lens_of_image(one).far for one in small)
+    assert [*by_one_lens(kt.PKC(), small)] == [0]  # of the others only if the tracks of this one tell a lens
     monkeypatch.setattr(one_lens, "lens_of_image", lambda *_: None)
     assert by_one_lens(kt.PKC(), people) == {}
 

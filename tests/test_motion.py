@@ -16,8 +16,19 @@ from kcs_torch.io import MOTION_READERS, detect_motion_format, load_any, load_mo
 from kcs_torch.io.formats.pages import as_result
 from kcs_torch.types import Motion
 from kcs_torch.types.axes import AXES, from_y_up, to_y_up
+from kcs_torch.types.upright import lean
 
 # ---------------------------------------------------------------------- the thing itself
+
+
+def test_an_animal_that_faces_the_camera_does_not_lean():
+    """Its head is before its feet; a person's is above them."""
+    for name, leans in (("ap10k", False), ("coco17", True)):
+        body = kt.SKELETONS[name]
+        points = body.template_points(dtype=torch.float64)[None]
+        points = to_y_up(points @ orbit(points.new_zeros(()), -20.0), "-y")
+        told = lean(points, torch.ones(points.shape[:-1], dtype=torch.bool), body)
+        assert abs(told) == pytest.approx(20, abs=5) if leans else told == 0
 
 
 @pytest.mark.parametrize("up", AXES)

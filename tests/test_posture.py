@@ -71,6 +71,19 @@ def test_frame_of_the_template_in_any_turn():
     assert_close(found, turn, rtol=0, atol=1e-8)
 
 
+def test_frame_is_of_each_frame_by_itself():
+    """Whatever the others are, and in half precision as in single, also of a body that is small there."""
+    energy = PostureEnergy("h36m17")
+    points = walking_person(6, dtype=torch.float32).points
+    found = energy.frame(points)
+    wrong = points.clone()
+    wrong[2] = math.nan
+    keep = [0, 1, 3, 4, 5]
+    assert torch.equal(energy.frame(wrong)[keep], found[keep])
+    half = energy.frame((points / 2e4).half())
+    assert half.dtype == torch.float16 and float((half.float() - found).abs().max()) < 0.02
+
+
 def test_frame_turns_with_the_body():
     turn = rotations(40, seed=3)
     frame = POSTURE.frame(WALK)

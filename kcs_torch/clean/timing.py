@@ -58,9 +58,9 @@ def trim(tracks: Tracks, start: int | None = None, stop: int | None = None) -> T
 
 
 def split(tracks: Tracks) -> list[Tracks]:
-    """Divide a clip at the cuts of its film, where the body is suddenly seen from another side.
+    """Divide a clip at the cuts of its film, where the body is suddenly seen from another side, or another one is.
 
-    Shots of one body are better solved together by PKC, as they tell each other's depth.
+    Shots of one body are better solved together by PKC, as they tell each other's depth; those of others by themselves.
 
     Args:
         tracks: what to divide.

@@ -307,7 +307,10 @@ def _often_seen(people: list[tuple[int, Tracks]], least: float, frames: str | No
     if not any(share > 0 for share in shares):
         return people
     if max(shares) < least:
-        raise OptionError(f"--least-seen: nobody is seen in a share of {least:g} of the frames, but {max(shares):.2g}")
+        raise OptionError(
+            f"--least-seen: nobody is seen in {100 * least:g} % of the frames; the most visible person is in "
+            f"{100 * max(shares):.2f} %"
+        )
     for (_, one), share in zip(people, shares, strict=True):
         if share < least:
             typer.echo(f"note: {one_line(one.source)}: seen in {100 * share:.0f} % of the frames: left out", err=True)

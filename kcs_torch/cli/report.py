@@ -8,7 +8,6 @@ import re
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["answer", "describe", "one_line", "print_json", "progress", "summary", "unsaid"]
 
 
-_warned: ContextVar[list[str]] = ContextVar("warned")
+_warned: list[str] = []
 """What the command that runs has warned of."""
 
 
@@ -37,7 +36,7 @@ def answer(as_json: bool = False) -> Iterator[dict[str, Any]]:
     What the body puts into the dictionary that it gets is printed as JSON together with the error.
     """
     found: dict[str, Any] = {}
-    _warned.set([])
+    _warned.clear()
     with warnings_told(_warn):
         try:
             yield found
@@ -49,14 +48,14 @@ def answer(as_json: bool = False) -> Iterator[dict[str, Any]]:
 
 
 def _warn(text: str) -> None:
-    _warned.get().append(text)
+    _warned.append(text)
     typer.echo(f"warning: {one_line(text)}", err=True)
 
 
 def unsaid(notes: Iterable[str], source: str) -> list[str]:
     """Those notes on what comes from a source, a file or one person in it, of which no warning has told."""
     whose = {f"{name}: " for name in (source, re.sub(r", person \d+$", "", source))}
-    told = [text.removeprefix(name) for text in _warned.get([]) for name in whose if text.startswith(name)]
+    told = [text.removeprefix(name) for text in _warned for name in whose if text.startswith(name)]
     return [note for note in notes if not any(text.startswith(note) for text in told)]
 
 

@@ -83,7 +83,7 @@ class Results:
         share = float(tracks.seen.any(1).double().mean())
         if self.everybody and share < FEW:
             say = f"visible in only {100 * share:.0f} % of the frames: the rest is guessed"
-            say += f" (--least-seen {FEW:g} leaves such people out)"
+            say += f" (--least-seen {FEW:g} leaves such people out)" if self.frames is None else ""
             typer.echo(f"warning: {one_line(tracks.source)}: {say}", err=True)
 
     def together(self) -> list[Path]:

@@ -116,7 +116,7 @@ class Method(ABC):
         return self.of_prepared(tracks, cameras, begin)
 
     def of_prepared(self, tracks: Tracks, cameras: Tensor | None, begin: float) -> Reconstruction:
-        """Reconstruct tracks that are :meth:`prepared`, as a call does, which ``begin`` at that time."""
+        """Reconstruct tracks that are :meth:`prepared`, as a call does that began at ``begin`` (``perf_counter``)."""
         with apart([tracks], self.differentiates):
             inner, size, known = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())

@@ -129,14 +129,14 @@ class PostureEnergy(SkeletonModule):
             ShapeError: the points are not of this skeleton.
         """
         self._check(points)
-        part = points.index_select(-2, self.trunk)
-        part = unit_size(part - part.mean(-2, keepdim=True), 3)
+        part = wide(points.index_select(-2, self.trunk))
+        part = unit_size(part - part.mean(-2, keepdim=True), 2)
         with full_precision(part):
             first, second = (self.affine.to(part) @ part).unbind(-2)  # images of the trunk's two long axes
             first = _unit(first)
             second = _unit(second - (second * first).sum(-1, keepdim=True) * first)
             turned = torch.stack([first, second, torch.linalg.cross(first, second)], -1)
-            return turned @ self.axes.to(part).mT
+            return narrow(turned @ self.axes.to(part).mT, points)
 
     def directions(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
         """Bones seen from the trunk over their lengths, (..., T, B, 3), 0 where a length is 0; as in :meth:`forward`.

@@ -93,10 +93,13 @@ def command_line(program: str, arguments: Sequence[str] | None = None, start: st
 def _for_hydra(argument: str) -> str:
     """An override as Hydra takes it.
 
-    It may also add a field: of a name that is not shown Hydra says to add it, be it right or wrong. A value that holds
-    an = is quoted, as in scale=height=1.75m.
+    It may also add a field: of a name that is not shown Hydra says to add it, be it right or wrong. Values that hold an
+    = are quoted, as in scale=height=1.75m.
     """
-    argument = re.sub(r"^([^-=][^=]*=)([^='\"()\[\]{},\\]+=[^='\"()\[\]{},\\]*)$", r"\1'\2'", argument)
+    name, _, value = argument.partition("=")
+    if "=" in value and not re.search(r"^-|['\"()\[\]{}\\]", argument):
+        quoted = (f"'{part}'" if "=" in part else part for part in value.split(","))
+        argument = f"{name}={','.join(quoted)}"
     return f"++{argument}" if re.match(r"(?!hydra\.)[A-Za-z_]\w*\.[^=]*=", argument) else argument
 
 

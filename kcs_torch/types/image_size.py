@@ -92,7 +92,7 @@ def fitting_size(points: Tensor, size: tuple[int, int], notes: list[str]) -> tup
 
 def may_be_shares(points: Tensor) -> bool:
     """Whether points (P, 2) of joints that are seen may be shares of an image, as hardly any lies outside of 0 to 1."""
-    return _held(points, (1, 1)) >= SHARES
+    return bool((points != points[:1]).any()) and _held(points, (1, 1)) >= SHARES
 
 
 def usual_size(points: Tensor) -> tuple[int, int]:

@@ -13,6 +13,9 @@ __all__ = ["ABOVE", "how_it_stands", "lean", "lies_down", "upside_down"]
 CLEARLY = 0.3
 """How far feet are above the rest, over the joints' root mean square distance from their mean height."""
 
+STRAIGHT = 0.14
+"""Horizontal distance of a template's feet from the rest, over the vertical one, up to which it stands upright."""
+
 FLAT = 3.0
 """How much farther to the side of the rest feet are than below it if the body lies."""
 
@@ -65,8 +68,15 @@ def lean(points: Tensor, seen: Tensor, skeleton: Skeleton) -> float:
     Args:
         points: (T, N, 3), y pointing up.
         seen: (T, N).
-        skeleton: one without contacts does not lean.
+        skeleton: one without contacts does not lean, nor does one without a template, or an animal, whose head is
+            before its feet: it would seem to lean as it faces.
     """
+    if skeleton.template is None:
+        return 0.0
+    rest = skeleton.template_points(dtype=points.dtype, device=points.device)[None]
+    x, y, z = _feet(rest, seen.new_ones(rest.shape[:-1]), skeleton)[0][0].tolist()
+    if math.hypot(x, z) > STRAIGHT * abs(y):
+        return 0.0
     away, _, shown = _feet(points, seen, skeleton)
     _, y, z = away[shown].double().mean(0).tolist() if bool(shown.any()) else (0.0, -1.0, 0.0)
     return math.degrees(math.atan2(-z, -y))

@@ -24,6 +24,10 @@ FOCAL = 0.85
 """Usual focal length over the image's longer side, that of phones, web and action cameras."""
 
 
+SAY_SIZE = "image_size=(width, height) (kcs-torch: --image-size), or "
+"""What is asked for first where tracks say that they are in pixels."""
+
+
 class LikelyLens(NamedTuple):
     """What the size of an image tells of the camera.
 
@@ -69,7 +73,7 @@ def lens_of_image(tracks: Tracks) -> LikelyLens | None:
     whose = " of all people in the file" if tracks.image_guess else ""
     said = (
         f"the image is taken to be {width} x {height} pixels, the smallest of usual size that holds the tracks{whose}: "
-        "if it is not, give image_size=(width, height) (kcs-torch: --image-size), or the camera's intrinsics"
+        f"if it is not, give {SAY_SIZE if tracks.units == 'px' else ''}the camera's intrinsics"
     )
     likely = math.sqrt(usual * USUAL * unit)
     lens = Intrinsics(likely, likely, width / 2, height / 2)

@@ -31,7 +31,7 @@ def by_one_lens(method: Method, people: Sequence[Tracks]) -> dict[int, Reconstru
         camera is far away after all, and of nobody if nobody tells a lens.
     """
     able = [i for i, one in enumerate(people) if may_be_near(one)]
-    lenses = {i: lens for i in able if (lens := lens_of_image(people[i])) is not None and not lens.far}
+    lenses = {i: lens for i in able if (lens := lens_of_image(people[i])) is not None}
     if not lenses:
         return {}
     first = max(lenses, key=lambda i: _filled(people[i]))
