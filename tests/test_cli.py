@@ -191,7 +191,7 @@ def test_lift_leaves_out_who_is_hardly_seen(openpose_folder, tmp_path):
     points[::2] = torch.nan
     np.savez(tmp_path / "one.npz", points2d=points.numpy())
     told = run("lift", tmp_path / "one.npz", *words[2:], 0.6, code=2).stderr
-    assert "--least-seen: nobody is seen in a share of 0.6 of the frames, but 0.5" in told
+    assert "--least-seen: nobody is seen in 60 % of the frames; the most visible person is in 50 %" in told
     assert "expected frames within 0:40" in run(*words, 0.9, "--frames", "90:", code=2).stderr
     for wrong in ((1.5,), (0.5, "--person", 1)):
         assert "--least-seen: expected a share from 0 to 1, with --person all" in run(*words, *wrong, code=2).stderr

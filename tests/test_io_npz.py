@@ -140,7 +140,7 @@ def test_letters_that_there_are_none_of(tmp_path):
 
 
 def test_what_may_be_shares_of_the_image_is_told(tmp_path):
-    points = arrays()["points2d"] * 0 + [0.25, 0.5]
+    points = np.random.default_rng(0).uniform(0.2, 0.8, arrays()["points2d"].shape)
     with pytest.warns(KcsWarning, match="if they are shares of the image"):
         notes = load_tracks(written(tmp_path / "a.npz", points2d=points, units="px")).notes
     told = [note for note in notes if "image_size=" in note]

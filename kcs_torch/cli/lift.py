@@ -309,7 +309,7 @@ def _often_seen(people: list[tuple[int, Tracks]], least: float, frames: str | No
     if max(shares) < least:
         raise OptionError(
             f"--least-seen: nobody is seen in {100 * least:g} % of the frames; the most visible person is in "
-            f"{100 * max(shares):.2f} %"
+            f"{100 * max(shares):.3g} %"
         )
     for (_, one), share in zip(people, shares, strict=True):
         if share < least:
