@@ -46,7 +46,9 @@ LITTLE = {
 
 @pytest.mark.parametrize("viewpoint", ["auto", "fixed", "moving"])
 @pytest.mark.parametrize("case", LITTLE)
-@pytest.mark.filterwarnings("ignore:.*never seen", "ignore:.*this is hardly a body of skeleton 'h36m17'")  # on a line
+@pytest.mark.filterwarnings(
+    "ignore:.*never seen", "ignore:.*this is hardly a body of skeleton 'h36m17'", "ignore:.*there is no pose to find"
+)
 def test_clips_that_tell_little(case, viewpoint):
     check(PKC(viewpoint=viewpoint, rounds=1, steps=3)(of(LITTLE[case]())))
 

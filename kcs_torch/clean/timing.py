@@ -81,12 +81,12 @@ def split(tracks: Tracks) -> list[Tracks]:
     return [trim(tracks, *ends) for ends in pairwise([0, *cuts, tracks.num_frames])]
 
 
-def cuts_of(tracks: Tracks) -> list[int]:
+def cuts_of(tracks: Tracks, *, leaps: bool = True) -> list[int]:
     """The first frames of the shots of a clip but the first, see :func:`kcs_torch.solvers.cuts.find_cuts`."""
     body, points = tracks.skeleton, tracks.points
     count = body.num_observed
     pairs = torch.tensor([pair for pair in body.mirror if max(pair) < count], dtype=torch.long, device=points.device)
-    return find_cuts(points[:, :count], tracks.seen[:, :count], pairs.view(-1, 2))
+    return find_cuts(points[:, :count], tracks.seen[:, :count], pairs.view(-1, 2), leaps=leaps)
 
 
 def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: float | None = None) -> Tracks:

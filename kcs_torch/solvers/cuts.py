@@ -28,7 +28,7 @@ LEAST, JOINTS = 4, 6
 """Frames that there must be on either side, and joints that both frames of a jump show."""
 
 
-def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
+def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor, *, leaps: bool = True) -> list[int]:
     """Find the first frame of each shot but the first: there the pose jumps, or the body, as it does nowhere near.
 
     Frames in which half of the joints are seen are compared with the next such one, if that follows at once. Sides that
@@ -40,6 +40,7 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
         points: (T, N, 2).
         seen: (T, N) bool.
         pairs: (P, 2) joints that are each other's twins.
+        leaps: whether a body that moves as a whole counts, or only another pose.
 
     >>> time = torch.arange(30.0)[:, None, None] / 30
     >>> pose = torch.randn(8, 2, generator=torch.Generator().manual_seed(0)) + time
@@ -66,9 +67,11 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor) -> list[int]:
     pace = nanmedian(pace, 1).norm(dim=-1) / shown.diff()
     lost = (from_beside(middle) > LEAP * size[:, None])[:, 0]  # frames that are at a wrong place
     step, pace = ((x / torch.minimum(size[1:], size[:-1])).nan_to_num(0.0, 0.0) for x in (step, pace))  # 0 / 0: a point
-    leaps = (_sudden(step, AWAY) & (shown.diff() == 1)) | (_sudden(pace, LEAP) & ~lost[1:] & ~lost[:-1])
-    leaps[: LEAST - 1] = leaps[len(leaps) - LEAST + 1 :] = False
-    return (shown[1:][leaps]).tolist()
+    jumps = _sudden(step, AWAY) & (shown.diff() == 1)
+    if leaps:
+        jumps |= _sudden(pace, LEAP) & ~lost[1:] & ~lost[:-1]
+    jumps[: LEAST - 1] = jumps[len(jumps) - LEAST + 1 :] = False
+    return (shown[1:][jumps]).tolist()
 
 
 def _sudden(steps: Tensor, least: float) -> Tensor:
