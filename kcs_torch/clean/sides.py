@@ -62,9 +62,8 @@ def unswap(tracks: Tracks) -> Tracks:
         return tracks
     points, weights = tracks.points[:, :count].clone(), tracks.weights[:, :count].clone()
     size = float(body_size(points, weights > 0))
-    shots = list(
-        starmap(slice, pairwise([0, *cuts_of(tracks, leaps=False), tracks.num_frames]))
-    )  # another view is no swap
+    cuts = cuts_of(tracks, leaps=False)  # another view is no swap
+    shots = list(starmap(slice, pairwise([0, *cuts, tracks.num_frames])))
     limbs = _limbs(body, pairs)
     trunk = [pair for pair in pairs if not any(pair in limb for _, limb in limbs)]
     long = _LONG * (tracks.fps or _RATE)

@@ -82,7 +82,7 @@ def split(tracks: Tracks) -> list[Tracks]:
 
 
 def cuts_of(tracks: Tracks, *, leaps: bool = True) -> list[int]:
-    """The first frames of the shots of a clip but the first, see :func:`kcs_torch.solvers.cuts.find_cuts`."""
+    """The first frames of the shots of a clip but the first; as :func:`kcs_torch.solvers.cuts.find_cuts`."""
     body, points = tracks.skeleton, tracks.points
     count = body.num_observed
     pairs = torch.tensor([pair for pair in body.mirror if max(pair) < count], dtype=torch.long, device=points.device)

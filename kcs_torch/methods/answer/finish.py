@@ -48,6 +48,7 @@ BY_SHOTS = (
 )
 
 NO_POSE = "all joints lie at one point in every frame: there is no pose to find"
+"""What is noted, and warned of, where tracks show a point."""
 
 HARDLY, SINGLE = "the viewpoint turned by only", "a single image shows one viewpoint"
 """How a note begins that says how little the viewpoint turned, and of one frame."""

@@ -275,7 +275,7 @@ class PKC(Method):
         return made
 
     def _fills(self, body: Body) -> bool:
-        """Whether gaps are filled by a first solution, of which only the image is then used."""
+        """Whether gaps are filled by what is found: of a first solution only the image is used if another follows."""
         return self.rounds > 0 and self.viewpoint != "moving" and bool(gaps_of(body.noise).any())
 
     def _filled(
