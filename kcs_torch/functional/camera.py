@@ -237,27 +237,34 @@ def _across(vectors: Tensor) -> Tensor:
     return torch.where(found.any(-1, keepdim=True), found, axis)
 
 
-def viewpoint_turn(cameras: Tensor) -> Tensor:
+def viewpoint_turn(cameras: Tensor, inside: Tensor | None = None) -> Tensor:
     """Return the largest angle in degrees between two viewing directions of a clip.
 
     Args:
         cameras: (..., T, 2, 3), orthonormal rows.
+        inside: (..., T), False in frames that pad a shorter clip, where the cameras are 0.
 
     Returns:
         (...). Turning about the optical axis does not count: it tells nothing of depth. Found in three sweeps, which is
         exact for a path; of directions scattered at random it may miss a fifth. 0 of no frames.
 
     Raises:
-        ShapeError: the cameras are not (..., T, 2, 3), or not in floating point.
+        ShapeError: the cameras are not (..., T, 2, 3) in floating point, or ``inside`` does not fit them.
     """
     check_floats(cameras, "viewpoint_turn: cameras", "T", 2, 3)
+    if inside is not None:
+        check_core(inside, "viewpoint_turn: inside", cameras.shape[-3])
+        check_batches("viewpoint_turn: cameras and inside", cameras, inside, cores=(3, 1))
     if not cameras.shape[-3]:
         return cameras.new_zeros(cameras.shape[:-3])
     view = complete_rotation(cameras)[..., 2, :]  # (..., T, 3)
     far = view.mean(-2, keepdim=True)
+    if inside is not None:
+        far = far * (view.shape[-2] / inside.sum(-1).clamp_min(1))[..., None, None]
     for _ in range(3):  # the farthest from the mean, the farthest from that, and once more
         anchor = far
-        index = (view - anchor).square().sum(-1).argmax(-1)
+        away = (view - anchor).square().sum(-1)
+        index = (away if inside is None else torch.where(inside, away, -1)).argmax(-1)
         far = view.gather(-2, index[..., None, None].expand(*index.shape, 1, 3))
     return torch.rad2deg(angle_between(anchor, far)).squeeze(-1)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcs_torch.functional.guarded import or_one
+from kcs_torch.functional.guarded import largest, or_one
 
 __all__ = ["known", "known_frames", "rms", "seen_weights"]
 
@@ -17,12 +17,16 @@ def known(values: Tensor, weights: Tensor | None) -> Tensor:
     return torch.where(weights[..., None] > 0, values, torch.zeros((), dtype=values.dtype, device=values.device))
 
 
-def rms(vectors: Tensor, weights: Tensor) -> Tensor:
-    """Weighted root mean square length of (..., D) vectors, scaled first, so that no square overflows."""
+def rms(vectors: Tensor, weights: Tensor, dimensions: int | None = None) -> Tensor:
+    """Weighted root mean square length of (..., D) vectors, scaled first, so that no square overflows.
+
+    The mean is over the last so many dimensions of the weights (...), all if None.
+    """
     vectors = known(vectors, weights)
-    top = or_one(vectors.abs().amax())
-    square = (vectors / top).square().sum(-1) * weights
-    return top * (square.sum() / weights.sum()).sqrt()
+    over = tuple(range(-(weights.ndim if dimensions is None else dimensions), 0))
+    top = or_one(largest(vectors, len(over) + 1))
+    square = ((vectors / top).square().sum(-1) * weights).sum(over)
+    return top.view(square.shape) * (square / weights.sum(over)).sqrt()
 
 
 def known_frames(points: Tensor, weights: Tensor | None) -> Tensor:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["ABOVE", "how_it_stands", "lean", "lies_down", "upside_down"]
+__all__ = ["ABOVE", "how_it_stands", "how_they_stand", "lean", "upside_down"]
 
 CLEARLY = 0.3
 """How far feet are above the rest, over the joints' root mean square distance from their mean height."""
@@ -53,13 +55,27 @@ def how_it_stands(points: Tensor, seen: Tensor, skeleton: Skeleton) -> str:
         seen: (T, N).
         skeleton: one without contacts stands.
     """
-    if lies_down(points, seen, skeleton, NEARLY_ALL):
-        said = _LYING
-    elif upside_down(points[..., 1], seen, skeleton, NEARLY_ALL):
-        said = _ASIDE if _leans(points, seen, skeleton, NEARLY_ALL) else _HEADSTAND
-    else:
-        said = ""
-    return said.format(often=" in nearly all frames" if len(points) > 1 else "")
+    return how_they_stand(points[None], seen[None], skeleton, [len(points)])[0]
+
+
+def how_they_stand(points: Tensor, seen: Tensor, skeleton: Skeleton, counts: Sequence[int]) -> list[str]:
+    """:func:`how_it_stands` of each of K clips (K, T, N, 2), of which so many frames are no padding: that is unseen."""
+    if not skeleton.contacts:
+        return [""] * len(counts)
+    away, spread, shown = _feet(points, seen, skeleton)
+    size = spread.sum(-1).sqrt()
+    right, (aside, below) = away[..., 0], away.abs().unbind(-1)
+    far = aside > CLEARLY * size
+    lies = far & (aside > FLAT * below)
+    bends = far & (FLAT * aside > below)  # or leans: swapped axes put such a body's feet there, above it or below
+    kinds = [lies, bends & (right > 0), bends & (right < 0)]
+    shares = [_share(kind, shown & (size > 0)) for kind in kinds] + [_above(away, spread, shown)]
+    said = []
+    for count, often in zip(counts, (torch.stack(shares, -1) > NEARLY_ALL).tolist(), strict=True):
+        down, to_right, to_left, above = often
+        words = _LYING if down else (_ASIDE if to_right or to_left else _HEADSTAND) if above else ""
+        said.append(words.format(often=" in nearly all frames" if count > 1 else ""))
+    return said
 
 
 def lean(points: Tensor, seen: Tensor, skeleton: Skeleton) -> float:
@@ -77,70 +93,49 @@ def lean(points: Tensor, seen: Tensor, skeleton: Skeleton) -> float:
     x, y, z = _feet(rest, seen.new_ones(rest.shape[:-1]), skeleton)[0][0].tolist()
     if math.hypot(x, z) > STRAIGHT * abs(y):
         return 0.0
-    away, _, shown = _feet(points, seen, skeleton)
+    away, spread, shown = _feet(points, seen, skeleton)
+    shown &= spread.any(-1)
     _, y, z = away[shown].double().mean(0).tolist() if bool(shown.any()) else (0.0, -1.0, 0.0)
     return math.degrees(math.atan2(-z, -y))
 
 
-def upside_down(heights: Tensor, seen: Tensor, skeleton: Skeleton, share: float = 0.5) -> bool:
-    """Whether the joints that touch the ground are clearly above the others in more than a share of the frames.
+def upside_down(heights: Tensor, seen: Tensor, skeleton: Skeleton) -> bool:
+    """Whether the joints that touch the ground are clearly above the others in more than half of the frames.
+
+    Frames count that show joints of both kinds.
 
     Args:
         heights: (T, N) y of the joints, pointing down.
         seen: (T, N).
         skeleton: one without contacts is never upside down.
-        share: of the frames that show joints of both kinds.
     """
-    below, size, shown = _feet(heights[..., None], seen, skeleton)
-    return bool(shown.any()) and _share(-below[:, 0] > CLEARLY * size, shown) > share
+    return bool(_above(*_feet(heights[..., None], seen, skeleton)) > 0.5)
 
 
-def lies_down(points: Tensor, seen: Tensor, skeleton: Skeleton, share: float) -> bool:
-    """Whether those joints are clearly beside the others, and hardly below them, in more than a share of the frames.
-
-    Args:
-        points: (T, N, 2).
-        seen: (T, N).
-        skeleton: one without contacts does not lie.
-        share: of the frames that show joints of both kinds.
-    """
-    away, size, shown = _feet(points, seen, skeleton)
-    aside, below = away.abs().unbind(-1)
-    return bool(shown.any()) and _share((aside > CLEARLY * size) & (aside > FLAT * below), shown) > share
-
-
-def _leans(points: Tensor, seen: Tensor, skeleton: Skeleton, share: float) -> bool:
-    """Whether those joints are to one side of the others as they are below them in a body that bends, or leans.
-
-    Swapped axes put such a body's feet there, and above it or below.
-
-    Args:
-        points: (T, N, 2).
-        seen: (T, N).
-        skeleton: with contacts.
-        share: of the frames that show joints of both kinds.
-    """
-    away, size, shown = _feet(points, seen, skeleton)
-    aside, below = away.unbind(-1)
-    far = (aside.abs() > CLEARLY * size) & (FLAT * aside.abs() > below.abs())
-    return max(_share(far & (aside > 0), shown), _share(far & (aside < 0), shown)) > share
+def _above(away: Tensor, spread: Tensor, shown: Tensor) -> Tensor:
+    """The share (...) of frames in which :func:`_feet` are clearly above the others, by the last coordinate."""
+    size = spread[..., -1].sqrt()
+    return _share(-away[..., -1] > CLEARLY * size, shown & (size > 0))
 
 
 def _feet(points: Tensor, seen: Tensor, skeleton: Skeleton) -> tuple[Tensor, Tensor, Tensor]:
-    """Where feet are, from the others (T, D); how far joints are from their mean (T,); frames that show both (T,)."""
+    """Where the joints (..., N, D) that touch the ground are from the others, how far all are from their mean.
+
+    Returns:
+        The means' difference (..., D), the mean square by coordinate (..., D), and whether both kinds are shown (...).
+    """
     feet = list(skeleton.contacts)
     others = [n for n in range(skeleton.num_joints) if n not in feet]
-
-    def mean(joints: list[int], values: Tensor) -> Tensor:
-        """(T, 1, D), over the joints that a frame shows."""
-        own = seen[:, joints, None]
-        return values[:, joints].where(own, 0).sum(1, keepdim=True) / own.sum(1, keepdim=True).clamp_min(1)
-
-    every = [*feet, *others]
-    size = mean(every, (points - mean(every, points)).square().sum(-1, keepdim=True))[:, 0, 0].sqrt()
-    shown = seen[:, feet].any(1) & seen[:, others].any(1) & (size > 0)
-    return (mean(feet, points) - mean(others, points))[:, 0], size, shown
+    kinds = [torch.tensor(joints, dtype=torch.long, device=points.device) for joints in (feet, others)]
+    own = seen[..., None]
+    feet_seen, others_seen = (own.index_select(-2, kind).sum(-2) for kind in kinds)
+    of_feet, of_others = (torch.where(own, points, 0).index_select(-2, kind).sum(-2) for kind in kinds)
+    count = (feet_seen + others_seen).clamp_min(1)
+    off = torch.where(own, points - ((of_feet + of_others) / count)[..., None, :], 0)
+    away = of_feet / feet_seen.clamp_min(1) - of_others / others_seen.clamp_min(1)
+    return away, off.square().sum(-2) / count, ((feet_seen > 0) & (others_seen > 0))[..., 0]
 
 
-def _share(of: Tensor, shown: Tensor) -> float:
-    return float(of[shown].double().mean())
+def _share(of: Tensor, shown: Tensor) -> Tensor:
+    """In how many of the frames that are shown (..., T) something holds, (...): a share, 0 of none."""
+    return (of & shown).sum(-1).double() / shown.sum(-1).clamp_min(1)
