@@ -8,15 +8,17 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from kcs_torch.clean.common import check_rate, check_tracks, frame_rate, rebuilt, runs
 from kcs_torch.errors import OptionError, ShapeError, unknown
-from kcs_torch.solvers.cuts import find_cuts
+from kcs_torch.skeleton import Skeleton
+from kcs_torch.solvers.cuts import cut_frames
 from kcs_torch.types import Tracks
 from kcs_torch.types.arrays import as_doubles
 from kcs_torch.types.hints import is_a
 
-__all__ = ["cuts_of", "resample", "split", "trim"]
+__all__ = ["cuts_of", "cuts_of_all", "resample", "split", "trim"]
 
 _KINDS = {"linear": 1, "cubic": 3}
 _EPS = 1e-6  # of a frame: rounding of times must not make a seen frame unseen
@@ -82,11 +84,19 @@ def split(tracks: Tracks) -> list[Tracks]:
 
 
 def cuts_of(tracks: Tracks, *, leaps: bool = True) -> list[int]:
-    """The first frames of the shots of a clip but the first; as :func:`kcs_torch.solvers.cuts.find_cuts`."""
-    body, points = tracks.skeleton, tracks.points
+    """The first frames of the shots of a clip but the first; see :func:`kcs_torch.solvers.cuts.find_cuts`."""
+    return cuts_of_all(tracks.points[None], tracks.seen[None], tracks.skeleton, leaps=leaps)[0]
+
+
+def cuts_of_all(points: Tensor, seen: Tensor, body: Skeleton, *, leaps: bool = True) -> list[list[int]]:
+    """:func:`cuts_of` of K clips: of points (K, T, N, 2), seen (K, T, N) or not, as padding is."""
     count = body.num_observed
     pairs = torch.tensor([pair for pair in body.mirror if max(pair) < count], dtype=torch.long, device=points.device)
-    return find_cuts(points[:, :count], tracks.seen[:, :count], pairs.view(-1, 2), leaps=leaps)
+    found = cut_frames(points[:, :, :count], seen[:, :, :count], pairs.view(-1, 2), leaps=leaps)
+    cuts: list[list[int]] = [[] for _ in found]
+    for clip, frame in found.nonzero().tolist():
+        cuts[clip].append(frame)
+    return cuts
 
 
 def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: float | None = None) -> Tracks:

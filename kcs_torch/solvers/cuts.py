@@ -9,7 +9,7 @@ from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.solvers.stray import from_beside
 
-__all__ = ["find_cuts"]
+__all__ = ["cut_frames", "find_cuts"]
 
 AWAY = 0.12
 """From the frame before to that after a cut half of the joints move, against the body's middle, by more than this share
@@ -48,41 +48,59 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor, *, leaps: bool = True
     >>> find_cuts(pose, torch.ones(30, 8, dtype=torch.bool), torch.zeros(0, 2, dtype=torch.long))
     [18]
     """
-    joints = points.shape[1]
-    shown = (2 * seen.sum(-1) >= joints).nonzero().flatten()
-    if joints < JOINTS or len(shown) < 2 * LEAST:
-        return []
-    some = seen.any(0)
-    whole = interpolate(points, seen)[shown][:, some]  # with those that are seen in a frame its middle would leap
-    middle = nanmedian(whole, 1, keepdim=True)
-    size = nanmedian((whole - middle).norm(dim=-1), 1)
-    known = torch.where(seen[..., None], points, torch.nan)[shown] - middle  # (K, N, 2)
-    known = torch.where((from_beside(known) > FAR * size[:, None])[..., None], torch.nan, known)
+    return cut_frames(points[None], seen[None], pairs, leaps=leaps)[0].nonzero().flatten().tolist()
+
+
+def cut_frames(points: Tensor, seen: Tensor, pairs: Tensor, *, leaps: bool = True) -> Tensor:
+    """:func:`find_cuts` in each of K clips (K, T, N, 2), in which padding is unseen: (K, T), True at cuts."""
+    clips, frames, joints = seen.shape
+    shown = 2 * seen.sum(-1) >= joints
+    none = torch.zeros_like(shown)
+    count = shown.sum(1, keepdim=True)
+    if joints < JOINTS or not bool((count >= 2 * LEAST).any()):
+        return none
+    time = (~shown).byte().argsort(dim=1, stable=True)[:, : int(count.max())]  # the frames that are shown, then others
+    step = torch.arange(1, time.shape[1], device=points.device)
+    at = lambda values: values[torch.arange(clips, device=points.device)[:, None], time]  # noqa: E731
+    held = torch.where((seen & shown[..., None])[..., None], points, torch.nan)
+    whole = held if bool(seen.all()) else interpolate(points, seen)  # of those seen in a frame the middle would leap
+    whole = at(torch.where((shown[..., None] & seen.any(1, keepdim=True))[..., None], whole, torch.nan))
+    middle = nanmedian(whole, 2, keepdim=True)
+    size = nanmedian((whole - middle).norm(dim=-1), 2)
+    held = at(held)
+    known = held - middle  # (K, S, N, 2)
+    known = torch.where((_from_beside(known) > FAR * size[..., None])[..., None], torch.nan, known)
     twins = torch.arange(joints, device=points.device)
     twins[pairs[:, 0]], twins[pairs[:, 1]] = pairs[:, 1], pairs[:, 0]
-    before, after = known[:-1], known[1:]
-    own, swapped = _moved(before, after), _moved(before, after[:, twins])
-    step = torch.minimum(own, swapped.nan_to_num(torch.inf))
-    pace = torch.where(seen[..., None], points, torch.nan)[shown].diff(dim=0)
-    pace = nanmedian(pace, 1).norm(dim=-1) / shown.diff()
-    lost = (from_beside(middle) > LEAP * size[:, None])[:, 0]  # frames that are at a wrong place
-    step, pace = ((x / torch.minimum(size[1:], size[:-1])).nan_to_num(0.0, 0.0) for x in (step, pace))  # 0 / 0: a point
-    jumps = _sudden(step, AWAY) & (shown.diff() == 1)
+    before, after = known[:, :-1], known[:, 1:]
+    own, swapped = _moved(before, after), _moved(before, after[:, :, twins])
+    way = torch.minimum(own, swapped.nan_to_num(torch.inf))
+    gap = time.diff(dim=1)
+    pace = nanmedian(held.diff(dim=1), 2).norm(dim=-1) / gap
+    lost = (_from_beside(middle) > LEAP * size[..., None])[..., 0]  # frames that are at a wrong place
+    least = torch.minimum(size[:, 1:], size[:, :-1])
+    way, pace = ((x / least).nan_to_num(0.0, 0.0) for x in (way, pace))  # 0 / 0: a point
+    jumps = _sudden(way, AWAY) & (gap == 1)
     if leaps:
-        jumps |= _sudden(pace, LEAP) & ~lost[1:] & ~lost[:-1]
-    jumps[: LEAST - 1] = jumps[len(jumps) - LEAST + 1 :] = False
-    return (shown[1:][jumps]).tolist()
+        jumps |= _sudden(pace, LEAP) & ~lost[:, 1:] & ~lost[:, :-1]
+    jumps &= (step >= LEAST) & (step <= count - LEAST)
+    return none.scatter(1, time[:, 1:], jumps)
+
+
+def _from_beside(values: Tensor) -> Tensor:
+    """:func:`from_beside` of clips (K, T, N, D): (K, T, N)."""
+    return from_beside(values.transpose(0, 1).flatten(1, 2)).unflatten(1, (-1, values.shape[2])).transpose(0, 1)
 
 
 def _sudden(steps: Tensor, least: float) -> Tensor:
-    """Which steps (K,) are larger than ``least``, and than those beside by far."""
-    beside = torch.nn.functional.pad(steps, (BESIDE, BESIDE)).unfold(0, 2 * BESIDE + 1, 1).clone()
-    beside[:, BESIDE] = 0
-    return (steps > least) & (steps > SUDDEN * beside.amax(1))
+    """Which steps (K, S) are larger than ``least``, and than those beside by far."""
+    around = torch.nn.functional.pad(steps, (BESIDE, BESIDE)).unfold(1, 2 * BESIDE + 1, 1)
+    beside = torch.maximum(around[..., :BESIDE].amax(-1), around[..., BESIDE + 1 :].amax(-1))
+    return (steps > least) & (steps > SUDDEN * beside)
 
 
 def _moved(before: Tensor, after: Tensor) -> Tensor:
-    """How far the middle one of the joints moves against all, (K,), by poses (K, N, 2); NaN where few are in both."""
+    """How far the middle one of the joints moves against all, (...), by poses (..., N, 2); NaN where few are in both."""
     way = after - before
-    enough = (~way.isnan().any(-1)).sum(1) >= JOINTS
-    return torch.where(enough, nanmedian((way - nanmedian(way, 1, keepdim=True)).norm(dim=-1), 1), torch.nan)
+    enough = (~way.isnan().any(-1)).sum(-1) >= JOINTS
+    return torch.where(enough, nanmedian((way - nanmedian(way, -2, keepdim=True)).norm(dim=-1), -1), torch.nan)
