@@ -17,6 +17,7 @@ from torch import Tensor
 
 from kcs_torch.errors import (
     ConvergenceWarning,
+    KcsError,
     KcsWarning,
     NotFiniteError,
     OptionError,
@@ -31,6 +32,7 @@ from kcs_torch.functional.temporal import interpolate
 from kcs_torch.functional.weights import rms
 from kcs_torch.methods.answer.finish import BY_SHOTS, NO_POSE, Estimate, finish
 from kcs_torch.methods.answer.wrong import WHY_LOOSE
+from kcs_torch.methods.clips.batches import FRAMES, batches
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Reconstruction, Tracks, as_floats
 from kcs_torch.types.hints import is_a, spoken
@@ -118,9 +120,9 @@ class Method(ABC):
     def of_prepared(self, tracks: Tracks, cameras: Tensor | None, begin: float) -> Reconstruction:
         """Reconstruct tracks that are :meth:`prepared`, as a call does that began at ``begin`` (``perf_counter``)."""
         with apart([tracks], self.differentiates):
-            inner, size, known = self._normalised(tracks)
+            inner, size, _ = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
-        return self._finished(tracks, found, size, known, time.perf_counter() - begin)
+        return self._finished([tracks], [found], [size], time.perf_counter() - begin)[0]
 
     def many(self, tracks: Sequence[Tracks]) -> list[Reconstruction]:
         """Reconstruct several clips, of one length or many: together where the method can, else one by one.
@@ -146,28 +148,26 @@ class Method(ABC):
         if len(found) != len(tracks):
             raise ShapeError(f"{self.name}: solve_all: expected {counted(len(tracks), 'estimate')}, got {len(found)}")
         each = (time.perf_counter() - begin) / max(len(tracks), 1)
-        rows = zip(tracks, found, parts, strict=True)
-        return [self._finished(one, estimate, size, known, each) for one, estimate, (_, size, known) in rows]
+        return self._finished(tracks, found, [size for _, size, _ in parts], each)
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
         """Reconstruct normalised tracks of several clips; one by one unless a method knows better."""
         return [self.solve(one, None) for one in tracks]
 
-    def _finished(self, tracks: Tracks, found: Estimate, size: Tensor, known: Tensor, seconds: float) -> Reconstruction:
-        """What :func:`finish` makes of an estimate, on the processor: its many small steps would hold up a GPU."""
-        device = tracks.points.device
-        found = checked_estimate(found, tracks, self.name or type(self).__name__)
-        if device.type == "cpu":
-            with apart([tracks], self.differentiates):
-                result = finish(self, tracks, found, size, known, seconds)
-        else:
-            here = tracks.to("cpu")
-            with apart([here], self.differentiates):
-                result = finish(self, here, found.to(here.points), size.cpu(), known.cpu(), seconds)
-                result = result.moved(lambda x: x.to(device), tracks)
-        result = plain(result, keep=tracks)
-        self.warn(result)
-        return result
+    def _finished(
+        self, tracks: Sequence[Tracks], found: Sequence[Estimate], sizes: Sequence[Tensor], seconds: float
+    ) -> list[Reconstruction]:
+        """What :func:`finish` makes of estimates, on the processor: its many small steps would hold up a GPU."""
+        results: dict[int, Reconstruction] = {}
+        for batch in batches(tracks, most=FRAMES):
+            some = [tracks[i] for i in batch]
+            sound = checked_estimates([found[i] for i in batch], some, self.name or type(self).__name__)
+            with apart(some, self.differentiates, "cpu"):
+                told = finish(self, some, sound, [sizes[i] for i in batch], seconds)
+            results |= zip(batch, (plain(one, keep=one.tracks) for one in told), strict=True)
+        for i in range(len(tracks)):
+            self.warn(results[i])
+        return [results[i] for i in range(len(tracks))]
 
     def _mended(self, tracks: Tracks) -> Tracks:
         """:meth:`prepared`, plain if they are other tracks than those given."""
@@ -226,12 +226,12 @@ class Method(ABC):
 
 
 @contextlib.contextmanager
-def apart(tracks: Sequence[Tracks], differentiates: bool = True) -> Iterator[None]:
-    """Leave the caller's autograd, inference mode and autocast alone; make on the tracks' device what is made anew.
+def apart(tracks: Sequence[Tracks], differentiates: bool = True, device: str | None = None) -> Iterator[None]:
+    """Leave the caller's autograd, inference mode and autocast alone; make on a device, or the tracks', what is new.
 
     What is not differentiated in between runs in inference mode, see :func:`kcs_torch.functional.inference.plain`.
     """
-    devices = {one.points.device for one in tracks}
+    devices = {one.points.device for one in tracks} if device is None else {torch.device(device)}
     with torch.inference_mode(not differentiates), torch.no_grad(), contextlib.ExitStack() as precision:
         for kind in {device.type for device in devices}:
             precision.enter_context(torch.autocast(kind, enabled=False))
@@ -256,14 +256,27 @@ def check_tracks(tracks: Any, what: str) -> None:
         )
 
 
-def checked_estimate(found: Any, tracks: Tracks, name: str) -> Estimate:
+def checked_estimates(found: Sequence[Any], tracks: Sequence[Tracks], name: str) -> list[Estimate]:
     """What a method found, which may be the user's own, as the tracks are: on their device and in their dtype.
 
+    The numbers of all are looked at together; only where some are wrong one by one, as frames are counted by clip.
+
     Raises:
-        OptionError: it is no :class:`Estimate`.
+        OptionError: one is no :class:`Estimate`.
         ShapeError: a part of it has another shape, or values that it cannot have.
         NotFiniteError: a part of it holds NaN or infinity.
     """
+    every = [_with_parts(one, clip, name) for one, clip in zip(found, tracks, strict=True)]
+    with contextlib.suppress(KcsError):
+        _check_numbers(every, name)
+        return every
+    for one in every:
+        _check_numbers([one], name)
+    return every
+
+
+def _with_parts(found: Any, tracks: Tracks, name: str) -> Estimate:
+    """The estimate in the tracks' dtype and on their device, if its parts have the right shapes."""
     if not isinstance(found, Estimate):
         raise OptionError(f"{name}: solve: expected an Estimate, got {type(found).__name__}")
     frames, joints = tracks.num_frames, tracks.num_joints
@@ -275,16 +288,23 @@ def checked_estimate(found: Any, tracks: Tracks, name: str) -> Estimate:
         if not isinstance(value, Tensor) or value.shape != shape:
             got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
             raise ShapeError(f"{name}: solve: {part}: expected a tensor {shape}, got {got}")
-        if not bool(value.isfinite().all()):
-            frame = int((~value.isfinite()).nonzero()[0, 0])
+    return found.to(tracks.points)
+
+
+def _check_numbers(found: Sequence[Estimate], name: str) -> None:
+    """Raise unless all numbers of estimates of one skeleton can be what they are; frames are counted through."""
+    for part in ("points", "cameras", "scales", "deviation"):
+        values = [value for one in found if (value := getattr(one, part)) is not None]
+        if values and not bool((finite := torch.cat(values).isfinite()).all()):
+            frame = int((~finite).nonzero()[0, 0])
             raise NotFiniteError(
                 f"{name}: solve: {part}: expected finite numbers, got NaN or infinity in frame {frame}"
             )
-    check_cameras(found.cameras, frames, f"{name}: solve: cameras")
-    if bool((found.scales < 0).any()):  # a body that is a point in a frame has none
-        frame = int(found.scales.argmin())
-        raise ShapeError(f"{name}: solve: scales: expected numbers >= 0, got {found.scales[frame]:g} in frame {frame}")
-    return found.to(tracks.points)
+    cameras, scales = (torch.cat([getattr(one, part) for one in found]) for part in ("cameras", "scales"))
+    check_cameras(cameras, len(cameras), f"{name}: solve: cameras")
+    if bool((scales < 0).any()):  # a body that is a point in a frame has none
+        frame = int(scales.argmin())
+        raise ShapeError(f"{name}: solve: scales: expected numbers >= 0, got {scales[frame]:g} in frame {frame}")
 
 
 def check_cameras(cameras: Tensor, frames: int, what: str = "cameras") -> Tensor:

@@ -12,6 +12,7 @@ from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.guarded import largest, or_one, safe_root
 from kcs_torch.functional.precision import narrow, wide
+from kcs_torch.functional.ranks import median
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.weights import known
 from kcs_torch.nn.checks import check_beside, check_lengths, check_points, check_positive, check_tensor, check_weights
@@ -19,7 +20,16 @@ from kcs_torch.nn.layers import SkeletonModule
 from kcs_torch.nn.masks import bone_share
 from kcs_torch.skeleton import Skeleton
 
-__all__ = ["LEAST", "ForeshorteningEnergy", "ProportionEnergy", "foreshortening", "free_bones", "oddity", "usual_size"]
+__all__ = [
+    "LEAST",
+    "ForeshorteningEnergy",
+    "ProportionEnergy",
+    "foreshortening",
+    "free_bones",
+    "oddities",
+    "oddity",
+    "usual_size",
+]
 
 LIMB_SPREAD = 26.0
 """Bones that stray from the template by more than this, in degrees, are of the limbs."""
@@ -222,6 +232,13 @@ def oddity(lengths: Tensor, usual: Tensor) -> float:
 
     0 where no usual length is known, which is then 0.
     """
+    return float(oddities(lengths, usual))
+
+
+def oddities(lengths: Tensor, usual: Tensor) -> Tensor:
+    """:func:`oddity` of each body, (...), of lengths (..., B)."""
     known = usual > 0
-    log = (lengths[known].clamp_min(torch.finfo(lengths.dtype).tiny) / usual[known]).log()
-    return float((log - log.median()).square().mean().sqrt()) if len(log) else 0.0
+    log = (lengths[..., known].clamp_min(torch.finfo(lengths.dtype).tiny) / usual[known]).log()
+    if not log.shape[-1]:
+        return lengths.new_zeros(lengths.shape[:-1])
+    return (log - median(log, -1, keepdim=True)).square().mean(-1).sqrt()

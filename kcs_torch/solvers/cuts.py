@@ -53,7 +53,7 @@ def find_cuts(points: Tensor, seen: Tensor, pairs: Tensor, *, leaps: bool = True
 
 def cut_frames(points: Tensor, seen: Tensor, pairs: Tensor, *, leaps: bool = True) -> Tensor:
     """:func:`find_cuts` in each of K clips (K, T, N, 2), in which padding is unseen: (K, T), True at cuts."""
-    clips, frames, joints = seen.shape
+    joints = seen.shape[2]
     shown = 2 * seen.sum(-1) >= joints
     none = torch.zeros_like(shown)
     count = shown.sum(1, keepdim=True)
@@ -61,7 +61,7 @@ def cut_frames(points: Tensor, seen: Tensor, pairs: Tensor, *, leaps: bool = Tru
         return none
     time = (~shown).byte().argsort(dim=1, stable=True)[:, : int(count.max())]  # the frames that are shown, then others
     step = torch.arange(1, time.shape[1], device=points.device)
-    at = lambda values: values[torch.arange(clips, device=points.device)[:, None], time]  # noqa: E731
+    at = lambda values: values[torch.arange(len(seen), device=points.device)[:, None], time]  # noqa: E731
     held = torch.where((seen & shown[..., None])[..., None], points, torch.nan)
     whole = held if bool(seen.all()) else interpolate(points, seen)  # of those seen in a frame the middle would leap
     whole = at(torch.where((shown[..., None] & seen.any(1, keepdim=True))[..., None], whole, torch.nan))
@@ -100,7 +100,7 @@ def _sudden(steps: Tensor, least: float) -> Tensor:
 
 
 def _moved(before: Tensor, after: Tensor) -> Tensor:
-    """How far the middle one of the joints moves against all, (...), by poses (..., N, 2); NaN where few are in both."""
+    """How far the middle joint moves against all, (...), from pose to pose (..., N, 2); NaN where few are in both."""
     way = after - before
     enough = (~way.isnan().any(-1)).sum(-1) >= JOINTS
     return torch.where(enough, nanmedian((way - nanmedian(way, -2, keepdim=True)).norm(dim=-1), -1), torch.nan)

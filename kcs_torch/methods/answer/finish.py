@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcs_torch.clean.timing import cuts_of
+from kcs_torch.clean.timing import cuts_of_all
 from kcs_torch.errors import counted
 from kcs_torch.functional.align import centre
 from kcs_torch.functional.camera import viewpoint_turn
 from kcs_torch.functional.chain import bone_lengths
-from kcs_torch.functional.ranks import median
+from kcs_torch.functional.guarded import largest, or_one
+from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.functional.weights import rms
 from kcs_torch.methods.answer.root import root_depth
 from kcs_torch.methods.answer.wrong import LOOSE, what_is_wrong
+from kcs_torch.methods.clips.batches import FRAMES, Clips, padded
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Diagnostics, Reconstruction, Tracks
-from kcs_torch.types.upright import how_it_stands
-from kcs_torch.types.variation import bone_variation
+from kcs_torch.types.upright import how_they_stand
+from kcs_torch.types.variation import BoneVariation, bone_variations
 
 if TYPE_CHECKING:
     from kcs_torch.methods.base import Method
@@ -93,33 +97,48 @@ class Estimate:
         return replace(self, **held, alternatives=tuple(other.to(like) for other in self.alternatives))  # type: ignore[arg-type]
 
 
+class _Told(NamedTuple):
+    """What is told of a solution, whose points (T, N, 3) are in the tracks' units and place."""
+
+    points: Tensor
+    lengths: Tensor
+    turn: float
+    off: float
+    variation: BoneVariation
+    wrong: list[str]
+
+
 def finish(
-    method: Method, tracks: Tracks, found: Estimate, size: Tensor, known: Tensor, seconds: float
-) -> Reconstruction:
-    """Bring an estimate to the tracks' units and place, and say what there is to say about it.
+    method: Method, tracks: Sequence[Tracks], found: Sequence[Estimate], sizes: Sequence[Tensor], seconds: float
+) -> list[Reconstruction]:
+    """Bring estimates to their tracks' units and place, and say what there is to say about them.
+
+    All is told on the processor, of as many solutions together as its cache holds.
 
     Args:
-        method: that found it.
-        tracks: it was found in.
-        found: in normalised units.
-        size: that the tracks were divided by.
-        known: (T,) frames that show something.
-        seconds: that it took.
+        method: that found them.
+        tracks: clips of one skeleton, dtype and device.
+        found: in each, in normalised units.
+        sizes: that each clip's tracks were divided by.
+        seconds: that each took.
     """
-    every = [found, *found.alternatives]
-    placed = [_placed(tracks, one, size, known) for one in every]
-    still, roots, remark = [i for i, one in enumerate(every) if one.still], None, ""
-    pointlike = not bool(extent(tracks) > 0)
-    if still and not pointlike and tracks.num_frames > 1:
-        roots, remark = root_depth(torch.stack([placed[i][0] for i in still]), tracks, found.standing)
-    paths = {} if roots is None else dict(zip(still, roots, strict=True))
-    results = [
-        _reconstruction(
-            method, tracks, one, size, seconds, *where, pointlike, paths.get(i), remark if one.still else ""
-        )
-        for i, (one, where) in enumerate(zip(every, placed, strict=True))
-    ]
-    return replace(results[0], alternatives=tuple(results[1:]))
+    clips, body = Clips.of(tracks).to("cpu"), tracks[0].skeleton
+    views, flat = _notes_on_view(clips, body), (~(extent(clips) > 0)).tolist()
+    every = [(k, one) for k, first in enumerate(found) for one in (first, *first.alternatives)]
+    few = max(1, FRAMES // max(clips.counts))
+    results: list[list[Reconstruction]] = [[] for _ in tracks]
+    for some in (every[begin : begin + few] for begin in range(0, len(every), few)):
+        of = [k for k, _ in some]
+        shown = clips if of == list(range(len(tracks))) else clips.take(torch.tensor(of))
+        told = _told(method, body, shown, [one for _, one in some], torch.stack([sizes[k] for k in of]))
+        for (k, one), facts in zip(some, told, strict=True):
+            notes = _notes_on_solution(method, tracks[k], one, facts)
+            notes += [*views[k], *facts.wrong, *_notes_on_tracks(method, tracks[k], flat[k])]
+            results[k].append(_reconstruction(method, tracks[k], one, sizes[k], seconds, facts, notes))
+    for k, first in enumerate(found):
+        if not flat[k] and tracks[k].num_frames > 1:
+            results[k] = _with_roots(results[k], tracks[k], first)
+    return [replace(own[0], alternatives=tuple(own[1:])) if own[1:] else own[0] for own in results]
 
 
 def little_turn(method: Method, tracks: Tracks, turn: float) -> str:
@@ -153,14 +172,51 @@ def _rest(method: Method, body: Skeleton) -> str:
     return "constant lengths alone" if body.rigid and method.keeps_lengths else "nothing"
 
 
-def _placed(tracks: Tracks, found: Estimate, size: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (T, N, 3) in the tracks' units and place, and their images (T, N, 2)."""
-    points = found.points * size
-    seen = points[..., :2] * found.scales[:, None, None]
-    shift = _shift(tracks.points - seen, tracks.weights)
+def _told(method: Method, body: Skeleton, clips: Clips, found: Sequence[Estimate], size: Tensor) -> list[_Told]:
+    """What is told of a solution of each of K clips, whose unit has a size (K,) in the tracks' units."""
+    like, bones = clips.points, body.bone_index()
+    given = (padded([getattr(one, name) for one in found]).to(like.device) for name in ("points", "scales", "cameras"))
+    relative, scales, cameras = given
+    points, images = _placed(clips, relative * size.to(like.device)[:, None, None, None], scales)
+    lengths = clips.fill(bone_lengths(points, bones), math.nan)
+    wrong = what_is_wrong(method, body, clips, points, images, [one.converged for one in found], lengths)
+    variations = bone_variations(lengths, body, clips.seen.any(1))
+    turns, off = viewpoint_turn(cameras, clips.inside), rms(images - clips.points, clips.seen.to(like), 2)
+    device = size.device
+    own = [one.clone() for one in clips.cut(points.to(device))]  # a part of the batch would keep all of it
+    usual = [one.clone() for one in nanmedian(lengths, 1).to(device)]
+    return [_Told(*row) for row in zip(own, usual, turns.tolist(), off.tolist(), variations, wrong, strict=True)]
+
+
+def _placed(clips: Clips, points: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (K, T, N, 3) of scales (K, T) in their tracks' place, 0 in the padding; and their images (K, T, N, 2)."""
+    images = points[..., :2] * scales[..., None, None]
+    shift = _shift(clips.points - images, clips.weights)
+    known = clips.seen.any(-1)
     if not bool(known.all()):
-        shift = interpolate(shift, known[:, None])
-    return points + torch.nn.functional.pad(shift, (0, 1)), seen + shift
+        shift = clips.fill(interpolate(shift, known[..., None]), 0.0)
+    return points + torch.nn.functional.pad(shift, (0, 1)), images + shift
+
+
+def _with_roots(results: Sequence[Reconstruction], tracks: Tracks, found: Estimate) -> list[Reconstruction]:
+    """Solutions of a clip with the root's path in depth, those before a camera that may be taken to stand still."""
+    still = [one.still for one in (found, *found.alternatives)]
+    if not any(still):
+        return list(results)
+    points = torch.stack([one.points for one, stands in zip(results, still, strict=True) if stands])
+    standing = None if found.standing is None else found.standing.to("cpu")
+    roots, remark = root_depth(points.to("cpu"), tracks.to("cpu"), standing)
+    paths = itertools.repeat(None) if roots is None else iter(roots.to(points.device))
+    return [
+        replace(
+            one,
+            root_depth=next(paths),
+            diagnostics=replace(one.diagnostics, notes=(*one.diagnostics.notes, remark)),
+        )
+        if stands
+        else one
+        for one, stands in zip(results, still, strict=True)
+    ]
 
 
 def _reconstruction(
@@ -169,66 +225,40 @@ def _reconstruction(
     found: Estimate,
     size: Tensor,
     seconds: float,
-    points: Tensor,
-    seen: Tensor,
-    pointlike: bool,
-    root: Tensor | None,
-    remark: str,
+    told: _Told,
+    notes: Sequence[str],
 ) -> Reconstruction:
-    """One solution, whose place is known.
-
-    Args:
-        method: that found it.
-        tracks: it was found in.
-        found: in normalised units.
-        size: of a unit of these in the tracks' units.
-        seconds: that it took.
-        points: (T, N, 3) in the tracks' units and place.
-        seen: (T, N, 2) their images.
-        pointlike: whether all joints lie at one point in every frame.
-        root: (T,) the root's path in depth, or None.
-        remark: on that path, for the user; may be empty.
-    """
-    body = tracks.skeleton
-    bones = bone_lengths(points, body.bone_index(device=points.device))
-    variation = bone_variation(bones, body, tracks.seen.any(0))
-    turn = float(viewpoint_turn(found.cameras))
-    notes = _notes_on_solution(method, tracks, found, turn, variation.median)
-    notes += what_is_wrong(method, points, seen, tracks, found.converged, lengths=bones)
-    notes += _notes_on_tracks(method, tracks, pointlike)
-    if remark:
-        notes.append(remark)
+    """One solution, of which everything is told but the root's path."""
     diagnostics = Diagnostics(
-        viewpoint_turn=turn,
+        viewpoint_turn=told.turn,
         unseen_share=tracks.unseen_share,
-        bone_variation=variation.median,
-        reprojection_rms=float(rms(seen - tracks.points, tracks.seen.to(points.dtype))),
+        bone_variation=told.variation.median,
+        reprojection_rms=told.off,
         converged=found.converged,
         iterations=found.iterations,
         seconds=seconds,
         notes=tuple(notes),
-        doubt=found.doubt or nothing_else(method, tracks, turn),
-        largest_bone_variation=variation.largest,
-        loosest_bone=variation.bone,
+        doubt=found.doubt or nothing_else(method, tracks, told.turn),
+        largest_bone_variation=told.variation.largest,
+        loosest_bone=told.variation.bone,
     )
     return Reconstruction(
-        points,
+        told.points,
         found.cameras,
         found.scales,
-        median(bones, 0),
+        told.lengths,
         tracks,
         method.name,
         diagnostics,
         uncertainty=None if found.deviation is None else _guessed(found.deviation, tracks) * size,
         objective=found.objective,
-        root_depth=root,
     )
 
 
-def _notes_on_solution(method: Method, tracks: Tracks, found: Estimate, turn: float, variation: float) -> list[str]:
-    """What is said of a solution: the viewpoint turns by so many degrees, and bones vary by so many per cent."""
-    notes = list(found.notes)
-    if little := little_turn(method, tracks, turn):
+def _notes_on_solution(method: Method, tracks: Tracks, found: Estimate, told: _Told) -> list[str]:
+    """What is said of a solution by itself."""
+    notes, variation = list(found.notes), told.variation.median
+    if little := little_turn(method, tracks, told.turn):
         notes.append(little)
     if found.doubt:
         notes.append(found.doubt)
@@ -236,11 +266,16 @@ def _notes_on_solution(method: Method, tracks: Tracks, found: Estimate, turn: fl
         notes.append(method.unsettled(found.iterations))
     if variation > LOOSE and not method.keeps_lengths:
         notes.append(f"bone lengths vary by {variation:.1f} %: '{method.name}' does not hold them constant")
-    if stands := how_it_stands(tracks.points, tracks.seen, tracks.skeleton):
-        notes.append(stands)
-    if cuts := cuts_of(tracks):
-        places = ", ".join(map(str, cuts[:SHOWN])) + (f" and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else "")
-        notes.append(f"the view jumps at frame {places}, {BY_SHOTS}")
+    return notes
+
+
+def _notes_on_view(clips: Clips, body: Skeleton) -> list[list[str]]:
+    """What is said of how each clip's body stands, and of cuts."""
+    notes = [[words] if words else [] for words in how_they_stand(clips.points, clips.seen, body, clips.counts)]
+    for own, cuts in zip(notes, cuts_of_all(clips.points, clips.seen, body), strict=True):
+        if cuts:
+            more = f" and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else ""
+            own.append(f"the view jumps at frame {', '.join(map(str, cuts[:SHOWN]))}{more}, {BY_SHOTS}")
     return notes
 
 
@@ -265,23 +300,22 @@ def _guessed(deviation: Tensor, tracks: Tracks) -> Tensor:
 
 
 def _shift(residuals: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean over joints, (T, 1, D), joints that are far from it counting less; 0 where no joint is seen."""
+    """Weighted mean over joints, (K, T, 1, D), those far from it counting less; 0 where no joint is seen."""
     middle = centre(residuals, weights)[1]
     for _ in range(FAR_STEPS):
         off = (residuals - middle).abs()
-        far = (off / off.amax().clamp_min(torch.finfo(off.dtype).tiny)).norm(dim=-1)  # no square overflows
-        usual = far[weights > 0].median() if bool((weights > 0).any()) else far.sum()
-        if not bool(usual > 0):
-            break
-        middle = centre(residuals, weights / (1 + (far / (3 * usual)).square()))[1]
+        far = (off / largest(off, 3).clamp_min(torch.finfo(off.dtype).tiny)).norm(dim=-1)  # no square overflows
+        usual = nanmedian(torch.where(weights > 0, far, torch.nan).flatten(1), 1)[:, None, None]
+        nearer = centre(residuals, weights / (1 + (far / (3 * or_one(usual))).square()))[1]
+        middle = torch.where(usual[..., None] > 0, nearer, middle)
     return middle
 
 
-def extent(tracks: Tracks) -> Tensor:
-    """How far seen joints lie apart, at most, in a frame; 0 where it is rounding."""
+def extent(tracks: Tracks | Clips) -> Tensor:
+    """How far seen joints lie apart, at most, in a frame; 0 where it is rounding. Of each clip, if there are some."""
     seen = tracks.seen[..., None]
     far = torch.full_like(tracks.points, math.inf)
-    low = torch.where(seen, tracks.points, far).amin(1)
-    apart = torch.where(seen, tracks.points, -far).amax(1) - low
+    low = torch.where(seen, tracks.points, far).amin(-2)
+    apart = torch.where(seen, tracks.points, -far).amax(-2) - low
     apart = torch.where(apart > 8 * torch.finfo(apart.dtype).eps * low.abs(), apart, torch.zeros_like(apart))
-    return apart.amax() if apart.numel() else apart.sum()
+    return largest(apart, 2).squeeze((-2, -1))

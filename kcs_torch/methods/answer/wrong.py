@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,13 +12,13 @@ from torch import Tensor
 from kcs_torch.errors import counted
 from kcs_torch.functional.align import centre
 from kcs_torch.functional.chain import bone_lengths
-from kcs_torch.functional.ranks import median, nanmedian
+from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.weights import rms
+from kcs_torch.methods.clips.batches import Clips
 from kcs_torch.methods.clips.template import guessed
-from kcs_torch.nn.lengths import oddity
+from kcs_torch.nn.lengths import oddities
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types import Tracks
-from kcs_torch.types.variation import bone_shares
+from kcs_torch.types.variation import bone_shares, ever_seen
 
 if TYPE_CHECKING:
     from kcs_torch.methods.base import Method
@@ -56,91 +56,114 @@ WHY_LOOSE = (
 
 
 def what_is_wrong(
-    method: Method, points: Tensor, images: Tensor, tracks: Tracks, settled: bool, lengths: Tensor | None = None
-) -> list[str]:
-    """What about points (T, N, 3) and their images (T, N, 2) tells that they are not the body's, and why that may be.
+    method: Method,
+    body: Skeleton,
+    clips: Clips,
+    points: Tensor,
+    images: Tensor,
+    settled: Sequence[bool],
+    lengths: Tensor | None = None,
+) -> list[list[str]]:
+    """What tells that points are not their clips' bodies, and why that may be, for each of K clips.
 
     Lengths that vary are no news of a solution that did not settle, and none of bones whose ends the tracks never show;
     a body unlike any is why it does not settle.
+
+    Args:
+        method: that found them.
+        body: the skeleton.
+        clips: the tracks.
+        points: (K, T, N, 3), 0 in the padding.
+        images: (K, T, N, 2) of these.
+        settled: whether the method's stopping rule was met.
+        lengths: (K, T, B) of the bones, NaN in the padding; found from the points if None.
     """
-    body = tracks.skeleton
-    told = [loose_bones(points, body, lengths, tracks.seen.any(0)) if method.keeps_lengths and settled else ""]
-    told.append(odd_body(points, body, lengths) if method.knows_template(body) else "")
-    told.append(far_joints(images, tracks) if method.keeps_lengths else "")
-    return [f"{sentence}: {WHY_LOOSE}" for sentence in told if sentence]
+    if lengths is None:
+        lengths = clips.fill(bone_lengths(points, body.bone_index(device=points.device)), math.nan)
+    none = [""] * len(settled)
+    loose = _loose_bones(points, body, lengths, clips) if method.keeps_lengths and any(settled) else none
+    loose = [words if sure else "" for words, sure in zip(loose, settled, strict=True)]
+    odd = _odd_bodies(points, body, lengths) if method.knows_template(body) else none
+    far = _far_joints(images, body, clips) if method.keeps_lengths else none
+    return [[f"{words}: {WHY_LOOSE}" for words in told if words] for told in zip(loose, odd, far, strict=True)]
 
 
-def far_joints(images: Tensor, tracks: Tracks) -> str:
-    """Which joints' images (T, N, 2) are away from their tracks in most frames, or most joints' in which frames.
+def _far_joints(images: Tensor, body: Skeleton, clips: Clips) -> list[str]:
+    """Which joints' images (K, T, N, 2) are away from their tracks in most frames, or most joints' in which frames.
 
-    A sentence for the user; empty where none is.
+    A sentence of each clip for the user; empty where none is.
     """
-    seen = tracks.seen
-    joints = (seen.to(images.dtype).mean(0) >= OFTEN).nonzero().flatten().tolist() if len(seen) else []
-    size = float(rms(centre(tracks.points, tracks.weights)[0], seen.to(images.dtype))) if joints else 0.0
-    if not size > 0:
-        return ""
-    away = torch.where(seen, ((images - tracks.points) / size).norm(dim=-1), torch.nan)[:, joints]
-    off = nanmedian(away, 0)
-    found = (off > AWAY).nonzero().flatten()
-    named = [f"{tracks.skeleton.joints[joints[i]]} by {100 * float(off[i]):.0f} %" for i in found.tolist()]
-    if named:
-        by = _the_worst(named, off[found])
-        return f"joints are away from their tracks in most frames that show them, {by} of the body's size"
-    off = nanmedian(away, 1)
-    frames = (off > AWAY).nonzero().flatten()
-    if len(frames) < OFTEN * len(seen):
-        return ""
-    return (
-        f"in {len(frames)} of {counted(len(seen), 'frame')}, from frame {int(frames[0])} on, most joints are away from "
-        f"their tracks, by up to {100 * float(off[frames].amax()):.0f} % of the body's size"
-    )
+    seen, told = clips.seen, [""] * len(images)
+    share = seen.to(images.dtype)
+    size = rms(centre(clips.points, clips.weights)[0], share, 2)[:, None, None]
+    some = seen & (clips.mean(share) >= OFTEN)[:, None] & (size > 0)
+    away = torch.where(some, ((images - clips.points) / size[..., None]).norm(dim=-1), torch.nan)
+    for k in (away > AWAY).any(2).any(1).nonzero().flatten().tolist():
+        count, off = clips.counts[k], nanmedian(away[k], 0).tolist()
+        named = {f"{joint} by {100 * by:.0f} %": by for joint, by in zip(body.joints, off, strict=True) if by > AWAY}
+        frames = {t: by for t, by in enumerate(nanmedian(away[k], 1).tolist()) if by > AWAY}
+        if named:
+            told[k] = (
+                f"joints are away from their tracks in most frames that show them, {_the_worst(named)} of the body's "
+                "size"
+            )
+        elif len(frames) >= OFTEN * count:
+            told[k] = (
+                f"in {len(frames)} of {counted(count, 'frame')}, from frame {min(frames)} on, most joints are away "
+                f"from their tracks, by up to {100 * max(frames.values()):.0f} % of the body's size"
+            )
+    return told
 
 
-def _the_worst(named: Sequence[str], by: Tensor, kind: str = "joint") -> str:
-    """The worst of what is ``named``, ``by`` (K,) so much, and how many more there are."""
-    shown, more = [named[i] for i in by.argsort(descending=True).tolist()], len(named) - NAMED
+def _the_worst(named: Mapping[str, float], kind: str = "joint") -> str:
+    """The worst of what is ``named``, and how many more there are."""
+    shown, more = sorted(named, key=lambda name: -named[name]), len(named) - NAMED
     return ", ".join(shown[:NAMED]) + (f" and {counted(more, f'more {kind}')}" if more > 0 else "")
 
 
-def loose_bones(points: Tensor, body: Skeleton, lengths: Tensor | None = None, seen: Tensor | None = None) -> str:
-    """Which rigid bones of points (T, N, 3), of lengths (T, B), change theirs, for the user; empty where none does.
-
-    Only bones between joints that are ``seen`` (N,) count.
-    """
-    ever = [True] * body.num_joints if seen is None else seen.tolist()
-    rigid = [b for b in body.rigid if all(ever[joint] for joint in body.bones[b])]
-    if not rigid or not len(points):
-        return ""
-    bones = (bone_lengths(points, body.bone_index(device=points.device)) if lengths is None else lengths)[:, rigid]
-    spread, share = bones.std(0, correction=0), 100 * bone_shares(bones)
-    if float(share.median()) > LOOSE:
-        return f"bone lengths vary by {float(share.median()):.1f} %"
-    if not body.is_tree:  # links between markers, say, of which some bend
-        return ""
-    size = (points - points.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()
-    found = ((share > LOOSE) & (100 * spread > PART * size)).nonzero().flatten().tolist()
-    if not found:
-        return ""
-    named = [f"{body.bone_names[rigid[b]]} by {float(share[b]):.0f} %" for b in found]
-    return f"lengths of rigid bones vary: {_the_worst(named, share[found], 'bone')}"
+def loose_bones(points: Tensor, body: Skeleton) -> str:
+    """Which rigid bones of points (T, N, 3) change their length, for the user; empty where none does."""
+    lengths = bone_lengths(points, body.bone_index(device=points.device))
+    return _loose_bones(points[None], body, lengths[None])[0]
 
 
-def odd_body(points: Tensor, body: Skeleton, lengths: Tensor | None = None) -> str:
-    """How points (T, N, 3) are unlike any body of the skeleton, for the user; empty where they are not."""
-    usual = body.relative_lengths(dtype=points.dtype, device=points.device)
+def _loose_bones(points: Tensor, body: Skeleton, lengths: Tensor, clips: Clips | None = None) -> list[str]:
+    """:func:`loose_bones` of points (K, T, N, 3); only bones between joints that the clips show count, all if None."""
+    told = [""] * len(points)
+    shares = 100 * bone_shares(lengths)
+    if clips is not None:
+        shares = torch.where(ever_seen(clips.seen.any(1), body), shares, torch.nan)
+    for k in (shares[:, list(body.rigid)] > LOOSE).any(1).nonzero().flatten().tolist():
+        bones = [b for b in body.rigid if not bool(shares[k, b].isnan())]
+        share, own = shares[k, bones], points[k] if clips is None else points[k, : clips.counts[k]]
+        usual = float(share.median())
+        if usual > LOOSE:
+            told[k] = f"bone lengths vary by {usual:.1f} %"
+        elif body.is_tree:  # of links between markers, say, some bend
+            size = (own - own.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()
+            spread = lengths[k, : len(own), bones].std(0, correction=0)
+            found = ((share > LOOSE) & (100 * spread > PART * size)).nonzero().flatten().tolist()
+            named = {f"{body.bone_names[bones[b]]} by {float(share[b]):.0f} %": float(share[b]) for b in found}
+            told[k] = f"lengths of rigid bones vary: {_the_worst(named, 'bone')}" if named else ""
+    return told
+
+
+def _odd_bodies(points: Tensor, body: Skeleton, lengths: Tensor) -> list[str]:
+    """How points (K, T, N, 3) are unlike any body of the skeleton, for the user; empty where they are not."""
+    usual, told = body.relative_lengths(dtype=points.dtype, device=points.device), [""] * len(points)
     rigid = list(body.rigid)
-    if usual is None or not rigid or not len(points):
-        return ""
-    own = median(bone_lengths(points, body.bone_index(device=points.device)) if lengths is None else lengths, 0)
-    odd = oddity(own[rigid], usual[rigid])
-    middle = points - points.mean(1, keepdim=True)
-    wide, far = float(middle[..., :2].norm()), float(middle[..., 2].norm())
-    deep = far > DEEP * wide
-    if odd <= ODD or not (deep or (odd > OTHER and not guessed(body))) or wide <= POINT * far:
-        return ""  # a point in the image shows no body
-    also = f", and it is {far / wide:.1f} times as deep as it is large in the image" if deep else ""
-    return (
-        f"this is hardly a body of skeleton '{body.name}': bones are {math.exp(odd):.1f} times as long or as short as "
-        f"usual{also}"
-    )
+    if usual is None or not rigid:
+        return told
+    every = oddities(nanmedian(lengths, 1)[:, rigid], usual[rigid]).tolist()
+    for k in (k for k, odd in enumerate(every) if odd > ODD):
+        middle = points[k] - points[k].mean(1, keepdim=True)
+        wide, far = float(middle[..., :2].norm()), float(middle[..., 2].norm())
+        deep = far > DEEP * wide
+        if not (deep or (every[k] > OTHER and not guessed(body))) or wide <= POINT * far:
+            continue  # a point in the image shows no body
+        also = f", and it is {far / wide:.1f} times as deep as it is large in the image" if deep else ""
+        told[k] = (
+            f"this is hardly a body of skeleton '{body.name}': bones are {math.exp(every[k]):.1f} times as long or as "
+            f"short as usual{also}"
+        )
+    return told

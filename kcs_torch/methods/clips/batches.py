@@ -12,7 +12,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from kcs_torch.types import Tracks
 
-__all__ = ["SPREAD", "Clips", "in_batches"]
+__all__ = ["FRAMES", "SPREAD", "Clips", "batches", "in_batches", "padded"]
 
 FRAMES = 2048
 """Frames of a batch, padding included, on a processor: more would leave its cache."""
@@ -51,6 +51,22 @@ class Clips:
             return cls(points, weights, None, counts)
         time = torch.arange(max(counts), device=points.device)
         return cls(points, weights, time < torch.tensor(counts, device=points.device)[:, None], counts)
+
+    @property
+    def seen(self) -> Tensor:
+        """(K, T, N), True where a joint is seen."""
+        return self.weights > 0
+
+    def to(self, device: torch.device | str) -> Clips:
+        """The same on a device."""
+        inside = None if self.inside is None else self.inside.to(device)
+        return Clips(self.points.to(device), self.weights.to(device), inside, self.counts)
+
+    def fill(self, values: Tensor, padding: float) -> Tensor:
+        """Values (K, T, ...) with a number in the padding."""
+        if self.inside is None:
+            return values
+        return torch.where(self.inside.view(*self.inside.shape, *[1] * (values.ndim - 2)), values, padding)
 
     def take(self, index: Tensor) -> Clips:
         """Some of the clips, (k,) of their numbers."""
@@ -98,26 +114,39 @@ def in_batches(
     solve: Callable[[list[Tracks]], list[Found]],
     kind: Callable[[Tracks], Hashable] = lambda _: None,
 ) -> list[Found]:
-    """Solve clips in batches of one kind and of nearly one length; results in the order of the clips.
+    """Solve clips in :func:`batches`; results in the order of the clips.
 
     Args:
         tracks: of any skeletons and lengths.
         solve: takes clips of one skeleton, dtype, device and kind.
         kind: what else the clips of a batch share.
     """
+    found: dict[int, Found] = {}
+    for batch in batches(tracks, kind):
+        found |= zip(batch, solve([tracks[i] for i in batch]), strict=True)
+    return [found[i] for i in range(len(tracks))]
+
+
+def batches(
+    tracks: Sequence[Tracks], kind: Callable[[Tracks], Hashable] = lambda _: None, most: int | None = None
+) -> list[list[int]]:
+    """Clips, by their numbers, in batches of one skeleton, dtype, device and kind, and of nearly one length.
+
+    Args:
+        tracks: of any skeletons and lengths.
+        kind: what else the clips of a batch share.
+        most: frames of a batch at most, as many as their device has room for if None; a clip by itself may have more.
+    """
     order = sorted(range(len(tracks)), key=lambda i: tracks[i].num_frames)
     groups: dict[object, list[list[int]]] = {}
     for i in order:
         one = tracks[i]
-        batches = groups.setdefault((one.skeleton, one.points.dtype, one.points.device, kind(one)), [])
-        last = batches[-1] if batches else []
-        most = batch_frames(one.points.device)
-        fits = last and (len(last) + 1) * one.num_frames <= most
+        own = groups.setdefault((one.skeleton, one.points.dtype, one.points.device, kind(one)), [])
+        last = own[-1] if own else []
+        room = batch_frames(one.points.device) if most is None else most
+        fits = last and (len(last) + 1) * one.num_frames <= room
         if fits and one.num_frames <= SPREAD * tracks[last[0]].num_frames:
             last.append(i)
         else:
-            batches.append([i])
-    found: dict[int, Found] = {}
-    for batch in (b for batches in groups.values() for b in batches):
-        found |= zip(batch, solve([tracks[i] for i in batch]), strict=True)
-    return [found[i] for i in range(len(tracks))]
+            own.append([i])
+    return [batch for own in groups.values() for batch in own]

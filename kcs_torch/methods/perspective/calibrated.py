@@ -18,6 +18,7 @@ from kcs_torch.methods.answer.finish import HARDLY, SINGLE, little_turn, nothing
 from kcs_torch.methods.answer.root import ABSENT, FOUND, standing_feet
 from kcs_torch.methods.answer.wrong import WHY_LOOSE, what_is_wrong
 from kcs_torch.methods.base import Method, apart, check_cameras
+from kcs_torch.methods.clips.batches import Clips
 from kcs_torch.methods.perspective.parallel_image import body_unit
 from kcs_torch.methods.perspective.refining import Found, refine, refine_again, seen_along
 from kcs_torch.methods.perspective.scene import BLOCK, GAIN, Bodies, ahead
@@ -358,4 +359,5 @@ def _notes_on_solution(
         notes.append(method.unsettled(found.steps))
     if little := little_turn(method, tracks, turn):
         notes.append(little)
-    return [*notes, *what_is_wrong(method, points, images, tracks, settled)]
+    clips = Clips.of([tracks])
+    return [*notes, *what_is_wrong(method, tracks.skeleton, clips, points[None], images[None], [settled])[0]]
