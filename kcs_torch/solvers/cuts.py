@@ -70,19 +70,21 @@ def cut_frames(points: Tensor, seen: Tensor, pairs: Tensor, *, leaps: bool = Tru
     held = at(held)
     known = held - middle  # (K, S, N, 2)
     known = torch.where((_from_beside(known) > FAR * size[..., None])[..., None], torch.nan, known)
-    twins = torch.arange(joints, device=points.device)
-    twins[pairs[:, 0]], twins[pairs[:, 1]] = pairs[:, 1], pairs[:, 0]
+    gap, least = time.diff(dim=1), torch.minimum(size[:, 1:], size[:, :-1])
+    sized = lambda steps: (steps / least).nan_to_num(0.0, 0.0)  # noqa: E731  # 0 / 0: a point
     before, after = known[:, :-1], known[:, 1:]
-    own, swapped = _moved(before, after), _moved(before, after[:, :, twins])
-    way = torch.minimum(own, swapped.nan_to_num(torch.inf))
-    gap = time.diff(dim=1)
-    pace = nanmedian(held.diff(dim=1), 2).norm(dim=-1) / gap
-    lost = (_from_beside(middle) > LEAP * size[..., None])[..., 0]  # frames that are at a wrong place
-    least = torch.minimum(size[:, 1:], size[:, :-1])
-    way, pace = ((x / least).nan_to_num(0.0, 0.0) for x in (way, pace))  # 0 / 0: a point
-    jumps = _sudden(way, AWAY) & (gap == 1)
+    own = _moved(before, after)
+    jumps = sized(own) > AWAY
+    if bool(jumps.any()):
+        twins = torch.arange(joints, device=points.device)
+        twins[pairs[:, 0]], twins[pairs[:, 1]] = pairs[:, 1], pairs[:, 0]
+        swapped = _moved(before, after[:, :, twins])
+        jumps = _sudden(sized(torch.minimum(own, swapped.nan_to_num(torch.inf))), AWAY) & (gap == 1)
     if leaps:
-        jumps |= _sudden(pace, LEAP) & ~lost[:, 1:] & ~lost[:, :-1]
+        leap = _sudden(sized(nanmedian(held.diff(dim=1), 2).norm(dim=-1) / gap), LEAP)
+        if bool(leap.any()):
+            lost = (_from_beside(middle) > LEAP * size[..., None])[..., 0]  # frames that are at a wrong place
+            jumps |= leap & ~lost[:, 1:] & ~lost[:, :-1]
     jumps &= (step >= LEAST) & (step <= count - LEAST)
     return none.scatter(1, time[:, 1:], jumps)
 

@@ -68,11 +68,10 @@ def how_they_stand(points: Tensor, seen: Tensor, skeleton: Skeleton, counts: Seq
     far = aside > CLEARLY * size
     lies = far & (aside > FLAT * below)
     bends = far & (FLAT * aside > below)  # or leans: swapped axes put such a body's feet there, above it or below
-    kinds = [lies, bends & (right > 0), bends & (right < 0)]
-    shares = [_share(kind, shown & (size > 0)) for kind in kinds] + [_above(away, spread, shown)]
+    shares = _share(torch.stack([lies, bends & (right > 0), bends & (right < 0)]), shown & (size > 0))
+    often = (torch.cat([shares, _above(away, spread, shown)[None]]) > NEARLY_ALL).T.tolist()
     said = []
-    for count, often in zip(counts, (torch.stack(shares, -1) > NEARLY_ALL).tolist(), strict=True):
-        down, to_right, to_left, above = often
+    for count, (down, to_right, to_left, above) in zip(counts, often, strict=True):
         words = _LYING if down else (_ASIDE if to_right or to_left else _HEADSTAND) if above else ""
         said.append(words.format(often=" in nearly all frames" if count > 1 else ""))
     return said
