@@ -129,7 +129,7 @@ def finish(
     results: list[list[Reconstruction]] = [[] for _ in tracks]
     for some in (every[begin : begin + few] for begin in range(0, len(every), few)):
         of = [k for k, _ in some]
-        shown = clips if of == list(range(len(tracks))) else clips.take(torch.tensor(of))
+        shown = clips if of == list(range(len(tracks))) else Clips.of([tracks[k] for k in of]).to("cpu")
         told = _told(method, body, shown, [one for _, one in some], torch.stack([sizes[k] for k in of]))
         for (k, one), facts in zip(some, told, strict=True):
             notes = _notes_on_solution(method, tracks[k], one, facts)
