@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -200,23 +199,18 @@ def _placed(clips: Clips, points: Tensor, scales: Tensor) -> tuple[Tensor, Tenso
 
 def _with_roots(results: Sequence[Reconstruction], tracks: Tracks, found: Estimate) -> list[Reconstruction]:
     """Solutions of a clip with the root's path in depth, those before a camera that may be taken to stand still."""
-    still = [one.still for one in (found, *found.alternatives)]
-    if not any(still):
+    still = [i for i, one in enumerate((found, *found.alternatives)) if one.still]
+    if not still:
         return list(results)
-    points = torch.stack([one.points for one, stands in zip(results, still, strict=True) if stands])
-    standing = None if found.standing is None else found.standing.to("cpu")
+    points, standing = torch.stack([results[i].points for i in still]), found.standing
+    standing = None if standing is None else standing.to("cpu")
     roots, remark = root_depth(points.to("cpu"), tracks.to("cpu"), standing)
-    paths = itertools.repeat(None) if roots is None else iter(roots.to(points.device))
-    return [
-        replace(
-            one,
-            root_depth=next(paths),
-            diagnostics=replace(one.diagnostics, notes=(*one.diagnostics.notes, remark)),
-        )
-        if stands
-        else one
-        for one, stands in zip(results, still, strict=True)
-    ]
+    paths = [None] * len(still) if roots is None else roots.to(points.device)
+    told = list(results)
+    for i, path in zip(still, paths, strict=True):
+        facts = told[i].diagnostics
+        told[i] = replace(told[i], root_depth=path, diagnostics=replace(facts, notes=(*facts.notes, remark)))
+    return told
 
 
 def _reconstruction(
