@@ -15,6 +15,7 @@ from kcs_torch.functional import interpolate
 from kcs_torch.solvers import complete_tracks, denoise_tracks
 from kcs_torch.solvers.denoise import _Model
 from kcs_torch.solvers.spectrum import spectrum_floor, temporal_modes
+from kcs_torch.solvers.stray import in_motion
 
 
 def walk(frames=90, **fields):
@@ -299,6 +300,19 @@ def test_frames_that_were_left_out_make_no_leap():
     weights = torch.ones(40, 8)
     assert bool(denoise_tracks(tracks, weights).outliers.any())
     assert not bool(denoise_tracks(tracks, weights, time=time).outliers.any())
+
+
+def test_where_a_joint_may_be_in_motion():
+    """As far from the middle line as others, and half as much more; not where one line leads alone, as at an end."""
+    at = torch.tensor([0.0, 0, 0, 1, 3, 6, 10, 15, 21], dtype=torch.float64)
+    places = torch.stack([at, 0 * at], -1)[None, :, None]
+    seen = torch.ones(1, 9, 1) > 0
+    assert in_motion(places, seen)[0, :, 0].tolist() == [True] * 8 + [False]  # one line says nothing of others
+    places[0, 4, 0, 1] = 6.0
+    assert not bool(in_motion(places, seen)[0, 4, 0])
+    places[0, 4, 0, 1] = 0.5
+    assert bool(in_motion(places, seen)[0, 4, 0])
+    assert not bool(in_motion(places[:, :1], seen[:, :1]).any())  # nothing is around
 
 
 @pytest.mark.parametrize("shape", [(0, 20, 4, 2), (0, 4, 2), (3, 0, 4, 2), (20, 0, 2)])

@@ -86,6 +86,34 @@ def test_noise_gaps_and_wrong_detections_are_cleaned_first():
     assert (grown[true > 200] - 1).abs().max() < 0.1  # mm; a hip of 130 is hardly longer than the noise is large
 
 
+def kicking(shift=0.0, noise=0.0):
+    """A walk of 90 frames in which an ankle swings .3 m aside and back within .2 s; its tracks, normalised."""
+    clip = walking_person(90, turn=0.0, yaw=90.0, noise=noise, generator=torch.Generator().manual_seed(0))
+    points, time = clip.tracks.points.clone(), torch.arange(90) / 30
+    points[:, clip.tracks.skeleton.index("left_ankle"), 0] += 300 * torch.exp(-(((time - 1) / 0.06) ** 2))
+    points[60, 3] += shift
+    return replace(clip.tracks, points=(points - points.mean(1, keepdim=True)) / 500)
+
+
+def test_a_kick_is_no_outlier():
+    """A few frames of it were rejected, so that all else of exact tracks was solved as that of doubtful ones."""
+    tracks = kicking()
+    (found,) = clean_all([Noisy(tracks.points, tracks.weights, torch.arange(90))])
+    assert bool(found.outliers.any())
+    points, noise, notes = run(cleaned(tracks, denoise=True), serve)
+    assert_close(points, tracks.points) and not bool(noise.any())
+    assert not any("rejected" in note for note in notes)
+
+
+@pytest.mark.parametrize("fields", [{"shift": 150.0}, {"noise": 5.0}])
+def test_beside_a_wrong_detection_or_in_noise_a_kick_is_left_to_the_model(fields):
+    tracks = kicking(**fields)
+    (found,) = clean_all([Noisy(tracks.points, tracks.weights, torch.arange(90))])
+    points, _, notes = run(cleaned(tracks, denoise=True), serve)
+    assert any("rejected as outliers" in note for note in notes)
+    assert bool(found.outliers[30].any()) and not bool((points == tracks.points)[found.outliers].any())
+
+
 def test_clips_are_cleaned_together_as_alone():
     tasks = []
     for seed, frames in enumerate((30, 41, 30, 30, 5)):

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcs_torch.functional.ranks import nanmedian
 
-__all__ = ["body_size", "each_joint", "far_off", "from_beside", "stray_from_neighbours"]
+__all__ = ["body_size", "each_joint", "far_off", "from_beside", "in_motion", "stray_from_neighbours"]
 
 STRAY, FLOOR = 6.0, 0.04
 """Of outliers: usual distances from what is predicted, and the share of the body's size beside."""
@@ -24,6 +24,12 @@ SIDE = 3
 
 NUMBERS = 2**18
 """Joints times frames that are judged at once: this takes a hundred times the memory."""
+
+LINES = ((-1, 1), (-2, 1), (-1, 2), (-2, 2), (-3, 3), (-2, -1), (1, 2))
+"""Pairs of neighbouring frames, counted among those in which a joint is seen, whose lines predict where it is."""
+
+QUICK = 1.5
+"""How much farther off than the farthest of these lines a joint may be that moves quickly."""
 
 COMMON, RATIO = 0.7, 1.318
 """A quantile of distances, and what it is over the median for a Gaussian in the plane."""
@@ -41,25 +47,49 @@ def stray_from_neighbours(values: Tensor, seen: Tensor, time: Tensor | None = No
     frames = values.shape[1]
     if frames < 5:
         return torch.zeros_like(seen)
+    lines = _lines(values, seen, time)
+    error = (values - nanmedian(lines, 0)).norm(dim=-1)
+    return far_off(error, seen & error.isfinite())
+
+
+def in_motion(values: Tensor, seen: Tensor, time: Tensor | None = None) -> Tensor:
+    """(K, T, N) whether a joint may have moved to where it is, as far as its nearest seen frames tell.
+
+    Lines through these lie apart where the joint speeds up, and where it is lies hardly farther from their median.
+
+    Args:
+        values: (K, T, N, 2) of all joints.
+        seen: (K, T, N) where its place is known to be no outlier.
+        time: (K, T) as of :func:`stray_from_neighbours`.
+    """
+    lines = _lines(values, seen, time)
+    middle = nanmedian(lines, 0)
+    apart = (lines - middle).norm(dim=-1).nan_to_num(0.0).amax(0)
+    return (values - middle).norm(dim=-1) <= QUICK * apart
+
+
+def _lines(values: Tensor, seen: Tensor, time: Tensor | None) -> Tensor:
+    """Where lines through pairs of a joint's nearest seen frames lead, (P, K, T, N, 2), NaN where there are too few."""
+    frames = values.shape[1]
     index = torch.arange(frames, device=values.device)[:, None].expand(seen.shape)
     time = index if time is None else time[..., None].expand(seen.shape)
     order = torch.where(seen, index, index + frames).argsort(1)
-    rank, count = seen.cumsum(1) - 1, seen.sum(1, keepdim=True)
+    before, count = seen.cumsum(1) - seen.long(), seen.sum(1, keepdim=True)  # seen frames before; at all
 
     def neighbour(k: int) -> tuple[Tensor, Tensor]:
-        at = order.gather(1, (rank + k).clamp(0, frames - 1))
+        rank = before + k if k < 0 else before + seen + (k - 1)
+        at = order.gather(1, rank.clamp(0, frames - 1))
         held = values.gather(1, at[..., None].expand(values.shape))
-        there = (rank + k >= 0) & (rank + k < count)
+        there = (rank >= 0) & (rank < count)
         return time.gather(1, at).to(values.dtype), torch.where(there[..., None], held, torch.full_like(held, math.nan))
 
     near = {k: neighbour(k) for k in (-3, -2, -1, 1, 2, 3)}
     lines = []
-    for a, b in ((-1, 1), (-2, 1), (-1, 2), (-2, 2), (-3, 3), (-2, -1), (1, 2)):
+    for a, b in LINES:
         (start, first), (stop, last) = near[a], near[b]
         gap = torch.where(stop == start, torch.ones_like(stop), stop - start)
         lines.append(first + ((time - start) / gap)[..., None] * (last - first))
-    error = (values - nanmedian(torch.stack(lines), 0)).norm(dim=-1)
-    return far_off(error, seen & error.isfinite())
+    return torch.stack(lines)
 
 
 def far_off(error: Tensor, seen: Tensor) -> Tensor:

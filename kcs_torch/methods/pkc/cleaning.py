@@ -23,6 +23,7 @@ from kcs_torch.nn.posture import has_trunk
 from kcs_torch.solvers.denoise import Denoised
 from kcs_torch.solvers.noise import SHORT
 from kcs_torch.solvers.spectrum import window_at
+from kcs_torch.solvers.stray import in_motion
 from kcs_torch.types import Tracks
 
 __all__ = ["CLEAN", "HELD", "PLAIN", "cleaned"]
@@ -78,14 +79,15 @@ def cleaned(
         kept = [_likely(shot) for shot in shots]
         asked = [torch.where(keep, shot.weights, 0) for shot, keep in zip(shots, kept, strict=True)]
         time = torch.arange(tracks.num_frames, device=tracks.points.device) if time is None else time
+        times = [time[slice(*some)] for some in parts]
         found = yield [
-            Noisy(shot.points, w, time[slice(*some)], window, quick)
-            for shot, w, some in zip(shots, asked, parts, strict=True)
+            Noisy(shot.points, w, at, window, quick) for shot, w, at in zip(shots, asked, times, strict=True)
         ]
         levels = [one.noise.median().expand(shot.num_frames) for one, shot in zip(found, shots, strict=True)]
         level = float(torch.cat(levels).median())  # one for all shots, or the sharper ones would fill the others
         clean = level <= (CLEAN * min(1.0, 30 / rate) if template else PLAIN)
-        made = [_smoothed(*one, None if clean else level, template) for one in zip(shots, kept, found, strict=True)]
+        rows = zip(shots, times, kept, found, strict=True)
+        made = [_smoothed(*one, None if clean else level, template) for one in rows]
     points, noise, notes = zip(*made, strict=True)
     return torch.cat(points), torch.cat(noise), tuple(dict.fromkeys(note for some in notes for note in some))
 
@@ -103,15 +105,20 @@ def _likely(tracks: Tracks) -> Tensor:
 
 
 def _smoothed(
-    tracks: Tracks, keep: Tensor, found: Denoised, level: float | None, template: bool
+    tracks: Tracks, time: Tensor, keep: Tensor, found: Denoised, level: float | None, template: bool
 ) -> tuple[Tensor, Tensor, list[str]]:
     """A shot whose outliers are rejected, and smoothed unless it is exact: then there is no level of noise."""
     notes = []
-    wrong = int((found.outliers & keep).sum()) + int((tracks.seen & ~keep).sum())
+    outliers = found.outliers & keep
+    if level is None and bool(outliers.any()):
+        right = keep & ~outliers
+        if bool(in_motion(tracks.points[None], right[None], time[None])[0][outliers].all()):
+            outliers = torch.zeros_like(outliers)  # a kick: one that is really wrong is seldom so near
+    wrong = int((outliers | (tracks.seen & ~keep)).sum())
     if wrong:
         share = wrong / int(tracks.seen.sum())
         notes.append(f"{counted(wrong, 'detection')} ({100 * share:.1f} %) rejected as outliers")
-    keep = keep & ~found.outliers
+    keep = keep & ~outliers
     exact = keep
     if level is not None:
         exact = torch.zeros_like(keep)
