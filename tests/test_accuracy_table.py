@@ -23,7 +23,7 @@ CASES = {
     "missing": {"turn": 180.0, "missing": 0.2},
 }
 TABLE = {  # a flat guess is at 92 mm
-    "pkc": {"still": 3.15, "sway": 0.91, "orbit": 0.18, "noise": 8.15, "missing": 1.81},
+    "pkc": {"still": 3.15, "sway": 0.91, "orbit": 0.18, "noise": 8.15, "missing": 1.51},
     "sfam": {"still": 91.4, "sway": 51.3, "orbit": 2.94, "noise": 43.7, "missing": 19.1},
     "kcs": {"still": 53.0, "sway": 34.8, "orbit": 43.9, "noise": 47.7, "missing": 59.6},
 }
