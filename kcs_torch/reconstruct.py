@@ -5,12 +5,14 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from kcs_torch.errors import KcsWarning, OptionError, ShapeError, unknown, users_level
 from kcs_torch.methods import METHODS
 from kcs_torch.methods.base import Method, check_tracks
+from kcs_torch.methods.clips.processes import check_workers, spread, spread_batch
 from kcs_torch.methods.found_skeleton import find_skeleton
 from kcs_torch.methods.perspective.calibrated import WIDE, reconstruct_perspective
 from kcs_torch.methods.perspective.one_lens import by_one_lens
@@ -19,7 +21,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.bodies import no_bones
 from kcs_torch.types.image_size import may_be_shares
-from kcs_torch.types.people import file_and_person, file_of, guess_images, of_one_image
+from kcs_torch.types.people import file_and_person, file_of, guess_images
 
 __all__ = ["method_named", "reconstruct", "reconstruct_all", "with_found_bones"]
 
@@ -133,7 +135,12 @@ def reconstruct(
 
 
 def reconstruct_all(
-    people: Iterable[Tracks], *, method: str | Method = "auto", intrinsics: Any = None, **fields: Any
+    people: Iterable[Tracks],
+    *,
+    method: str | Method = "auto",
+    intrinsics: Any = None,
+    workers: int = 1,
+    **fields: Any,
 ) -> list[Reconstruction]:
     """Turn the tracks of several bodies, or of many clips, into 3D motion, as one batch where the method can.
 
@@ -141,6 +148,8 @@ def reconstruct_all(
         people: tracks of any lengths, such as :func:`kcs_torch.io.load_people` gives.
         method: as of :func:`reconstruct`.
         intrinsics: of the camera that saw them all, as of :func:`reconstruct`.
+        workers: processes that solve them, at most; more than 1 needs joblib. They start within seconds, go on for the
+            next call, and use one thread each: of one body alone nothing is gained.
         **fields: of the method.
 
     Returns:
@@ -152,7 +161,8 @@ def reconstruct_all(
         far. "parallel" leaves everybody where the image has them, at no depth that compares.
 
     Raises:
-        OptionError: as :func:`reconstruct`; or something is not :class:`Tracks`.
+        OptionError: as :func:`reconstruct`; or something is not :class:`Tracks`; or workers are no number of processes,
+            joblib is missing, tracks are on a GPU, or a process died, as where memory is short.
         ShapeError: the intrinsics have the wrong shape or values.
 
     Warns:
@@ -168,35 +178,38 @@ def reconstruct_all(
     people = list(people)
     for i, one in enumerate(people):
         check_tracks(one, f"reconstruct_all: item {i}")
+    check_workers(workers, people)
     chosen = method_named(method, fields)
     lens = _lens(intrinsics)
     if isinstance(lens, Intrinsics):
-        return [_before(lens, chosen, one) for one in people]
+        return list(spread(partial(_before, lens, chosen), people, workers=workers))
     if lens == "parallel" or (lens is None and not chosen.turns_over):
-        return chosen.many(people)
-    people, found = guess_images(people), dict[int, Reconstruction]()
-    for group in of_one_image(people):
-        made = by_one_lens(chosen, [people[i] for i in group])
-        found |= {group[k]: one for k, one in made.items()}
+        return spread_batch(chosen.many, people, workers)
+    people = guess_images(people)
+    found = by_one_lens(chosen, people, workers)
     rest = [i for i in range(len(people)) if i not in found]
+    others = [people[i] for i in rest]
     if lens == "auto":
-        found |= {i: _before(lens, chosen, people[i]) for i in rest}
+        found |= zip(rest, spread(partial(_before, lens, chosen), others, workers=workers), strict=True)
     else:
-        found |= zip(rest, _unless_near(chosen, [people[i] for i in rest]), strict=True)
+        found |= zip(rest, _unless_near(chosen, others, workers), strict=True)
     return _told_of_lenses([found[i] for i in range(len(people))])
 
 
-def _unless_near(chosen: Method, people: Sequence[Tracks]) -> Iterator[Reconstruction]:
+def _unless_near(chosen: Method, people: Sequence[Tracks], workers: int) -> Iterator[Reconstruction]:
     """Bodies reconstructed as one batch under parallel rays, and one by one where the camera seems near."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
-        lifted = looking(chosen).many(people)
-    for one, result in zip(people, lifted, strict=True):
-        if may_be_near(one):
-            yield reconstruct_uncalibrated(chosen, one, lifted=result)
-        else:
-            chosen.warn(result)
-            yield result
+        lifted = spread_batch(looking(chosen).many, people, workers)
+    return spread(partial(_once_lifted, chosen), people, lifted, workers=workers)
+
+
+def _once_lifted(chosen: Method, one: Tracks, lifted: Reconstruction) -> Reconstruction:
+    """A body that was reconstructed under parallel rays."""
+    if may_be_near(one):
+        return reconstruct_uncalibrated(chosen, one, lifted=lifted)
+    chosen.warn(lifted)
+    return lifted
 
 
 def _told_of_lenses(found: list[Reconstruction]) -> list[Reconstruction]:

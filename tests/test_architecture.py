@@ -74,6 +74,7 @@ OUTSIDE = {
     "rich": {"cli"},
     "yaml": {"skeleton", "cli"},
     "triton": {"functional"},
+    "joblib": {"methods"},
 }
 
 
@@ -201,7 +202,18 @@ def test_import_is_light():
     code = "import kcs_torch as kt\nfor name in kt.__all__: getattr(kt, name)"
     names = loaded(code)
     assert "torch" in names  # the names were really loaded
-    assert not names & {"lightning", "hydra", "plotly", "scipy", "matplotlib", "yaml", "typer", "rich", "torchmetrics"}
+    assert not names & {
+        "lightning",
+        "hydra",
+        "joblib",
+        "plotly",
+        "scipy",
+        "matplotlib",
+        "yaml",
+        "typer",
+        "rich",
+        "torchmetrics",
+    }
 
 
 def test_modules_and_methods_do_without_the_compiler_of_torch():

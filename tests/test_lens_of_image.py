@@ -225,7 +225,7 @@ def test_people_whom_no_usual_image_holds_tell_so(tmp_path):
 
 def test_people_who_are_given_together_share_a_guess(tmp_path, monkeypatch):
     people = [replace(one, image_guess=None) for one in kt.io.load_people(two_people(tmp_path))]
-    stand_in = lambda method, group: {k: kt.KCS()(one) for k, one in enumerate(group)}  # noqa: E731
+    stand_in = lambda method, group, *_: {k: kt.KCS()(one) for k, one in enumerate(group)}  # noqa: E731
     monkeypatch.setattr(sys.modules["kcs_torch.reconstruct"], "by_one_lens", stand_in)
     assert [one.tracks.image_guess for one in kt.reconstruct_all(people)] == [(1920, 1080)] * 2
 

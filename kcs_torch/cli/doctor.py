@@ -33,6 +33,7 @@ PURPOSES = {
     "test": "running the tests",
     "train": "training networks",
     "video": "films as .mp4",
+    "workers": "several processes for one call: reconstruct_all(..., workers=2), kcs-torch lift --workers 2",
 }
 """What each extra is for."""
 

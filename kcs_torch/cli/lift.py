@@ -113,6 +113,12 @@ def lift(
             show_default=False,
         ),
     ] = None,
+    workers: Annotated[
+        int,
+        typer.Option(
+            metavar="NUMBER", min=1, help="With --person all: solve people in up to so many processes; needs joblib."
+        ),
+    ] = 1,
     fps: Annotated[
         float | None, typer.Option(metavar="NUMBER", help="Frames a second; those of TRACKS if not given.")
     ] = None,
@@ -167,6 +173,7 @@ def lift(
     """Turn 2D joint tracks, or a video where a detector is installed, into 3D motion."""
     with answer(as_json) as said:
         from kcs_torch.errors import OptionError
+        from kcs_torch.methods.clips.processes import check_workers
 
         output = check_outputs(output, source=tracks)
         learned = _learned(method, settings) if method.endswith((LEARNED, ".ckpt")) else None
@@ -176,6 +183,11 @@ def lift(
         person_number(person)
         if least_seen is not None and not (person == "all" and 0 <= least_seen <= 1):
             raise OptionError(f"--least-seen: expected a share from 0 to 1, with --person all, got {least_seen:g}")
+        if workers > 1:
+            if person != "all":
+                raise OptionError("--workers: expected it with --person all: one person is solved in one process")
+            check_workers(workers, [])
+            fields["workers"] = workers
         finish = finisher(smooth_3d)
         size_of = parse_scale(scale)
         check_up(up, pitch, output)

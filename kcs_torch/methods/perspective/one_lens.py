@@ -4,43 +4,53 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from kcs_torch.clean.detector import detected
 from kcs_torch.methods.base import Method
+from kcs_torch.methods.clips.processes import spread
 from kcs_torch.methods.perspective.calibrated import leaning, reconstruct_perspective
 from kcs_torch.methods.perspective.image_lens import lens_of_image
 from kcs_torch.methods.perspective.uncalibrated import may_be_near, reconstruct_uncalibrated
 from kcs_torch.methods.perspective.view import lens_note
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
-from kcs_torch.types.people import file_and_person
+from kcs_torch.types.people import file_and_person, of_one_image
 
 __all__ = ["by_one_lens"]
 
 
-def by_one_lens(method: Method, people: Sequence[Tracks]) -> dict[int, Reconstruction]:
+def by_one_lens(method: Method, people: Sequence[Tracks], workers: int = 1) -> dict[int, Reconstruction]:
     """Reconstruct people in one image, where its size tells the lens (:func:`.lens_of_image`), through one lens.
 
     Its focal length is found from the tracks of the one who fills most of the images.
 
     Args:
         method: any.
-        people: in one image, with one guess of its size where nobody says it (:func:`.guess_images`).
+        people: of any images, those in one (:func:`.of_one_image`) with one guess of its size where nobody says it
+            (:func:`.guess_images`).
+        workers: processes that solve them, at most: first those who tell lenses, then the others.
 
     Returns:
-        The reconstructions of those whom :func:`.may_be_near` lets be near, by their numbers: of that one alone if the
-        camera is far away after all, and of nobody if nobody tells a lens.
+        The reconstructions of those whom :func:`.may_be_near` lets be near, by their numbers. Of an image it is that
+        one alone if the camera is far away after all, and nobody if nobody tells a lens.
     """
-    able = [i for i, one in enumerate(people) if may_be_near(one)]
-    lenses = {i: lens for i in able if (lens := lens_of_image(people[i])) is not None}
-    if not lenses:
-        return {}
-    first = max(lenses, key=lambda i: _filled(people[i]))
-    told = reconstruct_uncalibrated(method, people[first])
-    if told.intrinsics is None:
-        return {first: told}
-    who, said = file_and_person(people[first].source)[1], lenses[first].said
-    others = (i for i in able if i != first)
-    return {first: told} | {i: _through(method, people[i], told.intrinsics, who, said) for i in others}
+    groups: dict[int, tuple[str, list[int]]] = {}
+    for group in of_one_image(people):
+        able = [i for i in group if may_be_near(people[i])]
+        lenses = {i: lens for i in able if (lens := lens_of_image(people[i])) is not None}
+        if lenses:
+            first = max(lenses, key=lambda i: _filled(people[i]))
+            groups[first] = lenses[first].said, [i for i in able if i != first]
+    tell = spread(partial(reconstruct_uncalibrated, method), [people[i] for i in groups], workers=workers)
+    found = dict(zip(groups, tell, strict=True))
+    others = {
+        i: (people[i], seen_through, file_and_person(people[first].source)[1], said)
+        for first, (said, rest) in groups.items()
+        if (seen_through := found[first].intrinsics) is not None
+        for i in rest
+    }
+    through = spread(partial(_through, method), *zip(*others.values(), strict=True), workers=workers)
+    return found | dict(zip(others, through, strict=True))
 
 
 def _filled(tracks: Tracks) -> float:
