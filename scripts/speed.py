@@ -178,11 +178,11 @@ def short_clips(length: int, count: int) -> list[kt.Tracks]:
     return [walking_person(n, turn=TURN * (i % 2), yaw=7.0 * i).tracks for i, n in enumerate(lengths)]
 
 
-def together(names: Sequence[str], frames: list[int], clips: int, runs: int, processes: int) -> Iterator[Row]:
+def together(names: Sequence[str], frames: list[int], clips: int, runs: int, workers: int) -> Iterator[Row]:
     """Milliseconds a clip one by one and as one batch, see :func:`short_clips`.
 
     Times are the processor's, in the best of some runs; ``wall`` ones the clock's, which tell what several threads of
-    PyTorch (``--threads``) are worth, or several processes (``--processes``), each with its share of the clips.
+    PyTorch (``--threads``) are worth, or several processes (``--workers``) that have started already.
     """
     for name in names:
         method = kt.METHODS[name]()
@@ -196,49 +196,12 @@ def together(names: Sequence[str], frames: list[int], clips: int, runs: int, pro
             for what, k in (("", 0), ("wall ", 1)):
                 one, many = alone[k] / len(few), batch[k] / clips
                 row |= {f"{what}one by one": one, f"{what}together": many, f"{what}ratio": one / many}
-            if processes > 1:
-                one, many = alone[1] / len(few), divided(name, length, clips, processes, runs) / clips
-                row |= {f"wall, {processes} processes": many, f"ratio, {processes} processes": one / many}
+            if workers > 1:
+                run = partial(kt.reconstruct_all, tracks, method=name, intrinsics="parallel", workers=workers)
+                run()  # starts them
+                one, many = alone[1] / len(few), spent(run, runs)[1] / clips
+                row |= {f"wall, {workers} workers": many, f"ratio, {workers} workers": one / many}
             yield row
-
-
-def divided(name: str, length: int, clips: int, processes: int, runs: int) -> float:
-    """Milliseconds of the clock that processes take, each with its share of the clips, in the best of some runs."""
-    command = [sys.executable, __file__, "--threads", str(torch.get_num_threads())]
-    shares = [[name, length, clips, i, processes] for i in range(processes)]
-    start = partial(subprocess.Popen, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    workers = [start([*command, "--share", *map(str, share)]) for share in shares]
-    times = []
-
-    def wait() -> None:
-        for worker in workers:
-            assert worker.stdout is not None
-            if not worker.stdout.readline():
-                raise SystemExit(f"--processes: one of {name} ended with {worker.wait()}")
-
-    try:
-        wait()  # until all are ready
-        for _ in range(runs):
-            begin = time.perf_counter()
-            for worker in workers:
-                print("go", file=worker.stdin, flush=True)
-            wait()
-            times.append(1000 * (time.perf_counter() - begin))
-    finally:
-        for worker in workers:
-            worker.kill()
-            worker.communicate()
-    return min(times)
-
-
-def work(name: str, length: int, clips: int, first: int, step: int) -> None:
-    """Solve every so-manieth clip for each line that comes in, and answer with a line."""
-    method, tracks = kt.METHODS[name](), short_clips(length, clips)[first::step]
-    method.many(tracks[:2])
-    print("ready", flush=True)
-    for _ in sys.stdin:
-        method.many(tracks)
-        print("done", flush=True)
 
 
 def one_by_one(method: kt.Method, tracks: Sequence[kt.Tracks]) -> None:
@@ -362,9 +325,7 @@ def arguments(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--which", nargs="+", choices=known, default=FAST, metavar="METHOD", help=", ".join(known))
     parser.add_argument("--clips", type=int, default=64, help="of the part batch")
     parser.add_argument("--threads", type=int, default=1, help="of PyTorch's own")
-    parser.add_argument(
-        "--processes", type=int, default=1, help="of the part batch: also divide the clips among so many"
-    )
+    parser.add_argument("--workers", type=int, default=1, help="of the part batch: also in so many processes")
     parser.add_argument("--short", type=int, nargs="+", default=[30, 100], metavar="FRAMES", help="of its clips")
     parser.add_argument("--scale", type=int, nargs="+", default=[1000, 100_000], metavar="FRAMES")
     parser.add_argument("--device", default="cuda", help="of the part gpu")
@@ -377,9 +338,8 @@ def arguments(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--runs", type=int, default=5, help="of which the median is taken")
     parser.add_argument("--csv", type=Path, help="also write all rows here")
     parser.add_argument("--peak", nargs=2, metavar=("METHOD", "FRAMES"), help=argparse.SUPPRESS)
-    parser.add_argument("--share", nargs=5, help=argparse.SUPPRESS)
     options = parser.parse_args(words)
-    for name in ("runs", "processes", "clips"):
+    for name in ("runs", "workers", "clips"):
         if (value := getattr(options, name)) < 1:
             parser.error(f"--{name}: expected at least 1, got {value}")
     return options
@@ -395,16 +355,13 @@ def main(words: list[str] | None = None) -> None:
     if options.peak:
         print(json.dumps(measure_peak(options.peak[0], int(options.peak[1]))))
         return
-    if options.share:
-        work(options.share[0], *map(int, options.share[1:]))
-        return
     parts: dict[str, Callable[[], Iterator[Row]]] = {
         "memory": lambda: peak_memory(options.which, options.memory),
         "methods": lambda: compare_methods(options.which, options.frames, options.runs),
         "kernels": lambda: compare_kernels(options.frames, options.runs),
         "growth": lambda: grow_frames(options.which, options.growth, options.runs),
         "joints": lambda: grow_joints(options.which, options.joints, options.frames, options.runs),
-        "batch": lambda: together(options.which, options.short, options.clips, min(options.runs, 3), options.processes),
+        "batch": lambda: together(options.which, options.short, options.clips, min(options.runs, 3), options.workers),
         "scale": lambda: peak_memory(options.which, options.scale),
         "gpu": lambda: on_gpu(options.device, options.batches, options.frames, options.which, options.most),
     }

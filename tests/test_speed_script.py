@@ -89,22 +89,20 @@ def test_script(root, tmp_path, capsys, part):
         assert float(next(row[name] for name in least if row.get(name))) > 0
 
 
-def test_clips_divided_among_processes(root, capsys):
+def test_clips_in_several_processes(root, capsys):
     script = runpy.run_path(str(root / "scripts" / "speed.py"))
     script["main"](
-        ["--parts", "batch", "--which", "kcs", "--clips", "3", "--short", "12", "--runs", "1", "--processes", "2"]
+        ["--parts", "batch", "--which", "kcs", "--clips", "3", "--short", "12", "--runs", "1", "--workers", "2"]
     )
     names, row = (line.split("  ") for line in capsys.readouterr().out.splitlines()[-2:])
-    assert "ratio, 2 processes" in (name.strip() for name in names) and float(row[-1]) > 0
-    with pytest.raises(SystemExit, match="--processes: one of foo ended with 1"):
-        script["divided"]("foo", 12, 3, 2, 1)
+    assert "ratio, 2 workers" in (name.strip() for name in names) and float(row[-1]) > 0
 
 
 @pytest.mark.parametrize(
     ("name", "words", "told"),
     [
         ("speed", ["--runs", "0"], "--runs: expected at least 1, got 0"),
-        ("speed", ["--processes", "0"], "--processes: expected at least 1, got 0"),
+        ("speed", ["--workers", "0"], "--workers: expected at least 1, got 0"),
         ("layers", ["--skeleton", "foo"], "argument --skeleton: invalid choice: 'foo'"),
         ("unrolled_memory", ["--solvers", "zz"], "argument --solvers: invalid choice: 'zz'"),
     ],
