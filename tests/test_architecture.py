@@ -48,6 +48,7 @@ ALLOWED = {
         "training",
     }
     | BASE,
+    "__main__": {"cli"},
     "many": {"io", "methods", "reconstruct"} | BASE,
     "": {"functional", "solvers", "nn", "methods", "reconstruct", "live", "io", "metrics"} | BASE,
 }

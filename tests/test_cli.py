@@ -1,6 +1,7 @@
 """The command line: what it writes, what it says, and how it answers mistakes."""
 
 import json
+import runpy
 import subprocess
 import sys
 from dataclasses import replace
@@ -50,6 +51,13 @@ def test_help_tells_exit_codes_and_what_is_replaced():
 
 def test_version():
     assert run("--version").stdout.strip() == f"kcs-torch {kt.__version__}"
+
+
+def test_as_a_module(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["kcs_torch", "--version"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_module("kcs_torch", run_name="__main__", alter_sys=True)
+    assert not end.value.code and capsys.readouterr().out.strip() == f"kcs-torch {kt.__version__}"
 
 
 def test_console_script_answers_an_error_with_one_line(tmp_path):

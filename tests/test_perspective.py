@@ -11,6 +11,7 @@ from near_cameras import LENS, error, filmed, quietly
 
 import kcs_torch as kt
 from kcs_torch.methods.perspective import calibrated, scene
+from kcs_torch.methods.perspective.parallel_image import image_noise
 from kcs_torch.types import Intrinsics, Motion
 
 
@@ -409,3 +410,12 @@ def test_y_up_and_other_corners_are_told_with_intrinsics():
         kt.reconstruct(tracks, method="kcs", intrinsics=(*LENS[:2], 0, 0))
     with pytest.warns(kt.KcsWarning, match=r"give -y instead \(with intrinsics the image's height - y\)"):
         kt.reconstruct(replace(tracks, points=up + torch.tensor([0.0, 1080.0])), method="kcs", intrinsics=LENS)
+
+
+def test_an_image_that_shrank_to_a_point_has_noise():
+    """Of somebody seen in three frames, most of whose detections were rejected: 0 / 0 ended the call."""
+    tracks, _ = filmed(yaw=60, frames=12)
+    weights = tracks.weights.clone()
+    weights[:9] = 0
+    noise = image_noise(replace(tracks, weights=weights), torch.zeros_like(tracks.points), 1.0)
+    assert bool(noise.isfinite().all()) and bool((noise > 0).all())

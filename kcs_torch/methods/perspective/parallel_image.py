@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.clean.detector import detector_deviation
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.weights import rms
 from kcs_torch.methods.clips.unseen import gap_deviation
 from kcs_torch.methods.pkc.objective import usual_posture
@@ -30,7 +31,7 @@ def image_noise(tracks: Tracks, flat: Tensor, unit: float) -> Tensor:
     size = rms(off, torch.ones_like(off[..., 0])) / unit
     stray = (flat - tracks.points).square().sum(-1)[tracks.seen]
     level = math.sqrt(float(stray.median()) / 1.39) / unit / 2 if len(stray) else 0.0  # whatever outliers there are
-    share = gap_deviation(off / (size * unit), tracks.seen, tracks.rate)
+    share = gap_deviation(off / or_one(size * unit), tracks.seen, tracks.rate)
     return (size * share.maximum(detector_deviation(tracks))).clamp_min(level)
 
 
