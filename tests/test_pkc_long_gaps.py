@@ -27,7 +27,10 @@ def walk():
 def test_frames_that_are_solved(walk):
     tracks = replace(walk.tracks, fps=30.0)
     assert shortened(tracks) is None
-    assert shortened(hidden(tracks, slice(0, 30), slice(60, 90))) is None  # ends are no gaps
+    assert shortened(hidden(tracks, slice(0, 8), slice(82, 90))) is None
+    assert shortened(hidden(tracks, slice(0, 90))) is None  # nobody is there at all
+    assert shortened(hidden(tracks, slice(0, 5), slice(60, 90))).tolist() == list(range(5, 60))
+    assert shortened(hidden(tracks, slice(0, 30), slice(31, 90))).tolist() == [30]
     assert shortened(hidden(tracks, slice(20, 28))) is None  # as long as a gap may be
     kept = shortened(hidden(tracks, slice(20, 60), slice(70, 73)))
     assert kept.tolist()[:20] == list(range(20)) and kept.tolist()[-30:] == list(range(60, 90))
@@ -47,6 +50,27 @@ def test_long_gap_of_a_synthetic_walk(walk):
     assert result.uncertainty[45].amin() > 2 * result.uncertainty[seen].median()
     assert len(result.cameras) == 90
     assert_close(result.cameras @ result.cameras.mT, torch.eye(2).double().expand(90, 2, 2), rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("intrinsics", ["parallel", None])
+def test_who_comes_and_goes_is_solved_while_seen(walk, intrinsics):
+    """Each frame in which nobody is seen took as long as another, of dozens of people in a long film."""
+    some = walk.tracks.frames(30, 60)
+    alone = kt.reconstruct(some, intrinsics=intrinsics)
+    result = kt.reconstruct(hidden(walk.tracks, slice(0, 30), slice(60, 90)), intrinsics=intrinsics)
+    assert_close(result.points[30:60], alone.points, rtol=1e-4, atol=0.5)  # mm
+    assert_close(result.points[:30], result.points[30:31].expand(30, -1, -1), rtol=0, atol=1e-6)
+    assert_close(result.points[60:], result.points[59:60].expand(30, -1, -1), rtol=0, atol=1e-6)
+    assert result.uncertainty[:30].median() > result.uncertainty[30:60].median()
+    assert "60 frames at the clip's ends show nobody: nearest pose held" in result.diagnostics.notes
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+def test_who_is_seen_in_one_frame_is_an_image(walk):
+    result = kt.reconstruct(hidden(walk.tracks, slice(0, 40), slice(41, 90)), intrinsics="parallel")
+    alone = kt.reconstruct(walk.tracks.frames(40, 41), intrinsics="parallel")
+    assert_close(result.points[40:41], alone.points, rtol=1e-4, atol=0.5)
+    assert bool(result.points.isfinite().all()) and result.points.shape == walk.points.shape
 
 
 def test_no_detection_beside_a_long_gap_is_an_outlier(walk):

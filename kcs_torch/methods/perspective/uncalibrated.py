@@ -279,10 +279,11 @@ def _is_far(near: Reconstruction, lifted: Reconstruction) -> bool:
     assert lens is not None
     flat, unit = clean_image(lifted), body_unit(lifted)
     depth = torch.stack([lifted.points[..., 2] / unit, near.points[..., 2] / body_unit(near)])
-    if not bool(depth.isfinite().all()):
+    middle = flat.new_tensor([lens.cx, lens.cy])
+    aside = float((flat - middle).square().sum(-1).mean().sqrt())
+    if not (bool(depth.isfinite().all()) and aside < WIDE * FAR * unit):  # a body that shrank to a point tells nothing
         return False
     focal = flat.new_tensor([1.0, lens.focal / (FAR * unit)])
-    middle = flat.new_tensor([lens.cx, lens.cy])
     energy = _seen_by_two(lifted.tracks, flat, depth, unit, middle, (focal, focal < 0), None)
     found = lbfgs(energy, energy.start, num_steps=2 * STEPS, tolerance=1e-6, slopes=True, part=energy.rows)
     assert found.energy is not None

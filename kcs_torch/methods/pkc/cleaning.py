@@ -26,7 +26,7 @@ from kcs_torch.solvers.spectrum import window_at
 from kcs_torch.solvers.stray import in_motion
 from kcs_torch.types import Tracks
 
-__all__ = ["CLEAN", "HELD", "PLAIN", "cleaned"]
+__all__ = ["CLEAN", "HELD", "PLAIN", "cleaned", "nobody_at_ends"]
 
 CLEAN, PLAIN = 0.0013, 0.0007
 """Noise below this share of the body's size, .6 mm of a person, is left in tracks at 30 frames a second or less: they
@@ -148,10 +148,13 @@ def _complete(tracks: Tracks, points: Tensor, keep: Tensor, left: float) -> tupl
     away = held != torch.arange(len(held), device=held.device)
     if bool(away.any()):  # nothing tells what goes on there, and a model of motion would run off
         points, noise = points[held], torch.where(away[:, None], points.new_full((), HELD), noise)
-        count = int(away.sum())
-        show = "shows" if count == 1 else "show"
-        notes.append(f"{counted(count, 'frame')} at the clip's ends {show} nobody: nearest pose held")
+        notes.append(nobody_at_ends(int(away.sum())))
     return points, noise, notes
+
+
+def nobody_at_ends(count: int) -> str:
+    """What is noted of so many frames before a body is first seen and after it was last seen."""
+    return f"{counted(count, 'frame')} at the clip's ends {'shows' if count == 1 else 'show'} nobody: nearest pose held"
 
 
 def _alike(tracks: Tracks, points: Tensor) -> float:

@@ -1,4 +1,4 @@
-"""Long gaps in which nobody is seen: solved as short ones, so that what is guessed there does not lead the rest."""
+"""Frames that show nobody: long gaps are solved as short ones, and what is before and after not at all."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.temporal import fill_between
 from kcs_torch.methods.base import Estimate
 from kcs_torch.methods.clips.unseen import gap_deviation
-from kcs_torch.methods.pkc.cleaning import HELD
+from kcs_torch.methods.pkc.cleaning import HELD, nobody_at_ends
 from kcs_torch.types import Tracks
 
 __all__ = ["first_frame", "lengthened", "shortened"]
@@ -26,23 +26,28 @@ SHOWN = 2
 
 
 def shortened(tracks: Tracks) -> Tensor | None:
-    """Indices (T',) of the frames that are solved, evenly spread over gaps that last too long; None if none do.
+    """Indices (T',) of the frames that are solved, evenly spread over gaps that last too long; None if all are.
 
-    What is unseen at the clip's ends is no gap.
+    Frames before the body is first seen, and after it was last seen, are left out where either take as long: people
+    come and go, while their tracks have all the frames of the film.
     """
     shown = tracks.seen.sum(-1) >= min(SHOWN, tracks.num_joints)
     most = max(2, round(LONGEST * tracks.rate))
     frames = shown.nonzero().flatten()
-    long = frames.diff() > most + 1
-    if not bool(long.any()):
+    if not len(frames):
         return None
+    first, last = int(frames[0]), int(frames[-1])
+    keep = torch.ones_like(shown)
+    if max(first, len(shown) - 1 - last) > most:
+        keep[:first] = keep[last + 1 :] = False
+    long = frames.diff() > most + 1
     before, after = frames[:-1][long], frames[1:][long]
     edges = torch.zeros_like(shown, dtype=torch.long)
     edges[before + 1], edges[after] = 1, -1
-    keep = edges.cumsum(0) == 0
+    keep &= edges.cumsum(0) == 0
     share = torch.arange(1, most + 1, device=frames.device) / (most + 1)
     keep[before[:, None] + (share * (after - before)[:, None]).round().long()] = True
-    return keep.nonzero().flatten()
+    return None if bool(keep.all()) else keep.nonzero().flatten()
 
 
 def lengthened(found: Estimate, kept: Tensor, tracks: Tracks, cameras: Tensor | None) -> Estimate:
@@ -54,14 +59,23 @@ def lengthened(found: Estimate, kept: Tensor, tracks: Tracks, cameras: Tensor | 
     def all_of(values: Tensor) -> Tensor:
         return fill_between(values[None], kept, tracks.num_frames)[0]
 
-    points = all_of(found.points)
+    points, frames = all_of(found.points), tracks.num_frames
     unseen = gap_deviation(points[..., :2], tracks.seen, tracks.rate, HELD)
+    deviation = None if found.deviation is None else all_of(found.deviation).maximum(unseen)
+    notes, ends = found.notes, int(kept[0]) + frames - 1 - int(kept[-1])
+    if ends:
+        notes = (*notes, nobody_at_ends(ends))
+        if deviation is not None:  # nothing tells what goes on there
+            time = torch.arange(frames, device=kept.device)
+            held = HELD * ((time < kept[0]) | (time > kept[-1])).to(deviation)
+            deviation = deviation.hypot(held[:, None])
     return replace(
         found,
+        notes=notes,
         points=points,
         cameras=nearest_rotation(all_of(complete_rotation(found.cameras)))[:, :2] if cameras is None else cameras,
         scales=all_of(found.scales),
-        deviation=None if found.deviation is None else all_of(found.deviation).maximum(unseen),
+        deviation=deviation,
         standing=None if found.standing is None else all_of(found.standing),
         alternatives=tuple(lengthened(other, kept, tracks, cameras) for other in found.alternatives),
     )

@@ -155,7 +155,11 @@ class PKC(Method):
         if kept is None:
             return (yield from self._whole(tracks, cameras))
         some = replace(tracks, points=tracks.points[kept], weights=tracks.weights[kept])
-        found = yield from self._whole(some, None if cameras is None else cameras[kept], kept)
+        seen_by = None if cameras is None else cameras[kept]
+        if len(kept) == 1 and self.knows_template(tracks.skeleton):
+            found = yield from self._image(some, seen_by)
+        else:
+            found = yield from self._whole(some, seen_by, kept)
         return lengthened(found, kept, tracks, cameras)
 
     def _by_parts(self, tracks: Tracks, cameras: Tensor | None, parts: Sequence[Part]) -> Search[Any, Any, Estimate]:
