@@ -307,3 +307,12 @@ def test_deviations_allow_for_a_lens_that_was_found(monkeypatch):
     for (one, _), result, angle in zip(cases, found, angles, strict=True):
         off = (result.points - result.points.mean(1, keepdim=True))[..., :2].norm(dim=-1)
         assert_close(result.uncertainty, quietly(one).uncertainty.hypot(angle * off))
+
+
+def test_a_body_that_shrank_to_a_point_is_not_far():
+    """Parallel rays found nothing of it; it lay beside a lens as long as it is large, which was an error."""
+    tracks, _ = aside(frames=6)
+    near = quietly(tracks, rounds=0, steps=3, intrinsics=IMAGE)
+    there = near.points.new_tensor([900.0, 400.0, 0.0])
+    shrunk = replace(near, points=there + 1e-3 * (near.points - near.points.mean(1, keepdim=True))).remeasured()
+    assert not uncalibrated._is_far(near, shrunk)
