@@ -91,7 +91,7 @@ def test_what_branches_like_a_hand_is_none():
 
 def test_each_hand_is_as_if_it_were_alone(person, solved):
     tracks = person[1]
-    inner, size, _ = kt.PKC()._normalised(tracks)
+    inner, size = kt.PKC()._normalised(tracks)
     for part in parts_of(tracks)[1:]:
         alone = kt.PKC()(part_of(inner, part)).points * size
         there = solved.points[:, list(part.joints)]

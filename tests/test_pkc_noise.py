@@ -19,6 +19,7 @@ from kcs_torch.methods.pkc import batch
 from kcs_torch.methods.pkc import method as module
 from kcs_torch.methods.pkc.batch import Noisy, clean_all, serve
 from kcs_torch.methods.pkc.cleaning import cleaned
+from kcs_torch.solvers.stray import in_motion
 
 # Many tests take few steps, after which nothing has settled.
 pytestmark = pytest.mark.filterwarnings("ignore::kcs_torch.ConvergenceWarning")
@@ -103,6 +104,17 @@ def test_a_kick_is_no_outlier():
     points, noise, notes = run(cleaned(tracks, denoise=True), serve)
     assert_close(points, tracks.points) and not bool(noise.any())
     assert not any("rejected" in note for note in notes)
+
+
+def test_a_long_clip_is_asked_for_kicks_joint_by_joint(monkeypatch):
+    """At once this would take a hundred times the memory of its joints and frames."""
+    asked = []
+    monkeypatch.setattr("kcs_torch.solvers.stray.NUMBERS", 90)
+    ask = lambda values, *rest, **time: asked.append(values.shape[2]) or in_motion(values, *rest, **time)  # noqa: E731
+    monkeypatch.setattr("kcs_torch.methods.pkc.cleaning.in_motion", ask)
+    tracks = kicking()
+    points, _, _ = run(cleaned(tracks, denoise=True), serve)
+    assert torch.equal(points, tracks.points) and asked == [1] * 17
 
 
 @pytest.mark.parametrize("fields", [{"shift": 150.0}, {"noise": 5.0}])

@@ -147,7 +147,7 @@ def test_telling_many_clips_takes_few_more_operations_than_one():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         parts = [method._normalised(one) for one in clips]
-        found, sizes = method.solve_all([one for one, _, _ in parts]), [size for _, size, _ in parts]
+        found, sizes = method.solve_all([one for one, _ in parts]), [size for _, size in parts]
         alone, together = (
             count_operations(lambda k=k: method._finished(clips[:k], found[:k], sizes[:k], 0.0)).total for k in (1, 16)
         )

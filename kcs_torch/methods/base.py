@@ -120,7 +120,7 @@ class Method(ABC):
     def of_prepared(self, tracks: Tracks, cameras: Tensor | None, begin: float) -> Reconstruction:
         """Reconstruct tracks that are :meth:`prepared`, as a call does that began at ``begin`` (``perf_counter``)."""
         with apart([tracks], self.differentiates):
-            inner, size, _ = self._normalised(tracks)
+            inner, size = self._normalised(tracks)
             found = self.solve(inner, None if cameras is None else cameras.clone())
         return self._finished([tracks], [found], [size], time.perf_counter() - begin)[0]
 
@@ -144,11 +144,11 @@ class Method(ABC):
         with apart(tracks, self.differentiates):
             tracks = [self._mended(one) for one in tracks]
             parts = [self._normalised(one) for one in tracks]
-            found = self.solve_all([inner for inner, _, _ in parts])
+            found = self.solve_all([inner for inner, _ in parts])
         if len(found) != len(tracks):
             raise ShapeError(f"{self.name}: solve_all: expected {counted(len(tracks), 'estimate')}, got {len(found)}")
         each = (time.perf_counter() - begin) / max(len(tracks), 1)
-        return self._finished(tracks, found, [size for _, size, _ in parts], each)
+        return self._finished(tracks, found, [size for _, size in parts], each)
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
         """Reconstruct normalised tracks of several clips; one by one unless a method knows better."""
@@ -173,8 +173,8 @@ class Method(ABC):
         """:meth:`prepared`, plain if they are other tracks than those given."""
         return plain(self.prepared(tracks), keep=tracks)
 
-    def _normalised(self, tracks: Tracks) -> tuple[Tracks, Tensor, Tensor]:
-        """Tracks about their middle, of root mean square 1; that size; and the frames (T,) that show something."""
+    def _normalised(self, tracks: Tracks) -> tuple[Tracks, Tensor]:
+        """Tracks about their middle, of root mean square 1; and that size."""
         # Means over the joints that happen to be seen would jump with every joint that comes and goes.
         seen, filled = tracks.seen, tracks.points
         if not bool(seen.all()):
@@ -186,7 +186,7 @@ class Method(ABC):
             middle = middle.mean(0)
         centred = (tracks.points - middle) * tracks.seen[..., None]
         inner = dataclasses.replace(tracks, points=centred / size, weights=tracks.weights.clone())
-        return inner, size, tracks.seen.any(-1)
+        return inner, size
 
     def warn(self, result: Reconstruction) -> None:
         """Tell what the user should not miss; for those who call :meth:`solve` and more by themselves."""

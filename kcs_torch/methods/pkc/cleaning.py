@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -23,7 +24,7 @@ from kcs_torch.nn.posture import has_trunk
 from kcs_torch.solvers.denoise import Denoised
 from kcs_torch.solvers.noise import SHORT
 from kcs_torch.solvers.spectrum import window_at
-from kcs_torch.solvers.stray import in_motion
+from kcs_torch.solvers.stray import each_joint, in_motion
 from kcs_torch.types import Tracks
 
 __all__ = ["CLEAN", "HELD", "PLAIN", "cleaned", "nobody_at_ends"]
@@ -112,7 +113,8 @@ def _smoothed(
     outliers = found.outliers & keep
     if level is None and bool(outliers.any()):
         right = keep & ~outliers
-        if bool(in_motion(tracks.points[None], right[None], time[None])[0][outliers].all()):
+        moving = each_joint(partial(in_motion, time=time[None]), tracks.points[None], right[None])[0]
+        if bool(moving[outliers].all()):
             outliers = torch.zeros_like(outliers)  # a kick: one that is really wrong is seldom so near
     wrong = int((outliers | (tracks.seen & ~keep)).sum())
     if wrong:

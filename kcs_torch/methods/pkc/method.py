@@ -166,8 +166,8 @@ class PKC(Method):
         """Solve the body, and each hand by itself."""
         shown = [self._normalised(part_of(tracks, part)) for part in parts]
         methods = [self, *(self._for_hands() for _ in parts[1:])]
-        steps = [one._steps(some, cameras) for one, (some, _, _) in zip(methods, shown, strict=True)]
-        found = joined(parts, (yield from together(steps)), [size for _, size, _ in shown], tracks.num_joints)
+        steps = [one._steps(some, cameras) for one, (some, _) in zip(methods, shown, strict=True)]
+        found = joined(parts, (yield from together(steps)), [size for _, size in shown], tracks.num_joints)
         return replace(found, alternatives=found.alternatives[: self.alternatives])
 
     def _for_hands(self) -> PKC:
