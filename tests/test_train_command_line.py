@@ -15,6 +15,7 @@ pytest.importorskip("lightning", reason="training needs the extra: pip install -
 pytest.importorskip("hydra")
 
 from omegaconf import DictConfig, OmegaConf
+from pools import end_pool
 from training_runs import SMALL, called, logged, rows
 
 from kcs_torch.training import LiftingModule, load_lifter
@@ -171,6 +172,7 @@ class TestSweeps:
     )
     def test_processes_come_to_the_same_figures(self, tmp_path, monkeypatch, capsys, launcher, package):
         pytest.importorskip(f"hydra_plugins.{package}")
+        end_pool()
         for name, options in (("here", ()), ("there", (f"hydra/launcher={launcher}",))):
             (tmp_path / name).mkdir()
             monkeypatch.chdir(tmp_path / name)

@@ -14,6 +14,7 @@ from typing import ClassVar
 import pytest
 import torch
 from command_line import run
+from pools import end_pool
 from torch.testing import assert_close
 
 import kcs_torch as kt
@@ -54,8 +55,7 @@ def talking():
 def pool():
     """That all calls share; it does not outlive the tests of this file."""
     yield
-    loky = pytest.importorskip("joblib.externals.loky")
-    loky.get_reusable_executor(reuse=True).shutdown(wait=True)
+    end_pool()
 
 
 def told(call):
