@@ -245,3 +245,23 @@ def test_searches_in_lockstep():
     for task, rounds, energies in zip(tasks, (2, 0, 3), found, strict=True):
         assert_close(energies, run(search(task, rounds), minimise_all), rtol=1e-6, atol=1e-6)
     assert run(together([]), minimise_all) == []
+
+
+def test_what_is_late_waits_for_all_others():
+    """Searches of different lengths ask for something together in the end, whatever they asked for before."""
+
+    def search(rounds):
+        asked = []
+        for k in range(rounds):
+            asked += yield [k]
+        return asked + (yield [1.5, rounds]) + (yield [0])
+
+    served = []
+
+    def serve(requests):
+        served.append(list(requests))
+        return [-request for request in requests]
+
+    found = run(together([search(n) for n in (2, 0, 1)], late=lambda request: request == 1.5), serve)
+    assert found == [[0, -1, -1.5, -2, 0], [-1.5, 0, 0], [0, -1.5, -1, 0]]
+    assert served == [[0, 0], [1], [1.5, 2, 1.5, 0, 1.5, 1], [0, 0, 0]]

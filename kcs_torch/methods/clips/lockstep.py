@@ -30,8 +30,14 @@ def run(search: Search[Request, Answer, Result], serve: Callable[[list[Request]]
         del requests
 
 
-def together(searches: Sequence[Search[Request, Answer, Result]]) -> Search[Request, Answer, list[Result]]:
-    """One search that runs several in lockstep and returns what each finds."""
+def together(
+    searches: Sequence[Search[Request, Answer, Result]], late: Callable[[Request], bool] = lambda _: False
+) -> Search[Request, Answer, list[Result]]:
+    """One search that runs several in lockstep and returns what each finds.
+
+    Those that ask for something ``late`` wait until none asks for anything else: what they come to by ways of different
+    lengths is then one batch.
+    """
     found: dict[int, Result] = {}
     asked: dict[int, list[Request]] = {}
 
@@ -44,8 +50,8 @@ def together(searches: Sequence[Search[Request, Answer, Result]]) -> Search[Requ
     for i in range(len(searches)):
         advance(i, None)
     while asked:
-        order = list(asked.items())
-        asked.clear()
+        waits = {i: any(map(late, asked[i])) for i in sorted(asked)}
+        order = [(i, asked.pop(i)) for i, wait in waits.items() if not wait or all(waits.values())]
         answers = iter((yield [request for _, requests in order for request in requests]))
         for i, requests in order:
             advance(i, [next(answers) for _ in requests])

@@ -17,7 +17,7 @@ from kcs_torch.methods.sfam import SfAM
 from kcs_torch.solvers.denoise import Denoised, denoise_tracks
 from kcs_torch.types import Tracks
 
-__all__ = ["Noisy", "Sized", "clean_all", "serve"]
+__all__ = ["Noisy", "Sized", "clean_all", "is_descent", "serve"]
 
 
 class Noisy(NamedTuple):
@@ -57,6 +57,11 @@ def serve(requests: Sequence[Task | Placing | Facing | Descent | Noisy | Sized |
         if asked:
             out |= zip(asked, answer([requests[i] for i in asked]), strict=True)
     return [out[i] for i in range(len(requests))]
+
+
+def is_descent(request: object) -> bool:
+    """Whether this is a descent: clips come to theirs after searches of different lengths."""
+    return isinstance(request, Descent)
 
 
 def clean_all(tasks: Sequence[Noisy]) -> list[Denoised]:

@@ -17,7 +17,7 @@ from kcs_torch.methods.answer.root import standing_feet
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.clips.lockstep import Search, run, together
 from kcs_torch.methods.pkc.around import turned_around
-from kcs_torch.methods.pkc.batch import Sized, serve
+from kcs_torch.methods.pkc.batch import Sized, is_descent, serve
 from kcs_torch.methods.pkc.blocks import Turned, search
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.cleaning import cleaned
@@ -143,7 +143,7 @@ class PKC(Method):
 
     def solve_all(self, tracks: Sequence[Tracks]) -> list[Estimate]:
         """Several clips, whose hypotheses are refined together."""
-        return run(together([self._steps(one, None) for one in tracks]), serve)
+        return run(together([self._steps(one, None) for one in tracks], late=is_descent), serve)
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
         parts = parts_of(tracks)
