@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from near_cameras import LENS, filmed
 from torch.testing import assert_close
 
 import kcs_torch as kt
 from kcs_torch.data import walking_person
 from kcs_torch.functional import superpose
+from kcs_torch.methods.perspective.scene import Scene
 from kcs_torch.methods.pkc.long_gaps import shortened
 
 
@@ -120,3 +122,26 @@ def test_a_single_image_is_solved_as_two_of_the_same(cameras):
     torch.testing.assert_close(ours.uncertainty, theirs.uncertainty[:1])
     assert len(ours.alternatives) == len(theirs.alternatives) > 0
     assert all(other.points.shape == (1, 17, 3) and other.cameras.shape == (1, 2, 3) for other in ours.alternatives)
+
+
+@pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")
+@pytest.mark.parametrize("gaps", [(slice(0, 40), slice(80, 120)), (slice(40, 90),)], ids=["ends", "between"])
+def test_the_lens_is_found_by_what_is_seen(monkeypatch, gaps):
+    """A body that is held while nobody is seen would make the focal length a quarter too short; in gaps it walks on."""
+    tracks = replace(filmed(frames=120)[0], image_size=(1920, 1080))
+    refined, lengths = Scene.refined, set()
+
+    def counted(scene, *arguments, **options):
+        lengths.add(len(scene.rays))
+        return refined(scene, *arguments, **options)
+
+    monkeypatch.setattr(Scene, "refined", counted)
+    result = kt.reconstruct(hidden(tracks, *gaps))
+    assert lengths == {40 if len(gaps) > 1 else 120}
+    assert 0.9 < result.intrinsics.fx / LENS[0] < 1.1
+    if len(gaps) > 1:
+        alone = kt.reconstruct(tracks.frames(40, 80))
+        assert result.intrinsics.fx == pytest.approx(alone.intrinsics.fx, rel=0.05)
+        place, known = result.in_space() / result.intrinsics.fx, alone.in_space() / alone.intrinsics.fx
+        assert_close(place[40:80], known, rtol=0, atol=0.02)  # of a body of .8 or so
+        assert_close(place[:40] - place[40], place.new_zeros(40, 17, 3), rtol=0, atol=0.05)

@@ -11,6 +11,7 @@ from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.methods.answer.finish import extent
 from kcs_torch.methods.clips.template import clip_scale
 from kcs_torch.methods.perspective.pinhole_coordinates import USUAL
+from kcs_torch.methods.pkc.long_gaps import time_seen
 from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.types import Intrinsics, Tracks
 from kcs_torch.types.image_size import usual_size
@@ -58,7 +59,8 @@ def lens_of_image(tracks: Tracks) -> LikelyLens | None:
     Returns:
         The lens; or None where the tracks are not in pixels, no image of usual size holds them, or they show a point.
     """
-    tracks = replace(tracks, points=tracks.points.detach())
+    time = time_seen(tracks)
+    tracks = replace(tracks, points=tracks.points.detach()).frames(time.start, time.stop)
     points = tracks.points[tracks.seen]
     if not bool(extent(tracks) > 0) or not (tracks.units == "px" or detected(tracks)):
         return None

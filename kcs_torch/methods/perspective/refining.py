@@ -14,6 +14,7 @@ from kcs_torch.methods.perspective.parallel_image import body_unit, clean_image,
 from kcs_torch.methods.perspective.scene import STEPS, Bodies, Scene, ahead
 from kcs_torch.methods.perspective.view import View, slow_part
 from kcs_torch.methods.pkc.limbs import outward
+from kcs_torch.methods.pkc.long_gaps import time_seen
 from kcs_torch.methods.pkc.moving_answer import STILL
 from kcs_torch.types import Reconstruction, Tracks
 
@@ -126,7 +127,7 @@ def refine(
     if mirror:
         others, start = (*others, lifted.mirrored()), torch.cat([start, -start[:1]])
     distance, start = distance / scales * (unit / own), start * (unit / own)
-    scene, bodies = _settled(scene, distance, start, flips, any_focal)
+    scene, bodies = _refined(scene, distance, start, lifted.tracks, flips, any_focal)
     return Found(bodies, others, scene, view, False, lifted.diagnostics.notes)
 
 
@@ -143,22 +144,36 @@ def refine_again(found: Found, view: View, standing: Tensor | None, flips: bool)
     usual = None if found.scene.usual is None else found.scene.usual * found.view.lens.focal / focal
     scene = replace(found.scene, rays=rays, standing=standing, any_focal=False, usual=usual)
     origin = bodies.origin
-    scene, bodies = _settled(scene, bodies.distance[0], bodies.depth, flips, any_focal=True)
+    seen = found.lifted[0].tracks
+    scene, bodies = _refined(scene, bodies.distance[0], bodies.depth, seen, flips, any_focal=True)
     bodies = replace(bodies, origin=origin[bodies.origin])
     lifted = tuple(_turned(one, view.look @ found.view.look.mT) for one in found.lifted)
     through = focal if flips else before
     return replace(found, bodies=bodies, lifted=lifted, scene=scene, view=view, through=through)
 
 
-def _settled(scene: Scene, distance: Tensor, depth: Tensor, flips: bool, any_focal: bool) -> tuple[Scene, Bodies]:
-    """Bodies refined from depths (H, T, N) at a distance (T,), best first; and the scene that they explain."""
+def _refined(
+    scene: Scene, distance: Tensor, depth: Tensor, tracks: Tracks, flips: bool, any_focal: bool
+) -> tuple[Scene, Bodies]:
+    """Bodies refined from depths (H, T, N) at a distance (T,), best first; and the scene that they explain.
+
+    Frames before the body is first seen, and after it was last seen, are held: a body that stands still in them would
+    tell as much of the lens, and of usual postures, as one that moves. In gaps it moves on, so that these are refined.
+    """
+    # A foot that comes along its ray seems to stand still, and would make the focal length too short.
+    goal = replace(scene, any_focal=True, standing=None) if any_focal else scene
+    time = time_seen(tracks)
+    bodies = _settled(scene.during(time), goal.during(time), distance[time], depth[:, time], flips)
+    return goal, bodies.held(time.start, len(scene.rays))
+
+
+def _settled(scene: Scene, goal: Scene, distance: Tensor, depth: Tensor, flips: bool) -> Bodies:
+    """Bodies refined in a scene, with runs of signs turned over if they may be, and then the best one in the goal."""
     bodies = scene.refined(distance, depth)
     if flips:
         bodies = scene.turned_over(bodies)
-    if any_focal:
-        # A foot that comes along its ray seems to stand still, and would make the focal length too short.
-        scene = replace(scene, any_focal=True, standing=None)
-        best = scene.refined(bodies.distance[0], bodies.depth[:1])
-        rest = replace(bodies[1:], energy=bodies.energy[1:] + (best.energy - bodies.energy[:1]))
-        bodies = replace(best, origin=bodies.origin[:1]).joined(rest)
-    return scene, bodies
+    if not goal.any_focal:
+        return bodies
+    best = goal.refined(bodies.distance[0], bodies.depth[:1])
+    rest = replace(bodies[1:], energy=bodies.energy[1:] + (best.energy - bodies.energy[:1]))
+    return replace(best, origin=bodies.origin[:1]).joined(rest)

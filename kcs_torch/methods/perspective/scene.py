@@ -71,6 +71,11 @@ class Bodies:
         both = Bodies(*(torch.cat(pair) for pair in pairs))
         return both[both.energy.argsort()]
 
+    def held(self, begin: int, frames: int) -> Bodies:
+        """Bodies of so many frames that are as these from frame ``begin`` on, and as at their ends before and after."""
+        index = (torch.arange(frames, device=self.depth.device) - begin).clamp(0, self.depth.shape[1] - 1)
+        return replace(self, depth=self.depth[:, index], distance=self.distance[:, index])
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -95,6 +100,11 @@ class Scene:
     standing: Tensor | None
     any_focal: bool = False
     usual: float | None = None
+
+    def during(self, time: slice) -> Scene:
+        """That of some frames."""
+        standing = None if self.standing is None else self.standing[time]
+        return replace(self, rays=self.rays[time], noise=self.noise[time], standing=standing)
 
     def refined(self, distance: Tensor, depth: Tensor, focal: Tensor | None = None, *, steps: int = STEPS) -> Bodies:
         """Bodies of least :class:`PinholeEnergy`, each from its own start, best first.

@@ -26,6 +26,7 @@ from kcs_torch.methods.perspective.scene import BLOCK, STEPS
 from kcs_torch.methods.perspective.view import View, lens_note
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
+from kcs_torch.methods.pkc.long_gaps import time_seen
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
 from kcs_torch.nn.posture import has_trunk, trunk_joints
 from kcs_torch.solvers.lbfgs import lbfgs
@@ -185,7 +186,7 @@ def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrin
         if cameras is not None:
             cameras = check_cameras(as_floats(cameras, "cameras", 3).to(tracks.points), tracks.num_frames)
         flat, unit = clean_image(lifted), body_unit(lifted)
-        x, y = flat.mean((0, 1)).tolist()
+        x, y = flat[time_seen(tracks)].mean((0, 1)).tolist()
         near = SEEMS_NEAR in lifted.diagnostics.notes
         if not near:
             distance = _nearness(tracks, flat, lifted.points[..., 2] / unit, unit, cameras)
@@ -233,7 +234,7 @@ def _nearness(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras:
         unit: of such a body, in the tracks' unit.
         cameras: (T, 2, 3) that are known, or None.
     """
-    middle = flat.mean((0, 1))
+    middle = flat[time_seen(tracks)].mean((0, 1))
     aside = float((flat - middle).square().sum(-1).mean().sqrt())
     if not (bool(extent(tracks) > 0) and aside < WIDE * USUAL * unit):  # a point is as likely at any distance
         return math.inf
@@ -311,7 +312,8 @@ def _seen_by_two(
         feet: (T, C) how surely contact points stand still, or None.
     """
     every = max(1, round(tracks.rate / RATE))
-    some = _liveliest(flat[::every], round(SECONDS * RATE)) * every
+    shown = flat[time_seen(tracks)]
+    some = time_seen(tracks).start + _liveliest(shown[::every], round(SECONDS * RATE)) * every
     rate, noise = tracks.rate / every, image_noise(tracks, flat, unit)
     depth = depth[:, some] - depth[:, some].mean(-1, keepdim=True)
     clean = replace(tracks, points=flat[some], weights=torch.ones_like(depth[0]), fps=rate)

@@ -15,7 +15,7 @@ from kcs_torch.methods.clips.unseen import gap_deviation
 from kcs_torch.methods.pkc.cleaning import HELD, nobody_at_ends
 from kcs_torch.types import Tracks
 
-__all__ = ["first_frame", "lengthened", "shortened"]
+__all__ = ["first_frame", "lengthened", "shortened", "time_seen"]
 
 LONGEST = 0.25
 """Seconds that a gap may last; of longer ones only so many frames are solved. What fills a gap bends as little as it
@@ -25,29 +25,43 @@ SHOWN = 2
 """Joints that a frame has to show so as not to be of a gap."""
 
 
-def shortened(tracks: Tracks) -> Tensor | None:
-    """Indices (T',) of the frames that are solved, evenly spread over gaps that last too long; None if all are.
+def time_seen(tracks: Tracks) -> slice:
+    """The frames from when the body is first seen until it was last seen, if it is away for long before or after.
 
-    Frames before the body is first seen, and after it was last seen, are left out where either take as long: people
-    come and go, while their tracks have all the frames of the film.
+    People come and go, while their tracks have all the frames of the film.
     """
-    shown = tracks.seen.sum(-1) >= min(SHOWN, tracks.num_joints)
-    most = max(2, round(LONGEST * tracks.rate))
-    frames = shown.nonzero().flatten()
-    if not len(frames):
-        return None
-    first, last = int(frames[0]), int(frames[-1])
-    keep = torch.ones_like(shown)
-    if max(first, len(shown) - 1 - last) > most:
-        keep[:first] = keep[last + 1 :] = False
+    frames = _showing(tracks).nonzero().flatten().tolist()
+    if not frames or max(frames[0], tracks.num_frames - 1 - frames[-1]) <= _longest(tracks):
+        return slice(0, tracks.num_frames)
+    return slice(frames[0], frames[-1] + 1)
+
+
+def shortened(tracks: Tracks) -> Tensor | None:
+    """Indices (T',) of the frames that are solved: of the :func:`time_seen` all but much of long gaps; None if all are.
+
+    Of gaps that last too long a few frames are solved, evenly spread.
+    """
+    most, frames = _longest(tracks), _showing(tracks).nonzero().flatten()
+    keep = torch.zeros(tracks.num_frames, dtype=torch.bool, device=frames.device)
+    keep[time_seen(tracks)] = True
     long = frames.diff() > most + 1
     before, after = frames[:-1][long], frames[1:][long]
-    edges = torch.zeros_like(shown, dtype=torch.long)
+    edges = torch.zeros_like(keep, dtype=torch.long)
     edges[before + 1], edges[after] = 1, -1
     keep &= edges.cumsum(0) == 0
     share = torch.arange(1, most + 1, device=frames.device) / (most + 1)
     keep[before[:, None] + (share * (after - before)[:, None]).round().long()] = True
     return None if bool(keep.all()) else keep.nonzero().flatten()
+
+
+def _showing(tracks: Tracks) -> Tensor:
+    """Whether frames (T,) show enough of the body."""
+    return tracks.seen.sum(-1) >= min(SHOWN, tracks.num_joints)
+
+
+def _longest(tracks: Tracks) -> int:
+    """Frames that a gap may last."""
+    return max(2, round(LONGEST * tracks.rate))
 
 
 def lengthened(found: Estimate, kept: Tensor, tracks: Tracks, cameras: Tensor | None) -> Estimate:
