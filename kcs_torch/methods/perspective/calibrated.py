@@ -33,7 +33,8 @@ from kcs_torch.types import Intrinsics, Reconstruction, Tracks, as_floats
 __all__ = ["WIDE", "feet_on_ground", "leaning", "reconstruct_perspective"]
 
 ROUNDS, FOCAL_ROUNDS = 3, 4
-"""Rounds, at most, of lifting and refining; and of refining alone, where the focal length is found."""
+"""Rounds, at most, of lifting and refining through a lens that is known, of which one is enough through one that is
+not; and of refining alone, where the focal length is found."""
 
 SETTLED = 0.01
 """Root mean square change of depth, for a body of 1.75, below which no further round is made."""
@@ -133,14 +134,14 @@ def _best_of_rounds(method: Method, tracks: Tracks, view: View, cameras: Tensor 
     """What is found until depths settle or nothing gets better, arguments as of :func:`reconstruct_perspective`.
 
     Each round straightens the tracks by the depths and distances of the one before, and lifts them. A ``usual`` focal
-    length is as of :func:`refine`.
+    length is as of :func:`refine`; then the lens is a guess, and what more rounds made of it would not last.
     """
     distance, depth = view.first_distance(tracks, tracks.rate), torch.zeros_like(view.rays[..., 0])
     feet = feet_on_ground(tracks, cameras)
     best: Found | None = None
     unit: float | None = None
     soft = SOFT if method.turns_over and not has_trunk(tracks.skeleton) else 0
-    rounds = ROUNDS
+    rounds = ROUNDS if usual is None else 1
     while rounds > 0:
         straight = _straighten(tracks, view.rays, distance, depth)
         # The tracks of the first round agree with no depths yet: there the method may find signs by itself.
