@@ -362,6 +362,9 @@ def test_the_first_round_searches_in_full(monkeypatch):
     monkeypatch.setattr(kt.PKC, "following", lambda self, searched: asked.append(searched) or real(self, searched))
     quietly(filmed(frames=20)[0], method="pkc", intrinsics=LENS)
     assert asked[:2] == [False, True] and all(asked[1:])
+    asked.clear()
+    quietly(replace(filmed(frames=20)[0], image_size=(1920, 1080)), method="pkc")
+    assert asked == [False]  # through a lens that is a guess further rounds would last no longer than it does
 
 
 def test_what_settles_is_what_is_found_along_rays(monkeypatch):
