@@ -391,3 +391,14 @@ def test_command_line(tmp_path, word):
     assert any("found from the tracks" in note for note in found.diagnostics.notes) == (word == "auto")
     if word == "parallel":
         assert_close(found.points, quietly(tracks, method="kcs", intrinsics=word).points)
+
+
+def test_a_body_beside_the_middle_of_its_image_is_seen_along_its_own_rays():
+    """It is turned against the optical axis: as if it were not, a far camera seemed to explain it better (42 mm)."""
+    clip, lens = kt.data.walking_person(50, turn=0.0, yaw=60.0), Intrinsics(1000.0, 1000.0, 960.0, 540.0)
+    points = clip.points + clip.points.new_tensor([4500.0, 800.0, 6000.0])
+    image = lens.project(points)
+    image = image + torch.randn(image.shape, generator=torch.Generator().manual_seed(0), dtype=image.dtype)
+    found = quietly(kt.Tracks.from_arrays(image, skeleton=clip.skeleton, fps=30.0, image_size=(1920, 1080)))
+    assert found.distance is not None and 0.7 < found.intrinsics.fx / lens.fx < 1.4
+    assert error(found.points, points) < 25

@@ -272,23 +272,44 @@ def _nearness(tracks: Tracks, flat: Tensor, depth: Tensor, unit: float, cameras:
 def _is_far(near: Reconstruction, lifted: Reconstruction) -> bool:
     """Whether a camera that is far away explains the tracks better than a near one, each by what was found through it.
 
+    Each is seen along its own rays, in its own image without noise: where tracks are noisy, bones are constant there.
+
     Args:
         near: through a lens, at a usual distance.
         lifted: under parallel rays.
     """
-    lens = near.intrinsics
+    lens, flat, unit = near.intrinsics, clean_image(lifted), body_unit(lifted)
     assert lens is not None
-    flat, unit = clean_image(lifted), body_unit(lifted)
-    depth = torch.stack([lifted.points[..., 2] / unit, near.points[..., 2] / body_unit(near)])
-    middle = flat.new_tensor([lens.cx, lens.cy])
-    aside = float((flat - middle).square().sum(-1).mean().sqrt())
-    if not (bool(depth.isfinite().all()) and aside < WIDE * FAR * unit):  # a body that shrank to a point tells nothing
+    far, space = Intrinsics(FAR * unit, FAR * unit, lens.cx, lens.cy), near.in_space()
+    aside = float(far.rays(flat)[..., :2].square().sum(-1).mean().sqrt())
+    if not (bool(lifted.points.isfinite().all()) and aside < WIDE):  # a body that shrank to a point tells nothing
         return False
-    focal = flat.new_tensor([1.0, lens.focal / (FAR * unit)])
-    energy = _seen_by_two(lifted.tracks, flat, depth, unit, middle, (focal, focal < 0), None)
-    found = lbfgs(energy, energy.start, num_steps=2 * STEPS, tolerance=1e-6, slopes=True, part=energy.rows)
-    assert found.energy is not None
-    return bool(found.energy[0] < found.energy[1])
+    tracks, some, rate = lifted.tracks, *_telling(lifted.tracks, flat)
+    noise = image_noise(tracks, flat, unit)[some]
+    images = [
+        replace(tracks, points=image[some], weights=torch.ones_like(noise), fps=rate)
+        for image in (flat, lens.project(space))
+    ]
+    views = [View.of(image, seen, rate) for image, seen in zip(images, (far, lens), strict=True)]
+    placed = (space[some] @ views[1].look.mT)[..., 2] / body_unit(near)
+    starts = (
+        (views[0].first_distance(images[0], rate) / unit, lifted.points[some, :, 2] / unit),
+        (placed.mean(-1), placed),
+    )
+    cost = []
+    for view, (path, depth) in zip(views, starts, strict=True):
+        depth = (depth - depth.mean(-1, keepdim=True))[None]
+        energy = PinholeEnergy(outward(tracks.skeleton), view.rays, path, depth, rate, noise)
+        found = lbfgs(energy, energy.start, num_steps=2 * STEPS, tolerance=1e-6, slopes=True)
+        assert found.energy is not None
+        cost.append(float(found.energy[0]))
+    return cost[0] < cost[1]
+
+
+def _telling(tracks: Tracks, flat: Tensor) -> tuple[Tensor, float]:
+    """Which frames (K,) tell how far the camera is, the five seconds in which an image moves most, and their rate."""
+    every, time = max(1, round(tracks.rate / RATE)), time_seen(tracks)
+    return time.start + _liveliest(flat[time][::every], round(SECONDS * RATE)) * every, tracks.rate / every
 
 
 def _seen_by_two(
@@ -311,10 +332,8 @@ def _seen_by_two(
         focal: (2,) focal lengths, over that of a camera at the distance FAR, and which are free (2,).
         feet: (T, C) how surely contact points stand still, or None.
     """
-    every = max(1, round(tracks.rate / RATE))
-    shown = flat[time_seen(tracks)]
-    some = time_seen(tracks).start + _liveliest(shown[::every], round(SECONDS * RATE)) * every
-    rate, noise = tracks.rate / every, image_noise(tracks, flat, unit)
+    some, rate = _telling(tracks, flat)
+    noise = image_noise(tracks, flat, unit)
     depth = depth[:, some] - depth[:, some].mean(-1, keepdim=True)
     clean = replace(tracks, points=flat[some], weights=torch.ones_like(depth[0]), fps=rate)
     view = View.of(clean, Intrinsics(FAR * unit, FAR * unit, *middle.tolist()), rate)
