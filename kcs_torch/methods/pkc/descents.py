@@ -14,7 +14,7 @@ from kcs_torch.solvers.procrustean import Pose, Stage, procrustean
 __all__ = ["TOGETHER", "Descent", "descend_all"]
 
 TOGETHER = 4800
-"""Frames of starts or hypotheses that are taken as one batch; more would only fall out of the processor's cache."""
+"""Frames of starts or hypotheses that are taken as one batch; more gained nothing."""
 
 
 @dataclass(frozen=True)
