@@ -228,7 +228,10 @@ def test_standing_feet_cost_what_they_slide():
 
 
 def test_usual_lenses_cost_least():
-    """A focal length costs what makes the distance unusual, and what it is off by from that of usual lenses."""
+    """A focal length costs what makes the distance unusual, and what it is off by from that of usual lenses.
+
+    Where these are known, it costs little to be far away.
+    """
     skeleton, rays, depth, far, _ = walk()
     focal = torch.tensor([1.0, 2.0, 2.0]).double()
     given = skeleton, rays, far, depth.expand(3, -1, -1), 30.0, level(rays), None, None
@@ -241,4 +244,7 @@ def test_usual_lenses_cost_least():
     off = (focal / 2.0).log().square() / 2 * FIRM
     away = (far.mean() * focal / USUAL).log().square() / 2 * FIRM
     assert_close(cost(None), away)
-    assert_close(cost(2.0), away + off)
+    far_away = far.mean() * focal > USUAL
+    assert far_away.tolist() == [False, True, True]
+    easy = (math.log(1.5) / math.log(3.0)) ** 2
+    assert_close(cost(2.0), torch.where(far_away, easy * away, away) + off)

@@ -1,8 +1,7 @@
-"""What the size of its image tells of a camera that nobody has calibrated: how far away it is, and its likely lens."""
+"""What the size of its image tells of a camera that nobody has calibrated: its likely lens."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,16 +9,13 @@ from kcs_torch.clean.detector import detected
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.methods.answer.finish import extent
 from kcs_torch.methods.clips.template import clip_scale
-from kcs_torch.methods.perspective.pinhole_coordinates import USUAL
+from kcs_torch.methods.perspective.pinhole_coordinates import EASY, USUAL
 from kcs_torch.methods.pkc.long_gaps import time_seen
 from kcs_torch.methods.pkc.objective import usual_posture
 from kcs_torch.types import Intrinsics, Tracks
 from kcs_torch.types.image_size import usual_size
 
-__all__ = ["NEAR", "LikelyLens", "lens_of_image"]
-
-NEAR = 10.0
-"""Distance up to which a camera is near: from there on a wrong focal length does more harm than parallel rays."""
+__all__ = ["LikelyLens", "lens_of_image"]
 
 FOCAL = 0.85
 """Usual focal length over the image's longer side, that of phones, web and action cameras."""
@@ -36,13 +32,11 @@ class LikelyLens(NamedTuple):
         lens: looks at the image's middle, of a focal length between the usual one, as images are cropped, and one that
             makes the camera's distance a usual one.
         usual: focal length of usual cameras with such an image.
-        far: whether the body is so small in it that rays of a usual camera might as well be parallel.
         said: what to say of it; empty where somebody said how large the image is.
     """
 
     lens: Intrinsics
     usual: float
-    far: bool
     said: str
 
 
@@ -77,6 +71,8 @@ def lens_of_image(tracks: Tracks) -> LikelyLens | None:
         f"the image is taken to be {width} x {height} pixels, the smallest of usual size that holds the tracks{whose}: "
         f"if it is not, give {SAY_SIZE if tracks.units == 'px' else ''}the camera's intrinsics"
     )
-    likely = math.sqrt(usual * USUAL * unit)
+    near = USUAL * unit  # focal length of a camera at the usual distance
+    pull = 1.0 if usual < near else EASY
+    likely = (usual * near**pull) ** (1 / (1 + pull))
     lens = Intrinsics(likely, likely, width / 2, height / 2)
-    return LikelyLens(lens, usual, not usual < NEAR * unit, "" if tracks.image_size else said)
+    return LikelyLens(lens, usual, "" if tracks.image_size else said)

@@ -14,7 +14,7 @@ from kcs_torch.methods.pkc.weights import HEAVY
 if TYPE_CHECKING:
     from kcs_torch.methods.perspective.pinhole import PinholeEnergy
 
-__all__ = ["FIRM", "STRAY", "USUAL", "coordinates"]
+__all__ = ["EASY", "FIRM", "STRAY", "USUAL", "coordinates"]
 
 STRAY = 0.1
 """Usual deviation of the distance from what is given, as a share, all frames counting as one."""
@@ -27,6 +27,13 @@ USUAL, FACTOR = 4.5, 1.5
 
 FIRM = math.log(FACTOR) ** -2
 """Curvature of what it costs, in the logarithm."""
+
+FARTHER = 3.0
+"""By what factor it strays to the far side where the usual focal length is known: images that are cropped make bodies
+large, while one that is small is more often far away than before a lens that is short."""
+
+EASY = FIRM**-1 * math.log(FARTHER) ** -2
+"""That side's curvature, over the other's."""
 
 
 def coordinates(energy: PinholeEnergy, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -18,7 +18,7 @@ from kcs_torch.methods.answer.finish import Estimate, extent
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.clips.lockstep import Search
 from kcs_torch.methods.perspective.calibrated import WIDE, feet_on_ground, reconstruct_perspective
-from kcs_torch.methods.perspective.image_lens import NEAR, LikelyLens, lens_of_image
+from kcs_torch.methods.perspective.image_lens import LikelyLens, lens_of_image
 from kcs_torch.methods.perspective.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.perspective.pinhole import PinholeEnergy
 from kcs_torch.methods.perspective.pinhole_coordinates import FIRM, USUAL
@@ -42,6 +42,10 @@ FAR = 34.0
 
 UNUSUAL = FIRM * math.log(FAR / USUAL) ** 2 / 2
 """What it costs to be as far away, where the focal length is not known."""
+
+NEAR = 10.0
+"""Distance up to which tracks tell that a camera is near, whose lens nothing else tells: from there on a wrong focal
+length does more harm than parallel rays."""
 
 CLOSE = 5.0
 """Distance up to which the search under parallel rays ends: what is farther away it finds signs of better."""
@@ -84,11 +88,10 @@ def reconstruct_uncalibrated(
 
     The nearer a camera is, the more the size of a limb in the image changes with its depth: bones of constant length,
     the template's posture and feet that stand still tell how much. Where the image's size is known, or can be guessed,
-    the tracks are lifted through the lens that such a camera usually has (:func:`lens_of_image`). Where it is not, or
-    the body is so small in it that such a camera is far away, PKC solves them as if rays were parallel, but ends where
-    it has found a body whose camera seems near all the same (:func:`likely_lens`), before it turns runs of signs over;
-    if nothing tells of the image, the principal point is taken to be the tracks' middle. Either way the focal length is
-    found together with depths, lengths, distances and signs by
+    the tracks are lifted through the lens that such a camera usually has (:func:`lens_of_image`). Where it is not, PKC
+    solves them as if rays were parallel, but ends where it has found a body whose camera seems near all the same
+    (:func:`likely_lens`), before it turns runs of signs over; the principal point is then taken to be the tracks'
+    middle. Either way the focal length is found together with depths, lengths, distances and signs by
     :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
 
     Args:
@@ -96,7 +99,7 @@ def reconstruct_uncalibrated(
         tracks: of a body with a template.
         cameras: as of :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
         lifted: what PKC, :func:`looking` for a near camera, found under parallel rays, if it was asked before: where
-            :func:`lens_of_image` tells nothing, or that the camera is far away.
+            :func:`lens_of_image` tells nothing, or another's tracks told that the camera is far away.
 
     Returns:
         As :func:`kcs_torch.methods.perspective.reconstruct_perspective`; a note tells the intrinsics. Where the tracks
@@ -115,7 +118,7 @@ def reconstruct_uncalibrated(
     likely = lens_of_image(tracks)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", KcsWarning)  # of solutions on the way
-        if likely is not None and not likely.far and lifted is None:
+        if likely is not None and lifted is None:
             result = _by_image(method, tracks, cameras, likely)
         else:
             result = _by_tracks(method, tracks, cameras, likely, lifted)
