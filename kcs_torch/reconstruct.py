@@ -15,8 +15,9 @@ from kcs_torch.methods.base import Method, check_tracks
 from kcs_torch.methods.clips.processes import check_workers, spread, spread_batch
 from kcs_torch.methods.found_skeleton import find_skeleton
 from kcs_torch.methods.perspective.calibrated import WIDE, reconstruct_perspective
+from kcs_torch.methods.perspective.near_or_far import may_be_near
 from kcs_torch.methods.perspective.one_lens import by_one_lens
-from kcs_torch.methods.perspective.uncalibrated import looking, may_be_near, reconstruct_uncalibrated
+from kcs_torch.methods.perspective.uncalibrated import looking, reconstruct_uncalibrated
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.bodies import no_bones

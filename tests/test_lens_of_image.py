@@ -13,10 +13,10 @@ from torch.testing import assert_close
 
 import kcs_torch as kt
 from kcs_torch.many import folder, reconstruct_folder
-from kcs_torch.methods.perspective import calibrated, image_lens, one_lens, uncalibrated
+from kcs_torch.methods.perspective import calibrated, image_lens, near_or_far, one_lens, uncalibrated
 from kcs_torch.methods.perspective.image_lens import lens_of_image
+from kcs_torch.methods.perspective.near_or_far import may_be_near
 from kcs_torch.methods.perspective.one_lens import by_one_lens
-from kcs_torch.methods.perspective.uncalibrated import may_be_near
 from kcs_torch.types import Intrinsics
 from kcs_torch.types.people import guess_images, of_one_image
 
@@ -308,4 +308,4 @@ def test_a_body_that_shrank_to_a_point_is_not_far():
     near = quietly(tracks, rounds=0, steps=3, intrinsics=IMAGE)
     there = near.points.new_tensor([900.0, 400.0, 0.0])
     shrunk = replace(near, points=there + 1e-3 * (near.points - near.points.mean(1, keepdim=True))).remeasured()
-    assert not uncalibrated._is_far(near, shrunk)
+    assert not near_or_far.is_far(near, shrunk)

@@ -17,8 +17,9 @@ import kcs_torch as kt
 from kcs_torch.cli import app
 from kcs_torch.io import load_reconstruction
 from kcs_torch.methods import PKC
-from kcs_torch.methods.perspective import calibrated, refining, scene, uncalibrated
-from kcs_torch.methods.perspective.uncalibrated import likely_lens, looking, may_be_near
+from kcs_torch.methods.perspective import calibrated, near_or_far, refining, scene, uncalibrated
+from kcs_torch.methods.perspective.near_or_far import may_be_near
+from kcs_torch.methods.perspective.uncalibrated import likely_lens, looking
 from kcs_torch.methods.pkc import blocks
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR
 from kcs_torch.types import Intrinsics
@@ -128,9 +129,9 @@ def test_runs_are_turned_over_once_through_one_lens(monkeypatch):
 def test_the_search_ends_where_the_camera_seems_near(monkeypatch, fps, block):
     """Before runs of signs are turned over, asked once of the liveliest block; what is then found has no note of it."""
     monkeypatch.setattr(blocks, "BLOCK", block)
-    asked, nearness, turned = [], uncalibrated._nearness, []
+    asked, nearness, turned = [], uncalibrated.nearness, []
     over = blocks.searching
-    monkeypatch.setattr(uncalibrated, "_nearness", lambda *given: asked.append(len(given[1])) or nearness(*given))
+    monkeypatch.setattr(uncalibrated, "nearness", lambda *given: asked.append(len(given[1])) or nearness(*given))
     monkeypatch.setattr(blocks, "searching", lambda *given, **how: turned.append(how["rounds"]) or over(*given, **how))
     tracks, _ = filmed(frames=60, fps=fps)
     with warnings.catch_warnings():
@@ -184,24 +185,24 @@ def test_a_hopeless_search_ends_early(monkeypatch):
         made.append(lbfgs(*given, **options))
         return made[-1]
 
-    lbfgs = uncalibrated.lbfgs
+    lbfgs = near_or_far.lbfgs
     far = quietly(kt.data.walking_person(90, turn=0.0, yaw=200.0).tracks, intrinsics="parallel")
     near = quietly(filmed()[0], intrinsics="parallel")
-    monkeypatch.setattr(uncalibrated, "lbfgs", counted)
-    assert likely_lens(far) is None and len(made) == 1 and made[0].iterations < uncalibrated.STEPS
+    monkeypatch.setattr(near_or_far, "lbfgs", counted)
+    assert likely_lens(far) is None and len(made) == 1 and made[0].iterations < near_or_far.STEPS
     made.clear()
-    assert likely_lens(near) is not None and made[0].iterations == uncalibrated.STEPS
+    assert likely_lens(near) is not None and made[0].iterations == near_or_far.STEPS
 
 
 def test_what_is_surely_far_is_asked_about_once(monkeypatch):
     """A near body that is dearer in the end tells it as well as one that is hopeless on the way."""
-    monkeypatch.setattr(uncalibrated, "HOPELESS", 1e9)
+    monkeypatch.setattr(near_or_far, "HOPELESS", 1e9)
     tracks = kt.data.walking_person(45, turn=0.0, yaw=200.0).tracks
-    asked, nearness = [], uncalibrated._nearness
-    monkeypatch.setattr(uncalibrated, "_nearness", lambda *given: asked.append(0) or nearness(*given))
+    asked, nearness = [], uncalibrated.nearness
+    monkeypatch.setattr(uncalibrated, "nearness", lambda *given: asked.append(0) or nearness(*given))
     found = {}
     for dearer, times in ((1e9, 2), (-1e9, 1)):
-        monkeypatch.setattr(uncalibrated, "DEARER", dearer)
+        monkeypatch.setattr(near_or_far, "DEARER", dearer)
         asked.clear()
         found[times] = quietly(tracks)
         assert len(asked) == times
@@ -317,16 +318,16 @@ def test_five_seconds_tell(fps):
     assert_close(torch.tensor([lens.cx, lens.cy]).double(), moving.points.mean((0, 1)), rtol=0.05, atol=0)
     image = torch.zeros(40, 3, 2)
     image[25:30, 0] = torch.arange(5.0)[:, None]
-    assert uncalibrated._liveliest(image, 40).tolist() == list(range(40))
-    some = uncalibrated._liveliest(image, 8).tolist()
+    assert near_or_far._liveliest(image, 40).tolist() == list(range(40))
+    some = near_or_far._liveliest(image, 8).tolist()
     assert len(some) == 8 and some[0] <= 24 and some[-1] >= 30
-    assert uncalibrated._liveliest(image[:5], 8).tolist() == list(range(5))
+    assert near_or_far._liveliest(image[:5], 8).tolist() == list(range(5))
 
 
 def test_a_detector_is_believed_sooner(monkeypatch):
     """Its tracks come from a real camera; others must show perspective beyond doubt."""
     tracks, _ = filmed(frames=30)
-    monkeypatch.setattr(uncalibrated, "BETTER", 1e6)
+    monkeypatch.setattr(near_or_far, "BETTER", 1e6)
     flat = quietly(tracks, intrinsics="parallel")
     assert likely_lens(flat) is None
     torch.manual_seed(0)

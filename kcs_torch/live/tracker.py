@@ -20,7 +20,8 @@ from kcs_torch.live.options import LEAST, Options, check_options
 from kcs_torch.live.pose import Chain, LivePose
 from kcs_torch.live.size import SizeFilter, longest_image
 from kcs_torch.live.solve import Solved, solve_window
-from kcs_torch.methods.perspective.uncalibrated import may_be_near, reconstruct_uncalibrated
+from kcs_torch.methods.perspective.near_or_far import may_be_near
+from kcs_torch.methods.perspective.uncalibrated import reconstruct_uncalibrated
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.nn.posture import has_trunk

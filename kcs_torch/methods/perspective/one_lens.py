@@ -11,7 +11,8 @@ from kcs_torch.methods.base import Method
 from kcs_torch.methods.clips.processes import spread
 from kcs_torch.methods.perspective.calibrated import leaning, reconstruct_perspective
 from kcs_torch.methods.perspective.image_lens import lens_of_image
-from kcs_torch.methods.perspective.uncalibrated import may_be_near, reconstruct_uncalibrated
+from kcs_torch.methods.perspective.near_or_far import may_be_near
+from kcs_torch.methods.perspective.uncalibrated import reconstruct_uncalibrated
 from kcs_torch.methods.perspective.view import lens_note
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.people import file_and_person, of_one_image
