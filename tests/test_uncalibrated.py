@@ -125,6 +125,29 @@ def test_runs_are_turned_over_once_through_one_lens(monkeypatch):
             assert focal not in flips
 
 
+def test_feet_stand_still_once_the_lens_is_found(monkeypatch):
+    """They tell nothing of it, but of depths; and only of bodies whose feet may stand still."""
+    torch.manual_seed(0)
+    tracks, _ = filmed(4000.0)
+    tracks = replace(tracks, points=tracks.points + torch.randn_like(tracks.points))
+    seen, after = [], calibrated.with_feet
+    monkeypatch.setattr(calibrated, "with_feet", lambda *given: seen.append((given, after(*given))) or seen[-1][1])
+    assert quietly(tracks).distance is not None
+    ((before, standing), stood) = seen[-1]
+    assert_close(stood.bodies.focal[0], before.bodies.focal[0])
+    assert len(stood.bodies.energy) == len(before.bodies.energy) and before.scene.standing is None
+    gaps = [one.bodies.energy[1:] - one.bodies.energy[0] for one in (before, stood)]
+    assert_close(*gaps)
+    feet = list(tracks.skeleton.contacts)
+
+    def slip(bodies):
+        far = bodies.distance[0, :, None] + bodies.depth[0, :, feet]
+        return float((far.diff(dim=0).abs() * torch.minimum(standing[1:], standing[:-1])).mean())
+
+    assert slip(stood.bodies) < 0.9 * slip(before.bodies)
+    assert refining.with_feet(before, None) is before and refining.with_feet(before, 0 * standing) is before
+
+
 @pytest.mark.parametrize(("fps", "block"), [(30.0, 400), (60.0, 400), (30.0, 25)], ids=["one", "strides", "blocks"])
 def test_the_search_ends_where_the_camera_seems_near(monkeypatch, fps, block):
     """Before runs of signs are turned over, asked once of the liveliest block; what is then found has no note of it."""

@@ -20,7 +20,7 @@ from kcs_torch.methods.answer.wrong import WHY_LOOSE, what_is_wrong
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.clips.batches import Clips
 from kcs_torch.methods.perspective.parallel_image import body_unit
-from kcs_torch.methods.perspective.refining import Found, refine, refine_again, seen_along
+from kcs_torch.methods.perspective.refining import Found, refine, refine_again, seen_along, with_feet
 from kcs_torch.methods.perspective.scene import BLOCK, GAIN, Bodies, ahead
 from kcs_torch.methods.perspective.view import View, lens_note, zoomed
 from kcs_torch.methods.pkc.answers import CLOSE, HEADING
@@ -122,10 +122,12 @@ def _reconstruct(
         best = _along(method, tracks, view, cameras, lifted)
     if (guessed is not None or lifted is not None) and not best.flat:
         best = _with_focal(method, tracks, best, cameras)
-    exact = has_trunk(tracks.skeleton) and not detected(tracks)
-    if method.turns_over and exact and not best.flat:
-        if lifted is not None and SEEMS_NEAR in lifted.diagnostics.notes:  # where the search ended
-            best = _lifted_anew(method, tracks, best, cameras)
+    exact = method.turns_over and has_trunk(tracks.skeleton) and not detected(tracks) and not best.flat
+    if exact and lifted is not None and SEEMS_NEAR in lifted.diagnostics.notes:  # where the search ended
+        best = _lifted_anew(method, tracks, best, cameras)
+    if best.scene.any_focal:
+        best = with_feet(best, feet_on_ground(tracks, cameras))
+    if exact:
         best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies))
     return _assemble(method, tracks, best)
 

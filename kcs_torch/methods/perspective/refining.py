@@ -18,7 +18,7 @@ from kcs_torch.methods.pkc.long_gaps import time_seen
 from kcs_torch.methods.pkc.moving_answer import STILL
 from kcs_torch.types import Reconstruction, Tracks
 
-__all__ = ["Found", "refine", "refine_again", "seen_along"]
+__all__ = ["Found", "refine", "refine_again", "seen_along", "with_feet"]
 
 FLAT = 0.0003
 """Root mean square parallax, for a body of 1.75, below which there is no perspective to speak of."""
@@ -152,6 +152,29 @@ def refine_again(found: Found, view: View, standing: Tensor | None, flips: bool)
     return replace(found, bodies=bodies, lifted=lifted, scene=scene, view=view, through=through)
 
 
+@undifferentiated
+def with_feet(found: Found, standing: Tensor | None) -> Found:
+    """What was found with its focal length, the best body once more, with feet that stand still, through this lens.
+
+    Args:
+        found: with a focal length.
+        standing: as of :func:`refine`.
+    """
+    if standing is None or not bool((standing > 0).any()):
+        return found
+    scene, bodies = replace(found.scene, standing=standing), found.bodies
+    time = time_seen(found.lifted[0].tracks)
+    best = scene.during(time).refined(bodies.distance[0, time], bodies.depth[:1, time], bodies.focal[:1], held=True)
+    best = replace(best.held(time.start, len(scene.rays)), origin=bodies.origin[:1])
+    return replace(found, scene=scene, bodies=_led_by(best, bodies))
+
+
+def _led_by(best: Bodies, bodies: Bodies) -> Bodies:
+    """The best of bodies refined in another scene, and the others behind it by as much as they were."""
+    rest = replace(bodies[1:], energy=bodies.energy[1:] + (best.energy - bodies.energy[:1]))
+    return best.joined(rest)
+
+
 def _refined(
     scene: Scene, distance: Tensor, depth: Tensor, tracks: Tracks, flips: bool, any_focal: bool
 ) -> tuple[Scene, Bodies]:
@@ -175,5 +198,4 @@ def _settled(scene: Scene, goal: Scene, distance: Tensor, depth: Tensor, flips: 
     if not goal.any_focal:
         return bodies
     best = goal.refined(bodies.distance[0], bodies.depth[:1])
-    rest = replace(bodies[1:], energy=bodies.energy[1:] + (best.energy - bodies.energy[:1]))
-    return replace(best, origin=bodies.origin[:1]).joined(rest)
+    return _led_by(replace(best, origin=bodies.origin[:1]), bodies)

@@ -106,7 +106,15 @@ class Scene:
         standing = None if self.standing is None else self.standing[time]
         return replace(self, rays=self.rays[time], noise=self.noise[time], standing=standing)
 
-    def refined(self, distance: Tensor, depth: Tensor, focal: Tensor | None = None, *, steps: int = STEPS) -> Bodies:
+    def refined(
+        self,
+        distance: Tensor,
+        depth: Tensor,
+        focal: Tensor | None = None,
+        *,
+        steps: int = STEPS,
+        held: bool = False,
+    ) -> Bodies:
         """Bodies of least :class:`PinholeEnergy`, each from its own start, best first.
 
         Memory is for as much as a block of a long clip. The liveliest block tells the lengths of the others, whose
@@ -117,6 +125,7 @@ class Scene:
             depth: (H, T, N) starts.
             focal: (1,) that the starts were found with, over that of the rays; 1 if None.
             steps: of L-BFGS.
+            held: whether the focal length stays.
         """
         frames = len(self.rays)
         count = max(1, math.ceil((frames - OVERLAP) / (BLOCK - OVERLAP)))
@@ -126,13 +135,14 @@ class Scene:
         path = distance / focal[0] / self.unit
         image = (self.rays * distance[:, None, None]).unfold(0, size, 1)[begins]  # (W, N, 2, T)
         lively = image.diff(dim=-1).square().sum((1, 2))
+        free = self.any_focal and not held
         z = depth.new_empty(len(begins), size, *depth[:, 0].shape)
         far = depth.new_empty(len(begins), size, len(depth))
         energy, moved, lengths = depth.new_zeros(len(depth)), depth.new_zeros(len(depth)), None
         for i in median(lively, -1).argsort(descending=True).tolist() if len(begins) > 1 else [0]:
             some = slice(begins[i], begins[i] + size)
             feet = None if self.standing is None else self.standing[some]
-            lens = focal, torch.full_like(focal, self.any_focal and lengths is None, dtype=torch.bool)
+            lens = focal, torch.full_like(focal, free and lengths is None, dtype=torch.bool)
             pinhole = PinholeEnergy(
                 self.skeleton, self.rays[some], path[some], depth[:, some] / self.unit, self.rate, self.noise[some],
                 lengths, feet, lens if self.any_focal else None, self.usual,
