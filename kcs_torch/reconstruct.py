@@ -75,15 +75,14 @@ def reconstruct(
         confidence: for arrays: (T, N) in 0..1.
         fps: for arrays: frames per second.
         units: for arrays; px if None.
-        image_size: for arrays: width and height of the image in pixels, by which the lens of a near camera is known
-            roughly.
+        image_size: for arrays: width and height of the image in pixels, by which the camera's lens is known roughly.
         cameras: (T, 2, 3) camera rows, world to camera, where they are known.
         intrinsics: (fx, fy, cx, cy) or a matrix K (3, 3) in the unit of the tracks, where it is known. Perspective is
             then taken into account, and ``result.in_space()`` lies before the camera and projects onto the tracks.
-            "auto" finds the focal length from the tracks of a body with a template, unless the camera is far away, from
-            that of usual cameras with such an image on; an image whose size nobody says is taken to be the smallest of
-            usual size that holds the tracks of its file. "parallel" takes rays to be parallel. None is "auto" for
-            "pkc", bodies with a template and unknown cameras, else "parallel".
+            "auto" finds the focal length from the tracks of a body with a template, unless parallel rays explain them
+            better, from that of usual cameras with such an image on; an image whose size nobody says is taken to be
+            the smallest of usual size that holds the tracks of its file. "parallel" takes rays to be parallel. None is
+            "auto" for "pkc", bodies with a template and unknown cameras, else "parallel".
         **fields: of the method, such as ``beta=2.0``.
 
     Returns:

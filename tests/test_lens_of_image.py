@@ -17,6 +17,7 @@ from kcs_torch.methods.perspective import calibrated, image_lens, near_or_far, o
 from kcs_torch.methods.perspective.image_lens import lens_of_image
 from kcs_torch.methods.perspective.near_or_far import may_be_near
 from kcs_torch.methods.perspective.one_lens import by_one_lens
+from kcs_torch.methods.perspective.uncalibrated import looking, reconstruct_uncalibrated
 from kcs_torch.types import Intrinsics
 from kcs_torch.types.people import guess_images, of_one_image
 
@@ -77,6 +78,8 @@ def test_the_focal_length_is_found_from_usual_ones_on(monkeypatch):
         ((40, 20), None, 0.4, (640, 480)),
         ((-300, 50), None, 1.0, None),  # a tenth of the joints and more beside it
         ((3000, 2900), None, 1.0, None),
+        ((100, 50), None, 0.005, None),  # of a few pixels: of another unit
+        ((1, 1), (1920, 1080), 0.002, None),  # metres
         ((100, 50), None, 0.1, (640, 360)),  # so small that the camera is likely to be far away
     ],
 )
@@ -92,7 +95,7 @@ def test_which_lens_an_image_has(corner, size, factor, expected):
     assert (2 * found.lens.cx, 2 * found.lens.cy) == expected and found.usual == 0.85 * max(expected)
     pull = (math.log(1.5) / math.log(3.0)) ** 2 if factor == 0.1 else 1.0  # of a distance beyond the usual one
     usual = (found.lens.fx ** (1 + pull) / found.usual) ** (1 / pull)  # makes the person of about 1.75 be 4.5 away
-    assert found.lens.fx == found.lens.fy and 0.7 < usual / (4.5 / 1.75 * factor * 850) < 1.3
+    assert found.lens.fx == found.lens.fy and abs(math.log(usual / (4.5 / 1.75 * factor * 850))) < 0.15 / pull**0.5
     assert (size is None) == (f"{expected[0]} x {expected[1]}" in found.said)
     assert lens_of_image(replace(tracks, units="mm")) is None
     assert lens_of_image(replace(tracks, units="mm", detector=True)) is not None
@@ -107,6 +110,23 @@ def test_a_body_that_is_small_in_its_image():
     assert (found.intrinsics.cx, found.intrinsics.cy) == (960, 540) and 0.75 < found.intrinsics.fx / 1300 < 1.33
     flat = quietly(tracks, intrinsics="parallel")
     assert error(found.points, truth) < 0.6 * error(flat.points, truth)
+    assert askew(found.points, truth) < 0.4 * askew(flat.points, truth)
+
+
+def test_who_was_lifted_before_is_seen_in_the_image_all_the_same():
+    """As the others are of an image whose first one told that the camera is far away."""
+    tracks, _ = aside(frames=30)
+    lifted = looking(kt.PKC())(tracks)
+    found = reconstruct_uncalibrated(kt.PKC(), tracks, lifted=lifted)
+    assert (found.intrinsics.cx, found.intrinsics.cy) == (960, 540)
+
+
+@pytest.mark.parametrize("unit", [0.3, 2.0], ids=["shares", "metres"])
+def test_what_is_no_pixels_has_no_lens(unit):
+    """Arrays whose unit nobody tells; a body that small would lie in the corner of an image, and be seen askew."""
+    flat = kt.data.walking_person(20, turn=0.0, yaw=60.0).tracks.points
+    points = (flat - flat.amin((0, 1))) / 1750 * unit + 0.2
+    assert quietly(points, skeleton="h36m17").distance is None
 
 
 def test_a_joint_or_two_beside_the_image_do_not_matter():
@@ -307,5 +327,6 @@ def test_a_body_that_shrank_to_a_point_is_not_far():
     tracks, _ = aside(frames=6)
     near = quietly(tracks, rounds=0, steps=3, intrinsics=IMAGE)
     there = near.points.new_tensor([900.0, 400.0, 0.0])
-    shrunk = replace(near, points=there + 1e-3 * (near.points - near.points.mean(1, keepdim=True))).remeasured()
-    assert not near_or_far.is_far(near, shrunk)
+    for size in (1e-3, 1e-6):
+        shrunk = replace(near, points=there + size * (near.points - near.points.mean(1, keepdim=True))).remeasured()
+        assert not near_or_far.is_far(near, shrunk)

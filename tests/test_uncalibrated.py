@@ -125,17 +125,22 @@ def test_runs_are_turned_over_once_through_one_lens(monkeypatch):
             assert focal not in flips
 
 
-def test_feet_stand_still_once_the_lens_is_found(monkeypatch):
+@pytest.mark.parametrize(("block", "away"), [(2000, 0), (25, 0), (2000, 5)], ids=["one", "blocks", "ends unseen"])
+def test_feet_stand_still_once_the_lens_is_found(monkeypatch, block, away):
     """They tell nothing of it, but of depths; and only of bodies whose feet may stand still."""
+    monkeypatch.setattr(scene, "BLOCK", block)
+    monkeypatch.setattr(scene, "OVERLAP", 5)
     torch.manual_seed(0)
     tracks, _ = filmed(4000.0)
-    tracks = replace(tracks, points=tracks.points + torch.randn_like(tracks.points))
+    weights = tracks.weights.clone()
+    weights[:away] = weights[len(weights) - away :] = 0
+    tracks = replace(tracks, points=tracks.points + torch.randn_like(tracks.points), weights=weights)
     seen, after = [], calibrated.with_feet
     monkeypatch.setattr(calibrated, "with_feet", lambda *given: seen.append((given, after(*given))) or seen[-1][1])
     assert quietly(tracks).distance is not None
     ((before, standing), stood) = seen[-1]
     assert_close(stood.bodies.focal[0], before.bodies.focal[0])
-    assert len(stood.bodies.energy) == len(before.bodies.energy) and before.scene.standing is None
+    assert len(stood.bodies.energy) == len(before.bodies.energy) > 1 and before.scene.standing is None
     gaps = [one.bodies.energy[1:] - one.bodies.energy[0] for one in (before, stood)]
     assert_close(*gaps)
     feet = list(tracks.skeleton.contacts)
@@ -146,6 +151,8 @@ def test_feet_stand_still_once_the_lens_is_found(monkeypatch):
 
     assert slip(stood.bodies) < 0.9 * slip(before.bodies)
     assert refining.with_feet(before, None) is before and refining.with_feet(before, 0 * standing) is before
+    lost = replace(before, bodies=replace(before.bodies, energy=torch.full_like(before.bodies.energy, torch.nan)))
+    assert refining.with_feet(lost, standing) is lost
 
 
 @pytest.mark.parametrize(("fps", "block"), [(30.0, 400), (60.0, 400), (30.0, 25)], ids=["one", "strides", "blocks"])

@@ -70,7 +70,7 @@ ImageSize = Annotated[
         "--image-size",
         metavar="WIDTHxHEIGHT",
         help="Size of the video in pixels: turns coordinates that are relative to it (as MediaPipe's are) into pixels, "
-        "and tells the lens of a near camera roughly. That of TRACKS if not given.",
+        "and tells the camera's lens roughly. That of TRACKS if not given.",
     ),
 ]
 Trust = Annotated[

@@ -81,7 +81,7 @@ class Tracker:
             False, for a camera, takes what a solve finds over when it has ended.
         method: whose fields :meth:`result` takes, and the solves, with fewer steps; ``PKC()`` if None.
         image_size: width and height of the image in pixels, which :meth:`tracks` have: by it :meth:`result` knows the
-            lens of a near camera roughly. Live poses are as before a far one.
+            camera's lens roughly. Live poses are as before a far one.
 
     Raises:
         SkeletonError: the skeleton is unknown, or its bones are no tree.
@@ -234,7 +234,7 @@ class Tracker:
     def result(self) -> Reconstruction:
         """Reconstruct the frames in the window anew by the method, at leisure: more accurate than the live poses.
 
-        Rays are taken to be parallel, unless ``image_size`` is known and the camera is near.
+        Rays are taken to be parallel, unless ``image_size`` is known and a lens explains the tracks better.
 
         Raises:
             ShapeError: no joint has been seen.

@@ -84,8 +84,9 @@ def reconstruct_perspective(
         lifted: what the method found in the tracks as if rays were parallel. The focal length is then to be found as
             well, from that of the intrinsics on, and noted; each round refines what the one before found, as its focal
             length shows it. Exact tracks whose first search ended early are lifted anew once, in the end.
+            The best body is then refined with feet that stand still.
         guessed: focal length of usual lenses, if that of the intrinsics is a guess. Tracks are then lifted through such
-            a lens, and the focal length is found together with what was found through it, and noted.
+            a lens, and the focal length is found together with what was found through it, and noted; feet as above.
 
     Returns:
         The reconstruction in the camera's frame: ``points + (0, 0, distance)`` projects onto the image. Its unit is one
@@ -122,12 +123,12 @@ def _reconstruct(
         best = _along(method, tracks, view, cameras, lifted)
     if (guessed is not None or lifted is not None) and not best.flat:
         best = _with_focal(method, tracks, best, cameras)
-    exact = method.turns_over and has_trunk(tracks.skeleton) and not detected(tracks) and not best.flat
-    if exact and lifted is not None and SEEMS_NEAR in lifted.diagnostics.notes:  # where the search ended
+    searched = method.turns_over and has_trunk(tracks.skeleton) and not detected(tracks) and not best.flat
+    if searched and lifted is not None and SEEMS_NEAR in lifted.diagnostics.notes:  # where the search ended
         best = _lifted_anew(method, tracks, best, cameras)
     if best.scene.any_focal:
         best = with_feet(best, feet_on_ground(tracks, cameras))
-    if exact:
+    if searched:
         best = replace(best, bodies=undifferentiated(best.scene.polished)(best.bodies))
     return _assemble(method, tracks, best)
 

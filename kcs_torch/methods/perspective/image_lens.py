@@ -20,6 +20,9 @@ __all__ = ["LikelyLens", "lens_of_image"]
 FOCAL = 0.85
 """Usual focal length over the image's longer side, that of phones, web and action cameras."""
 
+FARTHEST = 100.0
+"""Distance, for a body of 1.75, from which on a usual camera would show it so small that nobody could detect its
+joints: coordinates are then hardly pixels."""
 
 SAY_SIZE = "image_size=(width, height) (kcs-torch: --image-size), or "
 """What is asked for first where tracks say that they are in pixels."""
@@ -51,7 +54,8 @@ def lens_of_image(tracks: Tracks) -> LikelyLens | None:
             the motion.
 
     Returns:
-        The lens; or None where the tracks are not in pixels, no image of usual size holds them, or they show a point.
+        The lens; or None where the tracks are not in pixels, no image of usual size holds them, or they show a point or
+        a body of a few pixels: coordinates may be metres.
     """
     time = time_seen(tracks)
     tracks = replace(tracks, points=tracks.points.detach()).frames(time.start, time.stop)
@@ -66,6 +70,8 @@ def lens_of_image(tracks: Tracks) -> LikelyLens | None:
     lengths = bone_lengths(rest, body.bone_index(device=points.device))
     own = usual_posture(body, points.dtype, points.device).rest_lengths
     unit = float(clip_scale(tracks, rest).median() * (lengths / own).median())
+    if usual > FARTHEST * unit:
+        return None
     whose = " of all people in the file" if tracks.image_guess else ""
     said = (
         f"the image is taken to be {width} x {height} pixels, the smallest of usual size that holds the tracks{whose}: "

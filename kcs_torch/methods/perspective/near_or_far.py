@@ -32,7 +32,7 @@ FAR = 34.0
 """Distance, for a body of 1.75, of the far body that a near one is compared with."""
 
 UNUSUAL = FIRM * math.log(FAR / USUAL) ** 2 / 2
-"""What it costs to be as far away, where the focal length is not known."""
+"""What it costs to be as far away, where nothing tells of the focal length."""
 
 NEAR = 10.0
 """Distance up to which tracks tell that a camera is near, whose lens nothing else tells: from there on a wrong focal
@@ -125,8 +125,9 @@ def is_far(near: Reconstruction, lifted: Reconstruction) -> bool:
     lens, flat, unit = near.intrinsics, clean_image(lifted), body_unit(lifted)
     assert lens is not None
     far, space = Intrinsics(FAR * unit, FAR * unit, lens.cx, lens.cy), near.in_space()
-    aside = float(far.rays(flat)[..., :2].square().sum(-1).mean().sqrt())
-    if not (bool(lifted.points.isfinite().all()) and aside < WIDE):  # a body that shrank to a point tells nothing
+    aside = float((flat - flat.new_tensor([lens.cx, lens.cy])).square().sum(-1).mean().sqrt())
+    # a body that shrank to a point tells nothing
+    if not (bool(lifted.points.isfinite().all()) and aside < WIDE * far.focal):
         return False
     tracks, some, rate = lifted.tracks, *_telling(lifted.tracks, flat)
     noise = image_noise(tracks, flat, unit)[some]

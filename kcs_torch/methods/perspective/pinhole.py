@@ -90,7 +90,7 @@ class PinholeEnergy:
     Where the focal length is not known, rays are (u, v, 1 / w), of a focal length w times as short: then D = P / w with
     a path P that the size in the image tells, and points lie at (u (P + w z), v (P + w z), P / w + z). To w = 0 belong
     parallel rays. It is likely to make the camera's distance a usual one, and to be as long as lenses usually are.
-    Where that is known, it costs little to be farther away than usual.
+    Where usual focal lengths are known, it costs little to be farther away than usual.
 
     Unknowns are the bones' depths, the logarithms of lengths, and cosines of the distance's logarithm, and that of w,
     in coordinates about the start in which the energy is nearly a sphere. What a length, a distance or w changes in the
@@ -204,9 +204,9 @@ class PinholeEnergy:
         firm = 0.0 if self.free is None else FIRM * self.free.to(value)
         away = (wide * USUAL / self.path.mean(-1, keepdim=True)).log()  # (H, 1)
         lens = torch.zeros_like(away) if self.usual is None else (wide * self.usual).log()
-        unusual = away if self.usual is None else torch.where(away < 0, EASY * away, away)
+        unusual = away if self.usual is None else torch.where(away < 0, EASY * away, away)  # slope, in log w
         value = value + firm * (away * unusual + lens.square())[:, 0] / 2
-        likely = firm * (unusual + lens)[:, 0]
+        pulled = firm * (unusual + lens)[:, 0]
         value = value + change.square().mean(-1) / (2 * STRAY**2)
         rays = self.toward * wide[..., None, None]
         cost, slope, growth, drawn, shrink = self.body.with_image(laid.own, laid.lengths, laid.image, rays)
@@ -231,7 +231,7 @@ class PinholeEnergy:
         if not self.known:
             parts.insert(1, growth + (self.shear * slope).sum(-1))
         if self.free is not None:
-            parts.append((shrink * wide[:, 0] + likely - (self.lean * slope).sum((1, 2)))[:, None])
+            parts.append((shrink * wide[:, 0] + pulled - (self.lean * slope).sum((1, 2)))[:, None])
         return value, torch.cat(parts, 1).mul_(self.scale)
 
     def _laid(self, state: Tensor) -> _Laid:

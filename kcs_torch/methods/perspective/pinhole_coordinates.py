@@ -30,7 +30,7 @@ FIRM = math.log(FACTOR) ** -2
 
 FARTHER = 3.0
 """By what factor it strays to the far side where the usual focal length is known: images that are cropped make bodies
-large, while one that is small is more often far away than before a lens that is short."""
+large; one that is small is more often far away than seen through a short lens."""
 
 EASY = FIRM**-1 * math.log(FARTHER) ** -2
 """That side's curvature, over the other's."""

@@ -160,17 +160,18 @@ def with_feet(found: Found, standing: Tensor | None) -> Found:
         found: with a focal length.
         standing: as of :func:`refine`.
     """
-    if standing is None or not bool((standing > 0).any()):
-        return found
     scene, bodies = replace(found.scene, standing=standing), found.bodies
+    if standing is None or not bool((standing > 0).any() & bodies.energy[0].isfinite()):
+        return found
     time = time_seen(found.lifted[0].tracks)
-    best = scene.during(time).refined(bodies.distance[0, time], bodies.depth[:1, time], bodies.focal[:1], held=True)
+    start = bodies.distance[0, time], bodies.depth[:1, time], bodies.focal[:1]
+    best = scene.during(time).refined(*start, same_focal=True)
     best = replace(best.held(time.start, len(scene.rays)), origin=bodies.origin[:1])
     return replace(found, scene=scene, bodies=_led_by(best, bodies))
 
 
 def _led_by(best: Bodies, bodies: Bodies) -> Bodies:
-    """The best of bodies refined in another scene, and the others behind it by as much as they were."""
+    """``best`` in place of the first of bodies, from which it was refined; the others stay as far behind."""
     rest = replace(bodies[1:], energy=bodies.energy[1:] + (best.energy - bodies.energy[:1]))
     return best.joined(rest)
 

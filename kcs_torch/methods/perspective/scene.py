@@ -113,7 +113,7 @@ class Scene:
         focal: Tensor | None = None,
         *,
         steps: int = STEPS,
-        held: bool = False,
+        same_focal: bool = False,
     ) -> Bodies:
         """Bodies of least :class:`PinholeEnergy`, each from its own start, best first.
 
@@ -125,7 +125,7 @@ class Scene:
             depth: (H, T, N) starts.
             focal: (1,) that the starts were found with, over that of the rays; 1 if None.
             steps: of L-BFGS.
-            held: whether the focal length stays.
+            same_focal: whether the focal length stays.
         """
         frames = len(self.rays)
         count = max(1, math.ceil((frames - OVERLAP) / (BLOCK - OVERLAP)))
@@ -135,7 +135,7 @@ class Scene:
         path = distance / focal[0] / self.unit
         image = (self.rays * distance[:, None, None]).unfold(0, size, 1)[begins]  # (W, N, 2, T)
         lively = image.diff(dim=-1).square().sum((1, 2))
-        free = self.any_focal and not held
+        free = self.any_focal and not same_focal
         z = depth.new_empty(len(begins), size, *depth[:, 0].shape)
         far = depth.new_empty(len(begins), size, len(depth))
         energy, moved, lengths = depth.new_zeros(len(depth)), depth.new_zeros(len(depth)), None

@@ -41,9 +41,9 @@ def reconstruct_uncalibrated(
 ) -> Reconstruction:
     """Reconstruct a body before a camera of which nothing is known.
 
-    The nearer a camera is, the more the size of a limb in the image changes with its depth: bones of constant length,
-    the template's posture and feet that stand still tell how much. Where the image's size is known, or can be guessed,
-    the tracks are lifted through the lens that such a camera usually has (:func:`lens_of_image`). Where it is not, PKC
+    The nearer a camera is, the more the size of a limb in the image changes with its depth: bones of constant length
+    and the template's posture tell how much. Where the image's size is known, or can be guessed, the tracks are lifted
+    through the lens that such a camera usually has (:func:`lens_of_image`). Where nothing tells of the image, PKC
     solves them as if rays were parallel, but ends where it has found a body whose camera seems near all the same
     (:func:`likely_lens`), before it turns runs of signs over; the principal point is then taken to be the tracks'
     middle. Either way the focal length is found together with depths, lengths, distances and signs by
