@@ -130,9 +130,9 @@ def lift(
         typer.Option(
             metavar="FX,FY,CX,CY|auto|parallel",
             help="Focal lengths and principal point of the camera in pixels; auto: the focal length is found from the "
-            "tracks, from that of usual cameras with such an image (--image-size) on, unless the camera is far away "
-            "(what pkc does unless told otherwise); parallel: the camera is far away, and people are where the image "
-            "has them.",
+            "tracks, from that of usual cameras with such an image (--image-size) on, unless parallel rays explain "
+            "them better (what pkc does unless told otherwise); parallel: the camera is far away, and people are where "
+            "the image has them.",
             show_default=False,
         ),
     ] = None,
