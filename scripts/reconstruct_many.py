@@ -1,6 +1,7 @@
 r"""Reconstruct a folder of thousands of track files; stop it whenever you like, and run it again to go on.
 
     python scripts/reconstruct_many.py input=tracks output=motion
+    python scripts/reconstruct_many.py input=tracks output=motion workers=4 batch=64
     python scripts/reconstruct_many.py input=videos output=motion pattern='*_json' 'suffixes=[.npz,.bvh]' \
         scale=height=1.75m
     python scripts/reconstruct_many.py -m input=tracks output=motion shards=8 'shard=range(0,8)' hydra/launcher=joblib
@@ -41,7 +42,8 @@ def main(config: DictConfig) -> None:
     """Do one shard of the work."""
     global failed
     names = (
-        "pattern", "suffixes", "everybody", "shard", "shards", "batch", "retry", "scale", "up", "units", "intrinsics",
+        "pattern", "suffixes", "everybody", "shard", "shards", "batch", "workers", "retry",
+        "scale", "up", "pitch", "units", "intrinsics",
     )  # fmt: skip
     options = OmegaConf.to_container(config, resolve=True)
     options["pattern"] = str(options["pattern"])

@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 import torch
+from pools import end_pool
 
 import kcs_torch as kt
 from kcs_torch.data import random_motion, walking_person
@@ -467,3 +468,36 @@ def test_doubted_clips_are_told(clips, tmp_path):
     kt.save(still.tracks, source / "still.npz")
     ((path, why),) = run(source, tmp_path / "out", method="pkc").doubted
     assert path.name == "still.npz" and "guess" in why
+
+
+def test_results_are_levelled_in_the_files_that_hold_them_so(clips, tmp_path):
+    run(clips, tmp_path / "level", suffixes=[".npz", ".trc"], pattern="clip0*", pitch=20)
+    run(clips, tmp_path / "out", suffixes=[".npz", ".trc"], pattern="clip0*")
+    level, out = (kt.load_motion(tmp_path / name / "clip0.trc") for name in ("level", "out"))
+    alone = kt.Motion.of(load_reconstruction(tmp_path / "out" / "clip0.npz"), pitch=20)
+    moved, wanted = (motion.points - motion.points[:1].mean(1, keepdim=True) for motion in (level, alone))
+    torch.testing.assert_close(moved * (wanted.norm() / moved.norm()), wanted, rtol=1e-3, atol=1.0)
+    assert not torch.allclose(level.points, out.points)
+    with pytest.raises(kt.OptionError, match="pitch"):  # its results were made otherwise
+        run(clips, tmp_path / "level", suffixes=[".npz", ".trc"], pattern="clip0*", pitch=10)
+    with pytest.raises(kt.OptionError, match="pitch: none of .npz holds results"):
+        run(clips, tmp_path / "none", pitch=10)
+    with pytest.raises(kt.OptionError, match="pitch: expected the degrees"):
+        run(clips, tmp_path / "none", suffixes=[".bvh"], pitch=100)
+    with pytest.raises(kt.OptionError, match="unknown axis for up 'x'"):
+        run(clips, tmp_path / "none", suffixes=[".bvh"], up="x")
+    assert not (tmp_path / "none").exists()
+
+
+def test_several_processes_make_the_same(clips, tmp_path):
+    pytest.importorskip("joblib")
+    outcome = run(clips, tmp_path / "two", workers=2, batch=4)
+    end_pool()
+    assert (outcome.done, outcome.failed) == (6, ())
+    run(clips, tmp_path / "one", batch=4)
+    for path in sorted((tmp_path / "one").rglob("*.npz")):
+        two = load_reconstruction(tmp_path / "two" / path.relative_to(tmp_path / "one"))
+        torch.testing.assert_close(two.points, load_reconstruction(path).points, rtol=1e-6, atol=1e-3)
+    with pytest.raises(kt.OptionError, match="workers: expected a whole number"):
+        run(clips, tmp_path / "none", workers=0)
+    run(clips, tmp_path / "two", workers=1)  # how many make them is nothing that results depend on

@@ -10,20 +10,22 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from kcs_torch.errors import KcsError, KcsWarning, OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.load import check_reading, load_people, most_seen
-from kcs_torch.io.write import ready_writer, save, takes_up
+from kcs_torch.io.write import UP, ready_writer, save, takes_up
 from kcs_torch.many.clips import Clip, clips_of
 from kcs_torch.many.record import claim, settings_of
 from kcs_torch.methods.base import Method
+from kcs_torch.methods.clips.processes import check_workers
 from kcs_torch.reconstruct import method_named, reconstruct_all, with_found_bones
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.hints import is_a, spoken
+from kcs_torch.types.motion import check_pitch
 from kcs_torch.types.size import METRES, check_size, parse_size
 
 __all__ = ["Outcome", "reconstruct_folder"]
@@ -67,10 +69,12 @@ def reconstruct_folder(
     shard: int = 0,
     shards: int = 1,
     batch: int = 16,
+    workers: int = 1,
     everybody: bool = False,
     retry: bool = False,
     scale: str | None = None,
     up: str | None = None,
+    pitch: float | None = None,
     units: str | None = None,
     intrinsics: Any = None,
     progress: Callable[[str], None] | None = None,
@@ -92,10 +96,12 @@ def reconstruct_folder(
         shard: which part of the work to do, from 0: a process, or a machine, each.
         shards: how many parts there are.
         batch: clips that are reconstructed together (:func:`kcs_torch.reconstruct_all`).
+        workers: processes that reconstruct them, at most; more than 1 needs joblib. Results are written by one.
         everybody: reconstruct all people of a clip, to NAME_0, NAME_1, ..., not the most seen one alone.
         retry: try clips again that failed, perhaps with other options of reading.
         scale: the true size of every body, ``height=1.75m`` or a bone's; else results are in the unit of the tracks.
         up: the axis that points up in those files that hold results so: y or z.
+        pitch: degrees by which the camera looked down (below 0: up), to level results in these files.
         units: as of :func:`kcs_torch.save`.
         intrinsics: of the camera that saw them all, as of :func:`kcs_torch.reconstruct`.
         progress: gets a line every few seconds.
@@ -112,7 +118,8 @@ def reconstruct_folder(
         FormatError: the file that says how they were made is damaged, or that of the skeleton.
     """
     _check_share(shard, shards, batch, {"everybody": everybody, "retry": retry})
-    suffixes = _checked_suffixes(suffixes, up)
+    check_workers(workers, [])
+    suffixes = _checked_suffixes(suffixes, up, pitch)
     if units not in (None, "px", *METRES):
         raise unknown("unit of length", units, METRES)
     size = None if scale is None else parse_size(scale)
@@ -124,12 +131,11 @@ def reconstruct_folder(
     begin = time.monotonic()
     clips = [clip for clip in clips_of(source, output, pattern) if clip.share_of(shards) == shard]
     lens = intrinsics if intrinsics is None or isinstance(intrinsics, str) else Intrinsics.of(intrinsics)
-    options = {"scale": scale, "up": up, "units": units, "intrinsics": lens}
+    options = {"scale": scale, "up": up, "pitch": pitch, "units": units, "intrinsics": lens}
     claim(Path(output), settings_of(method, options, reading) | {"everybody": str(everybody)}, retry)
     workplace = Path(output) / f".part_{shard}_of_{shards}"
     _sweep(Path(output), workplace)
-    doubted: list[tuple[Path, str]] = []
-    work = _Work(method, suffixes, everybody, workplace, size, up, units, intrinsics, find, how, doubted)
+    work = _Work(method, suffixes, everybody, workplace, size, up, pitch, units, intrinsics, workers, find, how)
     todo, outdated, failed = _still_to_do(work, clips, retry)
     skipped = len(clips) - len(todo) - len(failed)
     done = frames = 0
@@ -145,7 +151,7 @@ def reconstruct_folder(
                 f"{rate:.1f} clips a second, {(len(todo) - tried) / rate / 60:.1f} minutes left"
             )
     _sweep(Path(output), workplace)
-    told_of = tuple(outdated), tuple(doubted), tuple(failed)
+    told_of = tuple(outdated), tuple(work.doubted), tuple(failed)
     return Outcome(len(clips), done, skipped, *told_of, frames, time.monotonic() - begin)
 
 
@@ -162,16 +168,21 @@ def _check_share(shard: int, shards: int, batch: int, switches: Mapping[str, boo
         raise OptionError(f"batch: expected at least 1 clip, got {batch}")
 
 
-def _checked_suffixes(suffixes: str | Sequence[str], up: str | None) -> list[str]:
-    """With their dots; all can be written, and one with an axis up if that is asked for."""
+def _checked_suffixes(suffixes: str | Sequence[str], up: str | None, pitch: float | None) -> list[str]:
+    """With their dots; all can be written, and one with an axis up, and level, if that is asked for."""
+    if up not in (None, *UP):
+        raise unknown("axis for up", up, UP)
+    if pitch is not None:
+        check_pitch(pitch)
     given = [suffixes] if isinstance(suffixes, str) else suffixes
     dotted = [s if s.startswith(".") else f".{s}" for s in given]
     if not dotted:
         raise OptionError("suffixes: expected at least one, such as .npz, got none")
     for suffix in dotted:
         ready_writer(Path(f"NAME{suffix}"))
-    if up is not None and not any(takes_up(Path(f"x{suffix}")) for suffix in dotted):
-        raise OptionError(f"up: none of {', '.join(dotted)} holds results with y or z up")
+    asked = [name for name, value in (("up", up), ("pitch", pitch)) if value is not None]
+    if asked and not any(takes_up(f"x{suffix}") for suffix in dotted):
+        raise OptionError(f"{asked[0]}: none of {', '.join(dotted)} holds results with y or z up")
     return dotted
 
 
@@ -203,11 +214,13 @@ class _Work:
     workplace: Path
     size: dict[str, Any] | None
     up: str | None
+    pitch: float | None
     units: str | None
     intrinsics: Any
+    workers: int
     find: bool
     reading: dict[str, object]
-    doubted: list[tuple[Path, str]]
+    doubted: list[tuple[Path, str]] = field(default_factory=list)
 
     def results(self, clip: Clip) -> list[Path]:
         """The clip's results if all are there, else none; of everybody's the last written says so."""
@@ -254,7 +267,7 @@ class _Work:
         return people
 
     def _lift(self, people: list[Tracks]) -> list[Reconstruction]:
-        return reconstruct_all(people, method=self.method, intrinsics=self.intrinsics)
+        return reconstruct_all(people, method=self.method, intrinsics=self.intrinsics, workers=self.workers)
 
     def _write(self, clip: Clip, results: list[Reconstruction]) -> None:
         """Write all results of a clip, and that they are all."""
@@ -274,7 +287,8 @@ class _Work:
         clip.target.parent.mkdir(parents=True, exist_ok=True)
         for path in clip.outputs(self.suffixes):
             part = self.workplace / path.name
-            save(result, part, up=self.up if takes_up(path) else None, units=self.units, notes=[])
+            up, pitch = (self.up, self.pitch) if takes_up(path) else (None, None)
+            save(result, part, up=up, pitch=pitch, units=self.units, notes=[])
             os.replace(part, path)
 
 

@@ -25,7 +25,7 @@ from kcs_torch.types.tracks import Tracks
 from kcs_torch.types.trajectories import Trajectories
 from kcs_torch.types.variation import BoneVariation, bone_variation
 
-__all__ = ["Motion"]
+__all__ = ["Motion", "check_pitch"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -133,9 +133,7 @@ class Motion(Trajectories):
         Raises:
             OptionError: the pitch is not within -90 to 90.
         """
-        degrees = as_number(pitch)
-        if degrees is None or not abs(degrees) <= 90:
-            raise OptionError(f"pitch: expected the degrees by which the camera looked down, -90 to 90, got {pitch!r}")
+        degrees = check_pitch(pitch)
         notes = [*result.tracks.notes, *result.diagnostics.notes]
         known = result.distance is not None or result.root_depth is not None
         points = result.in_space() if known else result.points
@@ -310,6 +308,18 @@ def _same(names: Sequence[str], edges: Any) -> Skeleton | None:
             if pairs == {frozenset((body.joints[a], body.joints[b])) for a, b in body.bones}:
                 return body
     return None
+
+
+def check_pitch(pitch: Any) -> float:
+    """The degrees by which a camera looked down.
+
+    Raises:
+        OptionError: it is no number, or not within -90 to 90.
+    """
+    degrees = as_number(pitch)
+    if degrees is None or not abs(degrees) <= 90:
+        raise OptionError(f"pitch: expected the degrees by which the camera looked down, -90 to 90, got {pitch!r}")
+    return degrees
 
 
 def _apart(
