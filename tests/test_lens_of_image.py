@@ -13,7 +13,7 @@ from torch.testing import assert_close
 
 import kcs_torch as kt
 from kcs_torch.many import folder, reconstruct_folder
-from kcs_torch.methods.perspective import calibrated, image_lens, near_or_far, one_lens, uncalibrated
+from kcs_torch.methods.perspective import answer, calibrated, image_lens, near_or_far, one_lens, uncalibrated
 from kcs_torch.methods.perspective.image_lens import lens_of_image
 from kcs_torch.methods.perspective.near_or_far import may_be_near
 from kcs_torch.methods.perspective.one_lens import by_one_lens
@@ -313,10 +313,10 @@ def test_deviations_allow_for_a_lens_that_was_found(monkeypatch):
     told = replace(tracks, image_size=(1920, 1080))
     cases = [(told, "LEAN"), (tracks, "ASIDE"), (beyond(tracks), "HEADING"), (replace(told, detector=True), "")]
     found = [quietly(one) for one, _ in cases]
-    angles = [getattr(calibrated, name, 0.0) for _, name in cases]
+    angles = [getattr(answer, name, 0.0) for _, name in cases]
     assert angles == [*sorted(angles[:3]), 0.0] and angles[0] > 0
     for name in ("LEAN", "ASIDE", "HEADING"):
-        monkeypatch.setattr(calibrated, name, 0.0)
+        monkeypatch.setattr(answer, name, 0.0)
     for (one, _), result, angle in zip(cases, found, angles, strict=True):
         off = (result.points - result.points.mean(1, keepdim=True))[..., :2].norm(dim=-1)
         assert_close(result.uncertainty, quietly(one).uncertainty.hypot(angle * off))

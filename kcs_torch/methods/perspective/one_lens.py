@@ -9,7 +9,8 @@ from functools import partial
 from kcs_torch.clean.detector import detected
 from kcs_torch.methods.base import Method
 from kcs_torch.methods.clips.processes import spread
-from kcs_torch.methods.perspective.calibrated import leaning, reconstruct_perspective
+from kcs_torch.methods.perspective.answer import leaning
+from kcs_torch.methods.perspective.calibrated import reconstruct_perspective
 from kcs_torch.methods.perspective.image_lens import lens_of_image
 from kcs_torch.methods.perspective.near_or_far import may_be_near
 from kcs_torch.methods.perspective.uncalibrated import reconstruct_uncalibrated

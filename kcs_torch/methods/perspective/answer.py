@@ -1,0 +1,142 @@
+"""What is told of a body that was found under full perspective: :func:`assemble`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from kcs_torch.clean.detector import detected
+from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
+from kcs_torch.methods.answer.finish import HARDLY, SINGLE, little_turn, nothing_else
+from kcs_torch.methods.answer.root import ABSENT, FOUND
+from kcs_torch.methods.answer.wrong import WHY_LOOSE, what_is_wrong
+from kcs_torch.methods.base import Method
+from kcs_torch.methods.clips.batches import Clips
+from kcs_torch.methods.perspective.refining import Found
+from kcs_torch.methods.perspective.scene import Bodies
+from kcs_torch.methods.perspective.view import View, lens_note, zoomed
+from kcs_torch.methods.pkc.answers import CLOSE, HEADING
+from kcs_torch.methods.pkc.fixed_answer import SEE_OTHERS, UNSIDED
+from kcs_torch.methods.pkc.near import SEEMS_NEAR
+from kcs_torch.types import Reconstruction, Tracks
+
+__all__ = ["assemble", "leaning"]
+
+APART = 0.04
+"""Root mean square difference in depth, for a body of 1.75, from which on solutions count as two."""
+
+LEAN, ASIDE = 0.05, 0.1
+"""Standard deviation, in radians, of the direction from which a body is seen if the focal length was found: a shorter
+lens and a body that leans explain much the same image; and if the image's size is a guess as well."""
+
+
+def assemble(method: Method, tracks: Tracks, found: Found) -> Reconstruction:
+    """The best solution in the camera's frame, with those of the others that differ from it."""
+    bodies, unit = found.bodies, found.scene.unit
+    keep: list[int] = []
+    for k, depth in enumerate(bodies.depth):
+        if keep and not bool(depth.isfinite().all() & bodies.distance[k].isfinite().all()):
+            continue
+        apart = [float((depth - bodies.depth[j]).square().mean().sqrt()) for j in keep]
+        if len(keep) <= max(1, len(found.lifted[0].alternatives)) and all(a > APART * unit for a in apart):
+            keep.append(k)
+    made = [_in_camera(method, tracks, found, k) for k in keep]
+    return replace(made[0], alternatives=tuple(made[1:]))
+
+
+def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstruction:
+    """Solution number ``k`` in the camera's frame."""
+    bodies, body = found.bodies, tracks.skeleton
+    lifted = found.lifted[int(bodies.origin[k])]
+    view, scene = found.view, found.scene
+    if scene.any_focal:
+        view = View.of(tracks, zoomed(view.lens, float(bodies.focal[k])), scene.rate)
+        scene = replace(scene, rays=view.seen_from(found.view, scene.rays))
+    intrinsics, look = view.lens, view.look
+    points = scene.points(bodies, k) @ look
+    points = body.complete(points[:, : body.num_observed])[0]
+    root = points[..., 2].mean(-1)
+    factor = intrinsics.focal / root.log().mean().exp()
+    points, root = points * factor, root * factor
+    n = body.num_observed  # virtual joints are means of others in the image, too, which no projection is
+    images = intrinsics.project(points)
+    off = (images - tracks.points)[:, :n][tracks.seen[:, :n]]
+    points = torch.cat([points[..., :2], points[..., 2:] - root[:, None, None]], -1)
+    cameras = (found.view.look.mT @ complete_rotation(lifted.cameras))[:, :2]
+    turn = float(viewpoint_turn(cameras))
+    notes = _notes_on_solution(method, tracks, found, k, points, images, turn)
+    varies = f": the body's distance varies by a factor of {root.amax() / root.amin():.2f}" if len(root) > 1 else ""
+    notes.append(f"full perspective{varies}")
+    if scene.any_focal:
+        notes.append(lens_note(intrinsics, tracks.units))
+    first = found.lifted[0].diagnostics
+    doubt = first.doubt
+    if doubt == nothing_else(method, tracks, first.viewpoint_turn):  # by the turn before the lens was known
+        doubt = nothing_else(method, tracks, turn)
+    if doubt == UNSIDED and not found.flat and _one_side(bodies):
+        doubt = ""
+    facts = replace(
+        lifted.diagnostics,
+        viewpoint_turn=turn,
+        converged=found.settled(k),
+        iterations=found.steps,
+        reprojection_rms=float(off.square().sum(-1).mean().sqrt()),
+        notes=tuple(notes),
+        doubt="" if k else doubt,
+    )
+    unsure = None if lifted.uncertainty is None else lifted.uncertainty * factor
+    if unsure is not None and scene.any_focal and not detected(tracks):
+        unsure = unsure.hypot(leaning(points, tracks, imaged=scene.usual is not None))
+    return replace(
+        lifted,
+        points=points,
+        cameras=cameras,
+        scales=intrinsics.focal / root,
+        tracks=tracks,
+        diagnostics=facts,
+        uncertainty=unsure,
+        objective=float(bodies.energy[k]),
+        root_depth=root - root[0],
+        distance=root,
+        intrinsics=intrinsics,
+        alternatives=(),
+    ).remeasured()
+
+
+def leaning(points: Tensor, tracks: Tracks, *, imaged: bool) -> Tensor:
+    """Standard deviation (T, N) of depths for the direction from which points (T, N, 3) are seen, the lens being found.
+
+    Where nothing is known of the image, the camera is taken to look at the tracks' middle. Of a detector's tracks the
+    method allows for as much by itself.
+    """
+    angle = HEADING if not imaged else ASIDE if tracks.image_size is None else LEAN
+    flat = points[..., :2]
+    return angle * (flat - flat.mean(-2, keepdim=True)).norm(dim=-1)
+
+
+def _one_side(bodies: Bodies) -> bool:
+    """Whether lengths, seen along the rays, tell the best body from mirror images as known cameras do not."""
+    turned = (bodies.depth * bodies.depth[0]).sum((1, 2)) < 0
+    return not bool((turned & (bodies.energy < bodies.energy[0] + CLOSE)).any())
+
+
+def _notes_on_solution(
+    method: Method, tracks: Tracks, found: Found, k: int, points: Tensor, images: Tensor, turn: float
+) -> list[str]:
+    """What is said of solution number ``k``: what the method said of the tracks, and what is true of this one."""
+    # True of what was lifted, perhaps not of this.
+    stale = [WHY_LOOSE, HARDLY, SINGLE, SEEMS_NEAR, "weak perspective", "did not settle"]
+    if k:
+        stale += [SEE_OTHERS, found.lifted[0].diagnostics.doubt or SEE_OTHERS]
+    notes = [
+        note for note in found.notes if not note.startswith((ABSENT, FOUND)) and not any(part in note for part in stale)
+    ]
+    settled = found.settled(k)
+    if not settled:
+        notes.append(method.unsettled(found.steps))
+    if little := little_turn(method, tracks, turn):
+        notes.append(little)
+    clips = Clips.of([tracks])
+    return [*notes, *what_is_wrong(method, tracks.skeleton, clips, points[None], images[None], [settled])[0]]
