@@ -87,6 +87,18 @@ def test_a_filter_of_somebody_else_is_noticed():
     assert not found_by_detector(replace(smooth, detector=False))
 
 
+def test_clips_too_short_to_tell_motion_from_a_filter_are_no_detector_s():
+    """What little two seconds of quick motion share is no more than filtered noise does: exact tracks were taken for it."""
+    walk = walking_person(480, turn=0.0, yaw=50.0, skeleton="coco17", fps=120.0).tracks
+    noise = 6 * torch.randn(walk.points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    noisy = replace(walk, points=walk.points + noise, skeleton=replace(walk.skeleton, name="mine"))
+    smooth = replace(kt.clean.smooth(noisy, cutoff=8.0), detector=None)
+    assert found_by_detector(smooth)
+    short = smooth.frames(0, 240)
+    assert measure_noise(*parts(smooth), window=256).told and not measure_noise(*parts(short), window=256).told
+    assert not found_by_detector(short)
+
+
 def test_kinds_of_noise():
     points = WALK.tracks.points
     size = float((points - points.mean(1, keepdim=True)).norm(dim=-1).median())

@@ -66,7 +66,7 @@ def found_by_detector(tracks: Tracks) -> bool:
         return False
     ratio, usual = noise.restless / max(noise.white, 1e-12), tracks.skeleton.name in SKELETONS
     if ratio > FILTERED:
-        return noise.share > (SMOOTHED if usual else SMOOTH)
+        return noise.told and noise.share > (SMOOTHED if usual else SMOOTH)
     if usual:
         return max(noise.white, noise.restless) > (NOISY if noise.restless > 0 else LOUD)
     return ratio > LASTING and noise.share > OWN and noise.restless > LOUD

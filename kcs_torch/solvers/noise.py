@@ -34,11 +34,14 @@ class Noise(NamedTuple):
         white: of the noise in the quickest modes.
         restless: of what joints do not share a few times slower, from six to eleven periods a second.
         share: of the deviation there that joints do not share: of exact tracks below .06, mostly.
+        told: whether modes are enough to tell the share, as many as the joints' coordinates: fewer leave each joint's
+            own what all may share. Of 17 joints more than two seconds are enough.
     """
 
     white: float
     restless: float
     share: float
+    told: bool
 
 
 def measure_noise(tracks: Tensor, weights: Tensor, *, window: int = 64) -> Noise | None:
@@ -89,6 +92,7 @@ def measure_noise(tracks: Tensor, weights: Tensor, *, window: int = 64) -> Noise
     part = modes[:, :, slice(*RESTLESS)]
     _, own = unshared(part)
     if not bool(own.isfinite()):
-        return Noise(white, 0.0, 0.0)
+        return Noise(white, 0.0, 0.0, False)
     share = own / part.square().mean((1, 2, 3)).clamp_min(TINY)
-    return Noise(white, math.sqrt(float(own)), math.sqrt(float(share)))
+    told = part.shape[1] * part.shape[2] >= part.shape[3]
+    return Noise(white, math.sqrt(float(own)), math.sqrt(float(share)), told)
