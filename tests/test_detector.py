@@ -88,7 +88,7 @@ def test_a_filter_of_somebody_else_is_noticed():
 
 
 def test_clips_too_short_to_tell_motion_from_a_filter_are_no_detector_s():
-    """What little two seconds of quick motion share is no more than filtered noise does: exact tracks were taken for it."""
+    """Two seconds of quick motion share no more than filtered noise does: exact tracks were taken for it."""
     walk = walking_person(480, turn=0.0, yaw=50.0, skeleton="coco17", fps=120.0).tracks
     noise = 6 * torch.randn(walk.points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     noisy = replace(walk, points=walk.points + noise, skeleton=replace(walk.skeleton, name="mine"))

@@ -9,7 +9,7 @@ from pathlib import Path
 from kcs_torch.errors import SkeletonError, unknown
 from kcs_torch.skeleton.core import Skeleton
 
-__all__ = ["SKELETONS", "fitting_links", "get_skeleton", "guess_skeleton"]
+__all__ = ["SKELETONS", "fitting_links", "get_skeleton", "guess_skeleton", "known_by_names"]
 
 
 class _BuiltIn(Mapping[str, Skeleton]):
@@ -83,6 +83,17 @@ def guess_skeleton(joint_names: Sequence[str], *, ordered: bool = True) -> Skele
         if own == names or (not ordered and sorted(own) == sorted(names)):
             return skeleton
     return None
+
+
+def known_by_names(joint_names: Sequence[str]) -> Skeleton | None:
+    """Return the built-in skeleton whose observed joints carry these names, with its joints in their order.
+
+    Args:
+        joint_names: names of a body's joints, in any order.
+    """
+    known = guess_skeleton(joint_names)
+    other = None if known is not None else guess_skeleton(joint_names, ordered=False)
+    return known if other is None else Skeleton.from_dict(other.to_dict() | {"joints": [str(j) for j in joint_names]})
 
 
 ALIKE = 0.9

@@ -159,13 +159,13 @@ class Skeleton:
         Raises:
             SkeletonError: an index is out of range, or the edges are not one tree.
         """
-        from kcs_torch.skeleton.builtin import guess_skeleton  # the built-in ones are made by this class
+        from kcs_torch.skeleton.builtin import known_by_names  # the built-in ones are made by this class
 
         names = [f"joint{i}" for i in range(joints)] if isinstance(joints, int) else listed(joints, "joints", name)
         names = tuple(map(str, names))
         pairs = index_pairs(edges, name)
         plain = cls(joints=names, bones=tuple(pairs), name=name, tree=tree)
-        return replace(plain, **facts_by_names(names, pairs, guess_skeleton(names)))
+        return replace(plain, **facts_by_names(names, pairs, known_by_names(names)))
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], *, source: str = "skeleton") -> Skeleton:

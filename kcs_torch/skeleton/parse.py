@@ -126,7 +126,7 @@ def arguments(
 
 
 def facts_by_names(names: Sequence[str], bones: Sequence[Pair], known: Skeleton | None) -> dict[str, Any]:
-    """Return what names tell of a skeleton of these bones: mirror, template, hinges, contacts, spread.
+    """Return what names tell of a skeleton of these bones: mirror, template, hinges, contacts, spread, flexible.
 
     Args:
         names: N joint names.
@@ -143,10 +143,13 @@ def facts_by_names(names: Sequence[str], bones: Sequence[Pair], known: Skeleton 
     if template is not None and any(math.dist(template[a], template[b]) < 1e-6 for a, b in bones):
         template = None  # two names for one place: this body is built otherwise
     hinges, contacts, spread = hinges_by_names(names, bones), contacts_by_names(names), spread_by_names(names, bones)
+    flexible: tuple[int, ...] = ()
     if known is not None:
         joined = {frozenset(b) for b in bones}
         hinges = tuple(h for h in known.hinges if {frozenset(b) for b in h.bones} <= joined)
         contacts = known.contacts
+        bends = {frozenset(known.bones[b]) for b in known.flexible}
+        flexible = tuple(i for i, bone in enumerate(bones) if frozenset(bone) in bends)
         if known.spread is not None:
             told = dict(zip(map(frozenset, known.bones), known.spread, strict=True))
             # A bone that the known skeleton has not, such as the links of hips and shoulders to a neck that is virtual
@@ -158,6 +161,7 @@ def facts_by_names(names: Sequence[str], bones: Sequence[Pair], known: Skeleton 
         "hinges": hinges,
         "contacts": contacts,
         "spread": None if template is None else spread,
+        "flexible": flexible,
     }
 
 

@@ -18,6 +18,7 @@ from kcs_torch.skeleton import (
     get_skeleton,
     guess_skeleton,
     has_middle,
+    known_by_names,
     map_joints,
     person_by_names,
 )
@@ -114,7 +115,7 @@ def _by_links(graph: Skeleton, names: Sequence[str] | None, notes: list[str]) ->
     if fits:
         which = " and ".join(fit.name for fit in fits)
         notes.append(f"the edges are those of skeletons {which}: skeleton='{fits[-1].name}' would tell much more")
-    known = guess_skeleton(graph.joints)
+    known = known_by_names(graph.joints)
     body = known or person_by_names(graph.joints, graph.name)
     if graph.is_tree and (body is None or not body.virtual or has_middle(graph.joints)):
         return replace(graph, tree=True)

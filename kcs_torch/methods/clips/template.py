@@ -10,7 +10,7 @@ from kcs_torch.functional.camera import back_project
 from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.clips.cameras import orthographic_cameras
 from kcs_torch.nn.deviation import template_scale
-from kcs_torch.skeleton import Skeleton, guess_skeleton
+from kcs_torch.skeleton import Skeleton, known_by_names
 from kcs_torch.types import Tracks
 
 __all__ = ["clip_scale", "guessed", "rigid_shape"]
@@ -53,5 +53,5 @@ def guessed(body: Skeleton) -> bool:
     names = body.joints
     if body.template is None or quadruped_places(names) is None:
         return False
-    ours = guess_skeleton(names)
+    ours = known_by_names(names)
     return body.template in (template_by_names("quadruped", names), None if ours is None else ours.template)
