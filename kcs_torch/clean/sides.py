@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcs_torch.clean.common import body_size, check_tracks, rebuilt, runs, share
 from kcs_torch.clean.timing import cuts_of
+from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.graph import find_pieces
@@ -33,13 +34,19 @@ _LONG, _RATE = 1.0, 30.0
 and the frames a second where tracks do not tell. Legs stay crossed for less."""
 
 
+_AHEAD, _TIMES, _AROUND = 0.05, 5.0, 3
+"""A step of most joints that differs by such a share of the body's size, and so many times as much as usual, from those
+of so many frames before and after: frames were dropped, or one was repeated, and legs have moved on meanwhile."""
+
+
 def unswap(tracks: Tracks) -> Tracks:
     """Swap left and right back where a detector mistakes them for each other; a note says in how many frames.
 
     First all pairs of joints together, then the arms, the legs and other limbs by themselves, without the joints of the
     trunk (:func:`kcs_torch.solvers.swapped_frames`). A pair that is mistaken jumps to the other side, while legs that
     cross move on evenly. Where a clip is half swapped, the longer part is taken to be right. A limb stays as it is if
-    it would be crossed for a second: it jumped as the body did, in a turn, or comes back slowly from a swap.
+    it would be crossed for a second: it jumped as the body did, in a turn, or comes back slowly from a swap. Where the
+    whole body leaps ahead, as frames were dropped or one was repeated, what a limb does at this moment tells nothing.
 
     Args:
         tracks: of a skeleton that has a left and a right; those of others are returned as they are.
@@ -64,6 +71,7 @@ def unswap(tracks: Tracks) -> Tracks:
     size = float(body_size(points, weights > 0))
     cuts = cuts_of(tracks, leaps=False)  # another view is no swap
     shots = list(starmap(slice, pairwise([0, *cuts, tracks.num_frames])))
+    leaps = _leaps_ahead(points, weights > 0, pairs, size)
     limbs = _limbs(body, pairs)
     trunk = [pair for pair in pairs if not any(pair in limb for _, limb in limbs)]
     long = _LONG * (tracks.fps or _RATE)
@@ -72,6 +80,11 @@ def unswap(tracks: Tracks) -> Tracks:
         left, right = torch.tensor(some, device=points.device).T
         seen, penalty = _comparable(points, weights, left, right, size), _LIMB if name else _BODY
         swapped = [swapped_frames(points[shot, left], points[shot, right], seen[shot], size, penalty) for shot in shots]
+        if name:
+            swapped = [
+                _through_leaps(found, [leap - shot.start for leap in leaps])
+                for shot, found in zip(shots, swapped, strict=True)
+            ]
         if name and trunk:
             across, straight = (_across(points, weights, these) for these in (some[:1], trunk))
             for shot, found in zip(shots, swapped, strict=True):
@@ -96,6 +109,35 @@ def _comparable(points: Tensor, weights: Tensor, left: Tensor, right: Tensor, si
         return seen
     lone = near.sum(1) < torch.minimum(seen.sum(1), seen.new_tensor(_FEWEST, dtype=torch.long))
     return near & ~lone[:, None]
+
+
+def _leaps_ahead(points: Tensor, seen: Tensor, pairs: list[tuple[int, int]], size: float) -> list[int]:
+    """Frames to which most joints (T, N, 2) make another step than around; of twins the middle, which no swap moves."""
+    left, right = torch.tensor(pairs, device=points.device).T
+    both = seen[:, left] & seen[:, right]
+    middle = torch.where(both[..., None], (points[:, left] + points[:, right]) / 2, torch.nan)
+    alone = [n for n in range(points.shape[1]) if n not in {*left.tolist(), *right.tolist()}]
+    others = torch.where(seen[:, alone, None], points[:, alone], torch.nan)
+    step = torch.cat([middle, others], 1).diff(dim=0)  # (T - 1, M, 2)
+    if not len(step):
+        return []
+    beside = torch.nn.functional.pad(step, (0, 0, 0, 0, _AROUND, _AROUND), value=torch.nan)
+    around = nanmedian(beside.unfold(0, 2 * _AROUND + 1, 1), -1)
+    away = nanmedian((step - around).norm(dim=-1), -1).nan_to_num(0.0)  # (T - 1,)
+    return ((away > _AHEAD * size) & (away > _TIMES * away.median())).nonzero().flatten().add(1).tolist()
+
+
+def _through_leaps(swapped: Tensor, leaps: list[int]) -> Tensor:
+    """The frames (T,) that are swapped if sides stay what they are where the whole body leaps ahead; as many or fewer.
+
+    Sides stand in one of two orders in most frames; a limb that is swapped for a moment comes back to this one.
+    """
+    for leap in leaps:
+        if 0 < leap < len(swapped) and bool(swapped[leap] != swapped[leap - 1]):
+            other = torch.cat([swapped[:leap], ~swapped[leap:]])
+            other = ~other if 2 * int(other.sum()) > len(other) else other
+            swapped = other if int(other.sum()) < int(swapped.sum()) else swapped
+    return swapped
 
 
 def _across(points: Tensor, weights: Tensor, pairs: list[tuple[int, int]]) -> Tensor:
