@@ -80,15 +80,15 @@ def unswap(tracks: Tracks) -> Tracks:
         left, right = torch.tensor(some, device=points.device).T
         seen, penalty = _comparable(points, weights, left, right, size), _LIMB if name else _BODY
         swapped = [swapped_frames(points[shot, left], points[shot, right], seen[shot], size, penalty) for shot in shots]
+        if name and trunk:
+            across, straight = (_across(points, weights, these) for these in (some[:1], trunk))
+            for shot, found in zip(shots, swapped, strict=True):
+                _keep_straight(found, across[shot], straight[shot], long)
         if name:
             swapped = [
                 _through_leaps(found, [leap - shot.start for leap in leaps])
                 for shot, found in zip(shots, swapped, strict=True)
             ]
-        if name and trunk:
-            across, straight = (_across(points, weights, these) for these in (some[:1], trunk))
-            for shot, found in zip(shots, swapped, strict=True):
-                _keep_straight(found, across[shot], straight[shot], long)
         frames = torch.cat(swapped).nonzero()  # (F, 1)
         for values in (points, weights):
             values[frames, left], values[frames, right] = values[frames, right], values[frames, left]
@@ -118,12 +118,12 @@ def _leaps_ahead(points: Tensor, seen: Tensor, pairs: list[tuple[int, int]], siz
     middle = torch.where(both[..., None], (points[:, left] + points[:, right]) / 2, torch.nan)
     alone = [n for n in range(points.shape[1]) if n not in {*left.tolist(), *right.tolist()}]
     others = torch.where(seen[:, alone, None], points[:, alone], torch.nan)
-    step = torch.cat([middle, others], 1).diff(dim=0)  # (T - 1, M, 2)
+    step = nanmedian(torch.cat([middle, others], 1).diff(dim=0), 1)  # (T - 1, 2)
     if not len(step):
         return []
-    beside = torch.nn.functional.pad(step, (0, 0, 0, 0, _AROUND, _AROUND), value=torch.nan)
+    beside = torch.nn.functional.pad(step, (0, 0, _AROUND, _AROUND), value=torch.nan)
     around = nanmedian(beside.unfold(0, 2 * _AROUND + 1, 1), -1)
-    away = nanmedian((step - around).norm(dim=-1), -1).nan_to_num(0.0)  # (T - 1,)
+    away = (step - around).norm(dim=-1).nan_to_num(0.0)
     return ((away > _AHEAD * size) & (away > _TIMES * away.median())).nonzero().flatten().add(1).tolist()
 
 
