@@ -17,6 +17,7 @@ from kcs_torch.data import random_motion, walking_person
 from kcs_torch.io import load_reconstruction
 from kcs_torch.many import clips_of, folder, reconstruct_folder
 from kcs_torch.many.record import MADE_BY, as_text
+from kcs_torch.methods.clips import processes
 
 
 def make_clips(folder, count, frames=8):
@@ -489,10 +490,15 @@ def test_results_are_levelled_in_the_files_that_hold_them_so(clips, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-def test_several_processes_make_the_same(clips, tmp_path):
+def test_several_processes_make_the_same(clips, tmp_path, monkeypatch):
     pytest.importorskip("joblib")
+    parts, real = [], processes._answers
+    monkeypatch.setattr(
+        processes, "_answers", lambda solve, rows, workers: parts.append(len(rows)) or real(solve, rows, workers)
+    )
     outcome = run(clips, tmp_path / "two", workers=2, batch=4)
     end_pool()
+    assert parts == [2, 2]
     assert (outcome.done, outcome.failed) == (6, ())
     run(clips, tmp_path / "one", batch=4)
     for path in sorted((tmp_path / "one").rglob("*.npz")):

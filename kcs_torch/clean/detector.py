@@ -23,8 +23,8 @@ SKELETONS = (
 
 NOISY, LOUD = 0.002, 0.0045
 """Noise, a share of the body's size, above which joints of such a skeleton are a detector's; and above which they are
-in clips too short to tell it well, and those of any skeleton if it lasts. That of motion capture comes to .0027 where a
-quick motion looks like it."""
+in clips too short to tell it well, or to tell a filter from motion, and those of any skeleton if it lasts. That of
+motion capture comes to .0027 where a quick motion looks like it."""
 
 LASTING, FILTERED = 1.2, 10.0
 """Noise of a few frames over that of single ones from which on it lasts, and from which on a filter has been there. Of
@@ -65,11 +65,12 @@ def found_by_detector(tracks: Tracks) -> bool:
     if noise is None:
         return False
     ratio, usual = noise.restless / max(noise.white, 1e-12), tracks.skeleton.name in SKELETONS
-    if ratio > FILTERED:
-        return noise.told and noise.share > (SMOOTHED if usual else SMOOTH)
+    filtered = ratio > FILTERED
+    if filtered and noise.told:
+        return noise.share > (SMOOTHED if usual else SMOOTH)
     if usual:
-        return max(noise.white, noise.restless) > (NOISY if noise.restless > 0 else LOUD)
-    return ratio > LASTING and noise.share > OWN and noise.restless > LOUD
+        return max(noise.white, noise.restless) > (NOISY if noise.restless > 0 and not filtered else LOUD)
+    return not filtered and ratio > LASTING and noise.share > OWN and noise.restless > LOUD
 
 
 def detector_deviation(tracks: Tracks) -> Tensor:

@@ -34,9 +34,10 @@ _LONG, _RATE = 1.0, 30.0
 and the frames a second where tracks do not tell. Legs stay crossed for less."""
 
 
-_AHEAD, _TIMES, _AROUND = 0.05, 5.0, 3
+_AHEAD, _TIMES, _AROUND, _RARE = 0.05, 5.0, 3, 0.05
 """A step of most joints that differs by such a share of the body's size, and so many times as much as usual, from those
-of so many frames before and after: frames were dropped, or one was repeated, and legs have moved on meanwhile."""
+of so many frames before and after: frames were dropped, or one was repeated, and legs have moved on meanwhile. Steps
+that differ in more than such a share of the frames are the tracks' own, or of a film at another rate."""
 
 
 def unswap(tracks: Tracks) -> Tracks:
@@ -85,10 +86,8 @@ def unswap(tracks: Tracks) -> Tracks:
             for shot, found in zip(shots, swapped, strict=True):
                 _keep_straight(found, across[shot], straight[shot], long)
         if name:
-            swapped = [
-                _through_leaps(found, [leap - shot.start for leap in leaps])
-                for shot, found in zip(shots, swapped, strict=True)
-            ]
+            for shot, found in zip(shots, swapped, strict=True):
+                _through_leaps(found, seen[shot].any(1), [leap - shot.start for leap in leaps])
         frames = torch.cat(swapped).nonzero()  # (F, 1)
         for values in (points, weights):
             values[frames, left], values[frames, right] = values[frames, right], values[frames, left]
@@ -112,32 +111,34 @@ def _comparable(points: Tensor, weights: Tensor, left: Tensor, right: Tensor, si
 
 
 def _leaps_ahead(points: Tensor, seen: Tensor, pairs: list[tuple[int, int]], size: float) -> list[int]:
-    """Frames to which most joints (T, N, 2) make another step than around; of twins the middle, which no swap moves."""
+    """Frames to which most joints (T, N, 2) step farther than around; of twins the middle, which no swap moves."""
     left, right = torch.tensor(pairs, device=points.device).T
     both = seen[:, left] & seen[:, right]
     middle = torch.where(both[..., None], (points[:, left] + points[:, right]) / 2, torch.nan)
-    alone = [n for n in range(points.shape[1]) if n not in {*left.tolist(), *right.tolist()}]
+    twins = {joint for pair in pairs for joint in pair}
+    alone = [n for n in range(points.shape[1]) if n not in twins]
     others = torch.where(seen[:, alone, None], points[:, alone], torch.nan)
     step = nanmedian(torch.cat([middle, others], 1).diff(dim=0), 1)  # (T - 1, 2)
     if not len(step):
         return []
     beside = torch.nn.functional.pad(step, (0, 0, _AROUND, _AROUND), value=torch.nan)
     around = nanmedian(beside.unfold(0, 2 * _AROUND + 1, 1), -1)
-    away = (step - around).norm(dim=-1).nan_to_num(0.0)
-    return ((away > _AHEAD * size) & (away > _TIMES * away.median())).nonzero().flatten().add(1).tolist()
+    away = (step - around).norm(dim=-1)
+    leaps = (away > _AHEAD * size) & (away > _TIMES * nanmedian(away, 0))  # NaN is not above
+    leaps &= step.norm(dim=-1) > around.norm(dim=-1)  # who stands still for a frame does not
+    return leaps.nonzero().flatten().add(1).tolist() if int(leaps.sum()) <= _RARE * len(points) else []
 
 
-def _through_leaps(swapped: Tensor, leaps: list[int]) -> Tensor:
-    """The frames (T,) that are swapped if sides stay what they are where the whole body leaps ahead; as many or fewer.
+def _through_leaps(swapped: Tensor, shown: Tensor, leaps: list[int]) -> None:
+    """Take back, in (T,), what changes where the whole body leaps ahead: from one to the next most frames are right.
 
-    Sides stand in one of two orders in most frames; a limb that is swapped for a moment comes back to this one.
+    Frames count that are shown, (T,); a limb that is swapped for a moment is swapped still.
     """
-    for leap in leaps:
-        if 0 < leap < len(swapped) and bool(swapped[leap] != swapped[leap - 1]):
-            other = torch.cat([swapped[:leap], ~swapped[leap:]])
-            other = ~other if 2 * int(other.sum()) > len(other) else other
-            swapped = other if int(other.sum()) < int(swapped.sum()) else swapped
-    return swapped
+    changes = [leap for leap in leaps if 0 < leap < len(swapped) and bool(swapped[leap] != swapped[leap - 1])]
+    for start, end in pairwise([0, *changes, len(swapped)] if changes else []):
+        part = slice(start, end)
+        if 2 * int(swapped[part].sum()) > int(shown[part].sum()):
+            swapped[part] = ~swapped[part] & shown[part]
 
 
 def _across(points: Tensor, weights: Tensor, pairs: list[tuple[int, int]]) -> Tensor:
