@@ -111,13 +111,16 @@ def test_a_clip_too_short_to_tell_a_filter_from_motion_has_to_be_loud():
 def test_quick_motion_of_short_clips_is_no_detector_s():
     """Every joint's own, nothing of it in single frames: what a filter leaves looks the same."""
     walk = walking_person(240, turn=0.0, yaw=50.0, skeleton="coco17", fps=120.0).tracks
-    time = torch.arange(240, dtype=torch.float64)[:, None, None] / 120
-    phase = 6.28 * torch.rand(2, 17, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    time = torch.arange(240, dtype=torch.float64)[:, None, None, None] / 120
+    pitch, generator = torch.linspace(6, 11, 12, dtype=torch.float64), torch.Generator().manual_seed(0)
+    phase = torch.rand(17, 2, 12, generator=generator, dtype=torch.float64)
+    size = torch.randn(17, 2, 12, generator=generator, dtype=torch.float64) / 3
+    quick = (size * (2 * torch.pi * (pitch * time + phase)).sin()).sum(-1)
+    quick = quick * torch.hann_window(240, periodic=False, dtype=torch.float64)[:, None, None]
     for body in (walk.skeleton, CUSTOM):
-        points = walk.points[:, :17] + (
-            torch.stack([(6.28 * f * time + phase[k]).sin() for k, f in enumerate((7, 9))])
-        ).sum(0)
-        points, weights = body.complete(points, walk.weights[:, :17])
+        points, weights = body.complete(walk.points[:, :17] + quick, walk.weights[:, :17])
+        noise = measure_noise(points, weights, window=256)
+        assert noise.restless > FILTERED * noise.white and noise.share > 0.1
         assert not found_by_detector(replace(walk, points=points, weights=weights, skeleton=body, detector=None))
 
 
