@@ -56,7 +56,7 @@ def found_by_detector(tracks: Tracks) -> bool:
     """As :func:`detected`; where nothing is known of a body with a template, noise tells, too.
 
     Noise that lasts for several frames, or that a filter has left, is a detector's, and so is any noise of a skeleton
-    that detectors have.
+    that detectors have. In a clip too short to tell a filter from quick motion only the latter is, if it is loud.
     """
     known = detected(tracks)
     if known or tracks.detector is not None or not has_trunk(tracks.skeleton):

@@ -35,9 +35,9 @@ and the frames a second where tracks do not tell. Legs stay crossed for less."""
 
 
 _AHEAD, _TIMES, _AROUND, _RARE = 0.05, 5.0, 3, 0.05
-"""A step of most joints that differs by such a share of the body's size, and so many times as much as usual, from those
-of so many frames before and after: frames were dropped, or one was repeated, and legs have moved on meanwhile. Steps
-that differ in more than such a share of the frames are the tracks' own, or of a film at another rate."""
+"""A longer step of most joints than around, which differs by such a share of the body's size, and so many times as much
+as usual, from those of so many frames before and after: frames were dropped, or one was repeated, and legs have moved
+on meanwhile. If more than such a share of the frames has one, that is how these tracks move."""
 
 
 def unswap(tracks: Tracks) -> Tracks:
@@ -135,7 +135,7 @@ def _through_leaps(swapped: Tensor, shown: Tensor, leaps: list[int]) -> None:
     Frames count that are shown, (T,); a limb that is swapped for a moment is swapped still.
     """
     changes = [leap for leap in leaps if 0 < leap < len(swapped) and bool(swapped[leap] != swapped[leap - 1])]
-    for start, end in pairwise([0, *changes, len(swapped)] if changes else []):
+    for start, end in pairwise([0, *changes, len(swapped)]):
         part = slice(start, end)
         if 2 * int(swapped[part].sum()) > int(shown[part].sum()):
             swapped[part] = ~swapped[part] & shown[part]

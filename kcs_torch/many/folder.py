@@ -24,8 +24,8 @@ from kcs_torch.methods.base import Method
 from kcs_torch.methods.clips.processes import check_workers
 from kcs_torch.reconstruct import method_named, reconstruct_all, with_found_bones
 from kcs_torch.types import Intrinsics, Reconstruction, Tracks
+from kcs_torch.types.axes import check_pitch
 from kcs_torch.types.hints import is_a, spoken
-from kcs_torch.types.motion import check_pitch
 from kcs_torch.types.size import METRES, check_size, parse_size
 
 __all__ = ["Outcome", "reconstruct_folder"]

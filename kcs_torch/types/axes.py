@@ -1,12 +1,15 @@
-"""Which way is up: from and to the axes of :class:`Motion`, by turns that keep left and right."""
+"""Which way is up: a camera's pitch; from and to the axes of :class:`Motion`, by turns that keep left and right."""
 
 from __future__ import annotations
 
+from typing import Any
+
 from torch import Tensor
 
-from kcs_torch.errors import unknown
+from kcs_torch.errors import OptionError, unknown
+from kcs_torch.types.intake import as_number
 
-__all__ = ["AXES", "from_y_up", "to_y_up"]
+__all__ = ["AXES", "check_pitch", "from_y_up", "to_y_up"]
 
 # Rows: what x, y (up) and z of a Motion are in the other axes.
 AXES = {
@@ -16,6 +19,18 @@ AXES = {
     "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),  # the camera's axes
     "-z": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
 }
+
+
+def check_pitch(pitch: Any) -> float:
+    """The degrees by which a camera looked down.
+
+    Raises:
+        OptionError: it is no number, or not within -90 to 90.
+    """
+    degrees = as_number(pitch)
+    if degrees is None or not abs(degrees) <= 90:
+        raise OptionError(f"pitch: expected the degrees by which the camera looked down, -90 to 90, got {pitch!r}")
+    return degrees
 
 
 def to_y_up(points: Tensor, up: str) -> Tensor:

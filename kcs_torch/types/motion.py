@@ -15,7 +15,7 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import interpolate, orbit
 from kcs_torch.skeleton import SKELETONS, Skeleton, get_skeleton
 from kcs_torch.types.angles import JointAngles, Joints, angles_of
-from kcs_torch.types.axes import from_y_up, to_y_up
+from kcs_torch.types.axes import check_pitch, from_y_up, to_y_up
 from kcs_torch.types.hints import is_a
 from kcs_torch.types.intake import as_floats, as_number, as_weights, check_places, take_in
 from kcs_torch.types.intrinsics import Intrinsics
@@ -25,7 +25,7 @@ from kcs_torch.types.tracks import Tracks
 from kcs_torch.types.trajectories import Trajectories
 from kcs_torch.types.variation import BoneVariation, bone_variation
 
-__all__ = ["Motion", "check_pitch"]
+__all__ = ["Motion"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -308,18 +308,6 @@ def _same(names: Sequence[str], edges: Any) -> Skeleton | None:
             if pairs == {frozenset((body.joints[a], body.joints[b])) for a, b in body.bones}:
                 return body
     return None
-
-
-def check_pitch(pitch: Any) -> float:
-    """The degrees by which a camera looked down.
-
-    Raises:
-        OptionError: it is no number, or not within -90 to 90.
-    """
-    degrees = as_number(pitch)
-    if degrees is None or not abs(degrees) <= 90:
-        raise OptionError(f"pitch: expected the degrees by which the camera looked down, -90 to 90, got {pitch!r}")
-    return degrees
 
 
 def _apart(
