@@ -227,6 +227,16 @@ def test_whom_a_file_shows_tell_the_image_of_the_one_that_is_read(tmp_path):
     assert kt.load_tracks(kt.save(replace(kept, image_guess=(0, 0)), tmp_path / "kept.npz")).image_guess == (0, 0)
 
 
+def test_joints_beside_the_image_s_left_and_upper_edge_hide_no_size():
+    """Of a body that the edge cuts detectors place some joints there; where many lie there it is no image's corner."""
+    points = torch.rand(1000, 2) * torch.tensor([600.0, 400.0]) + torch.tensor([650.0, 300.0])
+    few, many = points.clone(), points.clone()
+    few[:20, 0], few[20:40, 1] = -30.0, -80.0
+    many[:60, 0] = -30.0
+    assert image_lens.usual_size(points) == image_lens.usual_size(few) == (1280, 720)
+    assert image_lens.usual_size(many) == (0, 0)
+
+
 def test_people_whom_no_usual_image_holds_tell_so(tmp_path):
     """A person in its corner alone would be taken to fill a smaller one."""
     people = kt.io.load_people(two_people(tmp_path))

@@ -97,11 +97,12 @@ def test_a_clip_that_breaks_the_batch_is_found(clips, tmp_path, monkeypatch):
 
 
 def test_the_camera_is_kept_where_a_clip_breaks_the_batch(tmp_path, monkeypatch):
-    """Each for itself is still each with its intrinsics."""
+    """Halves of it, and each for itself, are still solved with its intrinsics."""
     source = make_clips(tmp_path / "in", 3)
     real, asked = folder.reconstruct_all, []
 
     def spied(tracks, **options):
+        tracks = list(tracks)
         asked.append((len(tracks), options["intrinsics"]))
         if len(tracks) > 1:
             raise ZeroDivisionError("planted")
@@ -110,7 +111,22 @@ def test_the_camera_is_kept_where_a_clip_breaks_the_batch(tmp_path, monkeypatch)
     monkeypatch.setattr(folder, "reconstruct_all", spied)
     camera = (1500.0, 1500.0, 960.0, 540.0)
     outcome = run(source, tmp_path / "out", intrinsics=camera)
-    assert outcome.done == 3 and asked == [(0, camera), (3, camera)] + 3 * [(1, camera)]
+    assert outcome.done == 3 and asked == [(n, camera) for n in (0, 3, 1, 2, 1, 1)]
+
+
+def test_a_clip_that_breaks_the_batch_leaves_the_others_in_batches(clips, tmp_path, monkeypatch):
+    """Clips alone take several times as long."""
+    real, asked = folder.reconstruct_all, []
+
+    def spied(tracks, **options):
+        tracks = list(tracks)
+        asked.append(len(tracks))
+        if any("clip0" in one.source for one in tracks):
+            raise ZeroDivisionError("planted")
+        return real(tracks, **options)
+
+    monkeypatch.setattr(folder, "reconstruct_all", spied)
+    assert run(clips, tmp_path).done == 5 and asked == [0, 6, 3, 1, 2, 3]
 
 
 def test_an_option_that_fits_some_clips_only_costs_the_others_alone(tmp_path):

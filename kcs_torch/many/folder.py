@@ -243,16 +243,12 @@ class _Work:
             for clip in clips:
                 with _listing(clip, failed):
                     read.append((clip, self._people(clip)))
-            try:
-                found = iter(self._lift([one for _, people in read for one in people]))
-            except Exception:  # one of them is to blame: each for itself
-                found = None
-            for clip, people in read:
-                own = None if found is None else list(itertools.islice(found, len(people)))
+            for (clip, people), found in zip(read, self._lift([people for _, people in read]), strict=True):
                 with _listing(clip, failed):
-                    results = self._lift(people) if own is None else own
-                    self._write(clip, results)
-                    doubts = [one.diagnostics.brief_doubt for one in results if one.diagnostics.doubt]
+                    if isinstance(found, Exception):
+                        raise found
+                    self._write(clip, found)
+                    doubts = [one.diagnostics.brief_doubt for one in found if one.diagnostics.doubt]
                     self.doubted.extend((clip.source, doubt) for doubt in doubts[:1])
                     made, frames = made + 1, frames + people[0].num_frames
         return made, frames, failed
@@ -266,8 +262,16 @@ class _Work:
                 check_size(one.skeleton, name, "scale")
         return people
 
-    def _lift(self, people: list[Tracks]) -> list[Reconstruction]:
-        return reconstruct_all(people, method=self.method, intrinsics=self.intrinsics, workers=self.workers)
+    def _lift(self, clips: Sequence[list[Tracks]]) -> list[list[Reconstruction] | Exception]:
+        """Results of each clip's people, or why it fails; if one does, halves of the clips are tried, and so on."""
+        people = itertools.chain.from_iterable(clips)
+        try:
+            found = reconstruct_all(people, method=self.method, intrinsics=self.intrinsics, workers=self.workers)
+        except Exception as error:
+            half = len(clips) // 2
+            return [*self._lift(clips[:half]), *self._lift(clips[half:])] if half else [error]
+        each = iter(found)
+        return [list(itertools.islice(each, len(one))) for one in clips]
 
     def _write(self, clip: Clip, results: list[Reconstruction]) -> None:
         """Write all results of a clip, and that they are all."""

@@ -96,7 +96,12 @@ def may_be_shares(points: Tensor) -> bool:
 
 
 def usual_size(points: Tensor) -> tuple[int, int]:
-    """The smallest image of usual size that holds nearly all of points (P, 2); (0, 0) if none does."""
+    """The smallest image of usual size that holds nearly all of points (P, 2); (0, 0) if none does.
+
+    Where few lie left of all images or above them, the image's edge cuts the body there, and tells nothing of the size.
+    """
+    if float((points < 0).any(-1).double().mean()) <= CLEAR:
+        points = points.clamp(min=0)
     usual = (size for wide, high in SIZES for size in ((wide, high), (high, wide)))
     return next((size for size in usual if _held(points, size) >= INSIDE), (0, 0))
 
