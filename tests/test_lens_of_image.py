@@ -340,3 +340,40 @@ def test_a_body_that_shrank_to_a_point_is_not_far():
     for size in (1e-3, 1e-6):
         shrunk = replace(near, points=there + size * (near.points - near.points.mean(1, keepdim=True))).remeasured()
         assert not near_or_far.is_far(near, shrunk)
+
+
+def hand_under_parallel_rays(shared, protocol, frames=75):
+    """A hand at a mug that turns by 120 degrees, in pixels, and where its joints are."""
+    data = protocol.load(shared / "data", "hand/manipnet_mug1_rightHand")
+    every = round(float(data["fps"]) / 30)
+    points = torch.tensor(data["points3d"])[::every][20 : 20 + frames].double() * torch.tensor([-1.0, 1, 1])
+    turns = torch.tensor(protocol.rotation(protocol.np.linspace(30, 150, frames), 10.0)).double()
+    points = points @ turns.mT
+    points = points - points[0].mean(0)
+    points = 60 * points / (points - points.mean(1, keepdim=True)).norm(dim=-1).mean()
+    bones, names = data["edges"].tolist(), data["joint_names"].tolist()
+    image = points[..., :2] + torch.tensor([640.0, 360.0])
+    tracks = kt.Tracks.from_arrays(image, edges=bones, joint_names=names, fps=30.0, image_size=(1280, 720))
+    return tracks, points
+
+
+def test_rays_that_are_parallel_are_not_taken_for_near_ones(shared, protocol):
+    """Exact tracks of a hand fit no camera that is merely far: a near one, found wrongly, won against it."""
+    tracks, truth = hand_under_parallel_rays(shared, protocol)
+    lifted = quietly(tracks, intrinsics="parallel")
+    assert error(lifted.points, truth) < 1
+    near = quietly(tracks, method="kcs", intrinsics=Intrinsics(1100.0, 1100.0, 640.0, 360.0))
+    assert near_or_far.is_far(near, lifted)
+
+
+def test_a_hand_that_comes_out_near_may_be_far(monkeypatch):
+    """Whoever has feet may not, which saves the time to ask."""
+    monkeypatch.setattr(uncalibrated, "is_far", lambda near, lifted: True)
+    for skeleton, far in (("hand21", True), ("coco17", False)):
+        clip = kt.data.random_motion(skeleton, 8, turn=0.0)
+        image = clip.tracks.points[:, : kt.SKELETONS[skeleton].num_observed]
+        image = 100 * image / image.abs().max() + 500
+        tracks = kt.Tracks.from_arrays(image, skeleton=skeleton, fps=30.0, image_size=(1280, 720))
+        near = quietly(tracks, method="kcs", intrinsics=(400.0, 400.0, 640.0, 360.0))
+        monkeypatch.setattr(uncalibrated, "reconstruct_perspective", lambda *_, near=near, **__: near)
+        assert (quietly(tracks, rounds=0, steps=3).distance is None) == far

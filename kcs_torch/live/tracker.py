@@ -275,9 +275,14 @@ class Tracker:
         return float(longest_image(image, weights > 0, self._chain.bones[self._rigid], lengths)) - shape.usual
 
     def _begin_again(self, image: Tensor, weights: Tensor) -> None:
-        """Find a known body anew, of any heading and size, in a frame."""
+        """Find a known body anew, of any heading and size, in a frame.
+
+        It may be another one: the next solve comes as soon as a window holds nothing else, and alone tells its bones.
+        """
         self._filter.reset()
         self._begun = self._frame
+        if self._shape is not None:
+            self._told, self._due = 0, deque([self._frame + self.window - 1])
         looks = self._looks(image, weights, self._body_now())
         self._size.value, self._size.slope = self._size.value + (0.0 if math.isnan(looks) else looks), 0.0
 

@@ -31,6 +31,9 @@ NARROW = 0.15
 FAR = 34.0
 """Distance, for a body of 1.75, of the far body that a near one is compared with."""
 
+FARTHER = 340.0
+"""Distance of another one, whose rays are parallel but for what no tracks tell."""
+
 UNUSUAL = FIRM * math.log(FAR / USUAL) ** 2 / 2
 """What it costs to be as far away, where nothing tells of the focal length."""
 
@@ -117,6 +120,7 @@ def is_far(near: Reconstruction, lifted: Reconstruction) -> bool:
     """Whether a camera that is far away explains the tracks better than a near one, each by what was found through it.
 
     Each is seen along its own rays, in its own image without noise: where tracks are noisy, bones are constant there.
+    What is exact under parallel rays is not so before a camera that is merely far: one that is farther is tried, too.
 
     Args:
         near: through a lens, at a usual distance.
@@ -124,31 +128,33 @@ def is_far(near: Reconstruction, lifted: Reconstruction) -> bool:
     """
     lens, flat, unit = near.intrinsics, clean_image(lifted), body_unit(lifted)
     assert lens is not None
-    far, space = Intrinsics(FAR * unit, FAR * unit, lens.cx, lens.cy), near.in_space()
+    space, depth = near.in_space(), lifted.points[..., 2] / unit
     aside = float((flat - flat.new_tensor([lens.cx, lens.cy])).square().sum(-1).mean().sqrt())
     # a body that shrank to a point tells nothing
-    if not (bool(lifted.points.isfinite().all()) and aside < WIDE * far.focal):
+    if not (bool(lifted.points.isfinite().all()) and aside < WIDE * FAR * unit):
         return False
     tracks, some, rate = lifted.tracks, *_telling(lifted.tracks, flat)
     noise = image_noise(tracks, flat, unit)[some]
-    images = [
-        replace(tracks, points=image[some], weights=torch.ones_like(noise), fps=rate)
-        for image in (flat, lens.project(space))
-    ]
-    views = [View.of(image, seen, rate) for image, seen in zip(images, (far, lens), strict=True)]
-    placed = (space[some] @ views[1].look.mT)[..., 2] / body_unit(near)
-    starts = (
-        (views[0].first_distance(images[0], rate) / unit, lifted.points[some, :, 2] / unit),
-        (placed.mean(-1), placed),
-    )
-    cost = []
-    for view, (path, depth) in zip(views, starts, strict=True):
+
+    def along(image: Tensor, through: Intrinsics) -> tuple[Tracks, View]:
+        clean = replace(tracks, points=image[some], weights=torch.ones_like(noise), fps=rate)
+        return clean, View.of(clean, through, rate)
+
+    def cost(view: View, path: Tensor, depth: Tensor) -> float:
         depth = (depth - depth.mean(-1, keepdim=True))[None]
         energy = PinholeEnergy(outward(tracks.skeleton), view.rays, path, depth, rate, noise)
         found = lbfgs(energy, energy.start, num_steps=2 * STEPS, tolerance=1e-6, slopes=True)
         assert found.energy is not None
-        cost.append(float(found.energy[0]))
-    return cost[0] < cost[1]
+        return float(found.energy[0])
+
+    def far(distance: float) -> float:
+        clean, view = along(flat, Intrinsics(distance * unit, distance * unit, lens.cx, lens.cy))
+        return cost(view, view.first_distance(clean, rate) / unit, depth[some])
+
+    _, view = along(lens.project(space), lens)
+    placed = (space[some] @ view.look.mT)[..., 2] / body_unit(near)
+    least = cost(view, placed.mean(-1), placed)
+    return any(far(distance) < least for distance in (FAR, FARTHER))
 
 
 def _telling(tracks: Tracks, flat: Tensor) -> tuple[Tensor, float]:
