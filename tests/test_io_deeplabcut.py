@@ -143,6 +143,14 @@ def test_csv_with_every_cell_in_quotes(tmp_path, delimiter):
     assert torch.equal(load_tracks(tmp_path / "b.csv").points, load_tracks(tmp_path / "a.csv").points)
 
 
+@pytest.mark.parametrize("end", ["\n\n", "\r\r\n", "\r\n\r\n"])
+def test_csv_whose_line_ends_were_doubled(tmp_path, end):
+    path = write_deeplabcut_csv(tmp_path / "mouse.csv", deeplabcut_columns(), deeplabcut_values(deeplabcut_columns()))
+    plain = load_tracks(path, fps=30)
+    path.write_bytes(path.read_text().replace("\n", end).encode())
+    assert torch.equal(load_tracks(path, fps=30).points, plain.points)
+
+
 def test_a_line_with_the_name_of_the_index_is_no_frame(tmp_path):
     columns, values = mouse_table()
     path = write_deeplabcut_csv(tmp_path / "a.csv", columns, values)

@@ -62,7 +62,8 @@ class Tracker:
 
     Bones keep their proportions until a window has been solved again. The size of a body that comes nearer or goes
     away is followed from frame to frame, by its trunk and the bones that look longest; without a template only growth
-    is, until the next solve. The camera is taken to move little. Without a template the viewpoint has to turn: depths
+    is, until the next solve. Whoever comes back after half a second may be another: once a window shows nobody else, it is
+    solved, and tells the bones alone. The camera is taken to move little. Without a template the viewpoint has to turn: depths
     are guesses and ``ready`` is False until a full window has been solved, two windows from the start. All work is done
     on the CPU in double precision; poses come back on the device and in the dtype of the input, float32 for half
     precision, float64 for whole numbers and lists. Memory does not grow beyond the window.

@@ -54,7 +54,8 @@ def recognises_motion(probe: Probe) -> bool:
 
 
 def _first_lines(probe: Probe) -> list[bytes]:
-    return [line.replace(b'"', b"") for line in probe.head.removeprefix(_BOM).split(b"\n", 4)[:4]]
+    lines = probe.head.removeprefix(_BOM).split(b"\n", 8)[:8]  # where line ends were doubled every other one is blank
+    return [line.replace(b'"', b"") for line in lines if line.strip()][:4]
 
 
 def read(path: Path, options: Options) -> list[Tracks]:
@@ -187,6 +188,8 @@ def _header(lines: Iterator[list[str]], path: Path) -> list[list[str]]:
     """The three or four lines of names."""
     header: list[list[str]] = []
     for line in lines:
+        if not line:
+            continue
         header.append(line)
         if line[:1] == ["coords"] or len(header) == 4:
             break
