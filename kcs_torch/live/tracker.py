@@ -60,13 +60,13 @@ class Tracker:
     the window's. Where frames come faster, or the machine is slow, that one update waits for the thread, unless
     ``wait`` is False.
 
-    Bones keep their proportions until a window has been solved again. The size of a body that comes nearer or goes
-    away is followed from frame to frame, by its trunk and the bones that look longest; without a template only growth
-    is, until the next solve. Whoever comes back after half a second may be another: once a window shows nobody else, it is
-    solved, and tells the bones alone. The camera is taken to move little. Without a template the viewpoint has to turn: depths
-    are guesses and ``ready`` is False until a full window has been solved, two windows from the start. All work is done
-    on the CPU in double precision; poses come back on the device and in the dtype of the input, float32 for half
-    precision, float64 for whole numbers and lists. Memory does not grow beyond the window.
+    Bones keep their proportions until a window has been solved again. The size of a body that comes nearer or goes away
+    is followed from frame to frame, by its trunk and the bones that look longest; without a template only growth is,
+    until the next solve. Whoever comes back after half a second may be another: once a window shows nobody else, it is
+    solved, and tells the bones alone. The camera is taken to move little. Without a template the viewpoint has to turn:
+    depths are guesses and ``ready`` is False until a full window has been solved, two windows from the start. All work
+    is done on the CPU in double precision; poses come back on the device and in the dtype of the input, float32 for
+    half precision, float64 for whole numbers and lists. Memory does not grow beyond the window.
 
     Frames come evenly in time: where a camera dropped some, call :meth:`update` with a frame of NaN for each. The
     arguments are attributes that cannot change: for another rate make a new tracker.
