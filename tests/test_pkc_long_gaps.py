@@ -29,7 +29,7 @@ def walk():
 def test_frames_that_are_solved(walk):
     tracks = replace(walk.tracks, fps=30.0)
     assert shortened(tracks) is None
-    assert shortened(hidden(tracks, slice(0, 8), slice(82, 90))) is None
+    assert shortened(hidden(tracks, slice(0, 1), slice(82, 90))).tolist() == list(range(1, 82))
     assert shortened(hidden(tracks, slice(0, 90))) is None  # nobody is there at all
     assert shortened(hidden(tracks, slice(0, 5), slice(60, 90))).tolist() == list(range(5, 60))
     assert shortened(hidden(tracks, slice(0, 30), slice(31, 90))).tolist() == [30]
@@ -65,6 +65,14 @@ def test_who_comes_and_goes_is_solved_while_seen(walk, intrinsics):
     assert_close(result.points[60:], result.points[59:60].expand(30, -1, -1), rtol=0, atol=1e-6)
     assert result.uncertainty[:30].median() > result.uncertainty[30:60].median()
     assert "60 frames at the clip's ends show nobody: nearest pose held" in result.diagnostics.notes
+
+
+def test_few_frames_without_the_body_at_the_ends_change_nothing(walk):
+    """They were taken for frames in which it stands still."""
+    some = walk.tracks.frames(30, 60)
+    result = kt.reconstruct(hidden(walk.tracks.frames(28, 63), slice(0, 2), slice(32, 35)), intrinsics="parallel")
+    alone = kt.reconstruct(some, intrinsics="parallel")
+    assert_close(result.points[2:32], alone.points, rtol=1e-4, atol=0.5)  # mm
 
 
 @pytest.mark.filterwarnings("ignore::kcs_torch.KcsWarning")

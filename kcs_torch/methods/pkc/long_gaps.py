@@ -26,14 +26,12 @@ SHOWN = 2
 
 
 def time_seen(tracks: Tracks) -> slice:
-    """The frames from when the body is first seen until it was last seen, if it is away for long before or after.
+    """The frames from when the body is first seen until it was last seen; all if it never is.
 
     People come and go, while their tracks have all the frames of the film.
     """
     frames = _showing(tracks).nonzero().flatten().tolist()
-    if not frames or max(frames[0], tracks.num_frames - 1 - frames[-1]) <= _longest(tracks):
-        return slice(0, tracks.num_frames)
-    return slice(frames[0], frames[-1] + 1)
+    return slice(frames[0], frames[-1] + 1) if frames else slice(0, tracks.num_frames)
 
 
 def shortened(tracks: Tracks) -> Tensor | None:
