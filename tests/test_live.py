@@ -331,7 +331,8 @@ def test_finds_the_body_again_after_it_turned_unseen(clip):
     assert error(torch.stack([p.points for p in found[-40:]]), behind.points[-40:]) < 40  # flat: 87
 
 
-def test_who_comes_back_may_be_another():
+@pytest.mark.parametrize(("before", "away"), [(60, 20), (42, 16)])  # a solve may be under way while they change
+def test_who_comes_back_may_be_another(before, away):
     """The bones of whoever went are not kept until the period ends: the first window without them tells."""
     body = kt.SKELETONS["coco17"]
     clip = walking_person(150, skeleton="coco17", yaw=30, turn=0)
@@ -339,8 +340,8 @@ def test_who_comes_back_may_be_another():
     for side in ("left", "right"):  # arms half as long
         shoulder, *rest = (body.index(f"{side}_{joint}") for joint in ("shoulder", "elbow", "wrist"))
         other[:, rest] = (other[:, rest] + other[:, [shoulder]]) / 2
-    away = torch.full((20, 17, 2), torch.nan)
-    after = kt.Tracker("coco17", fps=30, window=45), torch.cat([observed(clip)[:60], away, other[..., :2]])
+    gap = torch.full((away, 17, 2), torch.nan)
+    after = kt.Tracker("coco17", fps=30, window=45), torch.cat([observed(clip)[:before], gap, other[..., :2]])
     alone = kt.Tracker("coco17", fps=30, window=45), other[..., :2]
     ends = [body.index("left_shoulder"), body.index("left_elbow")]
     arms = []
@@ -348,7 +349,17 @@ def test_who_comes_back_may_be_another():
         with tracker:
             points = torch.stack([tracker.update(frame).points for frame in frames])
         arms.append(points[:, ends].diff(dim=1).norm(dim=-1)[:, 0])
-    assert float(arms[0][100]) > 1.2 * float(arms[1][-1]) and abs(float(arms[0][-1] / arms[1][-1]) - 1) < 0.05
+    assert float(arms[0][before + away + 20]) > 1.2 * float(arms[1][-1])
+    assert abs(float(arms[0][-1] / arms[1][-1]) - 1) < 0.05
+
+
+def test_who_goes_and_comes_is_solved_all_the_same(clip):
+    """Each return put the next solve off, so that there was none."""
+    frames = observed(clip)[:60].repeat(4, 1, 1)
+    frames[torch.arange(len(frames)) % 40 >= 23] = torch.nan
+    with kt.Tracker("coco17", fps=30, window=60, period=45) as tracker:
+        delays = [tracker.update(frame).delay for frame in frames]
+    assert max(delays[100:]) <= 45 + 20
 
 
 def test_closing_ends_the_thread_and_keeps_the_window(clip):

@@ -127,6 +127,7 @@ def test_a_clip_that_breaks_the_batch_leaves_the_others_in_batches(clips, tmp_pa
 
     monkeypatch.setattr(folder, "reconstruct_all", spied)
     assert run(clips, tmp_path).done == 5 and asked == [0, 6, 3, 1, 2, 3]
+    assert (tmp_path / "clip0.failed.txt").read_text().count("Traceback") == 1
 
 
 def test_an_option_that_fits_some_clips_only_costs_the_others_alone(tmp_path):

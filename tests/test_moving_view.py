@@ -285,6 +285,20 @@ def test_deviations_of_depth_know_of_noise(protocol, shared):
     assert 0.5 < float((off <= found.uncertainty).double().mean()) < 0.85
 
 
+def test_a_guessed_template_does_not_outvote_the_turn(protocol, shared):
+    """A dog that runs before a viewpoint that turns by 70 degrees, whose template is a guess by names."""
+    data = protocol.load(shared / "data", "dog/dog_run00")
+    points = torch.from_numpy(data["points3d"]).double()[::2][60:113] * torch.tensor([-1.0, 1, 1])
+    turns = torch.from_numpy(protocol.rotation(protocol.np.linspace(0, 70, len(points)), 10.0)).double()
+    truth = points @ turns.mT
+    names, bones = data["joint_names"].tolist(), data["edges"].tolist()
+    tracks = kt.Tracks.from_arrays(truth[..., :2], edges=bones, joint_names=names, fps=30.0, units="mm")
+    assert tracks.skeleton.template is not None
+    found = kt.PKC(alternatives=0)(tracks)
+    size = (truth - truth.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()
+    assert float(kt.metrics.mpjpe(found.points, truth, align="rigid") / size) < 0.05
+
+
 def test_gaps_of_a_body_without_template_are_filled_in_space():
     clip = walking_person(60, turn=180)
     body = Skeleton.from_edges(clip.skeleton.bones, 17)

@@ -148,6 +148,8 @@ class Tracker:
         self._solved = -1  # frame at which the last solve began
         self._known = self._frame  # frame from which on bone lengths are known
         self._told = 0  # frames that the proportions come from
+        self._alone: float = math.inf  # frame from which on the window holds nobody who may have gone
+        self._renews = False  # whether the running solve tells the body without what was known before
         self._begun = self._frame + 1  # frame from which the filter follows the body without a break
         self._due = deque(self._begun + frames - 1 for frames in self._early)
 
@@ -276,14 +278,10 @@ class Tracker:
         return float(longest_image(image, weights > 0, self._chain.bones[self._rigid], lengths)) - shape.usual
 
     def _begin_again(self, image: Tensor, weights: Tensor) -> None:
-        """Find a known body anew, of any heading and size, in a frame.
-
-        It may be another one: the next solve comes as soon as a window holds nothing else, and alone tells its bones.
-        """
+        """Find a known body anew, of any heading and size, in a frame; it may be another one."""
         self._filter.reset()
         self._begun = self._frame
-        if self._shape is not None:
-            self._told, self._due = 0, deque([self._frame + self.window - 1])
+        self._alone = self._frame + self.window - 1
         looks = self._looks(image, weights, self._body_now())
         self._size.value, self._size.slope = self._size.value + (0.0 if math.isnan(looks) else looks), 0.0
 
@@ -295,10 +293,13 @@ class Tracker:
             found, self._solving = self._solving.result(), None
             if found is not None:
                 self._adopt(found)
-        if self._solving is None and self._due[0] <= self._frame:
-            self._due.popleft()
+        if self._solving is None and min(self._due[0], self._alone) <= self._frame:
+            if self._due[0] <= self._frame:
+                self._due.popleft()
             if not self._due:
                 self._due.append(self._frame + self.period)
+            self._renews = self._alone <= self._frame
+            self._alone = math.inf if self._renews else self._alone
             image, weights = torch.stack(list(self._image)), torch.stack(list(self._weights))
             self._tell_up(how_it_stands(image, weights > 0, self.skeleton))
             self._solving = self._thread.submit(solve_window, self.method, self._body, image, weights, self.fps)
@@ -314,6 +315,8 @@ class Tracker:
     def _adopt(self, found: Solved) -> None:
         """Take over the body that was found, and let the filter take the window's last frames again."""
         count = len(found.told.depths)
+        if self._renews:  # deviations from another's bones teach nothing
+            self._told, self._known = 0, self._frame
         self._told = min(self._told + count, REMEMBERED * self.window)
         share = count / self._told
         shape = found.shape if self._shape is None else found.shape.blended(self._shape, share)

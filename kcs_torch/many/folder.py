@@ -266,12 +266,12 @@ class _Work:
         """Results of each clip's people, or why it fails; if one does, halves of the clips are tried, and so on."""
         people = itertools.chain.from_iterable(clips)
         try:
-            found = reconstruct_all(people, method=self.method, intrinsics=self.intrinsics, workers=self.workers)
+            found = iter(reconstruct_all(people, method=self.method, intrinsics=self.intrinsics, workers=self.workers))
+            return [list(itertools.islice(found, len(one))) for one in clips]
         except Exception as error:
-            half = len(clips) // 2
-            return [*self._lift(clips[:half]), *self._lift(clips[half:])] if half else [error]
-        each = iter(found)
-        return [list(itertools.islice(each, len(one))) for one in clips]
+            failed = error
+        half = len(clips) // 2  # beside the handler: what fails there is not told of here
+        return [*self._lift(clips[:half]), *self._lift(clips[half:])] if half else [failed]
 
     def _write(self, clip: Clip, results: list[Reconstruction]) -> None:
         """Write all results of a clip, and that they are all."""

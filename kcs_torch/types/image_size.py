@@ -35,7 +35,8 @@ MOST = 0.5
 
 CLEAR, BESIDE = 0.05, 0.1
 """Share of the joints, and how far they lie beside an image, over its sides, from which on width and height may be the
-wrong way round. Of people whom the image's edge cuts, detectors place more of them beside it, but not as far."""
+wrong way round. Of people whom the image's edge cuts, detectors place more of them beside it, but not as far. Up to
+this share may lie left of an image whose size is guessed, or above it."""
 
 
 def as_image_size(value: Any, units: str = "px", source: str = "") -> tuple[int, int] | None:

@@ -31,7 +31,7 @@ __all__ = ["likely_lens", "looking", "reconstruct_uncalibrated"]
 
 CLOSE = 5.0
 """Distance up to which the search under parallel rays ends: what is farther away it finds signs of better. Nor can
-whoever has feet be far away who comes out as near; a hand, whose template tells less, may."""
+a body of two sides be far away that comes out as near; a hand, whose template tells less, may."""
 
 
 def reconstruct_uncalibrated(
@@ -107,7 +107,7 @@ def _by_image(method: Method, tracks: Tracks, cameras: Tensor | None, likely: Li
     if not bool(near.points.isfinite().all()):
         return method(tracks, cameras)
     assert near.intrinsics is not None
-    if near.intrinsics.focal > CLOSE * body_unit(near) or not tracks.skeleton.contacts:
+    if near.intrinsics.focal > CLOSE * body_unit(near) or not tracks.skeleton.mirror:
         lifted = judge(tracks, cameras)
         if is_far(near, lifted):
             return lifted if judge is method else method(tracks, cameras)

@@ -15,6 +15,7 @@ from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
 from kcs_torch.functional.temporal import blend_windows, window_starts
 from kcs_torch.methods.clips.lockstep import Search
+from kcs_torch.methods.clips.template import guessed
 from kcs_torch.methods.pkc.assembly import TIGHT
 from kcs_torch.methods.pkc.descents import Descent
 from kcs_torch.methods.pkc.gaps import fill_gaps, gaps_of, usual_noise
@@ -66,7 +67,8 @@ ODD, LITTLE = 0.115, 30.0
 stray by .07 to .11. The viewpoint's turn tells depth better than such a template from so many degrees on."""
 
 LEAD, LESS = 10.0, 3.0
-"""By how much what was found without a template of another body must be better, and how much less that one counts."""
+"""By how much what was found without a template of another body must be better, and how much less that one counts. A
+guessed template has no such lead."""
 
 TOLD = 3.0
 """By how much a mirror image must be dearer for known cameras to rule it out: of what they rule out so in 2000 motions,
@@ -251,7 +253,8 @@ class Body:
                 ranked = replace(ranked, energy=ranked.energy + self._seen_by(ranked.depth, cameras))
             dearer = ranked.energy - found.energy[0]
             if self.is_odd(found):
-                rivals = rivals.joined(replace(ranked, depth=other, energy=found.energy[0] + LEAD + dearer / LESS))
+                lead = 0.0 if guessed(self.skeleton) else LEAD
+                rivals = rivals.joined(replace(ranked, depth=other, energy=found.energy[0] + lead + dearer / LESS))
             elif bool(dearer[0] < CLOSE):
                 rivals = rivals.joined(replace(ranked, depth=other))
         stages = (COARSE[-1], *POLISH) if around else POLISH
