@@ -367,7 +367,7 @@ def test_rays_that_are_parallel_are_not_taken_for_near_ones(shared, protocol):
 
 
 def test_a_hand_that_comes_out_near_may_be_far(monkeypatch):
-    """Whoever has feet may not, which saves the time to ask."""
+    """A body with a left and a right side may not, which saves the time to ask."""
     monkeypatch.setattr(uncalibrated, "is_far", lambda near, lifted: True)
     for skeleton, far in (("hand21", True), ("coco17", False)):
         clip = kt.data.random_motion(skeleton, 8, turn=0.0)
