@@ -66,6 +66,7 @@ class TestCommandLine:
             ("optimise=???", "error: optimise: expected a value, got none: add optimise="),
             ("+trainer.acelerator=cpu", "unknown field of trainer .*'acelerator': did you mean 'accelerator'"),
             ("trainer.accelerator=abacus", "abacus"),
+            ("trainer.accelerator=tpu", "error: trainer: .*torch_xla"),
             ("data=cmu shared=/nowhere", "/nowhere/data/cmu, found none"),
             ("resume=/nowhere", "resume=/nowhere: expected a run's folder"),
             ("model._target_=kcs_torch.nn.Nothing", "kcs_torch.nn.Nothing"),

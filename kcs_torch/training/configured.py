@@ -310,10 +310,11 @@ def _told(error: Exception, also: tuple[type[Exception], ...]) -> str | None:
         return f"{error.full_key}: expected a value, got none: add {error.full_key}=..."
     if isinstance(error, InstantiationException):
         cause, place = error.__cause__, re.search(r"full_key: (\S+)", str(error))
-        if isinstance(cause, (TypeError, ValueError, *told)):
+        located = re.search(r"Error locating target '(\S+)'", str(error))
+        lacks = located is None and isinstance(cause, ModuleNotFoundError)  # a package that what is configured needs
+        if lacks or isinstance(cause, (TypeError, ValueError, *told)):
             return str(cause) if isinstance(cause, KcsError) or place is None else f"{place.group(1)}: {cause}"
         if cause is not None:
-            located = re.search(r"Error locating target '(\S+)'", str(error))
             where = "" if place is None else f"{place.group(1)}."
             return None if located is None else _not_imported(where, located.group(1), cause)
     return str(error) if isinstance(error, told) else None
