@@ -42,6 +42,9 @@ SOFT = 8
 """Rounds of SfAM, at most, that come first where no template helps: straightened by wrong depths, tracks do not fit
 bones of constant length, which PKC insists on."""
 
+CLOSE = 6.0
+"""Distance, for a body of 1.75, below which tracks straightened anew, through the lens that was found, tell more."""
+
 WIDE = 3.0
 """Tangent of the angle off the optical axis from which on the focal length is hardly true."""
 
@@ -113,7 +116,7 @@ def _reconstruct(
     if (guessed is not None or lifted is not None) and not best.flat:
         best = _with_focal(method, tracks, best, cameras)
     searched = method.turns_over and has_trunk(tracks.skeleton) and not detected(tracks) and not best.flat
-    if searched and lifted is not None and SEEMS_NEAR in lifted.diagnostics.notes:  # where the search ended
+    if searched and best.scene.any_focal and (_is_close(best) if lifted is None else _ended_early(lifted)):
         best = _lifted_anew(method, tracks, best, cameras)
     if best.scene.any_focal:
         best = with_feet(best, feet_on_ground(tracks, cameras))
@@ -188,16 +191,23 @@ def _with_focal(method: Method, tracks: Tracks, best: Found, cameras: Tensor | N
     return best
 
 
-def _lifted_anew(method: Method, tracks: Tracks, best: Found, cameras: Tensor | None) -> Found:
-    """What the method finds in tracks straightened by the best body so far, through its lens, if that is better.
+def _is_close(best: Found) -> bool:
+    """Whether a body is so close that what was found through a lens that was guessed may hold through no other."""
+    return float(best.bodies.distance[0].mean()) < CLOSE * best.scene.unit
 
-    Under parallel rays the search ended before it looked for signs, and flips of single runs mend only some.
-    """
+
+def _ended_early(lifted: Reconstruction) -> bool:
+    """Whether the search under parallel rays ended before it looked for signs: flips of single runs mend only some."""
+    return SEEMS_NEAR in lifted.diagnostics.notes
+
+
+def _lifted_anew(method: Method, tracks: Tracks, best: Found, cameras: Tensor | None) -> Found:
+    """What the method finds in tracks straightened by the best body so far, through its lens, if that is better."""
     view = View.of(tracks, zoomed(best.view.lens, float(best.bodies.focal[0])), tracks.rate)
     distance, depth = best.bodies.distance[0], best.bodies.depth[0]
     made = _as_unsure(_lift(method, _straighten(tracks, view.rays, distance, depth), view, cameras), best)
     given = made, view, distance, depth, tracks.rate, feet_on_ground(tracks, cameras), best.scene.unit
-    found = refine(*given, mirror=cameras is None, flips=True, any_focal=True)
+    found = refine(*given, mirror=cameras is None, flips=True, any_focal=True, usual=best.usual(view))
     return found if bool(found.bodies.energy[0] < best.bodies.energy[0] - GAIN) else best
 
 

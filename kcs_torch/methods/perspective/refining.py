@@ -55,6 +55,10 @@ class Found:
             return self.lifted[int(self.bodies.origin[k])].diagnostics.converged
         return bool(self.bodies.moved[k] <= STILL)
 
+    def usual(self, view: View) -> float | None:
+        """Focal length of usual lenses, over that of a view; None where nothing tells."""
+        return None if self.scene.usual is None else self.scene.usual * self.view.lens.focal / view.lens.focal
+
     @property
     def steps(self) -> int:
         """Steps of the refinement that made the solutions what they are."""
@@ -141,8 +145,7 @@ def refine_again(found: Found, view: View, standing: Tensor | None, flips: bool)
     flips = flips and (before is None or abs(math.log(focal / before)) > SAME)
     bodies = found.bodies[found.bodies.energy.isfinite()]
     rays = view.seen_from(found.view, found.scene.rays)
-    usual = None if found.scene.usual is None else found.scene.usual * found.view.lens.focal / focal
-    scene = replace(found.scene, rays=rays, standing=standing, any_focal=False, usual=usual)
+    scene = replace(found.scene, rays=rays, standing=standing, any_focal=False, usual=found.usual(view))
     origin = bodies.origin
     seen = found.lifted[0].tracks
     scene, bodies = _refined(scene, bodies.distance[0], bodies.depth, seen, flips, any_focal=True)
