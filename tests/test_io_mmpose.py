@@ -116,6 +116,26 @@ def test_a_folder_with_the_file_of_a_video(tmp_path, whole):
     assert load_tracks(file).num_frames > 1
 
 
+def with_third(third):
+    frames = mmpose_frames()
+    for frame in frames:
+        for one in frame["instances"]:
+            one["keypoints"] = [[*row, third(i, one)] for i, row in enumerate(one["keypoints"])]
+    return frames
+
+
+def test_3d_joints_are_refused(tmp_path):
+    path = write_json(tmp_path / "a.json", with_third(lambda i, _: 0.1 * i - 0.2))
+    with pytest.raises(FormatError, match=r"a\.json: frame 1: entry 0: 'keypoints': expected 2D joints, got 3D motion"):
+        load_tracks(path)
+
+
+@pytest.mark.parametrize("third", [lambda i, one: one["keypoint_scores"][i], lambda i, _: i % 3, lambda i, _: i / 20])
+def test_rows_may_hold_scores_or_flags_again(tmp_path, third):
+    tracks = load_tracks(write_json(tmp_path / "a.json", with_third(third)))
+    assert np.allclose(numbers(tracks), person(4, 17))
+
+
 def changed(**parts):
     first, second, *_ = mmpose_frames()
     return [first, {**second, **parts}]
