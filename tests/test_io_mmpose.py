@@ -108,6 +108,13 @@ def test_a_folder_with_a_file_an_image(tmp_path):
     assert load_tracks(tmp_path / "predictions" / "clip_3.json").num_frames == 1
 
 
+def test_a_copy_in_the_folder_is_named(tmp_path):
+    for name, frame in zip(("a_1", "a_2", "a_2 (1)"), mmpose_frames(), strict=False):
+        write_json(tmp_path / f"{name}.json", frame["instances"])
+    said = "'a_2 (1).json' holds no frame number, unlike the other file names"
+    assert any(note.startswith(said) for note in load_tracks(tmp_path).notes)
+
+
 @pytest.mark.parametrize("whole", [lambda frames: frames, lambda frames: {"meta_info": {}, "instance_info": frames}])
 def test_a_folder_with_the_file_of_a_video(tmp_path, whole):
     file = write_json(tmp_path / "results_1.json", whole(mmpose_frames()))
