@@ -298,8 +298,9 @@ def test_odd_names_are_written(tmp_path):
     body = kt.Skeleton.from_names(["a b", "a_b", "{x}", "naïve"], [("a b", "a_b"), ("a_b", "{x}"), ("{x}", "naïve")])
     clip = kt.data.random_motion(body, 5, generator=torch.Generator().manual_seed(0))
     motion = Motion.from_arrays(clip.points, up="-y", skeleton=body, fps=30, units="mm")
-    back = load_motion(save(motion, tmp_path / "w.bvh", notes=[]))
-    assert back.skeleton.joints == ("a_b", "a_b_2", "_x_", "naïve")
+    told = "joints are named otherwise in the file: 'a b' is 'a_b', 'a_b' is 'a_b_2', '{x}' is '_x_'"
+    back = load_motion(save(motion, tmp_path / "w.bvh", notes=(notes := [])))
+    assert back.skeleton.joints == ("a_b", "a_b_2", "_x_", "naïve") and told in notes
 
 
 def test_markers_have_no_bones(tmp_path):

@@ -68,6 +68,36 @@ def test_too_many_joints_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_more_frames_than_the_header_counts(tmp_path):
+    points, seen = torch.randn(2**17 + 40000, 2, 3), torch.ones(2**17 + 40000, 2)
+    seen[65536, 1] = seen[70000] = 0
+    motion = kt.Motion.from_arrays(points, seen, joint_names=["a", "b"], fps=100, units="mm", up="y")
+    path = save(motion, tmp_path / "w.c3d")
+    back = load_motion(path)
+    assert back.notes == () and torch.equal(back.seen, motion.seen)
+    assert torch.allclose(back.points, motion.points.double())
+    words = {
+        key: ezc3d.c3d(str(path))["parameters"]["TRIAL"][f"ACTUAL_{key}_FIELD"]["value"] for key in ("START", "END")
+    }
+    assert {key: (value % 2**16).tolist() for key, value in words.items()} == {"START": [1, 0], "END": [40000, 2]}
+    with path.open("r+b") as file:
+        file.truncate(path.stat().st_size // 2)
+    cut = load_motion(path)
+    assert 65535 < cut.num_frames < len(points) and "171072 frames" in cut.notes[0] and "cut short" in cut.notes[0]
+
+
+def test_more_frames_than_anything_in_the_file_counts(tmp_path):
+    """So ezc3d writes them; zeros fill the last block."""
+    file, points = ezc3d.c3d(), np.ones((4, 3, 65550))
+    points[:3] = np.random.RandomState(0).rand(3, 3, 65550)
+    file["parameters"]["POINT"]["LABELS"]["value"] = ["a", "b", "c"]
+    file["parameters"]["POINT"]["RATE"]["value"] = [100.0]
+    file["data"]["points"] = points
+    file.write(str(tmp_path / "w.c3d"))
+    motion = load_motion(tmp_path / "w.c3d", up="y", units="mm")
+    assert motion.num_frames == 65550 and np.allclose(motion.points[-1], points[:3, :, -1].T)
+
+
 def test_what_only_begins_like_one(tmp_path):
     path = tmp_path / "x.c3d"
     path.write_bytes(b"\x02\x50" + bytes(14) + b"\x09" + bytes(495))

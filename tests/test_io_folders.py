@@ -44,6 +44,14 @@ def test_frame_numbers(numbers, frames, note):
     assert any(note in n for n in notes) if note else notes == []
 
 
+def test_who_has_no_number_is_named():
+    notes = []
+    assert frame_numbers([1, 2, None, None], notes, called=["f1", "f2", "f2 (1)", "f2 copy"]) == [0, 1, 2, 3]
+    assert notes[0].startswith("'f2 (1)', 'f2 copy' hold no frame number, unlike the other file names: frames are")
+    frame_numbers([None, None], notes, called=["a", "b"])
+    assert notes[1].startswith("the file names hold no frame numbers: ")
+
+
 @given(st.lists(st.none() | st.integers(0, 10**30), max_size=20))
 def test_frame_numbers_ascend_from_zero(numbers):
     frames = frame_numbers(numbers, [])

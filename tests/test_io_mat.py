@@ -72,6 +72,8 @@ def test_reads_points_confidence_and_edges_from_one(tmp_path):
     tracks = load_tracks(tmp_path / "p.mat")
     assert tracks.skeleton.bones == ((0, 1), (1, 2), (2, 3), (3, 4), (4, 5))
     assert torch.equal(tracks.weights, torch.from_numpy(confidence))
+    savemat(tmp_path / "several.mat", {"points2d": motion(), "confidences": confidence})
+    assert torch.equal(load_tracks(tmp_path / "several.mat").weights, tracks.weights)
     savemat(tmp_path / "zero.mat", {"points2d": motion(), "edges": np.array(edges) - 1})
     assert load_tracks(tmp_path / "zero.mat").skeleton.bones == tracks.skeleton.bones
 
@@ -104,7 +106,7 @@ def test_what_is_not_finite_is_unseen(tmp_path):
         ({"W": "text"}, "'W': expected real numbers"),
         ({"W": np.ones((4, 3)) * 1j}, "'W': expected real numbers"),
         ({"points2d": np.zeros((4, 3, 3))}, r"got points2d \(4, 3, 3\)"),
-        ({"W": np.ones((4, 3)), "edges": [[1, 9]]}, r"'edges': expected \(bones, 2\) joint numbers 1..3"),
+        ({"W": np.ones((4, 3)), "edges": [[1, 9]]}, r"'edges': expected \(bones, 2\) joint numbers 1..3, got 9"),
         ({"W": np.ones((4, 3)), "edges": [[1.5, 2]]}, "'edges': expected"),
         ({"W": np.ones((4, 3)), "confidence": np.full((2, 3), -1.0)}, "is negative"),
         ({"W": np.full((4, 3), np.nan)}, "no joint is seen"),

@@ -108,12 +108,39 @@ def test_a_folder_with_a_file_an_image(tmp_path):
     assert load_tracks(tmp_path / "predictions" / "clip_3.json").num_frames == 1
 
 
+def test_a_copy_in_the_folder_is_named(tmp_path):
+    for name, frame in zip(("a_1", "a_2", "a_2 (1)"), mmpose_frames(), strict=False):
+        write_json(tmp_path / f"{name}.json", frame["instances"])
+    said = "'a_2 (1).json' holds no frame number, unlike the other file names"
+    assert any(note.startswith(said) for note in load_tracks(tmp_path).notes)
+
+
 @pytest.mark.parametrize("whole", [lambda frames: frames, lambda frames: {"meta_info": {}, "instance_info": frames}])
 def test_a_folder_with_the_file_of_a_video(tmp_path, whole):
     file = write_json(tmp_path / "results_1.json", whole(mmpose_frames()))
     with pytest.raises(FormatError, match=r"results_1\.json: expected the people of an image, got .* the file itself"):
         load_tracks(tmp_path)
     assert load_tracks(file).num_frames > 1
+
+
+def with_third(third):
+    frames = mmpose_frames()
+    for frame in frames:
+        for one in frame["instances"]:
+            one["keypoints"] = [[*row, third(i, one)] for i, row in enumerate(one["keypoints"])]
+    return frames
+
+
+def test_3d_joints_are_refused(tmp_path):
+    path = write_json(tmp_path / "a.json", with_third(lambda i, _: 0.1 * i - 0.2))
+    with pytest.raises(FormatError, match=r"a\.json: frame 1: entry 0: 'keypoints': expected 2D joints, got 3D motion"):
+        load_tracks(path)
+
+
+@pytest.mark.parametrize("third", [lambda i, one: one["keypoint_scores"][i], lambda i, _: i % 3, lambda i, _: i / 20])
+def test_rows_may_hold_scores_or_flags_again(tmp_path, third):
+    tracks = load_tracks(write_json(tmp_path / "a.json", with_third(third)))
+    assert np.allclose(numbers(tracks), person(4, 17))
 
 
 def changed(**parts):

@@ -52,6 +52,12 @@ def test_reads_everything(tmp_path):
     assert torch.equal(tracks.weights, torch.from_numpy(arrays()["confidence"]))
 
 
+def test_confidences_may_be_called_so(tmp_path):
+    confidence = arrays()["confidence"]
+    tracks = load_tracks(written(tmp_path / "leg.npz", confidence=None, confidences=confidence))
+    assert torch.equal(tracks.weights, torch.from_numpy(confidence))
+
+
 def test_points_alone_are_enough(tmp_path):
     np.savez(tmp_path / "p.npz", points2d=arrays()["points2d"].astype(np.float32))
     tracks = load_tracks(tmp_path / "p.npz")

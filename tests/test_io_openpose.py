@@ -186,6 +186,13 @@ def test_two_files_of_one_frame_are_told(tmp_path):
         load_tracks(folder)
 
 
+def test_a_copy_in_the_folder_is_named(tmp_path):
+    folder = write_openpose(tmp_path / "json", alone(), name="f{}.json")
+    (folder / "f2 (1).json").write_text((folder / "f2.json").read_text())
+    said = "'f2 (1).json' holds no frame number, unlike the other file names"
+    assert any(note.startswith(said) for note in load_tracks(folder).notes)
+
+
 # ---------------------------------------------------------------------- files that are none
 
 

@@ -144,6 +144,27 @@ def test_confidences_in_per_cent():
     assert "confidences up to 60 are taken as per cent" in tracks.notes
 
 
+@pytest.mark.parametrize("odd", [95, 9.5, 1e4])
+def test_one_odd_confidence_is_no_scale(odd):
+    """A decimal point that was lost hid everybody else."""
+    scores = np.full((4, 17), 0.9)
+    scores[2, 3] = odd
+    (tracks,) = read(scored(scores))
+    assert np.allclose(tracks.weights[:, :17], scores.clip(max=1))
+    assert f"confidences above 1 (up to {odd:.3g}) are taken as 1" in tracks.notes
+
+
+def test_few_confidences_in_per_cent():
+    """All others are next to 0 or 0, or too few to tell."""
+    for others in (0.3, 0):
+        scores = np.full((4, 17), others)
+        scores[2, 3] = 95
+        (tracks,) = read(scored(scores))
+        assert tracks.weights[:, :17].nonzero().tolist() == [[2, 3]] and tracks.weights[2, 3] == 0.95
+    scores[2, 4:6] = 0.9
+    assert read(scored(scores))[0].weights[2, 3] == 0.95
+
+
 def test_negative_confidences_and_blank_joints_are_unseen():
     frames = scored(0.8)
     frames[1][0].joints[3, 2] = -0.1

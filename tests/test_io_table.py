@@ -163,6 +163,15 @@ def test_times_may_be_rounded(tmp_path, fps, unit, digits):
     assert not any("uneven" in note for note in tracks.notes)
 
 
+@pytest.mark.parametrize(
+    ("column", "start", "told"), [("time", 0, True), ("t", 1, True), ("time_s", 0, False), ("time", 0.5, True)]
+)
+def test_times_that_count_frames_are_told(tmp_path, column, start, told):
+    path = lines(tmp_path / "a.csv", f"{column},a_x,a_y,b_x,b_y", *(f"{start + i},{9 - i},2,3,4" for i in range(4)))
+    assert load_tracks(path).fps == 1
+    assert ("at 1 frame a second: give fps=... (kcs-torch: --fps) if they count frames" in notes_of(path)) == told
+
+
 def test_frames_go_before_times_and_their_steps_are_frames(tmp_path):
     path = lines(tmp_path / "a.csv", "frame,time,a_x,a_y,b_x,b_y", *(f"{5 * i},{i / 6},1,2,3,4" for i in (0, 1, 3)))
     tracks = load_tracks(path)
@@ -240,7 +249,7 @@ def result():
 
 def test_joints_of_no_name_have_no_columns(tmp_path):
     motion = Motion.from_arrays(torch.randn(3, 2, 3), joint_names=["a", " "])
-    with pytest.raises(kt.OutputError, match="that of joint 1 is blank"):
+    with pytest.raises(kt.OutputError, match=r"walk\.csv: .* that of joint 1 is blank"):
         kt.save(motion, tmp_path / "walk.csv")
     assert not list(tmp_path.iterdir())
 
@@ -248,7 +257,7 @@ def test_joints_of_no_name_have_no_columns(tmp_path):
 def test_joints_of_one_name_but_for_blanks_have_no_columns_of_their_own(tmp_path):
     """Such a table was written, and could not be read."""
     motion = Motion.from_arrays(torch.randn(3, 2, 3), joint_names=["a", " a"])
-    with pytest.raises(kt.OutputError, match="two joints are 'a': rename one"):
+    with pytest.raises(kt.OutputError, match=r"walk\.csv: .* two joints are 'a': rename one"):
         kt.save(motion, tmp_path / "walk.csv")
     assert not list(tmp_path.iterdir())
 

@@ -117,6 +117,14 @@ def test_what_is_written_is_read_back(tmp_path):
     assert torch.allclose(upright.points, motion.points, atol=1e-8)
 
 
+def test_names_with_blanks_are_told(tmp_path):
+    motion = kt.Motion.from_arrays(torch.randn(3, 3, 3), joint_names=["a b", "a_b", "c"], fps=30, units="m", up="y")
+    back = load_motion(save(motion, tmp_path / "w.trc", notes=(notes := [])))
+    assert back.skeleton.joints == ("a_b", "a_b_2", "c")
+    assert notes == ["joints are named otherwise in the file: 'a b' is 'a_b', 'a_b' is 'a_b_2'"]
+    assert "\ta_b_2\t" in (tmp_path / "w.trc").read_text()
+
+
 def test_mutated_files_end_in_our_errors(tmp_path):
     text = save(walk(4), tmp_path / "w.trc").read_text()
     read = 0

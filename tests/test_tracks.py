@@ -1,6 +1,7 @@
 """Tracks: which arrays are accepted, and which skeleton they get."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -298,6 +299,28 @@ def test_skeletons_are_offered_where_names_may_be_theirs():
     assert not offered(*names[1:], "nose tip")  # another order
     (note,) = (n for n in Tracks.from_arrays(grid(joints=33)).notes if "no bones" in n)
     assert "33 joints fit mediapipe33" in note
+
+
+COCO = SKELETONS["coco17"].joints[:17]
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        ((*COCO[:16], "rigth_ankle"), "16 .* 'rigth_ankle' is not: rename it (right_ankle is missing) or leave it out"),
+        ((*COCO[:0:-1], "snout"), "16 of 17 names .* 'snout' is not: rename it (nose is missing) or leave it out"),
+        ((*COCO, "a", "b"), "17 of 19 names .* 'a', 'b' are not: skeleton='coco17' leaves them out"),
+        ((*COCO, "Nose"), "17 of 18 names .* 'Nose' is not: skeleton='coco17' leaves it out"),
+        ((*COCO[5:], "tail"), "12 of 13 names .* 'tail' is not: rename it or leave it out"),
+        ((*COCO[:7], *(f"paw{i}" for i in range(7))), ""),
+    ],
+)
+def test_names_that_keep_others_from_being_a_skeletons_are_told(names, told):
+    (note,) = (n for n in Tracks.from_arrays(grid(joints=len(names)), joint_names=names).notes if "no bones" in n)
+    if told:
+        assert re.search(told.replace("(", r"\(").replace(")", r"\)") + r"\Z", note)
+    else:
+        assert note.endswith("find the bones")
 
 
 def test_joints_of_another_spelling_are_matched_by_name():

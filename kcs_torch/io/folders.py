@@ -45,7 +45,12 @@ def sibling_files(path: Path) -> list[Path]:
 
 
 def frame_numbers(
-    numbers: Sequence[int | None], notes: list[str], *, names: str = "file names", whole: str = "file"
+    numbers: Sequence[int | None],
+    notes: list[str],
+    *,
+    names: str = "file names",
+    whole: str = "file",
+    called: Sequence[str] = (),
 ) -> list[int]:
     """Turn the numbers of a folder's files, ascending, into frame indices that begin at 0.
 
@@ -57,6 +62,7 @@ def frame_numbers(
         notes: sentences for the user; added to.
         names: what holds the numbers, for the notes.
         whole: what a frame without a number lacks, for the notes.
+        called: what holds each number, for the notes.
 
     >>> notes = []
     >>> frame_numbers([7, 8, 10], notes), notes
@@ -67,7 +73,10 @@ def frame_numbers(
         return list(range(len(numbers)))
     steps = [b - a for a, b in itertools.pairwise(known)]
     if len(known) < len(numbers) or min(steps) < 0:
-        notes.append(f"the {names} hold no frame numbers: frames are taken in the order of the {names}")
+        odd = [f"'{name}'" for name, number in zip(called, numbers, strict=False) if number is None]
+        some = f"{listed(odd, 3)} {'holds' if len(odd) == 1 else 'hold'} no frame number, unlike the other {names}"
+        said = some if odd and known else f"the {names} hold no frame numbers"
+        notes.append(f"{said}: frames are taken in the order of the {names}")
         return list(range(len(numbers)))
     if 0 in steps:
         again = sorted({n for n, step in zip(known, steps, strict=False) if not step})

@@ -216,6 +216,12 @@ class Saving:
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
+    def told_names(self, names: Sequence[str], written: Sequence[str]) -> None:
+        """Note which joints have other names in the file."""
+        changed = [f"'{ours}' is '{theirs}'" for ours, theirs in zip(names, written, strict=True) if ours != theirs]
+        if changed:
+            self.notes.append(f"joints are named otherwise in the file: {listed(changed, 5)}")
+
     def rate(self, motion: Motion) -> float:
         """Frames per second of a file that cannot do without."""
         if motion.fps is None:

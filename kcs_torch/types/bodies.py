@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from kcs_torch.errors import ShapeError, SkeletonError
+from kcs_torch.errors import ShapeError, SkeletonError, listed
 from kcs_torch.skeleton import (
     SKELETONS,
     Skeleton,
@@ -28,6 +28,8 @@ __all__ = ["IN_ORDER", "MOST_LACKING", "choose_skeleton", "joint_order", "no_bon
 MOST_LACKING = 3
 """One joint in so many may be missing where those of another body are matched by name."""
 
+_TELLING = 8  # names of a skeleton's joints, from which on the others may be slips
+
 IN_ORDER = "joints taken in their order as those of skeleton"
 """How the note begins where as many joints as the skeleton has go by other names."""
 
@@ -43,8 +45,31 @@ def no_bones(body: Skeleton) -> str:
     choice = f" ({body.num_joints} joints fit {', '.join(fits)})" if fits else ""
     return (
         "no bones are given, so joints are taken as points that move freely: give a skeleton"
-        f"{choice}, or skeleton='auto' (--skeleton auto) to find the bones"
+        f"{choice}, or skeleton='auto' (--skeleton auto) to find the bones{_strangers(body.joints)}"
     )
+
+
+def _strangers(names: Sequence[str]) -> str:
+    """Which names keep the others from being those of a built-in skeleton, for a note; nothing where most do."""
+    best = max(SKELETONS.values(), key=lambda known: (_common(names, known), -known.num_observed))
+    found = map_joints(names, own := best.joints[: best.num_observed])
+    count = len(found) - found.count(None)
+    if count < max(_TELLING, len(names) * (1 - 1 / MOST_LACKING)) or count == len(names):
+        return ""
+    others = [f"'{name}'" for i, name in enumerate(names) if i not in found]
+    missing = [name for name, i in zip(own, found, strict=True) if i is None]
+    are, them = ("is", "it") if len(others) == 1 else ("are", "them")
+    if not missing:
+        cure = f"skeleton='{best.name}' leaves {them} out"
+    else:
+        of = f" ({listed(missing, 4)} {'is' if len(missing) == 1 else 'are'} missing)"
+        cure = f"rename {them}{of if len(missing) <= len(others) else ''} or leave {them} out"
+    return f"; {count} of {len(names)} names are those of {best.name}, {listed(others, 4)} {are} not: {cure}"
+
+
+def _common(names: Sequence[str], body: Skeleton) -> int:
+    """How many of the names are those of observed joints of the body."""
+    return sum(i is not None for i in map_joints(names, body.joints[: body.num_observed]))
 
 
 def numbered(names: Sequence[str]) -> bool:

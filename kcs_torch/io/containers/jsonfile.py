@@ -124,7 +124,7 @@ def as_joints(values: Any, where: str, scores: Any = None) -> NDArray[np.float64
         scores: N numbers, where they stand on their own; they go before those among ``values``. Without any, 1.
 
     Raises:
-        FormatError: these are no joints.
+        FormatError: these are no joints, or have x, y and z beside the scores.
     """
     if not isinstance(values, list) or not values:
         raise FormatError(f"{where}: expected a list of numbers x, y, score, got {kind(values)}")
@@ -148,7 +148,20 @@ def as_joints(values: Any, where: str, scores: Any = None) -> NDArray[np.float64
         if _length(scores) != len(rows):
             raise FormatError(f"{where}: expected {len(rows)} scores, one a joint, got {kind(scores)}")
         joints[:, 2] = _numbers(scores, where)
+        if width == 3 and _is_depth(rows[:, 2], joints[:, 2]):
+            raise FormatError(
+                f"{where}: expected 2D joints, got 3D motion (x, y, z, with the scores apart): give the file of 2D "
+                "joints from which it was made"
+            )
     return joints
+
+
+def _is_depth(third: NDArray[np.float64], scores: NDArray[np.float64]) -> bool:
+    """Whether third numbers are z: neither the scores again, nor shares, nor flags as COCO's 0, 1 and 2."""
+    both = np.isfinite(third) & np.isfinite(scores)
+    third, scores = third[both], scores[both]
+    within = ((third >= 0) & (third <= 1)).all() or np.isin(third, (-1, 0, 1, 2)).all()
+    return not (within or np.allclose(third, scores))
 
 
 def _length(value: Any) -> int:

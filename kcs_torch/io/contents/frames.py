@@ -34,7 +34,8 @@ def by_image(images: Mapping[str, Sequence[Sighting]], notes: list[str]) -> list
         notes.append(f"the images' names begin in {len(prefixes)} ways: frames are taken in the order of the names")
         return [list(images[name]) for name in names]
     order = sorted(range(len(names)), key=lambda i: (numbers[i] is None, numbers[i] or 0))
-    return _spread([images[names[i]] for i in order], [numbers[i] for i in order], notes, as_text(names[order[0]]))
+    called = [as_text(names[i]) for i in order]
+    return _spread([images[names[i]] for i in order], [numbers[i] for i in order], notes, called)
 
 
 def by_number(numbered: Mapping[int, Sequence[Sighting]], notes: list[str]) -> list[list[Sighting]]:
@@ -45,18 +46,18 @@ def by_number(numbered: Mapping[int, Sequence[Sighting]], notes: list[str]) -> l
         notes: sentences for the user on what was assumed; added to.
     """
     numbers = sorted(numbered)
-    return _spread([numbered[n] for n in numbers], numbers, notes, str(numbers[0]) if numbers else "")
+    return _spread([numbered[n] for n in numbers], numbers, notes, [str(n) for n in numbers[:1]])
 
 
 def _spread(
-    people: Sequence[Sequence[Sighting]], numbers: Sequence[int | None], notes: list[str], first: str
+    people: Sequence[Sequence[Sighting]], numbers: Sequence[int | None], notes: list[str], called: Sequence[str]
 ) -> list[list[Sighting]]:
-    frames = frame_numbers(numbers, notes, names="images", whole="person")
+    frames = frame_numbers(numbers, notes, names="images", whole="person", called=called)
     out: list[list[Sighting]] = [[] for _ in range(frames[-1] + 1)] if frames else []
     for frame, found in zip(frames, people, strict=True):
         out[frame] = list(found)
     if numbers and numbers[0] not in (None, 0, 1):
-        notes.append(f"frame 0 is image {first}")
+        notes.append(f"frame 0 is image {called[0]}")
     return out
 
 

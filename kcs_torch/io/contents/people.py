@@ -26,6 +26,8 @@ from kcs_torch.types.intake import at_the_corner
 __all__ = ["Sighting", "people_tracks"]
 
 _WELL_SEEN = 0.95  # quantile of the confidences that counts as certain where they are on another scale
+_ODD = 0.01  # share of the confidences that may be slips where all others end at 1
+_TELLING = 10  # others that tell
 _PER_CENT = (50.0, 100.0)  # between these the largest confidence is per cent
 _MOST_IN_FRAME = 100  # people of one frame
 _MOST_NUMBERS = 5e7  # of all tracks together: each person has a place in every frame
@@ -189,14 +191,14 @@ def _checked(
     scores = np.concatenate([s.joints[:, 2] for frame in frames for s in frame] or [np.zeros(0)])
     scores = scores[scores > 0]
     largest, scale = float(scores.max(initial=0)), 1.0
-    if _PER_CENT[0] < largest <= _PER_CENT[1]:
+    if largest > 1 and _up_to_one(scores):
+        notes.append(f"confidences above 1 (up to {largest:.3g}) are taken as 1")
+    elif _PER_CENT[0] < largest <= _PER_CENT[1]:
         scale = _PER_CENT[1]
         notes.append(f"confidences up to {largest:.4g} are taken as per cent")
     elif largest > OVERSHOOT:
         scale = float(np.quantile(scores, _WELL_SEEN))
         notes.append(f"confidences up to {largest:.4g}: divided by {scale:.4g}, their 95th percentile, and cut at 1")
-    elif largest > 1:
-        notes.append(f"confidences above 1 (up to {largest:.3g}) are taken as 1")
     out, negative, crowded = [], 0, 0
     for frame in frames:
         kept = []
@@ -219,6 +221,17 @@ def _checked(
     if crowded:
         notes.append(f"{crowded} frames have more than {_MOST_IN_FRAME} people: the best seen are taken")
     return out
+
+
+def _up_to_one(scores: NDArray[np.float64]) -> bool:
+    """Whether confidences end at 1 but for a few, which are slips: a decimal point that was lost, say.
+
+    Where all others are next to 0, these few are the ones that are seen.
+    """
+    others = scores[scores <= OVERSHOOT]
+    odd = len(scores) - len(others)
+    few = odd <= max(_ODD * len(scores), 1) and len(others) >= _TELLING
+    return odd == 0 or (few and float(np.quantile(others, _WELL_SEEN)) > 0.5)
 
 
 def _by_ids(frames: Sequence[Sequence[Sighting]], notes: list[str]) -> list[_Seen] | None:

@@ -60,6 +60,10 @@ def rate_of_times(times: Mapping[int, float], unit: str, notes: list[str]) -> fl
         if scale > 1:
             notes.append(f"times are taken to count {scale:.0f} a second")
         rate *= scale
+        if plain_rate(rate) == 1:
+            notes.append(
+                "times are taken for seconds, at 1 frame a second: give fps=... (kcs-torch: --fps) if they count frames"
+            )
     return plain_rate(rate)
 
 

@@ -228,11 +228,12 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
         saving.warnings.append(f"{told}: BVH has one length for each bone")
     else:
         saving.notes.append(told)
-    _write_rig(rig, path, saving.rate(motion))
-
-
-def _write_rig(rig: Rig, path: Path, rate: float) -> None:
     names = distinct([re.sub(r"[\s{}]+", "_", name) for name in rig.names])
+    saving.told_names(rig.names, names)
+    _write_rig(rig, names, path, saving.rate(motion))
+
+
+def _write_rig(rig: Rig, names: Sequence[str], path: Path, rate: float) -> None:
     children: dict[int, list[int]] = {i: [] for i in range(-1, len(names))}
     for node, parent in enumerate(rig.parents):
         children[parent].append(node)

@@ -27,6 +27,8 @@ __all__ = ["MOTION_READERS", "WRITERS"]
 
 _SCREEN = {"y": ("+X", "+Y"), "z": ("+X", "+Z")}  # which axes point right and up on a screen
 
+_FULL = 0xFFFF  # frames, of which a header counts no more
+
 
 def recognises(probe: Probe) -> bool:
     """Tell by the second byte and the parameters' own header, to which the first one points."""
@@ -53,8 +55,10 @@ def read(path: Path, options: MotionOptions) -> Motion:
         notes.append(f"never seen, left out: {listed(gone, 8)}")
     rate = float(f"{float(answer['rate']):.7g}")  # of single precision
     first, last = (int.from_bytes(Probe(path).head[at : at + 2], "little") for at in (6, 8))
-    if len(points) < last - first + 1 < 0xFFFF:
-        notes.append(f"the header tells {last - first + 1} frames, the file has {len(points)}: it is cut short")
+    told = int(answer["told"]) or last - first + 1
+    if len(points) < told and (told < _FULL or answer["told"]):
+        where = "parameters tell" if answer["told"] else "header tells"
+        notes.append(f"the {where} {told} frames, the file has {len(points)}: it is cut short")
     if first > 1:
         notes.append(f"the first frame is the recording's number {first}; it becomes frame 0")
     if answer["analogs"]:
@@ -110,6 +114,11 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
     right, up = _SCREEN[saving.up]
     file.add_parameter("POINT", "X_SCREEN", [right])
     file.add_parameter("POINT", "Y_SCREEN", [up])
+    if frames > _FULL:  # which these parameters count, of words of 16 bits, the lower one first
+        file.add_parameter("POINT", "LONG_FRAMES", [float(frames)])
+        for edge, number in (("START", 1), ("END", frames)):
+            file.add_parameter("TRIAL", f"ACTUAL_{edge}_FIELD", [number % 2**16, number // 2**16])
+            file["parameters"]["TRIAL"][f"ACTUAL_{edge}_FIELD"]["type"] = ezc3d.ezc3d.INT
     file["data"]["points"] = whole
     file["data"]["meta_points"]["residuals"] = np.where(seen, 0.0, -1.0).T[None]
     file["data"]["meta_points"]["camera_masks"] = np.zeros((7, count, frames), bool)

@@ -19,7 +19,7 @@ from kcs_torch.types import Tracks
 __all__ = ["READERS"]
 
 _SHAPES = "W (2 x frames, joints), rows x1, y1, x2, y2, ..., or points2d (frames, joints, 2)"
-_WANTED = ("W", "points2d", "confidence", "edges", "fps")
+_WANTED = ("W", "points2d", "confidence", "confidences", "edges", "fps")
 
 
 def recognises(probe: Probe) -> bool:
@@ -43,7 +43,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
         raise FormatError(f"{path}: expected {_SHAPES}; got {found}")
     if options.image_size is not None and are_shares(points):
         points = in_pixels(points, options.image_size, notes)
-    confidence = _real(values["confidence"], "confidence", path) if "confidence" in values else None
+    confidence = next((_real(values[k], k, path) for k in ("confidence", "confidences") if k in values), None)
     fps = values.get("fps")
     return [
         build_tracks(
@@ -81,8 +81,11 @@ def _roughness(points: NDArray[np.float64]) -> float:
 def _edges(value: Any, joints: int, path: Path, notes: list[str]) -> NDArray[np.int64]:
     """Bones as indices from 0; MATLAB counts from 1."""
     edges = _real(value, "edges", path)
-    if edges.ndim != 2 or edges.shape[1] != 2 or not np.isin(edges, np.arange(joints + 1)).all():
-        raise FormatError(f"{path}: 'edges': expected (bones, 2) joint numbers 1..{joints}, got shape {edges.shape}")
+    paired = edges.ndim == 2 and edges.shape[1] == 2
+    wrong = edges[~np.isin(edges, np.arange(joints + 1))]
+    if not paired or wrong.size:
+        got = f"{wrong[0]:g}" if paired else f"shape {edges.shape}"
+        raise FormatError(f"{path}: 'edges': expected (bones, 2) joint numbers 1..{joints}, got {got}")
     first = 1 if edges.size and edges.min() >= 1 else 0
     notes.append(f"edges are counted from {first}")
     return edges.astype(np.int64) - first

@@ -80,7 +80,8 @@ def _folder(probe: Probe, options: Options, notes: list[str]) -> list[Tracks]:
     files = probe.like(".json")
     if not files:
         raise FormatError(f"{probe.path}: expected a folder of MMPose .json files, got none")
-    frames = frame_numbers([last_number(f.name) for f in files], notes)
+    called = [as_text(f.name) for f in files]
+    frames = frame_numbers([last_number(f.name) for f in files], notes, called=called)
     people: list[list[Sighting]] = [[] for _ in range(frames[-1] + 1)]
     for frame, file in zip(frames, files, strict=True):
         data = read_json(file)

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcs_torch.errors import FormatError, KcsError
@@ -68,7 +69,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
     written = "skeleton" in file  # by this library
     tracks = build_tracks(
         points,
-        file.array("confidence", "fiub", 2) if "confidence" in file else None,
+        _confidence(file),
         dataclasses.replace(options, threshold=0.0) if written and options.threshold is None else options,
         source=str(path),
         names=file.texts("joint_names") if "joint_names" in file else None,
@@ -294,9 +295,7 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
     if "points3d" not in file:
         raise FormatError(f"{path}: expected 3D motion under 'points3d', got {', '.join(file.keys) or 'nothing'}")
     points = torch.from_numpy(file.array("points3d", "fiu", 3).astype(np.float64))
-    confidence = file.array("confidence", "fiub", 2).astype(np.float64) if "confidence" in file else None
-    if "points2d" in file:  # these are the tracks' confidences
-        confidence = None
+    confidence = None if "points2d" in file else _confidence(file)  # they would be the tracks'
     if points.shape[2] != 3:
         raise FormatError(f"{path}: 'points3d': expected shape (frames, joints, 3), got {tuple(points.shape)}")
     notes = _json(file, "notes", list) if "notes" in file else []
@@ -321,8 +320,14 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         units=file.text("units3d" if "units3d" in file else "units") if "units" in file else "",
         up=axis,
         notes=[str(note) for note in notes],
-        confidence=None if confidence is None else torch.from_numpy(confidence),
+        confidence=None if confidence is None else torch.from_numpy(confidence.astype(np.float64)),
     )
+
+
+def _confidence(file: Archive) -> NDArray[Any] | None:
+    """The joints' confidences, where the file has any."""
+    key = next((key for key in ("confidence", "confidences") if key in file), None)
+    return None if key is None else file.array(key, "fiub", 2)
 
 
 def _skeleton(file: Archive) -> Skeleton:

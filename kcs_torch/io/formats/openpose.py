@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError, counted
-from kcs_torch.io.containers.jsonfile import FARTHEST, kind, outline, read_json, short
+from kcs_torch.io.containers.jsonfile import FARTHEST, as_text, kind, outline, read_json, short
 from kcs_torch.io.contents.layout import BY_COUNT, likeliest
 from kcs_torch.io.contents.people import Sighting, people_tracks
 from kcs_torch.io.folders import frame_numbers
@@ -83,7 +83,7 @@ def _frame_files(probe: Probe, notes: list[str]) -> tuple[Sequence[Path], list[i
     for i, number in enumerate(numbers[1:]):
         if number is not None and number == numbers[i]:
             raise FormatError(f"{probe.path}: expected one file a frame, got {files[i].name} and {files[i + 1].name}")
-    return files, frame_numbers(numbers, notes)
+    return files, frame_numbers(numbers, notes, called=[as_text(f.name) for f in files])
 
 
 def _read_files(files: Sequence[Path], notes: list[str]) -> list[list[Person]]:

@@ -178,8 +178,11 @@ def _edges(tree: Tree, nodes: int, path: Path) -> NDArray[np.int64] | None:
     if "edge_inds" not in tree.arrays:
         return None
     edges = tree.arrays["edge_inds"]
-    if edges.ndim != 2 or edges.shape[1] != 2 or not np.isin(edges, np.arange(nodes)).all():
-        raise FormatError(f"{path}: 'edge_inds': expected (edges, 2) node numbers 0..{nodes - 1}, got {edges.shape}")
+    paired = edges.ndim == 2 and edges.shape[1] == 2
+    wrong = edges[~np.isin(edges, np.arange(nodes))]
+    if not paired or wrong.size:
+        got = f"{wrong[0]:g}" if paired else f"shape {edges.shape}"
+        raise FormatError(f"{path}: 'edge_inds': expected (edges, 2) node numbers 0..{nodes - 1}, got {got}")
     return edges.astype(np.int64) if edges.size else None
 
 

@@ -45,9 +45,13 @@ def _write_rows(
 ) -> None:
     names = [joint.strip() for joint in moved.skeleton.joints]  # who reads the table leaves blanks out
     if "" in names:
-        raise OutputError(f"a table's columns need joint names, and that of joint {names.index('')} is blank: name it")
+        raise OutputError(
+            f"{path}: a table's columns need joint names, and that of joint {names.index('')} is blank: name it"
+        )
     if twice := [joint for joint, count in Counter(names).items() if count > 1]:
-        raise OutputError(f"a table's columns need different names, and two joints are '{twice[0]}': rename one")
+        raise OutputError(
+            f"{path}: a table's columns need different names, and two joints are '{twice[0]}': rename one"
+        )
     unit = f" [{moved.units}]" if moved.units else ""
     header = [f"{cell(joint)}_{axis}{unit}" for joint in moved.skeleton.joints for axis in "xyz"]
     header += [f"{name}{unit}" for name in more]

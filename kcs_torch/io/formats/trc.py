@@ -144,7 +144,8 @@ def write(motion: Motion, path: Path, saving: Saving) -> None:
     """Write the joints as markers; numbers have 9 significant digits."""
     points, seen = as_array(from_y_up(motion.points, saving.up)), as_array(motion.seen) > 0
     rate, count = saving.rate(motion), motion.num_frames
-    names = [re.sub(r"\s+", "_", joint) for joint in motion.skeleton.joints]
+    names = distinct([re.sub(r"\s+", "_", joint) for joint in motion.skeleton.joints])
+    saving.told_names(motion.skeleton.joints, names)
     facts = (f"{rate:.9g}", f"{rate:.9g}", count, len(names), motion.units, f"{rate:.9g}", 1, count)
     keys = [
         "DataRate",
