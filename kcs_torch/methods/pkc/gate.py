@@ -8,12 +8,15 @@ import torch
 from torch import Tensor
 
 from kcs_torch.clean.common import rebuilt, share
+from kcs_torch.errors import listed
 from kcs_torch.functional.chain import bone_vectors, chain_inverse, incidence
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 
-__all__ = ["at_border", "elsewhere", "plausible", "repeats", "without_border", "without_others", "without_repeats"]
+__all__ = [
+    "at_border", "doubled", "plausible", "repeats", "without_border", "without_doubled", "without_repeats",
+]  # fmt: skip
 
 LONG = 2.0
 """An image longer than so many usual lengths is no bone's."""
@@ -24,22 +27,16 @@ SHORTER, AROUND = 2.5, 8
 ROUNDS = 4
 """Times that what is left is looked at again."""
 
+COMPARED = 32
+"""Frames of which all pairs of joints are compared at first."""
+
 SELDOM = 3
 """Joints that are seen in fewer frames tell nothing of their bones' lengths."""
 
-LEAP, SUDDEN = 1.0, 4.0
-"""From one frame to the next the whole body leaps where it moves by more than so many times its size, the median
-distance of joints from their middle, and by so many times what it moves in the frames beside: a hand that snaps aside
-takes several frames to do so."""
-
-BACK, PART = 0.5, 0.25
-"""What leaps away and back ends where it began, but for this share of its leaps, and is away for this share of the
-clip at most."""
-
-
 OFTEN, HELD, MOVED = 0.12, 6, 0.002
 """Frames that repeat the one before are a slower camera's if this share of all does, no more than so many on end, and
-if most joints move by this share of the body's size where they move: those of somebody who stands still are not."""
+if most joints move by this share of the body's size where they move: those of somebody who stands still are not. More
+on end are a detector's that has lost the body if this moved by as much just before: somebody who stops slows down."""
 
 CROWDED = 5
 """An outermost line of the tracks is the image's border where so many times as many places lie on it as on any other:
@@ -77,6 +74,48 @@ def at_border(points: Tensor, seen: Tensor, feet: Sequence[int] = ()) -> Tensor:
     return out
 
 
+def doubled(points: Tensor, seen: Tensor, skeleton: Skeleton) -> list[int]:
+    """Joints that lie exactly where another lies in all frames, as where a format has none of its own.
+
+    Of two of which a template knows that they are apart, the one that more bones lead to is no joint. Of a left and a
+    right one, or others as far out, either may be, so that both are left out. Nothing is said where half of the joints
+    are such: of a point, say.
+
+    Args:
+        points: (T, N, 2).
+        seen: (T, N) bool.
+        skeleton: whose first joints they are.
+    """
+    if skeleton.template is None or not skeleton.is_tree:
+        return []
+    rest = skeleton.template_points(dtype=points.dtype, device=points.device)[: points.shape[1]]
+    apart = (rest[:, None] - rest).norm(dim=-1) > 0
+    for some in (slice(0, COMPARED), slice(None)):  # of all frames, few pairs are left
+        pairs = apart.triu().nonzero()
+        place, shown = points[some], seen[some]
+        both = shown[:, pairs[:, 0]] & shown[:, pairs[:, 1]]
+        same = (place[:, pairs[:, 0]] == place[:, pairs[:, 1]]).all(-1)
+        like = (same | ~both).all(0) & ((both.sum(0) >= SELDOM) | (len(place) < len(points)))
+        apart = torch.zeros_like(apart)
+        apart[pairs[like, 0], pairs[like, 1]] = True
+    ends = incidence(skeleton.bone_index(device=points.device), skeleton.num_joints, dtype=points.dtype)
+    far = chain_inverse(ends).abs().sum(1)[: len(apart)]  # in bones, from the middle of all joints
+    out = (apart & (far[:, None] > far - 0.1)).any(1) | (apart & (far[:, None] < far + 0.1)).any(0)
+    return out.nonzero().flatten().tolist() if 2 * int(out.sum()) < len(out) else []
+
+
+def without_doubled(tracks: Tracks) -> Tracks:
+    """Tracks in which joints that only repeat others (:func:`doubled`) are unseen; a note says which."""
+    count, names = tracks.skeleton.num_observed, tracks.skeleton.joints
+    out = doubled(tracks.points[:, :count], tracks.seen[:, :count], tracks.skeleton)
+    if not out:
+        return tracks
+    weights = tracks.weights[:, :count].clone()
+    weights[:, out] = 0
+    which = f"{listed([names[joint] for joint in out], 6)}: exactly where another joint is in all frames"
+    return rebuilt(tracks, tracks.points[:, :count], weights, f"{which}: taken as unseen")
+
+
 def without_border(tracks: Tracks) -> Tracks:
     """Tracks in which joints :func:`at_border` are unseen; a note says how many."""
     count = tracks.skeleton.num_observed
@@ -92,7 +131,7 @@ def without_border(tracks: Tracks) -> Tracks:
 
 
 def repeats(points: Tensor, seen: Tensor) -> Tensor:
-    """Frames (T,) in which a slower camera, or detector, only shows what the frame before did.
+    """Frames (T,) in which a slower camera, or a detector at a loss, only shows what the frame before did.
 
     Args:
         points: (T, N, 2).
@@ -106,12 +145,21 @@ def repeats(points: Tensor, seen: Tensor) -> Tensor:
     for _ in range(HELD + 1):
         length = torch.where(same, 1 + torch.cat([length[:1], length[:-1]]), 0)
     new = shown[1:] & shown[:-1] & ~same[1:]
-    if int(same.sum()) < OFTEN * int(shown.sum()) or bool((length > HELD).any()) or not bool(new.any()):
+    if not bool(same.any()) or not bool(new.any()):
         return none
     known = torch.where(seen[..., None], points, torch.nan)
     size = (known - nanmedian(known, 1, keepdim=True)).norm(dim=-1).nanmedian()
-    step = nanmedian((known[1:] - known[:-1]).norm(dim=-1), 1)[new].nanmedian()
-    return same if bool(step > MOVED * size) else none
+    step = nanmedian((known[1:] - known[:-1]).norm(dim=-1), 1)
+    moves = torch.cat([none[:1], new & (step > MOVED * size)])
+    start = torch.where(same, 0, torch.arange(1, len(same) + 1, device=same.device)).cummax(0).values - 1
+    ends = torch.cat([~same[1:], ~none[:1]]) & same
+    long = torch.zeros_like(same)
+    long[start[ends & (length > HELD)]] = True
+    long = same & long[start]
+    frozen = long & moves[start]
+    slow = same & ~long
+    often = int(slow.sum()) >= OFTEN * int(shown.sum()) and not bool((long & ~frozen).any())
+    return frozen | slow if often and bool(step[new].nanmedian() > MOVED * size) else frozen
 
 
 def without_repeats(tracks: Tracks) -> Tracks:
@@ -121,52 +169,8 @@ def without_repeats(tracks: Tracks) -> Tracks:
     if not bool(same.any()):
         return tracks
     weights = torch.where(same[:, None], 0, tracks.weights)[:, :count]
-    which = f"{share(int(same.sum()), len(same))} frames repeat the one before, as of a slower camera or detector"
-    return rebuilt(tracks, tracks.points[:, :count], weights, f"{which}: taken as unseen")
-
-
-def elsewhere(points: Tensor, seen: Tensor) -> Tensor:
-    """Frames (T,) in which the whole body has leapt away and not yet back: most likely those of somebody else.
-
-    A tracker that takes two people for each other, say, shows the other one for some frames. How far the body moves
-    is told by the joints that both frames show. A leap without return is left: nobody knows which side is right.
-
-    Args:
-        points: (T, N, 2).
-        seen: (T, N) bool.
-    """
-    away = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    shown = (seen.sum(-1) > 1).nonzero().flatten()
-    if len(shown) < 4:
-        return away
-    known = torch.where(seen[..., None], points, torch.nan)[shown]  # (K, N, 2)
-    size = (known - nanmedian(known, 1, keepdim=True)).norm(dim=-1).nanmedian()
-    step = nanmedian(known[1:] - known[:-1], 1).norm(dim=-1).nan_to_num()
-    leaps = (step > LEAP * size).nonzero().flatten().tolist()
-    if not size > 0 or len(leaps) > PART * len(shown):  # a camera that shakes, or tracks of no one
-        return away
-    k = 0
-    while k + 1 < len(leaps):
-        first, last = leaps[k], leaps[k + 1]
-        gap, least = nanmedian(known[last + 1] - known[first], 0).norm(), torch.minimum(step[first], step[last])
-        beside = [step[i] for i in (first - 1, first + 1, last - 1, last + 1) if i not in (first, last, -1, len(step))]
-        sudden = all(bool(least > SUDDEN * one) for one in beside)
-        if last - first <= PART * len(shown) and sudden and bool(gap < BACK * least):
-            away[shown[first] + 1 : shown[last] + 1] = True
-            k += 1
-        k += 1
-    return away
-
-
-def without_others(tracks: Tracks) -> Tracks:
-    """Tracks in which frames of somebody else (:func:`elsewhere`) show nothing; a note says which."""
-    away = elsewhere(tracks.points, tracks.seen)
-    if not bool(away.any()):
-        return tracks
-    count = tracks.skeleton.num_observed
-    weights = torch.where(away[:, None], 0, tracks.weights)[:, :count]
-    which = f"{share(int(away.sum()), len(away))} frames, from frame {int(away.nonzero()[0])} on"
-    note = f"the whole body leaps away and back: left out as somebody else's: {which}"
+    which = f"{share(int(same.sum()), len(same))} frames repeat the one before"
+    note = f"{which}, as of a slower camera, or a detector that has lost the body: taken as unseen"
     return rebuilt(tracks, tracks.points[:, :count], weights, note)
 
 

@@ -22,9 +22,10 @@ from kcs_torch.methods.pkc.blocks import Turned, search
 from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.clip import LEAST_JOINTS, Clip
+from kcs_torch.methods.pkc.elsewhere import without_others, without_strange_limbs
 from kcs_torch.methods.pkc.fixed_answer import from_hypotheses
 from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of, usual_noise
-from kcs_torch.methods.pkc.gate import without_border, without_others, without_repeats
+from kcs_torch.methods.pkc.gate import without_border, without_doubled, without_repeats
 from kcs_torch.methods.pkc.hands import Part, joined, part_of, parts_of
 from kcs_torch.methods.pkc.held import with_lengths_held
 from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
@@ -116,7 +117,9 @@ class PKC(Method):
         return has_trunk(skeleton)
 
     def prepared(self, tracks: Tracks) -> Tracks:
-        tracks = unswap(without_others(without_repeats(without_border(tracks)))) if self.denoise else tracks
+        if self.denoise:
+            tracks = without_others(without_repeats(without_border(without_doubled(tracks))))
+            tracks = without_strange_limbs(unswap(without_strange_limbs(tracks, swapped=True)))
         told = self.detections
         if told is None and self.denoise and not detected(tracks) and found_by_detector(tracks):
             told = True
