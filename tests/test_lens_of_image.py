@@ -46,6 +46,25 @@ def same(one, other):
     return torch.equal(one.points, other.points) and (one.distance is None) == (other.distance is None)
 
 
+@pytest.mark.parametrize(("yaw", "distance", "focal"), [(60.0, 3000.0, 1100.0), (140.0, 2200.0, 900.0)])
+def test_near_tracks_are_lifted_anew_through_the_lens_that_was_found(monkeypatch, yaw, distance, focal):
+    """What was found through a usual lens, twice as long, holds through no other; flips mend only some of it."""
+    lens = Intrinsics(focal, focal, 960.0, 540.0)
+    tracks, truth = aside(distance, 60, yaw, 0.0, lens)
+    tracks = replace(tracks, image_size=(1920, 1080))
+    once = quietly(tracks)
+    monkeypatch.setattr(calibrated, "CLOSE", 0.0)
+    before = quietly(tracks)
+    assert once.objective < before.objective
+    assert error(once.points, truth) < 0.8 * error(before.points, truth)
+
+
+def test_far_away_nothing_is_lifted_anew(monkeypatch):
+    far, _ = aside(12000.0, 30, x=0.0, lens=Intrinsics(4000.0, 4000.0, 960.0, 540.0))
+    monkeypatch.setattr(calibrated, "_lifted_anew", lambda *_: pytest.fail("lifted anew"))
+    quietly(replace(far, image_size=(1920, 1080)))
+
+
 def test_a_person_beside_the_middle_of_an_image():
     """Whose size is guessed by what holds the tracks. About their own middle the lens would be another."""
     tracks, truth = aside()
