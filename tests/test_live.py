@@ -323,6 +323,32 @@ def test_a_joint_that_stays_where_it_jumped_to_is_believed(clip):
     assert not seen[0] and all(seen[4:])
 
 
+@pytest.mark.parametrize("wild", ["random", "another", "scaled", "reversed"])
+def test_one_wild_frame_is_as_one_without_the_person(clip, wild):
+    frames = observed(clip)[:50].clone()
+    others = {
+        "random": 1500 * torch.rand(17, 2, generator=torch.Generator().manual_seed(0)).double(),
+        "another": frames[10] / 2 + 3000,
+        "scaled": frames[40] * 1e12,
+        "reversed": frames[40].flip(0),
+    }
+    frames[40] = torch.nan
+    expected = follow(kt.Tracker("coco17", fps=30, window=45), frames)
+    frames[40] = others[wild]
+    tracker = kt.Tracker("coco17", fps=30, window=45)
+    found = follow(tracker, frames)
+    for one, other in zip(expected, found, strict=True):
+        assert torch.equal(one.points, other.points) and torch.equal(one.seen, other.seen)
+    assert not bool(tracker.tracks().seen[35].any())
+
+
+def test_what_stays_after_a_cut_is_believed_after_a_tenth_of_a_second(clip):
+    frames = observed(clip)[:50].clone()
+    frames[40:] = frames[40:] / 2 + 3000
+    seen = [bool(p.seen.all()) for p in follow(kt.Tracker("coco17", fps=30), frames)[40:]]
+    assert seen == [False] * 3 + [True] * 7
+
+
 def test_finds_the_body_again_after_it_turned_unseen(clip):
     behind = walking_person(60, skeleton="coco17", yaw=-150, turn=0)
     frames = torch.cat([observed(clip)[:60], torch.full((30, 17, 2), torch.nan), observed(behind)])

@@ -15,7 +15,7 @@ from torch import Tensor
 from kcs_torch.errors import KcsWarning, OptionError, ShapeError, users_level
 from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.live.filter import BodyFilter, ChainFilter, Shape, Told
-from kcs_torch.live.frame import FASTEST, Sight, take_frame
+from kcs_torch.live.frame import Sight, take_frame
 from kcs_torch.live.options import LEAST, Options, check_options
 from kcs_torch.live.pose import Chain, LivePose
 from kcs_torch.live.size import SizeFilter, longest_image
@@ -141,7 +141,7 @@ class Tracker:
         self._shape: Shape | None = None
         self._stray = torch.zeros(self.skeleton.num_joints, dtype=torch.float64)  # of depths from what solves found
         self._longest = torch.zeros(self.skeleton.num_bones, dtype=torch.float64)  # of the bones' images
-        self._sight = Sight(self._body)
+        self._sight = Sight(self._body, self.fps)
         self._size = SizeFilter(self.fps)
         self._solving: Future[Solved | None] | None = None
         self._asked = self._ready = -1  # frames at which the running solve began, and at which it is taken over
@@ -160,7 +160,8 @@ class Tracker:
             xy: (num_observed, 2) array or tensor; NaN where unseen. Without confidences, joints exactly at (0, 0)
                 or (-1, -1) are unseen, too, if nine of ten others lie right of (0, 0) and below it. A frame of NaN, or
                 whose joints all lie at one point, is one without the person; after a whole window of them the tracker
-                starts anew. A joint that jumps too far for a body, from one frame to the next, counts as unseen there.
+                starts anew. A joint that jumps too far for a body, from one frame to the next, counts as unseen there;
+                if more than a third of them do, all count as unseen, for a tenth of a second at most.
             confidence: (num_observed,) in 0..1; 1 where None.
 
         Raises:
@@ -177,8 +178,8 @@ class Tracker:
         last = self._image[-1] if self._image else None
         if last is not None:
             shape = self._body_now()
-            lengths, reach = shape.lengths / shape.factor, FASTEST / self.fps / shape.factor
-            points, weights = self._sight.trusted(points, weights, last, lengths, reach)
+            unit = 1 / shape.factor
+            points, weights = self._sight.trusted(points, weights, last, shape.lengths * unit, unit)
         seen = weights > 0
         if not self._image and not bool(seen.any()):
             self._due = deque(frame + 1 for frame in self._due)
