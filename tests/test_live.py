@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from concurrent.futures import Future
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from kcs_torch.data import walking_person
 from kcs_torch.functional.align import similarity
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.live import tracker as live
+from kcs_torch.live.filter import BodyFilter
 from kcs_torch.types import Intrinsics
 
 FRAMES = 120
@@ -271,6 +273,32 @@ def test_never_waits_if_so_told(clip):
         frames += 1
         time.sleep(0.01)
     assert 0 <= frames < 3000
+
+
+class AtOnce:
+    """An executor that is done when it is asked."""
+
+    def submit(self, call, *args):
+        future = Future()
+        future.set_result(call(*args))
+        return future
+
+
+def test_what_a_solve_finds_is_taken_over_a_few_frames_at_a_time_if_no_update_may_wait(clip, monkeypatch):
+    found, steps = [], []
+    step = BodyFilter.step
+    monkeypatch.setattr(BodyFilter, "step", lambda *args: steps.append(None) or step(*args))
+    for wait in (True, False):
+        tracker = kt.Tracker("coco17", fps=30, window=36, period=1000, wait=wait)
+        monkeypatch.setattr(tracker, "_thread", AtOnce())
+        counts = []
+        for xy in observed(clip)[:70]:
+            steps.clear()
+            pose = tracker.update(xy)
+            counts.append(len(steps))
+        found.append(pose.points)
+        assert max(counts) <= 1 + live.AT_ONCE if not wait else max(counts) > live.REPLAYED
+    assert torch.equal(*found)  # the same frames have been taken in the end
 
 
 def test_bodies_that_show_nothing(clip):
