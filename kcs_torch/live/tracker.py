@@ -7,7 +7,7 @@ import warnings
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, NoReturn, Self
 
 import torch
 from torch import Tensor
@@ -147,6 +147,9 @@ class Tracker:
         if name in Options._fields and name in vars(self):
             raise AttributeError(f"Tracker: {name} cannot change: make a new one, Tracker(..., {name}={value!r})")
         super().__setattr__(name, value)
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("Tracker: cannot be copied or pickled, as it holds a thread; its tracks() and result() can be")
 
     def reset(self) -> None:
         """Forget the body, its bone lengths and the window; frames are counted on."""
