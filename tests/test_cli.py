@@ -1,7 +1,9 @@
 """The command line: what it writes, what it says, and how it answers mistakes."""
 
 import json
+import os
 import runpy
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -349,6 +351,25 @@ def test_a_bug_in_a_writer_costs_no_other_file_and_shows_where_it_is(lifted, tmp
     with pytest.raises(ZeroDivisionError):
         run("convert", lifted[0] / "walk.npz", tmp_path / "a.bvh", tmp_path / "a.csv")
     assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
+
+
+def test_sigterm_leaves_no_file_half_written(lifted, tmp_path, monkeypatch):
+    import kcs_torch.io.write as write
+
+    def stopped(*args):
+        assert list(tmp_path.iterdir())
+        if signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:  # else this process would end
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    bvh = replace(write.WRITERS[".bvh"], write_motion=stopped)
+    monkeypatch.setattr(write, "WRITERS", {**write.WRITERS, ".bvh": bvh})
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        run("convert", lifted[0] / "walk.npz", tmp_path / "a.bvh", code=143)
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert not list(tmp_path.iterdir())
 
 
 def test_view_writes_what_it_can(lifted, tmp_path, broken):

@@ -145,6 +145,7 @@ def test_command_answers_in_json(saved):
         (["r.npz", "--joint", "nose"], "'nose' is no hinge"),
         (["r.npz", "--joint", "knie"], "unknown joint"),
         (["r.npz", "-o", "a.npz"], "expected a file with the suffix .csv for angles"),
+        (["r.npz", "-o", f"{'a' * 300}.csv"], "cannot be written: File name too long"),
         (["absent.npz"], "absent.npz"),
     ],
 )
@@ -160,6 +161,7 @@ def test_command_does_not_replace_what_it_reads(saved, monkeypatch):
     monkeypatch.chdir(saved)
     (saved / "m.csv").write_bytes((saved / "m.trc").read_bytes())
     assert "which it would replace" in run("m.csv", "-o", "m.csv", code=2).stderr
+    assert "which it would replace" in run("m.csv", "-o", "missing/../m.csv", code=2).stderr
 
 
 def test_a_knee_keeps_its_sign_where_the_other_hip_is_unseen():

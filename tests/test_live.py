@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from concurrent.futures import Future
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from kcs_torch.data import walking_person
 from kcs_torch.functional.align import similarity
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.live import tracker as live
+from kcs_torch.live.filter import BodyFilter
 from kcs_torch.types import Intrinsics
 
 FRAMES = 120
@@ -273,6 +275,32 @@ def test_never_waits_if_so_told(clip):
     assert 0 <= frames < 3000
 
 
+class AtOnce:
+    """An executor that is done when it is asked."""
+
+    def submit(self, call, *args):
+        future = Future()
+        future.set_result(call(*args))
+        return future
+
+
+def test_what_a_solve_finds_is_taken_over_a_few_frames_at_a_time_if_no_update_may_wait(clip, monkeypatch):
+    found, steps = [], []
+    step = BodyFilter.step
+    monkeypatch.setattr(BodyFilter, "step", lambda *args: steps.append(None) or step(*args))
+    for wait in (True, False):
+        tracker = kt.Tracker("coco17", fps=30, window=24, period=1000, wait=wait)
+        monkeypatch.setattr(tracker, "_thread", AtOnce())
+        counts = []
+        for xy in observed(clip)[:48]:
+            steps.clear()
+            pose = tracker.update(xy)
+            counts.append(len(steps))
+        found.append(pose.points)
+        assert max(counts) <= 1 + live.AT_ONCE if not wait else max(counts) > live.REPLAYED
+    assert torch.equal(*found)  # the same frames have been taken in the end
+
+
 def test_bodies_that_show_nothing(clip):
     still = observed(clip)[:1].expand(45, -1, -1)
     line = torch.stack([torch.zeros(17), torch.arange(17.0)], -1).expand(45, -1, -1)
@@ -321,6 +349,36 @@ def test_a_joint_that_stays_where_it_jumped_to_is_believed(clip):
     found = follow(kt.Tracker("coco17", fps=30), frames)
     seen = [bool(p.seen[9]) for p in found[25:]]
     assert not seen[0] and all(seen[4:])
+
+
+@pytest.fixture(scope="module")
+def with_a_gap(clip):
+    frames = observed(clip)[:36].clone()
+    frames[20] = torch.nan
+    return follow(kt.Tracker("coco17", fps=30, window=24), frames)
+
+
+@pytest.mark.parametrize("wild", ["random", "another", "scaled", "reversed"])
+def test_one_wild_frame_is_as_one_without_the_person(clip, with_a_gap, wild):
+    frames = observed(clip)[:36].clone()
+    others = {
+        "random": 1500 * torch.rand(17, 2, generator=torch.Generator().manual_seed(0)).double(),
+        "another": frames[5] / 2 + 3000,
+        "scaled": frames[20] * 1e12,
+        "reversed": frames[20].flip(0),
+    }
+    frames[20] = others[wild]
+    tracker = kt.Tracker("coco17", fps=30, window=24)
+    for one, other in zip(with_a_gap, follow(tracker, frames), strict=True):
+        assert torch.equal(one.points, other.points) and torch.equal(one.seen, other.seen)
+    assert not bool(tracker.tracks().seen[8].any())
+
+
+def test_what_stays_after_a_cut_is_believed_after_a_tenth_of_a_second(clip):
+    frames = observed(clip)[:30].clone()
+    frames[20:] = frames[20:] / 2 + 3000
+    seen = [bool(p.seen.all()) for p in follow(kt.Tracker("coco17", fps=30, window=24), frames)[20:]]
+    assert seen == [False] * 3 + [True] * 7
 
 
 def test_finds_the_body_again_after_it_turned_unseen(clip):

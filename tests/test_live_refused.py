@@ -1,5 +1,8 @@
 """The live mode: which frames and options are refused, and in what words."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -88,3 +91,9 @@ def test_odd_options_are_told(option):
 def test_units_are_spelt_as_elsewhere():
     with kt.Tracker("coco17", units="Millimetres") as tracker:
         assert tracker.units == "mm"
+
+
+@pytest.mark.parametrize("how", [pickle.dumps, copy.copy, copy.deepcopy])
+def test_no_copy_is_made(how):
+    with kt.Tracker("coco17") as tracker, pytest.raises(TypeError, match=r"Tracker: cannot be copied or pickled"):
+        how(tracker)

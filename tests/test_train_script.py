@@ -264,8 +264,8 @@ class TestResuming:
         assert told == [
             "warning: resume: model._target_ was kcs_torch.nn.TemporalLifter, is kcs_torch.nn.MLPLifter",
             "warning: resume: model.channels was 8, is None",
-            f"error: resume={run[1]}/checkpoints/last.ckpt: does not fit this configuration: it is of another network "
-            "or solver: set model and solver as they were, or leave resume out",
+            f"error: resume={run[1]}/checkpoints/last.ckpt: does not fit this configuration: it is of another network, "
+            "solver or skeleton: set model, solver and skeleton as they were, or leave resume out",
         ]
         assert len(err.strip().splitlines()) <= 6
 
@@ -301,6 +301,10 @@ class TestWrongConfigurations:
             ("trainer.max_epochs=0", "at least one epoch with validation"),
             ("+trainer.default_root_dir=elsewhere", "trainer: default_root_dir: expected none"),
             ("+solver.num_steps=8", "solver: there is none to set num_steps of: choose one first, as solver=sfam does"),
+            (
+                "+trainer.limit_train_batches=0",
+                "at least one epoch with validation, got none: .*limit_train_batches is 0",
+            ),
             ("+trainer.limit_val_batches=0", "at least one epoch with validation, got none: .*limit_val_batches is 0"),
             ("+trainer.check_val_every_n_epoch=9", "one epoch with validation, got none: .*n_epoch=9, .*max_epochs="),
             ("+trainer.max_steps=1", "at least one epoch with validation, got none: see the group trainer"),

@@ -134,7 +134,7 @@ def test_a_failing_ffmpeg_is_told(result, tmp_path, monkeypatch, script):
     program.chmod(0o755)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setenv("PATH", f"{folder}:/usr/bin:/bin")
-    with pytest.raises(OutputError, match="could not make an MP4: no such codec"):
+    with pytest.raises(OutputError, match=r"walk\.mp4: ffmpeg could not make an MP4: no such codec"):
         save(result, tmp_path / "walk.mp4")
     assert not (tmp_path / "walk.mp4").exists()
 

@@ -7,7 +7,17 @@ from typing import Annotated
 
 import typer
 
-from kcs_torch.cli.options import ImageSize, InFormat, Rate, Threshold, Trust, check_outputs, image_size, person_number
+from kcs_torch.cli.options import (
+    ImageSize,
+    InFormat,
+    Rate,
+    Threshold,
+    Trust,
+    check_outputs,
+    image_size,
+    person_number,
+    would_replace,
+)
 from kcs_torch.cli.outputs import Pitch, Scale, Units, Up, parse_scale, write_files
 from kcs_torch.cli.report import answer, progress
 
@@ -78,7 +88,7 @@ def convert(
 
         output = check_outputs(output, source=source)
         for path in output:
-            if path.exists() and not overwrite:
+            if would_replace(path) and not overwrite:
                 raise OutputError(
                     f"{path}: is there. One file is converted at a time, into all that follow it (a * may list more): "
                     "give another name, or --overwrite to replace it"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,6 +28,7 @@ __all__ = [
     "new_folders",
     "person_number",
     "use_one_thread",
+    "would_replace",
 ]
 
 TracksPath = Annotated[
@@ -96,12 +98,12 @@ def check_outputs(outputs: Sequence[Path], source: str | None = None, skeleton: 
     from kcs_torch.io.atomic import atomic_path
     from kcs_torch.io.write import check_skeleton, ready_writer
 
-    once: dict[Path, Path] = {}
+    once: dict[str, Path] = {}
     for path in outputs:
         ready_writer(path)
         if skeleton is not None:
             check_skeleton(path, skeleton)
-        once.setdefault(path.resolve(), path)
+        once.setdefault(os.path.realpath(path), path)
         if source is not None:
             check_other(path, source, "tracks")
         try:
@@ -120,8 +122,13 @@ def check_other(path: Path, source: str, what: str) -> None:
     """
     from kcs_torch.errors import OutputError
 
-    if path.exists() and path.resolve() == Path(source).resolve():
+    if would_replace(path) and os.path.realpath(path) == os.path.realpath(source):
         raise OutputError(f"{path}: expected another file than the {what}, which it would replace")
+
+
+def would_replace(path: Path) -> bool:
+    """Whether a file is where this one will be written: x/../a.npz is written to a.npz even where there is no x."""
+    return os.path.exists(os.path.realpath(path))
 
 
 def new_folders(outputs: Sequence[Path]) -> list[Path]:

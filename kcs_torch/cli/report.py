@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import re
+import signal
 import sys
+import threading
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -33,11 +35,13 @@ def one_line(text: object) -> str:
 def answer(as_json: bool = False) -> Iterator[dict[str, Any]]:
     """Run a command's body: an error of bad input becomes one line and exit code 2, a warning one line.
 
+    SIGTERM ends it as Ctrl-C does, but with exit code 143: files half written are removed.
+
     What the body puts into the dictionary that it gets is printed as JSON together with the error.
     """
     found: dict[str, Any] = {}
     _warned.clear()
-    with warnings_told(_warn):
+    with warnings_told(_warn), _stoppable():
         try:
             yield found
         except KcsError as error:
@@ -45,6 +49,24 @@ def answer(as_json: bool = False) -> Iterator[dict[str, Any]]:
             if as_json:
                 print_json({**found, "error": one_line(error), "type": type(error).__name__})
             raise typer.Exit(2) from None
+
+
+@contextmanager
+def _stoppable() -> Iterator[None]:
+    """Within this context SIGTERM raises SystemExit, unless whoever started the program has it ignored or handled."""
+    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+    def stop(number: int, _: object) -> None:
+        signal.signal(number, signal.SIG_DFL)  # a second one ends it at once
+        raise SystemExit(128 + number)
+
+    if ours:
+        signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        if ours:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _warn(text: str) -> None:

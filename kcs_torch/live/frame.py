@@ -22,7 +22,11 @@ FASTEST, LONG = 6.0, 1.2
 bone's length. Both show an error of the detector."""
 
 FEW = 3
-"""Of so many joints one may jump; where more do, it is the body that moves."""
+"""Of so many joints one may jump; where more do, the frame shows something else, or the body goes on elsewhere."""
+
+NEAR, HOLD = 0.2, 0.1
+"""Least jump of many joints that no body makes, a person being 1.75 tall; and seconds of such frames that count as
+unseen before they are believed."""
 
 
 def take_frame(
@@ -73,33 +77,43 @@ class Sight:
     Attributes:
         age: (N,) frames since each joint was seen.
         met: (N,) bool, whether it ever was.
+        held: frames up to now, without a break, in which many joints jumped.
     """
 
-    def __init__(self, body: Skeleton) -> None:
-        self.body = body
+    def __init__(self, body: Skeleton, fps: float) -> None:
+        self.body, self.fps, self.held = body, fps, 0
         self.rigid = list(body.rigid)
         self.bones = body.bone_index()[self.rigid]
         self.age = torch.zeros(body.num_joints, dtype=torch.float64)
         self.met = torch.zeros(body.num_joints, dtype=torch.bool)
 
     def trusted(
-        self, points: Tensor, weights: Tensor, last: Tensor, lengths: Tensor, reach: float
+        self, points: Tensor, weights: Tensor, last: Tensor, lengths: Tensor, unit: float
     ) -> tuple[Tensor, Tensor]:
-        """A frame's points and weights without the joints that jump away for a moment, whose bones would be too long.
+        """A frame's points and weights without the joints that jump away for a moment.
+
+        Few are wrong where their bones would be too long. Where many jump, none counts as seen until the frames that
+        follow have shown for :data:`HOLD` seconds that the body is not where it was.
 
         Args:
             points: (N, 2), 0 where unseen.
             weights: (N,), 0 where unseen.
             last: (N, 2) the frame before, complete.
             lengths: (B,) of the bones, in the points' units.
-            reach: how far a joint may move in a frame, in the points' units; farther if it was not seen before.
+            unit: of the template, in the points' units.
         """
         seen = weights > 0
         if not bool(seen.any()):
             return points, weights
         moved = points - last
-        far = (moved - median(moved[seen], 0)).norm(dim=-1) > reach * (1 + self.age)
-        far = far & seen & self.met
+        moved = torch.where(seen & self.met, (moved - median(moved[seen], 0)).norm(dim=-1), 0.0) / unit
+        reach = FASTEST / self.fps
+        many = moved > (reach * (1 + self.age - self.held)).clamp_min(NEAR)
+        if FEW * int(many.sum()) > int(seen.sum()) and self.held < HOLD * self.fps:
+            self.held += 1
+            return torch.zeros_like(points), torch.zeros_like(weights)
+        self.held = 0
+        far = moved > reach * (1 + self.age)
         if not bool(far.any()):
             return points, weights
         both = seen[self.bones].all(-1)

@@ -7,18 +7,17 @@ import warnings
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, NoReturn, Self
 
 import torch
 from torch import Tensor
 
 from kcs_torch.errors import KcsWarning, OptionError, ShapeError, users_level
-from kcs_torch.functional.chain import bone_vectors
-from kcs_torch.live.filter import BodyFilter, ChainFilter, Shape, Told
-from kcs_torch.live.frame import FASTEST, Sight, take_frame
+from kcs_torch.live.filter import BodyFilter, ChainFilter, Told
+from kcs_torch.live.follow import Follower
+from kcs_torch.live.frame import Sight, take_frame
 from kcs_torch.live.options import LEAST, Options, check_options
 from kcs_torch.live.pose import Chain, LivePose
-from kcs_torch.live.size import SizeFilter, longest_image
 from kcs_torch.live.solve import Solved, solve_window
 from kcs_torch.methods.perspective.near_or_far import may_be_near
 from kcs_torch.methods.perspective.uncalibrated import reconstruct_uncalibrated
@@ -44,8 +43,25 @@ REMEMBERED = 3
 REPLAYED = 15
 """Solved frames that the filter takes again when a window has been solved, and all frames since."""
 
+AT_ONCE = 4
+"""Frames that are taken again in an update that must not block."""
+
 LOST = 0.5
 """Seconds without the body after which the filter starts anew from many headings."""
+
+
+class _Next(NamedTuple):
+    """Who takes a window's last frames again.
+
+    Attributes:
+        follower: who knows the body that a solve found.
+        told: what that solve says of its frames.
+        frame: the next one.
+    """
+
+    follower: Follower
+    told: Told
+    frame: int
 
 
 class Tracker:
@@ -79,7 +95,8 @@ class Tracker:
         units: of the tracks.
         threshold: a joint with less confidence counts as unseen.
         wait: whether an update waits for a solve that should have ended. True gives the same poses for the same frames;
-            False, for a camera, takes what a solve finds over when it has ended.
+            False, for a camera, takes what a solve finds over when it has ended, within some updates more: each takes a
+            few frames again, in up to four times the time of a usual one.
         method: whose fields :meth:`result` takes, and the solves, with fewer steps; ``PKC()`` if None.
         image_size: width and height of the image in pixels, which :meth:`tracks` have: by it :meth:`result` knows the
             camera's lens roughly. Live poses are as before a far one.
@@ -113,15 +130,14 @@ class Tracker:
         given = check_options(skeleton, fps, window, period, units, threshold, wait, method, image_size)
         self.skeleton, self.fps, self.window, self.period, self.units, self.threshold, *_ = given
         self.wait, self.method, self.image_size = given.wait, given.method, given.image_size
-        self._filter: BodyFilter | ChainFilter
+        self._pose: BodyFilter | ChainFilter
         self._body, early = outward(self.skeleton), EARLY
         if has_trunk(self.skeleton):
-            self._filter, self._delay = BodyFilter(self._body, self.fps), DELAY
+            self._pose, self._delay = BodyFilter(self._body, self.fps), DELAY
         else:
-            self._filter, early, self._delay = ChainFilter(self._body, self.fps), EARLY[-1:], 1.0
+            self._pose, early, self._delay = ChainFilter(self._body, self.fps), EARLY[-1:], 1.0
         self._early = [min(max(LEAST, round(share * self.window)), self.window) for share in early]
-        self._rigid = list(self._body.rigid)
-        self._chain = Chain(self._body, self._filter.body, self.fps)
+        self._chain = Chain(self._body, self._pose.body, self.fps)
         self._thread = ThreadPoolExecutor(1, "kcs_torch.live")
         self._closed = self._told_up = False
         self._frame = -1
@@ -132,17 +148,19 @@ class Tracker:
             raise AttributeError(f"Tracker: {name} cannot change: make a new one, Tracker(..., {name}={value!r})")
         super().__setattr__(name, value)
 
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("Tracker: cannot be copied or pickled, as it holds a thread; its tracks() and result() can be")
+
     def reset(self) -> None:
         """Forget the body, its bone lengths and the window; frames are counted on."""
-        self._filter.reset()
+        self._pose.reset()
+        self._follower = Follower(self._body, self._pose, self.fps)
+        self._next: _Next | None = None  # who follows the body from the newest frame on
         self._image: deque[Tensor] = deque(maxlen=self.window)  # complete, (N, 2)
         self._weights: deque[Tensor] = deque(maxlen=self.window)
         self._depths: deque[Tensor] = deque(maxlen=self.window)  # of the joints (N,), in the template's units
-        self._shape: Shape | None = None
         self._stray = torch.zeros(self.skeleton.num_joints, dtype=torch.float64)  # of depths from what solves found
-        self._longest = torch.zeros(self.skeleton.num_bones, dtype=torch.float64)  # of the bones' images
-        self._sight = Sight(self._body)
-        self._size = SizeFilter(self.fps)
+        self._sight = Sight(self._body, self.fps)
         self._solving: Future[Solved | None] | None = None
         self._asked = self._ready = -1  # frames at which the running solve began, and at which it is taken over
         self._solved = -1  # frame at which the last solve began
@@ -160,7 +178,8 @@ class Tracker:
             xy: (num_observed, 2) array or tensor; NaN where unseen. Without confidences, joints exactly at (0, 0)
                 or (-1, -1) are unseen, too, if nine of ten others lie right of (0, 0) and below it. A frame of NaN, or
                 whose joints all lie at one point, is one without the person; after a whole window of them the tracker
-                starts anew. A joint that jumps too far for a body, from one frame to the next, counts as unseen there.
+                starts anew. A joint that jumps too far for a body, from one frame to the next, counts as unseen there;
+                if more than a third of them do, all count as unseen, for a tenth of a second at most.
             confidence: (num_observed,) in 0..1; 1 where None.
 
         Raises:
@@ -176,9 +195,9 @@ class Tracker:
         self._frame += 1
         last = self._image[-1] if self._image else None
         if last is not None:
-            shape = self._body_now()
-            lengths, reach = shape.lengths / shape.factor, FASTEST / self.fps / shape.factor
-            points, weights = self._sight.trusted(points, weights, last, lengths, reach)
+            shape = self._follower.body()
+            unit = 1 / shape.factor
+            points, weights = self._sight.trusted(points, weights, last, shape.lengths * unit, unit)
         seen = weights > 0
         if not self._image and not bool(seen.any()):
             self._due = deque(frame + 1 for frame in self._due)
@@ -187,17 +206,18 @@ class Tracker:
         away = float(self._sight.age.amin()) > LOST * self.fps and bool(seen.any())
         image = self._sight.complete(points, seen, last)
         if away:
-            self._begin_again(image, weights)
+            self._follower.begin_again(image, weights)
+            self._begun = self._frame
+            self._alone = self._frame + self.window - 1
         self._image.append(image)
         self._weights.append(weights)
-        self._longest = torch.maximum(self._longest, bone_vectors(image, self._chain.bones).norm(dim=-1))
-        dz, shape = self._follow(image, weights)
+        dz, shape = self._follower.take(image, weights)
         points = self._chain.place(image, weights, dz, shape)
         off = (points[:, :2] - image).norm(dim=-1)
-        unsure = self._chain.deviation(dz, shape, self._filter.doubt, self._sight.age, self._stray, off)
+        unsure = self._chain.deviation(dz, shape, self._follower.pose.doubt, self._sight.age, self._stray, off)
         self._depths.append(shape.factor * points[:, 2])
-        delay = self._frame - self._solved if self._shape else -1
-        ready = self._shape is not None
+        ready = self._follower.shape is not None
+        delay = self._frame - self._solved if ready else -1
         out = LivePose(self._frame, points.to(like), unsure.to(like), seen.to(like.device), ready, delay)
         if float(self._sight.age.amin()) >= self.window:
             self.reset()
@@ -246,45 +266,6 @@ class Tracker:
         near = tracks.image_size is not None and may_be_near(tracks)
         return reconstruct_uncalibrated(self.method, tracks) if near else self.method(tracks)
 
-    # ------------------------------------------------------------------ the newest frame
-
-    def _body_now(self) -> Shape:
-        """The body, as large as it was in the frame before."""
-        if self._shape is None:
-            return self._filter.guess(self._longest)
-        return self._shape.sized(self._size.value)
-
-    def _follow(self, image: Tensor, weights: Tensor, told: Told | None = None) -> tuple[Tensor, Shape]:
-        """Have a frame filtered: dz (B,) of its bones, and the body, as large as frames tell.
-
-        Args:
-            image: (N, 2), complete.
-            weights: (N,) confidences.
-            told: what a window solve says of this frame, if anything.
-        """
-        if told is None:
-            self._size.predict()
-        else:
-            self._size.value = float(told.sizes)
-        shape = self._body_now()
-        dz = self._filter.step(image, weights, shape, told)
-        if told is None and self._shape is not None:
-            self._size.correct(self._looks(image, weights, shape), self._filter.size)
-        return dz, shape
-
-    def _looks(self, image: Tensor, weights: Tensor, shape: Shape) -> float:
-        """Log of how long bones that hardly tilt look in a frame, over what is usual; NaN where too few are seen."""
-        lengths = shape.lengths[self._rigid] / shape.factor
-        return float(longest_image(image, weights > 0, self._chain.bones[self._rigid], lengths)) - shape.usual
-
-    def _begin_again(self, image: Tensor, weights: Tensor) -> None:
-        """Find a known body anew, of any heading and size, in a frame; it may be another one."""
-        self._filter.reset()
-        self._begun = self._frame
-        self._alone = self._frame + self.window - 1
-        looks = self._looks(image, weights, self._body_now())
-        self._size.value, self._size.slope = self._size.value + (0.0 if math.isnan(looks) else looks), 0.0
-
     # ------------------------------------------------------------------ the window
 
     def _advance(self) -> None:
@@ -292,8 +273,10 @@ class Tracker:
         if self._solving is not None and self._frame >= self._ready and (self.wait or self._solving.done()):
             found, self._solving = self._solving.result(), None
             if found is not None:
-                self._adopt(found)
-        if self._solving is None and min(self._due[0], self._alone) <= self._frame:
+                self._learn_from(found)
+        if self._next is not None:
+            self._catch_up(self._next)
+        if self._solving is None and self._next is None and min(self._due[0], self._alone) <= self._frame:
             if self._due[0] <= self._frame:
                 self._due.popleft()
             if not self._due:
@@ -312,29 +295,38 @@ class Tracker:
             self._told_up = True
             warnings.warn(f"Tracker: {stands}", KcsWarning, stacklevel=users_level())
 
-    def _adopt(self, found: Solved) -> None:
-        """Take over the body that was found, and let the filter take the window's last frames again."""
+    def _learn_from(self, found: Solved) -> None:
+        """Have one who knows the body that was found take the window's last frames again."""
         count = len(found.told.depths)
         if self._renews:  # deviations from another's bones teach nothing
             self._told, self._known = 0, self._frame
         self._told = min(self._told + count, REMEMBERED * self.window)
-        share = count / self._told
-        shape = found.shape if self._shape is None else found.shape.blended(self._shape, share)
+        share, before = count / self._told, self._follower.shape
         self._learn(found.told, share)
-        self._known = self._frame if self._shape is None else self._known
-        self._shape, self._solved = shape, self._asked
-        frames = list(zip(self._image, self._weights, strict=True))
-        since = self._frame - self._asked
-        again = min(REPLAYED + since, len(frames), self._frame + 1 - self._begun)
-        self._filter.reset()
-        for i, (image, weights) in enumerate(frames[-again:], count + since - again):
-            self._follow(image, weights, found.told[i] if i < count else None)
+        follower = self._follower.taught(found.shape if before is None else found.shape.blended(before, share))
+        self._next = _Next(follower, found.told, max(0, self._asked + 1 - REPLAYED))
+
+    def _catch_up(self, later: _Next) -> None:
+        """Go on with the frames that are taken again, all of them or a few; after the newest the other takes over."""
+        first = self._frame + 1 - len(self._image)
+        begin = max(first, later.frame, self._begun)
+        end = self._frame + 1 if self.wait else min(self._frame + 1, begin + AT_ONCE)
+        for frame in range(begin, end):
+            image, weights = self._image[frame - first], self._weights[frame - first]
+            if frame == self._begun > self._asked:
+                later.follower.begin_again(image, weights)
+            told = later.told[frame - self._asked - 1] if frame <= self._asked else None
+            later.follower.take(image, weights, told)
+        self._next = later._replace(frame=end)
+        if end > self._frame:
+            self._known = self._frame if self._renews or self._follower.shape is None else self._known
+            self._follower, self._next, self._solved = later.follower, None, self._asked
 
     def _learn(self, told: Told, share: float) -> None:
         """Learn from frames with bone lengths how far depths are from what a solve, counting ``share``, finds later."""
-        depths = list(self._depths)[: len(self._depths) - (self._frame - self._asked)]
+        depths = list(self._depths)[: max(0, len(self._depths) - (self._frame - self._asked))]
         depths = depths[max(0, len(depths) - (self._asked - self._known)) :]
-        if self._shape is None or len(depths) < LEAST:
+        if self._follower.shape is None or len(depths) < LEAST:
             return
         solved = told.depths[len(told.depths) - len(depths) :] @ self._chain.tree.mT
         off = (torch.stack(depths) - solved + solved.mean(-1, keepdim=True)).square().mean(0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import shutil
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,14 @@ from typing import Any
 import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
-from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 from lightning.pytorch.loggers.logger import rank_zero_experiment
 
 from kcs_torch.errors import OptionError, unknown
 from kcs_torch.io.atomic import atomic_path
 
-__all__ = ["Best", "Diverged", "Last", "Log", "Watch"]
+__all__ = ["Best", "Board", "Diverged", "Last", "Log", "Watch"]
 
 
 class Log(CSVLogger):
@@ -66,6 +67,32 @@ class _Table(ExperimentWriter):
     def save(self) -> None:
         if self.metrics:  # else it would write a file of hyperparameters
             super().save()
+
+
+class Board(TensorBoardLogger):
+    """TensorBoard's log of a run, in its ``tensorboard``, which touches no file before there is a figure."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, "tensorboard", "")
+
+    @property
+    def experiment(self) -> Any:
+        """What writes the log; Lightning asks for it before anything is checked."""
+        return super().experiment if self._experiment is not None else _Later(lambda: super(Board, self).experiment)
+
+    def save(self) -> None:
+        if self._experiment is not None:
+            super().save()
+
+
+class _Later:
+    """Stands for a thing that is made as soon as something of it is used."""
+
+    def __init__(self, make: Callable[[], Any]) -> None:
+        self._make = make
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._make(), name)
 
 
 def _rows_until(path: Path, epoch: int) -> list[dict[str, Any]]:
@@ -154,6 +181,7 @@ class Watch(Callback):
         """
         every, last = trainer.check_val_every_n_epoch, trainer.max_epochs
         reasons = {
+            "trainer.limit_train_batches is 0": trainer.limit_train_batches == 0,
             "trainer.limit_val_batches is 0": trainer.limit_val_batches == 0,
             f"trainer.check_val_every_n_epoch={every}, trainer.max_epochs={last}": every and 0 <= last < every,
             "data.val is empty": trainer.datamodule.val_dataloader() == [],

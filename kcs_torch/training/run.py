@@ -21,13 +21,12 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from hydra.utils import instantiate
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException, SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 
 from kcs_torch.errors import KcsWarning, NotFiniteError, OptionError, unknown, warnings_told
 from kcs_torch.io.atomic import atomic_path
-from kcs_torch.training.callbacks import Best, Diverged, Last, Log, Watch
+from kcs_torch.training.callbacks import Best, Board, Diverged, Last, Log, Watch
 from kcs_torch.training.checkpoint import describe, save_lifter
 from kcs_torch.training.configured import (
     changes,
@@ -118,10 +117,12 @@ def train(config: DictConfig, folder: Path) -> Outcome:
         except (RuntimeError, ValueError) as error:  # of a module's state, of an optimiser's
             if resumed is None or not re.search("state.dict", str(error)):
                 raise
-            why = "it is of another network or solver" if isinstance(error, RuntimeError) else error  # of many lines
+            why = (
+                "it is of another network, solver or skeleton" if isinstance(error, RuntimeError) else error
+            )  # of many lines
             raise OptionError(
-                f"resume={resumed}: does not fit this configuration: {why}: set model and solver as they were, or "
-                "leave resume out"
+                f"resume={resumed}: does not fit this configuration: {why}: set model, solver and skeleton as they "
+                "were, or leave resume out"
             ) from None
         except SystemExit as end:
             if trainer.interrupted:
@@ -165,7 +166,7 @@ def _trainer(config: DictConfig, callbacks: list[Any], folder: Path, epoch: int 
         plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
         config = OmegaConf.create({name: value for name, value in plain.items() if name != "callbacks"})
     if "logger" not in config:
-        made["logger"] = [Log(folder, epoch), TensorBoardLogger(folder, "tensorboard", "")]
+        made["logger"] = [Log(folder, epoch), Board(folder)]
     if "enable_progress_bar" not in config:
         made["enable_progress_bar"] = sys.stderr.isatty()
     return instantiate(config, **made, _convert_="all")

@@ -140,7 +140,7 @@ def save_mp4(results: Reconstruction | Sequence[Reconstruction], path: Path) -> 
         if process.wait():
             said.seek(0)
             words = said.read().decode("utf-8", "replace").strip().splitlines() or [f"exit code {process.returncode}"]
-            raise OutputError(f"ffmpeg could not make an MP4: {words[-1]}")
+            raise OutputError(f"{path}: ffmpeg could not make an MP4: {words[-1]}")
     if not _is_whole(path):  # ffmpeg does not always say so
         raise OutputError(f"{path}: cannot be written: ffmpeg left half of an MP4 (is the disk full?)")
 
