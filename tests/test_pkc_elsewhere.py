@@ -109,6 +109,19 @@ def test_joints_that_leap_away_and_back_are_found(joints, frames):
     assert torch.equal(limbs_elsewhere(twice, seen, 30.0), away)  # and not what lies between
 
 
+@pytest.mark.parametrize("frames", [slice(0, 1), slice(0, 12), slice(48, 60), slice(59, 60)])
+def test_of_a_leap_near_an_end_the_shorter_side_is_away(frames):
+    _, points, away = strayed(LEG, frames)
+    assert torch.equal(limbs_elsewhere(points, torch.ones_like(away), 30.0), away)
+
+
+def test_where_frames_are_lost_all_joints_leap():
+    clip = walking_person(90, turn=0.0, yaw=80.0)
+    for first in range(5, 75, 7):  # eight frames, a third of a stride
+        points = torch.cat([clip.tracks.points[:first], clip.tracks.points[first + 8 :]])
+        assert not limbs_elsewhere(points, torch.ones(points.shape[:2], dtype=torch.bool), 30.0).any()
+
+
 def test_what_stays_where_something_else_is_is_found():
     _, points, away = strayed(ARM, by=(700.0, -500.0))
     points[20:35, ARM] = points[20, ARM]

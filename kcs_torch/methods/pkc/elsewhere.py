@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
@@ -23,11 +24,15 @@ takes several frames to do so."""
 
 BACK, PART, MOST = 0.5, 0.25, 0.4
 """What leaps away and back ends where it began, but for this share of its leaps, and is away for this share of the
-clip at most; and a single joint for this share of the frames in which it is seen."""
+clip at most; what only leaps away, or back, as well, and a single joint for the last share of the frames in which it is
+seen."""
 
 FEW, BRIEF, ALIKE = 0.35, 3, 0.5
 """Of the joints that are seen, so many may leap at once; they are away for so many frames at least, and those that go
 together move alike but for this share of a leap."""
+
+AROUND, AHEAD = 3, 2.0
+"""Frames were lost where most joints go so many times as far as in the median of so many frames before and after."""
 
 ASIDE, FAST = 0.3, 8.0
 """A joint leaps where it moves by more than so many times the body's size in a frame, and by so many in a second: by
@@ -71,8 +76,10 @@ def limbs_elsewhere(points: Tensor, seen: Tensor, rate: float, twins: Sequence[t
     """Detections (T, N) of joints that have leapt away and not yet back while the body stayed: of something else.
 
     A detector takes another's arm for this one's, or what an arm is hidden by, for some frames. No joint starts and
-    stops so suddenly by itself. Joints that go the same way with one that does, there and back, are away with it. Where
-    more than a few leap it is the body that moves, or another view; and what is brief is for the model of the clip.
+    stops so suddenly by itself. Joints that go the same way with one that does, there and back, are away with it. Of a
+    leap without return, near an end of the clip, the shorter side is away. Where more than a few joints leap it is the
+    body that moves, or another view; where most go farther than around, frames were lost; and what is brief, but at the
+    ends, is for the model of the clip.
 
     Args:
         points: (T, N, 2).
@@ -90,19 +97,28 @@ def limbs_elsewhere(points: Tensor, seen: Tensor, rate: float, twins: Sequence[t
     step = move.norm(dim=-1).nan_to_num()  # (T - 1, N)
     leaps = step > max(ASIDE, FAST / rate) * size
     leaps &= leaps.sum(1, keepdim=True) <= FEW * seen.sum(1, keepdim=True)[1:]
+    leaps &= ~_lost(nanmedian(move.norm(dim=-1), 1))[:, None]
     left, right = (list(side) for side in zip(*twins, strict=True)) if twins else ([], [])
     both = leaps[:, left] & leaps[:, right]
     leaps[:, left], leaps[:, right] = leaps[:, left] & ~both, leaps[:, right] & ~both
-    for joint in (leaps.sum(0) > 1).nonzero().flatten().tolist():
-        at, longest = leaps[:, joint].nonzero().flatten().tolist(), MOST * int(seen[:, joint].sum())
-        for first, last in _stays(at, step[:, joint], longest, partial(_way_back, move[:, joint]), around=2):
-            if last - first < BRIEF:
-                continue
-            with_it = leaps[first] & leaps[last]
-            for end in (first, last):
-                with_it &= (move[end] - move[end, joint]).norm(dim=-1) < ALIKE * step[end, joint]
-            away[first + 1 : last + 1] |= with_it
+    for joint in leaps.any(0).nonzero().flatten().tolist():
+        own, at, shown = step[:, joint], leaps[:, joint].nonzero().flatten().tolist(), seen[:, joint].cumsum(0)
+        most, part = (share * int(shown[-1]) for share in (MOST, PART))
+        stays = _stays(at, own, math.inf, partial(_way_back, move[:, joint]), around=2)
+        lone = [i for i in at if not any(i in pair for pair in stays) and _is_sudden(own, i, i, 2)]
+        times = [([*stay], slice(stay[0] + 1, stay[1] + 1)) for stay in stays if BRIEF <= stay[1] - stay[0] <= most]
+        times += [([i], slice(0, i + 1)) for i in lone if shown[i] <= part][-1:]
+        times += [([i], slice(i + 1, len(seen))) for i in lone if shown[-1] - shown[i] <= part][:1]
+        for ends, time in times:
+            alike = (move[ends] - move[ends, joint][:, None]).norm(dim=-1) < ALIKE * own[ends, None]
+            away[time] |= (leaps[ends] & alike).all(0)
     return away & seen
+
+
+def _lost(step: Tensor) -> Tensor:
+    """Before which of (T - 1,) steps of most joints frames were lost: much longer than around, like all motion then."""
+    beside = torch.nn.functional.pad(step, (AROUND, AROUND), value=torch.nan).unfold(0, 2 * AROUND + 1, 1)
+    return step > AHEAD * nanmedian(beside, -1)
 
 
 def _way_back(move: Tensor, first: int, last: int) -> Tensor:
@@ -130,12 +146,17 @@ def _stays(
     for first, last in pairwise(leaps):
         if stays and stays[-1][1] == first:  # it has led back
             continue
-        least = torch.minimum(step[first], step[last])
-        beside = {at + by for at in (first, last) for by in range(-around, around + 1)} - {first, last}
-        sudden = all(bool(least > SUDDEN * step[i]) for i in beside if 0 <= i < len(step))
-        if last - first <= longest and sudden and bool(gap(first, last) < BACK * least):
+        back = bool(gap(first, last) < BACK * torch.minimum(step[first], step[last]))
+        if last - first <= longest and back and _is_sudden(step, first, last, around):
             stays.append((first, last))
     return stays
+
+
+def _is_sudden(step: Tensor, first: int, last: int, around: int) -> bool:
+    """Whether two of (T - 1,) steps are much longer than those around both."""
+    beside = {at + by for at in (first, last) for by in range(-around, around + 1)} - {first, last}
+    least = torch.minimum(step[first], step[last])
+    return all(bool(least > SUDDEN * step[i]) for i in beside if 0 <= i < len(step))
 
 
 def without_others(tracks: Tracks) -> Tracks:
