@@ -114,8 +114,11 @@ def test_frames_of_a_slower_camera_repeat(every):
 def test_what_does_not_repeat_as_a_slower_camera_does():
     points, seen = walk(42)
     assert not repeats(points, seen).any()
-    left = (1 - torch.arange(42).double() / 24).clamp_min(0)[:, None, None] ** 3
-    assert not repeats(points[-1] + left * (points - points[-1]), seen).any()  # somebody who stops
+    for frames in (8, 12, 24):  # somebody who stops, by the least jerk
+        time = (torch.arange(42).double() / frames).clamp_max(1)[:, None, None]
+        stops = points[:1] + (points[20:21] - points[:1]) * time**3 * (10 - 15 * time + 6 * time**2)
+        assert not repeats(stops, seen).any()
+        assert not repeats(stops.round(), seen).any()
     assert not repeats(torch.cat([points[:1], points[:-1]]), seen).any()  # once
     assert not repeats(points[:1].expand(42, -1, -1), seen).any()  # who stands
     rounded = (points[:1] + 0.2 * torch.arange(42)[:, None, None] / 42).round()  # and hardly moves, in whole pixels
@@ -261,6 +264,25 @@ def test_joints_exactly_where_another_is_are_none():
     assert doubled(0 * points, seen, BODY) == doubled(points[:0], seen[:0], BODY) == []
     seen[SELDOM - 1 :, KNEE] = False
     assert doubled(points, seen, BODY) == []
+
+
+def test_joints_that_meet_in_few_frames_stay():
+    points, seen = walk()
+    right = BODY.joints.index("right_ankle")
+    seen[4:, right] = False
+    points[:4, right] = points[:4, ANKLE]
+    assert doubled(points, seen, BODY) == [right]  # which shows nothing else
+    seen[:, right] = True
+    assert doubled(points, seen, BODY) == []
+    small = (points / 40).round()  # whole pixels of a body of 40
+    small[:, right] = small[:, ANKLE]
+    assert doubled(small, seen, BODY) == []
+
+
+def test_joints_are_compared_in_the_frames_that_show_most():
+    points, seen = walk(80)
+    points[:, KNEE], seen[:40] = points[:, HIP], False
+    assert doubled(points, seen, BODY) == [KNEE]
 
 
 def test_of_a_left_and_a_right_joint_in_one_place_neither_is_sure():

@@ -271,7 +271,8 @@ class Tracker:
     def _advance(self) -> None:
         """Begin to solve the window where that is due; take over what was found."""
         if self._solving is not None and self._frame >= self._ready and (self.wait or self._solving.done()):
-            found, self._solving = self._solving.result(), None
+            solving, self._solving = self._solving, None  # whatever it has come to
+            found = solving.result()
             if found is not None:
                 self._learn_from(found)
         if self._next is not None:

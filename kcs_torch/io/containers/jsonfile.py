@@ -21,6 +21,8 @@ __all__ = ["as_frame_number", "as_joints", "as_text", "entries", "kind", "outlin
 LIMIT = 2**30  # bytes of one file; Python needs several times as much
 FARTHEST = 1e9  # pixels
 MOST_JOINTS = 2000
+SCORE = 1.2  # up to which third numbers may be networks' scores
+LIKE = 0.9  # correlation of third numbers and scores from which on they are the same in other words
 _BLANK = b"\xef\xbb\xbf \t\r\n"  # what may stand before the JSON, a byte order mark included
 _TOKEN = re.compile(rb'"(?:[^"\\]|\\.)*"|[{}\[\],:]|"|[^\s{}\[\],:"]+', re.DOTALL)
 _DEEPEST = 16  # levels that an outline goes down
@@ -157,11 +159,14 @@ def as_joints(values: Any, where: str, scores: Any = None) -> NDArray[np.float64
 
 
 def _is_depth(third: NDArray[np.float64], scores: NDArray[np.float64]) -> bool:
-    """Whether third numbers are z: neither the scores again, nor shares, nor flags as COCO's 0, 1 and 2."""
+    """Whether third numbers are z: neither like the scores, nor shares, nor flags as COCO's 0, 1 and 2."""
     both = np.isfinite(third) & np.isfinite(scores)
     third, scores = third[both], scores[both]
-    within = ((third >= 0) & (third <= 1)).all() or np.isin(third, (-1, 0, 1, 2)).all()
-    return not (within or np.allclose(third, scores))
+    shares = (((third >= 0) & (third <= SCORE)) | (third == -1)).all() or np.isin(third, (-1, 0, 1, 2, 3)).all()
+    if shares or np.allclose(third, scores, atol=0.05):
+        return False
+    a, b = third - third.mean(), scores - scores.mean()
+    return bool((a * b).sum() < LIKE * np.sqrt((a * a).sum() * (b * b).sum()))
 
 
 def _length(value: Any) -> int:

@@ -31,13 +31,13 @@ FEW, BRIEF, ALIKE = 0.35, 3, 0.5
 """Of the joints that are seen, so many may leap at once; they are away for so many frames at least, and those that go
 together move alike but for this share of a leap."""
 
-AROUND, AHEAD = 3, 2.0
-"""Frames were lost where most joints go so many times as far as in the median of so many frames before and after."""
+AROUND, AHEAD = 3, 1.7
+"""Frames were lost where most joints that do not leap go so many times as far as in the median of so many frames before
+and after."""
 
 ASIDE, FAST = 0.3, 8.0
 """A joint leaps where it moves by more than so many times the body's size in a frame, and by so many in a second: by
-13 cm, and at 3.5 m/s, of a person. In a million places of motion capture, of 24 frames a second or more, no joint leaps
-so, away and back, as suddenly."""
+13 cm, and at 3.5 m/s, of a person. In a million places of people's motion capture no joint leaps so, as suddenly."""
 
 SLOW = 10.0
 """Frames a second where nobody says how many there are: at few of them all motion is sudden."""
@@ -78,8 +78,8 @@ def limbs_elsewhere(points: Tensor, seen: Tensor, rate: float, twins: Sequence[t
     A detector takes another's arm for this one's, or what an arm is hidden by, for some frames. No joint starts and
     stops so suddenly by itself. Joints that go the same way with one that does, there and back, are away with it. Of a
     leap without return, near an end of the clip, the shorter side is away. Where more than a few joints leap it is the
-    body that moves, or another view; where most go farther than around, frames were lost; and what is brief, but at the
-    ends, is for the model of the clip.
+    body that moves, or another view; where most go farther than around, frames were lost; and what is brief is for the
+    model of the clip. Steps are those between frames that show a joint, by the time in between.
 
     Args:
         points: (T, N, 2).
@@ -87,31 +87,44 @@ def limbs_elsewhere(points: Tensor, seen: Tensor, rate: float, twins: Sequence[t
         rate: frames a second.
         twins: pairs of joints that may have changed places: where both leap nothing is told.
     """
-    away = torch.zeros_like(seen)
+    away, frames = torch.zeros_like(seen), torch.arange(len(points), device=points.device)
     known = torch.where(seen[..., None], points, torch.nan)
     size = (known - nanmedian(known, 1, keepdim=True)).norm(dim=-1).nanmedian()
-    if len(points) < 2 + BRIEF or not size > 0:
+    there = seen.any(1).nonzero().flatten()
+    if len(there) < 2 + BRIEF or not size > 0:
         return away
-    move = known.diff(dim=0)
-    move = move - nanmedian(move, 1, keepdim=True)
-    step = move.norm(dim=-1).nan_to_num()  # (T - 1, N)
-    leaps = step > max(ASIDE, FAST / rate) * size
+    move = known[there].diff(dim=0)
+    drift = nanmedian(move, 1)  # of the body, to each frame that shows it
+    known[there[1:]] -= drift.nan_to_num().cumsum(0)[:, None]
+    last = torch.where(seen, frames[:, None], -1).cummax(0).values[:-1]  # frame that showed a joint last
+    gap = frames[1:, None] - last
+    move = known[1:] - known.gather(0, last.clamp_min(0)[..., None].expand(-1, -1, 2))  # NaN where unseen
+    move = torch.where((last < 0)[..., None], torch.nan, move)
+    step = move.norm(dim=-1)
+    leaps = step > (FAST * gap / rate).clamp_min(ASIDE) * size  # NaN is not above
     leaps &= leaps.sum(1, keepdim=True) <= FEW * seen.sum(1, keepdim=True)[1:]
-    leaps &= ~_lost(nanmedian(move.norm(dim=-1), 1))[:, None]
+    pace = nanmedian(torch.where(leaps, torch.nan, step / gap), 1)  # of the others
+    leaps[there[1:][_lost(pace[there[1:] - 1])] - 1] = False
     left, right = (list(side) for side in zip(*twins, strict=True)) if twins else ([], [])
     both = leaps[:, left] & leaps[:, right]
     leaps[:, left], leaps[:, right] = leaps[:, left] & ~both, leaps[:, right] & ~both
     for joint in leaps.any(0).nonzero().flatten().tolist():
-        own, at, shown = step[:, joint], leaps[:, joint].nonzero().flatten().tolist(), seen[:, joint].cumsum(0)
-        most, part = (share * int(shown[-1]) for share in (MOST, PART))
-        stays = _stays(at, own, math.inf, partial(_way_back, move[:, joint]), around=2)
-        lone = [i for i in at if not any(i in pair for pair in stays) and _is_sudden(own, i, i, 2)]
-        times = [([*stay], slice(stay[0] + 1, stay[1] + 1)) for stay in stays if BRIEF <= stay[1] - stay[0] <= most]
-        times += [([i], slice(0, i + 1)) for i in lone if shown[i] <= part][-1:]
-        times += [([i], slice(i + 1, len(seen))) for i in lone if shown[-1] - shown[i] <= part][:1]
-        for ends, time in times:
-            alike = (move[ends] - move[ends, joint][:, None]).norm(dim=-1) < ALIKE * own[ends, None]
-            away[time] |= (leaps[ends] & alike).all(0)
+        shown = seen[:, joint].nonzero().flatten()
+        begins = shown[1:] - 1  # rows of steps to a frame that shows it
+        own = (step[begins, joint] / gap[begins, joint]).cpu()
+        at, ways = leaps[begins, joint].nonzero().flatten().tolist(), move[begins, joint].cpu()
+        stays = _stays(at, own, math.inf, partial(_way_back, ways), around=2)
+        used = {i for pair in stays for i in pair}
+        lone = [i for i in at if i not in used and 2 <= i < len(own) - 2 and _is_sudden(own, i, i, 2)]
+        most, part, count = MOST * len(shown), PART * len(shown), len(shown)
+        times = [([*stay], stay[0] + 1, stay[1] + 1) for stay in stays if BRIEF <= stay[1] - stay[0] <= most]
+        times += [([i], 0, i + 1) for i in lone if i + 1 <= part][-1:]
+        times += [([i], i + 1, count) for i in lone if count - i - 1 <= part][:1]
+        for ends, start, stop in times:
+            rows = begins[ends]
+            alike = (move[rows] - move[rows, joint][:, None]).norm(dim=-1) < ALIKE * step[rows, joint][:, None]
+            with_it = (leaps[rows] & alike).all(0)
+            away[shown[start] : shown[stop - 1] + 1] |= with_it
     return away & seen
 
 
@@ -178,6 +191,8 @@ def without_strange_limbs(tracks: Tracks, *, swapped: bool = False) -> Tracks:
         tracks: of which some may be.
         swapped: whether left and right may have changed places in them, which is another's to mend.
     """
+    if not tracks.skeleton.mirror:  # fingers are quick for a hand's size
+        return tracks
     count = tracks.skeleton.num_observed
     seen = tracks.seen[:, :count]
     twins = [pair for pair in tracks.skeleton.mirror if max(pair) < count] if swapped else []
@@ -186,5 +201,5 @@ def without_strange_limbs(tracks: Tracks, *, swapped: bool = False) -> Tracks:
         return tracks
     names = listed([tracks.skeleton.joints[n] for n in away.any(0).nonzero().flatten().tolist()], 6)
     which = f"{share(int(away.sum()), int(seen.sum()))} detections, of {names}"
-    note = f"joints leap away and back by themselves: taken as unseen meanwhile: {which}"
+    note = f"joints leap away, or back, by themselves: taken as unseen meanwhile: {which}"
     return rebuilt(tracks, tracks.points[:, :count], torch.where(away, 0, tracks.weights[:, :count]), note)

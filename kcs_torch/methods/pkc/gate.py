@@ -27,8 +27,10 @@ SHORTER, AROUND = 2.5, 8
 ROUNDS = 4
 """Times that what is left is looked at again."""
 
-COMPARED = 32
-"""Frames of which all pairs of joints are compared at first."""
+COMPARED, MOSTLY, COARSE, APART = 32, 0.9, 30.0, 0.1
+"""Frames of which all pairs of joints are compared at first, those that show most; joints that repeat another do so in
+this share of the frames that show them; and they would be apart by so many steps of the image's grid, and by this share
+of the body's size."""
 
 SELDOM = 3
 """Joints that are seen in fewer frames tell nothing of their bones' lengths."""
@@ -37,6 +39,9 @@ OFTEN, HELD, MOVED = 0.12, 6, 0.002
 """Frames that repeat the one before are a slower camera's if this share of all does, no more than so many on end, and
 if most joints move by this share of the body's size where they move: those of somebody who stands still are not. More
 on end are a detector's that has lost the body if this moved by as much just before: somebody who stops slows down."""
+
+JUST, SLOWS = 3, 0.5
+"""The last step is less than this share of the median of so many before it."""
 
 CROWDED = 5
 """An outermost line of the tracks is the image's border where so many times as many places lie on it as on any other:
@@ -75,33 +80,53 @@ def at_border(points: Tensor, seen: Tensor, feet: Sequence[int] = ()) -> Tensor:
 
 
 def doubled(points: Tensor, seen: Tensor, skeleton: Skeleton) -> list[int]:
-    """Joints that lie exactly where another lies in all frames, as where a format has none of its own.
+    """Joints that lie exactly where another lies whenever both are seen, as where a format has none of its own.
 
-    Of two of which a template knows that they are apart, the one that more bones lead to is no joint. Of a left and a
-    right one, or others as far out, either may be, so that both are left out. Nothing is said where half of the joints
-    are such: of a point, say.
+    Of two that are well apart in a template, and not joined by a bone that changes its length, the one that more bones
+    lead to is no joint. Of a left and a right one, or others as far out, either may be, so that both are left out; but
+    none that is often seen without the other. Nothing is said where half of the joints are such, of a point, say, nor
+    where the image's grid is coarse for the body: there joints meet.
 
     Args:
         points: (T, N, 2).
         seen: (T, N) bool.
         skeleton: whose first joints they are.
     """
-    if skeleton.template is None or not skeleton.is_tree:
+    if skeleton.template is None or not skeleton.is_tree or not bool(seen.any()):
         return []
+    some = seen.sum(1).argsort(descending=True)[:COMPARED]
+    place, shown = points[some], seen[some]
+    both = shown[:, :, None] & shown[:, None]
+    same = (place[:, :, None] == place[:, None]).all(-1)
+    pairs = (both & same).any(0) & ~(both & ~same).any(0)
     rest = skeleton.template_points(dtype=points.dtype, device=points.device)[: points.shape[1]]
-    apart = (rest[:, None] - rest).norm(dim=-1) > 0
-    for some in (slice(0, COMPARED), slice(None)):  # of all frames, few pairs are left
-        pairs = apart.triu().nonzero()
-        place, shown = points[some], seen[some]
-        both = shown[:, pairs[:, 0]] & shown[:, pairs[:, 1]]
-        same = (place[:, pairs[:, 0]] == place[:, pairs[:, 1]]).all(-1)
-        like = (same | ~both).all(0) & ((both.sum(0) >= SELDOM) | (len(place) < len(points)))
-        apart = torch.zeros_like(apart)
-        apart[pairs[like, 0], pairs[like, 1]] = True
+    known = torch.where(seen[..., None], points, torch.nan)
+    size = (known - nanmedian(known, 1, keepdim=True)).norm(dim=-1).nanmedian()
+    apart = (rest[:, None] - rest).norm(dim=-1) / (rest - rest.median(0).values).norm(dim=-1).median() * size
+    pairs &= (apart > COARSE * _grid(points[seen])) & (apart > APART * size)
+    loose = skeleton.bone_index(device=points.device)[~skeleton.rigid_mask(device=points.device)]
+    loose = loose[(loose < len(rest)).all(1)]  # as those to wrists that hands have of their own
+    pairs[loose[:, 0], loose[:, 1]] = pairs[loose[:, 1], loose[:, 0]] = False
+    out = torch.zeros_like(seen[0])
     ends = incidence(skeleton.bone_index(device=points.device), skeleton.num_joints, dtype=points.dtype)
-    far = chain_inverse(ends).abs().sum(1)[: len(apart)]  # in bones, from the middle of all joints
-    out = (apart & (far[:, None] > far - 0.1)).any(1) | (apart & (far[:, None] < far + 0.1)).any(0)
+    far = chain_inverse(ends).abs().sum(1)  # in bones, from the middle of all joints
+    for a, b in pairs.triu(1).nonzero().tolist():
+        both = seen[:, a] & seen[:, b]
+        if int(both.sum()) < SELDOM or bool((points[both, a] != points[both, b]).any()):
+            continue
+        for one, other in ((a, b), (b, a)):
+            alone = int(both.sum()) < MOSTLY * int(seen[:, one].sum())
+            rarer = int(both.sum()) < MOSTLY * int(seen[:, other].sum())
+            out[one] |= not alone and (rarer or bool(far[one] > far[other] - 0.1))
     return out.nonzero().flatten().tolist() if 2 * int(out.sum()) < len(out) else []
+
+
+def _grid(places: Tensor) -> float:
+    """The finest power of ten, from 1 down to .001, of which all numbers are multiples; 0 if there is none."""
+    for grid in (1.0, 0.1, 0.01, 0.001):
+        if bool(((places / grid).round() * grid - places).abs().amax() < 1e-3 * grid):
+            return grid
+    return 0.0
 
 
 def without_doubled(tracks: Tracks) -> Tracks:
@@ -112,7 +137,7 @@ def without_doubled(tracks: Tracks) -> Tracks:
         return tracks
     weights = tracks.weights[:, :count].clone()
     weights[:, out] = 0
-    which = f"{listed([names[joint] for joint in out], 6)}: exactly where another joint is in all frames"
+    which = f"{listed([names[joint] for joint in out], 6)}: exactly where another joint is wherever both are seen"
     return rebuilt(tracks, tracks.points[:, :count], weights, f"{which}: taken as unseen")
 
 
@@ -150,7 +175,8 @@ def repeats(points: Tensor, seen: Tensor) -> Tensor:
     known = torch.where(seen[..., None], points, torch.nan)
     size = (known - nanmedian(known, 1, keepdim=True)).norm(dim=-1).nanmedian()
     step = nanmedian((known[1:] - known[:-1]).norm(dim=-1), 1)
-    moves = torch.cat([none[:1], new & (step > MOVED * size)])
+    before = torch.nn.functional.pad(step, (JUST, 0), value=torch.nan)[:-1].unfold(0, JUST, 1)
+    moves = torch.cat([none[:1], new & (step > MOVED * size) & ~(step < SLOWS * nanmedian(before, -1))])
     start = torch.where(same, 0, torch.arange(1, len(same) + 1, device=same.device)).cummax(0).values - 1
     ends = torch.cat([~same[1:], ~none[:1]]) & same
     long = torch.zeros_like(same)
