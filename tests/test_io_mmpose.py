@@ -137,7 +137,16 @@ def test_3d_joints_are_refused(tmp_path):
         load_tracks(path)
 
 
-@pytest.mark.parametrize("third", [lambda i, one: one["keypoint_scores"][i], lambda i, _: i % 3, lambda i, _: i / 20])
+THIRDS = [
+    lambda i, one: one["keypoint_scores"][i],
+    lambda i, one: 100 * one["keypoint_scores"][i],
+    lambda i, one: round(one["keypoint_scores"][i], 1) + 0.04,
+    lambda i, _: i % 3,
+    lambda i, _: -1 if i % 5 == 0 else i / 15,
+]
+
+
+@pytest.mark.parametrize("third", THIRDS)
 def test_rows_may_hold_scores_or_flags_again(tmp_path, third):
     tracks = load_tracks(write_json(tmp_path / "a.json", with_third(third)))
     assert np.allclose(numbers(tracks), person(4, 17))

@@ -166,7 +166,7 @@ def _is_depth(third: NDArray[np.float64], scores: NDArray[np.float64]) -> bool:
     if shares or np.allclose(third, scores, atol=0.05):
         return False
     a, b = third - third.mean(), scores - scores.mean()
-    return bool((a * b).sum() < LIKE * np.sqrt((a * a).sum() * (b * b).sum()))
+    return bool((third < 0).any() or (a * b).sum() < LIKE * np.sqrt((a * a).sum() * (b * b).sum()))
 
 
 def _length(value: Any) -> int:
