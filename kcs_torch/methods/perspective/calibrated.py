@@ -79,6 +79,7 @@ def reconstruct_perspective(
             The best body is then refined with feet that stand still.
         guessed: focal length of usual lenses, if that of the intrinsics is a guess. Tracks are then lifted through such
             a lens, and the focal length is found together with what was found through it, and noted; feet as above.
+            Exact tracks of a body that is close then are lifted anew once.
 
     Returns:
         The reconstruction in the camera's frame: ``points + (0, 0, distance)`` projects onto the image. Its unit is one
