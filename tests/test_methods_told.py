@@ -1,6 +1,7 @@
 """What every method does with joints that are not seen, and what it tells the user: warnings, errors, notes."""
 
 import math
+import re
 import warnings
 from dataclasses import dataclass, replace
 
@@ -292,6 +293,23 @@ def test_joints_in_another_order_are_warned_of():
     told = [str(w.message) for w in caught if "hardly a body of skeleton 'h36m17': bones are" in str(w.message)]
     assert len(told) == 1 and "joints may be wrong, swapped" in told[0]
     assert any("hardly a body of skeleton 'h36m17'" in note for note in result.diagnostics.notes)
+
+
+def test_a_bone_far_longer_than_its_twin_is_warned_of():
+    """One place of a template is mistyped: its bone follows, and the tracks of one view do not object."""
+    tracks = walking_person(30, skeleton="h36m17", yaw=30.0, turn=60.0).tracks
+    right = tracks.skeleton
+    places = dict(zip(right.joints, right.template, strict=True))
+    knee, ankle = torch.tensor(places["left_knee"]), torch.tensor(places["left_ankle"])
+    bones = [(right.joints[a], right.joints[b]) for a, b in right.bones]
+    for times, told in ((1, False), (3, True)):
+        places["left_ankle"] = (knee + times * (ankle - knee)).tolist()
+        body = Skeleton.from_names(right.joints, bones, template=places)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = reconstruct(tracks.points, skeleton=body, fps=30).diagnostics.notes
+        words = r"left_knee-left_ankle is [23]\.\d times as long as right_knee-right_ankle: joints may be wrong"
+        assert any(re.match(words, note) for note in found) == told
 
 
 @pytest.mark.parametrize(

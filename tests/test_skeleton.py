@@ -192,6 +192,16 @@ def test_graphs_are_admitted_when_asked_for():
             lambda: leg(hinges=[KNEE | {"parent": "left_heel", "axis": ["left_hip", "right_hip"]}]),
             "Add the bone left_heel-left_knee",
         ),
+        (lambda: leg(hinges=[KNEE, KNEE | {"bends": "forward"}]), "hinge at 'left_knee' bends both ways"),
+        (lambda: Skeleton("abcd", [(0, 1)], mirror=[(0, 1), (2, 0)]), "mirror: 'a' has two twins: expected each joint in one"),
+        (
+            lambda: Skeleton("ab", [(0, 1)], template=[(1, 2, 3)] * 2),
+            "template: both ends of bone a-b lie in one place",
+        ),
+        (
+            lambda: Skeleton("abcd", [(0, 1), (1, 2), (2, 3)], template=[(x, 0, 0) for x in (0, 1, 2, 500)]),
+            "bone c-d is 498 times as long as the median bone: is it in another unit",
+        ),
         (lambda: leg(contacts=["left_hel"]), "did you mean 'left_heel'"),
         (lambda: leg(contacts="left_heel"), "contacts of skeleton '.*': expected a list, got 'left_heel'"),
         (lambda: leg(contacts=3), "contacts of .* expected a list, got 3"),
@@ -248,10 +258,10 @@ def trees(draw):
     names = draw(st.lists(st.text(min_size=1, max_size=8), min_size=2, max_size=12, unique=True))
     bones = [(draw(st.integers(0, i - 1)), i) for i in range(1, len(names))]
     bones = [b if draw(st.booleans()) else b[::-1] for b in bones]
-    number = st.floats(-1e3, 1e3)
+    number = st.floats(-300, 300)
     extras = {}
     if draw(st.booleans()):
-        extras["template"] = [draw(st.tuples(number, number, number)) for _ in names]
+        extras["template"] = [(*draw(st.tuples(number, number)), 20.0 * i) for i in range(len(names))]
     if draw(st.booleans()):
         extras["proportions"] = [draw(st.floats(1e-6, 1e6)) for _ in bones]
     if draw(st.booleans()):
@@ -262,7 +272,8 @@ def trees(draw):
         extras["contacts"] = sorted(draw(st.sets(st.integers(0, len(names) - 1))))
     chains = [(a, b, c) for a, b in bones for d, c in bones if b == d]
     if chains:
-        ends = [draw(st.tuples(st.sampled_from(chains), st.permutations(range(len(names))))) for _ in range(2)]
+        end = st.tuples(st.sampled_from(chains), st.permutations(range(len(names))))
+        ends = draw(st.lists(end, min_size=1, max_size=2, unique_by=lambda e: (e[0], tuple(e[1][:2]))))
         extras["hinges"] = [
             Hinge(*chain, *order[:2], draw(st.sampled_from([1.0, -1.0])), draw(st.floats(0, 1)))
             for chain, order in ends

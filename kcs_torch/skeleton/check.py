@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import statistics
+from collections import Counter
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
@@ -15,6 +18,10 @@ if TYPE_CHECKING:
     from kcs_torch.skeleton.core import Skeleton
 
 __all__ = ["as_tuples", "check_facts", "check_observed", "check_tree"]
+
+SAME, HUGE = 1e-6, 100.0
+"""Length of a template's bone, over that of the median bone, up to which its ends are one place, and from which on it
+is none of this body's: a thigh is 20 times as long as a finger's bones."""
 
 
 def as_tuples(body: Skeleton) -> dict[str, Any]:
@@ -58,6 +65,11 @@ def check_facts(body: Skeleton) -> None:
     for a, b in body.mirror:
         if not (0 <= a < n and 0 <= b < n) or a == b:
             raise SkeletonError(f"{where}: mirror ({a}, {b}): expected two different joint indices in 0..{n - 1}")
+    twice = sorted(i for i, count in Counter(i for pair in body.mirror for i in pair).items() if count > 1)
+    if twice:
+        raise SkeletonError(
+            f"{where}: mirror: '{body.joints[twice[0]]}' has two twins: expected each joint in one pair"
+        )
     for i in body.flexible:
         if not 0 <= i < body.num_bones:
             raise SkeletonError(f"{where}: flexible {i}: expected bone indices 0..{body.num_bones - 1}")
@@ -68,6 +80,7 @@ def check_facts(body: Skeleton) -> None:
         for joint, p in zip(body.joints, body.template, strict=True):
             if len(p) != 3 or not all(map(math.isfinite, p)):
                 raise SkeletonError(f"{where}: template: '{joint}': expected 3 finite numbers, got {p}")
+        _check_places(body, body.template, where)
     if body.proportions is not None:
         if len(body.proportions) != body.num_bones:
             raise SkeletonError(f"{where}: proportions: expected {body.num_bones} lengths, got {len(body.proportions)}")
@@ -76,10 +89,30 @@ def check_facts(body: Skeleton) -> None:
                 raise SkeletonError(f"{where}: proportions: bone {bone}: expected a positive number, got {length}")
 
 
+def _check_places(body: Skeleton, template: Sequence[Sequence[float]], where: str) -> None:
+    """What the lengths of a template's bones tell of its places."""
+    if not body.bones:
+        return
+    lengths = [math.dist(template[a], template[b]) for a, b in body.bones]
+    usual = statistics.median(lengths)
+    shortest, longest = (lengths.index(pick(lengths)) for pick in (min, max))
+    if lengths[shortest] <= SAME * usual:
+        raise SkeletonError(
+            f"{where}: template: both ends of bone {body.bone_names[shortest]} lie in one place: expected two places, "
+            "or no template"
+        )
+    if lengths[longest] > HUGE * usual:
+        raise SkeletonError(
+            f"{where}: template: bone {body.bone_names[longest]} is {lengths[longest] / usual:.0f} times as long as "
+            "the median bone: is it in another unit?"
+        )
+
+
 def _check_motion(body: Skeleton, where: str) -> None:
     """What is said of hinges, contacts and spread."""
     n = body.num_joints
     joined = {frozenset(b) for b in body.bones}
+    ways: dict[tuple[int, ...], float] = {}
     for hinge in body.hinges:
         if not isinstance(hinge, Hinge):
             raise SkeletonError(
@@ -98,6 +131,8 @@ def _check_motion(body: Skeleton, where: str) -> None:
                 )
         if hinge.sign not in (1, -1):
             raise SkeletonError(f"{what}: sign: expected 1 (backward) or -1 (forward), got {hinge.sign}")
+        if ways.setdefault(used, hinge.sign) != hinge.sign:
+            raise SkeletonError(f"{what} bends both ways: expected one of them")
         if not 0 <= hinge.firm <= 1:
             raise SkeletonError(f"{what}: weight: expected a number within 0..1, got {hinge.firm}")
     for i in body.contacts:

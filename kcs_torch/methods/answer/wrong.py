@@ -43,6 +43,10 @@ AWAY, OFTEN = 0.25, 0.1
 of frames that have to show it, from which on it is another joint; or most joints in this share of the frames, which are
 another body's. Noise of 40 mm comes to .1 of the size."""
 
+UNEVEN, MUCH = 1.5, 0.15
+"""How many times as long as its twin on the other side a bone is, and by what share of the body's size, from which on
+one of them is another bone."""
+
 POINT = 1e-6
 """Size in the image, over the depth, up to which a body is a point."""
 
@@ -83,9 +87,11 @@ def what_is_wrong(
     none = [""] * len(settled)
     loose = _loose_bones(points, body, lengths, clips) if method.keeps_lengths and any(settled) else none
     loose = [words if sure else "" for words, sure in zip(loose, settled, strict=True)]
-    odd = _odd_bodies(points, body, lengths) if method.knows_template(body) else none
+    odd, uneven = none, none
+    if method.knows_template(body):
+        odd, uneven = _odd_bodies(points, body, lengths), _uneven_bodies(points, body, lengths, clips)
     far = _far_joints(images, body, clips) if method.keeps_lengths else none
-    return [[f"{words}: {WHY_LOOSE}" for words in told if words] for told in zip(loose, odd, far, strict=True)]
+    return [[f"{words}: {WHY_LOOSE}" for words in told if words] for told in zip(loose, odd, far, uneven, strict=True)]
 
 
 def _far_joints(images: Tensor, body: Skeleton, clips: Clips) -> list[str]:
@@ -166,4 +172,25 @@ def _odd_bodies(points: Tensor, body: Skeleton, lengths: Tensor) -> list[str]:
             f"this is hardly a body of skeleton '{body.name}': bones are {math.exp(every[k]):.1f} times as long or as "
             f"short as usual{also}"
         )
+    return told
+
+
+def _uneven_bodies(points: Tensor, body: Skeleton, lengths: Tensor, clips: Clips) -> list[str]:
+    """Which bones of points (K, T, N, 3) are far longer than their twins, for the user; empty where none is."""
+    told, rigid = [""] * len(points), set(body.rigid)
+    twins = [pair for pair in body.mirror_bones if rigid.issuperset(pair)]
+    if not twins:
+        return told
+    shown = ever_seen(clips.seen.any(1), body)[:, twins].all(-1)  # (K, P)
+    both = nanmedian(lengths, 1)[:, twins]  # (K, P, 2)
+    long, short = both.amax(-1), both.amin(-1)
+    size = clips.mean((points - points.mean(2, keepdim=True)).square().sum(-1).mean(-1, keepdim=True)).sqrt()
+    uneven = shown & (long > UNEVEN * short) & (long - short > MUCH * size)
+    for k in uneven.any(1).nonzero().flatten().tolist():
+        named = {}
+        for pair in uneven[k].nonzero().flatten().tolist():
+            longer = int(both[k, pair].argmax())
+            names, times = [body.bone_names[b] for b in twins[pair]], float(long[k, pair] / short[k, pair])
+            named[f"{names[longer]} is {times:.1f} times as long as {names[1 - longer]}"] = times
+        told[k] = _the_worst(named, "bone")
     return told
