@@ -242,6 +242,22 @@ def test_score_names_what_it_compares(scored):
     assert "taken to point up" not in run("score", scored / "pred.npz", scored / "truth.trc", "--truth-up", "y").output
 
 
+def test_units_of_score_are_of_whichever_file_does_not_say(scored):
+    run("convert", scored / "truth.trc", scored / "truth.bvh", "--units", "cm")
+    for pred, truth, unit, most in (
+        ("truth.trc", "truth.bvh", "cm", 10),
+        ("truth.bvh", "truth.trc", "mm", 100),
+        ("pred.npz", "truth.bvh", "cm", 10),
+        ("pred.npz", "truth.trc", "mm", 100),
+    ):
+        words = ["score", scored / pred, scored / truth, "--from-units", "cm", "--align", "none", "--json"]
+        found = json.loads(run(*words).stdout)
+        assert found["units"] == unit
+        assert found["mpjpe"]["none"] < most
+        told = f"{truth}: the file says that its unit is mm: its numbers are read as mm, and units=cm"
+        assert any(told in note for note in found["notes"]) == (truth == "truth.trc")
+
+
 def test_score_as_json(scored):
     words = ["score", scored / "pred.npz", scored / "truth.trc", "--align", "similarity", "--align", "none", "--json"]
     data = json.loads(run(*words).stdout)

@@ -28,11 +28,14 @@ FromUp = Annotated[
     typer.Option(
         "--from-up",
         metavar="y|z|x|-y|-z",
-        help="The axis that points up in IN, if it is 3D motion and does not say so.",
+        help="The axis that points up in a file of 3D motion, whatever the file says; y if neither says.",
     ),
 ]
 FromUnits = Annotated[
-    str | None, typer.Option("--from-units", metavar="m|cm|mm|in|ft", help="The unit of a file that does not say so.")
+    str | None,
+    typer.Option(
+        "--from-units", metavar="m|cm|mm|in|ft", help="The unit of a file of 3D motion, whatever the file says."
+    ),
 ]
 
 

@@ -101,7 +101,7 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         names=names,
         fps=found.fps,
         units=found.unit,
-        up=up,
+        likely_up=up,
         notes=found.notes,
     )
 
