@@ -494,3 +494,11 @@ def test_results_keep_their_path_in_depth_whatever_is_said_of_them(tmp_path):
     of = lambda motion, name: motion.points[:, motion.skeleton.index(name)]  # noqa: E731
     torch.testing.assert_close(of(fewer, "left_knee"), of(plain, "left_knee"))
     assert load_motion(tmp_path / "r.npz", units="metres").units == "m"
+
+
+@pytest.mark.parametrize("units", ["", "  "])
+def test_a_size_has_a_unit(units):
+    result = walk_result(4)
+    for motion in (result, Motion.of(result)):
+        with pytest.raises(OptionError, match="units: expected the name of the new unit"):
+            motion.scaled(units=units, height=1.75)
