@@ -325,8 +325,8 @@ def _folders(path: Path) -> str:
 
 
 def brief(value: Any) -> str:
-    """A text from a file as a message shows it, cut where it is long."""
-    text = str(value)
+    """A text from a file as a message shows it: cut where it is long, halves of characters escaped."""
+    text = str(value).encode("utf-8", "backslashreplace").decode()
     return text if len(text) <= 100 else f"{text[:96]} ..."
 
 
