@@ -100,7 +100,8 @@ def unknown(what: str, name: object, choices: Iterable[str], error: type[KcsErro
         small = {choice.lower(): choice for choice in choices}
         close = [small[found] for found in difflib.get_close_matches(str(name)[:100].lower(), small, n=2)]
     hint = f": did you mean {' or '.join(repr(c) for c in close)}?" if close else ":"
-    listing = f"(choices: {', '.join(choices)})" if close else f"choices are {', '.join(choices)}"
+    listing = ", ".join(choice or "''" for choice in choices)
+    listing = f"(choices: {listing})" if close else f"choices are {listing}"
     return error(f"unknown {what} {shown}{hint} {listing}")
 
 

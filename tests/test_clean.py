@@ -122,6 +122,18 @@ def test_savgol_takes_the_window_whose_gain_is_nearest(cutoff):
     assert miss(window) <= min(miss(length) for length in windows) + 1e-9
 
 
+@pytest.mark.parametrize("cutoff", [0.004, 1e-6, 1e-300])
+def test_savgol_refuses_windows_that_are_no_cubics_or_fill_the_memory(cutoff):
+    with pytest.raises(kt.errors.OptionError, match=r"smooth: cutoff: expected at least 0\.0044 Hz for savgol at 50"):
+        kt.clean.smooth(tracks_of(sine(1.0)), "savgol", cutoff)
+
+
+def test_smoothing_nothing_is_told():
+    tracks = tracks_of(sine(1.0))
+    with pytest.raises(kt.errors.ShapeError, match="smooth: expected joints that are seen in some frame, got none"):
+        kt.clean.smooth(replace(tracks, weights=0 * tracks.weights))
+
+
 def test_savgol_near_half_the_frame_rate_is_the_shortest():
     assert "over 5 frames" in kt.clean.smooth(tracks_of(sine(1.0)), "savgol", 24.9).notes[-1]
 

@@ -242,6 +242,22 @@ def test_score_names_what_it_compares(scored):
     assert "taken to point up" not in run("score", scored / "pred.npz", scored / "truth.trc", "--truth-up", "y").output
 
 
+def test_units_of_score_are_of_whichever_file_does_not_say(scored):
+    run("convert", scored / "truth.trc", scored / "truth.bvh", "--units", "cm")
+    for pred, truth, unit, most in (
+        ("truth.trc", "truth.bvh", "cm", 10),
+        ("truth.bvh", "truth.trc", "mm", 100),
+        ("pred.npz", "truth.bvh", "cm", 10),
+        ("pred.npz", "truth.trc", "mm", 100),
+    ):
+        words = ["score", scored / pred, scored / truth, "--from-units", "cm", "--align", "none", "--json"]
+        found = json.loads(run(*words).stdout)
+        assert found["units"] == unit
+        assert found["mpjpe"]["none"] < most
+        told = f"{truth}: the file says that its unit is mm: its numbers are read as mm, and units=cm"
+        assert any(told in note for note in found["notes"]) == (truth == "truth.trc")
+
+
 def test_score_as_json(scored):
     words = ["score", scored / "pred.npz", scored / "truth.trc", "--align", "similarity", "--align", "none", "--json"]
     data = json.loads(run(*words).stdout)
@@ -338,3 +354,44 @@ def test_score_takes_the_unit_of_files_without_one(scored):
     same = run("score", scored / "pred.npz", scored / "truth.npz", "--align", "root").output
     pick = lambda text: float(next(l for l in text.splitlines() if l.startswith("root")).split()[1])  # noqa: E731, E741
     assert pick(told) == pytest.approx(pick(same), rel=1e-3)
+
+
+# ---------------------------------------------------------------------- everybody
+
+
+@pytest.fixture
+def crowd(tmp_path):
+    """Two people of one file, beside one another."""
+    one = walk_result(12).tracks.points[:, :17]
+    rows = ["frame,person," + ",".join(f"{j}_x,{j}_y" for j in kt.SKELETONS["coco17"].joints[:17])]
+    for t, points in enumerate(one.tolist()):
+        for who in range(2):
+            rows.append(f"{t},{who}," + ",".join(f"{x + 5000 * who:.3f},{y:.3f}" for x, y in points))
+    (tmp_path / "crowd.csv").write_text("\n".join(rows) + "\n")
+    return tmp_path
+
+
+def test_everybody_of_a_file_has_a_file(crowd):
+    done = run("convert", crowd / "crowd.csv", crowd / "o.npz", "--person", "all")
+    assert sorted(p.name for p in crowd.glob("*.npz")) == ["o_0.npz", "o_1.npz"]
+    assert "wrote " + str(crowd / "o_1.npz") in done.stdout
+    means = [float(kt.load_tracks(crowd / f"o_{k}.npz").points[:, :17, 0].mean()) for k in range(2)]
+    assert abs(means[1] - means[0]) == pytest.approx(5000, abs=1)
+
+
+def test_nobody_is_written_where_somebody_cannot_be(crowd):
+    (crowd / "o_1.npz").write_text("mine")
+    words = ["convert", crowd / "crowd.csv", crowd / "o.npz", "--person", "all"]
+    assert "o_1.npz: is there" in run(*words, code=2).stderr
+    assert not (crowd / "o_0.npz").exists()
+    run(*words, "--overwrite")
+    assert len(kt.load_tracks(crowd / "o_1.npz").points) == 12
+    assert "a person is chosen of 2D tracks" in run(
+        "convert", _motion(crowd), crowd / "p.npz", "--person", "all", code=2
+    ).stderr  # fmt: skip
+    assert not list(crowd.glob("p*.npz"))
+
+
+def _motion(folder):
+    Motion.of(walk_result(4)).scaled(units="m", factor=1e-3).save(folder / "m.trc")
+    return folder / "m.trc"

@@ -54,6 +54,7 @@ def test_rays_of_nothing_and_of_what_is_not_known():
 @pytest.mark.parametrize(
     ("value", "kind", "says"),
     [
+        ([1500, 1500.0], kt.ShapeError, r"got \[1500, 1500\.0\]: the principal point is lacking"),
         ((1500, 1500, 960), kt.ShapeError, r"got shape \(3,\)"),
         ((1500, 1500, 960, 540, -0.2, 0.1), kt.ShapeError, r"got shape \(6,\): a lens that distorts .* undistort the"),
         ((np.eye(3), np.zeros(5)), kt.ShapeError, r"got two arrays: a lens that distorts .*undistortPoints"),

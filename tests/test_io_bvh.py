@@ -320,7 +320,7 @@ def test_one_frame_is_enough(tmp_path):
 
 @pytest.mark.parametrize("factor", [1e-28, 1e24])
 def test_bodies_of_any_size_keep_their_joints(tmp_path, factor):
-    motion = walking_motion(3).scaled(units="", factor=factor)
+    motion = walking_motion(3).scaled(units="u", factor=factor)
     back = load_motion(save(motion, tmp_path / "w.bvh", notes=[]))
     assert back.skeleton.joints == motion.skeleton.joints
     assert torch.allclose(back.points / factor, motion.points / factor, atol=1e-6)

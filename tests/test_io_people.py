@@ -93,9 +93,19 @@ def test_ids_that_do_not_say_who_is_who_are_no_ids(ids, say):
     assert f"a track id {say}: people are followed by their places, not by the ids" in a.notes
 
 
+def test_half_characters_of_ids_are_shown_escaped():
+    a, _ = read(two([0, 1, 1, 0, 1, 0], [["\ud800a"] * 6, ["b"] * 6]))
+    assert a.notes[0] == "the file calls this one '\\ud800a'"
+    "".join(a.notes).encode()
+
+
 @pytest.mark.parametrize(
     ("value", "expected"),
-    [(3, 3), ([0.0], 0), ([[7]], 7), ("p1", "p1"), (-1, None), (True, None), ([1, 2], None), (None, None), ({}, None)],
+    [
+        *[(3, 3), ([0.0], 0), ([[7]], 7), ("p1", "p1"), (-1, None), (True, None), ([1, 2], None), (None, None)],
+        *[({}, None), ("0", 0), (" 7 ", 7), ("7.0", 7), ("7.5", "7.5"), ("07", "07"), ("-1", None), ("  ", None)],
+        ("9" * 5000, "9" * 5000),
+    ],
 )
 def test_track_ids(value, expected):
     assert as_track_id(value) == expected

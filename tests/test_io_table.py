@@ -263,7 +263,7 @@ def test_joints_of_one_name_but_for_blanks_have_no_columns_of_their_own(tmp_path
 
 
 def test_coordinates_as_large_as_tracks_may_have_are_read_back(tmp_path, result):
-    back = load_motion(kt.save(Motion.of(result).scaled(units="", factor=1e24), tmp_path / "walk.csv"))
+    back = load_motion(kt.save(Motion.of(result).scaled(units="u", factor=1e24), tmp_path / "walk.csv"))
     assert torch.allclose(back.points / 1e24, Motion.of(result).points, rtol=1e-6, atol=1e-6)
 
 
@@ -442,3 +442,44 @@ def test_which_way_is_up_is_told_where_it_is_assumed(tmp_path):
     path = write_table(tmp_path / "a.csv", ("snout", "tail"), ("x", "y", "z"))
     assert any("point up" in note for note in load_motion(path).notes)
     assert not any("point up" in note for note in load_motion(path, up="-y").notes)
+
+
+def _two_people(path, spelt, *, long=False):
+    """Two people, 300 px apart, six frames; ``spelt`` tells what a frame calls each of them."""
+    rows = ["frame,person,joint,x,y" if long else "frame,person,a_x,a_y,b_x,b_y"]
+    for t in range(6):
+        for who in range(2):
+            places = {"a": (300 * who + 10 + t, 20), "b": (300 * who + 15 + t, 60)}
+            start = f"{t},{spelt(t, who)}"
+            if long:
+                rows += [f"{start},{name},{x},{y}" for name, (x, y) in places.items()]
+            else:
+                rows.append(",".join([start, *(f"{x},{y}" for x, y in places.values())]))
+    return lines(path, *rows)
+
+
+@pytest.mark.parametrize("long", [False, True])
+@pytest.mark.parametrize(
+    "spelt", [lambda t, who: f"{who}.0" if t % 2 else who, lambda t, who: f" {who}" if t % 2 else who]
+)
+def test_a_person_is_one_however_the_number_is_spelt(tmp_path, spelt, long):
+    people = load_people(_two_people(tmp_path / "a.csv", spelt, long=long), skeleton=None)
+    assert [int(one.seen.any(1).sum()) for one in people] == [6, 6]
+    assert {one.notes[0] for one in people} == {"the file calls this one '0'", "the file calls this one '1'"}
+
+
+@pytest.mark.parametrize("missing", ["", "nan", "NA", "-1"])
+def test_somebody_without_an_id_is_followed_by_place(tmp_path, missing):
+    spelt = lambda t, who: missing if who and t == 3 else f"p{who}"  # noqa: E731
+    people = load_people(_two_people(tmp_path / "a.csv", spelt))
+    assert [int(one.seen.any(1).sum()) for one in people] == [6, 6]
+    assert all(any("a track id is missing in frame 3" in note for note in one.notes) for one in people)
+    nobody = load_people(_two_people(tmp_path / "b.csv", lambda t, who: missing))
+    assert [int(one.seen.any(1).sum()) for one in nobody] == [6, 6]
+
+
+def test_motion_of_two_without_ids_is_not_of_one(tmp_path):
+    rows = [f"{t},,{x},1,1,{x + 1},2,2,{x + 2},3,3" for t in range(3) for x in (0, 50)]
+    path = lines(tmp_path / "a.csv", "frame,person,a_x,a_y,a_z,b_x,b_y,b_z,c_x,c_y,c_z", *rows)
+    with pytest.raises(FormatError, match="expected the motion of one body, got several"):
+        load_motion(path)

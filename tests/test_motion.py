@@ -349,7 +349,7 @@ def test_an_unknown_size_is_told(tmp_path):
     notes: list[str] = []
     save(motion, tmp_path / "m.bvh", notes=notes)
     assert any("--scale height=1.75m" in note for note in notes)
-    hand = replace(kt.Motion.from_arrays(torch.rand(3, 21, 3), skeleton="hand21", fps=30), units="px")
+    hand = replace(Motion.from_arrays(torch.rand(3, 21, 3), skeleton="hand21", fps=30), units="px")
     with pytest.warns(kt.KcsWarning, match="set it with .* or --scale wrist-thumb_cmc=...mm"):
         save(hand, tmp_path / "hand.trc")
     with pytest.raises(OptionError, match="'hand21' has none: give a bone, such as wrist-thumb_cmc"):
@@ -460,3 +460,45 @@ def test_own_virtual_joints_are_as_sure_as_they_are_told():
 def test_a_distance_is_a_number_that_something_tells(lens, distance):
     with pytest.raises(OptionError, match="distance: expected a number"):
         walk(8).tracks(intrinsics=lens, distance=distance)
+
+
+def test_what_is_said_of_a_file_goes_before_it_and_a_note_tells(tmp_path):
+    made = Motion.from_arrays(torch.rand(5, 17, 3, dtype=torch.float64), skeleton="h36m17", units="m", fps=30)
+    made.save(tmp_path / "a.trc")
+    made.save(tmp_path / "a.npz")
+    read = load_motion(tmp_path / "a.trc", units="Centimetres")
+    assert read.units == "cm"
+    note = "the file says that its unit is m: its numbers are read as cm, as units=cm (kcs-torch: --from-units) asks"
+    assert note in read.notes
+    turned = load_motion(tmp_path / "a.npz", up="z")
+    assert "the file says that y points up: z is taken to, as up=z (kcs-torch: --from-up) asks" in turned.notes
+    for same in (load_motion(tmp_path / "a.npz", up="y", units="m"), load_motion(tmp_path / "a.npz")):
+        assert not same.notes
+        torch.testing.assert_close(same.points, made.points, rtol=0, atol=0)
+    with pytest.raises(OptionError, match="unknown unit 'foo'"):
+        load_motion(tmp_path / "a.npz", units="foo")
+
+
+def test_results_keep_their_path_in_depth_whatever_is_said_of_them(tmp_path):
+    result = walk_result(12).scaled(units="m", factor=1e-3)
+    path = torch.linspace(0, 3, 12).to(result.points)
+    replace(result, root_depth=path).save(tmp_path / "r.npz")
+    plain = load_motion(tmp_path / "r.npz")
+    assert float(plain.points[..., 2].amax() - plain.points[..., 2].amin()) > 2.5
+    for same in ({"up": "-y"}, {"skeleton": plain.skeleton}):
+        torch.testing.assert_close(load_motion(tmp_path / "r.npz", **same).points, plain.points, rtol=0, atol=0)
+    turned = load_motion(tmp_path / "r.npz", up="z")
+    torch.testing.assert_close(turned.points[..., 1], -plain.points[..., 2])
+    assert any("the file says that -y points up: z is taken to" in note for note in turned.notes)
+    fewer = load_motion(tmp_path / "r.npz", skeleton="h36m17")
+    of = lambda motion, name: motion.points[:, motion.skeleton.index(name)]  # noqa: E731
+    torch.testing.assert_close(of(fewer, "left_knee"), of(plain, "left_knee"))
+    assert load_motion(tmp_path / "r.npz", units="metres").units == "m"
+
+
+@pytest.mark.parametrize("units", ["", "  "])
+def test_a_size_has_a_unit(units):
+    result = walk_result(4)
+    for motion in (result, Motion.of(result)):
+        with pytest.raises(OptionError, match="units: expected the name of the new unit"):
+            motion.scaled(units=units, height=1.75)

@@ -45,6 +45,7 @@ def test_round_trip_of_random_trees(body):
         ("", FormatError, "expected a mapping"),
         ("joints: [a, b\n", FormatError, "does not parse"),
         ("joints: [a, b]\nbones: [[a, c]]\n", SkeletonError, "arm.yaml: unknown joint in bones"),
+        ("joints: ['', b]\nbones: [[h, b]]\n", SkeletonError, "unknown joint in bones .*'h': choices are '', b"),
         ("joints: [a, b]\nbones: [3]\n", SkeletonError, "arm.yaml.*expected pairs"),
         ("joints: [a, b]\nbones: [[a, b]]\ntemplate: {a: [0, 0, 0], b: here}\n", SkeletonError, "arm.yaml.*3 numbers"),
         ("joints: [a, b]\nbones: [[a, b]]\ntemplate: {a: [0, 0, 0], b: [1]}\n", SkeletonError, "arm.yaml.*3 numbers"),

@@ -163,7 +163,12 @@ def test_telling_many_clips_takes_few_more_operations_than_one():
             NotFiniteError,
             "e 3$",
         ),
-        ("cameras", lambda x: x * torch.linspace(1, 2, len(x))[:, None, None], ShapeError, "in frame 27; a scale"),
+        (
+            "cameras",
+            lambda x: x * torch.linspace(1, 2, len(x))[:, None, None],
+            ShapeError,
+            "27 frames, the first .* is 1;",
+        ),
         ("scales", lambda x: torch.where(torch.arange(len(x)) == 5, -x, x), ShapeError, "got -.* in frame 5$"),
         ("deviation", lambda x: x[1:], ShapeError, r"expected a tensor \(28, 17\), got \(27, 17\)"),
         ("points", lambda _: None, ShapeError, "points: expected a tensor .* got NoneType"),

@@ -345,7 +345,7 @@ def test_bones_are_named_in_any_spelling():
     lengths = torch.arange(1.0, body.num_bones + 1)
     own = float(lengths[body.bone_names.index("LKnee-LAnkle")])
     for name in ("LKnee-LAnkle", "left_knee-left_ankle", "left_ankle-left_knee", "l_knee-LAnkle"):
-        assert size_factor(body, lengths, None, {name: 430.0}) == pytest.approx(430 / own)
+        assert size_factor(body, lengths, None, {name: 430.0}, units="mm") == pytest.approx(430 / own)
         check_size(body, name)
     for name in ("left_knee-right_ankle", "left_knee", "horn-tail"):
         with pytest.raises(OptionError, match="LKnee-LAnkle"):

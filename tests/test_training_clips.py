@@ -94,6 +94,28 @@ def test_bvh_files_of_one_skeleton(tmp_path):
     torch.testing.assert_close(length, true, rtol=0.02, atol=2)
 
 
+def test_what_is_said_of_files_holds_of_those_that_do_not_say(tmp_path):
+    walk = kt.Motion.from_arrays(walking_person(40).points, up="-y", skeleton="h36m17", fps=30, units="mm")
+    names = ["a.bvh", "b.trc", "c.npz"]
+    for name in names:
+        walk.save(tmp_path / name)
+    files = [tmp_path / name for name in names]
+    clips = file_clips(files, skeleton="h36m17", fps=30, up="y", units="mm", file_units="cm")
+    body = clips[0].skeleton
+    true = bone_lengths(walk.points, body.bones).mean(0).float()
+    for clip in clips:
+        torch.testing.assert_close(bone_lengths(clip.points, body.bones).mean(0), true, rtol=0.02, atol=2)
+    (clip,) = file_clips(files[2:3], skeleton="h36m17", fps=30, up="z", units="mm")
+    torch.testing.assert_close(clip.points, clips[2].points)
+
+
+def test_tracks_sized_motion_is_no_motion_to_train_on(tmp_path):
+    walk = kt.Motion.from_arrays(walking_person(40).points, up="-y", skeleton="h36m17", fps=30, units="px")
+    walk.save(tmp_path / "a.npz")
+    with pytest.raises(FormatError, match=r"a\.npz: expected a unit .*, got px: set its true size first"):
+        file_clips([tmp_path / "a.npz"], skeleton="h36m17", fps=30, up=None, units="mm", file_units="cm")
+
+
 def test_resampling_keeps_what_a_parabola_has():
     time = torch.arange(13.0, dtype=torch.float64)
     values = torch.stack([time, time**2, 3 - time + 0.5 * time**2], -1)[:, None]

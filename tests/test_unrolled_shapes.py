@@ -19,7 +19,7 @@ from numerics import (
 from torch.testing import assert_close
 from unrolled_scenes import each_body, scene
 
-from kcs_torch.errors import OptionError, ShapeError, SkeletonError
+from kcs_torch.errors import NotFiniteError, OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import rows_to_cameras
 from kcs_torch.nn import UnrolledFPC, UnrolledPKC, UnrolledSfAM
 
@@ -59,6 +59,15 @@ def test_autocast_does_not_coarsen(device):
             assert torch.equal(module(tracks, cameras), expected)
             start = normal(6, 7, 3, dtype=torch.bfloat16, device=device)
             assert module(tracks, cameras, start=start).dtype == torch.float32
+
+
+def test_cameras_that_are_not_finite_are_named():
+    tracks, cameras, _ = scene(BODY)
+    cameras = cameras.clone()
+    cameras[2] = torch.nan
+    for module in (UnrolledFPC(2), UnrolledSfAM(BODY, 2)):
+        with pytest.raises(NotFiniteError, match=r"and cameras, where any are given, finite numbers in every frame"):
+            module(tracks, cameras)
 
 
 def test_shapes_that_do_not_fit():

@@ -20,6 +20,7 @@ from kcs_torch.types import Diagnostics, Intrinsics, Reconstruction, Tracks
 from kcs_torch.viewer import player, sheet
 from kcs_torch.viewer.colours import COLOURS, bone_keys, bone_side, joint_keys
 from kcs_torch.viewer.film import Film
+from kcs_torch.viewer.names import as_people
 from kcs_torch.viewer.summary import summarise
 
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)>&amp;\u2028'
@@ -272,6 +273,21 @@ def test_people_of_no_clip_are_told(result):
         player([])
     with pytest.raises(OptionError, match="expected 1 names, got 2"):
         player(result, names=["a", "b"])
+
+
+@pytest.mark.parametrize("view", [player, lambda people: Film(as_people(people, "film"), 1.0)])
+def test_people_in_several_units_are_told_or_shown_in_the_first_ones(result, view):
+    ours = result.scaled(units="m", factor=1e-3)
+    theirs = ours.scaled(units="mm", factor=1e3)
+    made = view([ours, theirs])
+    if isinstance(made, str):
+        data = scene(made)
+        assert data["units"] == "m"
+        assert np.allclose(shown(data), shown(data, person=1), atol=1e-6)
+    else:
+        assert np.allclose(*made.points)
+    with pytest.raises(OptionError, match="everybody in one unit of length, got m and px .*--scale"):
+        view([ours, replace(result, units="px")])
 
 
 def test_names_from_files_are_text_and_not_markup(result):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kcs_torch.clean.common import Array
+from kcs_torch.errors import OptionError
 
 __all__ = ["FILTERS", "Filter"]
 
@@ -16,6 +17,9 @@ _STEPS = 60
 """Rounds in which less trusted frames give way to others; each leaves at most 1 - (least weight) of the error."""
 
 _SAVGOL_DEGREE = 3
+
+_LONGEST = 12_000
+"""Frames of a Savitzky-Golay window, at most: SciPy's coefficients of longer ones (from 15 879) are no cubic's."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,13 @@ def savgol(cutoff: float, fps: float, size: float) -> Filter:
         return float(taps @ np.cos(2 * math.pi * cutoff / fps * np.arange(-half, half + 1)))
 
     # The gain falls with the window's length until far below -3 dB; twice Schafer's estimate (2011) is beyond that.
-    below, above = 2, math.ceil(1.25 * fps / cutoff) + 4
+    period = fps / cutoff
+    if period > _LONGEST:
+        raise OptionError(
+            f"smooth: cutoff: expected at least {1.05 * fps / _LONGEST:.2g} Hz for savgol at {fps:g} frames a second, "
+            f"got {cutoff:g}: its window would be longer than {_LONGEST} frames"
+        )
+    below, above = 2, math.ceil(1.25 * period) + 4
     while above - below > 1:
         middle = (below + above) // 2
         below, above = (middle, above) if gain(middle) > math.sqrt(0.5) else (below, middle)

@@ -15,7 +15,7 @@ from kcs_torch.clean.common import Array, body_size, check_tracks, frame_rate, n
 from kcs_torch.clean.detector import found_by_detector
 from kcs_torch.clean.filters import FILTERS, Filter
 from kcs_torch.clean.sides import unswap
-from kcs_torch.errors import KcsWarning, unknown, users_level
+from kcs_torch.errors import KcsWarning, ShapeError, unknown, users_level
 from kcs_torch.types import Reconstruction, Tracks
 from kcs_torch.types.arrays import as_doubles
 
@@ -52,7 +52,9 @@ def smooth(
         The same kind of thing.
 
     Raises:
-        OptionError: the method is unknown, the rate is unknown, or the cut-off is not below half of it.
+        OptionError: the method is unknown, the rate is unknown, or the cut-off is not below half of it, or so low that
+            savgol's window has more than 12 000 frames.
+        ShapeError: the tracks show no joint in any frame.
 
     Warns:
         KcsWarning: the tracks' left and right are swapped in some frames, which :func:`unswap` should mend first.
@@ -71,6 +73,8 @@ def smooth(
     number(cutoff, "smooth: cutoff", expected, below=rate / 2)
     if isinstance(motion, Reconstruction):
         return _smooth_result(motion, method, cutoff, rate)
+    if not bool(tracks.seen.any()):
+        raise ShapeError(f"{tracks.source}: smooth: expected joints that are seen in some frame, got none")
     count = tracks.skeleton.num_observed
     points = as_doubles(tracks.points[:, :count])
     weights = as_doubles(tracks.weights[:, :count])

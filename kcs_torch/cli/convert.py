@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from kcs_torch.cli.detect import numbered
 from kcs_torch.cli.options import (
     ImageSize,
     InFormat,
@@ -18,8 +20,11 @@ from kcs_torch.cli.options import (
     person_number,
     would_replace,
 )
-from kcs_torch.cli.outputs import Pitch, Scale, Units, Up, parse_scale, write_files
+from kcs_torch.cli.outputs import Pitch, Scale, Units, Up, Written, parse_scale, write_files
 from kcs_torch.cli.report import answer, progress
+
+if TYPE_CHECKING:
+    from kcs_torch.types import Motion, Reconstruction, Tracks
 
 __all__ = ["FromUnits", "FromUp", "convert"]
 
@@ -28,11 +33,14 @@ FromUp = Annotated[
     typer.Option(
         "--from-up",
         metavar="y|z|x|-y|-z",
-        help="The axis that points up in IN, if it is 3D motion and does not say so.",
+        help="The axis that points up in a file of 3D motion, whatever the file says; y if neither says.",
     ),
 ]
 FromUnits = Annotated[
-    str | None, typer.Option("--from-units", metavar="m|cm|mm|in|ft", help="The unit of a file that does not say so.")
+    str | None,
+    typer.Option(
+        "--from-units", metavar="m|cm|mm|in|ft", help="The unit of a file of 3D motion, whatever the file says."
+    ),
 ]
 
 
@@ -71,7 +79,11 @@ def convert(
     fps: Rate = None,
     person: Annotated[
         str | None,
-        typer.Option(metavar="NUMBER", help="Which person's 2D tracks, counted from 0; the most visible if not given."),
+        typer.Option(
+            metavar="NUMBER|all",
+            help="Which person's 2D tracks, counted from 0, the most visible first; or all: each in a separate file "
+            "(OUT_0, OUT_1, ...). The most visible if not given.",
+        ),
     ] = None,
     threshold: Threshold = None,
     size: ImageSize = None,
@@ -82,35 +94,66 @@ def convert(
 ) -> None:
     """Convert tracks, results and motion from one kind of file to another."""
     with answer():
-        from kcs_torch.errors import OptionError, OutputError
-        from kcs_torch.io import load_any
+        from kcs_torch.errors import OptionError
         from kcs_torch.types import Reconstruction, Tracks
 
-        output = check_outputs(output, source=source)
-        for path in output:
-            if would_replace(path) and not overwrite:
-                raise OutputError(
-                    f"{path}: is there. One file is converted at a time, into all that follow it (a * may list more): "
-                    "give another name, or --overwrite to replace it"
-                )
+        every = person == "all"
+        if not every:
+            output = _free(output, source, overwrite)
         true_size = parse_scale(scale)
         with progress(f"reading {source}"):
-            data = load_any(
+            people = _read(
                 source,
+                every,
                 format=format,
                 skeleton=skeleton,
                 fps=fps,
                 up=from_up,
                 units=from_units,
-                person=person_number(person),
+                person=0 if every else person_number(person),
                 threshold=threshold,
                 image_size=image_size(size),
                 trust=trust,
             )
-        known = () if isinstance(data, Reconstruction) else data.notes
         if true_size is not None:
-            if isinstance(data, Tracks):
+            moving = [one for one in people if not isinstance(one, Tracks)]
+            if len(moving) < len(people):
                 raise OptionError("--scale: 2D tracks have no true size: lift them first")
-            data = data.scaled(**true_size)
-        written = write_files(data, output, up, units, pitch)
+            people = [one.scaled(**true_size) for one in moving]
+        outputs = [output]
+        if every:
+            outputs = [_free([numbered(path, k) for path in output], source, overwrite) for k in range(len(people))]
+        written, known = Written(), []
+        for data, paths in zip(people, outputs, strict=True):
+            if not isinstance(data, Reconstruction):
+                known += [f"{data.source}: {note}" if every else note for note in data.notes]
+            written.add(write_files(data, paths, up, units, pitch))
         written.tell(known)
+
+
+def _free(paths: Sequence[Path], source: str, overwrite: bool) -> list[Path]:
+    """The files, each once, if they can be written and are not there, or may be replaced.
+
+    Raises:
+        OutputError: one cannot, or is there.
+    """
+    from kcs_torch.errors import OutputError
+
+    paths = check_outputs(paths, source=source)
+    for path in paths:
+        if would_replace(path) and not overwrite:
+            raise OutputError(
+                f"{path}: is there. One file is converted at a time, into all that follow it (a * may list more): "
+                "give another name, or --overwrite to replace it"
+            )
+    return paths
+
+
+def _read(source: str, every: bool, **options: Any) -> list[Reconstruction | Motion | Tracks]:
+    """What is there: of 2D tracks the one person, or everybody; errors as of :func:`kcs_torch.io.load_any`."""
+    from kcs_torch.io import load_any, load_people
+    from kcs_torch.io.anything import kind_of
+
+    if every and options["up"] is options["units"] is None and kind_of(source, options["format"]) == "tracks":
+        return [*load_people(source, **{k: v for k, v in options.items() if k not in ("up", "units", "person")})]
+    return [load_any(source, **options)]

@@ -138,6 +138,12 @@ class Written:
             except Exception as error:
                 self.errors.append(error)
 
+    def add(self, other: Written) -> None:
+        """Count in what became of more files."""
+        self.files.extend(other.files)
+        self.notes.extend(other.notes)
+        self.errors.extend(other.errors)
+
     def tell(self, known: Sequence[str] = ()) -> None:
         """Say what was written, after notes that are known; raise what went wrong, alone where nothing was written.
 

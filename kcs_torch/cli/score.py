@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kcs_torch.cli.cleaning import frame_range
-from kcs_torch.cli.convert import FromUnits
 from kcs_torch.cli.options import AsJson
 from kcs_torch.cli.outputs import Scale, parse_scale, sized
 from kcs_torch.cli.report import answer, one_line, print_json, progress
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["score"]
 
-_Up = "The axis that points up in {}, if the file does not say so: y, z, x, -y (the camera's axes) or -z."
+_Up = "The axis that points up in {}, whatever the file says; y if neither says: y, z, x, -y (the camera's axes) or -z."
 _Format = "Format of {}; recognised by its content if not given."
 _Frames = "Take frames A to B of {}, counted from 0, without B (A: and :B extend to the ends)."
 
@@ -69,19 +68,25 @@ def score(
     truth_frames: Annotated[str | None, typer.Option(metavar="A:B", help=_Frames.format("TRUTH"))] = None,
     pred_fps: Annotated[float | None, typer.Option(metavar="NUMBER", help="PRED's frames a second.")] = None,
     truth_fps: Annotated[float | None, typer.Option(metavar="NUMBER", help="TRUTH's frames a second.")] = None,
-    from_units: FromUnits = None,
+    from_units: Annotated[
+        str | None,
+        typer.Option(
+            "--from-units",
+            metavar="m|cm|mm|in|ft",
+            help="The unit of PRED or TRUTH, or of both, where the file does not say; one that does keeps its own.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare a motion with ground truth; joints are matched by name, frames by number."""
     with answer(as_json):
-        from kcs_torch.io import load_motion
         from kcs_torch.metrics import compare
 
         with progress(f"reading {pred}"):
-            ours = _motion(pred, parse_scale(scale), format=pred_format, up=pred_up, fps=pred_fps)
+            ours = _motion(pred, parse_scale(scale), pred_format, pred_up, pred_fps, from_units)
             ours = _cut(ours, pred_frames, "--pred-frames")
         with progress(f"reading {truth}"):
-            theirs = load_motion(truth, format=truth_format, up=truth_up, fps=truth_fps, units=from_units)
+            theirs = _read(truth, truth_format, truth_up, truth_fps, from_units)
             theirs = _cut(theirs, truth_frames, "--truth-frames")
         found = compare(ours, theirs, align=align or None, root=root, mirror=mirror, within=within)
         read = [*_notes(ours, pred, pred_format, "--pred"), *_notes(theirs, truth, truth_format, "--truth")]
@@ -92,17 +97,27 @@ def score(
             typer.echo(_spoken(found, pred, truth, mirror))
 
 
-def _motion(path: str, size: dict[str, Any] | None, *, format: str | None, **options: Any) -> Motion:
+def _motion(
+    path: str, size: dict[str, Any] | None, format: str | None, up: str | None, fps: float | None, units: str | None
+) -> Motion:
     """A result, which knows its own bones' lengths, or any other motion; in its true size."""
-    from kcs_torch.io import load_any, load_motion
+    from kcs_torch.io import load_any
     from kcs_torch.io.anything import kind_of
     from kcs_torch.types import Motion, Reconstruction
 
     if kind_of(path, format) == "result":
-        data = load_any(path, format=format, **options)
+        data = load_any(path, format=format, up=up, fps=fps)
         assert isinstance(data, Reconstruction)
         return dataclasses.replace(Motion.of(sized(data, size)), source=path)
-    return sized(load_motion(path, format=format, **options), size)
+    return sized(_read(path, format, up, fps, units), size)
+
+
+def _read(path: str, format: str | None, up: str | None, fps: float | None, units: str | None) -> Motion:
+    """Motion, in these units where the file does not say its own: they are of both files."""
+    from kcs_torch.io.motion import read_motion
+    from kcs_torch.io.registry import MotionOptions
+
+    return read_motion(path, format, MotionOptions(None, fps, up, units, fill_in=("units",)))
 
 
 def _notes(motion: Motion, path: str, format: str | None, own: str) -> list[str]:

@@ -44,7 +44,8 @@ def why_failed(matrix: Tensor, error: Exception) -> NotFiniteError | ShapeError:
         return ShapeError(f"singular values: {error}")
     return NotFiniteError(
         f"singular values: expected finite numbers, got NaN or infinite ones in a {tuple(matrix.shape)} array: "
-        "give unseen joints weights of 0; where a network made them, its training diverged"
+        "give unseen joints weights of 0, and cameras, where any are given, finite numbers in every frame; where a "
+        "network made them, its training diverged"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from kcs_torch.errors import FormatError, unknown
@@ -9,8 +10,12 @@ from kcs_torch.io.registry import MotionOptions, Probe, check_fps, discover_moti
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion
 from kcs_torch.types.axes import AXES
+from kcs_torch.types.size import METRES, short_unit
 
-__all__ = ["MOTION_READERS", "detect_motion_format", "load_motion"]
+__all__ = ["MOTION_READERS", "detect_motion_format", "load_motion", "read_motion"]
+
+UNITS = (*METRES, "px")
+"""Units that a caller may say a file's numbers are in."""
 
 MOTION_READERS = discover_motion()
 """The formats that 3D motion comes in, by name."""
@@ -48,11 +53,14 @@ def load_motion(
         skeleton: a :class:`Skeleton`, a built-in name or a YAML/JSON file, whose joints are found by name; as the file
             says if None. For AMC the .asf file, if it is not beside it.
         fps: frames per second; as the file says if None.
-        up: the axis that points up in the file: y, z, x, -y (a camera's axes) or -z; as the file says if None, or y.
-        units: of the file's numbers, where it does not say (BVH).
+        up: the axis that points up in the file: y, z, x, -y (a camera's axes) or -z, whatever it says itself; as the
+            file says if None, or y.
+        units: of the file's numbers: m, cm, mm, in, ft or px, whatever it says itself; as the file says if None. BVH
+            does not say.
 
     Returns:
-        The motion, turned so that y is up; ``notes`` say what was assumed.
+        The motion, turned so that y is up; ``notes`` say what was assumed, and where ``up`` or ``units`` contradict the
+        file.
 
     Raises:
         FormatError: the path cannot be read as motion.
@@ -60,11 +68,20 @@ def load_motion(
         SkeletonError: the joints do not fit the skeleton.
         OptionError: an option is unknown or out of range.
     """
+    return read_motion(path, format, MotionOptions(skeleton, fps, up, units))
+
+
+def read_motion(path: str | Path, format: str | None, options: MotionOptions) -> Motion:
+    """As :func:`load_motion`, but some options may only fill in what the file does not say."""
     if format is not None and format not in MOTION_READERS:
         raise unknown("format", format, MOTION_READERS)
-    if up is not None and up not in AXES:
-        raise unknown("axis for up", up, AXES)
-    check_fps(fps)
+    if options.up is not None and options.up not in AXES:
+        raise unknown("axis for up", options.up, AXES)
+    if options.units is not None:
+        options = replace(options, units=short_unit(options.units))
+        if options.units not in UNITS:
+            raise unknown("unit", options.units, UNITS)
+    check_fps(options.fps)
     probe = Probe(path)
     reader = MOTION_READERS[detect_motion_format(path) if format is None else format]
-    return reader.read(probe.path, MotionOptions(skeleton, fps, up, units))
+    return reader.read(probe.path, options)

@@ -87,13 +87,15 @@ class MotionOptions:
             says.
         fps: frames per second; None: as the file says.
         up: which axis of the file points up (see ``Motion.from_arrays``); None: as the file says.
-        units: of the file's numbers; None: as the file says.
+        units: of the file's numbers, in short letters; None: as the file says.
+        fill_in: which of ``up`` and ``units`` hold only where the file does not say; the others go before it.
     """
 
     skeleton: str | Path | Skeleton | None = None
     fps: float | None = None
     up: str | None = None
     units: str | None = None
+    fill_in: tuple[str, ...] = ()
 
 
 class Probe:
@@ -323,8 +325,8 @@ def _folders(path: Path) -> str:
 
 
 def brief(value: Any) -> str:
-    """A text from a file as a message shows it, cut where it is long."""
-    text = str(value)
+    """A text from a file as a message shows it: cut where it is long, halves of characters escaped."""
+    text = str(value).encode("utf-8", "backslashreplace").decode()
     return text if len(text) <= 100 else f"{text[:96]} ..."
 
 

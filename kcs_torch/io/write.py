@@ -163,11 +163,11 @@ def takes_up(path: str | Path) -> bool:
 
 
 def save_people(results: Sequence[Reconstruction], path: str | Path) -> Path:
-    """Write several people of one clip to one file: .html, .gif, .mp4 or .rrd.
+    """Write several people of one clip to one file, in the first one's unit: .html, .gif, .mp4 or .rrd.
 
     Raises:
         OutputError: files of this suffix hold one person, or it is unknown, or the file cannot be written.
-        OptionError: there is nobody, or the frame rates differ.
+        OptionError: there is nobody, the frame rates differ, or units that do not convert.
 
     Warns:
         KcsWarning: the clips are not equally long, so that they may begin at different frames.

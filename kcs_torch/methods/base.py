@@ -316,9 +316,10 @@ def check_cameras(cameras: Tensor, frames: int, what: str = "cameras") -> Tensor
         where = f"{counted(len(lost), 'frame')}, the first of which is {int(lost[0])}"
         raise ShapeError(f"{what}: expected finite numbers, got NaN or infinity in {where}")
     off = (cameras @ cameras.mT - torch.eye(2, dtype=cameras.dtype, device=cameras.device)).abs().amax((-2, -1))
-    if bool((off > 0.01).any()):
+    wrong = (off > 0.01).nonzero().flatten()
+    if len(wrong):
         raise ShapeError(
-            f"{what}: expected the first two rows of rotations, got rows that are not orthonormal in frame "
-            f"{int(off.argmax())}; a scale belongs to the tracks"
+            f"{what}: expected the first two rows of rotations, got rows that are not orthonormal in "
+            f"{counted(len(wrong), 'frame')}, the first of which is {int(wrong[0])}; a scale belongs to the tracks"
         )
     return cameras

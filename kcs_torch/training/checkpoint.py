@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import FormatError, KcsError, OptionError, OutputError, listed, unknown
 from kcs_torch.io.atomic import atomic_path
-from kcs_torch.io.registry import need, read_error
+from kcs_torch.io.registry import check_fps, need, read_error
 from kcs_torch.nn import MLPLifter, RefinedLifter, TemporalLifter, UnrolledFPC, UnrolledSfAM
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers import Implicit
@@ -61,7 +61,8 @@ def save_lifter(
         The path.
 
     Raises:
-        OptionError: the network is none of these, or the notes are no JSON.
+        OptionError: the network is none of these, or its weights are not finite or not of one type; the notes are no
+            JSON; ``fps`` is no frame rate.
         OutputError: the file cannot be written.
 
     >>> import tempfile
@@ -69,8 +70,11 @@ def save_lifter(
     >>> load_lifter(path).network.options
     {'width': 8, 'num_blocks': 2, 'dropout': 0.1, 'window': 1}
     """
+    check_fps(fps)
     facts = {"version": version("kcs-torch"), "fps": fps, "notes": dict(notes or {})} | describe(network)
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
+    if fault := _fault(tensors):
+        raise OptionError(f"save_lifter: {path}: expected the weights of a trained network, got some that {fault}")
     try:
         text = json.dumps(facts, allow_nan=False)  # in this order: that of virtual joints counts
     except (TypeError, ValueError) as error:
@@ -214,17 +218,27 @@ def _build(path: Path, facts: Any, tensors: Mapping[str, Tensor]) -> nn.Module:
     wrong = [n for n in {*needed, *tensors} if n not in plan or n not in tensors or plan[n].shape != tensors[n].shape]
     if wrong:
         raise FormatError(f"{what}, got weights that do not fit its options: {min(wrong)}")
-    kinds = {value.dtype for name, value in tensors.items() if not name.startswith("solver.")}
-    if len(kinds) != 1 or not all(value.is_floating_point() for value in tensors.values()):
-        raise FormatError(f"{what}, got weights that are not of one floating-point type")
-    bad = [n for n, value in tensors.items() if not bool(torch.isfinite(value).all())]
-    if bad:
-        raise FormatError(f"{path}: weights that are not finite: {min(bad)}")
+    kinds = _kinds(tensors)
+    if fault := _fault(tensors):
+        raise FormatError(f"{what}, got weights that {fault}")
     with torch.random.fork_rng(devices=[]):  # reading draws no random numbers of the caller's
         network = make()
     (network.network if isinstance(network, RefinedLifter) else network).to(kinds.pop())
     network.load_state_dict(dict(tensors))
     return network
+
+
+def _kinds(tensors: Mapping[str, Tensor]) -> set[torch.dtype]:
+    """The types of a network's weights, without those of the solver behind it."""
+    return {value.dtype for name, value in tensors.items() if not name.startswith("solver.")}
+
+
+def _fault(tensors: Mapping[str, Tensor]) -> str:
+    """Why weights cannot be those of a network in a file; empty where they can."""
+    if len(_kinds(tensors)) != 1 or not all(value.is_floating_point() for value in tensors.values()):
+        return "are not of one floating-point type"
+    bad = [name for name, value in tensors.items() if not bool(torch.isfinite(value).all())]
+    return f"are not finite: {min(bad)}" if bad else ""
 
 
 def _checked(options: Any, count: int, what: str) -> dict[str, Any]:

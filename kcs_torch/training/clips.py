@@ -6,6 +6,7 @@ import glob
 import math
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,8 +15,9 @@ from torch import Tensor
 
 from kcs_torch.data import random_motion, walking_person
 from kcs_torch.errors import FormatError, KcsWarning, OptionError, SkeletonError, listed
-from kcs_torch.io import load_motion
 from kcs_torch.io.folders import natural_key
+from kcs_torch.io.motion import read_motion
+from kcs_torch.io.registry import MotionOptions
 from kcs_torch.skeleton import Skeleton, get_skeleton, map_joints
 from kcs_torch.training.seeds import generator_of
 from kcs_torch.types import Motion
@@ -96,9 +98,9 @@ def file_clips(
         files: in any format of :func:`kcs_torch.load_motion`.
         skeleton: whose joints are found by name; as the first file says if None.
         fps: frames per second that they are brought to; as they are if None.
-        up: the axis that points up in the files; as they say if None.
+        up: the axis that points up in those files that do not say.
         units: of the clips.
-        file_units: of the files' numbers, where they do not say.
+        file_units: of the numbers of those files that do not say.
 
     Raises:
         FormatError: a file is no motion, or its frame rate or unit is unknown.
@@ -111,14 +113,15 @@ def file_clips(
         KcsWarning: a body stands on its head, as the file does not say which axis is up.
     """
     body = None if skeleton is None else get_skeleton(skeleton)
+    options = MotionOptions(body, None, up, file_units, fill_in=("up", "units"))
     out = []
     told: set[str] = set()
     for path in files:
-        motion = load_motion(path, skeleton=body if skeleton is not None else None, up=up, units=file_units)
+        motion = read_motion(path, None, options)
         if body is None:
             body = motion.skeleton
         elif skeleton is not None and (taken := [note for note in motion.notes if note.startswith(IN_ORDER)]):
-            _check_names(load_motion(path, up=up, units=file_units).skeleton, body, path)
+            _check_names(read_motion(path, None, replace(options, skeleton=None)).skeleton, body, path)
             if taken[0] not in told:
                 warnings.warn(f"{path}: {taken[0]}", KcsWarning, stacklevel=2)
             told.add(taken[0])
@@ -130,7 +133,8 @@ def file_clips(
         clip = _clip_of(motion, body, path, fps, units)
         if up is None and upside_down(clip.points[..., 1], clip.known, clip.skeleton):
             warnings.warn(
-                f"{path}: the body stands on its head: say which axis points up in the file, up='y' or 'z'",
+                f"{path}: the body stands on its head: say which axis points up, with up='y' or 'z' where the file "
+                "does not, else by writing it anew (kcs-torch convert IN OUT --from-up -y)",
                 KcsWarning,
                 stacklevel=2,
             )
@@ -155,9 +159,13 @@ def _clip_of(motion: Motion, body: Skeleton, path: Path, fps: float | None, unit
         points, known = resampled(points, known, motion.fps, fps)
     ratio = unit_ratio(motion.units, units)
     if ratio is None:
+        how = (
+            "set its true size first (kcs-torch convert --scale height=1.75m)"
+            if motion.units == "px"
+            else "give file_units=..., one of m, cm, mm"
+        )
         raise FormatError(
-            f"{path}: expected a unit of length that converts to {units}, got {motion.units or 'none'}: give "
-            "file_units=..., one of m, cm, mm"
+            f"{path}: expected a unit of length that converts to {units}, got {motion.units or 'none'}: {how}"
         )
     return _placed(from_y_up(points, "-y") * ratio, known, str(path), body)
 

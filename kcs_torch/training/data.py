@@ -49,9 +49,9 @@ class TracksDataModule(lightning.LightningDataModule):
         folder: that patterns are relative to.
         skeleton: whose joints are found by name in every file; that of the first file if None ("h36m17" of synthetic
             motion).
-        up: the axis that points up in the files; as they say if None.
+        up: the axis that points up in those files that do not say; y if None.
         units: of the tracks: mm, cm or m.
-        file_units: of the files, where they do not say (BVH).
+        file_units: of those files that do not say (BVH); others keep their own.
         fps: frames per second that all motion is brought to; None takes it as it is. 2D tracks that do not
             say theirs are taken as they are.
         window: frames of a window.

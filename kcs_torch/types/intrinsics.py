@@ -67,6 +67,8 @@ class Intrinsics:
             return value
         what = "intrinsics: expected (fx, fy, cx, cy) or a matrix K (3, 3)"
         if isinstance(value, (tuple, list)) and len(value) == 2:
+            if all(isinstance(x, (int, float)) for x in value):
+                raise ShapeError(f"{what}, got {value!r}: the principal point is lacking, the image's middle as a rule")
             raise ShapeError(f"{what}, got two arrays{STRAIGHTEN}")
         if isinstance(value, (tuple, list)) and len(value) == 4 and all(isinstance(x, (int, float)) for x in value):
             try:

@@ -279,8 +279,8 @@ class Reconstruction:
                 been measured is more exact.
 
         Raises:
-            OptionError: not exactly one of ``factor`` and a size is given, it is no positive number, or the skeleton
-                has no head or no leg to tell a stature from.
+            OptionError: the unit has no name, not exactly one of ``factor`` and a size is given, it is no positive
+                number, or the skeleton has no head or no leg to tell a stature from.
 
         Warns:
             KcsWarning: nobody is so tall: 1.75 mm, or 175 m.

@@ -61,8 +61,8 @@ def size_factor(
     lengths: Tensor,
     factor: float | None,
     sizes: Mapping[str, float],
-    what: str = "scaled",
-    units: str = "",
+    *,
+    units: str,
 ) -> float:
     """The factor by which a body of bone ``lengths`` (B,) grows to the one size that is given, or ``factor`` itself.
 
@@ -71,15 +71,18 @@ def size_factor(
         lengths: (B,) of its bones.
         factor: or None.
         sizes: one entry, ``height`` or the name of a bone, in the new unit; or none.
-        what: who asks, for messages.
         units: the new unit.
 
     Raises:
-        OptionError: not exactly one of ``factor`` and a size is given, it is unknown, or it is not positive.
+        OptionError: the unit has no name, not exactly one of ``factor`` and a size is given, it is unknown, or it is
+            not positive.
 
     Warns:
         KcsWarning: nobody is so tall in this unit.
     """
+    what = "scaled"
+    if not units:
+        raise OptionError(f"{what}: units: expected the name of the new unit, such as 'm', got nothing")
     if (factor is None) == (len(sizes) != 1):
         raise OptionError(f"{what}: expected either factor=... or exactly one size, such as height=1.75")
     if factor is None:

@@ -46,7 +46,7 @@ def player(
         The page's text.
 
     Raises:
-        OptionError: there is no result, the frame rates differ, or the number of names does.
+        OptionError: there is no result, the frame rates or unknown units differ, or the number of names does.
         OutputError: a result has no joint at a finite place.
     """
     people = as_people(results, "player")

@@ -8,20 +8,37 @@ from pathlib import Path
 from kcs_torch.errors import OptionError
 from kcs_torch.types import Reconstruction
 from kcs_torch.types.people import file_and_person
+from kcs_torch.types.size import unit_ratio
 
 __all__ = ["as_people", "clip_rate", "person_names", "printable"]
 
 
 def as_people(results: Reconstruction | Sequence[Reconstruction], what: str) -> list[Reconstruction]:
-    """One or several results as a list.
+    """One or several results as a list, all in the first one's unit.
 
     Raises:
-        OptionError: there is none; ``what`` is to be made of them.
+        OptionError: there is none, one is something else, or its unit is not known in the first one's; ``what`` is to
+            be made of them.
     """
     people = [results] if isinstance(results, Reconstruction) else list(results)
     if not people:
         raise OptionError(f"{what}: expected at least one result, got none")
-    return people
+    if wrong := [one for one in people if not isinstance(one, Reconstruction)]:
+        raise OptionError(f"{what}: expected results of reconstruct(), got {type(wrong[0]).__name__}")
+    return [_in_unit(one, people[0].units, what) for one in people]
+
+
+def _in_unit(result: Reconstruction, units: str, what: str) -> Reconstruction:
+    """A result in this unit."""
+    if result.units == units:
+        return result
+    ratio = unit_ratio(result.units, units)
+    if ratio is None:
+        raise OptionError(
+            f"{what}: expected everybody in one unit of length, got {units} and {result.units} ({result.tracks.source})"
+            ": give each one's true size, with scaled(units=..., height=...) (kcs-torch view: --scale height=1.75m)"
+        )
+    return result.scaled(units=units, factor=ratio)
 
 
 def clip_rate(results: Sequence[Reconstruction], what: str) -> float | None:

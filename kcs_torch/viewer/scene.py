@@ -34,15 +34,13 @@ def scene_of(results: Sequence[Reconstruction], names: Sequence[str] | None = No
     """Collect what the page's script draws.
 
     Args:
-        results: the people, one or more.
+        results: the people, one or more, in one unit.
         names: what to call them; found from their sources if None.
 
     Raises:
-        OptionError: one is none of reconstruct(), the frame rates differ, or the number of names does.
+        OptionError: the frame rates differ, or the number of names does.
         OutputError: a result has no joint at a finite place.
     """
-    if wrong := [r for r in results if not isinstance(r, Reconstruction)]:
-        raise OptionError(f"player: expected results of reconstruct(), got {type(wrong[0]).__name__}")
     rate = clip_rate(results, "player")
     names = person_names(results) if names is None else list(names)
     if len(names) != len(results):

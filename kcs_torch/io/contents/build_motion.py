@@ -14,7 +14,7 @@ from kcs_torch.errors import FormatError
 from kcs_torch.io.registry import MotionOptions, read_error
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Motion
-from kcs_torch.types.size import short_unit
+from kcs_torch.types.size import METRES, short_unit
 
 __all__ = ["build_motion", "distinct", "numbers", "read_lines"]
 
@@ -32,6 +32,7 @@ def build_motion(
     fps: float | None = None,
     units: str = "",
     up: str | None = None,
+    likely_up: str | None = None,
     notes: Sequence[str] = (),
     confidence: Tensor | None = None,
 ) -> Motion:
@@ -39,7 +40,7 @@ def build_motion(
 
     Args:
         points: (T, N, 3) in the file's axes, NaN where unseen.
-        options: of the caller; they go before what the file says.
+        options: of the caller; they go before what the file says, with a note, unless they are to fill in.
         source: the path.
         names: N joints or markers.
         edges: the file's (B, 2) bones.
@@ -47,6 +48,7 @@ def build_motion(
         fps: the file's frames per second.
         units: the file's units.
         up: the file's axis that points up, where it says.
+        likely_up: the axis that seems to, where it does not say and neither does the caller.
         notes: sentences for the user.
         confidence: (T, N), or None.
 
@@ -55,7 +57,10 @@ def build_motion(
         SkeletonError: the joints do not fit the skeleton that the caller wants.
     """
     remarks = list(notes)
-    axis = options.up or up
+    axis = _settled(up, options, "up", "{} points up: {} is taken to", remarks) or likely_up
+    unit = short_unit(units)
+    own = unit if unit in METRES or unit == "px" else None  # other words say nothing of the size
+    unit = _settled(own, options, "units", "its unit is {}: its numbers are read as {}", remarks) or unit
     if axis is None:
         axis = "y"
         longest = _longest(points)
@@ -77,10 +82,24 @@ def build_motion(
         joint_names=names,
         edges=None if options.skeleton else edges,
         fps=options.fps if options.fps is not None else fps,
-        units=short_unit(options.units) if options.units else units,
+        units=unit,
         source=source,
         notes=remarks,
     )
+
+
+def _settled(said: str | None, options: MotionOptions, option: str, how: str, notes: list[str]) -> str | None:
+    """What holds of what a file says and what the caller does; a note tells ``how`` they contradict each other."""
+    asked = getattr(options, option)
+    if None in (said, asked) or said == asked:
+        return said or asked
+    told = f"the file says that {how}, "
+    given = f"{option}={asked} (kcs-torch: --from-{option})"
+    if option in options.fill_in:
+        notes.append(f"{told.format(said, said)}and {given} is for a file that does not say")
+        return said
+    notes.append(f"{told.format(said, asked)}as {given} asks")
+    return asked
 
 
 def _longest(points: Tensor) -> str | None:

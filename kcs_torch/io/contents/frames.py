@@ -11,6 +11,7 @@ from kcs_torch.io.folders import frame_numbers, natural_key
 
 __all__ = ["as_track_id", "by_image", "by_number", "last_number"]
 
+_WHOLE = re.compile(r"(0|-?[1-9][0-9]{0,17})(?:\.0*)?")
 _NAME = re.compile(r"(?P<prefix>.*?)(?P<number>[0-9]{1,15})?(?P<suffix>\.[A-Za-z]\w*)?\Z", re.DOTALL)
 
 
@@ -72,9 +73,20 @@ def last_number(name: str) -> int | None:
 
 
 def as_track_id(value: object) -> Hashable:
-    """A track id as detectors write it, a number or text, sometimes in a list of one; None for anything else."""
+    """A track id as detectors write it, a number or text, sometimes in a list of one; None for anything else.
+
+    However it is spelt: text that is a whole number is this number.
+
+    >>> as_track_id(" 3.0"), as_track_id(3), as_track_id("03"), as_track_id("")
+    (3, 3, '03', None)
+    """
     while isinstance(value, list) and len(value) == 1:
         value = value[0]
-    if isinstance(value, bool) or not isinstance(value, (int, float, str)) or value == -1 or value != value:
+    if isinstance(value, str):
+        value = value.strip()
+        value = int(whole[1]) if (whole := _WHOLE.fullmatch(value)) else value
+    elif isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)) or value in (-1, "") or value != value:
         return None
     return value

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +69,7 @@ def read(path: Path, options: MotionOptions) -> Motion:
     order = _parents_first(body, asf)
     points = _positions(body, order, _angles(lines, body, path))
     places = {"root": 0} | {bone.name: i for i, bone in enumerate(order, 1)}
-    rest = MotionOptions(None if named else options.skeleton, options.fps, options.up, options.units)
+    rest = replace(options, skeleton=None) if named else options
     notes = [f"skeleton of {asf.name}"]
     if options.fps is None:
         notes.append("the file does not tell the frame rate (CMU's are mostly 120): give fps=... (kcs-torch: --fps)")

@@ -289,9 +289,19 @@ def _lens_in(file: Archive, values: Tensor) -> Intrinsics:
 def read_motion(path: Path, options: MotionOptions) -> Motion:
     """Read the 3D motion of a native file, or of a result."""
     file = Archive(path)
-    if "points3d_all" in file and "diagnostics" in file and options.skeleton is None and options.up is None:
+    if "points3d_all" in file and "diagnostics" in file:
         motion = Motion.of(load_reconstruction(path))
-        return dataclasses.replace(motion, fps=options.fps or motion.fps, units=options.units or motion.units)
+        return build_motion(
+            torch.where(motion.seen[..., None], from_y_up(motion.points, "-y"), math.nan),
+            options,
+            source=motion.source,
+            names=motion.skeleton.joints,
+            skeleton=motion.skeleton,
+            fps=motion.fps,
+            units=motion.units,
+            up="-y",
+            notes=motion.notes,
+        )
     if "points3d" not in file:
         raise FormatError(f"{path}: expected 3D motion under 'points3d', got {', '.join(file.keys) or 'nothing'}")
     points = torch.from_numpy(file.array("points3d", "fiu", 3).astype(np.float64))
@@ -303,8 +313,8 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         notes.append(
             "the axes are taken to be the camera's, y down: give up=... (kcs-torch: --from-up) if they are not"
         )
-    axis = file.text("up") if "up" in file else "-y"
-    if axis not in AXES:
+    axis = file.text("up") if "up" in file else None
+    if axis is not None and axis not in AXES:
         raise FormatError(f"{path}: 'up': expected one of {', '.join(AXES)}, got {axis[:20]!r}")
     names = file.texts("joint_names") if "joint_names" in file else [f"joint{i}" for i in range(points.shape[1])]
     if len(names) != points.shape[1]:
@@ -319,6 +329,7 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         fps=file.number("fps") if "fps" in file else None,
         units=file.text("units3d" if "units3d" in file else "units") if "units" in file else "",
         up=axis,
+        likely_up="-y",
         notes=[str(note) for note in notes],
         confidence=None if confidence is None else torch.from_numpy(confidence.astype(np.float64)),
     )

@@ -72,7 +72,7 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
     """Read the motion of the one body in the table."""
     probe = _file(path)
     found = (read_long if _is_long(probe) else read_wide)(path, depth=True)
-    several = len({s.track for frame in found.frames.values() for s in frame})
+    several = max(len({s.track for f in found.frames.values() for s in f}), *map(len, found.frames.values()), 0)
     if several > 1:
         raise FormatError(
             f"{path}: expected the motion of one body, got several: column '{found.who}' has {several}: "
@@ -101,7 +101,7 @@ def read_motion(path: Path, options: MotionOptions) -> Motion:
         names=names,
         fps=found.fps,
         units=found.unit,
-        up=up,
+        likely_up=up,
         notes=found.notes,
     )
 

@@ -16,7 +16,7 @@ from kcs_torch.io.containers.jsonfile import MOST_JOINTS, as_frame_number, as_te
 from kcs_torch.io.contents.landmarks import CONFIDENCES, VISIBILITIES, Landmarks
 from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.tables.header import Header, plain_name
-from kcs_torch.io.tables.wide import Row, as_value, opened, place_rows
+from kcs_torch.io.tables.wide import Row, as_person, as_value, opened, place_rows
 from kcs_torch.types.intake import FARTHEST
 
 __all__ = ["MOST", "LongHeader", "read_long"]
@@ -146,7 +146,7 @@ class _Table:
             self.numbers.extend(values)
             self.lines.append(i)
             self.joints.append(names.setdefault(name, len(names)))
-            self.people.append(0 if header.who is None else called.setdefault(cells[header.who].strip(), len(called)))
+            self.people.append(0 if header.who is None else called.setdefault(cells[header.who], len(called)))
         if len(names) > MOST_JOINTS:
             column = header.cells[header.joint]
             raise FormatError(f"{self.path}: '{column}': expected {MOST_JOINTS} joints at most, got {len(names)}")
@@ -171,10 +171,13 @@ class _Table:
             self._value(self.lines[i], k, f"{values[i, k]}")
         places, frame = np.unique(self._places(values), return_inverse=True)
         who, joint = np.frombuffer(self.people, np.int64), np.frombuffer(self.joints, np.int64)
-        people = list(self.called)
+        ids = [as_person(cell) for cell in self.called]
+        people = list(dict.fromkeys(ids))
+        at = {one: k for k, one in enumerate(people)}
+        who = np.array([at[one] for one in ids] or [0])[who]  # one of all, where no column tells
         numbered = len(self.names) == len(people) == len(np.unique(joint * len(people) + who))
         if header.who is None or len(people) == len(values) or numbered:  # numbers of rows or of joints, not of people
-            who, people = np.zeros_like(who), [""]
+            who, people = np.zeros_like(who), [0]
         elif len(people) > 1:
             out.who = header.cells[header.who]
         _, first, group = np.unique(frame * len(people) + who, return_index=True, return_inverse=True)

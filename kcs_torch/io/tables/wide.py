@@ -24,7 +24,7 @@ from kcs_torch.io.registry import brief, read_error
 from kcs_torch.io.tables.header import Columns, Header, Layout, delimiter, first_line
 from kcs_torch.types.intake import FARTHEST
 
-__all__ = ["Row", "as_float", "as_value", "no_numbers", "opened", "place_rows", "read_wide"]
+__all__ = ["Row", "as_float", "as_person", "as_value", "no_numbers", "opened", "place_rows", "read_wide"]
 
 _LIMIT = 2**30  # bytes of a file
 _HEAD = 2**20  # characters of the first line, at most
@@ -39,7 +39,7 @@ class Row(NamedTuple):
         where: file and row, for messages.
         number: of the frame; None where the table has none.
         time: of the frame; NaN where the table has none.
-        who: it is.
+        who: it is; None where a column that tells is empty.
         joints: (N, 3).
     """
 
@@ -168,7 +168,7 @@ def place_rows(rows: Sequence[Row], unit: str, out: Landmarks) -> None:
         rows = [row._replace(who=0) for row in rows]
     for row, number in zip(rows, numbers, strict=True):
         people = out.frames.setdefault(number, [])
-        if any(s.track in (None, row.who) for s in people):
+        if row.who is not None and any(s.track == row.who for s in people):
             again = f"frame {number}" if row.number is not None else f"time {row.time:g}"
             raise FormatError(f"{row.where}: expected every frame once, or a column 'person', got {again} again")
         people.append(Sighting(row.joints, row.who))
@@ -204,9 +204,14 @@ def _row(
             raise FormatError(f"{where}: '{name}': expected a whole number, got {got}")
     if header.time is not None:
         time = value(header.time[0])
-    who = 0 if header.who is None else as_track_id(cells[header.who])  # one row a frame is one body
+    who = 0 if header.who is None else as_person(cells[header.who])  # one row a frame is one body
     joints = [[value(c) if c >= 0 else none for c, none in zip(three, blank, strict=True)] for three in columns]
     return Row(where, number, time, who, np.array(joints))
+
+
+def as_person(cell: str) -> Hashable:
+    """Who a cell says that somebody is; None where it says nothing."""
+    return None if cell.strip().lower() in (*_MISSING, "nan") else as_track_id(cell)
 
 
 def as_value(cell: str, where: str, name: str) -> float:
