@@ -193,7 +193,10 @@ def test_graphs_are_admitted_when_asked_for():
             "Add the bone left_heel-left_knee",
         ),
         (lambda: leg(hinges=[KNEE, KNEE | {"bends": "forward"}]), "hinge at 'left_knee' bends both ways"),
-        (lambda: Skeleton("abcd", [(0, 1)], mirror=[(0, 1), (2, 0)]), "mirror: 'a' has two twins: expected each joint in one"),
+        (
+            lambda: Skeleton("abcd", [(0, 1)], mirror=[(0, 1), (2, 0)]),
+            "mirror: 'a' has two twins: expected each joint in one",
+        ),
         (
             lambda: Skeleton("ab", [(0, 1)], template=[(1, 2, 3)] * 2),
             "template: both ends of bone a-b lie in one place",

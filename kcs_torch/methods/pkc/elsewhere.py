@@ -39,6 +39,9 @@ ASIDE, FAST = 0.3, 8.0
 """A joint leaps where it moves by more than so many times the body's size in a frame, and by so many in a second: by
 13 cm, and at 3.5 m/s, of a person. In a million places of people's motion capture no joint leaps so, as suddenly."""
 
+QUICK = 2.0
+"""How many times as far, and as fast, joints leap of bodies without twins: fingers are quick for a hand's size."""
+
 SLOW = 10.0
 """Frames a second where nobody says how many there are: at few of them all motion is sudden."""
 
@@ -72,7 +75,9 @@ def elsewhere(points: Tensor, seen: Tensor) -> Tensor:
     return away
 
 
-def limbs_elsewhere(points: Tensor, seen: Tensor, rate: float, twins: Sequence[tuple[int, int]] = ()) -> Tensor:
+def limbs_elsewhere(
+    points: Tensor, seen: Tensor, rate: float, twins: Sequence[tuple[int, int]] = (), *, quick: float = 1.0
+) -> Tensor:
     """Detections (T, N) of joints that have leapt away and not yet back while the body stayed: of something else.
 
     A detector takes another's arm for this one's, or what an arm is hidden by, for some frames. No joint starts and
@@ -86,6 +91,7 @@ def limbs_elsewhere(points: Tensor, seen: Tensor, rate: float, twins: Sequence[t
         seen: (T, N) bool.
         rate: frames a second.
         twins: pairs of joints that may have changed places: where both leap nothing is told.
+        quick: how many times as far and as fast as a person's joints these have to go.
     """
     away, frames = torch.zeros_like(seen), torch.arange(len(points), device=points.device)
     known = torch.where(seen[..., None], points, torch.nan)
@@ -101,7 +107,7 @@ def limbs_elsewhere(points: Tensor, seen: Tensor, rate: float, twins: Sequence[t
     move = known[1:] - known.gather(0, last.clamp_min(0)[..., None].expand(-1, -1, 2))  # NaN where unseen
     move = torch.where((last < 0)[..., None], torch.nan, move)
     step = move.norm(dim=-1)
-    leaps = step > (FAST * gap / rate).clamp_min(ASIDE) * size  # NaN is not above
+    leaps = step > quick * (FAST * gap / rate).clamp_min(ASIDE) * size  # NaN is not above
     leaps &= leaps.sum(1, keepdim=True) <= FEW * seen.sum(1, keepdim=True)[1:]
     pace = nanmedian(torch.where(leaps, torch.nan, step / gap), 1)  # of the others
     leaps[there[1:][_lost(pace[there[1:] - 1])] - 1] = False
@@ -191,12 +197,12 @@ def without_strange_limbs(tracks: Tracks, *, swapped: bool = False) -> Tracks:
         tracks: of which some may be.
         swapped: whether left and right may have changed places in them, which is another's to mend.
     """
-    if not tracks.skeleton.mirror:  # fingers are quick for a hand's size
-        return tracks
     count = tracks.skeleton.num_observed
     seen = tracks.seen[:, :count]
     twins = [pair for pair in tracks.skeleton.mirror if max(pair) < count] if swapped else []
-    away = limbs_elsewhere(tracks.points[:, :count], seen, tracks.fps or SLOW, twins)
+    away = limbs_elsewhere(
+        tracks.points[:, :count], seen, tracks.fps or SLOW, twins, quick=1.0 if tracks.skeleton.mirror else QUICK
+    )
     if not bool(away.any()):
         return tracks
     names = listed([tracks.skeleton.joints[n] for n in away.any(0).nonzero().flatten().tolist()], 6)

@@ -10,18 +10,23 @@ from torch import Tensor
 from kcs_torch.functional.ranks import kth_smallest
 from kcs_torch.methods.clips.lockstep import Search
 from kcs_torch.methods.pkc.descents import Descent
-from kcs_torch.methods.pkc.moving_search import FINER, ROBOT, soften, too_long
-from kcs_torch.methods.pkc.moving_view import MovingView, relative_weights
+from kcs_torch.methods.pkc.moving_search import FINER, soften
+from kcs_torch.methods.pkc.moving_solutions import MovingView, agreement
+from kcs_torch.methods.pkc.moving_view import relative_weights
 from kcs_torch.solvers.procrustean import FINE, Pose
 
-__all__ = ["fill_gaps", "fillable", "freed", "gaps_of", "usual_noise"]
+__all__ = ["EXACT", "fill_gaps", "gaps_of", "likelier", "usual_noise"]
 
 GAP, SHOWN = 3.0, 0.1
 """How many times as noisy a joint is in a frame that does not show it, at least, as in frames that do; and the share of
 the frames that do, at least."""
 
-EXACT = 0.003
-"""Standard deviation of what is shown in exact tracks while their gaps are filled, a share of the body's size."""
+EXACT = 0.001
+"""Standard deviation of what is shown in exact tracks with gaps, a share of the body's size, of bodies without a
+template: x and y are unknowns then, which gaps need; held where each joint's own path has them, all is bent by them."""
+
+ALIKE, OTHER = 0.9, 0.7
+"""Correlation of depths from which on two solutions are one, and below which they are bodies that differ."""
 
 SURER = 0.2
 """Share of a gap's noise that is left where it is filled in space."""
@@ -54,19 +59,26 @@ def fill_gaps(image: Tensor, polished: Tensor, noise: Tensor) -> tuple[Tensor, T
     return image - image.mean(1, keepdim=True), noise
 
 
-def fillable(image: Tensor) -> bool:
-    """Whether one solution of the moving viewpoint may fill the gaps of an image (T, N, 2) for the next."""
-    return image.shape[1] > ROBOT and not too_long(image)
+def likelier(free: MovingView, held: MovingView, image: Tensor, noise: Tensor) -> Search[Descent, Pose, MovingView]:
+    """The likelier of two solutions of an image (T, N, 2) that both may leave in gaps now, by their noise (T, N).
 
-
-def freed(moving: MovingView, image: Tensor, noise: Tensor) -> Search[Descent, Pose, MovingView]:
-    """Solutions whose x and y, held so far, may leave the image (T, N, 2) in gaps, by their noise (T, N)."""
-    pose, stages = moving.pose, tuple(soften(stage, EXACT) for stage in FINE)
-    weights, pull = relative_weights(noise, EXACT), FINER[moving.stiffness]
-    (pose,) = yield [
-        Descent(image, pose.points, pose.rotations, moving.bones, weights, moving.rigid, pull, EXACT, stages)
-    ]
-    return replace(moving, pose=pose)
+    Args:
+        free: that might leave it from the start.
+        held: that might not. Its lead is one only if both agree: what it led is as wrong as what was held.
+        image: of the tracks.
+        noise: standard deviation of the joints in it.
+    """
+    stages, weights = tuple(soften(stage, EXACT) for stage in FINE), relative_weights(noise, EXACT)
+    poses = []
+    for moving in (free, held):
+        pose, pull = moving.pose, FINER[moving.stiffness]
+        (pose,) = yield [
+            Descent(image, pose.points, pose.rotations, moving.bones, weights, moving.rigid, pull, EXACT, stages)
+        ]
+        poses.append(pose)
+    agree = agreement(*(pose.points[0, ..., 2] for pose in poses))
+    moving, pose = min(zip((free, held), poses, strict=True), key=lambda one: float(one[1].objective[0]))
+    return replace(moving, pose=pose, lead=held.lead if agree > ALIKE else 0.0, rivalled=agree < OTHER)
 
 
 def _ever(usual: Tensor) -> Tensor:

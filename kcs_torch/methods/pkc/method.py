@@ -24,7 +24,7 @@ from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.clip import LEAST_JOINTS, Clip
 from kcs_torch.methods.pkc.elsewhere import without_others, without_strange_limbs
 from kcs_torch.methods.pkc.fixed_answer import from_hypotheses
-from kcs_torch.methods.pkc.gaps import fill_gaps, fillable, freed, gaps_of, usual_noise
+from kcs_torch.methods.pkc.gaps import EXACT, gaps_of, likelier, usual_noise
 from kcs_torch.methods.pkc.gate import without_border, without_doubled, without_repeats
 from kcs_torch.methods.pkc.hands import Part, joined, part_of, parts_of
 from kcs_torch.methods.pkc.held import with_lengths_held
@@ -32,7 +32,7 @@ from kcs_torch.methods.pkc.hypotheses import Hypotheses, refined
 from kcs_torch.methods.pkc.limbs import outward
 from kcs_torch.methods.pkc.long_gaps import first_frame, lengthened, shortened
 from kcs_torch.methods.pkc.moving_answer import MOVING_STEPS, STILL, from_moving
-from kcs_torch.methods.pkc.moving_search import MovingSearch
+from kcs_torch.methods.pkc.moving_search import MovingSearch, is_small, too_long
 from kcs_torch.methods.pkc.moving_solutions import MovingView
 from kcs_torch.methods.pkc.moving_view import relative_weights, settled
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR, Asked
@@ -324,10 +324,10 @@ class PKC(Method):
             return found
         return (yield from turned_around(body, found, rival))
 
-    def _moving(self, clip: Clip, count: int = 1) -> Search[Any, Any, tuple[MovingView, Estimate]]:
-        """So many solutions of the moving viewpoint at most; and the first guess, SfAM's."""
+    def _moving(self, clip: Clip, count: int = 1, least: float = 0.0) -> Search[Any, Any, tuple[MovingView, Estimate]]:
+        """So many solutions of the moving viewpoint at most, of ``least`` noise; and the first guess, SfAM's."""
         (first,) = yield [clip.complete()]
-        start, usual = (first.points, complete_rotation(first.cameras)), usual_noise(clip.noise)
+        start, usual = (first.points, complete_rotation(first.cameras)), max(usual_noise(clip.noise), least)
         weights = relative_weights(clip.noise, usual) if usual > 0 else None
         search = MovingSearch(
             clip.image, clip.tracks.skeleton, *start, weights=weights, noise=usual, lifts=self.lifts,
@@ -337,16 +337,16 @@ class PKC(Method):
         return moving, first
 
     def _in_space(self, clip: Clip) -> Search[Any, Any, tuple[MovingView, Estimate]]:
-        """As :meth:`_moving`; where exact tracks have gaps, once more with these filled by the first one."""
-        count, exact = max(1, self.alternatives), usual_noise(clip.noise) == 0
-        moving, first = yield from self._moving(clip, count)
-        if self.rounds and exact and fillable(clip.image) and bool(gaps_of(clip.noise).any()):
-            moving = yield from freed(moving, clip.image, clip.noise)
-            image, noise = fill_gaps(clip.image, moving.pose.points[0, ..., :2], clip.noise)
-            clip = replace(clip, image=image, noise=noise)
-            moving, first = yield from self._moving(clip, count)
-            moving = yield from freed(moving, image, noise)
-        noise = clip.noise
+        """As :meth:`_moving`; of exact tracks with gaps, whose x and y are unknowns there, with next to no noise.
+
+        Of few joints bones that keep their length exactly tell more, and x and y in gaps more again: both are tried.
+        """
+        count, noise = max(1, self.alternatives), clip.noise
+        loose = self.rounds and usual_noise(noise) == 0 and bool(gaps_of(noise).any()) and not too_long(clip.image)
+        moving, first = yield from self._moving(clip, count, EXACT if loose else 0.0)
+        if loose and is_small(clip.image):
+            held, _ = yield from self._moving(clip, count)
+            moving = yield from likelier(moving, held, clip.image, noise)
         frame = noise[:, clip.tracks.seen.any(0)].square().mean(1, keepdim=True)  # whose pose they turn
         return replace(moving, noise=(noise.square() + frame).sqrt()), first
 

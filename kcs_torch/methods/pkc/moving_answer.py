@@ -13,7 +13,7 @@ from kcs_torch.methods.answer.finish import Estimate
 from kcs_torch.methods.answer.wrong import loose_bones
 from kcs_torch.methods.pkc.body import TOLD
 from kcs_torch.methods.pkc.leaps import leaps_of
-from kcs_torch.methods.pkc.moving_solutions import MovingView
+from kcs_torch.methods.pkc.moving_solutions import MovingView, agreement
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.camera_path import view_energy
 from kcs_torch.solvers.procrustean import COARSE, FINE
@@ -77,9 +77,9 @@ def from_moving(
     rivals = [one for one, _ in more]
     depth = best.points[..., 2]
     shown = math.inf if cameras is not None else float(viewpoint_turn(best.cameras))
-    agree = _agreement(depth, first.points[..., 2])
+    agree = agreement(depth, first.points[..., 2])
     sure = witnessed = max(agree, moving.lead / LEAD)
-    rivalled = 0 < moving.lead < CLOSE
+    rivalled = moving.rivalled or 0 < moving.lead < CLOSE
     leaps = leaps_of(depth[None])[0].nonzero().flatten().tolist()
     if loose_bones(best.points, skeleton) or shown < TURN or rivalled or leaps:  # another warning tells of the first
         sure = min(sure, BROKEN)
@@ -127,9 +127,3 @@ def _upright(moving: MovingView, index: int, cameras: Tensor | None) -> tuple[Es
 def _unsurer(one: Estimate, lack: Tensor) -> Estimate:
     """The estimate with a standard deviation that all its depths have beside their own."""
     return one if one.deviation is None else replace(one, deviation=torch.hypot(one.deviation, lack))
-
-
-def _agreement(depth: Tensor, other: Tensor) -> float:
-    """Correlation of two solutions' depths (T, N), whichever mirror images they are."""
-    a, b = (z - z.mean(-1, keepdim=True) for z in (depth, other))
-    return float((a * b).sum().abs() / (a.norm() * b.norm()).clamp_min(torch.finfo(a.dtype).tiny))

@@ -33,7 +33,7 @@ from kcs_torch.solvers.procrustean import (
     track_energy,
 )
 
-__all__ = ["FINER", "ROBOT", "TURNS", "MovingSearch", "soften", "too_long"]
+__all__ = ["FINER", "TURNS", "MovingSearch", "is_small", "soften", "too_long"]
 
 TURNS = (30.0, 60.0, 90.0, 120.0, 180.0, 360.0)
 """Degrees that the cameras of the starts turn, evenly, about the image's vertical."""
@@ -80,8 +80,7 @@ GIVEN = 3
 
 ROBOT = 10
 """Up to as many joints, angles between bones may be kept, and in noise, which hides the bones' paths, twenty times the
-random starts are tried: few bones leave much undecided. Nor does one solution fill gaps for another: where it is wrong,
-so are they."""
+random starts are tried: few bones leave much undecided."""
 
 
 class MovingSearch:
@@ -113,11 +112,11 @@ class MovingSearch:
         exact: bool = True,
         seed: int = 0,
     ) -> None:
-        frames, joints, _ = image.shape
+        frames = len(image)
         tree = skeleton.bone_index(device=image.device)
         self.is_tree, self.found = skeleton.is_tree, skeleton.found
         self.held = self.is_tree and exact and noise == 0 and not skeleton.flexible
-        self.small = joints <= ROBOT
+        self.small = is_small(image)
         if too_long(image):
             noise, weights = 0.0, None
         self.image, self.weights, self.noise = image, weights, noise
@@ -267,6 +266,11 @@ def _spread_tree(points: Tensor) -> Tensor:
 def soften(stage: Stage, noise: float) -> Stage:
     """The stage, with no scale far below the noise."""
     return replace(stage, eps=max(stage.eps, 0.1 * noise**2), slack=max(stage.slack, 0.3 * noise))
+
+
+def is_small(image: Tensor) -> bool:
+    """Whether an image (T, N, 2) has so few joints that much is left undecided."""
+    return image.shape[1] <= ROBOT
 
 
 def too_long(image: Tensor) -> bool:

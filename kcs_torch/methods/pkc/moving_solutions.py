@@ -11,7 +11,7 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.solvers.camera_path import CameraPath, choose_path, settle_path
 from kcs_torch.solvers.procrustean import Pose, depth_deviation
 
-__all__ = ["MovingView"]
+__all__ = ["MovingView", "agreement"]
 
 FARTHER = 1.8
 """How far depths are off, in deviations of the image, beyond what exact tracks leave open: fitted to dogs, hands and
@@ -31,6 +31,7 @@ class MovingView:
         lead: by how much the next solution is dearer, for each frame compared, where paths of bones were combined; 0
             where they were not, or no solution was left to compare.
         noise: (T, N) deviations of the image, a joint's own and those of its frame, or None where it is exact.
+        rivalled: whether another search, as good as this one, found a body that differs.
         found: whether the pairs were chosen for keeping their distance, so that it tells nothing that they do.
     """
 
@@ -40,6 +41,7 @@ class MovingView:
     rigid: Tensor
     stiffness: float
     lead: float = 0.0
+    rivalled: bool = False
     noise: Tensor | None = None
     found: bool = False
 
@@ -62,3 +64,9 @@ class MovingView:
             pose.points, pose.rotations, self.bones, views=views, rigid=telling, stiffness=self.stiffness
         )[0]
         return own if self.noise is None else torch.hypot(own, FARTHER * self.noise)
+
+
+def agreement(depth: Tensor, other: Tensor) -> float:
+    """Correlation of two solutions' depths (T, N), whichever mirror images they are."""
+    a, b = (z - z.mean(-1, keepdim=True) for z in (depth, other))
+    return float((a * b).sum().abs() / (a.norm() * b.norm()).clamp_min(torch.finfo(a.dtype).tiny))
