@@ -310,3 +310,42 @@ def test_gaps_of_a_body_without_template_are_filled_in_space():
         mirror = found.new_tensor([1.0, 1.0, -1.0])
         errors.append(min(kt.metrics.mpjpe(one, clip.points, align="rigid") for one in (found, found * mirror)))
     assert errors[1] < 0.7 * errors[0]
+
+
+def legs(count):
+    """A body of so many legs of three bones each, of which nothing but the bones is known."""
+    joints, bones = ["front", "back", "head"], [("front", "back"), ("front", "head")]
+    for leg in range(count):
+        chain = ["front" if 2 * leg < count else "back", *(f"{part}_{leg}" for part in ("coxa", "knee", "foot"))]
+        joints += chain[1:]
+        bones += zip(chain, chain[1:], strict=False)
+    return Skeleton.from_names(joints, bones)
+
+
+CHAIN = Skeleton.from_names([f"s{i}" for i in range(10)], [(f"s{i}", f"s{i + 1}") for i in range(9)])
+
+
+@pytest.mark.parametrize(
+    ("body", "seed", "swing", "hidden"),
+    [(legs(6), 61, 20.0, slice(None)), (CHAIN, 1, 15.0, slice(None)), (CHAIN, 3, 15.0, slice(-2, None))],
+)
+def test_gaps_of_exact_tracks_bend_nothing_else(body, seed, swing, hidden):
+    """Held where its own path fills a gap, each joint would pull the others along."""
+    clip = random_motion(body, 80, turn=360.0, swing=swing, generator=torch.Generator().manual_seed(seed))
+    points = clip.tracks.points.clone()
+    points[30:45, hidden] = torch.nan
+    found = kt.PKC(alternatives=0)(kt.Tracks.from_arrays(points, skeleton=body, fps=30.0)).points
+    mirror = found.new_tensor([1.0, 1.0, -1.0])
+    off = min(kt.metrics.mpjpe(one, clip.points, align="rigid") for one in (found, found * mirror))
+    assert off < 0.02 * (clip.points - clip.points.mean(1, keepdim=True)).norm(dim=-1).mean()
+
+
+def test_a_robot_that_two_searches_see_otherwise_is_doubted(protocol, shared):
+    """Half a second shows nothing of it: SfAM follows where it is wrong, and bones that are held lead it there."""
+    data = protocol.load(shared / "data", "robot/franka_panda_fk")
+    turns = protocol.rotation(45.0 + protocol.np.linspace(0, 180, 80), 10.0)
+    points = torch.from_numpy(data["points3d"][:80]).double() @ torch.from_numpy(turns).double().mT
+    points[30:45] = torch.nan
+    tracks = kt.Tracks.from_arrays(points[..., :2], edges=data["edges"].tolist(), fps=float(data["fps"]), units="mm")
+    with pytest.warns(KcsWarning, match="depth is"):
+        assert kt.PKC(alternatives=0)(tracks).diagnostics.doubt
