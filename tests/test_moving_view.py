@@ -1,6 +1,7 @@
 """PKC's half for viewpoints that turn: from a clip to ranked poses, cameras and uncertainty."""
 
 import dataclasses
+import itertools
 import sys
 
 import pytest
@@ -318,7 +319,7 @@ def legs(count):
     for leg in range(count):
         chain = ["front" if 2 * leg < count else "back", *(f"{part}_{leg}" for part in ("coxa", "knee", "foot"))]
         joints += chain[1:]
-        bones += zip(chain, chain[1:], strict=False)
+        bones += itertools.pairwise(chain)
     return Skeleton.from_names(joints, bones)
 
 

@@ -37,6 +37,7 @@ from kcs_torch.methods.pkc.moving_solutions import MovingView
 from kcs_torch.methods.pkc.moving_view import relative_weights, settled
 from kcs_torch.methods.pkc.near import SEEMS_FAR, SEEMS_NEAR, Asked
 from kcs_torch.methods.pkc.sizing import TRIED, resized, with_size
+from kcs_torch.methods.pkc.stuck import without_stuck
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.nn.posture import has_trunk
 from kcs_torch.skeleton import Skeleton
@@ -119,7 +120,8 @@ class PKC(Method):
 
     def prepared(self, tracks: Tracks) -> Tracks:
         if self.denoise:
-            tracks = without_others(without_repeats(without_border(without_doubled(tracks))))
+            tracks = without_stuck(without_repeats(without_border(without_doubled(tracks))))
+            tracks = without_others(tracks)
             tracks = without_strange_limbs(unswap(without_strange_limbs(tracks, swapped=True)))
         told = self.detections
         if told is None and self.denoise and not detected(tracks) and found_by_detector(tracks):
