@@ -57,6 +57,31 @@ def test_what_is_not_stuck():
     assert without_stuck(tracks) is tracks
 
 
+def test_outliers_of_a_joint_that_rests_are_no_leaps():
+    """What leaps away and straight back was there all along, as are feet that start and are not seen any more."""
+    points = walking_person(60, turn=0.0, yaw=60.0).tracks.points.clone()
+    seen = torch.ones(60, 17, dtype=torch.bool)
+    points[:, ARM[2]] = points[20, ARM[2]]
+    for frames in ([30], [10, 25, 40], [10, 11, 30, 31]):
+        some = points.clone()
+        some[frames, ARM[2]] += 300.0
+        assert not stuck(some, seen).any() and not stuck(some.round(), seen).any()
+    for count in (1, 2):
+        some = points.clone()
+        some[60 - count :, ARM[2]] += 50.0 * torch.arange(1, count + 1).double()[:, None]
+        assert not stuck(some, seen).any()
+
+
+def test_quick_moves_between_rests_are_not_stuck():
+    """A robot, or few frames a second: the joint rests before and behind."""
+    points = walking_person(60, turn=0.0, yaw=60.0).tracks.points.clone()
+    rests = (torch.arange(60) // 12).double()[:, None] * 300
+    points[:, ARM[2]] = points[0, ARM[2]] + rests
+    points[11::12, ARM[2]] += 120
+    assert not stuck(points, torch.ones(60, 17, dtype=torch.bool)).any()
+    assert not stuck(points.round(), torch.ones(60, 17, dtype=torch.bool)).any()
+
+
 def test_who_stops_and_starts_again_is_not_stuck():
     """A hand slows down to rest on something, and leaves it again; whole pixels make both sudden."""
     time = torch.arange(60).double()

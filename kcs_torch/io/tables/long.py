@@ -226,6 +226,7 @@ class _Table:
         at = f"frame {values[i, 0]:.0f}" if self.header.number is not None else f"time {values[i, 1]:g}"
         column = "" if self.header.who is None else f" of one '{self.header.cells[self.header.who]}'"
         hint = "" if column else ", or a column 'person'"
+        apart = " (people without an id cannot be told apart here)" if column else ""
         raise FormatError(
-            f"{self.where(i)}: expected every joint once in a frame{column}{hint}, got '{joint}' in {at} again"
+            f"{self.where(i)}: expected every joint once in a frame{column}{hint}, got '{joint}' in {at} again{apart}"
         )

@@ -170,7 +170,9 @@ def place_rows(rows: Sequence[Row], unit: str, out: Landmarks) -> None:
         people = out.frames.setdefault(number, [])
         if row.who is not None and any(s.track == row.who for s in people):
             again = f"frame {number}" if row.number is not None else f"time {row.time:g}"
-            raise FormatError(f"{row.where}: expected every frame once, or a column 'person', got {again} again")
+            whom = f" of person {row.who}" if row.who else ""  # or it is a file of one
+            hint = "" if whom else ", or a column 'person'"
+            raise FormatError(f"{row.where}: expected every frame{whom} once{hint}, got {again} again")
         people.append(Sighting(row.joints, row.who))
         out.times.setdefault(number, row.time)
     out.fps = rate_of_times(out.times, unit, out.notes)

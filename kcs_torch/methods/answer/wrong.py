@@ -192,5 +192,5 @@ def _uneven_bodies(points: Tensor, body: Skeleton, lengths: Tensor, clips: Clips
             longer = int(both[k, pair].argmax())
             names, times = [body.bone_names[b] for b in twins[pair]], float(long[k, pair] / short[k, pair])
             named[f"{names[longer]} is {times:.1f} times as long as {names[1 - longer]}"] = times
-        told[k] = _the_worst(named, "bone")
+        told[k] = f"{_the_worst(named, 'bone')} (where the template says so, a place there may be mistyped)"
     return told

@@ -25,8 +25,9 @@ EXACT = 0.001
 """Standard deviation of what is shown in exact tracks with gaps, a share of the body's size, of bodies without a
 template: x and y are unknowns then, which gaps need; held where each joint's own path has them, all is bent by them."""
 
-ALIKE, OTHER = 0.9, 0.7
-"""Correlation of depths from which on two solutions are one, and below which they are bodies that differ."""
+ALIKE, OTHER, DEARER = 0.9, 0.7, 6.0
+"""Correlation of depths from which on two solutions are one, and below which they are bodies that differ; and by how
+much a frame one has to be dearer so as to be no rival."""
 
 SURER = 0.2
 """Share of a gap's noise that is left where it is filled in space."""
@@ -78,7 +79,9 @@ def likelier(free: MovingView, held: MovingView, image: Tensor, noise: Tensor) -
         poses.append(pose)
     agree = agreement(*(pose.points[0, ..., 2] for pose in poses))
     moving, pose = min(zip((free, held), poses, strict=True), key=lambda one: float(one[1].objective[0]))
-    return replace(moving, pose=pose, lead=held.lead if agree > ALIKE else 0.0, rivalled=agree < OTHER)
+    dearer = float((poses[0].objective[0] - poses[1].objective[0]).abs()) / len(image)
+    lead = held.lead if agree > ALIKE else 0.0
+    return replace(moving, pose=pose, lead=lead, rivalled=agree < OTHER and dearer < DEARER)
 
 
 def _ever(usual: Tensor) -> Tensor:

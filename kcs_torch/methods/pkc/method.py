@@ -76,8 +76,8 @@ class PKC(Method):
             one, and by both where the trunk turns. Known cameras tell the sign of depth, and rank solutions.
         denoise: first leave out joints that only repeat another, or lie on the image's border, where some detectors put
             those outside; frames that repeat the one before, or in which the whole body leaps away, to somebody else,
-            and back; and limbs that do. Swap left and right back where a detector mistakes them
-            (:func:`kcs_torch.clean.unswap`); smooth noisy tracks, fill gaps and reject outliers
+            and back; and joints that do, or are stuck where they were. Swap left and right back where a detector
+            mistakes them (:func:`kcs_torch.clean.unswap`); smooth noisy tracks, fill gaps and reject outliers
             (:func:`kcs_torch.solvers.denoise_tracks`).
         lifts: random starts of the moving viewpoint's solver, for skeletons without a template.
         rounds: of discrete moves of the fixed viewpoint's solver; with 0 gaps stay as each joint's own path fills them,

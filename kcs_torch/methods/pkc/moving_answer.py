@@ -96,7 +96,8 @@ def from_moving(
     elif shown < TURN:
         doubt = f"depth may be drawn out or pressed flat: the viewpoint turned by only {shown:.0f} degrees. {needed}"
     elif rivalled:
-        doubt = f"depth is uncertain: bodies that differ fit the tracks nearly as well (see the alternatives). {needed}"
+        where = "" if moving.rivalled else " (see the alternatives)"
+        doubt = f"depth is uncertain: bodies that differ fit the tracks nearly as well{where}. {needed}"
 
     best, *rivals = (_unsurer(one, lack) for one in (best, *rivals))
     best = replace(best, notes=notes, doubt=doubt)

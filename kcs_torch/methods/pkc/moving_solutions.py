@@ -31,7 +31,7 @@ class MovingView:
         lead: by how much the next solution is dearer, for each frame compared, where paths of bones were combined; 0
             where they were not, or no solution was left to compare.
         noise: (T, N) deviations of the image, a joint's own and those of its frame, or None where it is exact.
-        rivalled: whether another search, as good as this one, found a body that differs.
+        rivalled: whether another search found a body that differs and is hardly dearer.
         found: whether the pairs were chosen for keeping their distance, so that it tells nothing that they do.
     """
 

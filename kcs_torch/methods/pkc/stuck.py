@@ -16,6 +16,9 @@ __all__ = ["stuck", "without_stuck"]
 STEPS = 3
 """A joint has to go by so many of the image's grid, the least that any goes, so as to stop, or leap away, at once."""
 
+SLOW = 10.0
+"""Frames a second below which a foot may well be moved from one place of rest to another in one or two."""
+
 LEAPS = 3.0
 """A joint leaps from where it was stuck if it goes so many times as far as in each of the frames behind."""
 
@@ -24,7 +27,8 @@ def stuck(points: Tensor, seen: Tensor) -> Tensor:
     """Detections (T, N) of joints that stop at once, are exactly where they were for a while, and leap; the body moves.
 
     What really stops slows down (but where a grid is fine no place repeats itself), and what starts again speeds up: a
-    joint that was stuck leaps to where it is by then. At the end of a clip nothing tells.
+    joint that was stuck leaps to where it is by then, and moves on. What only darts away from where it rests is an
+    outlier, and what rests before and behind a quick move moves so. At the end of a clip nothing tells.
 
     Args:
         points: (T, N, 2).
@@ -42,24 +46,34 @@ def stuck(points: Tensor, seen: Tensor) -> Tensor:
     grid = step[step > 0].amin()
     fine, least = bool(STEPS * grid < MOVED * size), (MOVED * size).maximum(STEPS * grid)
     pace = nanmedian(torch.where(same, torch.nan, step), 1)  # of all others
-    edge = torch.nn.functional.pad(same.to(torch.int8), (0, 0, 1, 1)).diff(dim=0)
-    step = torch.nn.functional.pad(step, (0, 0, 1 + JUST, 1 + JUST), value=torch.nan)
-    for joint in (same.sum(0) > HELD).nonzero().flatten().tolist():
-        begins, ends = ((edge[:, joint] == sign).nonzero().flatten().tolist() for sign in (1, -1))
-        own = step[:, joint]
-        for first, stop in zip(begins, ends, strict=True):  # of steps that are none
-            if stop - first <= HELD or not bool(nanmedian(pace[first:stop], 0) > MOVED * size):
-                continue
-            before, last = own[first : first + JUST], own[first + JUST]
-            away, behind = own[stop + 1 + JUST], own[stop + 2 + JUST : stop + 2 + 2 * JUST]
-            sudden = fine or (bool(last > least) and not bool(last < SLOWS * before.nanmedian()))
-            leaps = bool(away > least) and not bool(away < LEAPS * behind.nanmedian())
-            out[first + 1 : stop + 1, joint] = sudden and leaps
-    return out
+    edge = torch.nn.functional.pad(same.to(torch.int8), (0, 0, 1, 1)).diff(dim=0).mT
+    (joint, first), (_, stop) = ((edge == sign).nonzero().unbind(-1) for sign in (1, -1))  # runs of steps that are none
+    moves = torch.nn.functional.pad((pace > MOVED * size).cumsum(0), (1, 0))
+    kept = (stop - first > HELD) & (2 * (moves[stop] - moves[first]) > stop - first)
+    joint, first, stop = joint[kept], first[kept], stop[kept]
+    beyond, few = (0, 0, 1 + JUST, 1 + JUST), torch.arange(JUST, device=seen.device)
+    step = torch.nn.functional.pad(step, beyond, value=torch.nan)
+    place = torch.nn.functional.pad(known, (0, 0, *beyond), value=torch.nan)
+    last, away = step[first + JUST, joint], step[stop + 1 + JUST, joint]
+    earlier, later = first[:, None] + few, stop[:, None] + 2 + JUST + few
+    came, went = (nanmedian(step[rows, joint[:, None]], 1) for rows in (earlier, later))
+    rest = place[first + 1 + JUST, joint][:, None]
+    near = ((place[rows, joint[:, None]] - rest).norm(dim=-1) for rows in (earlier, later + 1))
+    darts = torch.stack([(off < SLOWS * far[:, None]).any(1) for off, far in zip(near, (last, away), strict=True)]).any(
+        0
+    )
+    sudden = (came > 0) & ((last > 0) if fine else (last > least) & (last >= SLOWS * came))
+    leaps = (away > least) & (went > 0) & (away >= LEAPS * went)
+    joint, first, stop = (x[sudden & leaps & ~darts] for x in (joint, first, stop))
+    change = torch.zeros(len(seen) + 1, seen.shape[1], dtype=torch.long, device=seen.device)
+    change[first + 1, joint], change[stop + 1, joint] = 1, -1
+    return change.cumsum(0)[:-1] > 0
 
 
 def without_stuck(tracks: Tracks) -> Tracks:
     """Tracks in which joints that are :func:`stuck` are unseen meanwhile; a note says which."""
+    if tracks.rate < SLOW:
+        return tracks
     count, body = tracks.skeleton.num_observed, tracks.skeleton
     seen = tracks.seen[:, :count]
     out = stuck(tracks.points[:, :count], seen)
