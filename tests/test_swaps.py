@@ -276,3 +276,32 @@ def test_shapes_that_do_not_fit():
     for arguments in ((left[0], left[0], seen), (left, left[1:], seen), (left, left, seen[:, :1])):
         with pytest.raises(ShapeError, match=r"swapped_frames: expected left and right \(T, P, 2\)"):
             swapped_frames(*arguments, 1.0, 1.5)
+
+
+def test_hands_that_are_mistaken_do_not_take_the_body_along():
+    """Forty joints of fingers against seventeen: a detector takes one hand for the other, and arms are right."""
+    body = kt.SKELETONS["wholebody63"]
+    clip = random_motion(body, 60, turn=20, swing=15, generator=torch.Generator().manual_seed(0)).tracks
+    fingers = [a for a, b in body.mirror if a >= 23 and b < body.num_observed]
+    assert len(fingers) == 20
+    wrong = swap(clip, list(range(20, 40)), [body.joints[a] for a in fingers])
+    found = kt.clean.unswap(wrong)
+    same(found, clip)
+    assert "in 0 of 60 (0 %) frames; of limbs by themselves, from left_thumb1 on in 20" in found.notes[-1]
+    everything = swap(clip, list(range(20, 40)))
+    same(kt.clean.unswap(everything), clip)
+
+
+def test_sides_of_one_shot_say_nothing_of_the_next(protocol, shared):
+    """Two people in one clip: the second was turned over, as at the cut all joints seemed to change sides."""
+    data_of = lambda name: protocol.load(shared / "data", f"cmu/cmu_{name}")["points3d"][::4][:100, protocol.CMU17]  # noqa: E731
+    time = protocol.np.linspace(0, 1, 100)
+    shots = []
+    for name, yaw in (("35_01", 45.0), ("07_01", 225.0)):
+        points = torch.from_numpy(data_of(name)).double()
+        turns = torch.from_numpy(protocol.rotation(yaw + 0 * time[: len(points)], 10.0)).double()
+        shots.append((points @ turns.mT)[..., :2])
+        shots[-1] = shots[-1] - shots[-1][0].mean(0)
+    noise = torch.randn(sum(map(len, shots)), 17, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    tracks = kt.Tracks.from_arrays(torch.cat(shots) + 8 * noise, skeleton="cmu17", fps=30.0, units="mm")
+    assert kt.clean.unswap(tracks) is tracks

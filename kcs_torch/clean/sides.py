@@ -29,6 +29,9 @@ there is more than this share of such pairs. What is swapped for a moment may be
 _FEWEST = 2
 """Pairs of joints of which a limb consists, at least: one pair by itself may be an outlier."""
 
+_BRANCHES = 4
+"""Fingers of a hand, at least."""
+
 _LONG, _RATE = 1.0, 30.0
 """A limb that points from right to left as the trunk does, for so many seconds more than it does not, is not swapped;
 and the frames a second where tracks do not tell. Legs stay crossed for less."""
@@ -43,8 +46,9 @@ on meanwhile. If more than such a share of the frames has one, that is how these
 def unswap(tracks: Tracks) -> Tracks:
     """Swap left and right back where a detector mistakes them for each other; a note says in how many frames.
 
-    First all pairs of joints together, then the arms, the legs and other limbs by themselves, without the joints of the
-    trunk (:func:`kcs_torch.solvers.swapped_frames`). A pair that is mistaken jumps to the other side, while legs that
+    First all pairs of joints together, of which those of fingers, who would outvote all others, tell nothing; then the
+    arms, the legs, the hands and other limbs by themselves, without the joints of the trunk
+    (:func:`kcs_torch.solvers.swapped_frames`). A pair that is mistaken jumps to the other side, while legs that
     cross move on evenly. Where a clip is half swapped, the longer part is taken to be right. A limb stays as it is if
     it would be crossed for a second: it jumped as the body did, in a turn, or comes back slowly from a swap. Where the
     whole body leaps ahead, as frames were dropped or one was repeated, what a limb does at this moment tells nothing.
@@ -70,17 +74,23 @@ def unswap(tracks: Tracks) -> Tracks:
         return tracks
     points, weights = tracks.points[:, :count].clone(), tracks.weights[:, :count].clone()
     size = float(body_size(points, weights > 0))
-    cuts = cuts_of(tracks, leaps=False)  # another view is no swap
-    shots = list(starmap(slice, pairwise([0, *cuts, tracks.num_frames])))
+    shots, views = (
+        list(starmap(slice, pairwise([0, *cuts_of(tracks, leaps=some), tracks.num_frames]))) for some in (False, True)
+    )  # another view is no swap, and another body's sides are its own
     leaps = _leaps_ahead(points, weights > 0, pairs, size)
     limbs = _limbs(body, pairs)
     trunk = [pair for pair in pairs if not any(pair in limb for _, limb in limbs)]
     long = _LONG * (tracks.fps or _RATE)
+    fingers = _fingers(body)
+    telling = [pair for pair in pairs if pair[0] not in fingers]
     counts = {}
-    for name, some in (("", pairs), *limbs):
+    for name, some in (("", telling if len(telling) >= _FEWEST else pairs), *limbs):
         left, right = torch.tensor(some, device=points.device).T
         seen, penalty = _comparable(points, weights, left, right, size), _LIMB if name else _BODY
-        swapped = [swapped_frames(points[shot, left], points[shot, right], seen[shot], size, penalty) for shot in shots]
+        swapped = [
+            swapped_frames(points[shot, left], points[shot, right], seen[shot], size, penalty)
+            for shot in (shots if name else views)
+        ]
         if name and trunk:
             across, straight = (_across(points, weights, these) for these in (some[:1], trunk))
             for shot, found in zip(shots, swapped, strict=True):
@@ -89,6 +99,7 @@ def unswap(tracks: Tracks) -> Tracks:
             for shot, found in zip(shots, swapped, strict=True):
                 _through_leaps(found, seen[shot].any(1), [leap - shot.start for leap in leaps])
         frames = torch.cat(swapped).nonzero()  # (F, 1)
+        left, right = torch.tensor(some if name else pairs, device=points.device).T
         for values in (points, weights):
             values[frames, left], values[frames, right] = values[frames, right], values[frames, left]
         counts[name] = len(frames)
@@ -162,7 +173,27 @@ def _limbs(body: Skeleton, pairs: list[tuple[int, int]]) -> list[tuple[str, list
     parent = {b: a for a, b in body.bones}
     trunk = set(trunk_joints(body)) or {a for a, _ in pairs if body.side(parent.get(a, a)) != "left"}
     twin = {a: b for a, b in pairs if a not in trunk}
-    pieces = find_pieces(body.num_joints, [bone for bone in body.bones if twin.keys() >= set(bone)])
+    fingers = _fingers(body)
+    inner = twin.keys() - fingers
+    pieces = find_pieces(body.num_joints, [bone for bone in body.bones if inner >= set(bone)])
     outer = [sorted(piece, key=lambda a: parent.get(a) in twin) for piece in pieces]
-    limbs = [[(a, twin[a]) for a in piece if a in twin] for piece in outer]
+    limbs = [[(a, twin[a]) for a in piece if a in inner] for piece in outer]
+    limbs.append([(a, b) for a, b in twin.items() if a in fingers])
     return [(body.joints[limb[0][0]], limb) for limb in limbs if len(limb) >= _FEWEST]
+
+
+def _fingers(body: Skeleton) -> set[int]:
+    """The joints of all that branches as a hand does: into so many parts that have joints of their own."""
+    children: dict[int, list[int]] = {}
+    for a, b in body.bones:
+        children.setdefault(a, []).append(b)
+
+    def below(joint: int) -> list[int]:
+        return [joint, *(one for child in children.get(joint, []) for one in below(child))]
+
+    fingers: set[int] = set()
+    for wrist in children if body.is_tree else ():
+        branches = [below(child) for child in children[wrist] if children.get(child)]
+        if len(branches) >= _BRANCHES and body.side(wrist) in ("left", "right"):
+            fingers.update(joint for branch in branches for joint in branch)
+    return fingers
