@@ -12,7 +12,7 @@ from kcs_torch.clean.timing import cuts_of
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.skeleton.graph import find_pieces
+from kcs_torch.skeleton.graph import find_branches, find_pieces
 from kcs_torch.solvers.stray import from_beside
 from kcs_torch.solvers.swaps import swapped_frames
 from kcs_torch.types import Tracks
@@ -184,16 +184,9 @@ def _limbs(body: Skeleton, pairs: list[tuple[int, int]]) -> list[tuple[str, list
 
 def _fingers(body: Skeleton) -> set[int]:
     """The joints of all that branches as a hand does: into so many parts that have joints of their own."""
-    children: dict[int, list[int]] = {}
-    for a, b in body.bones:
-        children.setdefault(a, []).append(b)
-
-    def below(joint: int) -> list[int]:
-        return [joint, *(one for child in children.get(joint, []) for one in below(child))]
-
     fingers: set[int] = set()
-    for wrist in children if body.is_tree else ():
-        branches = [below(child) for child in children[wrist] if children.get(child)]
-        if len(branches) >= _BRANCHES and body.side(wrist) in ("left", "right"):
-            fingers.update(joint for branch in branches for joint in branch)
+    for wrist, branches in find_branches(body.bones).items() if body.is_tree else ():
+        long = [branch for branch in branches if len(branch) > 1]
+        if len(long) >= _BRANCHES and body.side(wrist) in ("left", "right"):
+            fingers.update(joint for branch in long for joint in branch)
     return fingers

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-__all__ = ["direct_bones", "find_cycle", "find_parts", "find_pieces", "find_twins"]
+__all__ = ["direct_bones", "find_branches", "find_cycle", "find_parts", "find_pieces", "find_twins"]
 
 Pair = tuple[int, int]
 
@@ -61,6 +61,25 @@ def find_cycle(num_joints: int, bones: Sequence[Pair]) -> list[int] | None:
         neighbours[a].append(b)
         neighbours[b].append(a)
     return None
+
+
+def find_branches(bones: Sequence[Pair]) -> dict[int, list[list[int]]]:
+    """Return for each joint that bones of a tree lead away from, all joints behind each of these bones, nearest first.
+
+    >>> find_branches([(0, 1), (1, 2), (0, 3)])
+    {0: [[1, 2], [3]], 1: [[2]]}
+    """
+    children: dict[int, list[int]] = {}
+    for a, b in bones:
+        children.setdefault(a, []).append(b)
+
+    def behind(joint: int) -> list[int]:
+        found = [joint]
+        for one in found:
+            found.extend(children.get(one, ()))
+        return found
+
+    return {joint: [behind(child) for child in some] for joint, some in children.items()}
 
 
 def find_twins(bones: Sequence[Pair], mirror: Sequence[Pair]) -> list[Pair]:

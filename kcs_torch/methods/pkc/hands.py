@@ -21,6 +21,7 @@ from kcs_torch.errors import SkeletonError
 from kcs_torch.methods.base import Estimate
 from kcs_torch.nn.posture import has_trunk
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.skeleton.graph import find_branches
 from kcs_torch.types import Tracks
 
 __all__ = ["Part", "joined", "part_of", "parts_of"]
@@ -121,16 +122,9 @@ def _hands(skeleton: Skeleton) -> tuple[Part, ...]:
     """Hands that hang on a body with a template, by the joints' names."""
     if not skeleton.is_tree or not has_trunk(skeleton):
         return ()
-    children: dict[int, list[int]] = {}
-    for a, b in skeleton.bones:
-        children.setdefault(a, []).append(b)
-
-    def below(joint: int) -> list[int]:
-        return [joint, *chain.from_iterable(below(child) for child in children.get(joint, []))]
-
     hands = []
-    for wrist, branches in children.items():
-        fingers = [finger for child in branches if len(finger := below(child)) >= JOINTS]
+    for wrist, branches in find_branches(skeleton.bones).items():
+        fingers = [finger for finger in branches if len(finger) >= JOINTS]
         joints = [wrist, *sorted(chain.from_iterable(fingers))]
         if len(fingers) < FINGERS or joints[-1] >= skeleton.num_observed:
             continue
