@@ -385,7 +385,7 @@ def test_what_settles_is_what_is_found_along_rays(monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore:.*a principal point at .* is the image's corner")
-@pytest.mark.filterwarnings("ignore::kcs_torch.errors.ConvergenceWarning")
+@pytest.mark.filterwarnings("ignore::kcs_torch.errors.ConvergenceWarning", "ignore:.*times as long as")
 def test_a_focal_length_in_another_unit_is_told():
     with pytest.warns(kt.KcsWarning, match=r"focal length 120 in the tracks' unit \(px\)"):
         kt.reconstruct(filmed(frames=5)[0], method="kcs", intrinsics=(120, 120, 0, 0))
