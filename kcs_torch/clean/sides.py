@@ -78,10 +78,10 @@ def unswap(tracks: Tracks) -> Tracks:
         list(starmap(slice, pairwise([0, *cuts_of(tracks, leaps=some), tracks.num_frames]))) for some in (False, True)
     )  # another view is no swap, and another body's sides are its own
     leaps = _leaps_ahead(points, weights > 0, pairs, size)
-    limbs = _limbs(body, pairs)
+    fingers = _fingers(body)
+    limbs = _limbs(body, pairs, fingers)
     trunk = [pair for pair in pairs if not any(pair in limb for _, limb in limbs)]
     long = _LONG * (tracks.fps or _RATE)
-    fingers = _fingers(body)
     telling = [pair for pair in pairs if pair[0] not in fingers]
     counts = {}
     for name, some in (("", telling if len(telling) >= _FEWEST else pairs), *limbs):
@@ -168,12 +168,14 @@ def _keep_straight(swapped: Tensor, across: Tensor, straight: Tensor, long: floa
             swapped[run] = False
 
 
-def _limbs(body: Skeleton, pairs: list[tuple[int, int]]) -> list[tuple[str, list[tuple[int, int]]]]:
-    """Pairs of joints outside the trunk that are connected, those that hang on it first, by the first joints' names."""
+def _limbs(body: Skeleton, pairs: list[tuple[int, int]], fingers: set[int]) -> list[tuple[str, list[tuple[int, int]]]]:
+    """Pairs of joints outside the trunk that are connected, those that hang on it first, by the first joints' names.
+
+    All fingers together are a limb of their own.
+    """
     parent = {b: a for a, b in body.bones}
     trunk = set(trunk_joints(body)) or {a for a, _ in pairs if body.side(parent.get(a, a)) != "left"}
     twin = {a: b for a, b in pairs if a not in trunk}
-    fingers = _fingers(body)
     inner = twin.keys() - fingers
     pieces = find_pieces(body.num_joints, [bone for bone in body.bones if inner >= set(bone)])
     outer = [sorted(piece, key=lambda a: parent.get(a) in twin) for piece in pieces]

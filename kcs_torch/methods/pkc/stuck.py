@@ -20,7 +20,7 @@ SLOW = 10.0
 """Frames a second below which a foot may well be moved from one place of rest to another in one or two."""
 
 LEAPS = 3.0
-"""A joint leaps from where it was stuck if it goes so many times as far as in each of the frames behind."""
+"""A joint leaps from where it was stuck if it goes so many times as far as in the median of the frames behind."""
 
 
 def stuck(points: Tensor, seen: Tensor) -> Tensor:
