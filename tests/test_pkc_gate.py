@@ -138,6 +138,15 @@ def test_a_detector_that_has_lost_the_body_repeats(first):
         assert torch.equal(repeats(some, seen), frozen | slow)
 
 
+def test_a_clip_padded_with_its_last_pose_stands_there():
+    points, seen = walk(84)
+    for padded, left_out in ((10, False), (21, True)):
+        some = points.clone()
+        some[-padded:] = some[-padded - 1].clone()
+        same = (torch.arange(84) >= 84 - padded) if left_out else torch.zeros(84, dtype=torch.bool)
+        assert torch.equal(repeats(some, seen), same)
+
+
 def test_frozen_frames_do_not_make_a_noisy_clip_exact():
     clip = walking_person(80, yaw=60.0, turn=0.0)
     points = clip.tracks.points + 8 * torch.randn(80, 17, 2, generator=torch.Generator().manual_seed(0)).double()

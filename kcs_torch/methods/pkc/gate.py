@@ -40,6 +40,10 @@ OFTEN, HELD, MOVED = 0.12, 6, 0.002
 if most joints move by this share of the body's size where they move: those of somebody who stands still are not. More
 on end are a detector's that has lost the body if this moved by as much just before: somebody who stops slows down."""
 
+PADDED = 0.15
+"""A clip that shows its last pose on for less than this share of its frames only goes on for longer than its motion:
+that the body stands there is as good a guess as any, and the other frames still tell what noise there is."""
+
 JUST, SLOWS = 3, 0.5
 """The last step is less than this share of the median of so many before it."""
 
@@ -184,6 +188,9 @@ def repeats(points: Tensor, seen: Tensor) -> Tensor:
     long = same & long[start]
     frozen = long & moves[start]
     slow = same & ~long
+    padding = frozen & (start == start[-1])
+    if int(padding.sum()) < PADDED * int(shown.sum()):
+        frozen = frozen & ~padding
     often = int(slow.sum()) >= OFTEN * int(shown.sum()) and not bool((long & ~frozen).any())
     return frozen | slow if often and bool(step[new].nanmedian() > MOVED * size) else frozen
 
