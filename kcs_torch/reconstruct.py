@@ -131,7 +131,8 @@ def reconstruct(
     chosen = method_named(method, fields)
     if chosen.knows_bones and not tracks.skeleton.bones and (lacking := no_bones(tracks.skeleton)) in tracks.notes:
         warnings.warn(f"{tracks.source}: {lacking}", KcsWarning, stacklevel=users_level())
-    return _before(lens, chosen, tracks, cameras)
+    shown = chosen.without_ends(tracks)
+    return chosen.with_ends(_before(lens, chosen, shown, cameras), tracks)
 
 
 def reconstruct_all(
@@ -181,6 +182,13 @@ def reconstruct_all(
     check_workers(workers, people)
     chosen = method_named(method, fields)
     lens = _lens(intrinsics)
+    every, people = people, [chosen.without_ends(one) for one in people]
+    found = _of_all(lens, chosen, people, workers)
+    return [chosen.with_ends(one, tracks) for one, tracks in zip(found, every, strict=True)]
+
+
+def _of_all(lens: Intrinsics | str | None, chosen: Method, people: list[Tracks], workers: int) -> list[Reconstruction]:
+    """Several bodies reconstructed, as one batch where the method can."""
     if isinstance(lens, Intrinsics):
         return list(spread(partial(_before, lens, chosen), people, workers=workers))
     if lens == "parallel" or (lens is None and not chosen.turns_over):

@@ -83,6 +83,14 @@ class Method(ABC):
         """The tracks that are solved, and that the result names as its own: those given, or mended ones."""
         return tracks
 
+    def without_ends(self, tracks: Tracks) -> Tracks:
+        """The tracks of those joints that are solved, where others, that no frame shows, are placed afterwards."""
+        return tracks
+
+    def with_ends(self, result: Reconstruction, tracks: Tracks) -> Reconstruction:
+        """What was found :meth:`without_ends` with all joints of the tracks."""
+        return result
+
     def following(self, searched: bool = True) -> Method:
         """The method for tracks of a camera that turns after the body, by which nothing stands still in the image.
 

@@ -119,12 +119,12 @@ def gap_deviation(points: Tensor, seen: Tensor, rate: float, most: float = 0.1) 
 
 
 def place_unseen(points: Tensor, known: Tensor, skeleton: Skeleton) -> Tensor:
-    """Place joints that are never seen where the template has them, seen from their nearest seen neighbour.
+    """Place joints that are never seen where the template has them, seen from their nearest seen neighbours.
 
     The template is turned onto each frame's seen joints, at one scale for the clip, and mirrored in depth where that
     fits the clip better. The scale is that at which most seen bones are as long as they look at their longest: a pose
-    unlike the template's would shrink what is fitted to it. Without a template a joint takes its neighbour's place,
-    without a neighbour the middle.
+    unlike the template's would shrink what is fitted to it. A joint between several takes the mean of what they tell.
+    Without a template it takes its neighbours' place, without a neighbour the middle.
 
     Args:
         points: (T, N, 3).
@@ -151,15 +151,18 @@ def place_unseen(points: Tensor, known: Tensor, skeleton: Skeleton) -> Tensor:
             fits.append((((placed - local).square().sum(-1) * weights).sum(), placed))
         offsets = min(fits, key=lambda f: float(f[0]))[1]
     placed = torch.where(known[:, None], local, torch.zeros_like(local))
-    done = known.tolist()
+    done = known.to(points.dtype)  # (N,)
+    bones = skeleton.bone_index(device=points.device)
+    near = points.new_zeros(2 * [len(known)]).index_put((bones[:, 0], bones[:, 1]), points.new_ones(()))
+    near = near + near.mT
     for _ in range(skeleton.num_joints):
-        fresh = [(a, b) for p in skeleton.bones for a, b in (p, p[::-1]) if done[a] and not done[b]]
-        if not fresh:
+        count = near @ done
+        fresh = (done == 0) & (count > 0)
+        if not bool(fresh.any()):
             break
-        for near, joint in fresh:
-            placed = placed.index_copy(-2, torch.tensor([joint], device=points.device),
-                                       (placed[:, near] + offsets[:, joint] - offsets[:, near])[:, None])  # fmt: skip
-            done[joint] = True
+        guess = offsets + near @ (done[:, None] * (placed - offsets)) / count.clamp_min(1)[:, None]
+        placed = torch.where(fresh[:, None], guess, placed)
+        done = torch.where(fresh, 1, done)
     return torch.where(known[:, None], points, placed + middle)
 
 

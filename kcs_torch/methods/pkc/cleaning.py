@@ -140,6 +140,7 @@ def _complete(tracks: Tracks, points: Tensor, keep: Tensor, left: float) -> tupl
         flat = torch.nn.functional.pad(points, (0, 1))
         points = place_unseen(flat, known, tracks.skeleton)[..., :2]
     points = within_reach(points, keep, tracks.skeleton)
+    points, _ = tracks.skeleton.complete(points[:, : tracks.skeleton.num_observed])  # virtual ones follow their sources
     noise = (gap_deviation(points, keep, tracks.rate, HELD).square() + left**2).sqrt()
     if detected(tracks):
         noise = noise.maximum(detector_deviation(tracks))

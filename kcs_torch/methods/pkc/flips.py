@@ -253,7 +253,7 @@ def _runs(bend: Tensor) -> Runs:
         wide = torch.nn.functional.pad(bend[:, None], (WINDOW, WINDOW), mode="replicate")
         least = -torch.nn.functional.max_pool1d(-wide, 2 * WINDOW + 1, 1)[:, 0]
         passes = (bend <= least) & (bend < SHARP)
-        passes[:, :WINDOW] = passes[:, frames - WINDOW :] = False
+        passes[:, :WINDOW] = passes[:, frames - WINDOW + 1 :] = False
         value, place = torch.where(passes, bend, torch.inf).topk(min(PASSAGES, frames), largest=False)
         places.insert(1, torch.where(value < torch.inf, place, frames).sort(1).values)
     at = torch.cat(places, 1)  # (P, passages + 2)

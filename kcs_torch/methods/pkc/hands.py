@@ -24,7 +24,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.graph import find_branches
 from kcs_torch.types import Tracks
 
-__all__ = ["Part", "joined", "part_of", "parts_of"]
+__all__ = ["Part", "hands_of", "is_shown", "joined", "part_of", "parts_of", "without_joints"]
 
 FINGERS, JOINTS = 4, 2
 """A wrist has so many branches at least, of so many joints each."""
@@ -43,12 +43,12 @@ class Part(NamedTuple):
 
 def parts_of(tracks: Tracks) -> list[Part]:
     """The body without its hands, and these; nothing where there are none to be solved by themselves."""
-    hands = [hand for hand in _hands(tracks.skeleton) if _often(tracks, hand.joints)]
+    hands = [hand for hand in hands_of(tracks.skeleton) if is_shown(tracks, hand.joints)]
     fingers = {joint for hand in hands for joint in hand.joints[1:]}
     body = [joint for joint in range(tracks.num_joints) if joint not in fingers]
-    if not hands or not _often(tracks, body):
+    if not hands or not is_shown(tracks, body):
         return []
-    return [Part(tuple(body), _only(tracks.skeleton, body)), *hands]
+    return [Part(tuple(body), without_joints(tracks.skeleton, body)), *hands]
 
 
 def part_of(tracks: Tracks, part: Part) -> Tracks:
@@ -111,14 +111,14 @@ def _of_hand(part: Part, one: Estimate, body: Estimate) -> list[str]:
     return [f"{part.skeleton.joints[0]}: {note}" for note in said]
 
 
-def _often(tracks: Tracks, joints: Sequence[int]) -> bool:
+def is_shown(tracks: Tracks, joints: Sequence[int]) -> bool:
     """Whether enough frames show enough of some joints for a clip of their own."""
     frames = (tracks.seen[:, list(joints)].sum(1) >= SHOWN).sum()
     return int(frames) >= min(FRAMES, tracks.num_frames)
 
 
 @lru_cache(maxsize=64)
-def _hands(skeleton: Skeleton) -> tuple[Part, ...]:
+def hands_of(skeleton: Skeleton) -> tuple[Part, ...]:
     """Hands that hang on a body with a template, by the joints' names."""
     if not skeleton.is_tree or not has_trunk(skeleton):
         return ()
@@ -142,8 +142,8 @@ def _hands(skeleton: Skeleton) -> tuple[Part, ...]:
     return tuple(hands)
 
 
-def _only(skeleton: Skeleton, joints: Sequence[int]) -> Skeleton:
-    """The skeleton of some joints, and of the bones between them."""
+def without_joints(skeleton: Skeleton, joints: Sequence[int]) -> Skeleton:
+    """The skeleton of some joints alone, and of the bones between them."""
     new = {joint: k for k, joint in enumerate(joints)}
     bones = [k for k, bone in enumerate(skeleton.bones) if new.keys() >= set(bone)]
 

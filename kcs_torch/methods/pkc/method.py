@@ -23,6 +23,7 @@ from kcs_torch.methods.pkc.body import Body
 from kcs_torch.methods.pkc.cleaning import cleaned
 from kcs_torch.methods.pkc.clip import LEAST_JOINTS, Clip
 from kcs_torch.methods.pkc.elsewhere import without_others, without_strange_limbs
+from kcs_torch.methods.pkc.ends import estimate_with_ends, with_ends, without_ends
 from kcs_torch.methods.pkc.fixed_answer import from_hypotheses
 from kcs_torch.methods.pkc.gaps import EXACT, gaps_of, likelier, usual_noise
 from kcs_torch.methods.pkc.gate import without_border, without_doubled, without_repeats
@@ -41,7 +42,7 @@ from kcs_torch.methods.pkc.stuck import without_stuck
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.nn.posture import has_trunk
 from kcs_torch.skeleton import Skeleton
-from kcs_torch.types import Tracks
+from kcs_torch.types import Reconstruction, Tracks
 
 __all__ = ["PKC"]
 
@@ -128,6 +129,12 @@ class PKC(Method):
             told = True
         return tracks if told in (None, tracks.detector) else replace(tracks, detector=told)
 
+    def without_ends(self, tracks: Tracks) -> Tracks:
+        return without_ends(tracks)
+
+    def with_ends(self, result: Reconstruction, tracks: Tracks) -> Reconstruction:
+        return result if result.skeleton == tracks.skeleton else with_ends(result, tracks)
+
     def following(self, searched: bool = True) -> PKC:
         """The same without contacts: what stands still in space does not in the image."""
         if not searched:
@@ -152,6 +159,10 @@ class PKC(Method):
         return run(together([self._steps(one, None) for one in tracks], late=is_descent), serve)
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
+        shown = without_ends(tracks)
+        if shown is not tracks:
+            found = yield from self._steps(shown, cameras)
+            return estimate_with_ends(found, shown.skeleton, tracks.skeleton)
         parts = parts_of(tracks)
         if parts:
             return (yield from self._by_parts(tracks, cameras, parts))

@@ -245,7 +245,7 @@ def _likeliest(task: Placing, starts: list[int], size: int) -> Tensor:
     cost = sign_costs(unary, deep, cap=task.cap, transition=moves).view(count, tried, -1).sum(-1)
     usual = task.cost()["proportions"][:, None, None]
     prior = 0.5 * ((task.candidates / task.usual[:, None]).log() / usual).square().sum(-1)
-    best = (cost * (len(starts) / len(sample)) + prior).argmin(-1)
+    best = (cost * (task.frames / (len(sample) * size)) + prior).argmin(-1)
     return task.candidates[torch.arange(count, device=best.device), best]
 
 

@@ -35,8 +35,9 @@ TURN = 0.15
 """Standard deviation of the trunk's turn from frame to frame, in radians, at 30 frames a second."""
 
 
-LONGER = 1.5
-"""By how many standard deviations of its noise the longest image of a bone is too long."""
+LONGER, FILLED = 1.5, 3.0
+"""By how many standard deviations of its noise the longest image of a bone is too long; and how many times as noisy as
+where it is surest it is where a gap was filled, at least: a detector that is less sure still shows it."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ def longest_image(flat: Tensor, noise: Tensor) -> Tensor:
         noise: (T, B) their standard deviation.
     """
     size = flat.norm(dim=-1)
-    sure = noise <= 1.01 * noise.amin(0)
+    sure = noise <= FILLED * noise.amin(0)
     return torch.where(sure, size - LONGER * noise, torch.nan).nanquantile(0.985, 0).clamp_min(0)
 
 
