@@ -91,7 +91,7 @@ class BoneLengthEnergy(SkeletonModule):
             points: (..., T, N, 3).
             lengths: (..., B), as in :meth:`forward`.
             stiffness: the paper's beta, not negative; a tensor broadcasts against (..., T, B).
-            num_steps: Levenberg-Marquardt steps.
+            num_steps: Levenberg-Marquardt steps; from 2 on they never raise what is minimised.
 
         Returns:
             (..., T, N, 3).
