@@ -16,7 +16,7 @@ from kcs_torch.functional.shapes import broadcast_shapes, check_batches, check_c
 __all__ = ["fit_bones"]
 
 RAISE, EASE = 4.0, 0.5
-"""What a frame's damping grows by after a step that was not taken, and the share of it that stays after one that was."""
+"""What a frame's damping grows by after a step that is not taken, and what share of it stays after one that is."""
 
 
 @widened
@@ -49,8 +49,8 @@ def fit_bones(
         bones: (B, 2) integer (parent, child) pairs.
         stiffness: the paper's beta, non-negative: a number, or a tensor that broadcasts against (..., B); 0 frees a
             bone. Above 1 / (B eps) it is as good as infinite and is cut there (5e5 for 16 bones in single precision).
-        num_steps: Levenberg-Marquardt steps, also those not taken; each gains about a digit where bones are within a few
-            per cent of their length, less where they are far off.
+        num_steps: Levenberg-Marquardt steps, also those not taken; each gains about a digit where bones are within a
+            few per cent of their length, less where they are far off.
         damping: non-negative, the least; shortens the steps without moving the solution.
         start: (..., N, D), A to start from; ``points`` if None.
 

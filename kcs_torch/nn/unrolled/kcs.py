@@ -241,7 +241,7 @@ class UnrolledKCS(Unrolled):
         with full_precision(tracks):
             points, share = self._centred(wide(tracks), wide(weights))
             rows, rest = clear_padding(wide(cameras), inside), self.template(points)
-            threshold, step = self._values("threshold", points), self._step_sizes(points)
+            threshold, step = self._values("threshold", points), self._step_sizes(share, rows)
             matrix, inverse = self.matrix.to(points), self.inverse.to(points)
             scales, size = self._scales(scales, points, rows, share, rest, inside)
             given = (deviation_goal(rest, points / or_one(scales)[..., None, None], rows, share), rows, share)
