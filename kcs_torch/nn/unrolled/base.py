@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.weights import seen_weights
-from kcs_torch.nn.checks import check_beside, check_joints, check_points, check_tensor, check_weights
+from kcs_torch.nn.checks import check_beside, check_inside, check_joints, check_points, check_tensor, check_weights
 from kcs_torch.nn.layers import inverse_softplus
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.steps import corner_of
@@ -278,9 +278,7 @@ class Unrolled(nn.Module):
             check_beside(lengths, "lengths", (skeleton.num_bones,), tracks, self, "tracks")
         check_beside(scales, "scales", tracks.shape[-3:-2], tracks, self, "tracks")
         check_weights(weights, tracks, self)
-        check_beside(inside, "inside", tracks.shape[-3:-2], tracks, self, "tracks")
-        if inside is not None and inside.dtype != torch.bool:
-            raise ShapeError(f"{name}: inside: expected True or False for each frame, got {inside.dtype}")
+        check_inside(inside, tracks, self)
         if start is not None and start.shape[-3:] != (*tracks.shape[-3:-1], 3):
             expected = f"(..., {tracks.shape[-3]}, {tracks.shape[-2]}, 3)"
             raise ShapeError(f"{name}: expected start {expected}, got {tuple(start.shape)}")
