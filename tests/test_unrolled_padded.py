@@ -92,6 +92,9 @@ def test_cameras_of_a_template_too():
         assert_close(got[k, : len(one)], layer(one, rows, scales=sizes))
     assert not cameras[0, 70:].any() and not scales[0, 70:].any()
     assert_close(layer(tracks, cameras, inside=inside)[0, :70], layer(every[0], cameras[0, :70]))
+    last = layer.find_cameras(tracks.flip(-3), inside=inside.flip(-1))  # padding may come first
+    first = layer.find_cameras(every[0].flip(0))
+    assert_close((last[0][0, 60:], last[1][0, 60:]), first)
 
 
 def test_a_lifter_s_solver_is_told_too():
