@@ -319,6 +319,14 @@ def test_batches_equal_loops():
     same_as_loop(lambda p, ell: fit_bones(p, ell.abs(), BONES["tree"], damping=0.3), (7, 2), (6,))  # in the plane
 
 
+def test_the_default_device_makes_no_difference():
+    points, lengths = problem("tree", 2)
+    for options in ({"num_steps": 3}, {"num_steps": 1, "damping": 0.5}):
+        usual = fit_bones(points, lengths, BONES["tree"], **options)
+        with torch.device("meta"):
+            assert torch.equal(fit_bones(points, lengths, BONES["tree"], **options), usual)
+
+
 def test_no_bones():
     points = normal(2, 4, 3)
     none = torch.zeros(0, 2, dtype=torch.long)

@@ -113,7 +113,7 @@ def fit_bones(
         unit = vectors / size[..., None]
         weighted, way, base, share = root[..., None] * unit, anchor_bones - vectors, points, None
         if isinstance(level, Tensor) or level > 0:
-            share = 1 / (1 + torch.as_tensor(level).to(points))[..., None, None]
+            share = torch.as_tensor(1 / (1 + level), dtype=points.dtype, device=points.device)[..., None, None]
             weighted, way, base = share.sqrt() * weighted, share * way, shape + share * (points - shape)
         residual = size - lengths + (unit * way).sum(-1)
         pull = solve_coupled(weighted, root * residual, bones, overlap)[..., None] * weighted
@@ -130,7 +130,7 @@ def fit_bones(
         return bent.square().sum(-1) + moved.square().sum((-2, -1))
 
     value = energy(current, bone[1])
-    level: Tensor | float = damping
+    level = torch.full_like(value, damping)
     rounding = limits.eps * (root * lengths).detach().square().sum(-1)
     for _ in range(num_steps):
         trial = step(current, *bone, level)
