@@ -93,9 +93,8 @@ def window_by_window(step: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """A step of SfAM that takes the windows (W, T, N, 3) of one body, with a Python loop over them."""
 
     def looped(*batched: Tensor, corner: Tensor, **shared: Tensor) -> Tensor:
-        *windows, size = batched  # shape, tracks, cameras, weights, threshold and corner are each window's own
-        own = zip(*windows, corner, strict=True)
-        return torch.stack([step(*window, size, corner=bend, **shared) for *window, bend in own])
+        own = zip(*batched, corner, strict=True)  # all of them are each window's own
+        return torch.stack([step(*window, corner=bend, **shared) for *window, bend in own])
 
     return looped
 

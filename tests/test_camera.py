@@ -26,6 +26,7 @@ from kcs_torch.functional import (
     factorize,
     nearest_rotation,
     orthonormality_defect,
+    perspective,
     project,
     rows_to_cameras,
     viewpoint_turn,
@@ -59,6 +60,21 @@ def test_factorize_is_the_best_of_its_rank(frames, joints, rank):
     u, s, vt = torch.linalg.svd(stacked, full_matrices=False)
     assert_close(motion.flatten(0, 1) @ shape, (u[:, :rank] * s[:rank]) @ vt[:rank])
     assert_close(motion.flatten(0, 1).norm(dim=0), s[:rank])
+
+
+def test_factorize_keeps_small_singular_values_in_single_precision():
+    """The squares of those below 3e-4 of the largest are lost to its rounding."""
+    left, right = (torch.linalg.qr(normal(size, 9, seed=seed))[0] for seed, size in enumerate((200, 17)))
+    stacked = (left * torch.logspace(0, -4, 9, dtype=torch.float64)) @ right.mT
+    tracks = stacked.view(100, 2, 17).mT.float()
+    motion, shape = factorize(tracks, 9)
+    assert motion.dtype == shape.dtype == torch.float32
+    assert ((motion @ shape).mT - tracks).norm() < 1e-6 * tracks.norm()
+
+
+def test_perspective_of_half_precision_stays_in_range():
+    point, lens = torch.tensor([100.0, 200, 5000]), torch.tensor([1500.0, 1500, 960, 540])
+    assert_close(perspective(point.half(), lens.half()).float(), perspective(point, lens), rtol=1e-3, atol=0)
 
 
 @pytest.mark.parametrize("rank", [0, 6])

@@ -42,14 +42,14 @@ def eliminates(monkeypatch):
 @pytest.mark.parametrize("body", [body for body in BODIES if body != "none"])
 def test_elimination_is_the_dense_solution(body, share):
     bones = BODIES[body]
-    overlap = overlap_of(bones)
+    overlap = share * overlap_of(bones)
     vectors, right = normal(2, FRAMES, len(bones), 3), normal(2, FRAMES, len(bones), seed=1)
     vectors[0, 3] = 0
     vectors[1, 5] *= 1e3  # stiff
-    got = coupled._eliminated(vectors, right, order_of(bones), share * overlap)
-    matrix = torch.eye(len(bones), dtype=torch.float64) + share * overlap * kcs_matrix(vectors)
+    got = coupled._eliminated(vectors, right, order_of(bones), overlap)
+    matrix = torch.eye(len(bones), dtype=torch.float64) + overlap * kcs_matrix(vectors)
     assert_close(got, torch.linalg.solve(matrix, right[..., None])[..., 0], rtol=1e-7, atol=1e-9)
-    assert_close(solve_coupled(vectors, right, bones, overlap, share=share), got, rtol=1e-7, atol=1e-9)
+    assert_close(solve_coupled(vectors, right, bones, overlap), got, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("body", [body for body in BODIES if body not in ("star", "ring")])
@@ -105,3 +105,13 @@ def test_vmap_is_a_loop(eliminates):
         torch.func.vmap(solve_coupled)(vectors, right, torch.stack([bones, others]), overlaps), torch.stack(alone)
     )
     assert len(eliminates) == 4
+
+
+def test_the_order_does_not_take_the_default_device_of_its_first_call():
+    coupled._order.cache_clear()
+    try:
+        with torch.device("meta"):
+            order = order_of(BODIES["tree"])
+        assert order.first.device.type == order.second.device.type == "cpu"
+    finally:
+        coupled._order.cache_clear()

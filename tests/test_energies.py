@@ -247,6 +247,19 @@ def test_low_rank_prox_is_optimal():
     assert gradcheck(energy.prox, points, torch.tensor(0.8).double(), fast=True)
 
 
+@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize("weighted", [False, True])
+def test_log_det_energy_of_a_clip_at_rest_knows_no_rounding(dtype, weighted):
+    energy = LowRankEnergy("log_det")
+    points = (1e3 * normal(1, 7, 3, dtype=dtype)).expand(30, -1, -1).clone().requires_grad_()
+    weights = normal(30, 7, seed=1, dtype=dtype).abs() + 0.1 if weighted else None
+    value = energy(points, weights)
+    (grad,) = torch.autograd.grad(value, points)
+    assert torch.equal(value, energy(torch.zeros_like(points), weights)) and not grad.any()
+    (grad,) = torch.autograd.grad(energy(points + 1e-2 * normal(30, 7, 3, seed=2, dtype=dtype), weights), points)
+    assert grad.any()
+
+
 @pytest.mark.parametrize("options", [{"kind": "rank"}, {"kind": "log_det", "eps": 0.0}])
 def test_low_rank_options_out_of_range(options):
     with pytest.raises(OptionError, match="'nuclear' or 'log_det'"):

@@ -183,6 +183,16 @@ def test_coverage_counts_what_is_known_of_the_truth():
         coverage(pred, torch.ones(6), truth)
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -1.0])
+def test_deviations_that_are_none_are_refused_where_they_count(value):
+    truth, deviation, weights = clip(2), torch.ones(2, 12, 6).double(), torch.ones(2, 12, 6).double()
+    deviation[1, 7, 2] = value
+    with pytest.raises(ShapeError, match=r"deviation: expected .* >= 0, got .* at frame 7, joint 2 of clip 1$"):
+        coverage(truth, deviation, truth)
+    weights[1, 7, 2] = 0
+    assert (coverage(truth, deviation, truth, weights=weights) == 1).all()
+
+
 def test_bone_deviation_is_the_protocols_figure():
     points = clip(frames=30)
     length = np.linalg.norm(points[:, [a for a, _ in BONES]] - points[:, [b for _, b in BONES]], axis=-1)
@@ -278,6 +288,15 @@ def test_bones_of_joints_that_are_nan_count_where_they_are_seen():
     gone = torch.where(weights[..., None] > 0, points, torch.nan)
     for bones in (BONES, BONES[:1]):
         assert torch.equal(bone_deviation(gone, bones, weights=weights), bone_deviation(points, bones, weights=weights))
+
+
+def test_bones_that_count_are_finite():
+    points, weights = clip(), torch.ones(12, 6, dtype=torch.float64)
+    points[3, 4] = points[2, 5] = torch.nan  # an end of a bone, and of none
+    with pytest.raises(ShapeError, match=r"^points: expected finite points, got \[nan.*\] at frame 3, joint 4: where"):
+        bone_deviation(points, BONES)
+    weights[3, 0] = 0  # the bone's other end
+    assert bone_deviation(points, BONES, weights=weights).isfinite()
 
 
 def test_what_weighs_nothing_may_be_nan():

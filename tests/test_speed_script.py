@@ -29,7 +29,7 @@ def test_bone_step_twins(damping):
     points = normal(2, 5, 7, 3)
     bones = BODY.bone_index()
     lengths = bone_lengths(points, bones) * (1 + 0.2 * normal(2, 5, 6, seed=1)).abs()
-    options = {"stiffness": normal(6, seed=2).abs(), "num_steps": 3, "damping": damping}
+    options = {"stiffness": normal(6, seed=2).abs(), "num_steps": 1, "damping": damping}
     got = kt.solvers.fit_bones(points, lengths, bones, **options)
     for twin in (naive.fit_bones, naive.fit_bones_frame_by_frame):
         assert_close(got, twin(points, lengths, bones, **options), rtol=1e-6, atol=1e-6)

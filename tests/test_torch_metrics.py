@@ -127,6 +127,12 @@ def test_unknown_joints_may_be_anything():
     )
 
 
+def test_a_prediction_that_is_nan_has_no_constant_bones():
+    metric = fed(kt.metrics.BoneDeviation(BONES), PRED)
+    with pytest.raises(kt.ShapeError, match="expected finite points"):
+        metric.update(PRED * torch.nan)
+
+
 def test_frames_without_their_root_do_not_count():
     weights = torch.ones(7, 12, 6).double()
     weights[:, 4, 2] = 0

@@ -15,6 +15,13 @@ from kcs_torch.methods import SfAM
 from kcs_torch.nn import MLPLifter, RefinedLifter, UnrolledFPC, UnrolledKCS, UnrolledPKC, UnrolledSfAM
 from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape
 
+LAYERS = [
+    UnrolledFPC(40),
+    UnrolledSfAM(BODY, 40),
+    UnrolledKCS(BODY, 40, template=normal(7, 3, seed=8)),
+    UnrolledPKC(BODY, 5),
+]
+
 
 def naive(body, tracks, cameras, weights, *, steps, mu, final, tau, momentum, beta, articulate_from, corner):
     """The iteration written out, with plain SVDs and 3N x 3N systems: one clip."""
@@ -171,12 +178,32 @@ def test_lengths_may_be_given():
 
 
 def test_a_start_may_be_given():
-    tracks, cameras, weights = scene(BODY, "gaps")
+    tracks, cameras, weights = scene(BODY)
     module = UnrolledSfAM(BODY, 5)
     usual = module(tracks, cameras, weights=weights)
     start = start_shape(tracks, cameras, weights)
     assert_close(module(tracks, cameras, weights=weights, start=start), usual)
     assert not torch.allclose(module(tracks, cameras, weights=weights, start=start + normal(6, 7, 3)), usual)
+
+
+@pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: type(layer).__name__)
+def test_a_start_may_stand_anywhere(layer):
+    tracks, cameras, weights = scene(BODY, "gaps")
+    start, away = normal(6, 7, 3), 100 * normal(6, 1, 3, seed=1)
+    usual = layer(tracks, cameras, weights=weights, start=start)
+    assert_close(layer(tracks, cameras, weights=weights, start=start + away), usual)
+
+
+@pytest.mark.parametrize("layer", LAYERS[:3], ids=lambda layer: type(layer).__name__)
+def test_steps_do_not_diverge_whatever_the_weights_and_the_cameras_scale(layer):
+    tracks, cameras, weights = scene(BODY, "gaps")
+    usual = layer(tracks, cameras, weights=weights)
+    for one, rows, mass in [(tracks, cameras, 30 * weights), (9 * tracks, 9 * cameras, weights)]:
+        assert layer(one, rows, weights=mass).abs().max() < 30 * usual.abs().max()
+    several = torch.stack([weights, 5 * weights]), torch.stack([tracks] * 2), torch.stack([cameras] * 2)
+    got = layer(several[1], several[2], weights=several[0])
+    assert_close(got[0], usual)
+    assert_close(got[1], layer(tracks, cameras, weights=5 * weights))
 
 
 def test_solve_tells_of_convergence():

@@ -14,6 +14,8 @@ from kcs_torch.data import walking_person
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional import bone_lengths, bone_vectors, complete_rotation, incidence, rows_to_cameras
 from kcs_torch.nn import UnrolledKCS
+from kcs_torch.nn.unrolled import kcs as unrolled_kcs
+from kcs_torch.solvers.pose import fit_cameras
 
 REST = normal(7, 3)
 CLIP = walking_person(30, turn=60.0, missing=0.1, generator=torch.Generator().manual_seed(0))
@@ -243,6 +245,13 @@ def test_what_does_not_fit():
         module(tracks.tolist(), cameras)
     with pytest.raises(ShapeError, match=r"cameras \(\.\.\., T, 2, 3\)"):
         module(tracks, cameras[:3])
+
+
+def test_cameras_of_many_clips_are_found_together(monkeypatch):
+    calls = []
+    monkeypatch.setattr(unrolled_kcs, "fit_cameras", lambda *given: calls.append(len(given[0])) or fit_cameras(*given))
+    UnrolledKCS(BODY, 2, template=REST).find_cameras(normal(3, 2, 5, 7, 2), inside=torch.arange(5) < 4)
+    assert calls == [30]
 
 
 def test_an_empty_batch_has_no_cameras():

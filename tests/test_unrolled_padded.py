@@ -11,7 +11,7 @@ from unrolled_scenes import scene
 
 from kcs_torch import ShapeError
 from kcs_torch.data import walking_person
-from kcs_torch.nn import UnrolledFPC, UnrolledKCS, UnrolledPKC, UnrolledSfAM
+from kcs_torch.nn import MLPLifter, RefinedLifter, UnrolledFPC, UnrolledKCS, UnrolledPKC, UnrolledSfAM
 from kcs_torch.solvers import Implicit
 
 TEMPLATE = normal(BODY.num_joints, 3, seed=8).tolist()
@@ -92,6 +92,22 @@ def test_cameras_of_a_template_too():
         assert_close(got[k, : len(one)], layer(one, rows, scales=sizes))
     assert not cameras[0, 70:].any() and not scales[0, 70:].any()
     assert_close(layer(tracks, cameras, inside=inside)[0, :70], layer(every[0], cameras[0, :70]))
+    last = layer.find_cameras(tracks.flip(-3), inside=inside.flip(-1))  # padding may come first
+    first = layer.find_cameras(every[0].flip(0))
+    assert_close((last[0][0, 60:], last[1][0, 60:]), first)
+
+
+def test_a_lifter_s_solver_is_told_too():
+    refined = RefinedLifter(MLPLifter(BODY, width=8), UnrolledSfAM(BODY, 4)).double().eval()
+    every, (tracks, _, weights), inside = clips()
+    got = refined(tracks, weights, inside=inside)
+    for k, (one, _, seen) in enumerate(every):
+        assert_close(got[k, : len(one)], refined(one, seen), rtol=1e-7, atol=1e-9)
+    assert not got[~inside].any()
+    tracks[~inside] = 1e5
+    assert_close(refined(tracks, None, inside=inside)[1, :4], refined(every[1][0]), rtol=1e-7, atol=1e-9)
+    with pytest.raises(ShapeError, match="RefinedLifter: inside: expected True or False for each frame, got"):
+        refined(tracks, inside=inside.double())
 
 
 def test_what_is_inside_is_yes_or_no_for_each_frame():

@@ -26,7 +26,6 @@ class Lifter(torch.nn.Module):
 
     def forward(self, tracks):
         start = self.network(tracks)
-        start = start - start.mean(-2, keepdim=True)
         camera = torch.eye(3)[:2].expand(*tracks.shape[:-2], 2, 3)  # points are in its frame
         return start, self.refine(tracks, camera, start=start)
 

@@ -12,7 +12,7 @@ from kcs_torch.functional.angles import angle_between
 from kcs_torch.functional.derivatives import why_failed
 from kcs_torch.functional.eigen import eigh
 from kcs_torch.functional.guarded import or_one
-from kcs_torch.functional.precision import alike, full_precision, wide, widened
+from kcs_torch.functional.precision import alike, double, full_precision, wide, widened
 from kcs_torch.functional.shapes import check_batches, check_core, check_floats
 
 __all__ = [
@@ -65,7 +65,7 @@ def perspective(points: Tensor, intrinsics: Tensor) -> Tensor:
     check_core(points, "perspective: points", 3)
     check_core(intrinsics, "perspective: intrinsics", 4)
     check_batches("perspective: points and intrinsics", points, intrinsics, cores=(1, 1))
-    return intrinsics[..., :2] * points[..., :2] / points[..., 2:] + intrinsics[..., 2:]
+    return intrinsics[..., :2] * (points[..., :2] / points[..., 2:]) + intrinsics[..., 2:]
 
 
 def pinhole_translation(points: Tensor, rays: Tensor, weights: Tensor) -> Tensor:
@@ -162,8 +162,9 @@ def factorize(tracks: Tensor, rank: int) -> tuple[Tensor, Tensor]:
     stacked = tracks.mT.flatten(-3, -2)  # (..., 2T, N), rows x1, y1, x2, y2, ...
     try:
         if stacked.shape[-2] >= joints:
-            _, vectors = eigh(stacked.mT @ stacked)
-            shape = vectors.flip(-1)[..., :rank].mT
+            exact = double(stacked)
+            _, vectors = eigh(exact.mT @ exact)
+            shape = vectors.flip(-1)[..., :rank].mT.to(stacked.dtype)
         else:
             shape = torch.linalg.svd(stacked, full_matrices=False)[2][..., :rank, :]
     except torch.linalg.LinAlgError as error:

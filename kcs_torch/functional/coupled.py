@@ -54,8 +54,8 @@ class _Order(NamedTuple):
         return sum(2 * len(step.others) + len(step.among) for step in self.steps)
 
 
-def solve_coupled(vectors: Tensor, right: Tensor, bones: Tensor, overlap: Tensor, *, share: float = 1.0) -> Tensor:
-    """Solve (I + share (C^T C) o Psi) y = r, C being the incidence matrix and Psi the KCS matrix of bone vectors.
+def solve_coupled(vectors: Tensor, right: Tensor, bones: Tensor, overlap: Tensor) -> Tensor:
+    """Solve (I + (C^T C) o Psi) y = r, C being the incidence matrix and Psi the KCS matrix of bone vectors.
 
     C^T C couples bones that meet at a joint. There all are coupled with all, so that in a tree, eliminated from its
     leaves, zeros stay zeros: a few operations a bone, over all frames at once, where a dense factorisation takes some
@@ -68,7 +68,6 @@ def solve_coupled(vectors: Tensor, right: Tensor, bones: Tensor, overlap: Tensor
         bones: (B, 2) integer (parent, child) pairs.
         overlap: C^T C (B, B): 2 on its diagonal; where two bones meet, 1 if both come from that joint or both go to it,
             else -1.
-        share: not negative.
 
     Returns:
         y (..., B). Differentiable any number of times.
@@ -85,9 +84,9 @@ def solve_coupled(vectors: Tensor, right: Tensor, bones: Tensor, overlap: Tensor
     if plain and here and dense > CALL:
         order = _readable(bones)
         if order and 0 < order.work * (CALL + EACH * frames) < dense:
-            return _eliminated(vectors, right, order, share * overlap)
+            return _eliminated(vectors, right, order, overlap)
     eye = torch.eye(len(bones), dtype=vectors.dtype, device=vectors.device)
-    factor, _ = torch.linalg.cholesky_ex(torch.addcmul(eye, share * overlap, kcs_matrix(vectors)))
+    factor, _ = torch.linalg.cholesky_ex(torch.addcmul(eye, overlap, kcs_matrix(vectors)))
     return torch.cholesky_solve(right[..., None], factor)[..., 0]
 
 
@@ -150,5 +149,5 @@ def _order(bones: tuple[tuple[int, ...], ...]) -> _Order:
                 near[other].add(one)
         slots = tuple(slot[min(bone, other), max(bone, other)] for other in others)
         steps.append(_Step(bone, tuple(others), slots, tuple(among)))
-    first, second = torch.tensor(pairs, dtype=torch.long).reshape(-1, 2).unbind(1)
+    first, second = torch.tensor(pairs, dtype=torch.long, device="cpu").reshape(-1, 2).unbind(1)
     return _Order(first, second, len(slot), tuple(steps))

@@ -10,7 +10,7 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-__all__ = ["alike", "full_precision", "narrow", "wide", "widened"]
+__all__ = ["alike", "double", "full_precision", "narrow", "wide", "widened"]
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -34,6 +34,14 @@ def alike(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 def wide(tensor: Tensor) -> Tensor:
     """At least in single precision: squares of millimetres or pixels leave the range of half precision."""
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+
+
+def double(matrix: Tensor) -> Tensor:
+    """In double precision: single precision would lose singular values below 3e-4 of the largest, squared by Gram's.
+
+    MPS devices know no double precision.
+    """
+    return wide(matrix) if matrix.device.type == "mps" else matrix.double()
 
 
 def narrow(value: Tensor, like: Tensor) -> Tensor:

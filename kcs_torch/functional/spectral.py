@@ -21,7 +21,7 @@ from torch import Tensor
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.derivatives import LargestSum, PSDShrink, ShrinkSingularValues, applied, why_failed
 from kcs_torch.functional.eigen import eigvalsh
-from kcs_torch.functional.precision import wide
+from kcs_torch.functional.precision import double, wide
 from kcs_torch.functional.shapes import check_core, fit_together
 
 __all__ = ["dct_basis", "log_det", "nuclear_norm", "psd_shrink", "singular_values", "spectral_norm", "svt"]
@@ -57,7 +57,7 @@ def svt(matrix: Tensor, threshold: Tensor | float, corner: Tensor | float = math
     [[1.0, 0.0], [0.0, 0.0]]
     """
     _check_matrix(matrix, "svt")
-    work = _double(matrix)
+    work = double(matrix)
     level = _level(threshold, "svt: threshold", work, sign=True)
     size = _level(corner, "svt: corner", work, sign=True)
     least = torch.finfo(work.dtype).tiny ** 0.5  # of which the inverse, and its square in the derivative, are finite
@@ -111,7 +111,7 @@ def nuclear_norm(matrix: Tensor) -> Tensor:
     7.0
     """
     _check_matrix(matrix, "nuclear_norm")
-    out: Tensor = applied(LargestSum, _double(matrix), min(matrix.shape[-2:]))[0]
+    out: Tensor = applied(LargestSum, double(matrix), min(matrix.shape[-2:]))[0]
     return out.to(matrix.dtype)
 
 
@@ -131,7 +131,7 @@ def spectral_norm(matrix: Tensor) -> Tensor:
     4.0
     """
     _check_matrix(matrix, "spectral_norm")
-    out: Tensor = applied(LargestSum, _double(matrix), 1)[0]
+    out: Tensor = applied(LargestSum, double(matrix), 1)[0]
     return out.to(matrix.dtype)
 
 
@@ -180,7 +180,7 @@ def singular_values(matrix: Tensor) -> Tensor:
     """
     _check_matrix(matrix, "singular_values")
     with torch.no_grad():
-        work = _double(matrix)
+        work = double(matrix)
         gram = work.mT @ work if work.shape[-2] >= work.shape[-1] else work @ work.mT
         try:
             values = eigvalsh(gram)
@@ -218,14 +218,6 @@ def dct_basis(
     basis = torch.cos(torch.pi / length * time[:, None] * wave) * (2 / length) ** 0.5
     basis[:, 0] = length**-0.5
     return basis
-
-
-def _double(matrix: Tensor) -> Tensor:
-    """A Gram matrix squares the singular values: in single precision it would lose those below 3e-4 of the largest.
-
-    MPS devices know no double precision.
-    """
-    return wide(matrix) if matrix.device.type == "mps" else matrix.double()
 
 
 def _check_matrix(matrix: Tensor, name: str) -> None:

@@ -23,7 +23,8 @@ def interpolate(values: Tensor, seen: Tensor) -> Tensor:
         seen: (..., T, N), or what broadcasts to it, True where ``values`` hold.
 
     Returns:
-        (..., T, N, D). A joint never seen takes the mean of the seen joints of each frame (0 where there is none).
+        (..., T, N, D). A joint never seen takes the mean of the others in each frame, their gaps filled; 0 where there
+        are none.
 
     Raises:
         ShapeError: the values are not (..., T, N, D), or ``seen`` is not of truth values that fit them.

@@ -11,7 +11,7 @@ from kcs_torch.errors import ShapeError
 from kcs_torch.functional import ALIGNMENTS, superpose
 from kcs_torch.functional.align import check_alignment
 
-__all__ = ["ALIGNMENTS", "align", "check_tensors"]
+__all__ = ["ALIGNMENTS", "align", "check_finite", "check_tensors", "first_of"]
 
 
 def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = None, root: int | None = None) -> Tensor:
@@ -38,9 +38,7 @@ def align(pred: Tensor, truth: Tensor, how: str, *, weights: Tensor | None = Non
     check_alignment(how, root)
     check_tensors(pred=pred, truth=truth, weights=weights)
     _check_points(pred, truth)
-    for name, points in (("pred", pred), ("truth", truth)):
-        if not bool(torch.isfinite(points).all()):
-            raise ShapeError(f"{name}: {_not_finite(points)}")
+    check_finite(pred=pred, truth=truth)
     if weights is not None and weights.shape != truth.shape[:-1]:
         raise ShapeError(f"weights: expected shape {tuple(truth.shape[:-1])}, got {tuple(weights.shape)}")
     wide = torch.promote_types(torch.promote_types(pred.dtype, truth.dtype), torch.float32)
@@ -64,12 +62,20 @@ def _check_points(pred: Tensor, truth: Tensor) -> None:
     raise ShapeError(message)
 
 
-def _not_finite(points: Tensor) -> str:
-    """Where points (..., T, N, 3) are NaN or infinite first, and what to do about it, for the user."""
-    *batch, frame, joint = (~torch.isfinite(points)).any(-1).nonzero()[0].tolist()
+def check_finite(**given: Tensor) -> None:
+    """Raise a ShapeError unless all points (..., T, N, 3) that are given, by their names, are finite."""
+    for name, points in given.items():
+        if not bool(torch.isfinite(points).all()):
+            value, where = first_of(points, (~torch.isfinite(points)).any(-1))
+            told = f"expected finite points, got {value} at {where}"
+            raise ShapeError(f"{name}: {told}: where a joint is unknown, write 0, and 0 into its weight")
+
+
+def first_of(values: Tensor, odd: Tensor) -> tuple[Any, str]:
+    """The first of values (..., T, N, *) that is odd (..., T, N), and where it is, for the user."""
+    *batch, frame, joint = odd.nonzero()[0].tolist()
     where = f"frame {frame}, joint {joint}" + (f" of clip {', '.join(map(str, batch))}" if batch else "")
-    value = points[(*batch, frame, joint)].tolist()
-    return f"expected finite points, got {value} at {where}: where a joint is unknown, write 0, and 0 into its weight"
+    return values[(*batch, frame, joint)].tolist(), where
 
 
 def check_tensors(**given: Any) -> None:

@@ -11,13 +11,14 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import bone_lengths, centre, nearest_rotation
-from kcs_torch.functional.chain import index_rows
+from kcs_torch.functional.chain import incidence, index_rows
 from kcs_torch.functional.guarded import LOST, largest, or_one, safe_root
 from kcs_torch.functional.precision import wide
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.shapes import check_core
 from kcs_torch.functional.weights import known
 from kcs_torch.metrics.align import align as aligned
+from kcs_torch.metrics.align import check_finite, first_of
 from kcs_torch.skeleton import Skeleton, get_skeleton
 
 __all__ = ["Bones", "bone_deviation", "bone_pairs", "coverage", "distances", "e3d", "mpjpe", "pck"]
@@ -139,7 +140,7 @@ def coverage(
 
     Args:
         pred: (..., T, N, 3), in the camera's frame, as a :class:`~kcs_torch.Reconstruction` has its ``points``.
-        deviation: (..., T, N) standard deviations of its depths, in its unit: the ``uncertainty``.
+        deviation: (..., T, N) standard deviations of its depths, in its unit, not negative: the ``uncertainty``.
         truth: (..., T, N, 3), in the same camera's frame.
         scale: take the size from the truth first, one factor for a clip and its deviations; where both have one unit
             there is no need.
@@ -149,7 +150,7 @@ def coverage(
         (...), 0 to 1; NaN where nothing counts.
 
     Raises:
-        ShapeError: the shapes differ, or a number that counts is not finite.
+        ShapeError: the shapes differ, or a number that counts is not finite, or a deviation that counts negative.
 
     >>> truth = torch.tensor([[[0.0, 0, -1], [0, 1, 0], [0, 2, 1]]])
     >>> coverage(1.2 * truth, torch.full((1, 3), 0.1), truth).item()
@@ -161,6 +162,10 @@ def coverage(
     pred = aligned(pred, truth, "none", weights=weights)  # checks the rest; at least in single precision
     mass = torch.ones_like(pred[..., 0]) if weights is None else weights.to(pred).clamp_min(0)
     source, target = centre(pred, mass)[0], centre(truth.to(pred), mass)[0]
+    odd = (mass > 0) & ~(deviation.isfinite() & (deviation >= 0))
+    if bool(odd.any()):
+        value, where = first_of(deviation.expand(odd.shape), odd)
+        raise ShapeError(f"coverage: deviation: expected finite numbers >= 0, got {value} at {where}")
     each, factor = mass[..., None], mass.new_ones(mass.shape[:-2])
 
     def summed(values: Tensor) -> Tensor:
@@ -189,7 +194,7 @@ def bone_deviation(points: Tensor, bones: Bones, *, weights: Tensor | None = Non
         (...), a share: 0.01 is 1 per cent; NaN where no bone is known. The derivative is 0 where a length is constant.
 
     Raises:
-        ShapeError: there are no bones, or the shapes do not fit them.
+        ShapeError: there are no bones, or the shapes do not fit them, or an end of a bone that counts is not finite.
 
     >>> points = torch.tensor([[[0.0, 0, 0], [0, 9, 0]], [[0, 0, 0], [0, 11, 0]]])
     >>> round(bone_deviation(points, [(0, 1)]).item(), 4)
@@ -201,8 +206,12 @@ def bone_deviation(points: Tensor, bones: Bones, *, weights: Tensor | None = Non
     if weights is not None:
         check_core(weights, "bone_deviation: weights", *points.shape[-3:-1])
         mass = mass & (weights > 0)
-    lengths = bone_lengths(wide(torch.where(mass[..., None], points, 0.0)), index)  # (..., T, B)
-    share = (mass[..., index[:, 0]] & mass[..., index[:, 1]]).to(lengths)
+    both = mass[..., index[:, 0]] & mass[..., index[:, 1]]  # (..., T, B)
+    ends = both.to(torch.float32) @ incidence(index, points.shape[-2], dtype=torch.float32).abs().mT > 0
+    points = torch.where(ends[..., None], points, 0.0)
+    check_finite(points=points)
+    lengths = bone_lengths(wide(points), index)
+    share = both.to(lengths)
     count = share.sum(-2).clamp_min(1)
     mean = (lengths * share).sum(-2) / count
     spread = safe_root(((lengths - mean[..., None, :]).square() * share).sum(-2) / count)

@@ -186,6 +186,9 @@ class BoneDeviation(_Mean):
         """Add a batch of clips (..., T, N, 3) with weights (..., T, N), 0 where a joint is unknown.
 
         In a ``MetricCollection`` with others name the arguments: ``update(pred=..., truth=...)``.
+
+        Raises:
+            ShapeError: the shapes do not fit, or an end of a bone that counts is not finite.
         """
         value = bone_deviation(pred, self.bones, weights=weights)
         self._add(value, ~torch.isnan(value))

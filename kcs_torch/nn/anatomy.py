@@ -121,9 +121,9 @@ class HingeEnergy(_JointEnergy):
     def _wrong(self, points: Tensor, lengths: Tensor | None, weights: Tensor | None) -> Tensor:
         return (-self._sines(points, lengths, weights)).clamp_min(0)
 
-    def bend(self, points: Tensor, lengths: Tensor | None = None, weights: Tensor | None = None) -> Tensor:
+    def bend(self, points: Tensor, lengths: Tensor | None = None) -> Tensor:
         """The sine s of each hinge, (..., T, H), positive where it bends its way; arguments as in :meth:`forward`."""
-        return narrow(self._sines(points, lengths, weights), points)
+        return narrow(self._sines(points, lengths, None), points)
 
     def _sines(self, points: Tensor, lengths: Tensor | None, weights: Tensor | None) -> Tensor:
         upper, lower, axis = self._vectors(points, lengths, weights)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, cast
 
+import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
@@ -20,6 +21,7 @@ __all__ = [
     "check_beside",
     "check_clip",
     "check_coordinates",
+    "check_inside",
     "check_joints",
     "check_lengths",
     "check_one",
@@ -109,6 +111,14 @@ def check_beside(
     if own < 0 or given[own:] != tuple(shape) or not fit_together(given[:own], clip.shape[:-3]):
         expected = f"{what} (..., {', '.join(map(str, shape))})"
         raise ShapeError(f"{type(module).__name__}: expected {expected}, got {given} for {of} {tuple(clip.shape)}")
+
+
+def check_inside(inside: Any, tracks: Tensor, module: nn.Module) -> None:
+    """Raise a ShapeError unless ``inside`` is None or (..., T) bool, for tracks (..., T, N, 2)."""
+    check_beside(inside, "inside", tracks.shape[-3:-2], tracks, module, "tracks")
+    if inside is not None and inside.dtype != torch.bool:
+        kind = type(module).__name__
+        raise ShapeError(f"{kind}: inside: expected True or False for each frame, got {inside.dtype}")
 
 
 def check_weights(weights: Tensor | None, points: Tensor, module: nn.Module) -> None:

@@ -63,7 +63,7 @@ def deviation_step(
         cameras: R (..., T, 2, 3).
         weights: w (..., T, N).
         threshold: mu (...).
-        step: tau.
+        step: tau (...), or a number.
         matrix: C (N, B), the incidence matrix.
         inverse: D (N, B), its right inverse.
         arrangement: of the matrix whose singular values are shrunk.
@@ -73,7 +73,8 @@ def deviation_step(
     """
     share = weights[..., None, :]
     residual = _centred((cameras @ deviation) @ inverse.mT - goal, share) * share
-    moved = deviation - step * (cameras.mT @ (residual @ matrix))
+    size = step[..., None, None, None] if isinstance(step, Tensor) else step
+    moved = deviation - size * (cameras.mT @ (residual @ matrix))
     return svt(_fold(moved, arrangement), step * threshold).view(moved.shape)
 
 

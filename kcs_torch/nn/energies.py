@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional.chain import bone_lengths
-from kcs_torch.functional.guarded import largest, or_one, safe_root
+from kcs_torch.functional.guarded import LOST, largest, or_one, safe_root
 from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.spectral import log_det, nuclear_norm, svt
@@ -91,7 +91,7 @@ class BoneLengthEnergy(SkeletonModule):
             points: (..., T, N, 3).
             lengths: (..., B), as in :meth:`forward`.
             stiffness: the paper's beta, not negative; a tensor broadcasts against (..., T, B).
-            num_steps: Levenberg-Marquardt steps.
+            num_steps: Levenberg-Marquardt steps; from 2 on they never raise what is minimised.
 
         Returns:
             (..., T, N, 3).
@@ -127,7 +127,7 @@ class LowRankEnergy(nn.Module):
 
     Args:
         kind: "nuclear" (SfAM, KCS), or "log_det": T/2 log det(Sigma + eps I) of the poses' covariance, a tighter
-            surrogate of rank.
+            surrogate of rank. A clip at rest, but for rounding, has no derivative there.
         eps: of the log-determinant, relative to the mean variance of a coordinate.
 
     Raises:
@@ -176,17 +176,19 @@ class LowRankEnergy(nn.Module):
         """T/2 log det(Sigma + eps I) of rows (..., T, D); what has no share in any frame adds nothing."""
         if share is None:
             frames: Tensor | int = matrix.shape[-2]
-            centred = (matrix - matrix.sum(-2, keepdim=True) / max(frames, 1)) / max(frames, 1) ** 0.5
+            off = matrix - matrix.sum(-2, keepdim=True) / max(frames, 1)
+            centred, counts = off / max(frames, 1) ** 0.5, None
             gone = torch.zeros_like(matrix.sum(-2))
         else:
             share = share.to(matrix.dtype)
             frames, count = share.amax(-1).sum(-1), share.sum(-2, keepdim=True)
-            mean = (share * matrix).sum(-2, keepdim=True) / or_one(count)
-            centred = safe_root(share / or_one(count)) * (matrix - mean)
+            off, counts = matrix - (share * matrix).sum(-2, keepdim=True) / or_one(count), share > 0
+            centred = safe_root(share / or_one(count)) * off
             gone = (count <= 0).to(matrix.dtype).squeeze(-2)
         real = (1 - gone).sum(-1)
+        still = largest(off, 2, counts) <= LOST * torch.finfo(off.dtype).eps * largest(matrix, 2, counts)
         unit = or_one(largest(centred, 2))  # squares of what is small would underflow
-        centred = centred / unit
+        unit, centred = torch.where(still, 1, unit), torch.where(still, 0, centred / unit)
         covariance = centred.mT @ centred
         level = self.eps * or_one(covariance.diagonal(dim1=-2, dim2=-1).sum(-1) / or_one(real))
         low = log_det(covariance + torch.diag_embed(gone * (1 - level[..., None])), level)

@@ -12,6 +12,8 @@ from kcs_torch.functional import centre
 from kcs_torch.functional.guarded import largest, or_one
 from kcs_torch.functional.precision import narrow, wide
 from kcs_torch.functional.weights import seen_weights
+from kcs_torch.nn.checks import check_inside, check_points, check_weights
+from kcs_torch.nn.masks import clear_padding
 from kcs_torch.skeleton import Skeleton
 
 __all__ = ["RefinedLifter"]
@@ -25,7 +27,8 @@ class RefinedLifter(nn.Module):
 
     Args:
         network: (tracks, weights) to points, such as :class:`TemporalLifter`.
-        solver: called as ``solver(tracks, cameras, weights=..., start=points)``, such as :class:`UnrolledSfAM`.
+        solver: called as ``solver(tracks, cameras, weights=..., start=points)``, such as :class:`UnrolledSfAM`; with
+            ``inside``, too, where that is given.
 
     Raises:
         SkeletonError: the two are of different skeletons.
@@ -51,18 +54,36 @@ class RefinedLifter(nn.Module):
         assert isinstance(own, Skeleton)
         return own
 
-    def forward(self, tracks: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Lift tracks (..., T, N, 2) with weights (..., T, N) to points (..., T, N, 3).
+    def forward(self, tracks: Tensor, weights: Tensor | None = None, *, inside: Tensor | None = None) -> Tensor:
+        """Lift tracks.
+
+        Args:
+            tracks: (..., T, N, 2), NaN where unseen.
+            weights: (..., T, N), 0 where unseen.
+            inside: (..., T), False in frames that pad a shorter clip, as of :meth:`UnrolledFPC.forward`.
+
+        Returns:
+            (..., T, N, 3); 0 in padding.
 
         Raises:
-            ShapeError: the tracks are not of the network's skeleton.
+            ShapeError: the tracks are not of the network's skeleton, or the arguments do not fit.
         """
-        points = wide(self.network(tracks, weights))
+        more = {}
+        if inside is not None:
+            check_points(tracks, self, "tracks")
+            check_weights(weights, tracks, self)
+            check_inside(inside, tracks, self)
+            weights, more = clear_padding(seen_weights(tracks, weights), inside, 1), {"inside": inside}
+        points = clear_padding(wide(self.network(tracks, weights)), inside)
         top = or_one(largest(points, 3))  # divided out first, so that neither sums nor squares overflow
         points, middle = centre(points / top)
         weights = seen_weights(tracks, weights)
         image = torch.where(weights[..., None] > 0, wide(tracks) / top, points[..., :2] + middle[..., :2])
-        size = or_one(points[..., :2].square().mean((-3, -2, -1), keepdim=True).sqrt().detach())
+        square = points[..., :2].square().mean((-3, -2, -1), keepdim=True)
+        if inside is not None:
+            square = square * (points.shape[-3] / inside.sum(-1).clamp_min(1))[..., None, None, None]
+        size = or_one(square.sqrt().detach())
         cameras = torch.eye(3, dtype=image.dtype, device=image.device)[:2].expand(*image.shape[:-2], 2, 3)
-        refined: Tensor = self.solver((image - middle[..., :2]) / size, cameras, weights=weights, start=points / size)
-        return narrow((refined * size + middle) * top, tracks)
+        image, start = (image - middle[..., :2]) / size, points / size
+        refined: Tensor = self.solver(image, cameras, weights=weights, start=start, **more)
+        return narrow(clear_padding((refined * size + middle) * top, inside), tracks)

@@ -156,7 +156,7 @@ def shape_step(
         cameras: R (..., T, 2, 3).
         weights: w (..., T, N) or None.
         threshold: mu (...), in the unit of S#'s singular values.
-        step: tau.
+        step: tau (...), or a number.
         corner: (...), of :func:`kcs_torch.functional.svt`.
         bones: (B, 2), or None for plain FPC without A.
         lengths: (..., B) target lengths.
@@ -175,7 +175,8 @@ def shape_step(
         beta = stiffness[..., None, :] * directed
         articulated = fit_bones(shape, lengths[..., None, :], bones, stiffness=beta, num_steps=1)
         gradient = gradient + (shape - articulated)
-    return svt((shape - step * gradient).flatten(-2), step * threshold, corner).unflatten(-1, shape.shape[-2:])
+    size = step[..., None, None, None] if isinstance(step, Tensor) else step
+    return svt((shape - size * gradient).flatten(-2), step * threshold, corner).unflatten(-1, shape.shape[-2:])
 
 
 def start_shape(tracks: Tensor, cameras: Tensor, weights: Tensor | None) -> Tensor:

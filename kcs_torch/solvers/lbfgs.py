@@ -57,7 +57,8 @@ def lbfgs(
             left out: true ends the search.
 
     Returns:
-        A :class:`Solution`: the minimisers (H, D); whether all settled within ``num_steps``; the most steps that one
+        A :class:`Solution`: the minimisers (H, D); whether all settled within ``num_steps``, at a
+        finite energy; the most steps that one
         made; where they were ``memory`` steps earlier; and their energies (H,).
 
     Raises:
@@ -105,7 +106,8 @@ def lbfgs(
         index, *last = (torch.cat(column) for column in zip(*found, (index, *last), strict=True))
         last = [column[index.argsort()] for column in last]
     x, before, value, made, resting = last
-    return Solution(x, num_steps > 0 and bool(resting.all()), max(made.tolist(), default=0), before, value)
+    settled = num_steps > 0 and bool((resting & value.isfinite()).all())
+    return Solution(x, settled, max(made.tolist(), default=0), before, value)
 
 
 class _Rows:

@@ -77,7 +77,7 @@ def steady_cameras(fit: CameraFit, continuity: float = 1.0, *, inside: Tensor | 
     Args:
         fit: from :func:`fit_cameras`, or of a batch (C, ..., T).
         continuity: weight of the turn between frames (radians squared); 0 takes each frame's best.
-        inside: (..., T), False in frames that pad a shorter clip at its end, whose cost is 0.
+        inside: (..., T), False in frames that pad a shorter clip, whose cost is 0.
 
     Returns:
         rotations (..., T, 3, 3) and scales (..., T).
@@ -89,7 +89,7 @@ def steady_cameras(fit: CameraFit, continuity: float = 1.0, *, inside: Tensor | 
         del flat
         turn.sub_(1).div_(2).clamp_(-1, 1).arccos_().square_().mul_(continuity)
         if inside is not None:
-            turn *= inside[..., 1:, None, None]
+            turn *= (inside[..., 1:] & inside[..., :-1])[..., None, None]
         choice = best_path(cost, turn)[None]
     else:
         choice = cost.argmin(-1)[None]

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.weights import seen_weights
-from kcs_torch.nn.checks import check_beside, check_joints, check_points, check_tensor, check_weights
+from kcs_torch.nn.checks import check_beside, check_inside, check_joints, check_points, check_tensor, check_weights
 from kcs_torch.nn.layers import inverse_softplus
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.steps import corner_of
@@ -31,6 +31,9 @@ SETTLED = 5e-3
 
 SHARPEST = 1e-6
 """Least corner that a step may learn: at 0 nothing would be shrunk but what is 0."""
+
+STEEP = 1.01
+"""Weights times squared rows of cameras up to this are 1 but for rounding."""
 
 SHORTEST = 1e-6
 """Least relative length that a bone may learn: measured lengths are divided by it."""
@@ -165,13 +168,20 @@ class Unrolled(nn.Module):
     def _values(self, name: str, like: Tensor) -> Tensor:
         return nn.functional.softplus(getattr(self, f"raw_{name}")).to(like)
 
-    def _step_sizes(self, like: Tensor) -> Tensor:
-        """Step size of each step, with the derivative 0 where a fixed point is sought, which hardly depends on it.
+    def _step_sizes(self, weights: Tensor, cameras: Tensor) -> Tensor:
+        """Step size (...) of each step, for weights (..., T, N) and cameras (..., T, 2, 3).
 
-        What has not settled leaves some slope. Adam, which divides by its size, would go on to steps that diverge.
+        Where weights are above 1 or rows of cameras longer, the slope of the data term changes by as much more, and
+        steps are shorter, or they would diverge. Where a fixed point is sought, which hardly depends on it, the
+        derivative is 0: what has not settled leaves some slope. Adam, which divides by its size, would go on to steps
+        that diverge.
         """
-        size = self._values("step", like)
-        return size if self.implicit is None else size.detach() + 0 * size
+        size = self._values("step", weights)
+        steep = (weights.amax(-1) * cameras.square().sum(-1).amax(-1)).amax(-1)
+        steep = torch.where(steep > STEEP, steep, 1)
+        if self.implicit is not None:
+            size, steep = size.detach() + 0 * size, steep.detach()
+        return size[(..., *[None] * steep.ndim)] / steep
 
     def _hold_corner(self, corner: float) -> None:
         """Hold the corner of each step; an infinite one is the plain nuclear norm, and nothing to learn."""
@@ -268,9 +278,7 @@ class Unrolled(nn.Module):
             check_beside(lengths, "lengths", (skeleton.num_bones,), tracks, self, "tracks")
         check_beside(scales, "scales", tracks.shape[-3:-2], tracks, self, "tracks")
         check_weights(weights, tracks, self)
-        check_beside(inside, "inside", tracks.shape[-3:-2], tracks, self, "tracks")
-        if inside is not None and inside.dtype != torch.bool:
-            raise ShapeError(f"{name}: inside: expected True or False for each frame, got {inside.dtype}")
+        check_inside(inside, tracks, self)
         if start is not None and start.shape[-3:] != (*tracks.shape[-3:-1], 3):
             expected = f"(..., {tracks.shape[-3]}, {tracks.shape[-2]}, 3)"
             raise ShapeError(f"{name}: expected start {expected}, got {tuple(start.shape)}")

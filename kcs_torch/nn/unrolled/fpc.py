@@ -8,6 +8,7 @@ from dataclasses import replace
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
+from kcs_torch.functional.align import centre
 from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.weights import known
 from kcs_torch.nn.masks import clear_padding
@@ -85,7 +86,8 @@ class UnrolledFPC(Unrolled):
             tracks: (..., T, N, 2), NaN where unseen.
             cameras: (..., T, 2, 3).
             weights: (..., T, N), 0 where unseen.
-            start: (..., T, N, 3), a network's output, say, in any precision; the back-projected tracks if None.
+            start: (..., T, N, 3), a network's output, say, in any precision and about any origin, as each frame is
+                centred; the back-projected tracks if None.
             inside: (..., T), False in frames that pad a shorter clip; None where all are real. A clip is solved as if
                 it stood alone, and its padding is 0, whatever the other arguments have there.
 
@@ -117,7 +119,7 @@ class UnrolledFPC(Unrolled):
         weights = self._check(tracks, cameras, weights, start, inside=inside)
         given, tracks = tracks, wide(known(tracks, weights))
         cameras, weights = clear_padding(wide(cameras), inside), wide(weights)
-        threshold, step = self._values("threshold", tracks), self._step_sizes(tracks)
+        threshold, step = self._values("threshold", tracks), self._step_sizes(weights, cameras)
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
             corners = self._corners(scale)
@@ -125,7 +127,7 @@ class UnrolledFPC(Unrolled):
             def advance(shape: Tensor, k: int) -> Tensor:
                 return shape_step(shape, tracks, cameras, weights, threshold[k] * scale, step[k], corner=corners[k])
 
-            begin = start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype)
+            begin = start_shape(tracks, cameras, weights) if start is None else centre(start.to(tracks.dtype))[0]
             solution = self._run(
                 advance,
                 clear_padding(begin, inside),

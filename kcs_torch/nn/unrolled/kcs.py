@@ -31,7 +31,7 @@ from kcs_torch.nn.steps import continuation
 from kcs_torch.nn.unrolled.base import Gradient, Unrolled
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution
-from kcs_torch.solvers.pose import fit_cameras, steady_cameras
+from kcs_torch.solvers.pose import CameraFit, fit_cameras, steady_cameras
 
 __all__ = ["UnrolledKCS"]
 
@@ -154,8 +154,6 @@ class UnrolledKCS(Unrolled):
         tracks: Tensor,
         *,
         weights: Tensor | None = None,
-        continuity: float = 1.0,
-        robust: float | None = 0.4,
         inside: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Fit cameras to the template seen in each frame, as :class:`kcs_torch.KCS` does in its first round.
@@ -163,8 +161,6 @@ class UnrolledKCS(Unrolled):
         Args:
             tracks: (..., T, N, 2), NaN where unseen.
             weights: (..., T, N), 0 where unseen.
-            continuity: weight of the turn between frames in choosing among a frame's cameras.
-            robust: residuals of this share of the body's size count half; None is least squares.
             inside: (..., T), False in padding, as of :meth:`UnrolledFPC.forward`.
 
         Returns:
@@ -177,16 +173,14 @@ class UnrolledKCS(Unrolled):
         with torch.no_grad(), full_precision(tracks):
             points, share = self._centred(wide(tracks), wide(weights))
             rest = self.template(points)
-            rows, sizes = points.new_zeros(*share.shape[:-1], 2, 3), points.new_zeros(share.shape[:-1])
-            for at in _clips(share, inside):
-                one, seen = points[at], share[at]
-                if len(one):
-                    fit = fit_cameras(
-                        one, rest.expand(len(one), -1, -1), seen, *self._bounds(one, seen, rest), robust=robust
-                    )
-                    rotations, sizes[at] = steady_cameras(fit, continuity)
-                    rows[at] = rotations[:, :2]
-            return rows.to(tracks.dtype), narrow(sizes, tracks)
+            low, high = self._bounds(points, share, rest, inside)
+            frames = low.numel()  # each is a problem of its own
+            flat = points.flatten(0, -3), rest.expand(frames, -1, -1), share.flatten(0, -2)
+            fit = fit_cameras(*flat, low.flatten(), high.flatten())
+            parts = (x.unflatten(1, low.shape) for x in (fit.rotations, fit.scales, fit.cost))
+            rotations, scales = steady_cameras(CameraFit(*parts), inside=inside)
+            rows, scales = clear_padding(rotations[..., :2, :], inside), clear_padding(scales, inside, 0)
+            return rows.to(tracks.dtype), narrow(scales, tracks)
 
     def forward(
         self,
@@ -241,7 +235,7 @@ class UnrolledKCS(Unrolled):
         with full_precision(tracks):
             points, share = self._centred(wide(tracks), wide(weights))
             rows, rest = clear_padding(wide(cameras), inside), self.template(points)
-            threshold, step = self._values("threshold", points), self._step_sizes(points)
+            threshold, step = self._values("threshold", points), self._step_sizes(share, rows)
             matrix, inverse = self.matrix.to(points), self.inverse.to(points)
             scales, size = self._scales(scales, points, rows, share, rest, inside)
             given = (deviation_goal(rest, points / or_one(scales)[..., None, None], rows, share), rows, share)

@@ -10,6 +10,7 @@ from pathlib import Path
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
+from kcs_torch.functional.align import centre
 from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.weights import known
 from kcs_torch.nn.masks import clear_padding
@@ -106,7 +107,7 @@ class UnrolledSfAM(Unrolled):
             tracks: (..., T, N, 2), NaN where unseen.
             cameras: (..., T, 2, 3).
             weights: (..., T, N), 0 where unseen.
-            start: (..., T, N, 3); the back-projected tracks if None.
+            start: (..., T, N, 3), about any origin; the back-projected tracks if None.
             lengths: (..., B) bone lengths in the unit of the tracks, instead of the module's.
             inside: (..., T), False in padding, as of :meth:`UnrolledFPC.forward`.
 
@@ -162,7 +163,7 @@ class UnrolledSfAM(Unrolled):
         )
         given, tracks = tracks, wide(known(tracks, weights))
         cameras, weights = clear_padding(wide(cameras), inside), wide(weights)
-        threshold, step = self._values("threshold", tracks), self._step_sizes(tracks)
+        threshold, step = self._values("threshold", tracks), self._step_sizes(weights, cameras)
         stiffness = self._values("stiffness", tracks)
         if lengths is not None:
             lengths = lengths.to(tracks.dtype)
@@ -180,7 +181,7 @@ class UnrolledSfAM(Unrolled):
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)
             corners = self._corners(scale, corner)
-            begin = start_shape(tracks, cameras, weights) if start is None else start.to(tracks.dtype)
+            begin = start_shape(tracks, cameras, weights) if start is None else centre(start.to(tracks.dtype))[0]
             solution = self._run(
                 advance,
                 clear_padding(begin, inside),
