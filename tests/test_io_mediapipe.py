@@ -156,6 +156,15 @@ def test_times_place_frames_and_tell_the_rate(tmp_path, key, second, told):
     assert lost.fps == 25 and lost.num_frames == 4
 
 
+def test_the_rate_is_that_of_every_so_many_frames(tmp_path):
+    frames = [{"frame": 5 * t, "pose_landmarks": marks(p)} for t, p in enumerate(POSE)]
+    (tracks,) = read(tmp_path, {"fps": 30, "frames": frames})
+    assert tracks.fps == 6 and tracks.num_frames == 4
+    assert any("in steps of 5: each step is taken as one frame, at 1/5 of the video's fps" in n for n in tracks.notes)
+    (told,) = read(tmp_path, {"fps": 30, "frames": frames}, fps=12)
+    assert told.fps == 12
+
+
 @pytest.mark.parametrize("nobody", [{"pose_landmarks": None}, {"pose_landmarks": []}, {"pose_landmarks": [[]]}])
 def test_frames_without_anybody(tmp_path, nobody):
     (tracks,) = read(tmp_path, [nobody, *({"pose_landmarks": marks(p)} for p in POSE)])

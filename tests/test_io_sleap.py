@@ -141,7 +141,7 @@ def test_sleap_csv(tmp_path):
     lines = [["a", 3, 0.9, *CELLS], ["b", 4, 0.9, *CELLS], ["a", 6, 0.9, *CELLS[:6], "", "", ""]]
     people = load_people(write_sleap_csv(tmp_path / "a.csv", lines))
     assert detect_format(tmp_path / "a.csv") == "sleap"
-    assert [p.notes[:2] for p in people] == [
+    assert [p.notes[1:3] for p in people] == [
         ("1 of 4 frames has no row (number 5): unseen", f"the file calls this animal '{name}'") for name in "ab"
     ]
     assert people[0].seen.tolist() == [[True] * 3, [False] * 3, [False] * 3, [True, True, False]]

@@ -74,7 +74,8 @@ def frames_of(rows: Sequence[tuple[str | float, ...]], path: Path, notes: list[s
     order = list(range(len(rows)))
     if None not in numbers:
         order.sort(key=lambda i: numbers[i] or 0)
-    frames = frame_numbers([numbers[i] for i in order], notes, names="rows", whole="row")
+    ordered = [numbers[i] for i in order]
+    frames, _ = frame_numbers(ordered, notes, names="rows", one="the file's frame", whole="row")
     return order, frames
 
 

@@ -16,6 +16,7 @@ from kcs_torch.io.containers.jsonfile import FARTHEST, as_frame_number, as_joint
 from kcs_torch.io.contents.people import Sighting
 from kcs_torch.io.contents.shares import ASK, SIZE_HINT, are_shares
 from kcs_torch.io.contents.times import frames_of_times, rate_of_times, time_unit
+from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.types.image_size import told_image_size
@@ -120,6 +121,8 @@ def _frames(data: Any, path: Path) -> Iterator[tuple[int | None, Any, str]]:
     if isinstance(data, dict):
         key = next((k for k in _LISTS if isinstance(data.get(k), list)), None)
         if key is not None:
+    else:
+        out.fps /= frame_numbers(sorted(numbers), [])[1]
             yield from _frames(data[key], path)
         elif data and all(k.isdecimal() and len(k) < 16 for k in data):
             yield from ((int(k), frame, f"{path}: frame {int(k)}") for k, frame in data.items())
