@@ -20,6 +20,7 @@ from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.types.image_size import told_image_size
+from kcs_torch.types.size import METRES, short_unit
 
 __all__ = [
     "BODIES",
@@ -77,6 +78,12 @@ def read_landmarks_json(path: Path) -> Landmarks:
     if isinstance(data, dict):
         sizes = [data.get("image_size"), *([data.get(k + s) for s in ("width", "height")] for k in ("", "image_"))]
         out.size = next(filter(None, map(told_image_size, sizes)), None)
+    @property
+    def units(self) -> str:
+        """Of tracks: the file's unit of length, pixels where it tells none."""
+        unit = short_unit(self.unit)
+        return unit if unit in METRES else "px"
+
         out.fps = _positive(data, "fps")
     poses: dict[int, list[Sighting]] = {}
     hands: dict[int, list[Sighting]] = {}
@@ -243,14 +250,15 @@ def settle(found: Landmarks, path: Path, options: Options, *, shares: bool) -> N
     everything = np.concatenate(people or [np.zeros((0, 3))])
     if not np.isfinite(everything[:, :2]).any():
         raise FormatError(f"{path}: expected landmarks in at least one of {len(found.frames)} frames, got none")
-    small = are_shares(everything[:, :2])
+    pixels = found.units == "px"
+    small = pixels and are_shares(everything[:, :2])
     size = options.size_of(found.size)
     if size is None and small and shares:
         raise FormatError(
             f"{path}: its coordinates are shares of the image, which needs the video's size: give {SIZE_HINT}; if they "
             "are metres, say, in a table, name its format: csv"
         )
-    if size is None and (small or shares):
+    if size is None and pixels and (small or shares):
         found.notes.append(ASK if small else "the coordinates are pixels already")
     small = small and size is not None
     visible = not found.seen & set(CONFIDENCES)
