@@ -28,7 +28,9 @@ __all__ = [
     "FRAME_KEYS",
     "KEYS",
     "VISIBILITIES",
+    "VISIBLE",
     "Landmarks",
+    "by_visibility",
     "read_landmarks_json",
     "settle",
 ]
@@ -55,6 +57,12 @@ _HIDDEN = 0.3
 detections of the same video, joints of visibility below 0.5 are off by 2.5 times as much as the others, not by more:
 a guess that is worth something."""
 
+VISIBLE = (
+    f"visibility v tells what is hidden, not how well it is placed: it counts as confidence {_HIDDEN:g} + "
+    f"{1 - _HIDDEN:g} v"
+)
+"""What to say of confidences that are made of visibilities."""
+
 
 @dataclass
 class Landmarks:
@@ -70,6 +78,12 @@ class Landmarks:
     who: str = ""  # the column of a table that tells people apart
     notes: list[str] = field(default_factory=list)
 
+    @property
+    def units(self) -> str:
+        """Of tracks: the file's unit of length, pixels where it tells none."""
+        unit = short_unit(self.unit)
+        return unit if unit in METRES else "px"
+
 
 def read_landmarks_json(path: Path) -> Landmarks:
     """Read a list of frames, or an object that holds one; poses where there are any, hands otherwise."""
@@ -78,12 +92,6 @@ def read_landmarks_json(path: Path) -> Landmarks:
     if isinstance(data, dict):
         sizes = [data.get("image_size"), *([data.get(k + s) for s in ("width", "height")] for k in ("", "image_"))]
         out.size = next(filter(None, map(told_image_size, sizes)), None)
-    @property
-    def units(self) -> str:
-        """Of tracks: the file's unit of length, pixels where it tells none."""
-        unit = short_unit(self.unit)
-        return unit if unit in METRES else "px"
-
         out.fps = _positive(data, "fps")
     poses: dict[int, list[Sighting]] = {}
     hands: dict[int, list[Sighting]] = {}
@@ -113,6 +121,8 @@ def _numbers(listed: Sequence[tuple[int | None, Any, str]], out: Landmarks) -> l
     out.times = dict(zip(numbers, times, strict=True))
     if out.fps is None:
         out.fps = rate_of_times(out.times, time_unit(key) or "", out.notes)
+    else:
+        out.fps /= frame_numbers(sorted(numbers), [])[1]
     return numbers
 
 
@@ -128,8 +138,6 @@ def _frames(data: Any, path: Path) -> Iterator[tuple[int | None, Any, str]]:
     if isinstance(data, dict):
         key = next((k for k in _LISTS if isinstance(data.get(k), list)), None)
         if key is not None:
-    else:
-        out.fps /= frame_numbers(sorted(numbers), [])[1]
             yield from _frames(data[key], path)
         elif data and all(k.isdecimal() and len(k) < 16 for k in data):
             yield from ((int(k), frame, f"{path}: frame {int(k)}") for k, frame in data.items())
@@ -231,6 +239,11 @@ def _joints(landmarks: Any, where: str, seen: set[str]) -> NDArray[np.float64]:
     return joints
 
 
+def by_visibility(visibility: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights of joints within the image by MediaPipe's guesses, 0 to 1, at whether they are visible."""
+    return _HIDDEN + (1 - _HIDDEN) * visibility
+
+
 def settle(found: Landmarks, path: Path, options: Options, *, shares: bool) -> None:
     """Turn shares of the image into pixels, and visibilities into weights; confidences are weights as they are.
 
@@ -265,15 +278,12 @@ def settle(found: Landmarks, path: Path, options: Options, *, shares: bool) -> N
     seen = everything[:, 2]
     known = visible and bool((seen[np.isfinite(seen)] > 0).any())  # hands have 0 everywhere
     if known:
-        found.notes.append(
-            f"visibility v tells what is hidden, not how well it is placed: it counts as confidence {_HIDDEN:g} + "
-            f"{1 - _HIDDEN:g} v, and outside the image as v"
-        )
+        found.notes.append(f"{VISIBLE}, and outside the image as v")
     for joints in people:
         if visible:
             outside = small & ((joints[:, :2] < 0) | (joints[:, :2] > 1)).any(-1)
             weight = np.where(np.isnan(joints[:, 2]), 1.0, joints[:, 2].clip(0, 1)) if known else np.ones(len(joints))
-            joints[:, 2] = np.where(outside, weight, _HIDDEN + (1 - _HIDDEN) * weight)
+            joints[:, 2] = np.where(outside, weight, by_visibility(weight))
         if small and size is not None:
             joints[:, :2] *= size
 
