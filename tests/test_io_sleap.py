@@ -160,6 +160,15 @@ def test_sleap_csv_as_a_spreadsheet_saves_it(tmp_path, delimiter, quote):
     assert torch.equal(load_tracks(path).points, expected)
 
 
+def test_blank_lines_of_a_sleap_csv_are_none(tmp_path):
+    path = write_sleap_csv(tmp_path / "a.csv", [["a", 3, 0.9, *CELLS], [], ["a", 4, 0.9, *CELLS], [""] * 12, []])
+    tracks = load_tracks(path)
+    assert tracks.num_frames == 2 and "frame 0 is the file's frame 3" in tracks.notes
+    path.write_text(path.read_text() + "a,5\n")
+    with pytest.raises(FormatError, match="line 7: expected 12 cells, got 2"):
+        load_tracks(path)
+
+
 def test_sleap_csv_without_tracks_is_followed(tmp_path):
     def cells(x):
         return [x, 0, 0.9, x, 10, 0.9, x, 20, 0.9]
