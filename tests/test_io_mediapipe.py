@@ -143,8 +143,9 @@ def test_frames_by_number(tmp_path):
     ("key", "second", "told"),
     [("timestamp_ms", 1000, None), ("time", 1, None), ("timestamp", 1e6, "times are taken to count 1000000 a second")],
 )
-def test_times_place_frames_and_tell_the_rate(tmp_path, key, second, told):
-    frames = [{key: i / 25 * second, "pose_landmarks": marks(POSE[0])} for i in (0, 1, 2, 4, 5)]
+@pytest.mark.parametrize("since", [0.0, 1.7e9], ids=["the clip's beginning", "1970"])
+def test_times_place_frames_and_tell_the_rate(tmp_path, key, second, told, since):
+    frames = [{key: (since + i / 25) * second, "pose_landmarks": marks(POSE[0])} for i in (0, 1, 2, 4, 5)]
     (tracks,) = read(tmp_path, frames)
     assert tracks.fps == 25 and tracks.seen.any(1).tolist() == [True, True, True, False, True, True]
     assert told is None or told in tracks.notes

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.containers.jsonfile import FARTHEST, as_frame_number, as_joints, as_text, entries, read_json
+from kcs_torch.io.containers.jsonfile import as_frame_number, as_joints, as_text, entries, read_json
 from kcs_torch.io.contents.people import Sighting
 from kcs_torch.io.contents.shares import ASK, SIZE_HINT, are_shares
 from kcs_torch.io.contents.times import frames_of_times, rate_of_times, time_unit
@@ -20,6 +20,7 @@ from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.types.image_size import told_image_size
+from kcs_torch.types.intake import FARTHEST
 from kcs_torch.types.size import METRES, short_unit
 
 __all__ = [

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError, counted
-from kcs_torch.io.containers.jsonfile import FARTHEST, kind, outline, read_json, short
+from kcs_torch.io.containers.jsonfile import MOST_PIXELS, kind, outline, read_json, short
 from kcs_torch.io.contents.layout import BY_COUNT, likeliest
 from kcs_torch.io.contents.people import Sighting, people_tracks
 from kcs_torch.io.folders import frames_of_files
@@ -117,7 +117,7 @@ def _numbers(values: Any, file: Path) -> list[float]:
     for i, v in enumerate(values):
         if type(v) not in (int, float):
             raise FormatError(f"{file}: '{_BODY}': number {i}: expected a number, got {kind(v)}")
-        if abs(v) > FARTHEST:
+        if abs(v) > MOST_PIXELS:
             raise FormatError(f"{file}: '{_BODY}': number {i} is {short(v)}: expected pixels and confidences")
         if i % 3 == 2 and v < 0:
             raise FormatError(f"{file}: '{_BODY}': joint {i // 3} has a negative confidence {v:g}; expected 0..1")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.containers.archive import Archive, array_names
-from kcs_torch.io.containers.jsonfile import FARTHEST, as_text
+from kcs_torch.io.containers.jsonfile import MOST_PIXELS, as_text
 from kcs_torch.io.containers.pickles import opened
 from kcs_torch.io.contents.build_tracks import build_tracks
 from kcs_torch.io.contents.layout import choose_layout
@@ -81,8 +81,8 @@ def _sequences(nest: Any, where: str) -> Iterator[tuple[tuple[Any, ...], str, ND
 
 def _tracks(array: NDArray[Any], where: str, meta: Any, size: Any, path: Path, options: Options) -> Tracks:
     points = array[..., :2].astype(np.float64)
-    if (np.abs(points) > FARTHEST).any():
-        raise FormatError(f"{where}: expected pixels, got numbers beyond {FARTHEST:g}")
+    if (np.abs(points) > MOST_PIXELS).any():
+        raise FormatError(f"{where}: expected pixels, got numbers beyond {MOST_PIXELS:g}")
     confidence = array[..., 2].astype(np.float64) if array.shape[-1] == 3 else None
     notes: list[str] = []
     if are_shares(points):
