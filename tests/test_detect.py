@@ -134,15 +134,27 @@ def test_pose_comes_in_pixels_with_its_visibility(video, mediapipe):
     (tracks,) = detect_video(video.path, progress=lambda k, total: done.append((k, total)))
     assert tracks.skeleton.name == "mediapipe33" and tracks.fps == 25 and tracks.units == "px"
     assert tracks.image_size == (WIDTH, HEIGHT)
-    expected = np.where(visibility >= 0.3, visibility, 0)
+    expected = 0.3 + 0.7 * visibility  # as of files
     np.testing.assert_allclose(tracks.weights[:, :33], np.broadcast_to(expected, (FRAMES, 33)))
-    seen = expected > 0
-    np.testing.assert_allclose(tracks.points[:, :33][:, seen], truth[:, seen], atol=1e-9)
+    np.testing.assert_allclose(tracks.points[:, :33], truth, atol=1e-9)
     assert tracks.source == str(video.path)
     assert tracks.notes[0] == "MediaPipe Pose on 40 frames of 640 x 480 pixels"
+    assert any("counts as confidence 0.3 + 0.7 v, and outside the image as 0" in note for note in tracks.notes)
     assert done == [(k + 1, FRAMES) for k in range(FRAMES)]
     assert mediapipe.closed == 1 and video.capture.released == 1
     assert mediapipe.options == [{"static_image_mode": False, "model_complexity": 1}]  # the model that is shipped
+
+
+@pytest.mark.parametrize(("start", "stop", "told"), [(0, None, True), (5, 30, True), (5, 20, False), (0, 60, True)])
+def test_a_video_that_breaks_off_is_told(video, mediapipe, start, stop, told):
+    """Its 21st frame cannot be decoded."""
+    truth = moves()
+    mediapipe.pose = lambda k: landmarks(truth[k], np.ones(33))
+    whole = video.capture.retrieve
+    video.capture.retrieve = lambda self: (self.at != 20, whole(self)[1])
+    (tracks,) = detect_video(video.path, start=start, stop=stop)
+    early = f"only 20 of {FRAMES if stop is None else stop} frames could be read: the video ends there, or is damaged"
+    assert (early in tracks.notes) == told and tracks.num_frames == 20 - start
 
 
 def test_landmarks_outside_the_picture_are_unseen(video, mediapipe):

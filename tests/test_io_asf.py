@@ -98,6 +98,20 @@ def test_by_hand(files):
     assert torch.allclose(motion.points[1] / UNIT, turned, atol=1e-9)
 
 
+def test_frames_are_placed_by_their_numbers(files):
+    pose = "\nroot 1 2 3 0 0 0\nthigh 0 0\nshank 0\n"
+    head = AMC[: AMC.index("\n1\n") + 1]
+    (files / "s_01.amc").write_text(head + "".join(f"{number}{pose}" for number in (5, 6, 9)))
+    motion = load_motion(files / "s_01.amc")
+    assert motion.seen.all(1).tolist() == [True, True, False, False, True]
+    assert "frame 0 is the file's frame 5" in motion.notes
+    assert "2 of 5 frames have no pose (numbers 7, 8): unseen" in motion.notes
+    (files / "s_01.amc").write_text(head + "".join(f"{number}{pose}" for number in (1, 2, 1)))
+    again = load_motion(files / "s_01.amc")
+    assert again.num_frames == 3 and again.seen.all()
+    assert any(note.startswith("the numbers of the frames do not ascend") for note in again.notes)
+
+
 def test_bones_may_stand_in_any_order(files):
     expected = load_motion(files / "s_01.amc")
     first, *bones = ASF.partition(":bonedata")[2].partition(":hierarchy")[0].split("  begin\n")

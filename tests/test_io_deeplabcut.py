@@ -80,8 +80,9 @@ def test_labels_are_placed_by_the_images_numbers(tmp_path, layout, apart):
     assert tracks.seen.any(1).tolist() == [True, False, True, True]
     assert np.array_equal(tracks.points[[2, 0, 3]].numpy(), values.reshape(3, 3, 2))
     assert (tracks.weights[0] == 1).all()
-    assert tracks.notes[:2] == (
+    assert tracks.notes[:3] == (
         "rows are placed by the numbers in the images' names",
+        "frame 0 is the file's frame 7",
         "1 of 4 frames has no row (number 8): unseen",
     )
 

@@ -143,8 +143,9 @@ def test_frames_by_number(tmp_path):
     ("key", "second", "told"),
     [("timestamp_ms", 1000, None), ("time", 1, None), ("timestamp", 1e6, "times are taken to count 1000000 a second")],
 )
-def test_times_place_frames_and_tell_the_rate(tmp_path, key, second, told):
-    frames = [{key: i / 25 * second, "pose_landmarks": marks(POSE[0])} for i in (0, 1, 2, 4, 5)]
+@pytest.mark.parametrize("since", [0.0, 1.7e9], ids=["the clip's beginning", "1970"])
+def test_times_place_frames_and_tell_the_rate(tmp_path, key, second, told, since):
+    frames = [{key: (since + i / 25) * second, "pose_landmarks": marks(POSE[0])} for i in (0, 1, 2, 4, 5)]
     (tracks,) = read(tmp_path, frames)
     assert tracks.fps == 25 and tracks.seen.any(1).tolist() == [True, True, True, False, True, True]
     assert told is None or told in tracks.notes
@@ -154,6 +155,15 @@ def test_times_place_frames_and_tell_the_rate(tmp_path, key, second, told):
     assert said.fps == 24 and said.num_frames == 6
     (lost,) = read(tmp_path, [*frames[:3], {key: None, "pose_landmarks": marks(POSE[0])}])
     assert lost.fps == 25 and lost.num_frames == 4
+
+
+def test_the_rate_is_that_of_every_so_many_frames(tmp_path):
+    frames = [{"frame": 5 * t, "pose_landmarks": marks(p)} for t, p in enumerate(POSE)]
+    (tracks,) = read(tmp_path, {"fps": 30, "frames": frames})
+    assert tracks.fps == 6 and tracks.num_frames == 4
+    assert any("in steps of 5: each step is taken as one frame, at 1/5 of the video's fps" in n for n in tracks.notes)
+    (told,) = read(tmp_path, {"fps": 30, "frames": frames}, fps=12)
+    assert told.fps == 12
 
 
 @pytest.mark.parametrize("nobody", [{"pose_landmarks": None}, {"pose_landmarks": []}, {"pose_landmarks": [[]]}])

@@ -108,6 +108,17 @@ def test_a_folder_with_a_file_an_image(tmp_path):
     assert load_tracks(tmp_path / "predictions" / "clip_3.json").num_frames == 1
 
 
+def test_two_recordings_in_a_folder_are_told(tmp_path):
+    """They were joined to one clip; cam1 is the beginning of cam10, too."""
+    for name in ("cam1", "cam10"):
+        for t, frame in enumerate(mmpose_frames()):
+            write_json(tmp_path / f"{name}_{t}.json", frame["instances"])
+    for path in (tmp_path, tmp_path / "cam1"):
+        with pytest.raises(FormatError, match=r"2 kinds of file names: give .*cam10_\*' or .*cam1_\*'"):
+            load_tracks(path)
+    assert load_tracks(tmp_path / "cam1_").num_frames == 4
+
+
 def test_a_copy_in_the_folder_is_named(tmp_path):
     for name, frame in zip(("a_1", "a_2", "a_2 (1)"), mmpose_frames(), strict=False):
         write_json(tmp_path / f"{name}.json", frame["instances"])

@@ -17,7 +17,7 @@ from kcs_torch.errors import FormatError, KcsError, KcsWarning, OptionError, Ske
 from kcs_torch.io import load_people, load_reconstruction, load_tracks, save
 from kcs_torch.io.containers import archive
 from kcs_torch.skeleton import SKELETONS, Skeleton
-from kcs_torch.types import Intrinsics
+from kcs_torch.types import Intrinsics, Tracks
 
 quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -114,6 +114,15 @@ def test_the_file_may_tell_the_size_of_the_image(tmp_path):
     assert load_tracks(path).image_size is None
     with pytest.raises(OptionError, match=r"mm.npz: image_size: expected tracks in pixels .* got units 'mm': leave it"):
         load_tracks(path, image_size=(1280, 720))  # it went unheard
+
+
+def test_what_was_saved_is_not_taken_for_shares(tmp_path):
+    """Small coordinates came back times the size of the image."""
+    tracks = Tracks.from_arrays(np.random.default_rng(0).random((5, 17, 2)), skeleton="coco17", image_size=(1280, 720))
+    back = load_tracks(path := save(tracks, tmp_path / "a.npz"))
+    assert torch.equal(back.points, tracks.points) and back.image_size == (1280, 720) and back.notes == tracks.notes
+    asked = load_tracks(path, image_size=(640, 480))
+    assert torch.allclose(asked.points[:, :17], tracks.points[:, :17] * torch.tensor([640, 480]))
 
 
 def test_none_is_as_good_as_no_array(tmp_path):

@@ -179,6 +179,11 @@ def test_two_recordings_in_a_folder_are_chosen_by_the_beginning_of_the_names(tmp
     assert load_tracks(folder / "cam2*.json").num_frames == 6
 
 
+def test_frames_that_begin_elsewhere_are_told(tmp_path):
+    folder = write_openpose(tmp_path / "json", alone(), name="v_{}_keypoints.json", frames=range(500, 504))
+    assert "frame 0 is file v_500_keypoints.json" in load_tracks(folder).notes
+
+
 def test_two_files_of_one_frame_are_told(tmp_path):
     folder = write_openpose(tmp_path / "json", alone(), name="f{}.json")
     (folder / "f02.json").write_text((folder / "f2.json").read_text())

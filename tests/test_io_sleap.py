@@ -141,7 +141,7 @@ def test_sleap_csv(tmp_path):
     lines = [["a", 3, 0.9, *CELLS], ["b", 4, 0.9, *CELLS], ["a", 6, 0.9, *CELLS[:6], "", "", ""]]
     people = load_people(write_sleap_csv(tmp_path / "a.csv", lines))
     assert detect_format(tmp_path / "a.csv") == "sleap"
-    assert [p.notes[:2] for p in people] == [
+    assert [p.notes[1:3] for p in people] == [
         ("1 of 4 frames has no row (number 5): unseen", f"the file calls this animal '{name}'") for name in "ab"
     ]
     assert people[0].seen.tolist() == [[True] * 3, [False] * 3, [False] * 3, [True, True, False]]
@@ -158,6 +158,15 @@ def test_sleap_csv_as_a_spreadsheet_saves_it(tmp_path, delimiter, quote):
     path.write_text("\ufeff" + "\r\n".join(rows), encoding="utf-8", newline="")
     assert detect_format(path) == "sleap"
     assert torch.equal(load_tracks(path).points, expected)
+
+
+def test_blank_lines_of_a_sleap_csv_are_none(tmp_path):
+    path = write_sleap_csv(tmp_path / "a.csv", [["a", 3, 0.9, *CELLS], [], ["a", 4, 0.9, *CELLS], [""] * 12, []])
+    tracks = load_tracks(path)
+    assert tracks.num_frames == 2 and "frame 0 is the file's frame 3" in tracks.notes
+    path.write_text(path.read_text() + "a,5\n")
+    with pytest.raises(FormatError, match="line 7: expected 12 cells, got 2"):
+        load_tracks(path)
 
 
 def test_sleap_csv_without_tracks_is_followed(tmp_path):

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import kcs_torch as kt
 from kcs_torch.cli import app
-from kcs_torch.errors import FormatError, KcsError, KcsWarning
+from kcs_torch.errors import FormatError, KcsError, KcsWarning, OptionError
 from kcs_torch.io import (
     READERS,
     detect_format,
@@ -47,6 +47,23 @@ def test_confidences_are_weights_whatever_they_are_called(tmp_path, what):
     assert np.allclose(tracks.points[2:], person(4, 3)[2:, :, :2])
     assert tracks.fps == 25
     assert load_tracks(path, threshold=0.05).weights[0, 2] == pytest.approx(0.1)
+
+
+@pytest.mark.filterwarnings("ignore:.*shares of the image")
+@pytest.mark.parametrize(("said", "unit"), [("[mm]", "mm"), ("[Metres]", "m"), ("[px]", "px"), ("[pixels]", "px")])
+def test_the_header_tells_the_unit_of_tracks(tmp_path, said, unit):
+    """They were taken for pixels."""
+    wide = lines(tmp_path / "a.csv", f"a_x {said},a_y {said},b_x {said},b_y {said}", ".1,.2,.3,.4", ".1,.3,.2,.4")
+    long = lines(
+        tmp_path / "b.csv", f"frame,joint,x {said},y {said}", "0,a,.1,.2", "0,b,.3,.4", "1,a,.1,.3", "1,b,.2,.4"
+    )
+    for path in (wide, long):
+        tracks = load_tracks(path)
+        assert tracks.units == unit
+        assert any("image_size" in note for note in tracks.notes) == (unit == "px")  # as they may be shares of it
+        if unit != "px":
+            with pytest.raises(OptionError, match=f"expected tracks in pixels of the image, got units '{unit}'"):
+                load_tracks(path, image_size=(640, 480))
 
 
 def test_visibility_is_no_confidence(tmp_path):

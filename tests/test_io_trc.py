@@ -143,10 +143,10 @@ def test_mutated_files_end_in_our_errors(tmp_path):
     assert 0 < read < 150
 
 
-def rows(path, order, first=1, cells=None):
+def rows(path, order, first=1, cells=None, rate=10):
     """A file of ten frames of two markers, its rows in another order, or some of them."""
     head = "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\n"
-    head += "10\t10\t10\t2\tmm\nFrame#\tTime\tA\t\t\tB\n\t\tX1\tY1\tZ1\tX2\tY2\tZ2\n\n"
+    head += f"{rate}\t10\t10\t2\tmm\nFrame#\tTime\tA\t\t\tB\n\t\tX1\tY1\tZ1\tX2\tY2\tZ2\n\n"
     lines = [[first + k, k / 10, k, 0, 0, k, 1, 1][:cells] for k in order]
     path.write_text(head + "".join("\t".join(map(str, line)) + "\n" for line in lines), encoding="utf-8")
     return load_motion(path)
@@ -167,6 +167,14 @@ def test_rows_are_frames_by_their_numbers(tmp_path):
     assert load_motion(path).num_frames == odd
     with pytest.raises(FormatError, match="expected every frame once, got frame 3 again"):
         rows(path, [0, 1, 2, 2, 3])
+
+
+@pytest.mark.parametrize(("rate", "fps", "told"), [(10, 5, False), (5, 5, False), (30, 15, True)])
+def test_the_rate_of_every_second_row(tmp_path, rate, fps, told):
+    """The header's may be that of the numbers, or of the rows: which one, the times tell."""
+    motion = rows(tmp_path / "a.trc", range(0, 10, 2), rate=rate)
+    assert (motion.fps, motion.num_frames) == (fps, 5)
+    assert any("the header is believed" in note for note in motion.notes) == told
 
 
 def test_rows_that_end_early_are_told(tmp_path):

@@ -88,9 +88,18 @@ def test_a_video_tells_the_size_of_its_image(tmp_path):
     for videos in (None, "none", {"a.mp4": "large"}, {"a.mp4": {"w": "x", "h": [1]}}, {3: {"w": 1280, "h": 720}}):
         path = write_videopose3d(tmp_path / "b.npz", positions, metadata={"video_metadata": videos})
         assert [p.image_size for p in load_people(path, trust=True)] == [None] * 3
-    shares = {"S1": {"Walk": [A / 1000]}}  # taken as they are
-    path = write_videopose3d(tmp_path / "c.npz", shares)
-    assert load_tracks(path, trust=True, image_size=(1600, 900)).image_size is None
+
+
+@pytest.mark.parametrize("stray", [1.0, 5.0])
+def test_shares_have_no_size(tmp_path, stray):
+    """It was left out without a word where a joint was far away."""
+    shares = A / 1000
+    shares[0, 0] *= stray / shares[0, 0].max()
+    path = write_videopose3d(tmp_path / "c.npz", {"S1": {"Walk": [shares]}})
+    said = "the coordinates are shares of the image: they are taken as they are"
+    assert said in load_tracks(path, trust=True).notes
+    tracks = load_tracks(path, trust=True, image_size=(1600, 900))
+    assert tracks.image_size is None and f"{said}, and the image's size is left out" in tracks.notes
 
 
 def test_scores_are_confidences(tmp_path):

@@ -210,6 +210,8 @@ def lift(
                 threshold=threshold,
             )
         else:
+            if detector != "auto" or models or what != "pose":
+                raise OptionError(f"--detector, --model, --what: belong to videos, got {tracks}: leave them out")
             clean = cleaner(frames, unswap, gate, fill, smooth, resample)
             with progress(f"reading {tracks}"):
                 people = _people(
@@ -229,7 +231,7 @@ def lift(
         use_one_thread()
         together = results.together()
         for number, one in people:
-            results.check(number, one, tracks, find)
+            results.check(number, one, tracks, find, together)
         cleaned = [clean(one) for _, one in people]
         chosen = (one.solution(solution) for one in _lifted(cleaned, learned or method, fields, find))
         found = [sized(finish(one.mirrored() if mirror else one), size_of) for one in chosen]

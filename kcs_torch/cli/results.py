@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -61,7 +62,7 @@ class Results:
     quiet: bool
     written: Written = field(default_factory=Written)
 
-    def check(self, number: int, tracks: Tracks, source: str, found: bool) -> None:
+    def check(self, number: int, tracks: Tracks, source: str, found: bool, together: Sequence[Path]) -> None:
         """Make sure that what a person's tracks become can be written, before anything is made of them.
 
         Args:
@@ -69,14 +70,20 @@ class Results:
             tracks: of theirs.
             source: what they were read from, which no file may replace.
             found: whether the skeleton is still to be found.
+            together: the files that hold everybody.
 
         Raises:
             OptionError: a file cannot be written, or not in such units or of such a size.
-            OutputError: there is no place for a file.
+            OutputError: there is no place for a file, or it would hold everybody, too.
         """
+        from kcs_torch.errors import OutputError
         from kcs_torch.types.size import check_size
 
-        check_outputs(self._names(number), source=source, skeleton=None if found else tracks.skeleton)
+        names = self._names(number)
+        for path in together:
+            if os.path.realpath(path) in map(os.path.realpath, names):
+                raise OutputError(f"{path}: would hold both person {number} and everybody: give another name")
+        check_outputs(names, source=source, skeleton=None if found else tracks.skeleton)
         check_units(self.units, tracks.units, self.scale)
         if self.scale is not None and not found:
             check_size(tracks.skeleton, next(name for name in self.scale if name != "units"), "--scale")

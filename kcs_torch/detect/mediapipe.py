@@ -10,6 +10,7 @@ import numpy as np
 
 from kcs_torch.detect.detector import MEDIAPIPE, Detector, Image, People, need_detector, nobody
 from kcs_torch.errors import OptionError
+from kcs_torch.io.contents.landmarks import VISIBLE, by_visibility
 
 __all__ = ["open_detector"]
 
@@ -35,8 +36,9 @@ def open_detector(what: str, models: Sequence[str | Path]) -> Detector:
         model = solutions.pose.Pose(static_image_mode=False, model_complexity=1)
         names = tuple(landmark.name.lower() for landmark in solutions.pose.PoseLandmark)
         note = "MediaPipe follows one person at a time; where it goes over to another, a new track begins"
+        seen = f"{VISIBLE}, and outside the image as 0"
         find = lambda image: _poses(model, image, len(names))  # noqa: E731
-        return Detector("MediaPipe Pose", "mediapipe33", names, find, model.close, (note,))
+        return Detector("MediaPipe Pose", "mediapipe33", names, find, model.close, (note, seen))
     model = solutions.hands.Hands(static_image_mode=False, max_num_hands=2)
     names = tuple(landmark.name.lower() for landmark in solutions.hands.HandLandmark)
     note = "MediaPipe tells no confidence of a hand's joints: all count alike"
@@ -58,11 +60,11 @@ def _hands(model: Any, image: Image, count: int) -> People:
 
 
 def _pixels(people: Sequence[Any], image: Image, *, visible: bool) -> People:
-    """Landmarks in pixels; those outside the image, which the model only supposes, count nothing."""
+    """Landmarks in pixels, weighted by visibility; those outside the image, which the model only supposes, count 0."""
     height, width = image.shape[:2]
     out = np.array([[(p.x, p.y, p.visibility if visible else 1.0) for p in person] for person in people], np.float64)
     inside = ((out[..., :2] >= 0) & (out[..., :2] <= 1)).all(-1)
-    out[..., 2] = np.where(inside, out[..., 2].clip(0, 1), 0.0)
+    out[..., 2] = np.where(inside, by_visibility(out[..., 2].clip(0, 1)), 0.0)
     out[..., :2] *= (width, height)
     return out
 

@@ -88,6 +88,8 @@ def detect_video(
     if not detections:
         raise FormatError(f"{path}: expected frames from {start}, got a video of {video.num_frames}")
     size = f"{video.width} x {video.height} pixels"
+    end, whole = start + len(detections), video.num_frames if stop is None else stop
+    early = f"only {end} of {whole} frames could be read: the video ends there, or is damaged"
     told = f"{finder.words} on {len(detections)} frames of {size}" + (f", from frame {start}" if start else "")
     if not any(len(found) for found in detections):
         raise FormatError(f"{path}: {finder.words} found nobody in {len(detections)} frames of {size}")
@@ -98,7 +100,7 @@ def detect_video(
         names=finder.joints,
         skeleton=finder.skeleton,
         fps=video.fps,
-        notes=(told, *finder.notes),
+        notes=(told, *([early] if end < whole else []), *finder.notes),
         size=(video.width, video.height),
     )
     people.sort(key=lambda one: float(one.weights[:, : one.skeleton.num_observed].sum()), reverse=True)

@@ -54,10 +54,10 @@ def load_any(
         raise unknown("format", format, {*READERS, *MOTION_READERS})
     check_fps(fps)
     kind = kind_of(path, format)
-    if kind != "tracks" and image_size is not None:
-        raise OptionError(
-            f"{path}: image_size (kcs-torch: --image-size) belongs to 2D tracks, got {_SPOKEN[kind]}: leave it out"
-        )
+    for option, given in {"image_size": image_size, "threshold": threshold, "trust": trust or None}.items():
+        if kind != "tracks" and given is not None:
+            name = f"{option} (kcs-torch: --{option.replace('_', '-')})"
+            raise OptionError(f"{path}: {name} belongs to 2D tracks, got {_SPOKEN[kind]}: leave it out")
     if kind == "result":
         if skeleton is not None or up is not None or units is not None or person is not None:
             raise OptionError(f"{path}: a result has its own skeleton, axes, units and person; save it as motion first")

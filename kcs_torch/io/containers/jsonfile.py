@@ -19,7 +19,7 @@ from kcs_torch.io.registry import read_error
 __all__ = ["as_frame_number", "as_joints", "as_text", "entries", "kind", "outline", "read_json", "short"]
 
 LIMIT = 2**30  # bytes of one file; Python needs several times as much
-FARTHEST = 1e9  # pixels
+MOST_PIXELS = 1e9  # from an image's corner; beyond it is no place in one
 MOST_JOINTS = 2000
 SCORE = 1.2  # up to which third numbers may be networks' scores
 LIKE = 0.9  # correlation of third numbers and scores from which on they are the same in other words
@@ -181,7 +181,7 @@ def _numbers(values: list[Any], where: str) -> list[float]:
             v = math.nan
         elif type(v) not in (int, float):
             raise FormatError(f"{where}: number {i}: expected a number, got {kind(v)}")
-        elif abs(v) > FARTHEST:
+        elif abs(v) > MOST_PIXELS:
             raise FormatError(f"{where}: number {i} is {short(v)}: expected pixels and confidences")
         out.append(float(v))
     return out

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError, counted, listed
-from kcs_torch.io.containers.jsonfile import FARTHEST
+from kcs_torch.io.containers.jsonfile import MOST_PIXELS
 from kcs_torch.io.contents.build_tracks import OVERSHOOT, build_tracks, nothing_seen
 from kcs_torch.io.contents.shares import are_shares, in_pixels
 from kcs_torch.io.folders import frame_numbers
@@ -74,7 +74,8 @@ def frames_of(rows: Sequence[tuple[str | float, ...]], path: Path, notes: list[s
     order = list(range(len(rows)))
     if None not in numbers:
         order.sort(key=lambda i: numbers[i] or 0)
-    frames = frame_numbers([numbers[i] for i in order], notes, names="rows", whole="row")
+    ordered = [numbers[i] for i in order]
+    frames, _ = frame_numbers(ordered, notes, names="rows", one="the file's frame", whole="row")
     return order, frames
 
 
@@ -171,7 +172,7 @@ def _seen(animal: Animal, threshold: float) -> NDArray[np.bool_]:
 def _check(animal: Animal, path: Path) -> None:
     """Refuse coordinates that are no pixels."""
     with np.errstate(invalid="ignore"):
-        far = np.argwhere(np.abs(animal.points) > FARTHEST)
+        far = np.argwhere(np.abs(animal.points) > MOST_PIXELS)
     if len(far):
         t, n, axis = far[0].tolist()
         whose = f" of '{brief(animal.name)}'" if animal.name else ""

@@ -9,7 +9,7 @@ from kcs_torch.io.containers.jsonfile import as_text
 from kcs_torch.io.contents.people import Sighting
 from kcs_torch.io.folders import frame_numbers, natural_key
 
-__all__ = ["as_track_id", "by_image", "by_number", "last_number"]
+__all__ = ["as_track_id", "by_image", "by_number"]
 
 _WHOLE = re.compile(r"(0|-?[1-9][0-9]{0,17})(?:\.0*)?")
 _NAME = re.compile(r"(?P<prefix>.*?)(?P<number>[0-9]{1,15})?(?P<suffix>\.[A-Za-z]\w*)?\Z", re.DOTALL)
@@ -53,23 +53,11 @@ def by_number(numbered: Mapping[int, Sequence[Sighting]], notes: list[str]) -> l
 def _spread(
     people: Sequence[Sequence[Sighting]], numbers: Sequence[int | None], notes: list[str], called: Sequence[str]
 ) -> list[list[Sighting]]:
-    frames = frame_numbers(numbers, notes, names="images", whole="person", called=called)
+    frames, _ = frame_numbers(numbers, notes, names="images", one="image", whole="person", called=called)
     out: list[list[Sighting]] = [[] for _ in range(frames[-1] + 1)] if frames else []
     for frame, found in zip(frames, people, strict=True):
         out[frame] = list(found)
-    if numbers and numbers[0] not in (None, 0, 1):
-        notes.append(f"frame 0 is image {called[0]}")
     return out
-
-
-def last_number(name: str) -> int | None:
-    """The number at the end of a file's or an image's name, before its suffix; None where there is none.
-
-    >>> last_number("cam1_0012.json"), last_number("first.json")
-    (12, None)
-    """
-    match = _NAME.match(name)
-    return int(match["number"]) if match and match["number"] else None
 
 
 def as_track_id(value: object) -> Hashable:

@@ -12,13 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.containers.jsonfile import FARTHEST, as_frame_number, as_joints, as_text, entries, read_json
+from kcs_torch.io.containers.jsonfile import as_frame_number, as_joints, as_text, entries, read_json
 from kcs_torch.io.contents.people import Sighting
 from kcs_torch.io.contents.shares import ASK, SIZE_HINT, are_shares
 from kcs_torch.io.contents.times import frames_of_times, rate_of_times, time_unit
+from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.registry import Options
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.types.image_size import told_image_size
+from kcs_torch.types.intake import FARTHEST
+from kcs_torch.types.size import METRES, short_unit
 
 __all__ = [
     "BODIES",
@@ -26,7 +29,9 @@ __all__ = [
     "FRAME_KEYS",
     "KEYS",
     "VISIBILITIES",
+    "VISIBLE",
     "Landmarks",
+    "by_visibility",
     "read_landmarks_json",
     "settle",
 ]
@@ -53,6 +58,12 @@ _HIDDEN = 0.3
 detections of the same video, joints of visibility below 0.5 are off by 2.5 times as much as the others, not by more:
 a guess that is worth something."""
 
+VISIBLE = (
+    f"visibility v tells what is hidden, not how well it is placed: it counts as confidence {_HIDDEN:g} + "
+    f"{1 - _HIDDEN:g} v"
+)
+"""What to say of confidences that are made of visibilities."""
+
 
 @dataclass
 class Landmarks:
@@ -67,6 +78,12 @@ class Landmarks:
     unit: str = ""  # of the coordinates, where the file tells
     who: str = ""  # the column of a table that tells people apart
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def units(self) -> str:
+        """Of tracks: the file's unit of length, pixels where it tells none."""
+        unit = short_unit(self.unit)
+        return unit if unit in METRES else "px"
 
 
 def read_landmarks_json(path: Path) -> Landmarks:
@@ -105,6 +122,8 @@ def _numbers(listed: Sequence[tuple[int | None, Any, str]], out: Landmarks) -> l
     out.times = dict(zip(numbers, times, strict=True))
     if out.fps is None:
         out.fps = rate_of_times(out.times, time_unit(key) or "", out.notes)
+    else:
+        out.fps /= frame_numbers(sorted(numbers), [])[1]
     return numbers
 
 
@@ -221,6 +240,11 @@ def _joints(landmarks: Any, where: str, seen: set[str]) -> NDArray[np.float64]:
     return joints
 
 
+def by_visibility(visibility: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights of joints within the image by MediaPipe's guesses, 0 to 1, at whether they are visible."""
+    return _HIDDEN + (1 - _HIDDEN) * visibility
+
+
 def settle(found: Landmarks, path: Path, options: Options, *, shares: bool) -> None:
     """Turn shares of the image into pixels, and visibilities into weights; confidences are weights as they are.
 
@@ -240,29 +264,27 @@ def settle(found: Landmarks, path: Path, options: Options, *, shares: bool) -> N
     everything = np.concatenate(people or [np.zeros((0, 3))])
     if not np.isfinite(everything[:, :2]).any():
         raise FormatError(f"{path}: expected landmarks in at least one of {len(found.frames)} frames, got none")
-    small = are_shares(everything[:, :2])
+    pixels = found.units == "px"
+    small = pixels and are_shares(everything[:, :2])
     size = options.size_of(found.size)
     if size is None and small and shares:
         raise FormatError(
             f"{path}: its coordinates are shares of the image, which needs the video's size: give {SIZE_HINT}; if they "
             "are metres, say, in a table, name its format: csv"
         )
-    if size is None and (small or shares):
+    if size is None and pixels and (small or shares):
         found.notes.append(ASK if small else "the coordinates are pixels already")
     small = small and size is not None
     visible = not found.seen & set(CONFIDENCES)
     seen = everything[:, 2]
     known = visible and bool((seen[np.isfinite(seen)] > 0).any())  # hands have 0 everywhere
     if known:
-        found.notes.append(
-            f"visibility v tells what is hidden, not how well it is placed: it counts as confidence {_HIDDEN:g} + "
-            f"{1 - _HIDDEN:g} v, and outside the image as v"
-        )
+        found.notes.append(f"{VISIBLE}, and outside the image as v")
     for joints in people:
         if visible:
             outside = small & ((joints[:, :2] < 0) | (joints[:, :2] > 1)).any(-1)
             weight = np.where(np.isnan(joints[:, 2]), 1.0, joints[:, 2].clip(0, 1)) if known else np.ones(len(joints))
-            joints[:, 2] = np.where(outside, weight, _HIDDEN + (1 - _HIDDEN) * weight)
+            joints[:, 2] = np.where(outside, weight, by_visibility(weight))
         if small and size is not None:
             joints[:, :2] *= size
 

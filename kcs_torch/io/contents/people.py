@@ -57,6 +57,7 @@ def people_tracks(
     edges: Any = None,
     skeleton: str | Skeleton | None = None,
     fps: float | None = None,
+    units: str = "px",
     notes: Sequence[str] = (),
     measured: bool = False,
     size: Any = None,
@@ -76,12 +77,14 @@ def people_tracks(
         edges: the file's (B, 2) bones.
         skeleton: the file's own skeleton.
         fps: the file's frames per second.
+        units: the file's units.
         notes: sentences for the user.
         measured: no detector made them: only joints at (0, 0) or (-1, -1) with all others beyond are unseen.
         size: width and height of the image, as the file tells them.
 
     Raises:
         FormatError: nobody is in any frame, or people have different numbers of joints.
+        OptionError: the caller says the size of an image that people, by their units, are not in.
         ShapeError: no joint reaches the threshold.
         SkeletonError: the joints do not fit the skeleton.
     """
@@ -103,7 +106,9 @@ def people_tracks(
         remarks.append("people are followed by the file's own track ids")
         people = _without_breaks(people, frames, gap, remarks)
     several = len({s.track for frame in frames for s in frame} - {None}) > 1
-    wrap = partial(build_tracks, source=source, names=names, edges=edges, skeleton=skeleton, fps=fps, size=size)
+    wrap = partial(
+        build_tracks, source=source, names=names, edges=edges, skeleton=skeleton, fps=fps, units=units, size=size
+    )
     out = []
     for seen in _shown(people, frames, options.least, source, remarks):
         track = np.zeros((len(frames), *everybody[0].shape))

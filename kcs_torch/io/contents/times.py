@@ -49,7 +49,8 @@ def rate_of_times(times: Mapping[int, float], unit: str, notes: list[str]) -> fl
         notes: added to.
     """
     numbers = sorted(times)
-    known = [(f, times[n]) for f, n in zip(frame_numbers(numbers, []), numbers, strict=True) if times[n] == times[n]]
+    frames, _ = frame_numbers(numbers, [])
+    known = [(f, times[n]) for f, n in zip(frames, numbers, strict=True) if times[n] == times[n]]
     if len(known) < 2 or not known[-1][1] > known[0][1]:
         return None
     rate = (known[-1][0] - known[0][0]) / (known[-1][1] - known[0][1])

@@ -18,6 +18,7 @@ from torch import Tensor
 from kcs_torch.errors import FormatError
 from kcs_torch.functional import euler_rotation
 from kcs_torch.io.contents.build_motion import build_motion, numbers, read_lines
+from kcs_torch.io.folders import frame_numbers
 from kcs_torch.io.registry import MotionOptions, MotionReader, Probe
 from kcs_torch.types import Motion
 
@@ -25,6 +26,7 @@ __all__ = ["MOTION_READERS"]
 
 _INCH = 25.4  # mm
 _BONES = 10_000  # of one file
+_DIGITS = 16  # from which on a number is none of a frame
 
 
 @dataclass
@@ -67,10 +69,13 @@ def read(path: Path, options: MotionOptions) -> Motion:
     asf = Path(str(named)) if named else _beside(path)
     body = _skeleton(asf)
     order = _parents_first(body, asf)
-    points = _positions(body, order, _angles(lines, body, path))
+    notes = [f"skeleton of {asf.name}"]
+    angles, numbered = _angles(lines, body, path)
+    frames, _ = frame_numbers(numbered, notes, names="frames", one="the file's frame", whole="pose")
+    points = torch.full((max(frames) + 1, len(order) + 1, 3), torch.nan, dtype=torch.float64)
+    points[frames] = _positions(body, order, angles)
     places = {"root": 0} | {bone.name: i for i, bone in enumerate(order, 1)}
     rest = replace(options, skeleton=None) if named else options
-    notes = [f"skeleton of {asf.name}"]
     if options.fps is None:
         notes.append("the file does not tell the frame rate (CMU's are mostly 120): give fps=... (kcs-torch: --fps)")
     return build_motion(
@@ -205,16 +210,17 @@ def _parents_first(body: _Body, path: Path) -> list[_Bone]:
     return out
 
 
-def _angles(lines: Sequence[str], body: _Body, path: Path) -> dict[str, Tensor]:
-    """The channel values (T, C) of the root and each bone that moves."""
+def _angles(lines: Sequence[str], body: _Body, path: Path) -> tuple[dict[str, Tensor], list[int | None]]:
+    """The channel values (T, C) of the root and each bone that moves, and what numbers the T frames."""
     kinds = {"root": body.root.channels} | {b.name: b.channels for b in body.bones.values() if b.channels}
     values: dict[str, list[array[float]]] = {name: [] for name in kinds}
-    frames = 0
+    numbered: list[int | None] = []
     for number, words in _words(lines, body):
         where = f"{path}: line {number}"
-        if len(words) == 1 and words[0].isdigit():
+        frames = len(numbered)
+        if len(words) == 1 and words[0].isdecimal():
             _complete(values, frames, where)
-            frames += 1
+            numbered.append(int(words[0]) if len(words[0]) < _DIGITS else None)
             continue
         name = words[0]
         if name not in kinds or not frames:
@@ -226,10 +232,12 @@ def _angles(lines: Sequence[str], body: _Body, path: Path) -> dict[str, Tensor]:
         if len(row) != len(kinds[name]):
             raise FormatError(f"{where}: '{name}': expected {len(kinds[name])} numbers, got {len(row)}")
         values[name].append(array("d", row))
+    frames = len(numbered)
     if not frames:
         raise FormatError(f"{path}: expected frames, each below a line with its number, got none")
     _complete(values, frames, f"{path}: line {len(lines)}")
-    return {n: torch.from_numpy(np.array(v, np.float64)).reshape(frames, len(kinds[n])) for n, v in values.items()}
+    rows = {n: torch.from_numpy(np.array(v, np.float64)).reshape(frames, len(kinds[n])) for n, v in values.items()}
+    return rows, numbered
 
 
 def _words(lines: Sequence[str], body: _Body) -> Iterator[tuple[int, list[str]]]:

@@ -149,11 +149,9 @@ def _read_csv(path: Path, coords: Sequence[str], notes: list[str]) -> Table:
             if not take:
                 raise FormatError(f"{path}: expected columns {', '.join(coords)}, got none of them")
             cells = itemgetter(*take) if len(take) > 1 else lambda line: (line[take[0]],)
-            for line in lines:
-                if not any(line):
-                    continue
+            for number, line in lines:
                 if len(line) > width or len(line) <= first:
-                    raise FormatError(f"{path}: line {lines.line_num}: expected {width} cells, got {len(line)}")
+                    raise FormatError(f"{path}: line {number}: expected {width} cells, got {len(line)}")
                 short += len(line) < width
                 line += [""] * (width - len(line))
                 values = cells(line)
@@ -163,7 +161,7 @@ def _read_csv(path: Path, coords: Sequence[str], notes: list[str]) -> Table:
                     numbers.extend([as_float(v) for v in values])
                 except ValueError:
                     wrong = no_numbers([_said(columns[i]) for i in take], values)
-                    raise FormatError(f"{path}: line {lines.line_num}: {wrong}") from None
+                    raise FormatError(f"{path}: line {number}: {wrong}") from None
                 rows.append(tuple(line[:first]))
     except (csv.Error, ValueError) as error:
         if isinstance(error, FormatError):
@@ -184,12 +182,10 @@ def _said(column: tuple[str, ...]) -> str:
     return f"{coord} of '{brief(part)}'" + (f" of '{brief(whose[0])}'" if whose else "")
 
 
-def _header(lines: Iterator[list[str]], path: Path) -> list[list[str]]:
+def _header(lines: Iterator[tuple[int, list[str]]], path: Path) -> list[list[str]]:
     """The three or four lines of names."""
     header: list[list[str]] = []
-    for line in lines:
-        if not line:
-            continue
+    for _, line in lines:
         header.append(line)
         if line[:1] == ["coords"] or len(header) == 4:
             break

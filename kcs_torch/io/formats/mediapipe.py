@@ -55,6 +55,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
         names=found.names,
         skeleton=skeleton,
         fps=found.fps,
+        units=found.units,
         notes=found.notes,
         size=found.size,
     )

@@ -7,10 +7,10 @@ from typing import Any
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.containers.jsonfile import as_frame_number, as_joints, as_text, entries, outline, read_json
-from kcs_torch.io.contents.frames import as_track_id, by_number, last_number
+from kcs_torch.io.contents.frames import as_track_id, by_number
 from kcs_torch.io.contents.layout import named_layout, names_of
 from kcs_torch.io.contents.people import Sighting, people_tracks
-from kcs_torch.io.folders import frame_numbers
+from kcs_torch.io.folders import frames_of_files
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.types import Tracks
 
@@ -80,8 +80,7 @@ def _folder(probe: Probe, options: Options, notes: list[str]) -> list[Tracks]:
     files = probe.like(".json")
     if not files:
         raise FormatError(f"{probe.path}: expected a folder of MMPose .json files, got none")
-    called = [as_text(f.name) for f in files]
-    frames = frame_numbers([last_number(f.name) for f in files], notes, called=called)
+    frames = frames_of_files(files, probe.path, notes)
     people: list[list[Sighting]] = [[] for _ in range(frames[-1] + 1)]
     for frame, file in zip(frames, files, strict=True):
         data = read_json(file)

@@ -64,9 +64,11 @@ def read(path: Path, options: Options) -> list[Tracks]:
     units = file.text("units") if "units" in file else "px"
     notes = _json(file, "notes", list) if "notes" in file else []
     size = _size_in(file)
-    if units == "px" and points.shape[-1] == 2 and are_shares(points):
+    written = "skeleton" in file  # by this library, with coordinates as they were
+    shares = units == "px" and points.shape[-1] == 2 and are_shares(points)
+    kept = shares and written and size is not None and options.image_size is None
+    if shares and not kept:
         points = in_pixels(points, options.size_of(size), notes)
-    written = "skeleton" in file  # by this library
     tracks = build_tracks(
         points,
         _confidence(file),
@@ -81,6 +83,8 @@ def read(path: Path, options: Options) -> list[Tracks]:
         detector=_detector_in(file),
         size=size,
     )
+    if kept:
+        tracks = dataclasses.replace(tracks, image_size=size)
     return [dataclasses.replace(tracks, image_guess=_size_in(file, "image_guess", 0))]
 
 

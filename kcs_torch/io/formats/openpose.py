@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError, counted
-from kcs_torch.io.containers.jsonfile import FARTHEST, as_text, kind, outline, read_json, short
+from kcs_torch.io.containers.jsonfile import MOST_PIXELS, kind, outline, read_json, short
 from kcs_torch.io.contents.layout import BY_COUNT, likeliest
 from kcs_torch.io.contents.people import Sighting, people_tracks
-from kcs_torch.io.folders import frame_numbers
+from kcs_torch.io.folders import frames_of_files
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.skeleton import SKELETONS, get_skeleton
 from kcs_torch.types import Tracks
@@ -25,7 +24,6 @@ LAYOUTS = {count: BY_COUNT[count] for count in (25, 18, 15, 21)}
 """Skeletons by the number of joints that a person has; the usual one first."""
 _BODY = "pose_keypoints_2d"
 _OTHERS = ("face_keypoints_2d", "hand_left_keypoints_2d", "hand_right_keypoints_2d")
-_NAME = re.compile(r"(?P<prefix>.*?)(?P<number>[0-9]+)?(?:_keypoints)?\Z", re.DOTALL)
 
 Person = NDArray[np.float64]  # (..., N, 3): x, y, confidence
 
@@ -71,19 +69,7 @@ def _frame_files(probe: Probe, notes: list[str]) -> tuple[Sequence[Path], list[i
         others = len(probe.files) - len(files)
         are = "is" if others == 1 else "are"
         notes.append(f"{counted(others, 'file')} that {are} not .json {are} left out")
-    names = [_NAME.match(f.stem) for f in files]
-    prefixes = sorted({m["prefix"] for m in names if m and m["number"]})
-    if len(prefixes) > 1:
-        folder = files[0].parent
-        ways = " or ".join(repr(str(folder / f"{p}*")) for p in prefixes[:4])
-        raise FormatError(
-            f"{probe.path}: expected the files of one recording, got {len(prefixes)} kinds of file names: give {ways}"
-        )
-    numbers = [int(m["number"]) if m and m["number"] else None for m in names]
-    for i, number in enumerate(numbers[1:]):
-        if number is not None and number == numbers[i]:
-            raise FormatError(f"{probe.path}: expected one file a frame, got {files[i].name} and {files[i + 1].name}")
-    return files, frame_numbers(numbers, notes, called=[as_text(f.name) for f in files])
+    return files, frames_of_files(files, probe.path, notes)
 
 
 def _read_files(files: Sequence[Path], notes: list[str]) -> list[list[Person]]:
@@ -131,7 +117,7 @@ def _numbers(values: Any, file: Path) -> list[float]:
     for i, v in enumerate(values):
         if type(v) not in (int, float):
             raise FormatError(f"{file}: '{_BODY}': number {i}: expected a number, got {kind(v)}")
-        if abs(v) > FARTHEST:
+        if abs(v) > MOST_PIXELS:
             raise FormatError(f"{file}: '{_BODY}': number {i} is {short(v)}: expected pixels and confidences")
         if i % 3 == 2 and v < 0:
             raise FormatError(f"{file}: '{_BODY}': joint {i // 3} has a negative confidence {v:g}; expected 0..1")

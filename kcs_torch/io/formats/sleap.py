@@ -221,24 +221,24 @@ def _instances(path: Path) -> tuple[list[str], dict[str, _Frames]]:
     instances: dict[str, _Frames] = {}
     try:
         with bounded_rows(path) as lines:
-            header: list[str] = next(lines, [])
+            _, header = next(lines, (0, []))
             names = list(dict.fromkeys(c.rpartition(".")[0] for c in header[3:]))
             places = [[_place(header, f"{n}.{c}") for c in ("x", "y", "score")] for n in names]
             if not names or any(None in p[:2] for p in places):
                 raise FormatError(
                     f"{path}: expected columns node.x, node.y, node.score, got {brief(', '.join(header[3:7]))}"
                 )
-            for line in lines:
+            for number, line in lines:
                 if len(line) != len(header):
-                    raise FormatError(f"{path}: line {lines.line_num}: expected {len(header)} cells, got {len(line)}")
+                    raise FormatError(f"{path}: line {number}: expected {len(header)} cells, got {len(line)}")
                 try:
                     frame = as_frame_number(float(line[1]))  # tables that pandas wrote again may say 7.0
                     values = [[as_float(line[i]) if i is not None else math.nan for i in p] for p in places]
                 except ValueError:
                     wrong = no_numbers([f"'{brief(column)}'" for column in header[1:]], line[1:])
-                    raise FormatError(f"{path}: line {lines.line_num}: {wrong}") from None
+                    raise FormatError(f"{path}: line {number}: {wrong}") from None
                 if frame is None or not 0 <= frame < 10**15:
-                    raise FormatError(f"{path}: line {lines.line_num}: expected a frame number, got {brief(line[1])}")
+                    raise FormatError(f"{path}: line {number}: expected a frame number, got {brief(line[1])}")
                 instances.setdefault(line[0], {}).setdefault(frame, []).append(np.array(values))
     except csv.Error as error:
         raise FormatError(f"{path}: expected SLEAP's analysis CSV, got damaged text: {error}") from None

@@ -64,7 +64,14 @@ def read(path: Path, options: Options) -> list[Tracks]:
     settle(found, path, options, shares=False)
     frames = by_number(found.frames, found.notes)
     return people_tracks(
-        frames, options, source=str(path), names=found.names, fps=found.fps, notes=found.notes, measured=True
+        frames,
+        options,
+        source=str(path),
+        names=found.names,
+        fps=found.fps,
+        units=found.units,
+        notes=found.notes,
+        measured=True,
     )
 
 

@@ -70,9 +70,10 @@ def write_table(header: Iterable[str], rows: NDArray[Any], fps: float | None, pa
 
 
 def write_json(result: Reconstruction, path: Path) -> None:
-    """Write one object with the keys of the native .npz, but ``points3d``, ``joint_names`` and ``edges`` of all joints.
+    """Write the motion as one object; the tracks, the lens and other solutions are in the native .npz alone.
 
-    Numbers have 9 significant digits; what is not a number is null.
+    ``points3d``, ``joint_names`` and ``edges`` are those of all joints, of which the first ``num_observed`` are not
+    virtual; ``units`` are those of ``points3d``. Numbers have 9 significant digits; what is not a number is null.
     """
     body = result.skeleton
     data = {

@@ -57,15 +57,19 @@ def read(path: Path, options: MotionOptions) -> Motion:
         raise FormatError(f"{path}: line {at + 1}: expected names of markers, got none")
     notes: list[str] = []
     frames, numbered, told_at = _rows(map(cells_of, lines[at + 1 :]), at + 2, len(names), path, notes)
-    places = _places(numbered, path, notes)
+    places, step = _places(numbered, path, notes)
     times = {places[i]: time for i, time in told_at.items()}
     told = header.get("NumFrames", "")
     if told.isdigit() and int(told) != len(frames):
         notes.append(f"the header tells {told} frames, the file has {len(frames)}")
-    rate, real = header.get("DataRate", ""), rate_of_times(times, "s", []) if len(times) == len(frames) else None
-    fps = (_rate(rate, path) if rate else None) or real
-    if fps and real and abs(1 / real - 1 / fps) > _OFF / fps + _ROUNDED / len(frames):
-        notes.append(f"the header tells {fps:g} frames a second, the rows' times {real:g}: the header is believed")
+    real = rate_of_times(times, "s", []) if len(times) == len(frames) else None
+    told_rate = _rate(header.get("DataRate", ""), path)
+    fps = told_rate / step if told_rate else real
+    if fps and real and not _alike(real, fps, len(frames)):
+        if told_rate and _alike(real, told_rate, len(frames)):
+            fps = told_rate  # of the rows: their numbers count other frames
+        else:
+            notes.append(f"the header tells {fps:g} frames a second, the rows' times {real:g}: the header is believed")
     points = np.full((max(places) + 1, 3 * len(names)), np.nan)
     points[places] = np.array(frames, np.float64)
     return build_motion(
@@ -117,10 +121,13 @@ def _rows(
     return frames, numbered, told_at
 
 
-def _places(numbered: list[str], path: Path, notes: list[str]) -> list[int]:
-    """Which frame each row is, by its number; rows that hold no whole numbers are taken in their order."""
+def _places(numbered: list[str], path: Path, notes: list[str]) -> tuple[list[int], int]:
+    """Which frame each row is, by its number, and the step in which these count the frames.
+
+    Rows that hold no whole numbers are taken in their order.
+    """
     if not all(text.isdecimal() and len(text) < _DIGITS for text in numbered):
-        return list(range(len(numbered)))
+        return list(range(len(numbered))), 1
     numbers = [int(text) for text in numbered]
     order = sorted(range(len(numbers)), key=numbers.__getitem__)
     again = next((numbers[b] for a, b in itertools.pairwise(order) if numbers[a] == numbers[b]), None)
@@ -128,15 +135,18 @@ def _places(numbered: list[str], path: Path, notes: list[str]) -> list[int]:
         raise FormatError(f"{path}: Frame#: expected every frame once, got frame {again} again")
     if order != sorted(order):
         notes.append("the rows are put in the order of their numbers, Frame#")
-    first = numbers[order[0]]
-    if first > 1:
-        notes.append(f"frame 0 is the file's frame {first}")
-    frames = frame_numbers([numbers[i] for i in order], notes, names="rows", whole="row")
-    return [frame for _, frame in sorted(zip(order, frames, strict=True))]
+    ordered = [numbers[i] for i in order]
+    frames, step = frame_numbers(ordered, notes, names="rows", one="the file's frame", whole="row")
+    return [frame for _, frame in sorted(zip(order, frames, strict=True))], step
+
+
+def _alike(real: float, told: float, frames: int) -> bool:
+    """Whether the rate of so many frames by their times, which are rounded, is the one that is told."""
+    return abs(1 / real - 1 / told) <= _OFF / told + _ROUNDED / frames
 
 
 def _rate(text: str, path: Path) -> float | None:
-    value = numbers([text], f"{path}: line 3: DataRate")[0]
+    value = numbers([text], f"{path}: line 3: DataRate")[0] if text else 0.0
     return value if value > 0 else None
 
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.containers.archive import Archive, array_names
-from kcs_torch.io.containers.jsonfile import FARTHEST, as_text
+from kcs_torch.io.containers.jsonfile import MOST_PIXELS, as_text
 from kcs_torch.io.containers.pickles import opened
 from kcs_torch.io.contents.build_tracks import build_tracks
 from kcs_torch.io.contents.layout import choose_layout
+from kcs_torch.io.contents.shares import are_shares
 from kcs_torch.io.registry import Options, Probe, Reader
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.types import Tracks
@@ -22,7 +23,6 @@ from kcs_torch.types import Tracks
 __all__ = ["READERS"]
 
 _KEY = "positions_2d"
-_SHARES = 2.0  # coordinates that never pass this are no pixels
 _MOST = 100_000  # arrays and mappings of a file
 
 
@@ -81,12 +81,13 @@ def _sequences(nest: Any, where: str) -> Iterator[tuple[tuple[Any, ...], str, ND
 
 def _tracks(array: NDArray[Any], where: str, meta: Any, size: Any, path: Path, options: Options) -> Tracks:
     points = array[..., :2].astype(np.float64)
-    if (np.abs(points) > FARTHEST).any():
-        raise FormatError(f"{where}: expected pixels, got numbers beyond {FARTHEST:g}")
+    if (np.abs(points) > MOST_PIXELS).any():
+        raise FormatError(f"{where}: expected pixels, got numbers beyond {MOST_PIXELS:g}")
     confidence = array[..., 2].astype(np.float64) if array.shape[-1] == 3 else None
     notes: list[str] = []
-    if (np.abs(points[np.isfinite(points)]) <= _SHARES).all():
-        notes.append("the coordinates are within -2..2, shares of the image: they are taken as they are")
+    if are_shares(points):
+        left = "" if options.size_of(size) is None else ", and the image's size is left out"
+        notes.append(f"the coordinates are shares of the image: they are taken as they are{left}")
     skeleton = _by_symmetry(meta, array.shape[1])
     names = None
     if skeleton is None:

@@ -6,7 +6,6 @@ import csv
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from kcs_torch.errors import FormatError
 from kcs_torch.io.registry import read_error
@@ -18,8 +17,8 @@ LINES, LINE = 2**23, 2**23  # of a table of text, and letters of one
 
 
 @contextmanager
-def bounded_rows(path: Path) -> Iterator[Any]:
-    """Open a table of text: a csv reader of its rows.
+def bounded_rows(path: Path) -> Iterator[Iterator[tuple[int, list[str]]]]:
+    """Open a table of text: its rows that are not blank, and the number of the line at which each ends.
 
     Raises:
         FormatError: it cannot be read; a line is longer, or there are more, than any table of tracks has.
@@ -28,7 +27,8 @@ def bounded_rows(path: Path) -> Iterator[Any]:
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
             between = delimiter(file.readline(LINE))
             file.seek(0)
-            yield csv.reader(_bounded(file, path), delimiter=between)
+            rows = csv.reader(_bounded(file, path), delimiter=between)
+            yield ((rows.line_num, row) for row in rows if any(row))
     except OSError as error:
         raise read_error(path, error) from None
 

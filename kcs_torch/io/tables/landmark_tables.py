@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from kcs_torch.errors import FormatError
-from kcs_torch.io.containers.jsonfile import FARTHEST
+from kcs_torch.io.containers.jsonfile import MOST_PIXELS
 from kcs_torch.io.contents.landmarks import BODIES, VISIBILITIES, Landmarks
 from kcs_torch.io.contents.people import Sighting
 from kcs_torch.io.registry import read_error
@@ -177,8 +177,8 @@ def read_npy(path: Path) -> Landmarks:
         if (np.isnan(third) | ((third >= 0) & (third <= 1))).all():
             seen = third
             out.notes.append("the third number of each landmark is taken as its visibility: it is within 0..1")
-    if not (np.isnan(rows) | (np.abs(rows) <= FARTHEST)).all():
-        raise FormatError(f"{path}: expected coordinates, got numbers beyond {FARTHEST:g}")
+    if not (np.isnan(rows) | (np.abs(rows) <= MOST_PIXELS)).all():
+        raise FormatError(f"{path}: expected coordinates, got numbers beyond {MOST_PIXELS:g}")
     joints = np.concatenate([rows[..., :2], seen[..., None]], -1)
     out.frames = {t: [Sighting(j)] if np.isfinite(j[:, :2]).any() else [] for t, j in enumerate(joints)}
     return out

@@ -210,7 +210,8 @@ class _Table:
     def _check_size(self, places: NDArray[np.float64], groups: int) -> None:
         count = len(places)
         if self.header.number is not None:
-            count = frame_numbers([as_frame_number(place) for place in places.tolist()], [])[-1] + 1
+            frames, _ = frame_numbers([as_frame_number(place) for place in places.tolist()], [])
+            count = frames[-1] + 1
         count, joints = max(count, groups), len(self.names)
         if count * joints * 3 > MOST:
             raise FormatError(f"{self.path}: {count} frames of {joints} joints are more than fits: split the file")
