@@ -180,10 +180,14 @@ def test_angles_are_surer_of_a_body_that_is_seen_from_aside(degrees):
     for angle in (0.0, degrees):
         c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
         body = rest @ torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]).double().mT
-        goal = Objective(skeleton, body[..., :2], Weights(), torch.zeros(30, 17).double())
-        lengths = bone_lengths(body, goal.bones).mean(0)
-        doubts.append(angle_doubt(goal, body[..., 2], lengths, 0.0))
-    front, aside = doubts
+        for lying in (False, True):  # turned in the image, it is as sure
+            if lying:
+                body = body @ torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).double().mT
+            goal = Objective(skeleton, body[..., :2], Weights(), torch.zeros(30, 17).double())
+            lengths = bone_lengths(body, goal.bones).mean(0)
+            doubts.append(angle_doubt(goal, body[..., 2], lengths, 0.0))
+    front, aside = doubts[::2]
+    assert doubts[1::2] == pytest.approx(doubts[::2])
     least = (answers.SIDE / answers.FRONT) ** 2  # the share of the variance that is the same from all sides
     assert (aside / front) ** 2 == pytest.approx((1 / (1 + (s / answers.ASIDE) ** 2) + least) / (1 + least), rel=0.03)
     assert aside / front < (0.55 if degrees < 20 else 0.35)

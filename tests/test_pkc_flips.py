@@ -74,6 +74,15 @@ def test_flips_change_one_run_of_one_part(seed):
     assert len(seen) > 0.8 * len(which)  # the same run of a part is not told twice
 
 
+@pytest.mark.parametrize("first", range(1, 6))
+def test_runs_backward_are_the_same(first):
+    """A bone that only touches the image plane: also near the clip's end its sign may have been lost there."""
+    depth = 0.02 * (torch.arange(40).double() - (first - 0.5)).abs()[:, None]
+    runs = [flipped_runs(one, torch.ones(1, 1).double(), ACCELERATION) for one in (depth, depth.flip(0))]
+    there, back = ({*zip(one.starts.tolist(), one.ends.tolist(), strict=True)} for one in runs)
+    assert there == {(40 - end, 40 - start) for start, end in back}
+
+
 @pytest.mark.parametrize("frames", [1, 2, 3, 4, 40])
 def test_bends_are_counted_where_signs_change(frames, monkeypatch):
     """As a count over all frames says; what bends too much is left out."""

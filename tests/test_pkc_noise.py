@@ -126,6 +126,14 @@ def test_beside_a_wrong_detection_or_in_noise_a_kick_is_left_to_the_model(fields
     assert bool(found.outliers[30].any()) and not bool((points == tracks.points)[found.outliers].any())
 
 
+@pytest.mark.parametrize("fields", [{"noise": 5.0}, {"missing": 0.2}])
+def test_virtual_joints_stay_the_middle_of_their_sources(fields):
+    clip = walking_person(60, skeleton="coco17", generator=torch.Generator().manual_seed(0), **fields)
+    tracks = replace(clip.tracks, points=clip.tracks.points / 500)
+    points, _, _ = run(cleaned(tracks, denoise=True), serve)
+    assert_close(points, tracks.skeleton.complete(points[:, :17])[0])
+
+
 def test_clips_are_cleaned_together_as_alone():
     tasks = []
     for seed, frames in enumerate((30, 41, 30, 30, 5)):

@@ -16,6 +16,7 @@ from kcs_torch.methods.pkc.trunk import (
     Trunk,
     facings,
     image_scale,
+    longest_image,
     mirror,
     trunk_misfit,
     trunk_path,
@@ -59,6 +60,16 @@ def test_scale_follows_units_and_ignores_what_noise_adds():
     noisy = image + 40 * normal(60, 17, 2)
     plain, rough, told = scale_of(image), scale_of(noisy), scale_of(noisy, 40 * 2**0.5)
     assert rough > 1.05 * plain and abs(told - plain) < 0.6 * abs(rough - plain)
+
+
+def test_all_frames_that_show_a_bone_tell_its_longest_image():
+    """Not those alone of which a detector is surest; what fills gaps does not."""
+    flat = torch.zeros(60, 1, 2).double()
+    flat[:, 0, 0] = torch.linspace(1, 2, 60).double()
+    noise = torch.linspace(0.01, 0.02, 60).double()[:, None]
+    assert longest_image(flat, noise).item() == pytest.approx(2, rel=0.03)
+    noise[40:] = 0.1
+    assert longest_image(flat, noise).item() == pytest.approx(1.66, rel=0.03)
 
 
 def test_scale_of_nothing():

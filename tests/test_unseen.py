@@ -53,6 +53,20 @@ def test_seen_joints_stay_and_unseen_ones_keep_their_bones():
     assert_close(found, place_unseen(points, known, BODY))  # whatever stood there
 
 
+def test_a_joint_between_two_that_are_seen_is_told_by_both():
+    """Whatever the order of the bones."""
+    points, known = turned_template() + 20 * normal(8, 17, 3, seed=2), known_but(KNEE)
+    found = place_unseen(points, known, BODY)
+    order = list(range(BODY.num_bones))[::-1]
+    named = {"bones": BODY.bones, "proportions": BODY.proportions, "spread": BODY.spread}
+    other = replace(BODY, flexible=(), **{k: tuple(v[i] for i in order) for k, v in named.items() if v is not None})
+    assert_close(found, place_unseen(points, known, other))
+    hip = BODY.index("left_hip")
+    by_one = [place_unseen(points, known_but(KNEE, end), BODY)[:, KNEE] for end in (ANKLE, hip)]
+    far = [(found[:, KNEE] - one).norm(dim=-1).mean() for one in by_one]
+    assert abs(far[0] / far[1] - 1) < 0.5  # by the hip alone, or by the ankle
+
+
 def test_a_pose_unlike_the_templates_does_not_shrink_what_is_unseen():
     points, known = turned_template(), known_but(KNEE, ANKLE)
     bent = points.clone()
