@@ -23,10 +23,10 @@ from kcs_torch.io.anything import kind_of
 def clips(folder: Path) -> Iterator[Path]:
     """Files, and folders that are one clip, in order."""
     for path in sorted(folder.iterdir()):
-        if path.is_file() or is_clip(path):
-            yield path
-        else:
+        if path.is_dir() and not is_clip(path):
             yield from clips(path)
+        else:
+            yield path
 
 
 def is_clip(folder: Path) -> bool:
@@ -56,13 +56,17 @@ def main() -> None:
     options = parser.parse_args()
     if not options.folder.is_dir():
         parser.error(f"{options.folder}: expected a folder, found none")
+    try:
+        size = image_size(options.image_size)
+    except kt.OptionError as error:
+        parser.error(str(error))
     warnings.simplefilter("ignore", kt.KcsWarning)
     print("| file | format | frames | joints | people | unseen, % |\n|---|---|---|---|---|---|")
     left = []
     for path in clips(options.folder):
         name = path.relative_to(options.folder).as_posix()
         try:
-            print(f"| {name} | {' | '.join(row(path, image_size(options.image_size)))} |", flush=True)
+            print(f"| {name} | {' | '.join(row(path, size))} |", flush=True)
         except kt.KcsError as error:
             left.append(f"{name}: {error}")
     print("\n".join(["", *left]))

@@ -53,7 +53,12 @@ def runs_of(folders: list[Path], metric: str) -> dict[str, dict[str, dict[int, f
         with table.open(newline="", encoding="utf-8") as file:
             for row in csv.DictReader(file):
                 figure = row.get(f"test/{metric}")
-                if not figure:
+                if figure == "":
+                    raise SystemExit(
+                        f"{table}: run {row.get('run')} has no test/{metric}: it diverged, or was not tested; make it "
+                        "anew, or remove its line"
+                    )
+                if figure is None:
                     names = ", ".join(name.removeprefix("test/") for name in row if name.startswith("test/"))
                     raise SystemExit(f"metric={metric}: expected one of {names}")
                 experiment, seed = row.get("experiment") or "-", int(row.get("seed") or 0)

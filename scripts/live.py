@@ -96,6 +96,9 @@ def main() -> None:
         parser.error("--inputs and --truth go together")
     if options.inputs is not None and not any(options.inputs.glob("*.npz")):
         parser.error(f"--inputs {options.inputs}: expected a folder with .npz files of tracks, found none")
+    for path in [] if options.inputs is None else sorted(options.inputs.glob("*.npz")):
+        if not (options.truth / path.name).is_file():
+            parser.error(f"--truth {options.truth}: expected a file {path.name} as in --inputs, found none")
     torch.set_num_threads(1)
     head = f"{'clip':<32}{'frames':>7}{'fps':>7}{'offline':>8}{'ms: med':>8}{'99 %':>7}{'worst':>7}"
     print(f"{head}{'mm: all':>8}{'ready':>9}{'offline':>9}{'sure':>9}")

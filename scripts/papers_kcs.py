@@ -192,7 +192,7 @@ def rounds(settings: Settings) -> Iterator[Row]:
 
 
 def growth(settings: Settings) -> Iterator[Row]:
-    """CPU seconds over the number of frames, 17 joints, one thread; the median of three runs."""
+    """CPU seconds over the number of frames, 17 joints, one thread; the median of three runs, of PKC one run."""
     chosen = [name for name in ("kcs", "sfam", "pkc") if name in settings.methods]
     for frames in [count for count in LENGTHS if count <= settings.frames]:
         clip = kt.data.walking_person(frames, skeleton="h36m17", yaw=30, turn=20, noise=2, generator=generator(0))

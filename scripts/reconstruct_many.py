@@ -77,10 +77,10 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        with command_line("reconstruct_many"):
+    with command_line("reconstruct_many"):
+        try:
             main()
-    except KeyboardInterrupt:
-        print("stopped: run it again to go on", file=sys.stderr)
-        sys.exit(130)
+        except KeyboardInterrupt:
+            print("stopped: run it again to go on", file=sys.stderr)
+            raise
     sys.exit(1 if failed else 0)

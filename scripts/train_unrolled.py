@@ -157,7 +157,11 @@ def main() -> None:
             parser.error(f"--{name}: expected at least 1, got {getattr(options, name)}")
     torch.set_num_threads(1)
     skeleton, clips = motions(options.data, tested=False)
-    film, unseen = Film(clips, options), Film(motions(options.data, tested=True)[1], options)
+    others = motions(options.data, tested=True)[1]
+    longest = min(max(map(len, some)) for some in (clips, others))
+    if options.frames > longest:
+        parser.error(f"--frames: expected at most {longest}, as the clips have, got {options.frames}")
+    film, unseen = Film(clips, options), Film(others, options)
     generator = torch.Generator().manual_seed(options.seed + 1)
     sizes = [min(options.batch, options.test - first) for first in range(0, options.test, options.batch)]
     held_out = [unseen.batch(size, generator) for size in sizes]

@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import itertools
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 import kcs_torch as kt
-from kcs_torch.training.configured import _for_hydra, check_values
+from kcs_torch.training.configured import _for_hydra, check_values, command_line
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 PROGRAMS = sorted(path.stem for path in CONFIGS.glob("*.yaml"))
@@ -165,13 +166,39 @@ def test_a_value_that_holds_an_equals_sign_needs_no_quotes(word, value):
     assert OverridesParser.create().parse_override(_for_hydra(word)).value() == value
 
 
+@pytest.mark.parametrize(
+    "name", ["Läufe", "日本", "a&b", "a#b", "a;b", "x^y", "it's", "clip (1)", "take(2)", "s[12]_*", "ä\\"]
+)
+def test_names_of_files_need_no_quotes(name):
+    parse = OverridesParser.create().parse_override
+    assert parse(_for_hydra(f"input={name}")).value() == name
+    assert parse(_for_hydra(f"input=videos/{name}")).value() == f"videos/{name}"
+
+
+def test_parts_of_lists_and_sweeps_need_no_quotes():
+    parse = OverridesParser.create().parse_override
+    assert parse(_for_hydra("data.train=[ä/*.npz,!b*,c,7]")).value() == ["ä/*.npz", "!b*", "c", 7]
+    assert [*parse(_for_hydra("input=ä,b,7")).sweep_string_iterator()] == ["'ä'", "b", "7"]
+
+
+def test_a_folder_of_the_user_is_meant_by_a_tilde(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    with command_line("train", ["data.folder=~/motion", "hydra.run.dir=~", "data.train=a~b", "data.val=~b"]):
+        assert sys.argv[1:] == [
+            "++data.folder=/home/me/motion", "hydra.run.dir=/home/me", "++data.train='a~b'", "++data.val='~b'",
+        ]  # fmt: skip
+
+
 def test_a_sweep_over_values_that_hold_an_equals_sign():
     parsed = OverridesParser.create().parse_override(_for_hydra("scale=height=1.75m,height=1.8m"))
     assert [*parsed.sweep_string_iterator()] == ["'height=1.75m'", "'height=1.8m'"]
 
 
 def test_what_hydra_reads_itself_is_left_to_it():
-    for word in ("shard=range(start=0,stop=8)", "seed=1,2", "--config-dir=a=b", "output=${now:%Y=%m}"):
+    for word in (
+        *("shard=range(start=0,stop=8)", "seed=1,2", "--config-dir=a=b", "output=${now:%Y=%m}"),
+        *("input='ä'", "shard=rnage(0,8)", "input=choice(ä)", "data={ä: 1}", "input=[[ä],b]"),
+    ):
         assert _for_hydra(word) == word
 
 

@@ -44,6 +44,14 @@ def test_the_same_run_twice_is_refused(script, tmp_path):
         script.runs_of([write(tmp_path / "sweep", rows)], "pa_mpjpe")
 
 
+def test_a_run_that_diverged_is_named(script, tmp_path):
+    rows = [run(k, "" if k else 1.0, experiment="labels", seed=k) for k in range(2)]
+    with pytest.raises(SystemExit, match=r"results\.csv: run 1 has no test/pa_mpjpe: it diverged"):
+        script.runs_of([write(tmp_path / "sweep", rows)], "pa_mpjpe")
+    with pytest.raises(SystemExit, match="metric=mpjpe: expected one of pa_mpjpe"):
+        script.runs_of([tmp_path / "sweep"], "mpjpe")
+
+
 def test_help_tells_the_options(script, capsys):
     with pytest.raises(SystemExit):
         script.main(["--help"])

@@ -420,6 +420,20 @@ def test_who_goes_and_comes_is_solved_all_the_same(clip):
     assert max(delays[100:]) <= 45 + 20
 
 
+@pytest.mark.parametrize("error", [torch.linalg.LinAlgError("svd"), MemoryError("full")])
+def test_a_solve_that_fails_is_told_once_and_costs_no_pose(clip, monkeypatch, error):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr("kcs_torch.live.tracker.solve_window", fail)
+    with kt.Tracker("coco17", fps=30, window=24) as tracker, pytest.warns(kt.KcsWarning) as told:
+        poses = follow(tracker, observed(clip)[:60])
+    assert [str(w.message) for w in told] == [
+        f"Tracker: a window could not be solved, and is left out ({type(error).__name__}: {error})"
+    ]
+    assert [pose.frame for pose in poses] == list(range(60)) and not poses[-1].ready
+
+
 def test_closing_ends_the_thread_and_keeps_the_window(clip):
     frames = observed(clip)
     before = set(threading.enumerate())

@@ -2,10 +2,12 @@
 
 import json
 import os
+import runpy
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -317,6 +319,20 @@ def test_what_the_killed_left_is_removed(clips, tmp_path):
     assert [p.name for p in tmp_path.glob(".part*")] == [".part_2_of_4"]
 
 
+def test_what_another_part_removes_meanwhile_is_no_matter(clips, tmp_path, monkeypatch):
+    glob = Path.glob
+
+    def vanishing(self, pattern, **options):
+        for path in glob(self, pattern, **options):
+            if path.name.startswith(".part_1"):
+                path.rmdir()
+            yield path
+
+    (tmp_path / ".part_1_of_2").mkdir()
+    monkeypatch.setattr(Path, "glob", vanishing)
+    assert run(clips, tmp_path).done == 6
+
+
 def test_true_size(clips, tmp_path):
     run(clips, tmp_path, scale="height=1.75m", suffixes=["npz", "trc"])
     result = load_reconstruction(tmp_path / "clip0.npz")
@@ -402,6 +418,22 @@ def test_a_wrong_call_of_the_script_is_a_line(tmp_path, root, words, told):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr
     assert {path.name for path in tmp_path.iterdir()} <= {"in", "out"}  # Hydra leaves nothing unasked
+
+
+def test_ctrl_c_tells_how_to_go_on(clips, tmp_path, root, monkeypatch, capsys):
+    pytest.importorskip("hydra")
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(folder._Work, "reconstruct", stop)
+    words = [f"input={clips}", f"output={tmp_path / 'out'}", f"hydra.run.dir={tmp_path / 'run'}", "method=kcs"]
+    monkeypatch.setattr(sys, "argv", ["reconstruct_many.py", *words])
+    threads = torch.get_num_threads()
+    with pytest.raises(SystemExit, match="130"):
+        runpy.run_path(str(root / "scripts" / "reconstruct_many.py"), run_name="__main__")
+    torch.set_num_threads(threads)
+    assert "stopped: run it again to go on" in capsys.readouterr().err
 
 
 def test_names_of_results_are_distinct_whatever_clips_are_called(tmp_path):

@@ -50,6 +50,13 @@ def test_what_is_fixed_is_not_learned(scripts, monkeypatch, capsys, tmp_path):
         scripts[0].main()
 
 
+def test_windows_that_no_clip_has_are_told(scripts, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["train_unrolled.py", "--data", "synthetic", "--frames", "1000"])
+    with pytest.raises(SystemExit, match="2"):
+        scripts[0].main()
+    assert "--frames: expected at most 240, as the clips have, got 1000" in capsys.readouterr().err
+
+
 def test_training_lowers_the_error_of_others(scripts):
     script = scripts[0]
     options = argparse.Namespace(

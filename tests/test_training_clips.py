@@ -34,9 +34,18 @@ def test_files_by_patterns(folder):
     assert names("s1_*.npz") == ["s1_a.npz", "s1_b.npz"]
     assert names(["*.npz", "!s[1-3]_*"]) == ["s4_a.npz", "s4_b.npz"]
     assert names(["s2_a.npz", "s1_a.npz", "s2_*"]) == ["s1_a.npz", "s2_a.npz", "s2_b.npz"]
+    assert names(["*.npz", f"!{folder}/s[1-3]_*"]) == ["s4_a.npz", "s4_b.npz"]
+    assert names(["s1_*.npz", f"{folder}/s1_a.npz"]) == ["s1_a.npz", "s1_b.npz"]
+    with pytest.raises(OptionError, match=r"pattern !s5_\*: expected it to leave out some"):
+        names(["*.npz", "!s1_*", "!s5_*"])
     for patterns in ("none*.npz", ["*.npz", "!*"], []):
         with pytest.raises(OptionError, match="found none"):
             find_files(patterns, folder)
+
+
+def test_the_folder_is_no_pattern(tmp_path):
+    folder = write_motions(tmp_path / "take [1]*")
+    assert [p.name for p in find_files(["s1_*.npz", "!s1_b*"], folder)] == ["s1_a.npz"]
 
 
 def test_a_clip_is_what_the_motion_is_from_the_front(folder):

@@ -1,10 +1,12 @@
 """Training data: the module that makes batches of windows."""
 
 import itertools
+import json
 import math
 import re
 
 import lightning
+import numpy as np
 import pytest
 import torch
 from training_samples import motion, write_motions
@@ -192,6 +194,26 @@ def test_own_tracks_may_be_all_that_is_trained_on(detections):
     assert len(drawn.unique(dim=0)) == 3
 
 
+def test_own_tracks_are_read_as_is_asked(folder):
+    """MediaPipe's files without the image's size, and VideoPose3D's, which are pickles."""
+    points = walking_person(20, skeleton="mediapipe33").tracks.points[:, :33]
+    shares = (points - points.amin((0, 1))) / (points.amax((0, 1)) - points.amin((0, 1)))
+    frames = [{"pose_landmarks": [{"x": x, "y": y, "visibility": 0.9} for x, y in frame]} for frame in shares.tolist()]
+    (folder / "shares.json").write_text(json.dumps(frames))
+    pixels = walking_person(20, skeleton="h36m17").tracks.points[:, :17].numpy() / 10 + 500
+    np.savez(folder / "pickled.npz", positions_2d={"S1": {"Walk": [pixels]}})
+    for tracks, reading in (("shares.json", {"image_size": [1920, 1080]}), ("pickled.npz", {"trust": True})):
+        with pytest.raises(FormatError, match=tracks):
+            TracksDataModule(folder=folder, tracks=tracks, window=5, skeleton="h36m17").setup("fit")
+        data = TracksDataModule(folder=folder, tracks=tracks, reading=reading, window=5, skeleton="h36m17")
+        data.setup("fit")
+        assert len(data.detected)
+    with pytest.raises(OptionError, match="unknown reading option 'imagesize': did you mean 'image_size'"):
+        TracksDataModule(reading={"imagesize": (1, 1)})
+    with pytest.raises(OptionError, match="data: reading: expected options of load_tracks"):
+        TracksDataModule(reading="trust")
+
+
 def test_own_tracks_that_do_not_fit_are_told(detections):
     def told(error, match, **options):
         with pytest.raises(error, match=match):
@@ -222,6 +244,28 @@ def test_splits_do_not_share_files(folder):
     data = module(folder, ["s1_*.npz"], test=["*.npz"])
     with pytest.raises(OptionError, match=r"s1_a\.npz is in train and in test"):
         data.setup("fit")
+
+
+@pytest.mark.parametrize("spelled", ["{folder}/s1_a.npz", "../{folder.name}/s1_a.npz", "link/s1_a.npz"])
+def test_splits_do_not_share_files_by_other_paths(folder, spelled):
+    (folder / "link").symlink_to(folder)
+    pattern = spelled.format(folder=folder)
+    with pytest.raises(OptionError, match=r"s1_a\.npz is in train and in val"):
+        module(folder, ["*.npz"], val=pattern).setup("fit")
+    data = module(folder, ["*.npz", f"!{pattern}"], val=pattern)
+    data.setup("fit")
+    assert len(data.sets["train"].clips) == 7 and len(data.sets["val"].clips) == 1
+
+
+def test_own_tracks_are_of_no_clip_that_is_measured_on(folder):
+    """A file of a result holds both."""
+    clip = walking_person(30, skeleton="coco17", turn=60)
+    kt.reconstruct(clip.tracks, method="kcs").scaled(units="mm", factor=1.0).save(folder / "both.npz")
+    for split in ("val", "test"):
+        data = TracksDataModule(tracks="both.npz", **{split: "both.npz"}, folder=folder, skeleton="coco17", window=5)
+        with pytest.raises(OptionError, match=rf"both\.npz is in {split} and in tracks"):
+            data.setup("fit")
+    TracksDataModule("both.npz", tracks="both.npz", folder=folder, skeleton="coco17", window=5).setup("fit")
 
 
 def test_setup_reads_what_a_stage_needs(folder):
@@ -280,9 +324,12 @@ def test_what_files_may_not_be(folder, tmp_path):
         module(other, ["c.npz"]).setup("fit")
     silent = motion(60)
     kt.Motion.from_arrays(silent.points, skeleton="h36m17", units="mm").save(other / "d.npz")
-    with pytest.raises(FormatError, match=r"d\.npz: its frame rate is unknown: give fps=None"):
+    with pytest.raises(FormatError, match=r"d\.npz: its frame rate is unknown: give file_fps=.*, or fps=None"):
         module(other, ["d.npz"]).setup("fit")
     module(other, ["d.npz"], fps=None).setup("fit")
+    half = module(other, ["d.npz"], file_fps=60.0)
+    half.setup("fit")
+    assert len(half.sets["train"].points) == 30
 
 
 @pytest.mark.parametrize("options", [

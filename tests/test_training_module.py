@@ -169,6 +169,13 @@ def test_half_precision_trains_and_predicts():
     assert points[0].shape[1:] == (9, 17, 3) and torch.isfinite(points[0].float()).all()
 
 
+def test_a_body_without_twins_is_not_mirrored():
+    hand = kt.SKELETONS["hand21"]
+    points = torch.randn(3, 4, 21, 3)
+    batch = Batch(points[..., :2], torch.ones(3, 4, 21), points, torch.ones(3), torch.zeros(3, 4, 21))
+    assert mirrored(batch, hand, 1.0) is batch
+
+
 def test_mirrored_clips_are_clips_of_a_mirrored_body():
     batch = batch_of()
     torch.manual_seed(0)

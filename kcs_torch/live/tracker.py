@@ -139,7 +139,7 @@ class Tracker:
         self._early = [min(max(LEAST, round(share * self.window)), self.window) for share in early]
         self._chain = Chain(self._body, self._pose.body, self.fps)
         self._thread = ThreadPoolExecutor(1, "kcs_torch.live")
-        self._closed = self._told_up = False
+        self._closed = self._told_up = self._told_failed = False
         self._frame = -1
         self.reset()
 
@@ -188,6 +188,7 @@ class Tracker:
 
         Warns:
             KcsWarning: once, when a window shows the feet above the rest of the body, as where y points up.
+            KcsWarning: once, when solving a window fails; poses go on as if it had told nothing.
         """
         if self._closed:
             raise OptionError("Tracker: closed: it takes no frames any more; make another one")
@@ -272,7 +273,7 @@ class Tracker:
         """Begin to solve the window where that is due; take over what was found."""
         if self._solving is not None and self._frame >= self._ready and (self.wait or self._solving.done()):
             solving, self._solving = self._solving, None  # whatever it has come to
-            found = solving.result()
+            found = self._outcome(solving)
             if found is not None:
                 self._learn_from(found)
         if self._next is not None:
@@ -289,6 +290,17 @@ class Tracker:
             self._solving = self._thread.submit(solve_window, self.method, self._body, image, weights, self.fps)
             self._asked = self._frame
             self._ready = self._frame + max(1, round(self._delay * len(image)))
+
+    def _outcome(self, solving: Future[Solved | None]) -> Solved | None:
+        """What a solve found; None where it failed, which is told once."""
+        try:
+            return solving.result()
+        except Exception as error:
+            if not self._told_failed:
+                self._told_failed = True
+                text = f"Tracker: a window could not be solved, and is left out ({type(error).__name__}: {error})"
+                warnings.warn(text, KcsWarning, stacklevel=users_level())
+            return None
 
     def _tell_up(self, stands: str) -> None:
         """Warn, once, where a window shows that y may point up."""

@@ -311,6 +311,8 @@ def _listing(clip: Clip, failed: list[tuple[Path, str]]) -> Iterator[None]:
 
 def _sweep(output: Path, workplace: Path) -> None:
     """Remove what a killed process left: of this part, and of other divisions into parts an hour ago."""
-    old = [p for p in output.glob(".part_*_of_*") if time.time() - p.stat().st_mtime > STALE]
-    for folder in (workplace, *old):
-        shutil.rmtree(folder, ignore_errors=True)
+    shutil.rmtree(workplace, ignore_errors=True)
+    for folder in output.glob(".part_*_of_*"):
+        with suppress(OSError):  # another part, which ends, has removed it
+            if time.time() - folder.stat().st_mtime > STALE:
+                shutil.rmtree(folder, ignore_errors=True)

@@ -15,7 +15,12 @@ __all__ = ["mirrored", "turned", "unit_size"]
 
 
 def mirrored(batch: Batch, skeleton: Skeleton, share: float = 0.5) -> Batch:
-    """Mirror clips left to right, each with the probability ``share``; twins change places."""
+    """Mirror clips left to right, each with the probability ``share``; twins change places.
+
+    Of a body without twins, such as a hand, nothing is mirrored: it would become another one.
+    """
+    if not skeleton.mirror:
+        return batch
     order = list(range(skeleton.num_joints))
     for a, b in skeleton.mirror:
         order[a], order[b] = b, a

@@ -57,6 +57,8 @@ def find_files(
 ) -> list[Path]:
     """List the files of one pattern or several in natural order, without those of patterns that begin with ``!``.
 
+    A file that is found by several paths is listed once.
+
     Args:
         patterns: one or several.
         folder: that they are relative to.
@@ -64,17 +66,25 @@ def find_files(
         folders: whether a folder counts as a file (OpenPose writes one a clip).
 
     Raises:
-        OptionError: there are none.
+        OptionError: there are none, or a pattern that begins with ``!`` leaves out none of them.
     """
     every = [patterns] if isinstance(patterns, (str, Path)) else list(patterns)
-    found: set[Path] = set()
-    left_out: set[Path] = set()
+    found: dict[Path, Path] = {}  # by where they really are
+    left_out: dict[str, set[Path]] = {}
     for pattern in map(str, every):
-        files = (Path(p) for p in glob.glob(str(Path(folder, pattern.removeprefix("!"))), recursive=True))
-        (left_out if pattern.startswith("!") else found).update(
-            p for p in files if p.is_file() or (folders and p.is_dir())
-        )
-    out = sorted(found - left_out, key=lambda p: natural_key(str(p)))
+        paths = (Path(folder, p) for p in glob.glob(pattern.removeprefix("!"), root_dir=folder, recursive=True))
+        files = {p.resolve(): p for p in sorted(paths) if p.is_file() or (folders and p.is_dir())}
+        if pattern.startswith("!"):
+            left_out[pattern] = set(files)
+        else:
+            found = files | found
+    out = sorted((found[p] for p in found.keys() - set().union(*left_out.values())), key=lambda p: natural_key(str(p)))
+    for pattern, which in left_out.items():
+        if found and not which & found.keys():
+            raise OptionError(
+                f"data: pattern {pattern}: expected it to leave out some of the files of {of} in "
+                f"{Path(folder).resolve()}, it leaves out none"
+            )
     if not out:
         raise OptionError(
             f"data: expected files of {of} that match {', '.join(map(str, every)) or 'a pattern'} in "
@@ -91,6 +101,7 @@ def file_clips(
     up: str | None,
     units: str,
     file_units: str | None = None,
+    file_fps: float | None = None,
 ) -> list[Clip]:
     """Read motion files, all onto one skeleton, frame rate and unit.
 
@@ -101,6 +112,7 @@ def file_clips(
         up: the axis that points up in those files that do not say.
         units: of the clips.
         file_units: of the numbers of those files that do not say.
+        file_fps: frames per second of those files that do not say.
 
     Raises:
         FormatError: a file is no motion, or its frame rate or unit is unknown.
@@ -118,6 +130,7 @@ def file_clips(
     told: set[str] = set()
     for path in files:
         motion = read_motion(path, None, options)
+        motion = motion if motion.fps is not None else replace(motion, fps=file_fps)
         if body is None:
             body = motion.skeleton
         elif skeleton is not None and (taken := [note for note in motion.notes if note.startswith(IN_ORDER)]):
@@ -154,7 +167,8 @@ def _clip_of(motion: Motion, body: Skeleton, path: Path, fps: float | None, unit
     if fps is not None:
         if motion.fps is None:
             raise FormatError(
-                f"{path}: its frame rate is unknown: give fps=None (data.fps=null) to take its frames as they are"
+                f"{path}: its frame rate is unknown: give file_fps=... (data.file_fps=...), or fps=None "
+                "(data.fps=null) to take its frames as they are"
             )
         points, known = resampled(points, known, motion.fps, fps)
     ratio = unit_ratio(motion.units, units)

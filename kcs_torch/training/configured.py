@@ -17,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import CompactHydraException, HydraException, InstantiationException
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -67,7 +68,7 @@ def command_line(program: str, arguments: Sequence[str] | None = None, start: st
         start: what is to start each further process; by default what has started this one.
     """
     before = sys.argv
-    given = list(before[1:] if arguments is None else arguments)
+    given = [_at_home(one) for one in (before[1:] if arguments is None else arguments)]
     try:
         _check_names(program, given)
         _check_folders(given)
@@ -90,17 +91,54 @@ def command_line(program: str, arguments: Sequence[str] | None = None, start: st
         sys.argv = before
 
 
+def _at_home(argument: str) -> str:
+    """An override with the user's folder for a ~ that a value begins with: of most names shells leave it."""
+    name, sign, value = argument.partition("=")
+    return f"{name}{sign}{os.path.expanduser(value)}" if re.match(r"~(/|$)", value) else argument
+
+
 def _for_hydra(argument: str) -> str:
     """An override as Hydra takes it.
 
-    It may also add a field: of a name that is not shown Hydra says to add it, be it right or wrong. Values that hold an
-    = are quoted, as in scale=height=1.75m.
+    It may also add a field: of a name that is not shown Hydra says to add it, be it right or wrong. Values that Hydra
+    cannot read are quoted, as those of scale=height=1.75m and input=Läufe.
     """
-    name, _, value = argument.partition("=")
-    if "=" in value and not re.search(r"^-|['\"()\[\]{}\\]", argument):
-        quoted = (f"'{part}'" if "=" in part else part for part in value.split(","))
-        argument = f"{name}={','.join(quoted)}"
+    name, sign, value = argument.partition("=")
+    if sign and not name.startswith("-") and not _is_read(argument):
+        argument = f"{name}={_quoted(value)}"
     return f"++{argument}" if re.match(r"(?!hydra\.)[A-Za-z_]\w*\.[^=]*=", argument) else argument
+
+
+def _quoted(value: str) -> str:
+    """A value with quotes about what Hydra cannot read: all of it, or those parts of a list or a sweep.
+
+    Values with brackets or quotes of which it is not plain where the parts end stay as they are.
+    """
+    listed = value.startswith("[") and value.endswith("]")
+    inner = value[1:-1] if listed else value
+    called = re.match(r"(\w+)\(", value)
+    if (
+        (re.search(r"['\"()\[\]{}]", inner) and (listed or "," in value))
+        or re.match(r"['\"{\[]", inner)
+        or (called is not None and called[1] in OverridesParser.create().functions.functions)
+    ):
+        return value
+    parts = ",".join(part if _is_read(f"x={part}") else _in_quotes(part) for part in inner.split(","))
+    return f"[{parts}]" if listed else parts
+
+
+def _in_quotes(text: str) -> str:
+    """Text in quotes, in which Hydra takes a backslash for one unless a quote follows."""
+    return "'" + re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + found[2].replace("'", "\\'"), text) + "'"
+
+
+def _is_read(argument: str) -> bool:
+    """Whether Hydra can read an override."""
+    try:
+        OverridesParser.create().parse_override(argument)
+    except HydraException:
+        return False
+    return True
 
 
 def _check_folders(arguments: Sequence[str]) -> None:

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import lightning
 import torch
 from torch import Tensor
 
 from kcs_torch.errors import OptionError, unknown
+from kcs_torch.io.load import check_reading
 from kcs_torch.methods import METHODS, Method
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.training.batch import Batch
 from kcs_torch.training.clips import SYNTHETIC, Clip, file_clips, find_files, synthetic_clips
 from kcs_torch.training.detections import DetectedWindows
 from kcs_torch.training.loader import BatchLoader, Deck
-from kcs_torch.training.options import AMOUNT, COUNT, COUNT_OR_NONE, POSITIVE, SHARE, WHOLE, check_options
+from kcs_torch.training.options import AMOUNT, COUNT, COUNT_OR_NONE, POSITIVE, SHARE, WHOLE, Rule, check_options
 from kcs_torch.training.pseudo import pseudo_labels
 from kcs_torch.training.seeds import generator_of
 from kcs_torch.training.windows import FilmedWindows
@@ -25,6 +28,7 @@ from kcs_torch.training.windows import FilmedWindows
 __all__ = ["TracksDataModule"]
 
 Patterns = str | Path | Sequence[str | Path]
+RATE_OR_NONE: Rule = float | None, lambda x: x is None or 0 < x < math.inf, "a positive number or None"
 TILTS = "two angles within -90..90 degrees, the smaller one first"
 
 
@@ -46,12 +50,15 @@ class TracksDataModule(lightning.LightningDataModule):
             reads, the most seen person of each, as patterns; a folder that one matches is a clip. Joints are matched by
             name, and a third of them may be missing. Windows with half of the joints seen in every frame stand among
             those without truth, and serve losses that need none.
+        reading: options of :func:`kcs_torch.load_tracks` for ``tracks``: MediaPipe's files may need ``image_size``,
+            VideoPose3D's ``trust``.
         folder: that patterns are relative to.
         skeleton: whose joints are found by name in every file; that of the first file if None ("h36m17" of synthetic
             motion).
         up: the axis that points up in those files that do not say; y if None.
         units: of the tracks: mm, cm or m.
         file_units: of those files that do not say (BVH); others keep their own.
+        file_fps: frames per second of those files of motion that do not say (ASF/AMC).
         fps: frames per second that all motion is brought to; None takes it as it is. 2D tracks that do not
             say theirs are taken as they are.
         window: frames of a window.
@@ -92,11 +99,13 @@ class TracksDataModule(lightning.LightningDataModule):
         val: Patterns = (),
         test: Patterns = (),
         tracks: Patterns = (),
+        reading: Mapping[str, Any] | None = None,
         folder: str | Path = ".",
         skeleton: str | Path | Skeleton | None = None,
         up: str | None = None,
         units: str = "mm",
         file_units: str | None = None,
+        file_fps: float | None = None,
         fps: float | None = 30.0,
         window: int = 27,
         stride: int | None = None,
@@ -119,7 +128,9 @@ class TracksDataModule(lightning.LightningDataModule):
         super().__init__()
         check_options(
             "data",
-            fps=(fps, (float | None, lambda x: x is None or 0 < x < math.inf, "a positive number or None")),
+            reading=(reading, (Mapping | None, lambda _: True, "options of load_tracks, by name, or None")),
+            file_fps=(file_fps, RATE_OR_NONE),
+            fps=(fps, RATE_OR_NONE),
             window=(window, COUNT),
             stride=(stride, COUNT_OR_NONE),
             views=(views, COUNT),
@@ -147,9 +158,10 @@ class TracksDataModule(lightning.LightningDataModule):
         if pseudo is not None and fresh_cameras:
             raise OptionError("data: pseudo: reconstructions are of tracks that stay the same: not with fresh_cameras")
         self.files = {"train": train, "val": val, "test": test}
-        self.tracks = tracks
+        check_reading(**reading or {})
+        self.tracks, self.reading = tracks, dict(reading or {})
         self.folder, self.body, self.up, self.units, self.fps = folder, skeleton, up, units, fps
-        self.file_units = file_units
+        self.file_units, self.file_fps = file_units, file_fps
         self.window, self.stride, self.views = window, stride or window, views
         self.pitch = float(pitch[0]), float(pitch[1])
         self.noise, self.occlusion, self.fresh_cameras = noise, occlusion, fresh_cameras
@@ -174,7 +186,8 @@ class TracksDataModule(lightning.LightningDataModule):
         """Read, cut and film what a stage needs ("fit", "validate", "test"; all if None).
 
         Raises:
-            OptionError: no file matches a pattern, or one is in two of train, val and test.
+            OptionError: no file matches a pattern, one that begins with ``!`` leaves out none, or a file is in two of
+                train, val and test, or in ``tracks`` and val or test.
             FormatError: a file cannot be read as motion.
             SkeletonError: its joints do not fit.
             ShapeError: a clip is shorter than a window.
@@ -266,8 +279,10 @@ class TracksDataModule(lightning.LightningDataModule):
     def _detected(self) -> DetectedWindows | None:
         """The windows of 2D tracks, where there are any."""
         if self.tracks and self.detected is None:
+            self._check_apart()
             self.detected = DetectedWindows.cut(
-                find_files(self.tracks, self.folder, of="2D tracks", folders=True),
+                self._track_files(),
+                reading=self.reading,
                 skeleton=self.skeleton,
                 fps=self.fps,
                 window=self.window,
@@ -307,25 +322,38 @@ class TracksDataModule(lightning.LightningDataModule):
                 seed=self.seed,
                 split=split,
             )
-        files = {name: self._files(name) for name in self.files}
-        for name, others in files.items():
-            twice = set(others) & set(files[split]) if name != split else set()
-            if twice:
-                raise OptionError(
-                    f"data: {min(twice)} is in {split} and in {name}: leave it out of one by a pattern !..."
-                )
+        self._check_apart()
         return file_clips(
-            files[split],
+            self._files(split),
             skeleton=self._body(split),
             fps=self.fps,
             up=self.up,
             units=self.units,
             file_units=self.file_units,
+            file_fps=self.file_fps,
         )
+
+    def _check_apart(self) -> None:
+        """Make sure that no file is in two splits, by whatever paths, and that 2D tracks are of neither val nor test.
+
+        Raises:
+            OptionError: one is.
+        """
+        files = {split: {path.resolve(): path for path in self._files(split)} for split in self.files}
+        files["tracks"] = {path.resolve(): path for path in self._track_files()}
+        for one, other in itertools.combinations(files, 2):
+            twice = files[one].keys() & files[other].keys()
+            if twice and (one, other) != ("train", "tracks"):
+                raise OptionError(
+                    f"data: {files[one][min(twice)]} is in {one} and in {other}: leave it out of one by a pattern !..."
+                )
 
     def _files(self, split: str) -> list[Path]:
         named = self._named(split)
         return find_files(named, self.folder) if named and named != SYNTHETIC else []
+
+    def _track_files(self) -> list[Path]:
+        return find_files(self.tracks, self.folder, of="2D tracks", folders=True) if self.tracks else []
 
     def _body(self, split: str) -> str | Path | Skeleton | None:
         """The skeleton that was asked for, or that of the training files."""

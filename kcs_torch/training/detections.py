@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -43,7 +44,14 @@ class DetectedWindows:
 
     @classmethod
     def cut(
-        cls, files: Sequence[Path], *, skeleton: Skeleton, fps: float | None, window: int, stride: int
+        cls,
+        files: Sequence[Path],
+        *,
+        skeleton: Skeleton,
+        fps: float | None,
+        window: int,
+        stride: int,
+        reading: Mapping[str, Any] | None = None,
     ) -> DetectedWindows:
         """Read files and cut them into windows in which enough is seen.
 
@@ -54,6 +62,7 @@ class DetectedWindows:
             fps: frames per second that clips are brought to; those that do not say theirs are taken as they are.
             window: frames.
             stride: frames from one window to the next.
+            reading: options of :func:`kcs_torch.load_tracks`.
 
         Raises:
             FormatError: a file cannot be read as tracks, or has no window in which enough is seen.
@@ -65,9 +74,10 @@ class DetectedWindows:
         """
         points, weights, starts, first = [], [], [], 0
         for path in files:
-            clip = load_tracks(path)
+            how = dict(reading or {})
+            clip = load_tracks(path, **how)
             if numbered(clip.skeleton.joints):  # whose order is all that they tell
-                clip = load_tracks(path, skeleton=skeleton)
+                clip = load_tracks(path, **how | {"skeleton": skeleton})
                 for note in (note for note in clip.notes if note.startswith(IN_ORDER)):
                     warnings.warn(f"{path}: {note}", KcsWarning, stacklevel=2)
             if fps is not None and clip.fps is not None and clip.fps != fps:

@@ -45,7 +45,8 @@ class LiftingModule(lightning.LightningModule):
         critic: tells poses of labelled clips from the network's, such as :class:`kcs_torch.nn.KCSCritic`; the network
             learns to please it, and both take steps in turn.
         critic_weight: factor of what the network pays.
-        flip: share of the clips that are mirrored left to right.
+        flip: share of the clips that are mirrored left to right, of bodies with twins; others, such as a hand, never
+            are.
         turn: share of the clips with labels, or pseudo-labels, that are shown from another side.
         lr: step size of AdamW at its highest; it rises over the first twentieth of the steps and falls like a cosine.
         weight_decay: of AdamW.

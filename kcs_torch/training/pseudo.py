@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import logging
 import warnings
@@ -28,7 +29,7 @@ __all__ = ["pseudo_labels"]
 _LOG = logging.getLogger(__name__)
 
 TOGETHER = 16
-"""Clips that are reconstructed as one batch, before they are put into the cache."""
+"""Most views of a clip that are reconstructed as one batch."""
 
 
 def pseudo_labels(
@@ -43,9 +44,12 @@ def pseudo_labels(
 ) -> tuple[Tensor, Tensor]:
     """Reconstruct whole clips from their tracks alone.
 
+    The wanted views of a clip are reconstructed together: what comes of them depends on them, by rounding and more, but
+    on no other clip, nor on what is kept already.
+
     Args:
         filmed: the tracks.
-        pairs: (P, 2) of (clip, view) to reconstruct.
+        pairs: (P, 2) of (clip, view) to reconstruct, those of a clip one after another.
         method: that does it.
         fps: of the tracks.
         units: of the tracks.
@@ -63,38 +67,61 @@ def pseudo_labels(
     points = torch.zeros(views, frames, joints, 3)
     weights = torch.zeros(views, frames, joints)
     folder = None if cache is None else Path(cache)
-    work: list[tuple[int, slice, Tracks, Path | None]] = []
     failed: list[str] = []
-    for clip, view in pairs.tolist():
-        span = filmed.frames_of(clip)
-        image, seen = filmed.tracks[view, span].double(), filmed.weights[view, span].double()
-        if not bool((seen > 0).any()):
-            failed.append(f"{filmed.clips[clip].source}, view {view}: no joint is seen in any frame")
-            continue
-        one = Tracks(image, seen, filmed.skeleton, fps, units, f"{filmed.clips[clip].source}, view {view}")
-        kept = None if folder is None else folder / f"{_key(one, method)}.npz"
-        found = None if kept is None else _load(kept, image.shape[:2])
-        if found is None:
-            work.append((view, span, one, kept))
-        else:
-            points[view, span], weights[view, span] = _label(one, *found, trust)
-    for start in range(0, len(work), TOGETHER):
-        _LOG.info("pseudo-labels: %d of %d clips reconstructed by %s", start, len(work), method.name)
-        part = work[start : start + TOGETHER]
-        for (view, span, one, kept), result in zip(part, _lift([w[2] for w in part], method, failed), strict=True):
-            if result is None:
-                continue
-            spread = None if result.uncertainty is None else result.uncertainty.float()
-            found = result.points.float(), spread
-            if kept is not None:
-                _keep(kept, *found)
-            points[view, span], weights[view, span] = _label(one, *found, trust)
+    for number, (clip, part) in enumerate(parts := _parts(pairs.tolist())):
+        span, source = filmed.frames_of(clip), filmed.clips[clip].source
+        clips: dict[int, Tracks] = {}
+        for view in part:
+            image, seen = filmed.tracks[view, span].double(), filmed.weights[view, span].double()
+            if bool((seen > 0).any()):
+                clips[view] = Tracks(image, seen, filmed.skeleton, fps, units, f"{source}, view {view}")
+            else:
+                failed.append(f"{source}, view {view}: no joint is seen in any frame")
+        places = _places(clips, method, folder)
+        found = {view: kept for view, path in places.items() if (kept := _load(path, clips[view].weights.shape))}
+        if len(found) < len(clips):
+            _LOG.info("pseudo-labels: %d of %d batches reconstructed by %s", number, len(parts), method.name)
+            found = _made(clips, method, places, failed)
+        for view, one in found.items():
+            points[view, span], weights[view, span] = _label(clips[view], *one, trust)
     if failed:
         shown = "; ".join(failed[:3]) + ("; ..." if len(failed) > 3 else "")
         warnings.warn(
             f"pseudo-labels: {len(failed)} of {len(pairs)} clips have none: {shown}", KcsWarning, stacklevel=2
         )
     return points, weights
+
+
+def _parts(pairs: list[tuple[int, int]]) -> list[tuple[int, list[int]]]:
+    """The views that are reconstructed together, and their clip."""
+    parts = []
+    for clip, group in itertools.groupby(pairs, lambda pair: pair[0]):
+        views = [view for _, view in group]
+        parts += [(clip, views[start : start + TOGETHER]) for start in range(0, len(views), TOGETHER)]
+    return parts
+
+
+def _places(clips: dict[int, Tracks], method: Method, folder: Path | None) -> dict[int, Path]:
+    """The files of views by their number, named after all that are reconstructed together; none without a folder."""
+    if folder is None:
+        return {}
+    keys = {view: _key(one, method) for view, one in clips.items()}
+    together = hashlib.sha256("".join(keys.values()).encode()).hexdigest()[:16]
+    return {view: folder / f"{key}_{together}.npz" for view, key in keys.items()}
+
+
+def _made(
+    clips: dict[int, Tracks], method: Method, places: dict[int, Path], failed: list[str]
+) -> dict[int, tuple[Tensor, Tensor | None]]:
+    """Points and deviations of views that are reconstructed together, by their number; none of those that fail."""
+    out = {}
+    for (view, _), result in zip(clips.items(), _lift([*clips.values()], method, failed), strict=True):
+        if result is None:
+            continue
+        out[view] = result.points.float(), None if result.uncertainty is None else result.uncertainty.float()
+        if view in places:
+            _keep(places[view], *out[view])
+    return out
 
 
 def _lift(clips: list[Tracks], method: Method, failed: list[str]) -> list[Reconstruction | None]:
