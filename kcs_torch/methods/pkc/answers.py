@@ -109,8 +109,9 @@ def angle_doubt(objective: Objective, depth: Tensor, lengths: Tensor, turn: floa
     counted = (len(depth) / posture.correlation + posture.strength) * len(lengths)
     strange = float(posture(points[None], lengths[None])) / counted / POSTURE
     odd = max(1.0, objective.oddity(lengths) / ODDITY)
-    side, upright, _ = posture.frame(points)[:, 2].square().unbind(-1)  # of its axes towards the camera
-    aside = float((side / (1 - upright).clamp_min(torch.finfo(side.dtype).eps)).mean())  # however the image is turned
+    upright, forward = posture.frame(points)[:, 2, 1:].square().unbind(-1)  # of its axes towards the camera
+    level = (1 - upright).clamp_min(torch.finfo(points.dtype).eps)
+    aside = float((1 - forward / level).mean())  # however the image is turned
     tilt = float(upright.mean())
     blur = objective.usual_noise / max(float(lengths.mean()), 1e-9)
     view = FRONT**2 / (1 + aside / (ASIDE**2 + BLURRED * blur)) + SIDE**2 + TILT**2 * tilt / max(1 - tilt, 1 - STEEP**2)
