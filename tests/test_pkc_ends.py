@@ -90,6 +90,7 @@ def test_the_body_is_as_without_them(call):
     assert alone.skeleton == without_joints(BODY, [j for j in range(BODY.num_joints) if j not in FINGERS])
     result, expected = call(tracks, intrinsics="parallel"), call(alone, intrinsics="parallel")
     kept = [j for j in range(BODY.num_joints) if j not in FINGERS]
+    assert float(result.points[..., 2].mean(1).abs().amax()) < 1e-6
     middle = lambda x: x - x[:, :1]  # noqa: E731
     assert_close(middle(result.points[:, kept]), middle(expected.points), rtol=1e-6, atol=1e-3)
     assert result.skeleton == BODY
@@ -97,6 +98,17 @@ def test_the_body_is_as_without_them(call):
     wrists = [BODY.index("left_wrist"), BODY.index("right_wrist")]
     assert bool((result.uncertainty[:, FINGERS] > result.uncertainty[:, wrists].amin(1, keepdim=True)).all())
     assert all(one.points.shape == truth.shape and one.skeleton == BODY for one in result.alternatives)
+
+
+def test_before_a_camera_they_project_as_before():
+    tracks, _ = tracks_of("coco17", ["left_ankle", "right_ankle"], frames=8)
+    alone = without_ends(tracks)
+    result, expected = (kt.reconstruct(t, intrinsics=(9000, 9000, 0, 0), steps=2, rounds=0) for t in (tracks, alone))
+    kept = [tracks.skeleton.index(joint) for joint in alone.skeleton.joints]
+    assert_close(result.in_space()[:, kept], expected.in_space())
+    assert float(result.points[..., 2].mean(1).abs().amax()) < 1e-6
+    assert_close(result.root_depth, result.distance - result.distance[0])
+    assert_close(result.scales, 9000 / result.distance, rtol=1e-2, atol=0)
 
 
 def test_notes_and_warnings_name_them():

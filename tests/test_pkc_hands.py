@@ -135,9 +135,9 @@ def test_clips_together_are_as_alone(solved, person):
     assert second.points.shape == (30, BODY.num_joints, 3)
 
 
-def test_hands_may_have_wrists_of_their_own(person):
+def test_hands_may_have_wrists_of_their_own():
     """As right as with the body's wrists alone."""
-    points = person[0]
+    points, _ = person_with_hands(30, yaw=60.0)
     shown = [joint for joint in range(BODY.num_observed) if bool(points[0, joint].isfinite().all())]
     names = [BODY.joints[joint] for joint in shown]
     own = points[:, [BODY.index(f"{side}_wrist") for side in ("left", "right")]]

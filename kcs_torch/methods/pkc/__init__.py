@@ -3,8 +3,9 @@
 - The recipe: ``method``, for a ``clip``, and for ``hands`` by themselves; ``batch`` answers what searches of several
   clips ask for at once.
 - What goes in: ``gate`` leaves out what is no detection of the body, ``elsewhere`` what leaps away and back, and
-  ``stuck`` what only repeats itself; ``cleaning`` smooths and completes, ``long_gaps`` are shortened and ``gaps``
-  filled in space; ``sizing`` takes out a size that changes, ``near`` asks for a near camera.
+  ``stuck`` what only repeats itself; ``ends`` that no frame shows are placed afterwards; ``cleaning`` smooths and
+  completes, ``long_gaps`` are shortened and ``gaps`` filled in space; ``sizing`` takes out a size that changes,
+  ``near`` asks for a near camera.
 - A body with a template: ``fixed_view`` makes hypotheses, of a ``trunk`` and its ``limbs``, by ``placing`` these where
   their ``limb_costs`` are least; ``blocks`` divides long clips, and ``body`` ranks and polishes what is found.
 - The objective: ``objective`` by its ``weights``, and ``refinement`` of ``hypotheses`` on it by the gradient of

@@ -114,7 +114,7 @@ def with_ends(result: Reconstruction, tracks: Tracks) -> Reconstruction:
     def grown(one: Reconstruction) -> Reconstruction:
         points, unsure = _placed(one.points, one.uncertainty, kept, body)
         facts = replace(one.diagnostics, unseen_share=whole.unseen_share, notes=_on_contacts(one, body))
-        one = replace(one, points=points, uncertainty=unsure, tracks=whole, diagnostics=facts)
+        one = _about_its_middle(replace(one, points=points, uncertainty=unsure, tracks=whole, diagnostics=facts))
         return replace(one, alternatives=tuple(grown(other) for other in one.alternatives)).remeasured()
 
     return grown(result)
@@ -199,6 +199,16 @@ def _least_turn(start: Tensor, end: Tensor) -> Tensor:
     flip = 2 * axis[..., :, None] * axis[..., None, :] - eye
     first = 2 * a[..., :, None] * a[..., None, :] - eye
     return flip @ first
+
+
+def _about_its_middle(one: Reconstruction) -> Reconstruction:
+    """The same in space, with depths about the middle of all joints, which goes along the root's path."""
+    middle = one.points[..., 2].mean(1)
+    points = one.points - torch.nn.functional.pad(middle[:, None, None], (2, 0))
+    path, away = one.root_depth, one.distance
+    scales = one.scales if away is None else one.scales * away / (away + middle)
+    path, away = None if path is None else path + middle - middle[0], None if away is None else away + middle
+    return replace(one, points=points, scales=scales, root_depth=path, distance=away)
 
 
 def _on_contacts(one: Reconstruction, body: Skeleton) -> tuple[str, ...]:
