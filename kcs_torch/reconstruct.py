@@ -23,6 +23,7 @@ from kcs_torch.types import Intrinsics, Reconstruction, Tracks
 from kcs_torch.types.bodies import no_bones
 from kcs_torch.types.image_size import may_be_shares
 from kcs_torch.types.people import file_and_person, file_of, guess_images
+from kcs_torch.types.tracks import unseen_notes
 
 __all__ = ["method_named", "reconstruct", "reconstruct_all", "with_found_bones"]
 
@@ -129,8 +130,7 @@ def reconstruct(
     if find:
         tracks = with_found_bones(tracks)
     chosen = method_named(method, fields)
-    if chosen.knows_bones and not tracks.skeleton.bones and (lacking := no_bones(tracks.skeleton)) in tracks.notes:
-        warnings.warn(f"{tracks.source}: {lacking}", KcsWarning, stacklevel=users_level())
+    _warn_of_lacking_bones(chosen, tracks)
     shown = chosen.without_ends(tracks)
     return chosen.with_ends(_before(lens, chosen, shown, cameras), tracks)
 
@@ -181,6 +181,8 @@ def reconstruct_all(
         check_tracks(one, f"reconstruct_all: item {i}")
     check_workers(workers, people)
     chosen = method_named(method, fields)
+    for one in people:
+        _warn_of_lacking_bones(chosen, one)
     lens = _lens(intrinsics)
     every, people = people, [chosen.without_ends(one) for one in people]
     found = _of_all(lens, chosen, people, workers)
@@ -204,6 +206,12 @@ def _of_all(lens: Intrinsics | str | None, chosen: Method, people: list[Tracks],
     return _told_of_lenses([found[i] for i in range(len(people))])
 
 
+def _warn_of_lacking_bones(method: Method, tracks: Tracks) -> None:
+    """Tell where no bones are given to a method that knows of bones."""
+    if method.knows_bones and not tracks.skeleton.bones and (lacking := no_bones(tracks.skeleton)) in tracks.notes:
+        warnings.warn(f"{tracks.source}: {lacking}", KcsWarning, stacklevel=users_level())
+
+
 def _unless_near(chosen: Method, people: Sequence[Tracks], workers: int) -> Iterator[Reconstruction]:
     """Bodies reconstructed as one batch under parallel rays, and one by one where the camera seems near."""
     with warnings.catch_warnings():
@@ -221,12 +229,14 @@ def _once_lifted(chosen: Method, one: Tracks, lifted: Reconstruction) -> Reconst
 
 
 def _told_of_lenses(found: list[Reconstruction]) -> list[Reconstruction]:
-    """The same; the user is told where people of one file got lenses of their own."""
+    """The same; the user is told where people of one file got lenses of their own, unless it shows several shots."""
     clips: dict[str, list[Reconstruction]] = {}
     for one in found:
         if file_and_person(one.tracks.source)[1]:
             clips.setdefault(file_of(one.tracks), []).append(one)
     for file, people in clips.items():
+        if len({one.tracks.source for one in people}) < len(people):
+            continue  # who is there twice is there in several shots, as of_one_image has it
         near = sum(one.distance is not None for one in people)
         if len({one.intrinsics for one in people}) > 1:
             each = "got lenses and origins that not all have" if near > 1 else "got a lens and an origin of its own"
@@ -241,13 +251,15 @@ def _told_of_lenses(found: list[Reconstruction]) -> list[Reconstruction]:
 
 
 def with_found_bones(tracks: Tracks) -> Tracks:
-    """The tracks with the skeleton that their motion shows, and without the note that bones are lacking.
+    """The tracks with the skeleton that their motion shows, and notes on what these bones lack alone.
 
     Args:
         tracks: of a body that moves.
     """
-    said = no_bones(tracks.skeleton)
-    return replace(tracks, skeleton=find_skeleton(tracks), notes=tuple(note for note in tracks.notes if note != said))
+    stale = no_bones(tracks.skeleton), *unseen_notes(tracks.weights, tracks.skeleton)
+    body = find_skeleton(tracks)
+    kept = [note for note in tracks.notes if note not in stale]
+    return replace(tracks, skeleton=body, notes=(*kept, *unseen_notes(tracks.weights, body)))
 
 
 def _lens(value: Any) -> Intrinsics | str | None:

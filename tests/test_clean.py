@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import kcs_torch as kt
 from kcs_torch.clean import gating
 from kcs_torch.clean.common import runs
+from kcs_torch.clean.detector import detected
 from kcs_torch.data.synthetic import walking_person
 from kcs_torch.functional import bone_lengths
 from kcs_torch.types.tracks import unseen_notes
@@ -161,6 +162,15 @@ def test_a_frame_of_little_weight_pulls_less():
     doubted = kt.clean.smooth(tracks_of(points, weights)).points[200]
     truth = torch.from_numpy(sine(0.5))[200]
     assert bool(((doubted - truth).norm(dim=-1) < 0.3 * (plain - truth).norm(dim=-1)).all())
+
+
+def test_a_smoothed_body_before_a_camera_has_the_scale_of_its_distance(walk):
+    distance = torch.linspace(900, 1100, walk.num_frames).double() + 50 * (torch.arange(walk.num_frames) % 2)
+    result = kt.reconstruct(walk, method="rigid", intrinsics="parallel")
+    result = replace(result, distance=distance, scales=1000 / distance)
+    smoothed = kt.clean.smooth(result, cutoff=2.0)
+    assert not torch.allclose(smoothed.distance, result.distance)
+    torch.testing.assert_close(smoothed.scales * smoothed.distance, torch.full_like(smoothed.scales, 1000.0))
 
 
 def test_smooth_knows_no_bridge_over_gaps():
@@ -338,6 +348,13 @@ def test_gate_judges_nothing_without_neighbours():
     assert kt.clean.gate(tracks_of(points)).notes[-1] == "gate: 0 of 55 (0 %) detections dropped as outliers"
 
 
+@pytest.mark.parametrize("clean", [kt.clean.gate, lambda tracks: kt.clean.resample(tracks, 60)])
+def test_tracks_without_frames_are_told(walk, clean):
+    with pytest.raises(kt.ShapeError, match="expected joints that are seen in some frame, got none"):
+        clean(walk.frames(5, 5))
+    assert kt.clean.unswap(empty := walk.frames(5, 5)) is empty
+
+
 def test_gate_looks_at_long_clips_part_by_part(walk, monkeypatch):
     points = walk.points.clone()
     points[7, 3] += 500
@@ -408,7 +425,8 @@ def test_resample_linear_is_numpys_and_gaps_stay():
     new = kt.clean.resample(tracks_of(points, weights), 100.0, kind="linear")
     time = np.arange(new.num_frames) / 2
     np.testing.assert_allclose(new.points[:, 1, 0], np.interp(time, np.arange(100), points[:, 1, 0]), atol=1e-9)
-    np.testing.assert_allclose(new.weights[:, 1], np.interp(time, np.arange(100), weights[:, 1]), atol=1e-9)
+    ends = weights[np.floor(time).astype(int), 1], weights[np.ceil(time).astype(int), 1]
+    np.testing.assert_allclose(new.weights[:, 1], np.minimum(*ends), atol=1e-9)
     unseen = (time > 39) & (time < 50)
     np.testing.assert_array_equal(~new.seen[:, 0].numpy(), unseen)
 
@@ -420,6 +438,14 @@ def test_resample_halves_by_taking_every_other_frame():
     points[73, 1] = np.nan  # frame 72 stands alone
     new = kt.clean.resample(tracks_of(points), FPS / 2)
     np.testing.assert_allclose(np.where(new.seen[..., None], new.points, np.nan), points[::2], atol=1e-9)
+
+
+def test_resample_makes_no_detectors_confidences_of_two_weights():
+    tracks = walking_person(60, missing=0.1, generator=torch.Generator().manual_seed(0)).tracks
+    filled = kt.clean.fill(replace(tracks, detector=None), 10)
+    new = kt.clean.resample(filled, 50)
+    assert set(new.weights.unique().tolist()) <= set(filled.weights.unique().tolist())
+    assert not detected(filled) and not detected(new)
 
 
 def test_resample_takes_a_rate_where_the_tracks_have_none():

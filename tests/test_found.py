@@ -130,5 +130,23 @@ def test_bad_input():
         find_skeleton(torch.full((4, 3, 3), float("nan")))
     with pytest.raises(ShapeError, match="weights"):
         find_skeleton(torch.randn(4, 3, 3), weights=torch.ones(3, 3))
-    with pytest.raises(OptionError, match="rigid_below"):
-        find_skeleton(torch.randn(4, 3, 3), rigid_below=-1.0)
+    with pytest.raises(ShapeError, match="joints: expected 3 names, got 2"):
+        find_skeleton(torch.randn(4, 3, 3), joints=["a", "b"])
+    for share in (-1.0, None):
+        with pytest.raises(OptionError, match="rigid_below"):
+            find_skeleton(torch.randn(4, 3, 3), rigid_below=share)
+    nobody = walking_person(5).tracks
+    with pytest.raises(ShapeError, match="find_skeleton: expected joints that are seen"):
+        find_skeleton(replace(nobody, weights=0 * nobody.weights))
+
+
+def test_weights_may_be_a_list():
+    points, _ = swinging_body()
+    assert find_skeleton(points, weights=[[1.0] * 6] * 60).bones == find_skeleton(points).bones
+
+
+def test_bones_that_tracks_have_already_tell_nothing():
+    clip = walking_person(90, skeleton="h36m17", turn=180, noise=3, generator=torch.Generator().manual_seed(0))
+    names = [f"m{i}" for i in range(17)]
+    chain = Tracks.from_arrays(clip.tracks.points, edges=[(i, i + 1) for i in range(16)], joint_names=names)
+    assert find_skeleton(chain) == find_skeleton(Tracks.from_arrays(clip.tracks.points, joint_names=names))

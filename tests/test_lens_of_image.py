@@ -159,6 +159,8 @@ def test_other_methods_before_an_image(method):
     """PKC finds the lens, through which they lift."""
     tracks, truth = aside(frames=30)
     found = quietly(tracks, method=method, intrinsics="auto")
+    for one in (found, *found.alternatives):
+        assert sum("found from the tracks" in note for note in one.diagnostics.notes) == 1
     assert found.method == method and found.intrinsics.cx == 960 and 0.7 < found.intrinsics.fx / IMAGE.fx < 1.4
     assert error(found.points, truth) < error(quietly(tracks, method=method, intrinsics="parallel").points, truth)
 
@@ -349,6 +351,18 @@ def test_deviations_allow_for_a_lens_that_was_found(monkeypatch):
     for (one, _), result, angle in zip(cases, found, angles, strict=True):
         off = (result.points - result.points.mean(1, keepdim=True))[..., :2].norm(dim=-1)
         assert_close(result.uncertainty, quietly(one).uncertainty.hypot(angle * off))
+
+
+def test_a_lens_of_others_is_told_of_every_solution(monkeypatch):
+    clips = [aside(frames=8, x=x)[0] for x in (900.0, -1000.0)]
+    people = [replace(one, source=f"a.json, person {k}", image_size=(1920, 1080)) for k, one in enumerate(clips)]
+    monkeypatch.setattr(one_lens, "leaning", lambda points, *_, **__: torch.full_like(points[..., 0], 1e6))
+    found = by_one_lens(kt.PKC(), people)
+    (other,) = [one for one in found.values() if any(" of person " in note for note in one.diagnostics.notes)]
+    assert other.alternatives
+    for one in (other, *other.alternatives):
+        assert any("found from the tracks of person" in note for note in one.diagnostics.notes)
+        assert float(one.uncertainty.min()) >= 1e6
 
 
 def test_a_body_that_shrank_to_a_point_is_not_far():

@@ -10,6 +10,7 @@ import torch
 from near_cameras import LENS, error, filmed, quietly
 
 import kcs_torch as kt
+from kcs_torch.methods.answer.finish import loose_lengths
 from kcs_torch.methods.perspective import calibrated, scene
 from kcs_torch.methods.perspective.parallel_image import image_noise
 from kcs_torch.types import Intrinsics, Motion
@@ -48,6 +49,18 @@ def test_the_turn_that_the_lens_shows_tells_whether_depth_is_a_guess(turn):
     told = [str(w.message) for w in caught if "nothing else that tells depth" in str(w.message)]
     assert bool(found.doubt) == (found.viewpoint_turn < 30) == (turn == 0) and len(told) == (turn == 0)
     assert f"by only {found.viewpoint_turn:.0f} degree" in found.doubt or turn
+    assert [note for note in found.notes if "turned by only" in note] == [found.doubt][turn:]
+
+
+def test_how_much_bones_vary_is_told_as_measured_before_the_camera():
+    found = quietly(filmed(frames=40, turn=90)[0], method="csf", intrinsics=LENS).diagnostics
+    told = [note for note in found.notes if "does not hold them constant" in note]
+    assert told == loose_lengths(kt.METHODS["csf"](), found.bone_variation)
+
+
+def test_all_solutions_took_the_same_time():
+    result = quietly(filmed(frames=8)[0], intrinsics=LENS)
+    assert {one.diagnostics.seconds for one in result.alternatives} == {result.diagnostics.seconds}
 
 
 def test_a_person_who_walks_towards_the_camera_comes_nearer_by_the_true_ratio():

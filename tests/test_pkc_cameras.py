@@ -103,6 +103,7 @@ def test_lengths_along_rays_tell_such_a_hand_from_its_mirror_image(recwarn):
     image = 1000 * rays[..., :2] / rays[..., 2:]
     result = kt.reconstruct(replace(tracks, points=image), cameras=cameras, intrinsics=(1000, 1000, 0, 0))
     assert not [w for w in recwarn if "mirrored" in str(w.message)] and "mirrored" not in result.diagnostics.doubt
+    assert not any("mirrored" in note for note in result.diagnostics.notes)
     found = 1.5 * result.points  # a pixel at the hand's distance is 1.5 mm
     assert error(found, points) < error(found * FLIP, points) / 2
 

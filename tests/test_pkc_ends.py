@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 import kcs_torch as kt
 from kcs_torch.data import walking_person
-from kcs_torch.methods.pkc.ends import ends_of, estimate_with_ends, without_ends
+from kcs_torch.methods.pkc.ends import _least_turn, ends_of, estimate_with_ends, without_ends
 from kcs_torch.methods.pkc.hands import without_joints
 
 BODY = kt.SKELETONS["wholebody63"]
@@ -66,11 +66,47 @@ def test_a_hand_that_few_frames_show_is_told_of():
     some = without_ends(tracks)
     assert some.num_joints == BODY.num_joints - 40
     side = next(s for s in ("left", "right") if BODY.joints[FINGERS[0]].startswith(s))
-    told = [note for note in some.notes if "too few to find the hand from" in note]
-    assert told == [f"{side}_wrist: 3 frames too few to find the hand from: its fingers are taken as unseen"]
+    told = [note for note in some.notes if "show the hand" in note]
+    assert told == [f"{side}_wrist: 3 of 20 frames show the hand: its fingers are taken as unseen"]
     result = kt.reconstruct(tracks, intrinsics="parallel", steps=2, rounds=0)
     assert not result.tracks.seen[:, FINGERS].any()
     assert told[0] in result.tracks.notes
+    assert told[0] in kt.PKC(steps=2, rounds=0)(tracks).diagnostics.notes
+
+
+def test_a_hand_of_which_a_few_joints_are_seen_all_along_is_kept():
+    tips = [j for j in FINGERS if BODY.joints[j].endswith("4")]
+    tracks, _ = tracks_of("wholebody63", [j for j in FINGERS if j not in tips])
+    assert not {*ends_of(tracks)} & {*tips}
+    hidden = replace(tracks_of("wholebody63", [], frames=10)[0])
+    weights = hidden.weights.clone()
+    weights[4, FINGERS] = 0
+    assert not ends_of(replace(hidden, weights=weights))  # all but one frame of a short clip
+
+
+def test_what_the_caller_does_is_left_alone():
+    tracks, _ = tracks_of("coco17", ["left_ankle", "right_ankle"], frames=8)
+    call = lambda: kt.reconstruct(tracks, intrinsics="parallel", steps=2, rounds=0)  # noqa: E731
+    plain = call()
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(call().points, plain.points)
+    with torch.inference_mode():
+        result = call()
+    scale = torch.ones((), dtype=torch.float64, requires_grad=True)
+    (result.points * scale).sum().backward()
+    assert bool(scale.grad.isfinite())
+
+
+@pytest.mark.parametrize(
+    "start, end", [([1.0, 2, 3], [-1.0, -2, -3]), ([0.0, 0, 0], [1.0, 0, 0]), ([0.0, 0, 2], [0.0, 3, 0])]
+)
+def test_least_turns_are_rotations(start, end):
+    a, b = torch.tensor(start).double(), torch.tensor(end).double()
+    turn = _least_turn(a, b)
+    assert_close(torch.linalg.det(turn), torch.ones(()).double())
+    assert_close(turn @ turn.mT, torch.eye(3).double())
+    if bool(a.any()):
+        assert_close(turn @ a / a.norm(), b / b.norm())
 
 
 def test_bodies_without_a_template_and_tracks_that_show_nothing_are_whole():
@@ -137,7 +173,7 @@ def test_a_hand_follows_the_forearm():
 
     def completed(points):
         made = kt.methods.base.Estimate(points[:, kept], turn[:, :2], turn[:, 0, 0], True, 1)
-        full = estimate_with_ends(made, some.skeleton, BODY).points
+        full = estimate_with_ends(made, some, tracks).points
         return full - full[:, :1] + points[:, :1]
 
     assert_close(completed(rest), rest)
@@ -162,7 +198,7 @@ def test_standing_feet_keep_their_columns():
     found = kt.methods.base.Estimate(
         points, rows, torch.ones(8).double(), True, 1, standing=torch.rand(8, count).double()
     )
-    standing = estimate_with_ends(found, some.skeleton, body).standing
+    standing = estimate_with_ends(found, some, tracks).standing
     for k, joint in enumerate(body.contacts):
         name = body.joints[joint]
         there = [some.skeleton.joints[j] for j in some.skeleton.contacts]

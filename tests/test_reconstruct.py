@@ -15,6 +15,7 @@ from kcs_torch import KCS, METHODS, PKC, OptionError, SfAM, ShapeError, Skeleton
 from kcs_torch.data import walking_person
 from kcs_torch.errors import KcsError
 from kcs_torch.methods import Estimate, Method
+from kcs_torch.reconstruct import with_found_bones
 from kcs_torch.skeleton import SKELETONS
 
 # Few steps are made here, after which little has settled.
@@ -73,6 +74,21 @@ def test_arrays_without_a_skeleton():
     assert (result.method, result.skeleton.name, result.units) == ("pkc", "points", "px")
     assert result.lengths.shape == (0,)
     assert len(told) == 1 and told[0].filename == __file__
+
+
+def test_several_bodies_without_a_skeleton():
+    people = [replace(kt.Tracks.from_arrays(POINTS), source=name) for name in ("one", "two")]
+    with pytest.warns(kt.KcsWarning, match="no bones are given") as told:
+        kt.reconstruct_all(people, method="sfam")
+    assert [str(one.message).partition(":")[0] for one in told if "no bones" in str(one.message)] == ["one", "two"]
+
+
+def test_notes_are_those_of_the_bones_that_were_found():
+    points = POINTS.clone()
+    points[:, 0] = math.nan
+    tracks = kt.Tracks.from_arrays(points, skeleton="h36m17", notes=["kept"])
+    notes = ("kept", "never seen, so placed beside their neighbours, as there is no template: pelvis")
+    assert with_found_bones(tracks).notes == notes
 
 
 def test_arrays_that_seem_to_be_shares_of_an_image_are_told():

@@ -80,6 +80,17 @@ def test_a_stature_in_another_unit_is_told(units, height, metres):
     walk_result().scaled(units="dragons", height=175)  # a warning would be an error here
 
 
+def test_before_a_camera_every_solution_gets_the_size():
+    result = walk_result()
+    other = replace(result, lengths=2 * result.lengths)
+    bone = result.skeleton.index("left_knee"), result.skeleton.index("left_ankle")
+    at = [set(pair) for pair in result.skeleton.bones].index(set(bone))
+    for distance, lengths in ((torch.ones(12), [0.4, 0.4]), (None, [0.4, 0.8])):
+        both = [replace(one, distance=distance) for one in (result, other)]
+        found = replace(both[0], alternatives=(both[1],)).scaled(units="m", **{"left_knee-left_ankle": 0.4})
+        assert [float(one.lengths[at]) for one in (found, *found.alternatives)] == pytest.approx(lengths)
+
+
 def test_scaled_by_height():
     chain = Skeleton.from_names(
         ["head_top", "hip", "left_ankle", "right_foot"],

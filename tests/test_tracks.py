@@ -177,6 +177,10 @@ def test_unknown_fps(fps):
     assert Tracks.from_arrays(grid(), fps=12.5).rate == 12.5
 
 
+def test_a_note_alone_is_one_note():
+    assert Tracks.from_arrays(torch.rand(3, 17, 2), skeleton="coco17", notes="seen twice").notes == ("seen twice",)
+
+
 def test_frames_cuts_a_run():
     part = Tracks.from_arrays(grid(), fps=5, skeleton="h36m17").frames(1, 3)
     assert_close(part.points, grid()[1:3])

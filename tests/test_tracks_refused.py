@@ -73,13 +73,25 @@ def test_bad_confidence(confidence, words):
     assert str(caught.value).startswith("clip") and words in str(caught.value)
 
 
+@pytest.mark.parametrize("count", [16, 20])
+def test_confidences_fit_the_points_before_joints_are_put_in_order(count):
+    names = SKELETONS["coco17"].joints[16::-1]
+    with pytest.raises(ShapeError, match=rf"confidence: expected shape \(4, 17\), got \(4, {count}\)"):
+        Tracks.from_arrays(grid(), torch.ones(4, count), joint_names=names)
+
+
+def test_a_list_of_tensors_with_gradients_is_told():
+    with pytest.raises(ShapeError, match="got list of tensors: torch.stack makes one of them"):
+        Tracks.from_arrays([frame.requires_grad_() for frame in torch.rand(3, 17, 2)])
+
+
 def test_confidence_of_what_is_nan_does_not_count():
     with pytest.raises(ShapeError, match="no joint is seen"):
         seen = torch.eye(4, 17)
         Tracks.from_arrays(torch.where(seen[..., None] > 0, grid(), NAN), 1 - seen)
 
 
-@pytest.mark.parametrize("fps", [0, -25.0, -INF, "25", [25], 10**400])
+@pytest.mark.parametrize("fps", [0, -25.0, -INF, "25", [25], 10**400, True])
 def test_bad_fps(fps):
     with pytest.raises(ShapeError, match="fps: expected a positive number, got"):
         Tracks.from_arrays(grid(), fps=fps)

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import sys
 import warnings
 from dataclasses import replace
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from kcs_torch.cli import app
 from kcs_torch.io import load_reconstruction
 from kcs_torch.methods import PKC
 from kcs_torch.methods.perspective import calibrated, near_or_far, refining, scene, uncalibrated
+from kcs_torch.methods.perspective.answer import noted
 from kcs_torch.methods.perspective.near_or_far import may_be_near
 from kcs_torch.methods.perspective.uncalibrated import likely_lens, looking
 from kcs_torch.methods.pkc import blocks
@@ -239,6 +241,15 @@ def test_what_is_surely_far_is_asked_about_once(monkeypatch):
     assert same(found[1], found[2]) and found[1].distance is None
 
 
+def test_the_mark_of_a_far_camera_is_left_on_no_solution():
+    tracks = kt.data.walking_person(8, turn=0.0).tracks
+    lifted = noted(PKC()(tracks), SEEMS_FAR)
+    found = uncalibrated.reconstruct_uncalibrated(PKC(), tracks, lifted=lifted)
+    assert found.alternatives
+    for one in (found, *found.alternatives):
+        assert SEEMS_FAR not in one.diagnostics.notes and one.diagnostics.seconds == found.diagnostics.seconds
+
+
 def test_hips_or_shoulders_alone_tell_no_perspective():
     """Their middle and both ends lie on a line: what turns about it looks like perspective."""
     legs = [f"{side}_{part}" for part in ("hip", "knee", "ankle") for side in ("left", "right")]
@@ -336,6 +347,12 @@ def test_people_of_one_file_with_lenses_of_their_own_are_warned_of():
     assert told([near, far]) == told(together, intrinsics="parallel") == told(together[:1]) == []
     assert len(told(together, intrinsics="auto", method="kcs")) == 1
     assert told(together, intrinsics=(1500, 1500, 500, 500), method="kcs") == []
+
+
+def test_shots_of_one_person_are_not_taken_for_people():
+    shot = replace(lifted_near(), tracks=replace(lifted_near().tracks, source="film.json, person 0"))
+    shots = [shot, replace(shot, intrinsics=LENS)]
+    assert sys.modules["kcs_torch.reconstruct"]._told_of_lenses(shots) == shots  # a warning would be an error here
 
 
 @pytest.mark.parametrize("fps", [30.0, 90.0])

@@ -15,7 +15,18 @@ from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.types import Tracks
 from kcs_torch.types.intake import RATES, as_number
 
-__all__ = ["Array", "body_size", "check_rate", "check_tracks", "frame_rate", "number", "rebuilt", "runs", "share"]
+__all__ = [
+    "Array",
+    "body_size",
+    "check_rate",
+    "check_seen",
+    "check_tracks",
+    "frame_rate",
+    "number",
+    "rebuilt",
+    "runs",
+    "share",
+]
 
 Array = NDArray[np.float64]
 
@@ -27,13 +38,19 @@ def check_tracks(given: Any, what: str, kinds: tuple[type, ...] = (Tracks,)) -> 
         raise OptionError(f"{what}: expected {wanted}, got {type(given).__name__}")
 
 
+def check_seen(tracks: Tracks, what: str) -> None:
+    """Raise a ShapeError unless some frame of the tracks shows a joint."""
+    if not bool(tracks.seen.any()):
+        raise ShapeError(f"{tracks.source}: {what}: expected joints that are seen in some frame, got none")
+
+
 def number(value: Any, what: str, expected: str, *, above: float = 0.0, below: float = math.inf) -> float:
     """A finite number within limits, both excluded.
 
     Raises:
         OptionError: it is something else; the message says what was expected.
     """
-    found = None if isinstance(value, bool) else as_number(value)
+    found = as_number(value)
     if found is None:
         raise OptionError(f"{what}: expected {expected}, got {value!r}")
     if not above < found < below:

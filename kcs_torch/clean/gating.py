@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcs_torch.clean.common import body_size, check_tracks, frame_rate, number, rebuilt, share
+from kcs_torch.clean.common import body_size, check_seen, check_tracks, frame_rate, number, rebuilt, share
 from kcs_torch.errors import listed
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.types import Tracks
@@ -54,7 +54,7 @@ def gate(tracks: Tracks, *, threshold: float = 6.0, floor: float = 0.2, reach: f
 
     Raises:
         OptionError: an option is not positive.
-        ShapeError: nothing is left.
+        ShapeError: no joint is seen, or none is left.
 
     >>> from kcs_torch.data.synthetic import walking_person
     >>> tracks = walking_person(60).tracks
@@ -64,6 +64,7 @@ def gate(tracks: Tracks, *, threshold: float = 6.0, floor: float = 0.2, reach: f
     (False, 'gate: 1 of 1020 (0.098 %) detections dropped as outliers: neck 1')
     """
     check_tracks(tracks, "gate")
+    check_seen(tracks, "gate")
     number(threshold, "gate: threshold", "a positive number of usual errors")
     number(floor, "gate: floor", "a positive share of the body's size")
     number(reach, "gate: reach", "a positive number of seconds")

@@ -70,7 +70,7 @@ def unswap(tracks: Tracks) -> Tracks:
     check_tracks(tracks, "unswap")
     body, count = tracks.skeleton, tracks.skeleton.num_observed
     pairs = [pair for pair in body.mirror if max(pair) < count]
-    if len(pairs) < _FEWEST:
+    if len(pairs) < _FEWEST or not tracks.num_frames:
         return tracks
     points, weights = tracks.points[:, :count].clone(), tracks.weights[:, :count].clone()
     size = float(body_size(points, weights > 0))

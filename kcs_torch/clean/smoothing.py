@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kcs_torch.clean.common import Array, body_size, check_tracks, frame_rate, number, rebuilt, runs, share
+from kcs_torch.clean.common import Array, body_size, check_seen, check_tracks, frame_rate, number, rebuilt, runs, share
 from kcs_torch.clean.detector import found_by_detector
 from kcs_torch.clean.filters import FILTERS, Filter
 from kcs_torch.clean.sides import unswap
-from kcs_torch.errors import KcsWarning, ShapeError, unknown, users_level
+from kcs_torch.errors import KcsWarning, unknown, users_level
 from kcs_torch.types import Reconstruction, Tracks
 from kcs_torch.types.arrays import as_doubles
 
@@ -73,8 +73,7 @@ def smooth(
     number(cutoff, "smooth: cutoff", expected, below=rate / 2)
     if isinstance(motion, Reconstruction):
         return _smooth_result(motion, method, cutoff, rate)
-    if not bool(tracks.seen.any()):
-        raise ShapeError(f"{tracks.source}: smooth: expected joints that are seen in some frame, got none")
+    check_seen(tracks, "smooth")
     count = tracks.skeleton.num_observed
     points = as_doubles(tracks.points[:, :count])
     weights = as_doubles(tracks.weights[:, :count])
@@ -129,12 +128,16 @@ def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: flo
         one = as_doubles(values)[:, None]
         return torch.from_numpy(chosen.apply(one, np.ones(len(one)))[:, 0].copy()).to(values)  # no negative strides
 
+    distance, scales = path(result.distance), result.scales
+    if result.distance is not None and distance is not None:
+        scales = scales * result.distance / distance  # which are the focal length over the distance
     return replace(
         result,
         points=torch.from_numpy(moved).to(result.points),
         diagnostics=replace(result.diagnostics, notes=(*result.diagnostics.notes, note)),
+        scales=scales,
         root_depth=path(result.root_depth),
-        distance=path(result.distance),
+        distance=distance,
         alternatives=tuple(_smooth_result(other, method, cutoff, rate) for other in result.alternatives),
     ).remeasured()
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcs_torch.clean.common import check_rate, check_tracks, frame_rate, rebuilt, runs
+from kcs_torch.clean.common import check_rate, check_seen, check_tracks, frame_rate, rebuilt, runs
 from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.cuts import cut_frames
@@ -102,8 +102,8 @@ def cuts_of_all(points: Tensor, seen: Tensor, body: Skeleton, *, leaps: bool = T
 def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: float | None = None) -> Tracks:
     """Put the same motion at another frame rate, by splines within runs of seen frames.
 
-    Gaps stay gaps: a new frame sees a joint where the old frames on either side do. Nothing is smoothed: where the
-    rate falls, noise stays what it is, so smooth first.
+    Gaps stay gaps: a new frame sees a joint where the old frames on either side do, and as surely as the less sure of
+    them. Nothing is smoothed: where the rate falls, noise stays what it is, so smooth first.
 
     Args:
         tracks: what to resample.
@@ -116,13 +116,14 @@ def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: flo
 
     Raises:
         OptionError: a rate is unknown or no positive number.
-        ShapeError: no joint is seen in any new frame.
+        ShapeError: no joint is seen in any frame, or in any new one.
 
     >>> from kcs_torch.data.synthetic import walking_person
     >>> resample(walking_person(61, fps=30).tracks, 60).num_frames
     121
     """
     check_tracks(tracks, "resample")
+    check_seen(tracks, "resample")
     if kind not in _KINDS:
         raise unknown("kind of resample", kind, _KINDS)
     check_rate(fps, "resample: fps")
@@ -148,6 +149,7 @@ def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: flo
                 continue
             degree = _KINDS[kind] if stop - start > 3 else 1  # a cubic takes four frames
             new_points[inside, joint] = make_interp_spline(time, points[start:stop, joint], degree)(at)
-            new_weights[inside, joint] = np.interp(at, time, weights[start:stop, joint])
+            before, after = np.floor(at + _EPS).astype(int), np.ceil(at - _EPS).astype(int)
+            new_weights[inside, joint] = np.minimum(weights[before, joint], weights[after, joint])
     note = f"resample: from {frames} frames at {rate:g} a second to {length} at {fps:g} ({kind})"
     return rebuilt(tracks, torch.from_numpy(new_points), torch.from_numpy(new_weights), note, fps=float(fps))

@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from kcs_torch.clean.common import check_seen
 from kcs_torch.errors import KcsWarning, OptionError, ShapeError, users_level
 from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.ranks import median
@@ -18,7 +19,8 @@ from kcs_torch.methods.pkc.clip import LEAST_JOINTS
 from kcs_torch.methods.sfam import SfAM
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.core import FOUND
-from kcs_torch.types import Reconstruction, Tracks
+from kcs_torch.types import Reconstruction, Tracks, as_floats
+from kcs_torch.types.intake import as_number
 
 __all__ = ["find_skeleton"]
 
@@ -52,8 +54,9 @@ def find_skeleton(
         makes no depth surer: give the skeleton another name if they were found elsewhere, in motion capture say.
 
     Raises:
-        ShapeError: there are no two joints, points that are not finite (T, N, 3), or no tensor of them.
-        OptionError: ``rigid_below`` is negative.
+        ShapeError: there are no two joints, points that are not finite (T, N, 3), or no tensor of them; the weights or
+            the joints' names do not fit them; tracks show no joint in any frame.
+        OptionError: ``rigid_below`` is no share, or negative.
 
     Warns:
         KcsWarning: no joints keep their distance; or the body is at rest, so that bones are a guess.
@@ -66,10 +69,12 @@ def find_skeleton(
     >>> find_skeleton(points).bones
     ((0, 1), (1, 2))
     """
-    if not rigid_below >= 0:
-        raise OptionError(f"find_skeleton: rigid_below: expected a share >= 0, got {rigid_below}")
+    share = as_number(rigid_below)
+    if share is None or not share >= 0:
+        raise OptionError(f"find_skeleton: rigid_below: expected a share >= 0, got {rigid_below!r}")
     unsure = False
     if isinstance(source, Tracks):
+        check_seen(source, "find_skeleton")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", KcsWarning)  # of depths that nobody sees
             source, unsure = _lifted(source, rigid_below)
@@ -110,26 +115,30 @@ def _given(
         raise ShapeError(f"find_skeleton: expected points (T, N, 3) of at least 2 joints, got {tuple(source.shape)}")
     if not torch.isfinite(source).all():
         raise ShapeError("find_skeleton: expected finite points; give weights 0 where a joint is unseen")
-    if weights is not None and weights.shape != source.shape[:2]:
-        raise ShapeError(f"find_skeleton: expected weights {tuple(source.shape[:2])}, got {tuple(weights.shape)}")
+    if weights is not None:
+        weights = as_floats(weights, "find_skeleton: weights", None).to(source)
+        if weights.shape != source.shape[:2]:
+            raise ShapeError(f"find_skeleton: expected weights {tuple(source.shape[:2])}, got {tuple(weights.shape)}")
+    if joints is not None and len(joints) != source.shape[1]:
+        raise ShapeError(f"find_skeleton: joints: expected {source.shape[1]} names, got {len(joints)}")
     return source, weights, joints
 
 
 def _lifted(tracks: Tracks, rigid_below: float) -> tuple[Reconstruction, bool]:
-    """Tracks in space, of a body of which nothing is known, and whether nothing says that joints keep their distance.
+    """Tracks in space, and whether nothing says that joints keep their distance. The tracks' own bones tell nothing.
 
     SfAM alone is off by so much that a good part of the bones in its depths are wrong. PKC corrects it by links between
     many pairs, which are pulled weakly: what varies nonetheless is no bone. Links pull together what is no body, too:
     then no joints keep their distance in SfAM's depths, and PKC's are in doubt.
     """
-    first = SfAM()(tracks)
+    joints = tracks.skeleton.joints
+    first = SfAM()(replace(tracks, skeleton=Skeleton(joints=joints, bones=(), name="points", tree=False)))
     if tracks.num_joints < LEAST_JOINTS:  # links would hold any depths
         return first, False
     cost, ratio, _ = _variation(first.points, tracks.weights)
     pairs = torch.triu_indices(len(cost), len(cost), 1, device=cost.device)
     least = pairs[:, cost[tuple(pairs)].argsort(stable=True)[: LINKS * len(cost)]]
     links = torch.cat([rigid_tree(cost).sort(-1).values, least.mT]).unique(dim=0)
-    joints = tracks.skeleton.joints
     body = Skeleton(joints=joints, bones=tuple((int(a), int(b)) for a, b in links), name="links", tree=False)
     found = PKC()(replace(tracks, skeleton=body))
     return found, bool(found.diagnostics.doubt) and bool((ratio[tuple(pairs)] > rigid_below).all())

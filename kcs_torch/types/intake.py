@@ -55,11 +55,13 @@ def as_floats(value: Any, what: str, ndim: int | None) -> Tensor:
         try:
             array = np.asanyarray(value)
             value = torch.as_tensor(array if np.iscomplexobj(array) else np.ma.filled(array.astype(np.float64), np.nan))
-        except (TypeError, ValueError, OverflowError):
+        except (TypeError, ValueError, OverflowError, RuntimeError):
             kind = f"one of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
             hint = "; kcs_torch.load_tracks reads files" if isinstance(value, (str, Path)) else ""
             if isinstance(value, (list, tuple)) and any(item is None for item in value):
                 hint = " with None in it: a frame that shows nobody is one of NaN"
+            elif isinstance(value, (list, tuple)) and any(isinstance(item, Tensor) for item in value):
+                hint = " of tensors: torch.stack makes one of them"
             raise ShapeError(f"{what}: expected an array of numbers, got {kind}{hint}") from None
     if value.is_complex():
         raise ShapeError(f"{what}: expected real numbers, got {str(value.dtype).removeprefix('torch.')}")
@@ -71,9 +73,9 @@ def as_floats(value: Any, what: str, ndim: int | None) -> Tensor:
 
 
 def as_number(value: Any) -> float | None:
-    """A real number as a float; None for anything else, and for whole numbers that are larger than any float."""
+    """A real number as a float; None for anything else (True is none), and for whole numbers larger than any float."""
     try:
-        return float(value) if isinstance(value, Real) else None
+        return float(value) if not isinstance(value, bool) and isinstance(value, Real) else None
     except OverflowError:
         return None
 
@@ -186,7 +188,7 @@ def take_in(
     notes: Sequence[str],
 ) -> Intake:
     """Check arrays of one body's motion in ``dims`` dimensions; arguments and errors as of ``Tracks.from_arrays``."""
-    remarks = list(notes)
+    remarks = [notes] if isinstance(notes, str) else list(notes)
     xy, confidence = _shaped(points, confidence, dims, source)
     num_joints, rate = xy.shape[1], _rate(fps, source)
     least = as_number(threshold)
@@ -254,6 +256,8 @@ def _shaped(points: Any, confidence: Any, dims: int, source: str) -> tuple[Tenso
         raise ShapeError(f"{source}: expected at least 1 frame, got none")
     if num_joints < 2:
         raise ShapeError(f"{source}: expected at least 2 joints, got {num_joints}")
+    if confidence is not None and confidence.shape != xy.shape[:2]:
+        raise ShapeError(f"{source}: confidence: expected shape {tuple(xy.shape[:2])}, got {tuple(confidence.shape)}")
     return xy, confidence
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError
+from kcs_torch.errors import KcsWarning, OptionError
 from kcs_torch.functional import bone_lengths
 from kcs_torch.functional.ranks import median
 from kcs_torch.skeleton import Skeleton
@@ -43,7 +44,7 @@ class Diagnostics:
         iterations: how many steps were made.
         seconds: wall-clock time of the method.
         notes: sentences for the user.
-        doubt: the one of them that says why depth is hardly to be believed, or nothing.
+        doubt: the one of the notes that says why depth is hardly to be believed, or nothing.
         largest_bone_variation: that of the rigid bone whose length varies most, per cent; NaN where it is not known.
         loosest_bone: the name of this bone; empty where it is not known.
     """
@@ -276,7 +277,8 @@ class Reconstruction:
                 joint of the head to the heels or ankles, enlarged by what usually lies above and below these: a nose is
                 8.6 % of the stature below the top of the head, a joint named head 5 % (where the skull turns, in motion
                 capture, 12.6 %), an ankle 4 % above the floor. Individuals differ by some per cent; a bone that has
-                been measured is more exact.
+                been measured is more exact. Before a camera whose intrinsics were given or found each alternative gets
+                this size by its own lengths; under parallel rays all share one factor.
 
         Raises:
             OptionError: the unit has no name, not exactly one of ``factor`` and a size is given, it is no positive
@@ -286,7 +288,14 @@ class Reconstruction:
             KcsWarning: nobody is so tall: 1.75 mm, or 175 m.
         """
         units = short_unit(units)
+        own = factor is None and self.distance is not None
         factor = size_factor(self.skeleton, self.lengths, factor, sizes, units=units)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", KcsWarning)  # of a size that this one was told of
+            others = tuple(
+                other.scaled(units=units, **sizes) if own else other.scaled(units=units, factor=factor)
+                for other in self.alternatives
+            )
         spread = None if self.uncertainty is None else self.uncertainty * factor
         return replace(
             self,
@@ -297,7 +306,7 @@ class Reconstruction:
             units=units,
             root_depth=None if self.root_depth is None else self.root_depth * factor,
             distance=None if self.distance is None else self.distance * factor,
-            alternatives=tuple(other.scaled(units=units, factor=factor) for other in self.alternatives),
+            alternatives=others,
         )
 
     def save(self, path: str | Path) -> Path:

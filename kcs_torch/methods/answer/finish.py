@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     *("BY_SHOTS", "HARDLY", "NO_POSE", "SINGLE", "WEAK_TURN", "Estimate"),
-    *("extent", "finish", "little_turn", "nothing_else"),
+    *("UNHELD", "extent", "finish", "loose_lengths", "nothing_else", "on_turn"),
 ]
 
 WEAK_TURN = 30.0
@@ -55,6 +55,9 @@ NO_POSE = "all joints lie at one point in every frame: there is no pose to find"
 
 HARDLY, SINGLE = "the viewpoint turned by only", "a single image shows one viewpoint"
 """How a note begins that says how little the viewpoint turned, and of one frame."""
+
+UNHELD = "does not hold them constant"
+"""How the note ends on bones' lengths that a method leaves free."""
 
 
 @dataclass(frozen=True)
@@ -131,20 +134,28 @@ def finish(
         shown = clips if of == list(range(len(tracks))) else Clips.of([tracks[k] for k in of]).to("cpu")
         told = _told(method, body, shown, [one for _, one in some], torch.stack([sizes[k] for k in of]))
         for (k, one), facts in zip(some, told, strict=True):
-            notes = _notes_on_solution(method, tracks[k], one, facts)
+            doubt = one.doubt or nothing_else(method, tracks[k], facts.turn)
+            notes = _notes_on_solution(method, tracks[k], one, facts, doubt)
             notes += [*views[k], *facts.wrong, *_notes_on_tracks(method, tracks[k], flat[k])]
-            results[k].append(_reconstruction(method, tracks[k], one, sizes[k], seconds, facts, notes))
+            results[k].append(_reconstruction(method, tracks[k], one, sizes[k], seconds, facts, notes, doubt))
     for k, first in enumerate(found):
         if not flat[k] and tracks[k].num_frames > 1:
             results[k] = _with_roots(results[k], tracks[k], first)
     return [replace(own[0], alternatives=tuple(own[1:])) if own[1:] else own[0] for own in results]
 
 
-def little_turn(method: Method, tracks: Tracks, turn: float) -> str:
-    """What depth rests on where the viewpoint hardly turns, by so many degrees, for the user; else empty."""
-    if turn >= WEAK_TURN or method.learned:
-        return ""
-    return f"{_how_little(tracks, turn)}: depth rests on {_rest(method, tracks.skeleton)}"
+def on_turn(method: Method, tracks: Tracks, turn: float, doubt: str) -> list[str]:
+    """What depth rests on where the viewpoint hardly turns, by so many degrees, for the user, if no doubt tells it."""
+    if turn >= WEAK_TURN or method.learned or (doubt and doubt == nothing_else(method, tracks, turn)):
+        return []
+    return [f"{_how_little(tracks, turn)}: depth rests on {_rest(method, tracks.skeleton)}"]
+
+
+def loose_lengths(method: Method, variation: float) -> list[str]:
+    """That bones' lengths vary, by so many per cent, if a method leaves them free."""
+    if not variation > LOOSE or method.keeps_lengths:
+        return []
+    return [f"bone lengths vary by {variation:.1f} %: '{method.name}' {UNHELD}"]
 
 
 def _how_little(tracks: Tracks, turn: float) -> str:
@@ -221,6 +232,7 @@ def _reconstruction(
     seconds: float,
     told: _Told,
     notes: Sequence[str],
+    doubt: str,
 ) -> Reconstruction:
     """One solution, of which everything is told but the root's path."""
     diagnostics = Diagnostics(
@@ -232,7 +244,7 @@ def _reconstruction(
         iterations=found.iterations,
         seconds=seconds,
         notes=tuple(notes),
-        doubt=found.doubt or nothing_else(method, tracks, told.turn),
+        doubt=doubt,
         largest_bone_variation=told.variation.largest,
         loosest_bone=told.variation.bone,
     )
@@ -249,18 +261,14 @@ def _reconstruction(
     )
 
 
-def _notes_on_solution(method: Method, tracks: Tracks, found: Estimate, told: _Told) -> list[str]:
+def _notes_on_solution(method: Method, tracks: Tracks, found: Estimate, told: _Told, doubt: str) -> list[str]:
     """What is said of a solution by itself."""
-    notes, variation = list(found.notes), told.variation.median
-    if little := little_turn(method, tracks, told.turn):
-        notes.append(little)
-    if found.doubt:
-        notes.append(found.doubt)
+    notes = [*found.notes, *on_turn(method, tracks, told.turn, doubt)]
+    if doubt:
+        notes.append(doubt)
     if not found.converged:
         notes.append(method.unsettled(found.iterations))
-    if variation > LOOSE and not method.keeps_lengths:
-        notes.append(f"bone lengths vary by {variation:.1f} %: '{method.name}' does not hold them constant")
-    return notes
+    return [*notes, *loose_lengths(method, told.variation.median)]
 
 
 def _notes_on_view(clips: Clips, body: Skeleton) -> list[list[str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from kcs_torch.clean.detector import detected
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
-from kcs_torch.methods.answer.finish import HARDLY, SINGLE, little_turn, nothing_else
+from kcs_torch.methods.answer.finish import HARDLY, SINGLE, UNHELD, loose_lengths, nothing_else, on_turn
 from kcs_torch.methods.answer.root import ABSENT, FOUND
 from kcs_torch.methods.answer.wrong import WHY_LOOSE, what_is_wrong
 from kcs_torch.methods.base import Method
@@ -22,7 +23,7 @@ from kcs_torch.methods.pkc.fixed_answer import SEE_OTHERS, UNSIDED
 from kcs_torch.methods.pkc.near import SEEMS_NEAR
 from kcs_torch.types import Reconstruction, Tracks
 
-__all__ = ["assemble", "leaning"]
+__all__ = ["assemble", "in_every_solution", "leaning", "noted", "timed"]
 
 APART = 0.04
 """Root mean square difference in depth, for a body of 1.75, from which on solutions count as two."""
@@ -66,30 +67,18 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
     points = torch.cat([points[..., :2], points[..., 2:] - root[:, None, None]], -1)
     cameras = (found.view.look.mT @ complete_rotation(lifted.cameras))[:, :2]
     turn = float(viewpoint_turn(cameras))
-    notes = _notes_on_solution(method, tracks, found, k, points, images, turn)
-    varies = f": the body's distance varies by a factor of {root.amax() / root.amin():.2f}" if len(root) > 1 else ""
-    notes.append(f"full perspective{varies}")
-    if scene.any_focal:
-        notes.append(lens_note(intrinsics, tracks.units))
-    first = found.lifted[0].diagnostics
-    doubt = first.doubt
-    if doubt == nothing_else(method, tracks, first.viewpoint_turn):  # by the turn before the lens was known
-        doubt = nothing_else(method, tracks, turn)
-    if doubt == UNSIDED and not found.flat and _one_side(bodies):
-        doubt = ""
     facts = replace(
         lifted.diagnostics,
         viewpoint_turn=turn,
         converged=found.settled(k),
         iterations=found.steps,
         reprojection_rms=float(off.square().sum(-1).mean().sqrt()),
-        notes=tuple(notes),
-        doubt="" if k else doubt,
+        doubt=_doubt(method, found, k, turn),
     )
     unsure = None if lifted.uncertainty is None else lifted.uncertainty * factor
     if unsure is not None and scene.any_focal and not detected(tracks):
         unsure = unsure.hypot(leaning(points, tracks, imaged=scene.usual is not None))
-    return replace(
+    made = replace(
         lifted,
         points=points,
         cameras=cameras,
@@ -103,6 +92,35 @@ def _in_camera(method: Method, tracks: Tracks, found: Found, k: int) -> Reconstr
         intrinsics=intrinsics,
         alternatives=(),
     ).remeasured()
+    notes = _notes_on_solution(method, found, k, made, images)
+    varies = f": the body's distance varies by a factor of {root.amax() / root.amin():.2f}" if len(root) > 1 else ""
+    notes.append(f"full perspective{varies}")
+    if scene.any_focal:
+        notes.append(lens_note(intrinsics, tracks.units))
+    return replace(made, diagnostics=replace(made.diagnostics, notes=tuple(notes)))
+
+
+def in_every_solution(result: Reconstruction, change: Callable[[Reconstruction], Reconstruction]) -> Reconstruction:
+    """A result with a change made to it and to each of its alternatives."""
+    return replace(change(result), alternatives=tuple(map(change, result.alternatives)))
+
+
+def noted(result: Reconstruction, *notes: str) -> Reconstruction:
+    """A result with further notes on every solution."""
+
+    def change(one: Reconstruction) -> Reconstruction:
+        return replace(one, diagnostics=replace(one.diagnostics, notes=(*one.diagnostics.notes, *notes)))
+
+    return in_every_solution(result, change)
+
+
+def timed(result: Reconstruction, seconds: float) -> Reconstruction:
+    """A result that took so long, all of its solutions together."""
+
+    def change(one: Reconstruction) -> Reconstruction:
+        return replace(one, diagnostics=replace(one.diagnostics, seconds=seconds))
+
+    return in_every_solution(result, change)
 
 
 def leaning(points: Tensor, tracks: Tracks, *, imaged: bool) -> Tensor:
@@ -122,21 +140,35 @@ def _one_side(bodies: Bodies) -> bool:
     return not bool((turned & (bodies.energy < bodies.energy[0] + CLOSE)).any())
 
 
-def _notes_on_solution(
-    method: Method, tracks: Tracks, found: Found, k: int, points: Tensor, images: Tensor, turn: float
-) -> list[str]:
+def _doubt(method: Method, found: Found, k: int, turn: float) -> str:
+    """Why depth of solution number ``k``, seen from viewpoints that turn by so many degrees, is hardly to be believed.
+
+    What the method doubts holds of its best solution, unless the rays tell better.
+    """
+    first, tracks = found.lifted[0].diagnostics, found.lifted[0].tracks
+    if first.doubt == nothing_else(method, tracks, first.viewpoint_turn):  # by the turn before the lens was known
+        return nothing_else(method, tracks, turn)
+    told = first.doubt == UNSIDED and not found.flat and _one_side(found.bodies)
+    return "" if k or told else first.doubt
+
+
+def _notes_on_solution(method: Method, found: Found, k: int, made: Reconstruction, images: Tensor) -> list[str]:
     """What is said of solution number ``k``: what the method said of the tracks, and what is true of this one."""
+    tracks, facts, before = made.tracks, made.diagnostics, found.lifted[0].diagnostics.doubt
     # True of what was lifted, perhaps not of this.
-    stale = [WHY_LOOSE, HARDLY, SINGLE, SEEMS_NEAR, "weak perspective", "did not settle"]
+    stale = [WHY_LOOSE, UNHELD, HARDLY, SINGLE, SEEMS_NEAR, "weak perspective", "did not settle"]
     if k:
-        stale += [SEE_OTHERS, found.lifted[0].diagnostics.doubt or SEE_OTHERS]
+        stale.append(SEE_OTHERS)
     notes = [
-        note for note in found.notes if not note.startswith((ABSENT, FOUND)) and not any(part in note for part in stale)
+        note
+        for note in found.notes
+        if not note.startswith((ABSENT, FOUND)) and note != before and not any(part in note for part in stale)
     ]
-    settled = found.settled(k)
-    if not settled:
+    if not facts.converged:
         notes.append(method.unsettled(found.steps))
-    if little := little_turn(method, tracks, turn):
-        notes.append(little)
+    notes += on_turn(method, tracks, facts.viewpoint_turn, facts.doubt)
+    if facts.doubt:
+        notes.append(facts.doubt)
+    notes += loose_lengths(method, facts.bone_variation)
     clips = Clips.of([tracks])
-    return [*notes, *what_is_wrong(method, tracks.skeleton, clips, points[None], images[None], [settled])[0]]
+    return notes + what_is_wrong(method, tracks.skeleton, clips, made.points[None], images[None], [facts.converged])[0]

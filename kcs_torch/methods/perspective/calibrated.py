@@ -16,7 +16,7 @@ from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
 from kcs_torch.functional.inference import undifferentiated
 from kcs_torch.methods.answer.root import standing_feet
 from kcs_torch.methods.base import Method, apart, check_cameras
-from kcs_torch.methods.perspective.answer import assemble
+from kcs_torch.methods.perspective.answer import assemble, timed
 from kcs_torch.methods.perspective.parallel_image import body_unit
 from kcs_torch.methods.perspective.refining import Found, refine, refine_again, seen_along, with_feet
 from kcs_torch.methods.perspective.scene import BLOCK, GAIN, ahead
@@ -92,7 +92,7 @@ def reconstruct_perspective(
     with apart([tracks]):
         tracks = method.prepared(tracks)
         result = _reconstruct(method, tracks, intrinsics, cameras, lifted, guessed)
-    result = replace(result, diagnostics=replace(result.diagnostics, seconds=time.perf_counter() - begin))
+    result = timed(result, time.perf_counter() - begin)
     method.warn(result)
     return result
 
@@ -113,7 +113,7 @@ def _reconstruct(
     if lifted is None:
         best = _best_of_rounds(method, tracks, view, cameras, None if guessed is None else guessed / intrinsics.focal)
     else:
-        best = _along(method, tracks, view, cameras, lifted)
+        best = _along(tracks, view, cameras, lifted)
     if (guessed is not None or lifted is not None) and not best.flat:
         best = _with_focal(method, tracks, best, cameras)
     searched = method.turns_over and has_trunk(tracks.skeleton) and not detected(tracks) and not best.flat
@@ -165,7 +165,7 @@ def _best_of_rounds(method: Method, tracks: Tracks, view: View, cameras: Tensor 
     return best
 
 
-def _along(method: Method, tracks: Tracks, view: View, cameras: Tensor | None, lifted: Reconstruction) -> Found:
+def _along(tracks: Tracks, view: View, cameras: Tensor | None, lifted: Reconstruction) -> Found:
     """What was lifted under parallel rays, refined along those of a lens together with its focal length."""
     distance, depth = view.first_distance(tracks, tracks.rate), torch.zeros_like(view.rays[..., 0])
     made = seen_along(view, lifted, distance, _straighten(tracks, view.rays, distance, depth))

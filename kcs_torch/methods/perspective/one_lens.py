@@ -9,7 +9,7 @@ from functools import partial
 from kcs_torch.clean.detector import detected
 from kcs_torch.methods.base import Method
 from kcs_torch.methods.clips.processes import spread
-from kcs_torch.methods.perspective.answer import leaning
+from kcs_torch.methods.perspective.answer import in_every_solution, leaning, noted
 from kcs_torch.methods.perspective.calibrated import reconstruct_perspective
 from kcs_torch.methods.perspective.image_lens import lens_of_image
 from kcs_torch.methods.perspective.near_or_far import may_be_near
@@ -67,8 +67,13 @@ def _through(method: Method, tracks: Tracks, lens: Intrinsics, who: str, said: s
     found = reconstruct_perspective(method, tracks, lens)
     if not bool(found.points.isfinite().all()):
         return method(tracks)
-    unsure = found.uncertainty
-    if unsure is not None and not detected(tracks):
-        unsure = unsure.hypot(leaning(found.points, tracks, imaged=True))
-    notes = (*found.diagnostics.notes, lens_note(lens, tracks.units, who), *([said] if said else []))
-    return replace(found, uncertainty=unsure, diagnostics=replace(found.diagnostics, notes=notes))
+    if not detected(tracks):
+        found = in_every_solution(found, _less_sure)
+    return noted(found, lens_note(lens, tracks.units, who), *([said] if said else []))
+
+
+def _less_sure(found: Reconstruction) -> Reconstruction:
+    """A solution with the uncertainty of a lens that was found."""
+    if found.uncertainty is None:
+        return found
+    return replace(found, uncertainty=found.uncertainty.hypot(leaning(found.points, found.tracks, imaged=True)))

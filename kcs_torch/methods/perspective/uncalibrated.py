@@ -14,6 +14,7 @@ from kcs_torch.errors import KcsWarning, OptionError
 from kcs_torch.methods.answer.finish import Estimate
 from kcs_torch.methods.base import Method, apart, check_cameras
 from kcs_torch.methods.clips.lockstep import Search
+from kcs_torch.methods.perspective.answer import in_every_solution, noted, timed
 from kcs_torch.methods.perspective.calibrated import reconstruct_perspective
 from kcs_torch.methods.perspective.image_lens import LikelyLens, lens_of_image
 from kcs_torch.methods.perspective.near_or_far import NEAR, is_far, may_be_near, nearness
@@ -79,9 +80,14 @@ def reconstruct_uncalibrated(
         else:
             result = _by_tracks(method, tracks, cameras, likely, lifted)
     method.warn(result)
-    notes = tuple(note for note in result.diagnostics.notes if note != SEEMS_FAR)
-    spent = before + time.perf_counter() - begin
-    return replace(result, diagnostics=replace(result.diagnostics, seconds=spent, notes=notes))
+    result = in_every_solution(result, _without_mark)
+    return timed(result, before + time.perf_counter() - begin)
+
+
+def _without_mark(one: Reconstruction) -> Reconstruction:
+    """A solution without the mark that :func:`looking` leaves."""
+    notes = tuple(note for note in one.diagnostics.notes if note != SEEMS_FAR)
+    return replace(one, diagnostics=replace(one.diagnostics, notes=notes))
 
 
 def _by_tracks(
@@ -112,8 +118,7 @@ def _by_image(method: Method, tracks: Tracks, cameras: Tensor | None, likely: Li
         if is_far(near, lifted):
             return lifted if judge is method else method(tracks, cameras)
     near = _through(method, tracks, cameras, near)
-    notes = (*near.diagnostics.notes, likely.said) if likely.said else near.diagnostics.notes
-    return replace(near, diagnostics=replace(near.diagnostics, notes=notes))
+    return noted(near, likely.said) if likely.said else near
 
 
 def _through(method: Method, tracks: Tracks, cameras: Tensor | None, near: Reconstruction) -> Reconstruction:
@@ -121,9 +126,7 @@ def _through(method: Method, tracks: Tracks, cameras: Tensor | None, near: Recon
     lens = near.intrinsics
     if isinstance(method, PKC) or lens is None:
         return near
-    found = reconstruct_perspective(method, tracks, lens, cameras)
-    notes = (*found.diagnostics.notes, lens_note(lens, tracks.units))
-    return replace(found, diagnostics=replace(found.diagnostics, notes=notes))
+    return noted(reconstruct_perspective(method, tracks, lens, cameras), lens_note(lens, tracks.units))
 
 
 def likely_lens(lifted: Reconstruction, cameras: Tensor | None = None) -> Intrinsics | None:

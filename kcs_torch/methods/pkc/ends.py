@@ -16,9 +16,10 @@ from torch import Tensor
 from kcs_torch.errors import KcsWarning, counted, listed, users_level
 from kcs_torch.functional.align import centre, procrustes
 from kcs_torch.functional.chain import bone_lengths
+from kcs_torch.functional.inference import plain
 from kcs_torch.methods.answer.root import ABSENT
-from kcs_torch.methods.base import Estimate
-from kcs_torch.methods.pkc.hands import hands_of, is_shown, without_joints
+from kcs_torch.methods.base import Estimate, apart
+from kcs_torch.methods.pkc.hands import Part, hands_of, is_shown, without_joints
 from kcs_torch.nn.posture import has_trunk, trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.graph import direct_bones
@@ -26,6 +27,12 @@ from kcs_torch.types import Reconstruction, Tracks
 from kcs_torch.types.tracks import never_seen, unseen_notes
 
 __all__ = ["ends_of", "estimate_with_ends", "with_ends", "without_ends"]
+
+RARE = 0.15
+"""Share of the frames that show anything of a hand, up to which its fingers are taken as unseen."""
+
+TAKEN = "its fingers are taken as unseen"
+"""How the note ends that says so."""
 
 ANYWHERE = 3**-0.5
 """Root mean square of the depth of a bone that may point anywhere, over its length."""
@@ -44,7 +51,10 @@ def ends_of(tracks: Tracks) -> list[int]:
     fingers: set[int] = set()
     for hand in hands_of(body):
         fingers.update(hand.joints[1:])
-        gone[list(hand.joints[1:])] = not is_shown(tracks, hand.joints)
+        if _is_rare(tracks, hand):
+            gone[list(hand.joints[1:])] = True
+        elif is_shown(tracks, hand.joints):
+            gone[list(hand.joints[1:])] = False
     kept = {joint for _, sources in body.virtual for joint in sources} | set(trunk_joints(body))
     free = {joint for joint in gone.nonzero().flatten().tolist() if joint < body.num_observed and joint not in kept}
     children: dict[int, list[int]] = {joint: [] for joint in range(body.num_joints)}
@@ -78,12 +88,22 @@ def without_ends(tracks: Tracks) -> Tracks:
         notes=tuple(note for note in tracks.notes if note not in unseen_notes(tracks.weights, body)),
     )
     rare = [
-        f"{body.joints[hand.joints[0]]}: {counted(int(tracks.seen[:, list(hand.joints[1:])].any(1).sum()), 'frame')} "
-        "too few to find the hand from: its fingers are taken as unseen"
+        f"{body.joints[hand.joints[0]]}: {_showing(tracks, hand)} of {counted(tracks.num_frames, 'frame')} "
+        f"{'shows' if _showing(tracks, hand) == 1 else 'show'} the hand: {TAKEN}"
         for hand in hands_of(body)
-        if hand.joints[1] in ends and bool(tracks.seen[:, list(hand.joints[1:])].any())
+        if hand.joints[1] in ends and _showing(tracks, hand)
     ]
     return replace(rest, notes=(*rest.notes, *unseen_notes(rest.weights, rest.skeleton), *rare))
+
+
+def _showing(tracks: Tracks, hand: Part) -> int:
+    """How many frames show anything of a hand's fingers."""
+    return int(tracks.seen[:, list(hand.joints[1:])].any(1).sum())
+
+
+def _is_rare(tracks: Tracks, hand: Part) -> bool:
+    """Whether hardly any frame shows anything of a hand, too few to find it by itself."""
+    return _showing(tracks, hand) <= RARE * tracks.num_frames and not is_shown(tracks, hand.joints)
 
 
 def with_ends(result: Reconstruction, tracks: Tracks) -> Reconstruction:
@@ -96,6 +116,19 @@ def with_ends(result: Reconstruction, tracks: Tracks) -> Reconstruction:
     Warns:
         KcsWarning: which joints were never seen.
     """
+    with apart([tracks], differentiates=False):
+        made = _with_ends(result, tracks)
+    ends = [joint for joint in tracks.skeleton.joints if joint not in result.skeleton.joints]
+    warnings.warn(
+        f"{tracks.source}: never seen, so placed by the skeleton alone: {', '.join(ends)}",
+        KcsWarning,
+        stacklevel=users_level(),
+    )
+    return plain(made)
+
+
+def _with_ends(result: Reconstruction, tracks: Tracks) -> Reconstruction:
+    """:func:`with_ends`, of which nobody is told."""
     body, some = tracks.skeleton, result.skeleton
     kept = _kept(body, some)
     points, weights = torch.zeros_like(tracks.points), torch.zeros_like(tracks.weights)
@@ -104,12 +137,6 @@ def with_ends(result: Reconstruction, tracks: Tracks) -> Reconstruction:
     notes = [note for note in result.tracks.notes if note not in stale]
     whole = replace(result.tracks, points=points, weights=weights, skeleton=body)
     whole = replace(whole, notes=(*notes, *unseen_notes(weights, body)))
-    ends = [joint for k, joint in enumerate(body.joints) if k not in set(kept)]
-    warnings.warn(
-        f"{tracks.source}: never seen, so placed by the skeleton alone: {', '.join(ends)}",
-        KcsWarning,
-        stacklevel=users_level(),
-    )
 
     def grown(one: Reconstruction) -> Reconstruction:
         points, unsure = _placed(one.points, one.uncertainty, kept, body)
@@ -120,8 +147,9 @@ def with_ends(result: Reconstruction, tracks: Tracks) -> Reconstruction:
     return grown(result)
 
 
-def estimate_with_ends(found: Estimate, some: Skeleton, body: Skeleton) -> Estimate:
-    """As :func:`with_ends`, of an estimate of a skeleton's joints as one of the whole body's."""
+def estimate_with_ends(found: Estimate, shown: Tracks, tracks: Tracks) -> Estimate:
+    """As :func:`with_ends`, of an estimate of the tracks that were ``shown`` to the method as one of all joints."""
+    some, body = shown.skeleton, tracks.skeleton
     kept = _kept(body, some)
     points, unsure = _placed(found.points, found.deviation, kept, body)
     standing = found.standing
@@ -136,7 +164,8 @@ def estimate_with_ends(found: Estimate, some: Skeleton, body: Skeleton) -> Estim
         points=points - points.mean(1, keepdim=True),
         deviation=unsure,
         standing=standing,
-        alternatives=tuple(estimate_with_ends(other, some, body) for other in found.alternatives),
+        notes=(*found.notes, *(note for note in shown.notes if note.endswith(TAKEN))),
+        alternatives=tuple(estimate_with_ends(other, shown, tracks) for other in found.alternatives),
     )
 
 
@@ -194,11 +223,14 @@ def _least_turn(start: Tensor, end: Tensor) -> Tensor:
     tiny = torch.finfo(start.dtype).tiny
     a, b = (x / x.norm(dim=-1, keepdim=True).clamp_min(tiny) for x in (start, end))
     half = a + b
-    axis = half / half.norm(dim=-1, keepdim=True).clamp_min(tiny)  # half a turn about it, after one about the start
+    beside = torch.nn.functional.one_hot(a.abs().argmin(-1), 3).to(a)
+    opposite = half.norm(dim=-1, keepdim=True) < torch.finfo(a.dtype).eps ** 0.5
+    half = torch.where(opposite, torch.linalg.cross(a, beside, dim=-1), half)
+    half = half / half.norm(dim=-1, keepdim=True).clamp_min(tiny)
     eye = torch.eye(3, dtype=start.dtype, device=start.device)
-    flip = 2 * axis[..., :, None] * axis[..., None, :] - eye
-    first = 2 * a[..., :, None] * a[..., None, :] - eye
-    return flip @ first
+    turns = [2 * axis[..., :, None] * axis[..., None, :] - eye for axis in (half, a)]  # half a turn about each
+    known = (a.norm(dim=-1) > 0) & (b.norm(dim=-1) > 0)
+    return torch.where(known[..., None, None], turns[0] @ turns[1], eye)
 
 
 def _about_its_middle(one: Reconstruction) -> Reconstruction:

@@ -162,7 +162,7 @@ class PKC(Method):
         shown = without_ends(tracks)
         if shown is not tracks:
             found = yield from self._steps(shown, cameras)
-            return estimate_with_ends(found, shown.skeleton, tracks.skeleton)
+            return estimate_with_ends(found, shown, tracks)
         parts = parts_of(tracks)
         if parts:
             return (yield from self._by_parts(tracks, cameras, parts))
