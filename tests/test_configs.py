@@ -178,6 +178,7 @@ def test_names_of_files_need_no_quotes(name):
 def test_parts_of_lists_and_sweeps_need_no_quotes():
     parse = OverridesParser.create().parse_override
     assert parse(_for_hydra("data.train=[ä/*.npz,!b*,c,7]")).value() == ["ä/*.npz", "!b*", "c", 7]
+    assert parse(_for_hydra("data.train=[a*, !ä*,b]")).value() == ["a*", "!ä*", "b"]  # as if nothing had to be quoted
     assert [*parse(_for_hydra("input=ä,b,7")).sweep_string_iterator()] == ["'ä'", "b", "7"]
 
 
@@ -187,6 +188,8 @@ def test_a_folder_of_the_user_is_meant_by_a_tilde(monkeypatch):
         assert sys.argv[1:] == [
             "++data.folder=/home/me/motion", "hydra.run.dir=/home/me", "++data.train='a~b'", "++data.val='~b'",
         ]  # fmt: skip
+    parse = OverridesParser.create().parse_override
+    assert parse(_for_hydra("data.train=[~/a, !~/b,~c]")).value() == ["/home/me/a", "!/home/me/b", "~c"]
 
 
 def test_a_sweep_over_values_that_hold_an_equals_sign():

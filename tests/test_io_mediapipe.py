@@ -164,6 +164,10 @@ def test_the_rate_is_that_of_every_so_many_frames(tmp_path):
     assert any("in steps of 5: each step is taken as one frame, at 1/5 of the video's fps" in n for n in tracks.notes)
     (told,) = read(tmp_path, {"fps": 30, "frames": frames}, fps=12)
     assert told.fps == 12
+    timed = [{**frame, "timestamp_ms": 1000 * t / 6} for t, frame in enumerate(frames)]
+    for rate in (6, 30):  # of these frames, or of all
+        (tracks,) = read(tmp_path, {"fps": rate, "frames": timed})
+        assert tracks.fps == 6
 
 
 @pytest.mark.parametrize("nobody", [{"pose_landmarks": None}, {"pose_landmarks": []}, {"pose_landmarks": [[]]}])

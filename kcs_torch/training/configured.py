@@ -123,12 +123,13 @@ def _quoted(value: str) -> str:
         or (called is not None and called[1] in OverridesParser.create().functions.functions)
     ):
         return value
-    parts = ",".join(part if _is_read(f"x={part}") else _in_quotes(part) for part in inner.split(","))
+    parts = ",".join(part if _is_read(f"x={part}") else _in_quotes(part.strip()) for part in inner.split(","))
     return f"[{parts}]" if listed else parts
 
 
 def _in_quotes(text: str) -> str:
-    """Text in quotes, in which Hydra takes a backslash for one unless a quote follows."""
+    """Text in quotes, in which Hydra takes a backslash for one unless a quote follows; of ~/ the user's folder."""
+    text = re.sub(r"\A(!?)(~(?:/.*)?)\Z", lambda found: found[1] + os.path.expanduser(found[2]), text)
     return "'" + re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + found[2].replace("'", "\\'"), text) + "'"
 
 

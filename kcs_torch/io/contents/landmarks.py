@@ -47,6 +47,7 @@ _ONE_HAND = {
 }
 KEYS = frozenset([*_POSE[:2], *_HANDS, *_ONE_HAND])
 """Keys that only MediaPipe's results have."""
+_UNLIKE = 0.25  # share by which a rate that is told and that of the times differ if they are of other frames
 _LISTS = ("frames", "results", "data", "detections")
 FRAME_KEYS = ("frame", "frame_id", "frame_number", "frame_idx", "frame_index", "index")
 CONFIDENCES = ("confidence", "conf", "score", "likelihood", "probability", "prob", "c")
@@ -123,7 +124,9 @@ def _numbers(listed: Sequence[tuple[int | None, Any, str]], out: Landmarks) -> l
     if out.fps is None:
         out.fps = rate_of_times(out.times, time_unit(key) or "", out.notes)
     else:
-        out.fps /= frame_numbers(sorted(numbers), [])[1]
+        real = rate_of_times(out.times, time_unit(key) or "", [])
+        if real is None or abs(real / out.fps - 1) > _UNLIKE:  # else it is the rate of the frames that are listed
+            out.fps /= frame_numbers(sorted(numbers), [])[1]
     return numbers
 
 
