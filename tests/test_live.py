@@ -244,7 +244,7 @@ def test_the_image_may_be_of_any_size_and_place(clip):
         for given in (frames, 0.01 * frames + 500)
     )
     off = (100 * (b - torch.tensor([500.0, 500, 0])) - a).abs().amax(-1)
-    assert off.median() < 0.1 and (off < 5).double().mean() > 0.98  # whose sign is a toss-up, rounding tells
+    assert off.median() < 0.1 and (off < 5).double().mean() > 0.97  # whose sign is a toss-up, rounding tells
 
 
 def test_without_a_template():
