@@ -57,9 +57,8 @@ def lbfgs(
             left out: true ends the search.
 
     Returns:
-        A :class:`Solution`: the minimisers (H, D); whether all settled within ``num_steps``, at a
-        finite energy; the most steps that one
-        made; where they were ``memory`` steps earlier; and their energies (H,).
+        A :class:`Solution`: the minimisers (H, D); whether all settled within ``num_steps``, at a finite energy; the
+        most steps that one made; where they were ``memory`` steps earlier; and their energies (H,).
 
     Raises:
         ShapeError: ``start`` is not (H, D), or ``energy`` gives no value of each row.

@@ -55,18 +55,16 @@ def ends_of(tracks: Tracks) -> list[int]:
             gone[list(hand.joints[1:])] = True
         elif is_shown(tracks, hand.joints):
             gone[list(hand.joints[1:])] = False
-    kept = {joint for _, sources in body.virtual for joint in sources} | set(trunk_joints(body))
+    trunk = trunk_joints(body)
+    kept = {joint for _, sources in body.virtual for joint in sources} | set(trunk)
     free = {joint for joint in gone.nonzero().flatten().tolist() if joint < body.num_observed and joint not in kept}
-    children: dict[int, list[int]] = {joint: [] for joint in range(body.num_joints)}
-    for parent, child in direct_bones(body.bones, trunk_joints(body)[0]):
-        children[parent].append(child)
-
-    def is_end(joint: int) -> bool:
-        return joint in free and all(is_end(child) for child in children[joint])
-
+    inward = list(_outward(body, trunk))[::-1] if free else []
     twins = [pair for pair in body.mirror if not fingers.issuperset(pair)]
     while True:
-        ends = {joint for joint in free if is_end(joint)}
+        ends = set(free)
+        for _, parent, joint in inward:
+            if joint not in ends:
+                ends.discard(parent)
         alone = {joint for pair in twins if len(ends.intersection(pair)) == 1 for joint in pair} & ends
         if not alone:
             return sorted(ends)
@@ -118,12 +116,10 @@ def with_ends(result: Reconstruction, tracks: Tracks) -> Reconstruction:
     """
     with apart([tracks], differentiates=False):
         made = _with_ends(result, tracks)
-    ends = [joint for joint in tracks.skeleton.joints if joint not in result.skeleton.joints]
-    warnings.warn(
-        f"{tracks.source}: never seen, so placed by the skeleton alone: {', '.join(ends)}",
-        KcsWarning,
-        stacklevel=users_level(),
-    )
+    solved = torch.zeros_like(tracks.weights)  # of others, which no frame shows either, the method has told
+    solved[:, _kept(tracks.skeleton, result.skeleton)] = 1
+    for gone in never_seen(solved, tracks.skeleton):
+        warnings.warn(f"{tracks.source}: {gone}", KcsWarning, stacklevel=users_level())
     return plain(made)
 
 
@@ -133,8 +129,7 @@ def _with_ends(result: Reconstruction, tracks: Tracks) -> Reconstruction:
     kept = _kept(body, some)
     points, weights = torch.zeros_like(tracks.points), torch.zeros_like(tracks.weights)
     points[:, kept], weights[:, kept] = result.tracks.points, result.tracks.weights
-    stale = {*unseen_notes(result.tracks.weights, some), *never_seen(result.tracks.weights, some)}
-    notes = [note for note in result.tracks.notes if note not in stale]
+    notes = [note for note in result.tracks.notes if note not in unseen_notes(result.tracks.weights, some)]
     whole = replace(result.tracks, points=points, weights=weights, skeleton=body)
     whole = replace(whole, notes=(*notes, *unseen_notes(weights, body)))
 
