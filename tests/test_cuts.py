@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from near_cameras import error, filmed, quietly
 
 import kcs_torch as kt
 from kcs_torch.clean import split
@@ -143,6 +144,19 @@ def test_a_cut_is_told_under_perspective_too():
     unsettled = pytest.warns(kt.ConvergenceWarning, match="kcs did not settle")  # across a cut
     with unsettled, pytest.warns(kt.KcsWarning, match="the view jumps at frame 20"):
         kt.reconstruct(moved, method="kcs", intrinsics=(1000, 1000, 500, 500))
+
+
+def test_shots_before_a_near_camera_share_its_lens():
+    """Each at a distance of its own; under parallel rays, 30 to 60 mm off, no more than a rotation tells them apart."""
+    shots = [filmed(nearest, frames=20, yaw=yaw) for nearest, yaw in ((2500.0, 30), (5000.0, 110))]
+    points = torch.cat([tracks.points for tracks, _ in shots])
+    found = quietly(kt.Tracks.from_arrays(points, skeleton="h36m17", fps=30.0, image_size=(1920, 1080)))
+    assert found.intrinsics is not None
+    assert sum("the view jumps at frame 20" in note for note in found.diagnostics.notes) == 1
+    truth = torch.cat([x for _, x in shots])
+    ratio, true = (z[20:].mean() / z[:20].mean() for z in (found.distance, truth[..., 2]))
+    assert abs(float(ratio / true) - 1) < 0.1
+    assert [error(part, x) < 20 for part, (_, x) in zip(found.points.split(20), shots, strict=True)] == [True, True]
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

@@ -172,6 +172,21 @@ def test_slope(skeleton, frames, known, focal):
             assert_close(one, other[part])
 
 
+def test_a_distance_that_steps_where_a_film_was_cut_costs_nothing():
+    rays, depth = 0.1 * normal(11, 4, 2), 0.1 * normal(2, 11, 4, seed=1)
+    far = torch.cat([torch.full((5,), 2.0), torch.full((6,), 3.0)]).double()
+    whole, shots = (PinholeEnergy(CHAIN, rays, far, depth, 30.0, level(rays), cuts=cuts) for cuts in ((), (5,)))
+    step = (30.0 / pinhole.SPEED) ** 2 / (2 * pinhole.INDEPENDENT) + 1 / pinhole.ROOT**2  # and two second differences
+    assert_close(whole(whole.start)[0] - shots(shots.start)[0], torch.full((2,), step).double())
+    lens = torch.ones(2).double(), torch.ones(2, dtype=torch.bool)
+    shots = PinholeEnergy(CHAIN, rays, far, depth, 30.0, level(rays), focal=lens, cuts=(5,))
+    state = shots.start + 0.1 * normal(*shots.start.shape)
+    along = 1e-4 * normal(*state.shape, seed=1)
+    fall = (shots(state + along)[0] - shots(state - along)[0]) / 2
+    assert_close((shots(state)[1] * along).sum(-1), fall, rtol=1e-5, atol=1e-6 * float(shots(state)[0].amax()))
+    assert bool((shots.waves[:5].any(0) != shots.waves[5:].any(0)).all())  # each moves one shot alone
+
+
 def test_unknowns_are_nearly_a_sphere():
     """Steps of one unit change the energy by about as much, whatever they move: few steps of a descent are enough."""
     skeleton, rays, depth, far, _ = walk(30)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     *("BY_SHOTS", "HARDLY", "NO_POSE", "SINGLE", "WEAK_TURN", "Estimate"),
-    *("UNHELD", "extent", "finish", "loose_lengths", "nothing_else", "on_turn"),
+    *("UNHELD", "extent", "finish", "loose_lengths", "note_on_cuts", "nothing_else", "on_turn"),
 ]
 
 WEAK_TURN = 30.0
@@ -275,10 +275,16 @@ def _notes_on_view(clips: Clips, body: Skeleton) -> list[list[str]]:
     """What is said of how each clip's body stands, and of cuts."""
     notes = [[words] if words else [] for words in how_they_stand(clips.points, clips.seen, body, clips.counts)]
     for own, cuts in zip(notes, cuts_of_all(clips.points, clips.seen, body), strict=True):
-        if cuts:
-            more = f" and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else ""
-            own.append(f"the view jumps at frame {', '.join(map(str, cuts[:SHOWN]))}{more}, {BY_SHOTS}")
+        own += note_on_cuts(cuts)
     return notes
+
+
+def note_on_cuts(cuts: Sequence[int]) -> list[str]:
+    """What is said of shots that begin at these frames; nothing where there are none."""
+    if not cuts:
+        return []
+    more = f" and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else ""
+    return [f"the view jumps at frame {', '.join(map(str, cuts[:SHOWN]))}{more}, {BY_SHOTS}"]
 
 
 def _notes_on_tracks(method: Method, tracks: Tracks, pointlike: bool) -> list[str]:

@@ -93,7 +93,9 @@ def slow_waves(frames: int, rate: float, like: Tensor, *, most: int = 12) -> Ten
     return torch.stack([line, *waves], -1)
 
 
-def size_path(image: Tensor, seen: Tensor, skeleton: Skeleton, rate: float) -> tuple[Tensor, Tensor]:
+def size_path(
+    image: Tensor, seen: Tensor, skeleton: Skeleton, rate: float, cuts: Sequence[int] = ()
+) -> tuple[Tensor, Tensor]:
     """Relative size of the body's image in each frame, and how well it tells each bone's.
 
     log |bone's image| = log length + log size + (what foreshortening takes away, never negative). The size's log is a
@@ -105,17 +107,18 @@ def size_path(image: Tensor, seen: Tensor, skeleton: Skeleton, rate: float) -> t
         seen: (T, N) bool.
         skeleton: whose rigid bones are used; all pairs of joints where it has none.
         rate: frames a second.
+        cuts: first frames of the shots but the first, where the size may step.
 
     Returns:
         (T,), positive, of geometric mean 1; and (P,), by how much smaller each pair's deviation is with it, as a share.
     """
-    path, gain = _paths(image[None], seen[None], skeleton, slow_waves(len(image), rate, image)[None], (len(image),))
+    path, gain = _paths(image[None], seen[None], skeleton, _waves(image, rate, cuts)[None], (len(image),))
     return path[0], gain[0]
 
 
-def weak_perspective(image: Tensor, seen: Tensor, skeleton: Skeleton, rate: float) -> Size:
+def weak_perspective(image: Tensor, seen: Tensor, skeleton: Skeleton, rate: float, cuts: Sequence[int] = ()) -> Size:
     """The :class:`Size` that :func:`size_path` finds, and whether the tracks clearly ask for it."""
-    return _judged(*size_path(image, seen, skeleton, rate))
+    return _judged(*size_path(image, seen, skeleton, rate, cuts))
 
 
 def weak_perspectives(tracks: Sequence[Tracks]) -> list[Size]:
@@ -123,7 +126,7 @@ def weak_perspectives(tracks: Sequence[Tracks]) -> list[Size]:
 
     def solve(some: list[Tracks]) -> list[Size]:
         clips = Clips.of(some)
-        waves = [_waves(one) for one in some]
+        waves = [_waves(one.points, one.rate, cuts_of(one)) for one in some]
         most = max(each.shape[1] for each in waves)
         wide = [torch.nn.functional.pad(each, (0, most - each.shape[1])) for each in waves]
         paths, gains = _paths(clips.points, clips.weights > 0, some[0].skeleton, padded(wide), clips.counts)
@@ -132,12 +135,12 @@ def weak_perspectives(tracks: Sequence[Tracks]) -> list[Size]:
     return in_batches(tracks, solve)
 
 
-def _waves(tracks: Tracks) -> Tensor:
+def _waves(image: Tensor, rate: float, cuts: Sequence[int]) -> Tensor:
     """What the log of the size may be a sum of, (T, W): slow waves, and steps at the cuts of the film."""
-    waves, cuts = slow_waves(tracks.num_frames, tracks.rate, tracks.points), cuts_of(tracks)
+    waves = slow_waves(len(image), rate, image)
     if not cuts:
         return waves
-    time = torch.arange(tracks.num_frames, device=waves.device)[:, None]
+    time = torch.arange(len(image), device=waves.device)[:, None]
     later = (time >= torch.tensor(cuts, device=waves.device)).to(waves)
     return torch.cat([waves, later - later.mean(0)], 1)
 

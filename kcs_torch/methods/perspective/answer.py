@@ -10,7 +10,16 @@ from torch import Tensor
 
 from kcs_torch.clean.detector import detected
 from kcs_torch.functional.camera import complete_rotation, viewpoint_turn
-from kcs_torch.methods.answer.finish import HARDLY, SINGLE, UNHELD, loose_lengths, nothing_else, on_turn
+from kcs_torch.methods.answer.finish import (
+    BY_SHOTS,
+    HARDLY,
+    SINGLE,
+    UNHELD,
+    loose_lengths,
+    note_on_cuts,
+    nothing_else,
+    on_turn,
+)
 from kcs_torch.methods.answer.root import ABSENT, FOUND
 from kcs_torch.methods.answer.wrong import WHY_LOOSE, what_is_wrong
 from kcs_torch.methods.base import Method
@@ -155,8 +164,8 @@ def _doubt(method: Method, found: Found, k: int, turn: float) -> str:
 def _notes_on_solution(method: Method, found: Found, k: int, made: Reconstruction, images: Tensor) -> list[str]:
     """What is said of solution number ``k``: what the method said of the tracks, and what is true of this one."""
     tracks, facts, before = made.tracks, made.diagnostics, found.lifted[0].diagnostics.doubt
-    # True of what was lifted, perhaps not of this.
-    stale = [WHY_LOOSE, UNHELD, HARDLY, SINGLE, SEEMS_NEAR, "weak perspective", "did not settle"]
+    # True of what was lifted, perhaps not of this; straightened tracks do not leap where a film was cut.
+    stale = [WHY_LOOSE, UNHELD, HARDLY, SINGLE, SEEMS_NEAR, BY_SHOTS, "weak perspective", "did not settle"]
     if k:
         stale.append(SEE_OTHERS)
     notes = [
@@ -164,6 +173,7 @@ def _notes_on_solution(method: Method, found: Found, k: int, made: Reconstructio
         for note in found.notes
         if not note.startswith((ABSENT, FOUND)) and note != before and not any(part in note for part in stale)
     ]
+    notes += note_on_cuts(found.view.cuts)
     if not facts.converged:
         notes.append(method.unsettled(found.steps))
     notes += on_turn(method, tracks, facts.viewpoint_turn, facts.doubt)

@@ -12,6 +12,7 @@ from kcs_torch.clean.detector import detected
 from kcs_torch.clean.timing import cuts_of
 from kcs_torch.methods.answer.finish import extent
 from kcs_torch.methods.perspective.calibrated import WIDE, feet_on_ground
+from kcs_torch.methods.perspective.image_lens import lens_of_image
 from kcs_torch.methods.perspective.parallel_image import body_unit, clean_image, image_noise
 from kcs_torch.methods.perspective.pinhole import PinholeEnergy
 from kcs_torch.methods.perspective.pinhole_coordinates import FIRM, USUAL
@@ -57,12 +58,14 @@ EVERY, HOPELESS, AWAY = 20, 10.0, 6.5
 
 
 def may_be_near(tracks: Tracks) -> bool:
-    """Whether perspective can be told: from a body with a template and a whole trunk, in one shot of one camera.
+    """Whether perspective can be told: from a body with a template and a whole trunk.
+
+    Of several shots only where the image tells the lens: under parallel rays each shot looks as near as any other.
 
     Hips alone, with the legs, lie on a line: what turns about it looks like perspective.
     """
     body = tracks.skeleton
-    if not has_trunk(body) or cuts_of(tracks):
+    if not has_trunk(body) or (cuts_of(tracks) and lens_of_image(tracks) is None):
         return False
     trunk = body.template_points(dtype=torch.float64)[trunk_joints(body)]
     long, wide, _ = torch.linalg.svdvals(trunk - trunk.mean(0)).tolist()
@@ -142,7 +145,7 @@ def is_far(near: Reconstruction, lifted: Reconstruction) -> bool:
 
     def cost(view: View, path: Tensor, depth: Tensor) -> float:
         depth = (depth - depth.mean(-1, keepdim=True))[None]
-        energy = PinholeEnergy(outward(tracks.skeleton), view.rays, path, depth, rate, noise)
+        energy = PinholeEnergy(outward(tracks.skeleton), view.rays, path, depth, rate, noise, cuts=view.cuts)
         found = lbfgs(energy, energy.start, num_steps=2 * STEPS, tolerance=1e-6, slopes=True)
         assert found.energy is not None
         return float(found.energy[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import copy
 from typing import NamedTuple
 
@@ -108,6 +109,7 @@ class PinholeEnergy:
         focal: (H,) where the search for a focal length starts, over that of the rays' camera, and which are free (H,);
             None where it is known.
         usual: focal length of usual lenses, over that of the rays' camera; None where nothing tells.
+        cuts: first frames of all shots of the film but the first, where the distance steps.
 
     Attributes:
         start: (H, D) the unknowns of the start.
@@ -125,7 +127,9 @@ class PinholeEnergy:
         standing: Tensor | None = None,
         focal: tuple[Tensor, Tensor] | None = None,
         usual: float | None = None,
+        cuts: Sequence[int] = (),
     ) -> None:
+        self.cuts = list(cuts)
         self.slow = 30.0 / rate  # more frames a second tell no more, and move less from one to the next
         self.skeleton, self.rate, self.known = skeleton, rate, lengths is not None
         self.rays = rays.permute(2, 1, 0).contiguous()  # (2, N, T)
@@ -145,7 +149,11 @@ class PinholeEnergy:
             ratio = median(lengths / self.lengths, -1, keepdim=True)
             self.path, self.lengths = self.path * ratio, lengths
             self.depth, self.own = self.depth * ratio[..., None], self.own * ratio[..., None]
-        self.waves = _waves(rays, rate)[:, 0 if self.known else 1 :]  # (T, K); unknown lengths make up for the first
+        waves = torch.block_diag(*(_waves(shot, rate) for shot in rays.tensor_split(self.cuts)))
+        self.waves = waves[:, 0 if self.known else 1 :]  # (T, K); unknown lengths make up for the first
+        self.follows = rays.new_ones(len(rays))  # (T,) 0 in the first frames of shots
+        self.follows[self.cuts] = 0
+        self.bends = self.follows * self.follows.roll(1)  # (T,) and in their second ones
         self.rough = (ROOT * self.slow**2) ** -2
         self.model: Objective | None = None
         self.body: ObjectiveGradient | PlainBody
@@ -264,10 +272,10 @@ class PinholeEnergy:
     def _steady(self, distance: Tensor) -> tuple[Tensor, Tensor]:
         """What speed and changes of it cost, (H,), and the slope in the distance (H, T)."""
         quick = (self.rate / SPEED) ** 2 * self.slow / INDEPENDENT
-        pull = quick * distance.diff()
+        pull = quick * distance.diff() * self.follows[1:]
         slope = _gathered(pull)
         value = (pull * distance.diff()).sum(-1) / 2
-        return value + bend_cost(distance[:, None], self.rough, slope[:, None]), slope
+        return value + bend_cost(distance[:, None], self.rough, slope[:, None], self.bends), slope
 
     def _contact(self, laid: _Laid, distance: Tensor, deep: Tensor, along: Tensor, shrink: Tensor) -> Tensor:
         """What standing feet cost that move along their rays, (H,); adds to slopes in depths, distance and w."""
@@ -280,7 +288,7 @@ class PinholeEnergy:
         steep = (1 + laid.wide.square()[..., None] * slant).sqrt()
         where = distance[:, None] + laid.depth[:, feet]
         step = (where * steep).diff()
-        both = torch.minimum(model.standing[1:], model.standing[:-1]).mT * model.weights.contact
+        both = torch.minimum(model.standing[1:], model.standing[:-1]).mT * model.weights.contact * self.follows[1:]
         ratio = step / model.feet.slip**2
         value = (both * (ratio * step).log1p()).sum((1, 2)) / 2
         pull = both * ratio / (1 + ratio * step)

@@ -69,16 +69,19 @@ def coordinates(energy: PinholeEnergy, image: Tensor) -> tuple[Tensor, Tensor, T
     own = (pull * (size - dz * shear / size).square()).sum(-1) + 1 / FREE**2
     own = own + shear.diff(n=2).square().sum(-1) / acceleration**2
     left = (pull * (flat / size - dz * drift / size).square()).sum(1)  # (H, T)
-    steps = [energy.waves.diff(n=n, dim=0).square().sum(0) for n in (1, 2)]  # (K,) each
+    steps = [  # (K,) each
+        (real[n:, None] * energy.waves.diff(n=n, dim=0)).square().sum(0)
+        for n, real in ((1, energy.follows), (2, energy.bends))
+    ]
     waves = left @ energy.waves.square() + 1 / STRAY**2
     waves = waves + distance.square().mean(-1, keepdim=True) * steps[1] * energy.rough
     waves = waves + drift.square().mean(-1).sum(-1, keepdim=True) * steps[1] / acceleration**2
     focus = (pull * ((slid - dz * lean) / size).square()).sum((1, 2)) + FIRM
     focus = focus + lean.diff(n=2).square().sum((1, 2)) / acceleration**2
-    focus = focus + distance.diff(n=2).square().sum(-1) * energy.rough
+    focus = focus + (energy.bends[2:] * distance.diff(n=2)).square().sum(-1) * energy.rough
     if model is not None and model.standing is not None and model.standing.numel():
         firm = model.weights.contact / model.feet.slip**2
-        both = torch.minimum(model.standing[1:], model.standing[:-1])
+        both = torch.minimum(model.standing[1:], model.standing[:-1]) * energy.follows[1:, None]
         each = torch.nn.functional.pad(both, (0, 0, 0, 1)) + torch.nn.functional.pad(both, (0, 0, 1, 0))
         lines = energy.lines[list(energy.skeleton.contacts)]  # (C, B)
         curve = curve + firm * lines.mT.square() @ each.mT

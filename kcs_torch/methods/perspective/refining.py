@@ -118,9 +118,10 @@ def refine(
     start = start - start.mean(-1, keepdim=True)
     own = body_unit(lifted)
     unit = unit or own
-    scales = slow_part(lifted.scales.clamp_min(1e-9).log()[:, None], rate)[:, 0].exp()  # a method's own may jump
+    scales = lifted.scales.clamp_min(1e-9).log()[:, None]
+    scales = slow_part(scales, rate, view.cuts)[:, 0].exp()  # a method's own may jump
     noise = image_noise(lifted.tracks, flat, own)
-    scene = Scene(outward(lifted.skeleton), rays, noise, rate, unit, standing, usual=usual)
+    scene = Scene(outward(lifted.skeleton), rays, noise, rate, unit, standing, view.cuts, usual=usual)
     parallax = float((rays.norm(dim=-1) * start[0]).square().mean().sqrt()) / own
     if parallax < FLAT or not lifted.skeleton.num_bones:
         energy = start.new_tensor([o.objective for o in others])

@@ -88,6 +88,7 @@ class Scene:
         rate: frames a second.
         unit: the length that 1 stands for in a body of 1.75, in units of the distance.
         standing: (T, C) how surely the skeleton's contact points stand still, or None where nothing tells.
+        cuts: first frames of all shots of the film but the first.
         any_focal: whether the focal length is to be found, too.
         usual: focal length of usual lenses, over that of the rays; None where nothing tells.
     """
@@ -98,13 +99,18 @@ class Scene:
     rate: float
     unit: float
     standing: Tensor | None
+    cuts: tuple[int, ...] = ()
     any_focal: bool = False
     usual: float | None = None
 
     def during(self, time: slice) -> Scene:
         """That of some frames."""
         standing = None if self.standing is None else self.standing[time]
-        return replace(self, rays=self.rays[time], noise=self.noise[time], standing=standing)
+        return replace(self, rays=self.rays[time], noise=self.noise[time], standing=standing, cuts=self._cuts(time))
+
+    def _cuts(self, time: slice) -> tuple[int, ...]:
+        """The cuts within some frames, counted from their first."""
+        return tuple(cut - time.start for cut in self.cuts if time.start < cut < time.stop)
 
     def refined(
         self,
@@ -145,7 +151,7 @@ class Scene:
             lens = focal, torch.full_like(focal, free and lengths is None, dtype=torch.bool)
             pinhole = PinholeEnergy(
                 self.skeleton, self.rays[some], path[some], depth[:, some] / self.unit, self.rate, self.noise[some],
-                lengths, feet, lens if self.any_focal else None, self.usual,
+                lengths, feet, lens if self.any_focal else None, self.usual, self._cuts(some),
             )  # fmt: skip
             solution = lbfgs(pinhole, pinhole.start, num_steps=steps, tolerance=1e-6, slopes=True, part=pinhole.rows)
             assert solution.energy is not None and solution.before is not None

@@ -10,6 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
+from kcs_torch.clean.timing import cuts_of
 from kcs_torch.errors import KcsWarning, OptionError
 from kcs_torch.methods.answer.finish import Estimate
 from kcs_torch.methods.base import Method, apart, check_cameras
@@ -48,8 +49,8 @@ def reconstruct_uncalibrated(
     through the lens that such a camera usually has (:func:`lens_of_image`). Where nothing tells of the image, PKC
     solves them as if rays were parallel, but ends where it has found a body whose camera seems near all the same
     (:func:`likely_lens`), before it turns runs of signs over; the principal point is then taken to be the tracks'
-    middle. Either way the focal length is found together with depths, lengths, distances and signs by
-    :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
+    middle. Of several shots of a film only the image tells whether they are near. Either way the focal length is found
+    together with depths, lengths, distances and signs by :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
 
     Args:
         method: any.
@@ -96,7 +97,8 @@ def _by_tracks(
     """A body before a camera of which the tracks tell whether it is near."""
     judge = method if isinstance(method, PKC) else PKC()
     result = looking(judge)(tracks, cameras) if lifted is None else lifted
-    lens = None if SEEMS_FAR in result.diagnostics.notes else likely_lens(result, cameras)
+    far = SEEMS_FAR in result.diagnostics.notes or bool(cuts_of(tracks))
+    lens = None if far else likely_lens(result, cameras)
     if lens is not None and likely is not None:
         return _by_image(method, tracks, cameras, likely)
     if lens is not None:
@@ -167,7 +169,7 @@ class _Looking(PKC):
 
     def _steps(self, tracks: Tracks, cameras: Tensor | None) -> Search[Any, Any, Estimate]:
         # in longer clips no signs are turned over under perspective
-        asked = tracks.num_frames <= BLOCK and may_be_near(tracks)
+        asked = tracks.num_frames <= BLOCK and may_be_near(tracks) and not cuts_of(tracks)
         return super()._steps(tracks, cameras) if asked else _as(PKC, self)._steps(tracks, cameras)
 
     def _for_hands(self) -> PKC:
