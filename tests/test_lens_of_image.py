@@ -296,13 +296,15 @@ def test_a_far_camera_tells_no_lens_for_others(monkeypatch):
 
 
 def test_who_may_not_be_near_has_no_lens_of_others():
-    """A person whom two cameras show, one after the other, and joints without a template."""
+    """Joints without a template; a person whom two shots show has it."""
     shown, other = (aside(frames=24, x=x)[0] for x in (-900.0, 900.0))
     cut = replace(other, points=torch.cat([other.points[:12], other.points[12:] * 0.6 + 300.0]))
     bare = replace(other, skeleton=kt.Skeleton(other.skeleton.joints, other.skeleton.bones, name="bare"))
     people = [replace(one, source=f"a.json, person {k}") for k, one in enumerate((shown, cut, bare))]
-    assert [may_be_near(one) for one in people] == [True, False, False]
-    assert [*by_one_lens(kt.PKC(), people)] == [0]
+    assert [may_be_near(one) for one in people] == [True, True, False]
+    assert not may_be_near(replace(cut, units="mm"))  # nothing tells of the image
+    with pytest.warns(kt.KcsWarning, match="person 1: the view jumps at frame 12"):
+        assert [*by_one_lens(kt.PKC(), people)] == [0, 1]
 
 
 def test_shots_of_one_person_may_have_several_cameras():
