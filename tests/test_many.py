@@ -283,6 +283,11 @@ def test_names_that_would_meet_keep_their_suffix(tmp_path):
     assert targets == {"a.json", "a.csv", "b"}
 
 
+def test_the_folder_itself_is_no_clip(tmp_path):
+    (tmp_path / "in" / "walk").mkdir(parents=True)
+    assert [clip.name for clip in clips_of(tmp_path / "in", tmp_path / "out", "**")] == ["walk"]
+
+
 def test_results_in_the_input_are_no_clips(tmp_path):
     source = make_clips(tmp_path / "in", 2)
     run(source, source / "out")
@@ -299,6 +304,7 @@ def test_results_in_the_input_are_no_clips(tmp_path):
         ({"retry": "no"}, "retry: expected true or false, got 'no'"),
         ({"pattern": "*.xyz"}, "found none"),
         ({"suffixes": [".doc"]}, "suffix"),
+        ({"suffixes": None}, "suffixes: expected a list of some, such as .npz, got None"),
         ({"beta": 1}, "beta"),
     ],
 )
@@ -492,6 +498,21 @@ def test_what_was_changed_since_is_told(tmp_path):
     os.utime(source / "clip1.npz", (later, later))
     again = run(source, tmp_path / "out")
     assert (again.skipped, again.outdated) == (2, (source / "clip1.npz",))
+
+
+def test_a_file_of_a_folder_that_was_changed_since_is_told(tmp_path):
+    """A folder's own time tells of files that come and go, not of one that is written anew."""
+    clip = tmp_path / "walk"
+    clip.mkdir()
+    (clip / "f0.json").touch()
+    (made,) = clips_of(tmp_path, tmp_path / "out")
+    result = tmp_path / "result.npz"
+    result.touch()
+    for path, time_of in ((clip / "f0.json", 10), (clip, 10), (result, 20)):
+        os.utime(path, (time_of, time_of))
+    assert not made.is_newer_than([result])
+    os.utime(clip / "f0.json", (30, 30))
+    assert made.is_newer_than([result])
 
 
 def test_a_number_is_the_same_however_it_is_written(clips, tmp_path):

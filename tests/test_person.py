@@ -41,6 +41,8 @@ def test_every_person_is_one_tree(name):
         ["left_hip", "hip_left", "right_hip", "left_knee"],  # two names of one place
         ["left_elbow", "left_wrist", "right_elbow", "right_wrist"],  # two pieces
         ["left_hip", "left_knee", "pelvis", "left_shoulder"],  # a shoulder that nothing links
+        ["neck", "nose", "left_eye", "right_eye"],  # a head alone
+        ["pelvis", "spine", "neck", "head"],  # a trunk alone
         SKELETONS["ap10k"].joints,
         SKELETONS["hand21"].joints,
         ["joint0", "joint1", "joint2"],
@@ -48,6 +50,47 @@ def test_every_person_is_one_tree(name):
 )
 def test_others_are_none(names):
     assert person_by_names(list(names)) is None
+
+
+@pytest.mark.parametrize(
+    ("names", "edges"),
+    [
+        (["neck", "nose", "left_eye", "right_eye"], [(0, 1), (1, 2), (1, 3)]),
+        (["pelvis", "spine", "neck", "head"], [(0, 1), (1, 2), (2, 3)]),
+    ],
+)
+def test_a_head_or_a_trunk_alone_keeps_its_edges(names, edges):
+    body = kt.Tracks.from_arrays(torch.rand(20, 4, 2), joint_names=names, edges=edges).skeleton
+    assert body.bones == tuple(edges) and body.is_tree and body.template is None
+    assert not kt.Tracks.from_arrays(torch.rand(20, 4, 2), joint_names=names).skeleton.bones
+
+
+def test_fingers_hang_on_an_arm_of_bones_named_by_their_far_ends():
+    body = person_by_names(["l_humerus", "l_radius", "l_wrist", "l_thumb2", "l_thumb3"])
+    assert body.bone_names[-2:] == ("l_wrist-l_thumb2", "l_thumb2-l_thumb3") and body.template is not None
+
+
+MIXAMO = (
+    "Hips Spine Spine1 Spine2 Neck Head HeadTop_End LeftShoulder LeftArm LeftForeArm LeftHand RightShoulder RightArm "
+    "RightForeArm RightHand LeftUpLeg LeftLeg LeftFoot RightUpLeg RightLeg RightFoot"
+)
+UNREAL = (
+    "pelvis spine_01 spine_02 spine_03 neck_01 head clavicle_l upperarm_l lowerarm_l hand_l clavicle_r upperarm_r "
+    "lowerarm_r hand_r thigh_l calf_l foot_l ball_l thigh_r calf_r foot_r ball_r"
+)
+
+
+@pytest.mark.parametrize(
+    ("names", "bones"),
+    [
+        (MIXAMO.split(), {"Head-HeadTop_End", "Spine2-Neck", "LeftForeArm-LeftHand"}),
+        (UNREAL.split(), {"pelvis-spine_01", "spine_03-neck_01", "neck_01-head", "foot_l-ball_l"}),
+    ],
+    ids=["Mixamo", "Unreal"],
+)
+def test_names_of_animation_software(names, bones):
+    body = person_by_names(names)
+    assert bones <= set(body.bone_names) and body.is_tree and body.template is not None
 
 
 def test_an_arm_needs_no_middle():

@@ -55,6 +55,7 @@ def test_from_edges_finds_what_names_tell():
     assert body.template is not None
     assert Skeleton.from_edges([[0, 1]], ["tail1", "tail2"]).template is None
     assert Skeleton.from_edges([[0, 1]], 2).joints == ("joint0", "joint1")
+    assert Skeleton.from_edges([[0, 1]], np.int64(2)).joints == ("joint0", "joint1")
     hand = SKELETONS["hand21"]
     assert Skeleton.from_edges(hand.bones, hand.joints).template == hand.template
     # names of a built-in skeleton take its template, also where the names alone would say otherwise
@@ -86,6 +87,8 @@ def test_hinges():
     assert leg(hinges=[]).hinges == ()
     told = KNEE | {"axis": ["right_hip", "left_hip"], "weight": 0.5, "bends": "forward", "child": None}
     assert leg(hinges=[told]).hinges == (Hinge(0, 2, 3, left=1, right=0, sign=-1.0, firm=0.5),)
+    numbers = {"mirror": [(1, 2)], "bones": [(1, 2), (1, 3), (3, 4)]}  # as YAML reads names
+    assert Skeleton.from_names([1, 2, 3, 4], hinges=[KNEE | {"joint": 3}], **numbers).hinges == (expected,)
     # the ends may be given, also against the direction of the bones
     bend = {"joint": "b", "bends": "backward", "parent": "a", "child": "c", "axis": ["a", "d"]}
     turned = Skeleton.from_names("abcd", [("b", "a"), ("c", "b"), ("c", "d")], hinges=[bend])
@@ -237,6 +240,7 @@ def test_graphs_are_admitted_when_asked_for():
         (lambda: ARM.index("elbw"), "did you mean 'elbow'"),
         (lambda: ARM.template_points(), "has no template"),
         (lambda: get_skeleton("mpi16"), "did you mean 'mpii16'"),
+        (lambda: get_skeleton("x" * 5000), "unknown skeleton 'xxx"),
     ],
 )
 def test_errors(make, message):
@@ -325,6 +329,8 @@ def test_connected():
     whole = body.connected()
     assert len(whole.pieces()) == 1 and whole.bones[: body.num_bones] == body.bones
     assert [whole.bones[i] for i in whole.flexible] == [(2, 0), (2, 5)]
+    places = ((0, 0, 0), (1, 0, 0), (0, 0, 0), (0, 1, 0))  # two pieces that meet in one place
+    assert Skeleton("abcd", ((0, 1), (2, 3)), tree=False, template=places).connected().bones[2] == (1, 2)
     names = ("left_hip", "left_knee", "left_ankle", "right_hip")
     apart = Skeleton.from_edges([[0, 1], [1, 2]], names, tree=False)
     joined = apart.connected()

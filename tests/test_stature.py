@@ -22,6 +22,12 @@ def test_the_template_of_every_built_in_person_is_175_tall(name):
     assert found.tolist() == pytest.approx([1.75, 1.75], rel=0.001)
 
 
+@pytest.mark.parametrize("name", ["halpe26", "mpi15"])
+def test_what_these_detectors_call_head_is_its_top(name):
+    body, other = get_skeleton(name), get_skeleton("mpii16")
+    assert body.template[body.index("Head")] == other.template[other.index("head_top")]
+
+
 def test_nothing_above_the_neck_counts_twice():
     body = get_skeleton("body25b")  # UpperNeck - HeadTop - Nose - LEye - LEar
     left = dict(zip(body.bone_names, stature_weights(body)[0].tolist(), strict=True))

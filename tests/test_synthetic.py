@@ -1,6 +1,7 @@
 """The generator of walking people and random motion keeps what it promises."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from kcs_torch.data import random_motion, walking_person
 from kcs_torch.data.gait import STRIDE_METRES, STRIDE_SECONDS
 from kcs_torch.errors import OptionError, SkeletonError
 from kcs_torch.functional import bone_lengths, bone_vectors, complete_rotation
-from kcs_torch.skeleton import SKELETONS, Skeleton
+from kcs_torch.skeleton import SKELETONS, Skeleton, person_by_names
 
 HUMANS = sorted(set(SKELETONS) - {"ap10k", "hand21"})
 FRONT = {"yaw": 0.0, "pitch": 0.0, "turn": 0.0}  # the camera frame is the world: the person walks towards -z
@@ -178,6 +179,17 @@ def test_random_motion_of_any_forest(body, num_frames, seed):
     assert 0 < lengths[0].sum() <= 500 + 1e-9
 
 
+def test_bones_on_the_way_from_a_virtual_joint_to_its_sources_are_rigid():
+    """A neck, the middle of shoulders that hang on collar bones."""
+    parts = ("clavicle", "shoulder", "elbow")
+    body = person_by_names([f"{side}_{part}" for part in parts for side in ("left", "right")])
+    clip = random_motion(body, 40, generator=seeded())
+    lengths = bone_lengths(clip.points, body.bones)
+    assert (lengths - lengths[0]).abs().max() < 1e-9
+    ((neck, shoulders),) = body.virtual
+    assert torch.allclose(clip.points[:, neck], clip.points[:, list(shoulders)].mean(1))
+
+
 def test_random_motion_keeps_given_proportions():
     body = Skeleton.from_names(["a", "b", "c"], [("a", "b"), ("b", "c")], proportions={"a-b": 1, "b-c": 3})
     clip = random_motion(body, 5, size=100.0, generator=seeded())
@@ -216,12 +228,13 @@ def test_skeletons_that_do_not_fit():
         random_motion(Skeleton.from_edges([], 3, tree=False))
 
 
-def test_a_template_in_another_unit_gives_the_same_person():
+def test_a_template_in_another_unit_or_elsewhere_gives_the_same_person():
     names, bones = ["LHip", "LKnee", "LAnkle"], [("LHip", "LKnee"), ("LKnee", "LAnkle")]
     metres = Skeleton.from_names(names, bones, template="human")
     inches = Skeleton.from_names(
         names, bones, template={j: [39.37 * c for c in p] for j, p in zip(names, metres.template, strict=True)}
     )
     bare = Skeleton.from_names(names, bones)
-    for body in (inches, bare):
+    shifted = replace(metres, template=[(x, y - 0.9, z + 3) for x, y, z in metres.template])
+    for body in (inches, bare, shifted):
         assert torch.allclose(walking_person(9, skeleton=body).points, walking_person(9, skeleton=metres).points)

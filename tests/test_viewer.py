@@ -310,6 +310,13 @@ def test_title_and_summary_are_on_the_page(result):
     assert summarise(result) in [e["text"] for e in page.all("p")]
     assert {"é <b>", "made for a test"} <= {e["text"] for e in page.all("li")}
     assert Page(player(result, title="A & B")).all("title")[0]["text"] == "A & B"
+    with pytest.raises(OptionError, match="title: expected text or none, got 5"):
+        player(result, title=5)
+
+
+def test_a_page_can_be_written_whatever_bytes_a_files_name_holds(result):
+    tracks = replace(result.tracks, source="walk\udcff.npz", notes=("walk\udcff.npz: read",))
+    assert "walk?.npz: read" in player(replace(result, tracks=tracks)).encode().decode()
 
 
 def test_doubts_are_in_the_head_of_the_page(result):

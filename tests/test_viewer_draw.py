@@ -143,6 +143,8 @@ def test_wrong_frames_are_told():
         draw_tracks(tracks(), frame=5)
     with pytest.raises(OptionError, match="at least one person"):
         draw_tracks([])
+    with pytest.raises(OptionError, match="expected Tracks, got ndarray"):
+        draw_tracks(np.zeros((3, 17, 2)))
 
 
 def test_what_is_no_frame_and_a_skeleton_by_its_name():

@@ -36,7 +36,7 @@ _CENTRE_NAMES = _spellings(
         "lowerneck": "lowerneck neck0",
         "upperneck": "upperneck necktop",
         "head": "head headcenter headcentre",
-        "headtop": "headtop topofhead tophead vertex headend",
+        "headtop": "headtop topofhead tophead vertex headend headtopend",
         "nose": "nose",
         "mouth": "mouth midmouth",
         "chin": "chin jaw",
@@ -152,7 +152,7 @@ def part_of(name: str, kind: str) -> str | None:
     name = name.rsplit(":", 1)[-1]  # "mixamorig:LeftArm"
     found = _side_span(name)
     rest = name if found is None else name[: found[1]] + " " + name[found[2] :]
-    key = "".join(_WORD.findall(rest)).lower()
+    key = "".join(word.lstrip("0") or "0" for word in _WORD.findall(rest)).lower()  # "spine_01" is "spine1"
     keys = [key, key.removesuffix("joint")]
     if kind == "hand":
         table = {**_HAND_NAMES, "wrist": "wrist"}

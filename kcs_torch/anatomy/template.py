@@ -17,12 +17,13 @@ from kcs_torch.anatomy.names import FINGER_JOINTS, part_of, side_of
 from kcs_torch.anatomy.quadruped import PLACES, quadruped_places
 from kcs_torch.errors import SkeletonError, unknown
 
-__all__ = ["KINDS", "places_by_names", "places_of_known", "share_of_stature", "template_by_names"]
+__all__ = ["KINDS", "STATURE", "places_by_names", "places_of_known", "share_of_stature", "template_by_names"]
 
 KINDS = ("human", "hand", "quadruped")
 """Bodies whose template the names of joints tell."""
 
 STATURE = 1.75
+"""Metres, of the person of the template."""
 
 Point = tuple[float, float, float]
 
@@ -115,7 +116,7 @@ def _hanging_hand() -> dict[str, Point]:
 
 _LEFT_FINGERS = _hanging_hand()
 # A sided joint of these says that its fingers are those of a whole person.
-_ABOVE_HANDS = frozenset(["hip", "knee", "ankle", "shoulder", "arm", "elbow"])
+_ABOVE_HANDS = frozenset(["hip", "knee", "ankle", "shoulder", "arm", "humerus", "elbow"])
 
 
 def template_by_names(kind: str, names: Sequence[str]) -> tuple[Point, ...]:

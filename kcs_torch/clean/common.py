@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.types import Tracks
-from kcs_torch.types.intake import RATES, as_number
+from kcs_torch.types.intake import as_number, check_rate
 
 __all__ = [
     "Array",
@@ -69,16 +69,6 @@ def frame_rate(own: float | None, given: float | None, what: str, source: str) -
             f"{what}: {source} does not say how many frames a second it has: give fps=... (kcs-torch: --fps)"
         )
     return check_rate(own if given is None else given, f"{what}: fps")
-
-
-def check_rate(value: Any, what: str) -> float:
-    """Frames a second that tracks may have.
-
-    Raises:
-        OptionError: it is no positive number, or far from any camera's.
-    """
-    expected = f"a positive number of frames a second, {RATES[0]:g} to {RATES[1]:g}"
-    return number(value, what, expected, above=math.nextafter(RATES[0], 0), below=math.nextafter(RATES[1], math.inf))
 
 
 def runs(seen: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcs_torch.anatomy import template_by_names
+from kcs_torch.anatomy import STATURE, template_by_names
 from kcs_torch.data.gait import STRIDE_SECONDS, joint_segments, outer, rank, segment_rotations, walking_path
 from kcs_torch.errors import OptionError, SkeletonError
 from kcs_torch.functional import bone_lengths, bone_vectors, chain_inverse, incidence, orbit, points_from_bones
@@ -20,7 +20,6 @@ from kcs_torch.types.hints import is_a
 
 __all__ = ["SyntheticClip", "random_motion", "walking_person"]
 
-_STATURE = 1.75  # metres, of the template
 _GAP = 5  # frames for which a hidden joint stays hidden, at least
 _RANGES = {
     "num_frames": (1, math.inf, "a whole number, at least 1"),
@@ -104,7 +103,7 @@ def walking_person(
     points = _pose(body, turned, bone_vectors(rest, body.bones))
     anchor = int(rest.norm(dim=-1).argmin())  # the joint nearest to the middle of the hips goes where that goes
     place = walking_path(phase) + rotations[segments[anchor]] @ rest[anchor]  # (T, 3)
-    points = (points - points[:, anchor : anchor + 1] + place[:, None]) * (1000 * height / _STATURE)
+    points = (points - points[:, anchor : anchor + 1] + place[:, None]) * (1000 * height / STATURE)
     return _film(points, body, fps, yaw, pitch, turn, noise, missing, generator, dtype, "walking_person")
 
 
@@ -141,8 +140,8 @@ def random_motion(
         dtype: of all results.
 
     Returns:
-        The clip. Bones from a virtual joint to its sources turn together, so that it stays their mean; without a
-        template they do so in vain, and its bones are not rigid.
+        The clip. The bones between a virtual joint and its sources turn together, so that it stays their mean;
+        without a template they do so in vain, and its bones are not rigid.
 
     Raises:
         SkeletonError: the skeleton has a closed chain, or no bone.
@@ -190,7 +189,10 @@ def _check(**numbers: float) -> None:
 
 
 def _rest_pose(body: Skeleton) -> tuple[Tensor, list[str]]:
-    """Rest positions (N, 3) in metres, for a stature of 1.75 m, and the body segment of each joint."""
+    """Rest positions (N, 3) in metres, for a stature of 1.75 m, and the body segment of each joint.
+
+    The origin is the middle of the hips, wherever that of the skeleton's template lies.
+    """
     real = body.joints[: body.num_observed]
     try:
         usual = torch.tensor(template_by_names("human", real), dtype=torch.float64)
@@ -206,7 +208,9 @@ def _rest_pose(body: Skeleton) -> tuple[Tensor, list[str]]:
         return usual, segments
     own = body.template_points(dtype=torch.float64)
     ratio = bone_lengths(usual, body.bones) / bone_lengths(own, body.bones)
-    return own * ratio.median(), segments  # whatever unit the template has
+    own = own * ratio.median()  # whatever unit the template has
+    anchor = int(usual.norm(dim=-1).argmin())
+    return own + (usual[anchor] - own[anchor]), segments
 
 
 def _pose(body: Skeleton, rotations: Tensor, rest: Tensor) -> Tensor:
@@ -219,12 +223,13 @@ def _pose(body: Skeleton, rotations: Tensor, rest: Tensor) -> Tensor:
 
 
 def _leaders(body: Skeleton) -> list[int]:
-    """For each bone the one that it turns with: the first from the same virtual joint to a source, or itself."""
+    """For each bone the one that it turns with: the first between a virtual joint and its sources, or itself."""
+    from_root = chain_inverse(incidence(body.bones, body.num_joints, dtype=torch.float64))
     leader = list(range(body.num_bones))
     for joint, sources in body.virtual:
-        group = [i for i, bone in enumerate(body.bones) if joint in bone and set(bone) & set(sources)]
-        for i in group:
-            leader[i] = group[0]
+        way = (from_root[list(sources)] - from_root[joint]).abs().amax(0) > 0.5  # 1 on the way, 0 elsewhere
+        group = {leader[i] for i in way.nonzero().flatten().tolist()}
+        leader = [min(group) if i in group else i for i in leader]
     return leader
 
 

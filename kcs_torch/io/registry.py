@@ -17,12 +17,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from kcs_torch.errors import FormatError, KcsError, OptionError, listed
+from kcs_torch.errors import FormatError, KcsError, listed
 from kcs_torch.io.folders import natural_key, sibling_files
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types import Tracks
 from kcs_torch.types.image_size import told_image_size
-from kcs_torch.types.intake import RATES, as_number
+from kcs_torch.types.intake import check_rate
 
 if TYPE_CHECKING:
     from kcs_torch.io.containers.hdf5 import Tree
@@ -336,11 +336,8 @@ def check_fps(fps: float | None) -> None:
     Raises:
         OptionError: it is out of range.
     """
-    if fps is not None and not RATES[0] <= (as_number(fps) or 0) <= RATES[1]:
-        raise OptionError(
-            f"fps (--fps): expected a positive number, got {fps!r}; leave it out where it is not known "
-            f"(frames a second, {RATES[0]:g} to {RATES[1]:g})"
-        )
+    if fps is not None:
+        check_rate(fps, "fps (--fps)", "; leave it out where it is not known")
 
 
 def read_error(path: Any, error: BaseException) -> FormatError:

@@ -10,7 +10,7 @@ from kcs_torch.methods.pkc import PKC
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types.hints import is_a
 from kcs_torch.types.image_size import as_image_size
-from kcs_torch.types.intake import RATES, as_number
+from kcs_torch.types.intake import as_number, check_rate
 from kcs_torch.types.size import short_unit
 
 __all__ = ["LEAST", "Options", "check_options"]
@@ -59,11 +59,7 @@ def check_options(
             f"Tracker: expected a skeleton whose bones form one tree, got '{body.name if body else skeleton}'; "
             "kcs_torch.find_skeleton finds one from a clip"
         )
-    rate, least = as_number(fps), as_number(threshold)
-    if rate is None or not RATES[0] <= rate <= RATES[1]:
-        raise OptionError(
-            f"Tracker: fps: expected a positive number, {RATES[0]:g} to {RATES[1]:g} frames a second, got {fps!r}"
-        )
+    rate, least = check_rate(fps, "Tracker: fps"), as_number(threshold)
     if least is None or not 0 <= least <= 1:
         raise OptionError(f"Tracker: threshold: expected a confidence within 0..1, got {threshold!r}")
     if not is_a(wait, bool):

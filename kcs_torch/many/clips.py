@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from kcs_torch.errors import OptionError
-from kcs_torch.io.folders import natural_key
+from kcs_torch.io.folders import natural_key, sibling_files
 from kcs_torch.many.record import MADE_BY
 
 __all__ = ["Clip", "clips_of"]
@@ -52,9 +52,10 @@ class Clip:
         return replace(self, target=self.target.with_name(f"{self.target.name}_{number}"))
 
     def is_newer_than(self, results: Sequence[Path]) -> bool:
-        """Whether its file was changed after any of the results was made."""
+        """Whether its file, or one of its folder's, was changed after any of the results was made."""
         with suppress(OSError):
-            return self.source.stat().st_mtime > min(path.stat().st_mtime for path in results)
+            made = min(path.stat().st_mtime for path in results)
+            return any(path.stat().st_mtime > made for path in (self.source, *sibling_files(self.source)))
         return False
 
     def share_of(self, shards: int) -> int:
@@ -71,6 +72,7 @@ def clips_of(source: str | Path, output: str | Path, pattern: str = "*") -> list
         output: of the results: a clip ``a/b.json`` becomes ``OUTPUT/a/b.json.npz``, or ``OUTPUT/a/b.npz`` where that is
             no other clip's. Folders that hold results are no clips.
         pattern: of clips within the folder; ``**/*.json`` looks into folders, ``*`` takes files, and folders as clips.
+            The folder itself is none.
 
     Raises:
         OptionError: the folder is none, lies in the output, or holds nothing of the pattern.
@@ -91,7 +93,7 @@ def clips_of(source: str | Path, output: str | Path, pattern: str = "*") -> list
         for p in found
         if p.resolve() != inside and inside not in p.resolve().parents and not results & {p, *p.parents}
     ]
-    names = [name for name in names if not any(part.startswith(".") for part in name.parts)]
+    names = [name for name in names if name.parts and not any(part.startswith(".") for part in name.parts)]
     if not names:
         raise OptionError(f"{folder}: expected tracks that match {pattern!r}, found none")
     short = [n if (folder / n).is_dir() else n.with_suffix("") for n in names]

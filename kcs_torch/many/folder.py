@@ -175,6 +175,8 @@ def _checked_suffixes(suffixes: str | Sequence[str], up: str | None, pitch: floa
     if pitch is not None:
         check_pitch(pitch)
     given = [suffixes] if isinstance(suffixes, str) else suffixes
+    if not is_a(given, Sequence[str]):
+        raise OptionError(f"suffixes: expected a list of some, such as .npz, got {suffixes!r}")
     dotted = [s if s.startswith(".") else f".{s}" for s in given]
     if not dotted:
         raise OptionError("suffixes: expected at least one, such as .npz, got none")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -58,14 +59,15 @@ def get_skeleton(skeleton: str | Path | Skeleton) -> Skeleton:
         return skeleton
     if isinstance(skeleton, Path) or str(skeleton).lower().endswith(SUFFIXES):
         return Skeleton.load(skeleton)
-    if isinstance(skeleton, str) and skeleton not in SKELETONS and Path(skeleton).is_file():
-        raise SkeletonError(f"{skeleton}: expected a skeleton's file to be called .yaml or .json")
     if not isinstance(skeleton, str):
         raise SkeletonError(
             f"unknown skeleton {str(skeleton)[:100]}: expected a Skeleton, a built-in name or a file, got a "
             f"{type(skeleton).__name__}: Skeleton.from_names(joints, bones) or Skeleton.from_edges(edges, joints)"
         )
     if skeleton not in SKELETONS:
+        with suppress(OSError):  # a name too long for a file's
+            if Path(skeleton).is_file():
+                raise SkeletonError(f"{skeleton}: expected a skeleton's file to be called .yaml or .json")
         raise unknown("skeleton", skeleton, SKELETONS, SkeletonError)
     return SKELETONS[skeleton]
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from torch import Tensor
 
 from kcs_torch.anatomy import UNKNOWN_SPREAD, Hinge
 from kcs_torch.errors import FormatError, SkeletonError, unknown
-from kcs_torch.skeleton.check import as_tuples, check_facts, check_observed, check_tree
+from kcs_torch.skeleton.check import SAME, as_tuples, check_facts, check_observed, check_tree
 from kcs_torch.skeleton.files import as_mapping, check_mapping, read_mapping
 from kcs_torch.skeleton.graph import find_cycle, find_pieces, find_twins
 from kcs_torch.skeleton.mapping import map_joints
@@ -161,8 +163,9 @@ class Skeleton:
         """
         from kcs_torch.skeleton.builtin import known_by_names  # the built-in ones are made by this class
 
-        names = [f"joint{i}" for i in range(joints)] if isinstance(joints, int) else listed(joints, "joints", name)
-        names = tuple(map(str, names))
+        if isinstance(joints, (int, Integral)):  # NumPy's too
+            joints = [f"joint{i}" for i in range(joints)]
+        names = tuple(map(str, listed(joints, "joints", name)))
         pairs = index_pairs(edges, name)
         plain = cls(joints=names, bones=tuple(pairs), name=name, tree=tree)
         return replace(plain, **facts_by_names(names, pairs, known_by_names(names)))
@@ -330,10 +333,17 @@ class Skeleton:
         if len(pieces) == 1:
             return self
         main = max(pieces, key=len)
-        extra = tuple((main[0], p[0]) for p in pieces if p is not main)
+        extra = tuple((self._apart(main, p[0]), p[0]) for p in pieces if p is not main)
         first = self.num_bones
         flexible = self.flexible + tuple(range(first, first + len(extra)))
         return self._with_bones(extra, flexible=flexible)
+
+    def _apart(self, piece: Sequence[int], joint: int) -> int:
+        """The first joint of a piece; where the template has that and another joint in one place, the farthest."""
+        if self.template is None:
+            return piece[0]
+        far = [math.dist(self.template[i], self.template[joint]) for i in piece]
+        return piece[0] if far[0] > SAME * max(far) else piece[far.index(max(far))]
 
     def _with_bones(self, extra: tuple[Pair, ...], **changes: Any) -> Skeleton:
         """More bones, of which neither length nor spread is known."""

@@ -195,7 +195,7 @@ def _read_hinge(
             raise unknown(f"key in {what}", key, keys, SkeletonError)
 
     def at(joint: object) -> int:
-        if joint not in names:
+        if str(joint) not in names:
             raise unknown(f"joint in {what}", joint, names, SkeletonError)
         return list(names).index(str(joint))
 

@@ -74,9 +74,10 @@ def has_middle(names: Sequence[str]) -> bool:
 def person_by_names(names: Sequence[str], name: str = "person") -> Skeleton | None:
     """The tree of a person's joints, in any usual spelling and order; None where these are others, or too few to link.
 
-    Where no joint lies between the hips, or between the shoulders, a virtual pelvis or neck does. A face moves against
-    the neck: the bone that links them is flexible. So is that between a body's wrist and a hand's own, which two models
-    of a detector see in nearly the same place.
+    A head or a trunk alone, without a joint of an arm or a leg, may be any animal's. Where no joint lies between the
+    hips, or between the shoulders, a virtual pelvis or neck does. A face moves against the neck: the bone that links
+    them is flexible. So is that between a body's wrist and a hand's own, which two models of a detector see in nearly
+    the same place.
 
     Args:
         names: N joint names.
@@ -116,6 +117,6 @@ def person_by_names(names: Sequence[str], name: str = "person") -> Skeleton | No
         bones.append((at[upper], joint))
         if (part in _HEAD and upper[1] in _NECK) or part == "handwrist":
             flexible.append(bones[-1])
-    if roots != 1 or len(bones) < 2:
+    if roots != 1 or len(bones) < 2 or all(side == "centre" or part in _HEAD for side, part in at):
         return None
     return Skeleton.from_names(names, bones, name=name, virtual=virtual, template="human", flexible=flexible)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -32,6 +34,7 @@ def stature_weights(body: Skeleton) -> Tensor | None:
     Along the bones from the head to a foot, each counts by how far it goes down in the template, so that a bone across
     the body, to a hip, does not count; without a template, each counts in full. That is divided by the share of a
     stature that lies between those two joints: 98 % from the top of the head to a heel, 87 % from the nose to an ankle.
+    A joint called head lies at the top of the head or in its middle, as the template has it.
     Nothing of the skull counts twice: bones to the face are left out where a joint of the head is higher.
 
     Returns:
@@ -54,7 +57,8 @@ def stature_weights(body: Skeleton) -> Tensor | None:
     for side in ("left", "right", "centre"):
         feet = [(i, f) for f in _FEET for i, p in enumerate(places) if p == (side, f) and i in reached]
         for foot, depth in feet[:1]:
-            rows.append(reached[foot] / (share_of_stature(height) - share_of_stature(depth)))
+            highest = _head(body, places, top, foot) if height == "head" else height
+            rows.append(reached[foot] / (share_of_stature(highest) - share_of_stature(depth)))
     return torch.stack(rows) if rows else None
 
 
@@ -65,6 +69,16 @@ def _places(body: Skeleton) -> list[tuple[str, str | None]]:
         key = "".join(c for c in name.lower() if c.isalpha())
         found.append(known or (side_of(name), next((place for word, place in _WORDS if word in key), None)))
     return found
+
+
+def _head(body: Skeleton, places: Sequence[tuple[str, str | None]], top: int, foot: int) -> str:
+    """Whether a joint called head lies in the middle of the head or at its top: as the template has it."""
+    base = next((i for i, (_, place) in enumerate(places) if place in ("neck", "thorax", "shoulder")), None)
+    if body.template is None or base is None:
+        return "head"
+    tall, trunk = (body.template[foot][1] - body.template[i][1] for i in (top, base))
+    least, neck = (share_of_stature(places[i][1] or "") for i in (foot, base))
+    return min(("head", "headtop"), key=lambda p: abs((share_of_stature(p) - least) * trunk - (neck - least) * tall))
 
 
 def _reach(body: Skeleton, top: int) -> dict[int, Tensor]:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError, counted
+from kcs_torch.errors import KcsError, OptionError, ShapeError, counted
 from kcs_torch.skeleton import Skeleton, get_skeleton, guess_skeleton
 from kcs_torch.types.bodies import choose_skeleton, joint_order
 
@@ -26,6 +26,7 @@ __all__ = [
     "at_one_point",
     "at_the_corner",
     "check_places",
+    "check_rate",
     "take_in",
 ]
 
@@ -78,6 +79,19 @@ def as_number(value: Any) -> float | None:
         return float(value) if not isinstance(value, bool) and isinstance(value, Real) else None
     except OverflowError:
         return None
+
+
+def check_rate(value: Any, what: str, hint: str = "", error: type[KcsError] = OptionError) -> float:
+    """Frames a second that tracks may have, as a number.
+
+    Raises:
+        KcsError: the one given: it is no number, or beyond RATES.
+    """
+    rate = as_number(value)
+    if rate is None or not RATES[0] <= rate <= RATES[1]:
+        limits = f"frames a second, {RATES[0]:g} to {RATES[1]:g}"
+        raise error(f"{what}: expected a positive number, got {value!r}{hint} ({limits})")
+    return rate
 
 
 def at_the_corner(points: Tensor, seen: Tensor, notes: list[str], *, alone: bool = False) -> Tensor:
@@ -264,16 +278,9 @@ def _shaped(points: Any, confidence: Any, dims: int, source: str) -> tuple[Tenso
 def _rate(fps: Any, source: str) -> float | None:
     """Frames a second, None where not known."""
     rate = as_number(fps)
-    if fps is not None and (rate is None or rate <= 0):
-        raise ShapeError(f"{source}: fps: expected a positive number, got {fps!r}; leave it out where it is not known")
-    if rate is None or not math.isfinite(rate):
+    if fps is None or (rate is not None and not rate < math.inf):  # nor NaN
         return None
-    if not RATES[0] <= rate <= RATES[1]:
-        raise ShapeError(
-            f"{source}: fps: expected {RATES[0]:g} to {RATES[1]:g} frames a second, got {rate:g}; leave it out where "
-            "it is not known"
-        )
-    return rate
+    return check_rate(fps, f"{source}: fps", "; leave it out where it is not known", ShapeError)
 
 
 def _check_near(points: Tensor, seen: Tensor, body: Skeleton, source: str) -> None:

@@ -49,11 +49,13 @@ def draw_tracks(people: Tracks | Sequence[Tracks], *, frame: int | None = None) 
         A matplotlib figure, of no window; ``figure.savefig(path)`` writes it.
 
     Raises:
-        OptionError: there is nobody, or no such frame.
+        OptionError: there is nobody, somebody who is no tracks, or no such frame.
     """
     people = [people] if isinstance(people, Tracks) else list(people)
     if not people:
         raise OptionError("draw_tracks: expected tracks of at least one person, got none")
+    if wrong := [one for one in people if not isinstance(one, Tracks)]:
+        raise OptionError(f"draw_tracks: expected Tracks, got {type(wrong[0]).__name__}")
     frames = max(p.num_frames for p in people)
     chosen = clearest_frame(people) if frame is None else frame
     if not (is_a(chosen, int) and 0 <= chosen < frames):

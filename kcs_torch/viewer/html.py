@@ -8,9 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from kcs_torch.errors import OptionError
 from kcs_torch.types import Reconstruction
+from kcs_torch.types.hints import is_a
 from kcs_torch.types.people import files_named, shared
-from kcs_torch.viewer.names import as_people
+from kcs_torch.viewer.names import as_people, printable
 from kcs_torch.viewer.scene import scene_of
 from kcs_torch.viewer.summary import doubts, summarise
 
@@ -46,9 +48,12 @@ def player(
         The page's text.
 
     Raises:
-        OptionError: there is no result, the frame rates or unknown units differ, or the number of names does.
+        OptionError: there is no result, the frame rates or unknown units differ, the number of names does, or the title
+            is no text.
         OutputError: a result has no joint at a finite place.
     """
+    if not is_a(title, str | None):
+        raise OptionError(f"player: title: expected text or none, got {title!r}")
     people = as_people(results, "player")
     data = scene_of(people, names)
     if title is None:
@@ -66,7 +71,7 @@ def player(
     }
     page = (folder / "player.html").read_text(encoding="utf-8")
     head, *tail = page.split("@@")  # text, key, text, key, ..., text: nothing of a value is looked at again
-    return head + "".join(parts[k] + text for k, text in zip(tail[::2], tail[1::2], strict=True))
+    return printable(head + "".join(parts[k] + text for k, text in zip(tail[::2], tail[1::2], strict=True)))
 
 
 def _head(people: Sequence[Reconstruction], step: int) -> str:
