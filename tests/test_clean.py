@@ -194,6 +194,17 @@ def test_short_runs_are_left_and_counted():
     assert "64 of 104 (62 %) detections, in runs of fewer than 10 frames, were left" in smoothed.notes[-1]
 
 
+@pytest.mark.parametrize("method", kt.clean.SMOOTHERS)
+def test_a_number_that_is_missing_in_a_result_stays_by_itself(walk, method):
+    result = kt.reconstruct(walk, method="rigid", intrinsics="parallel")
+    points, path = result.points.clone(), torch.linspace(0, 50, walk.num_frames).double()
+    points[40, 4] = path[40] = torch.nan
+    smoothed = kt.clean.smooth(replace(result, points=points, root_depth=path), method)
+    assert smoothed.points.isnan().nonzero()[:, :2].unique(dim=0).tolist() == [[40, 4]]
+    assert smoothed.root_depth.isnan().nonzero().tolist() == [[40]]
+    assert "nan" not in smoothed.diagnostics.notes[-1] and bool(smoothed.lengths.isfinite().all())
+
+
 def test_smooth_brings_noisy_tracks_nearer_to_the_truth(walk):
     truth = walking_person(90, skeleton="coco17", generator=torch.Generator().manual_seed(3)).tracks
     before = change(truth, walk)

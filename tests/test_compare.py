@@ -149,6 +149,43 @@ def test_what_is_not_seen_does_not_count():
         compare(pred, replace(truth, weights=torch.zeros_like(weights)))
 
 
+def test_frames_of_fewer_than_three_joints_do_not_count():
+    """A similarity takes two joints onto any others."""
+    truth = walking_motion(20)
+    pred = noisy(truth)
+    weights = truth.weights.clone()
+    weights[:10, 2:] = 0
+    few = compare(pred, replace(truth, weights=weights, points=truth.points * weights[..., None]))
+    full = compare(pred.frames(10, 20), truth.frames(10, 20))
+    assert few.frames == 10 and few.mpjpe == pytest.approx(full.mpjpe) and few.e3d == pytest.approx(full.e3d)
+    assert "10 of 20 frames, in which fewer than 3 joints of both are seen: not compared" in few.notes
+
+
+def without_pelvis(motion, frames=slice(None)):
+    weights = motion.weights.clone()
+    weights[frames, motion.skeleton.index("pelvis")] = 0
+    return replace(motion, weights=weights, points=motion.points * weights[..., None])
+
+
+def test_a_pelvis_that_is_never_seen_is_no_root():
+    truth = walking_motion(20)
+    found = compare(noisy(truth), without_pelvis(truth))
+    assert found.root is None and all(map(math.isfinite, (*found.mpjpe.values(), *found.pck.values())))
+    named = compare(noisy(truth), without_pelvis(truth), root="pelvis")
+    assert math.isnan(named.mpjpe["root"]) and math.isfinite(named.mpjpe["rigid"])
+    said = "the root pelvis is not seen in 20 of 20 compared frames, which do not count for root and scale"
+    assert named.notes == (said,)
+
+
+def test_frames_without_the_root_are_told():
+    truth = walking_motion(20)
+    hidden = without_pelvis(truth, slice(0, 5))
+    found = compare(noisy(truth), hidden)
+    assert found.root == "pelvis" and "pelvis is not seen in 5 of 20 compared frames" in found.notes[0]
+    assert found.mpjpe["root"] == pytest.approx(compare(noisy(truth).frames(5, 20), truth.frames(5, 20)).mpjpe["root"])
+    assert compare(noisy(truth), hidden, align="rigid").notes == ()
+
+
 def test_roots_by_name():
     truth = walking_motion(20)
     found = compare(noisy(truth), truth, align=["root"], root="nose")
@@ -181,7 +218,12 @@ def test_against_the_protocol_on_a_lifted_walk(protocol, shared):
     assert found.e3d == pytest.approx(expected["e3d"], rel=1e-5)
 
 
-@pytest.mark.parametrize("align", [3, [3]])
-def test_alignments_that_are_no_names_are_told(align):
-    with pytest.raises(OptionError, match="unknown alignment 3"):
+@pytest.mark.parametrize(("align", "what"), [(3, "3"), ([3], "3"), ([["root"]], r"\['root'\]")])
+def test_alignments_that_are_no_names_are_told(align, what):
+    with pytest.raises(OptionError, match=f"unknown alignment {what}"):
         compare(walking_motion(), walking_motion(), align=align)
+
+
+def test_alignments_may_come_one_by_one():
+    truth = walking_motion()
+    assert list(compare(truth, truth, align=iter(("rigid", "root"))).mpjpe) == ["rigid", "root"]

@@ -1,10 +1,12 @@
 """Cuts of a film: found, told, and what lies between them solved by itself."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 from near_cameras import error, filmed, quietly
+from samples import walk_result
 
 import kcs_torch as kt
 from kcs_torch.clean import split
@@ -171,6 +173,79 @@ def test_a_cut_is_found_where_one_side_is_hidden(side):
 def test_a_cut_is_no_swap_of_sides():
     tracks, _ = film(20.0, 120.0, -60.0)
     assert kt.clean.unswap(tracks) is tracks
+
+
+def gappy(tracks):
+    """The same with gaps of two frames within the shots, and before the cut at frame 24."""
+    weights = tracks.weights.clone()
+    weights[10:12, 9] = weights[30:32, 9] = weights[22:24, 13] = 0
+    return replace(tracks, weights=weights, points=torch.where(weights[..., None] > 0, tracks.points, 0))
+
+
+CLEANED = {
+    "gate": kt.clean.gate,
+    **{name: partial(kt.clean.smooth, method=name, cutoff=3.0) for name in kt.clean.SMOOTHERS},
+    "fill": partial(kt.clean.fill, longest=4),
+    "fill linearly": partial(kt.clean.fill, longest=4, kind="linear"),
+    "resample": partial(kt.clean.resample, fps=15.0),  # half the frames: both shots begin with one that stays
+}
+
+
+@pytest.mark.parametrize("name", CLEANED)
+@pytest.mark.parametrize("larger", [1.0, 4.0])
+def test_shots_are_cleaned_as_by_themselves(name, larger):
+    tracks, _ = film(0.0, 90.0)
+    points = tracks.points.clone()
+    points[24:] *= larger
+    points[[5, 40], 3] += 300.0
+    tracks = gappy(replace(tracks, points=points))
+    clean = CLEANED[name]
+    parts = [clean(shot) for shot in split(tracks)]
+    together = clean(tracks)
+    assert cuts_of(together) == [parts[0].num_frames]
+    for what in ("points", "weights"):
+        torch.testing.assert_close(getattr(together, what), torch.cat([getattr(part, what) for part in parts]))
+
+
+@pytest.mark.parametrize("fps", [20.0, 24.0, 25.0, 50.0, 60.0, 90.0, 120.0])
+@pytest.mark.parametrize("kind", ["cubic", "linear"])
+def test_new_frames_between_shots_show_the_nearer_one(fps, kind):
+    tracks, _ = film(0.0, 90.0)
+    new = kt.clean.resample(tracks, fps, kind=kind)
+    place = torch.arange(new.num_frames).double() * 30 / fps
+    (cut,) = cuts_of(new)
+    assert bool(new.seen.all()) and place[cut - 1] < 23.5 <= place[cut]
+    between = (place > 23) & (place < 24)
+    nearer = torch.where(place[between] < 23.5, 23, 24)
+    torch.testing.assert_close(new.points[between], tracks.points[nearer])
+
+
+def test_a_smoothed_result_keeps_its_shots_apart():
+    tracks, clips = film(0.0, 90.0)
+    truth = torch.cat([clip.points for clip in clips])
+    body = replace(walk_result(48, skeleton="h36m17"), tracks=tracks, points=truth)
+    path = torch.cat([torch.full((24,), 1000.0), torch.full((24,), 2000.0)]).double()
+    smoothed = kt.clean.smooth(replace(body, root_depth=path), cutoff=6.0)
+    parts = [kt.clean.smooth(shot, cutoff=6.0).points for shot in split(tracks)]
+    torch.testing.assert_close(smoothed.points[..., :2], torch.cat(parts))
+    torch.testing.assert_close(smoothed.root_depth, path)
+    short = kt.clean.smooth(replace(body, root_depth=path), "savgol", cutoff=1.0)
+    torch.testing.assert_close(short.points, truth)
+    assert "; 816 of 816 (100 %) points, in runs of fewer than" in short.diagnostics.notes[-1]
+
+
+@pytest.mark.parametrize("larger", [1.0, 10.0])
+def test_sides_are_told_by_the_size_of_their_shot(larger):
+    """Where a close-up follows, the smaller body's size, or the larger one's steps, told of the other."""
+    draw = torch.Generator().manual_seed(0)
+    clips = [walking_person(60, yaw=yaw, turn=0.0, noise=20.0, generator=draw).tracks for yaw in (30.0, 90.0)]
+    true = torch.cat([clips[0].points, larger * clips[1].points])
+    left, right = torch.tensor(clips[0].skeleton.mirror).unbind(1)
+    points = true.clone()
+    for frames in (slice(20, 24), slice(70, 75)):
+        points[frames, left], points[frames, right] = true[frames, right], true[frames, left]
+    tracks = replace(clips[0], points=points, weights=torch.ones(120, 17).double())
+    torch.testing.assert_close(kt.clean.unswap(tracks).points, true)
 
 
 def test_shots_of_other_sizes_are_solved_together():

@@ -88,6 +88,9 @@ def test_a_flipped_forearm_is_named_with_its_share_of_frames():
     # 300 in 10 frames and 151 in one, of which the pose's middle takes a 17th
     assert found.rms == pytest.approx(((10 * 300**2 + 151**2) / 20 * (16 / 17) / 17) ** 0.5, rel=1e-3)
     assert "left_elbow-left_wrist in 50 % of the frames" in str(found)
+    assert next(iter(found.joints)) == "left_wrist" and len(found.joints) == 17
+    depth = ((10 * 300**2 + 151**2) / 20) ** 0.5
+    assert found.joints["left_wrist"] == pytest.approx(16 / 17 * depth, rel=1e-3)
 
 
 def test_more_than_four_bones_are_counted():
@@ -99,6 +102,7 @@ def test_where_depth_begins_is_no_difference():
     result = walk_result()
     found = difference(result, replace(result, points=result.points + torch.tensor([0.0, 0, 50])))
     assert found.rms == pytest.approx(0, abs=1e-9) and not found.flipped and not found.mirrored
+    assert str(found) == str(difference(result, result)) == "depths are the same" and found.joints == {}
 
 
 def test_other_frames_are_refused():

@@ -2,7 +2,7 @@
 
 Nothing here happens unasked, but that ``pkc`` begins with ``unswap``. Methods deal with noise, gaps and outliers by
 themselves (``pkc`` does), so that the rest is for what one knows better than they: a cut-off that a field expects, a
-frame rate, a part of a clip.
+frame rate, a part of a clip. Where a film has cuts, each shot is cleaned by itself.
 """
 
 from kcs_torch.clean.gaps import fill

@@ -17,7 +17,6 @@ from kcs_torch.types.intake import as_number, check_rate
 
 __all__ = [
     "Array",
-    "body_size",
     "check_rate",
     "check_seen",
     "check_tracks",
@@ -85,13 +84,6 @@ def share(count: int, whole: int) -> str:
     """A count with its per cent, such as "12 of 4000 (0.3 %)"."""
     part = 100 * count / max(whole, 1)
     return f"{count} of {whole} ({part:.0f} %)" if part >= 10 else f"{count} of {whole} ({part:.2g} %)"
-
-
-def body_size(points: Tensor, seen: Tensor) -> Tensor:
-    """Median distance of the seen joints from the middle of those of their frame."""
-    kept = seen[..., None].to(points.dtype)
-    middle = (points * kept).sum(1, keepdim=True) / kept.sum(1, keepdim=True).clamp_min(1)
-    return (points - middle).norm(dim=-1)[seen].median()
 
 
 def rebuilt(tracks: Tracks, points: Tensor, weights: Tensor, note: str, *, fps: float | None = None) -> Tracks:

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from kcs_torch.clean.common import check_tracks, number, rebuilt, runs, share
+from kcs_torch.clean.timing import shots_of
 from kcs_torch.errors import OptionError, unknown
 from kcs_torch.types import Tracks
 from kcs_torch.types.arrays import as_doubles
@@ -23,7 +24,8 @@ def fill(tracks: Tracks, longest: int, *, kind: str = "cubic", weight: float = 0
 
     Args:
         tracks: what to fill.
-        longest: frames of the longest gap to fill. Longer ones, and those at the ends of the clip, stay.
+        longest: frames of the longest gap to fill. Longer ones, and those at the ends of the clip, or of a shot where a
+            film has cuts (:func:`~kcs_torch.clean.split`), stay.
         kind: "cubic" (monotone cubic, PCHIP, which never overshoots) or "linear".
         weight: what a filled joint counts, as a share of the lesser of its gap's two ends.
 
@@ -51,23 +53,24 @@ def fill(tracks: Tracks, longest: int, *, kind: str = "cubic", weight: float = 0
     points = as_doubles(tracks.points[:, :count]).copy()
     weights = as_doubles(tracks.weights[:, :count]).copy()
     unseen, filled, gaps = int((weights == 0).sum()), 0, 0
-    time = np.arange(len(points))
-    for joint in range(count):
-        known = weights[:, joint] > 0
-        short = [(a, b) for a, b in runs(~known) if a > 0 and b < len(time) and b - a <= longest]
-        if not short:
-            continue
-        if kind == "cubic":
-            curve = PchipInterpolator(time[known], points[known, joint])
-        for start, stop in short:
-            inside, ends = time[start:stop], [start - 1, stop]
+    for shot in shots_of(tracks):
+        for joint in range(count):
+            place, trust = points[shot, joint], weights[shot, joint]  # views
+            time, known = np.arange(len(trust)), trust > 0
+            short = [(a, b) for a, b in runs(~known) if a > 0 and b < len(time) and b - a <= longest]
+            if not short:
+                continue
             if kind == "cubic":
-                points[inside, joint] = curve(inside)
-            else:
-                part = ((inside - ends[0]) / (ends[1] - ends[0]))[:, None]
-                points[inside, joint] = (1 - part) * points[ends[0], joint] + part * points[ends[1], joint]
-            weights[inside, joint] = weight * weights[ends, joint].min()
-            filled, gaps = filled + len(inside), gaps + 1
+                curve = PchipInterpolator(time[known], place[known])
+            for start, stop in short:
+                inside, ends = time[start:stop], [start - 1, stop]
+                if kind == "cubic":
+                    place[inside] = curve(inside)
+                else:
+                    part = ((inside - ends[0]) / (ends[1] - ends[0]))[:, None]
+                    place[inside] = (1 - part) * place[ends[0]] + part * place[ends[1]]
+                trust[inside] = weight * trust[ends].min()
+                filled, gaps = filled + len(inside), gaps + 1
     what = f"{share(filled, unseen)} unseen detections filled"
     note = f"fill: {what} ({kind}): gaps of up to {longest} frames, {gaps} of them"
     return rebuilt(tracks, torch.from_numpy(points), torch.from_numpy(weights), note)

@@ -7,9 +7,11 @@ import math
 import torch
 from torch import Tensor
 
-from kcs_torch.clean.common import body_size, check_seen, check_tracks, frame_rate, number, rebuilt, share
+from kcs_torch.clean.common import check_seen, check_tracks, number, rebuilt, share
+from kcs_torch.clean.timing import shots_of
 from kcs_torch.errors import listed
 from kcs_torch.functional.ranks import nanmedian
+from kcs_torch.solvers.stray import around_usual, body_size
 from kcs_torch.types import Tracks
 
 __all__ = ["gate", "steady"]
@@ -19,9 +21,6 @@ _SIDE = 5
 
 _LEAST = 3
 """Neighbours without which a detection is not judged."""
-
-_AROUND = 8
-"""Frames before and after over which the usual error is taken."""
 
 _ROUNDS = 2
 """What is dropped first no longer spoils the prediction of its neighbours."""
@@ -40,8 +39,8 @@ def gate(tracks: Tracks, *, threshold: float = 6.0, floor: float = 0.2, reach: f
 
     ``usual`` is the median of |y - p| of the joint, over the clip or, where it moves more abruptly, over the nearest
     frames (four times the clip's at most). ``size`` is the body's: the median distance of its joints from their
-    middle. Runs of outliers that last longer than ``reach`` look like motion and stay, as do detections that have
-    fewer than three neighbours.
+    middle. Where a film has cuts (:func:`~kcs_torch.clean.split`), each shot is a clip of its own. Runs of outliers
+    that last longer than ``reach`` look like motion and stay, as do detections that have fewer than three neighbours.
 
     Args:
         tracks: what to clean.
@@ -70,8 +69,8 @@ def gate(tracks: Tracks, *, threshold: float = 6.0, floor: float = 0.2, reach: f
     number(reach, "gate: reach", "a positive number of seconds")
     count = tracks.skeleton.num_observed
     points, seen = tracks.points[:, :count].double(), tracks.seen[:, :count]
-    rate = None if tracks.fps is None else frame_rate(tracks.fps, None, "gate", tracks.source)
-    kept = steady(points, seen, rate, threshold, floor, reach)
+    shots = [steady(points[shot], seen[shot], tracks.fps, threshold, floor, reach) for shot in shots_of(tracks)]
+    kept = torch.cat(shots)
     dropped = (seen & ~kept).sum(0)
     total = int(dropped.sum())
     which = [f"{tracks.skeleton.joints[n]} {int(dropped[n])}" for n in dropped.argsort(descending=True).tolist()]
@@ -87,11 +86,13 @@ def steady(
     """Which detections to keep (T, N), of points (T, N, 2) that are seen (T, N); options as of :func:`gate`."""
     side = 3 if rate is None else max(3, round(reach * rate))
     offsets = sorted({round(1 + i * (side - 1) / (_SIDE - 1)) for i in range(_SIDE)})
-    size = body_size(points, seen)
+    size = body_size(points[None], seen[None])
     kept = seen
     for _ in range(_ROUNDS):
         error = (points - _line(points, kept, offsets)).norm(dim=-1)
-        kept = seen & ~(error > threshold * _usual(error, kept) + floor * size)  # NaN, not judged, is not above
+        known = torch.where(kept, error, math.nan)
+        usual = around_usual(known, nanmedian(known, 0, keepdim=True))
+        kept = seen & ~(error > threshold * usual + floor * size)  # NaN, not judged, is not above
     return kept
 
 
@@ -125,12 +126,3 @@ def _line_through(points: Tensor, seen: Tensor, offsets: list[int]) -> Tensor:
     place = nanmedian(near - slope * time, -1)
     enough = near.isfinite().sum(-1) >= _LEAST
     return torch.where(enough, place, math.nan)
-
-
-def _usual(error: Tensor, seen: Tensor) -> Tensor:
-    """(T, N) median error of each joint: about each frame, but within one to four times that of the clip."""
-    known = torch.where(seen, error, math.nan)
-    clip = nanmedian(known, 0, keepdim=True)
-    around = torch.nn.functional.pad(known.mT, (_AROUND, _AROUND), value=math.nan).unfold(-1, 2 * _AROUND + 1, 1)
-    near = nanmedian(around, -1).mT.nan_to_num(0.0)
-    return torch.maximum(clip, torch.minimum(near, 4 * clip)).nan_to_num(0.0)

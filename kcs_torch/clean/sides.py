@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from itertools import pairwise, starmap
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
-from kcs_torch.clean.common import body_size, check_tracks, rebuilt, runs, share
-from kcs_torch.clean.timing import cuts_of
+from kcs_torch.clean.common import check_tracks, rebuilt, runs, share
+from kcs_torch.clean.timing import shots_of
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.nn.posture import trunk_joints
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.skeleton.graph import find_branches, find_pieces
-from kcs_torch.solvers.stray import from_beside
+from kcs_torch.solvers.stray import body_size, from_beside
 from kcs_torch.solvers.swaps import swapped_frames
 from kcs_torch.types import Tracks
 
@@ -73,11 +73,11 @@ def unswap(tracks: Tracks) -> Tracks:
     if len(pairs) < _FEWEST or not tracks.num_frames:
         return tracks
     points, weights = tracks.points[:, :count].clone(), tracks.weights[:, :count].clone()
-    size = float(body_size(points, weights > 0))
-    shots, views = (
-        list(starmap(slice, pairwise([0, *cuts_of(tracks, leaps=some), tracks.num_frames]))) for some in (False, True)
-    )  # another view is no swap, and another body's sides are its own
-    leaps = _leaps_ahead(points, weights > 0, pairs, size)
+    shots, views = (  # another view is no swap, and another body's sides are its own
+        [(shot, float(body_size(points[None, shot], weights[None, shot] > 0))) for shot in shots_of(tracks, leaps=some)]
+        for some in (False, True)
+    )
+    leaps = [_leaps_ahead(points[shot], weights[shot] > 0, pairs, size) for shot, size in shots]
     fingers = _fingers(body)
     limbs = _limbs(body, pairs, fingers)
     trunk = [pair for pair in pairs if not any(pair in limb for _, limb in limbs)]
@@ -86,18 +86,17 @@ def unswap(tracks: Tracks) -> Tracks:
     counts = {}
     for name, some in (("", telling if len(telling) >= _FEWEST else pairs), *limbs):
         left, right = torch.tensor(some, device=points.device).T
-        seen, penalty = _comparable(points, weights, left, right, size), _LIMB if name else _BODY
-        swapped = [
-            swapped_frames(points[shot, left], points[shot, right], seen[shot], size, penalty)
-            for shot in (shots if name else views)
-        ]
-        if name and trunk:
-            across, straight = (_across(points, weights, these) for these in (some[:1], trunk))
-            for shot, found in zip(shots, swapped, strict=True):
-                _keep_straight(found, across[shot], straight[shot], long)
-        if name:
-            for shot, found in zip(shots, swapped, strict=True):
-                _through_leaps(found, seen[shot].any(1), [leap - shot.start for leap in leaps])
+        swapped = []
+        for k, (shot, size) in enumerate(shots if name else views):
+            here, trust = points[shot], weights[shot]
+            seen = _comparable(here, trust, left, right, size)
+            found = swapped_frames(here[:, left], here[:, right], seen, size, _LIMB if name else _BODY)
+            if name and trunk:
+                across, straight = (_across(here, trust, these) for these in (some[:1], trunk))
+                _keep_straight(found, across, straight, long)
+            if name:
+                _through_leaps(found, seen.any(1), leaps[k])
+            swapped.append(found)
         frames = torch.cat(swapped).nonzero()  # (F, 1)
         left, right = torch.tensor(some if name else pairs, device=points.device).T
         for values in (points, weights):

@@ -11,11 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kcs_torch.clean.common import Array, body_size, check_seen, check_tracks, frame_rate, number, rebuilt, runs, share
+from kcs_torch.clean.common import Array, check_seen, check_tracks, frame_rate, number, rebuilt, runs, share
 from kcs_torch.clean.detector import found_by_detector
 from kcs_torch.clean.filters import FILTERS, Filter
 from kcs_torch.clean.sides import unswap
+from kcs_torch.clean.timing import shots_of
 from kcs_torch.errors import KcsWarning, unknown, users_level
+from kcs_torch.solvers.stray import body_size
 from kcs_torch.types import Reconstruction, Tracks
 from kcs_torch.types.arrays import as_doubles
 
@@ -37,14 +39,15 @@ def smooth(
     """Take out of a motion what is faster than a cut-off, within runs of seen frames.
 
     Gaps stay gaps: each run of frames in which a joint is seen is filtered by itself, and runs that are too short are
-    left as they are. Frames count by their weights relative to the best of their run; even weights give the plain
-    filter. A note says by how much the joints moved.
+    left as they are. Runs end where a film has cuts (:func:`~kcs_torch.clean.split`), and in a result where a number is
+    NaN. Frames count by their weights relative to the best of their run; even weights give the plain filter. A note
+    says by how much the joints moved.
 
     Args:
         motion: tracks, or a result: then its 3D points and the depth of its root, not its tracks. Bones of a smoothed
             result keep their length less exactly; its lengths and ``bone_variation`` are told anew.
         method: "butterworth" (order 4, no lag, -3 dB at the cut-off), "savgol" (Savitzky-Golay, cubic, no lag) or
-            "one-euro" (causal, but for the body's size, the whole clip's; follows fast motion).
+            "one-euro" (causal, but for the body's size, the whole shot's; follows fast motion).
         cutoff: in Hz.
         fps: frames a second; as the motion says if None.
 
@@ -78,13 +81,12 @@ def smooth(
     points = as_doubles(tracks.points[:, :count])
     weights = as_doubles(tracks.weights[:, :count])
     seen = weights > 0
-    chosen = FILTERS[method](cutoff, rate, _size(points, seen))
-    moved, short = _smooth_runs(points, weights, chosen)
+    filters = _filters(points, seen, shots_of(tracks), method, cutoff, rate)
+    moved, short = _smooth_runs(points, weights, filters)
+    chosen = filters[0][1]
     change = math.sqrt(float(np.square(moved - points).sum(-1)[seen].mean()))
     note = f"smooth ({chosen.words}): joints moved by {change:.2g} {tracks.units} (root mean square)"
-    if short:
-        left = share(short, int(seen.sum()))
-        note += f"; {left} detections, in runs of fewer than {chosen.least} frames, were left as they are"
+    note += _left(short, int(seen.sum()), "detections", chosen)
     mended = unswap(tracks)
     if mended is not tracks:
         message = (
@@ -96,37 +98,59 @@ def smooth(
     return rebuilt(tracks, torch.from_numpy(moved), tracks.weights[:, :count], note)
 
 
-def _smooth_runs(points: Array, weights: Array, chosen: Filter) -> tuple[Array, int]:
-    """Points (T, N, D) smoothed run by run, and how many detections are in runs that are too short."""
+def _filters(
+    points: Array, seen: NDArray[np.bool_], shots: list[slice], method: str, cutoff: float, rate: float
+) -> list[tuple[slice, Filter]]:
+    """Each shot with its filter, of finite points (T, N, D), seen (T, N); one-euro measures speeds in body sizes."""
+    given, shown = torch.from_numpy(points)[None], torch.from_numpy(seen)[None]
+    sizes = [float(body_size(given[:, shot], shown[:, shot])) or 1.0 for shot in shots]
+    return [(shot, FILTERS[method](cutoff, rate, size)) for shot, size in zip(shots, sizes, strict=True)]
+
+
+def _smooth_runs(points: Array, weights: Array, filters: list[tuple[slice, Filter]]) -> tuple[Array, int]:
+    """Points (T, N, D) smoothed run by run in each shot, and how many detections are in runs that are too short."""
     out, short = points.copy(), 0
-    for joint in range(points.shape[1]):
-        for start, stop in runs(weights[:, joint] > 0):
-            if stop - start < chosen.least:
-                short += stop - start
-                continue
-            part = weights[start:stop, joint]
-            out[start:stop, joint] = chosen.apply(points[start:stop, joint], part / part.max())
+    for shot, chosen in filters:
+        for joint in range(points.shape[1]):
+            values, trust, made = points[shot, joint], weights[shot, joint], out[shot, joint]
+            for start, stop in runs(trust > 0):
+                if stop - start < chosen.least:
+                    short += stop - start
+                    continue
+                part = trust[start:stop]
+                made[start:stop] = chosen.apply(values[start:stop], part / part.max())
     return out, short
+
+
+def _left(short: int, whole: int, what: str, chosen: Filter) -> str:
+    """What a note adds where some are in runs that are too short for a filter."""
+    if not short:
+        return ""
+    return f"; {share(short, whole)} {what}, in runs of fewer than {chosen.least} frames, were left as they are"
 
 
 def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: float) -> Reconstruction:
     """A result with smoothed points and root; the other solutions are smoothed like it."""
     points = as_doubles(result.points)
-    chosen = FILTERS[method](cutoff, rate, _size(points, np.ones(points.shape[:2], dtype=bool)))
+    known = np.asarray(np.isfinite(points).all(-1))
+    filters = _filters(np.where(known[..., None], points, 0), known, shots_of(result.tracks), method, cutoff, rate)
+    chosen = filters[0][1]
     words = chosen.words
     if len(points) < chosen.least:
         note = f"smooth 3D ({words}): left as it is: {len(points)} frames are fewer than {chosen.least}"
         return replace(result, diagnostics=replace(result.diagnostics, notes=(*result.diagnostics.notes, note)))
-    moved = _smooth_runs(points, np.ones(points.shape[:2]), chosen)[0]
-    change = math.sqrt(float(np.square(moved - points).sum(-1).mean()))
-    told = f"joints moved by {change:.2g} {result.units} (root mean square); the reprojection is that before"
-    note = f"smooth 3D ({words}): {told}"
+    moved, short = _smooth_runs(points, known.astype(float), filters)
+    change = math.sqrt(float(np.square(moved - points).sum(-1)[known].mean()))
+    told = f"joints moved by {change:.2g} {result.units} (root mean square)"
+    told += _left(short, int(known.sum()), "points", chosen)
+    note = f"smooth 3D ({words}): {told}; the reprojection is that before"
 
     def path(values: torch.Tensor | None) -> torch.Tensor | None:
         if values is None:
             return None
-        one = as_doubles(values)[:, None]
-        return torch.from_numpy(chosen.apply(one, np.ones(len(one)))[:, 0].copy()).to(values)  # no negative strides
+        one = as_doubles(values)[:, None, None]
+        smoothed, _ = _smooth_runs(one, np.isfinite(one[..., 0]).astype(float), filters)
+        return torch.from_numpy(smoothed[:, 0, 0]).to(values)
 
     distance, scales = path(result.distance), result.scales
     if result.distance is not None and distance is not None:
@@ -140,8 +164,3 @@ def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: flo
         distance=distance,
         alternatives=tuple(_smooth_result(other, method, cutoff, rate) for other in result.alternatives),
     ).remeasured()
-
-
-def _size(points: Array, seen: NDArray[np.bool_]) -> float:
-    """The body's size, never 0: what one-euro measures speeds in."""
-    return float(body_size(torch.from_numpy(points), torch.from_numpy(seen))) or 1.0

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, starmap
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kcs_torch.clean.common import check_rate, check_seen, check_tracks, frame_rate, rebuilt, runs
+from kcs_torch.clean.common import Array, check_rate, check_seen, check_tracks, frame_rate, rebuilt, runs
 from kcs_torch.errors import OptionError, ShapeError, unknown
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.cuts import cut_frames
@@ -18,7 +18,7 @@ from kcs_torch.types import Tracks
 from kcs_torch.types.arrays import as_doubles
 from kcs_torch.types.hints import is_a
 
-__all__ = ["cuts_of", "cuts_of_all", "resample", "split", "trim"]
+__all__ = ["cuts_of", "cuts_of_all", "resample", "shots_of", "split", "trim"]
 
 _KINDS = {"linear": 1, "cubic": 3}
 _EPS = 1e-6  # of a frame: rounding of times must not make a seen frame unseen
@@ -77,10 +77,13 @@ def split(tracks: Tracks) -> list[Tracks]:
     [30, 30]
     """
     check_tracks(tracks, "split")
-    cuts = cuts_of(tracks)
-    if not cuts:
-        return [tracks]
-    return [trim(tracks, *ends) for ends in pairwise([0, *cuts, tracks.num_frames])]
+    shots = shots_of(tracks)
+    return [trim(tracks, shot.start, shot.stop) for shot in shots] if len(shots) > 1 else [tracks]
+
+
+def shots_of(tracks: Tracks, *, leaps: bool = True) -> list[slice]:
+    """The frames of each shot of a clip, which lie between its cuts (:func:`cuts_of`): all in one where it has none."""
+    return list(starmap(slice, pairwise([0, *cuts_of(tracks, leaps=leaps), tracks.num_frames])))
 
 
 def cuts_of(tracks: Tracks, *, leaps: bool = True) -> list[int]:
@@ -103,7 +106,8 @@ def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: flo
     """Put the same motion at another frame rate, by splines within runs of seen frames.
 
     Gaps stay gaps: a new frame sees a joint where the old frames on either side do, and as surely as the less sure of
-    them. Nothing is smoothed: where the rate falls, noise stays what it is, so smooth first.
+    them. Nothing is smoothed: where the rate falls, noise stays what it is, so smooth first. Between two shots of a
+    film (:func:`split`) a new frame shows the old one that is nearer: shots stay apart, and stay seen.
 
     Args:
         tracks: what to resample.
@@ -128,8 +132,6 @@ def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: flo
         raise unknown("kind of resample", kind, _KINDS)
     check_rate(fps, "resample: fps")
     rate = frame_rate(tracks.fps, source_fps, "resample", tracks.source)
-    from scipy.interpolate import make_interp_spline
-
     frames, count = tracks.num_frames, tracks.skeleton.num_observed
     length = math.floor((frames - 1) * fps / rate + _EPS) + 1
     if length > 1_000_000 and length > 10 * frames:
@@ -138,7 +140,20 @@ def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: flo
     points = as_doubles(tracks.points[:, :count])
     weights = as_doubles(tracks.weights[:, :count])
     new_points, new_weights = np.zeros((length, count, 2)), np.zeros((length, count))
-    for joint in range(count):
+    for shot in shots_of(tracks):
+        here = (place >= shot.start - 0.5) & (place < shot.stop - 0.5)
+        inside = place[here].clip(shot.start, shot.stop - 1) - shot.start
+        new_points[here], new_weights[here] = _at(inside, points[shot], weights[shot], _KINDS[kind])
+    note = f"resample: from {frames} frames at {rate:g} a second to {length} at {fps:g} ({kind})"
+    return rebuilt(tracks, torch.from_numpy(new_points), torch.from_numpy(new_weights), note, fps=float(fps))
+
+
+def _at(place: Array, points: Array, weights: Array, degree: int) -> tuple[Array, Array]:
+    """Points and weights of a shot (T, N, 2), (T, N) at places (L,) between its frames, by splines of a degree."""
+    from scipy.interpolate import make_interp_spline
+
+    new_points, new_weights = np.zeros((len(place), *points.shape[1:])), np.zeros((len(place), weights.shape[1]))
+    for joint in range(points.shape[1]):
         for start, stop in runs(weights[:, joint] > 0):
             inside = np.flatnonzero((place >= start - _EPS) & (place <= stop - 1 + _EPS))
             if not len(inside):
@@ -147,9 +162,8 @@ def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: flo
             if stop - start == 1:
                 new_points[inside, joint], new_weights[inside, joint] = points[start, joint], weights[start, joint]
                 continue
-            degree = _KINDS[kind] if stop - start > 3 else 1  # a cubic takes four frames
-            new_points[inside, joint] = make_interp_spline(time, points[start:stop, joint], degree)(at)
+            fitting = degree if stop - start > 3 else 1  # a cubic takes four frames
+            new_points[inside, joint] = make_interp_spline(time, points[start:stop, joint], fitting)(at)
             before, after = np.floor(at + _EPS).astype(int), np.ceil(at - _EPS).astype(int)
             new_weights[inside, joint] = np.minimum(weights[before, joint], weights[after, joint])
-    note = f"resample: from {frames} frames at {rate:g} a second to {length} at {fps:g} ({kind})"
-    return rebuilt(tracks, torch.from_numpy(new_points), torch.from_numpy(new_weights), note, fps=float(fps))
+    return new_points, new_weights

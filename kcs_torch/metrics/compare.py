@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from kcs_torch.errors import OptionError, ShapeError, SkeletonError, listed, unknown
+from kcs_torch.errors import OptionError, ShapeError, SkeletonError, counted, listed, unknown
 from kcs_torch.functional import centre
 from kcs_torch.metrics.align import ALIGNMENTS
 from kcs_torch.metrics.errors import bone_deviation, e3d, mpjpe, pck
@@ -20,6 +20,10 @@ from kcs_torch.types.size import METRES, unit_ratio
 
 __all__ = ["Comparison", "compare"]
 
+_FEWEST = 3
+"""Joints of a frame that count, at least: a similarity takes fewer exactly onto any others."""
+
+_ROOTED = ("root", "scale")  # alignments that take the root joint onto the truth's
 _SIZED = ("scale", "similarity", "sequence")  # alignments that bring the unit along
 _USUAL_PCK = 0.15  # metres
 ODD_SIZE = 5.0
@@ -32,7 +36,7 @@ class Comparison:
 
     Attributes:
         joints: (name in the prediction, name in the truth) of the joints that are compared.
-        frames: how many frames are compared.
+        frames: how many frames are compared: those in which both show 3 joints.
         units: of the truth, and of ``mpjpe``.
         root: the truth's joint for the alignments ``root`` and ``scale``; None: the middle of the joints.
         mpjpe: mean distance by alignment; ``similarity`` is PA-MPJPE, ``scale`` N-MPJPE.
@@ -67,7 +71,7 @@ def compare(
     pred: Motion,
     truth: Motion,
     *,
-    align: str | Sequence[str] | None = None,
+    align: str | Iterable[str] | None = None,
     root: str | None = None,
     mirror: bool = False,
     within: float | None = None,
@@ -81,7 +85,8 @@ def compare(
         truth: of any skeleton and unit; joints that it does not see do not count.
         align: one or more names in :data:`~kcs_torch.metrics.ALIGNMENTS`; all that make sense if None: those without a
             scale need a known size of both, ``none`` has to be asked for.
-        root: name of the truth's root joint; a pelvis, if None and there is one.
+        root: name of the truth's root joint; a pelvis, if None and one is seen. Frames without it do not count for
+            ``root`` and ``scale``; a note says so.
         mirror: compare the prediction's mirror image in depth.
         within: distance for PCK in the truth's unit; 150 mm if None.
 
@@ -113,11 +118,21 @@ def compare(
     if bool(gone.any()):
         notes.append(f"{100 * float(gone.double().mean()):.1f} % of the prediction's joints are missing: not compared")
     weights = (truth.seen[:, theirs] & ~gone).to(target)
-    if not bool((weights.sum(1) >= 3).any()):
-        raise ShapeError("compare: expected a frame in which 3 joints of both are seen, got none")
+    enough = (weights > 0).sum(1) >= _FEWEST
+    frames = int(enough.sum())
+    if not frames:
+        raise ShapeError(f"compare: expected a frame in which {_FEWEST} joints of both are seen, got none")
+    if frames < len(weights):
+        fewer = f"fewer than {_FEWEST} joints of both are seen"
+        notes.append(f"{len(weights) - frames} of {counted(len(weights), 'frame')}, in which {fewer}: not compared")
+    weights = weights * enough[:, None]
     if ratio is not None:
         notes += _odd_size(points, target, weights, pred.units)
-    at = _root(root, [name for _, name in names])
+    at = _root(root, [name for _, name in names], weights)
+    rooted = [how for how in chosen if how in _ROOTED]
+    if at is not None and rooted and (without := frames - int((weights[:, at] > 0).sum())):
+        words = f"the root {names[at][1]} is not seen in {without} of {counted(frames, 'compared frame')}"
+        notes.append(f"{words}, which do not count for {' and '.join(rooted)}")
     flip = points * points.new_tensor([1.0, 1.0, -1.0])
     if mirror:
         points, flip = flip, points
@@ -126,7 +141,7 @@ def compare(
     variation = pred.variation
     return Comparison(
         joints=tuple(names),
-        frames=len(target),
+        frames=frames,
         units=truth.units,
         root=None if at is None else names[at][1],
         mpjpe={how: figure(points, how) for how in chosen},
@@ -210,12 +225,12 @@ def _same_frames(pred: Motion, truth: Motion, notes: list[str]) -> tuple[Motion,
     )
 
 
-def _alignments(align: str | Sequence[str] | None, ratio: float | None, pred: Motion, truth: Motion) -> list[str]:
+def _alignments(align: str | Iterable[str] | None, ratio: float | None, pred: Motion, truth: Motion) -> list[str]:
     if align is None:
         return [how for how in ALIGNMENTS if how in _SIZED or (ratio is not None and how != "none")]
-    align = align if isinstance(align, Iterable) and not isinstance(align, str) else [align]
-    for how in align:
-        if how not in ALIGNMENTS:
+    names = list(align) if isinstance(align, Iterable) and not isinstance(align, str) else [align]
+    for how in names:
+        if not isinstance(how, str) or how not in ALIGNMENTS:
             raise unknown("alignment", how, ALIGNMENTS)
         if ratio is None and how not in _SIZED:
             raise OptionError(
@@ -223,19 +238,17 @@ def _alignments(align: str | Sequence[str] | None, ratio: float | None, pred: Mo
                 f"truth in {truth.units or 'an unknown unit'}: set the size with scaled() or --scale, or use "
                 f"{', '.join(_SIZED)}"
             )
-    return list(dict.fromkeys(align))
+    return list(dict.fromkeys(names))
 
 
-def _root(name: str | None, shared: Sequence[str]) -> int | None:
-    """Where the root is among the compared joints."""
+def _root(name: str | None, shared: Sequence[str], weights: Tensor) -> int | None:
+    """Where the root is among the compared joints, of weights (T, N): as named, or a pelvis that is seen."""
     if name is not None:
         if name not in shared:
             raise unknown("root among the compared joints", name, shared, SkeletonError)
         return shared.index(name)
-    at = map_joints(shared, ["pelvis"])[0]
-    if at is None:
-        at = map_joints(shared, ["mid_hip"])[0]
-    return at
+    found = [map_joints(shared, [pelvis])[0] for pelvis in ("pelvis", "mid_hip")]
+    return next((at for at in found if at is not None and bool((weights[:, at] > 0).any())), None)
 
 
 def _deviation(motion: Motion) -> float:

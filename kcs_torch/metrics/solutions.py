@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
@@ -19,7 +19,7 @@ MIRRORED = 0.3
 """A mirror image's depths add up to less than this share of their difference."""
 
 EXACT = 1e-3
-"""And those of the mirror image itself to less than this share."""
+"""And those of the mirror image itself to less than this share; as the difference of the same depths to their sum."""
 
 FEW = 0.05
 """Share of frames in which a bone must be flipped to be named."""
@@ -35,6 +35,7 @@ class Difference:
         flipped: bones that tip the other way in depth, and the share of frames in which they do; most often first.
         beside_mirror: root mean square distance in depth from the mirror image, 0 where it is just that.
         units: the solutions'.
+        joints: those whose depths differ, and by how much (root mean square); farthest first.
     """
 
     rms: float
@@ -42,6 +43,7 @@ class Difference:
     flipped: dict[str, float]
     beside_mirror: float = 0.0
     units: str = ""
+    joints: dict[str, float] = field(default_factory=dict)
 
     def __str__(self) -> str:
         if self.mirrored and not self.beside_mirror:
@@ -49,7 +51,7 @@ class Difference:
         if self.mirrored:
             return f"nearly the mirror image in depth, {f'{self.beside_mirror:.3g} {self.units}'.rstrip()} from it"
         if not self.flipped:
-            return "depths differ, no bone tips the other way"
+            return "depths differ, no bone tips the other way" if self.joints else "depths are the same"
         some = dict(list(self.flipped.items())[:4])
         more = f", and {counted(len(self.flipped) - 4, 'more bone')}" if len(self.flipped) > 4 else ""
         if min(some.values()) == 1:  # all the time, as in a single image
@@ -90,6 +92,11 @@ def difference(best: Reconstruction, other: Reconstruction) -> Difference:
     rms = float(apart.square().sum(-1).nanmean().sqrt())
     add, subtract = (float(z.square().nanmean().sqrt()) for z in (depth.sum(0), depth[1] - depth[0]))
     body = best.skeleton
+    joints: dict[str, float] = {}
+    if subtract > EXACT * add:
+        far = (depth[1] - depth[0]).square().nanmean(0).sqrt().nan_to_num(0.0)
+        order = far.argsort(descending=True, stable=True).tolist()
+        joints = {body.joints[j]: float(far[j]) for j in order if far[j] > 0}
     flipped: dict[str, float] = {}
     if body.num_bones:
         tips = bone_vectors(both, body.bone_index(device=both.device))
@@ -98,4 +105,4 @@ def difference(best: Reconstruction, other: Reconstruction) -> Difference:
         order = share.argsort(descending=True, stable=True).tolist()
         flipped = {body.bone_names[b]: float(share[b]) for b in order if share[b] >= FEW}
     beside = 0.0 if add <= EXACT * subtract else add
-    return Difference(rms, add < MIRRORED * subtract, flipped, beside, best.units)
+    return Difference(rms, add < MIRRORED * subtract, flipped, beside, best.units, joints)

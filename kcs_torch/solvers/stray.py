@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcs_torch.functional.ranks import nanmedian
 
-__all__ = ["body_size", "each_joint", "far_off", "from_beside", "in_motion", "stray_from_neighbours"]
+__all__ = ["around_usual", "body_size", "each_joint", "far_off", "from_beside", "in_motion", "stray_from_neighbours"]
 
 STRAY, FLOOR = 6.0, 0.04
 """Of outliers: usual distances from what is predicted, and the share of the body's size beside."""
@@ -98,10 +98,15 @@ def far_off(error: Tensor, seen: Tensor) -> Tensor:
     # Of a Gaussian's distances the quantile is at the median. It is above it where a joint is still most of the time
     # and then swings: no quick stride is an outlier, no outliers are as common.
     clip = torch.maximum(nanmedian(known, 1, keepdim=True), known.nanquantile(COMMON, 1, keepdim=True) / RATIO)
-    around = torch.nn.functional.pad(known.mT, (AROUND, AROUND), value=math.nan).unfold(-1, 2 * AROUND + 1, 1)
+    return seen & (error > STRAY * around_usual(known, clip) + FLOOR)
+
+
+def around_usual(error: Tensor, clip: Tensor) -> Tensor:
+    """Median error (..., T, N) about each frame, within one to four times the clip's (..., 1, N); NaN: unknown."""
+    around = torch.nn.functional.pad(error.mT, (AROUND, AROUND), value=math.nan).unfold(-1, 2 * AROUND + 1, 1)
+    near = nanmedian(around, -1).mT.nan_to_num(0.0)
     # Bounded, as near the ends of a clip one outlier may spoil the prediction of all that is around.
-    usual = torch.maximum(clip, torch.minimum(nanmedian(around, -1).mT, 4 * clip)).nan_to_num(0.0)
-    return seen & (error > STRAY * usual + FLOOR)
+    return torch.maximum(clip, torch.minimum(near, 4 * clip)).nan_to_num(0.0)
 
 
 def from_beside(values: Tensor, mirrored: bool = False) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kcs_torch.errors import KcsWarning, OptionError
 from kcs_torch.functional import bone_lengths
-from kcs_torch.functional.ranks import median
+from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.angles import JointAngles, Joints, angles_of
 from kcs_torch.types.hints import is_a
@@ -189,7 +189,7 @@ class Reconstruction:
             largest_bone_variation=variation.largest,
             loosest_bone=variation.bone,
         )
-        return replace(self, lengths=median(bones, 0), diagnostics=facts)
+        return replace(self, lengths=nanmedian(bones, 0), diagnostics=facts)
 
     def solution(self, number: int) -> Reconstruction:
         """The solution of this number, with all the others as its alternatives: 1 is this one, 2 the first alternative.

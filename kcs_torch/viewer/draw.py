@@ -26,7 +26,7 @@ from kcs_torch.viewer.names import printable
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["any_letters", "clearest_frame", "draw_skeleton", "draw_tracks", "new_figure"]
+__all__ = ["any_letters", "clearest_frame", "draw_skeleton", "draw_tracks", "fit", "frame_alone", "new_figure"]
 
 LOOK = 100  # frames from the first in which anybody is seen, among which a clear one is looked for
 CLEAR = 0.9  # share of the most joints seen in any of these frames, from which on a frame is clear
@@ -71,7 +71,7 @@ def draw_tracks(people: Tracks | Sequence[Tracks], *, frame: int | None = None) 
     _title(figure, f"{head}{which} · skeleton {people[0].skeleton.name}")
     for axis, members in zip(axes, panels, strict=True):
         together = len(panels) > 1 and axis is axes[0]
-        _fit(axis, np.concatenate([poses[k] for k in members]))
+        _fit_places(axis, np.concatenate([poses[k] for k in members]))
         for k in members:
             _body(axis, people[k].skeleton, poses[k], named=not together)
             if together:
@@ -106,7 +106,7 @@ def draw_skeleton(skeleton: str | Path | Skeleton) -> Figure:
     facts += ["template pose" if skeleton.template is not None else "no template pose: only what joins what"]
     _title(figure, f"{skeleton.name}: {', '.join(facts)}")
     places = flat_layout(skeleton)
-    _fit(axis, places)
+    _fit_places(axis, places)
     _body(axis, skeleton, places, named=True)
     return figure
 
@@ -147,6 +147,18 @@ def frame_alone(axis: Any) -> None:
         spine.set_color("#dddddd")
 
 
+def fit(axis: Any, middle: Array, half: Array, share: tuple[float, float]) -> None:
+    """Limits so that what reaches ``half`` to either side of the middle fills a share of the width and of the height.
+
+    Both axes have one scale, with y down; the larger of the two shares that come out is as asked.
+    """
+    box = axis.get_window_extent()
+    room = np.array([box.width, box.height])
+    half = room / (share * room / np.maximum(half, 1e-9)).min()
+    axis.set_xlim(middle[0] - half[0], middle[0] + half[0])
+    axis.set_ylim(middle[1] + half[1], middle[1] - half[1])
+
+
 def _panels(count: int, joints: int) -> tuple[Figure, list[Any]]:
     side = SIDE * (1.6 if joints > MANY else 1.0)
     figure = new_figure(side * count, side + 0.7, 110)
@@ -171,17 +183,11 @@ def _pose(tracks: Tracks, frame: int) -> Array:
     return np.where(tracks.seen[frame].cpu().numpy()[:, None], points, np.nan)
 
 
-def _fit(axis: Any, places: Array) -> None:
-    """Limits with room for names around the known places, both axes in one scale, y down."""
+def _fit_places(axis: Any, places: Array) -> None:
+    """Fit a panel to the known places, with room for names."""
     known = places[np.isfinite(places).all(-1)]
     low, high = (known.min(0), known.max(0)) if len(known) else (np.zeros(2), np.ones(2))
-    box = axis.get_window_extent()
-    size = np.maximum(high - low, 1e-9)
-    scale = min(0.68 * box.width / size[0], 0.84 * box.height / size[1])
-    half = np.array([box.width, box.height]) / scale / 2
-    middle = (low + high) / 2
-    axis.set_xlim(middle[0] - half[0], middle[0] + half[0])
-    axis.set_ylim(middle[1] + half[1], middle[1] - half[1])
+    fit(axis, (low + high) / 2, (high - low) / 2, (0.68, 0.84))
 
 
 def _body(axis: Any, skeleton: Skeleton, places: Array, *, named: bool) -> None:

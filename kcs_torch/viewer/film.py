@@ -12,7 +12,7 @@ from kcs_torch.types import Reconstruction
 from kcs_torch.types.arrays import as_doubles
 from kcs_torch.types.people import files_named
 from kcs_torch.viewer.colours import COLOURS, bone_keys, joint_keys
-from kcs_torch.viewer.draw import frame_alone, new_figure
+from kcs_torch.viewer.draw import fit, frame_alone, new_figure
 from kcs_torch.viewer.layout import turned
 from kcs_torch.viewer.names import person_names, printable
 from kcs_torch.viewer.together import points_together
@@ -22,6 +22,7 @@ __all__ = ["Film"]
 SIZE, DPI = (8.8, 4.4), 100  # inches
 YAW, SWING, PITCH = -35.0, 25.0, 12.0  # degrees: the middle of the 3D view, how far it turns to either side, its height
 LOST = 0.002  # share of points left out at either end of an axis
+FILLED = (0.9, 0.9)  # share of a picture's width and height
 FAR = 2.5  # a body that goes farther than so many of its sizes stays in the middle of the picture
 Array = NDArray[np.float64]
 
@@ -51,9 +52,10 @@ class Film:
         flat = np.concatenate([x[np.isfinite(x).all(-1)] for x in self.tracks])
         flat = flat if len(flat) else np.zeros((1, 2))
         low, high = np.quantile(flat, [LOST, 1 - LOST], axis=0)
-        _limits(axes[0], (low + high) / 2, (high - low) / 2)
-        _limits(axes[1], self.space.middle, self.space.half)
+        fit(axes[0], (low + high) / 2, (high - low) / 2, FILLED)
+        fit(axes[1], self.space.middle, self.space.half, FILLED)
         for axis, title in zip(axes, ("tracks", "3D"), strict=True):
+            frame_alone(axis)
             axis.set_title(title, fontsize=9, pad=3)
         title = f"{', '.join(dict.fromkeys(r.method for r in people))}: {files_named(r.tracks for r in people)}"
         self.title = printable(title)[:90]
@@ -188,14 +190,3 @@ class Room:
         lines = np.array([ends for c in np.linspace(-1, 1, 9) for ends in (((c, -1), (c, 1)), ((-1, c), (1, c)))])
         x, z = np.moveaxis(lines * self.reach + self.centre[[0, 2]], -1, 0)
         return self.seen(np.stack([x, np.full(x.shape, self.ground), z], -1), yaw)[..., :2]
-
-
-def _limits(axis: Any, middle: Array, half: Array) -> None:
-    """Both axes in one scale, y down, with a margin; without ticks."""
-    box = axis.get_window_extent()
-    half = np.maximum(half, 1e-9 + 1e-3 * half.max())
-    scale = 0.9 * min(box.width / half[0], box.height / half[1])
-    half = np.array([box.width, box.height]) / scale
-    axis.set_xlim(middle[0] - half[0], middle[0] + half[0])
-    axis.set_ylim(middle[1] + half[1], middle[1] - half[1])
-    frame_alone(axis)

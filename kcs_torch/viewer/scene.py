@@ -163,11 +163,8 @@ def _difference(best: Reconstruction, other: Reconstruction) -> str:
     found = difference(best, other)
     if found.mirrored:
         return "nearly the mirror image" if found.beside_mirror else "mirror image"
-    depths = [as_doubles(r.points)[..., 2] for r in (best, other)]
-    ours, theirs = (z - np.nanmean(z, 1, keepdims=True) for z in depths)
-    apart = np.sqrt(np.nanmean((ours - theirs) ** 2, 0))
-    most = np.argsort(-np.nan_to_num(apart))
-    worst = [best.skeleton.joints[j] for j in most if apart[j] > 0.6 * apart[most[0]]]
+    most = max(found.joints.values(), default=0.0)
+    worst = [joint for joint, apart in found.joints.items() if apart > 0.6 * most]
     more = f" and {len(worst) - 2} more" if len(worst) > 2 else ""
     return f"other depth of {', '.join(worst[:2])}{more}" if worst else "much the same"
 
