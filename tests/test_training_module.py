@@ -24,6 +24,7 @@ from kcs_torch.training import (
     save_lifter,
 )
 from kcs_torch.training.augment import mirrored, turned, unit_size
+from kcs_torch.training.batch import check_batch
 from kcs_torch.training.module import step_share
 
 BODY = kt.SKELETONS["h36m17"]
@@ -114,6 +115,9 @@ def test_a_loss_over_nothing_is_0():
         (lambda: LossTerm(nn.MSELoss()), "MSELoss needs input"),
         (lambda: LossTerm(kt.nn.JointDistance(), clips="some"), "expected one of all, labelled, unlabelled"),
         (lambda: LossTerm("JointDistance"), "expected a torch.nn.Module, got str"),
+        (lambda: LossTerm(kt.nn.JointDistance(), -1), "LossTerm: weight: expected a number not below 0, got -1"),
+        (lambda: LossTerm(kt.nn.KCSCritic(BODY, width=4)), r"got KCSCritic.*LiftingModule\(critic="),
+        (lambda: LossTerm(torch.compile(kt.nn.KCSCritic(BODY, width=4), backend="eager")), "got KCSCritic"),
         (lambda: LiftingModule(kt.nn.MLPLifter(BODY), {}), "losses: expected a mapping"),
         (lambda: LiftingModule(kt.nn.MLPLifter(BODY), {"a": kt.nn.JointDistance()}), "losses: expected a mapping"),
         (lambda: LiftingModule(kt.nn.MLPLifter(BODY), [LossTerm(CycleConsistency())]), "losses: expected a mapping"),
@@ -234,6 +238,71 @@ def test_losses_see_clips_of_one_size():
     torch.testing.assert_close(small.points, large.points)
     blank = unit_size(batch._replace(tracks=0 * batch.tracks, weights=0 * batch.weights))
     assert torch.isfinite(blank.points).all()
+
+
+def test_what_is_nan_is_unseen_or_not_labelled():
+    """In the size of clips, in turns, and in losses of targets."""
+    batch = batch_of()
+    hidden = (batch.weights > 0)[..., None]
+    size = unit_size(batch)
+    for weights in (batch.weights, torch.ones_like(batch.weights)):
+        got = unit_size(batch._replace(tracks=torch.where(hidden, batch.tracks, torch.nan), weights=weights))
+        torch.testing.assert_close(got.points, size.points)
+        torch.testing.assert_close(torch.where(hidden, got.tracks, 0), size.tracks)
+    points = batch.points.clone()
+    points[:2, :, 9] = points[1, 3] = torch.nan
+    some = batch._replace(points=points)
+    got = turned(some, 1.0)
+    assert torch.equal(got.points.isnan(), points.isnan())
+    assert not torch.equal(got.tracks[0], batch.tracks[0]) and torch.equal(got.tracks[1], batch.tracks[1])
+    assert got.tracks.isfinite().all() and not got.weights[0, :, 9].any() and not got.tracks[0, :, 9].any()
+    rest = [joint for joint in range(17) if joint != 9]
+    assert torch.equal(got.weights[0][:, rest], batch.weights[0][:, rest])
+    assert torch.equal(got.weights[1:], batch.weights[1:])
+    noise = (tracks - p[..., :2] for tracks, p in ((got.tracks[0], got.points[0]), (batch.tracks[0], points[0])))
+    seen = batch.weights[0][:, rest, None]
+    torch.testing.assert_close(*(x[:, rest] * seen for x in noise), rtol=1e-4, atol=1e-3)
+    half = batch._replace(points=torch.where(torch.arange(5)[:, None, None] < 2, batch.points, torch.nan))
+    loss = lambda at: LossTerm(kt.nn.JointDistance(), clips="labelled").value(  # noqa: E731
+        at.points.nan_to_num() + torch.arange(3), at, nn.Identity()
+    )
+    assert float(loss(half)) == pytest.approx(float(loss(batch)), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda b: tuple(b), r"batch: expected a kcs_torch.training.Batch\(tracks, .*\), got tuple"),
+        (lambda b: b._replace(pseudo=None), "batch.pseudo: expected a tensor, got NoneType"),
+        (lambda b: b._replace(points=b.points.int()), "batch.points: expected numbers in floating point"),
+        (
+            lambda b: Batch(*(x[:, :, :17] if x.ndim > 1 else x for x in b)),
+            r"batch.tracks: expected \(B, T, 19, 2\) .* got \(4, 5, 17, 2\): without its virtual joints pelvis, neck",
+        ),
+        (lambda b: Batch(*(torch.stack([x, x]) for x in b)), "batches were stacked, .*batch_size=None"),
+        (lambda b: Batch(*(x[0] for x in b)), "a single clip has B = 1"),
+        (lambda b: b._replace(weights=b.weights[..., None]), r"batch.weights: expected \(4, 5, 19\) for tracks"),
+        (
+            lambda b: b._replace(points=b.points[..., :2]),
+            r"batch.points: expected \(4, 5, 19, 3\) .*, got",
+        ),
+        (lambda b: b._replace(labelled=b.labelled[:, None]), r"batch.labelled: expected \(4,\) .* got \(4, 1\)"),
+        (lambda b: b._replace(pseudo=b.pseudo[:, 0]), r"batch.pseudo: expected \(4, 5, 19\) .* got \(4, 19\)"),
+    ],
+)
+def test_a_batch_that_is_none_is_told(change, told):
+    points, weights = torch.randn(4, 5, 19, 3), torch.ones(4, 5, 19)
+    batch = Batch(points[..., :2], weights, points, torch.ones(4), torch.zeros_like(weights))
+    module = LiftingModule(kt.nn.MLPLifter("coco17", width=4), {"joints": LossTerm(kt.nn.JointDistance())})
+    for step in (module.training_step, module.validation_step, module.test_step, module.predict_step):
+        with pytest.raises(kt.ShapeError, match=told):
+            step(change(batch), 0)
+
+
+def test_labels_may_be_true_or_false():
+    batch = batch_of()
+    got = check_batch(batch._replace(labelled=batch.labelled > 0, weights=batch.weights.int()), BODY)
+    assert all(torch.equal(one, other) and one.dtype == other.dtype for one, other in zip(got, batch, strict=True))
 
 
 def test_cycle_consistency_is_0_for_a_network_that_is_right():
@@ -488,6 +557,22 @@ def test_the_critic_learns_from_labelled_clips_alone():
     assert all(torch.equal(before[name], value) for name, value in module.critic.state_dict().items())
 
 
+def test_clips_of_which_some_joints_have_labels_train_and_measure():
+    """A critic sees whole poses alone; what is not labelled counts nowhere."""
+    batch = batch_of(labelled=6, pseudo=0)
+    points = batch.points.clone()
+    points[:3, 1:, 9] = torch.nan
+    batch = batch._replace(points=points, labelled=batch.labelled > 0)
+    module = module_of(critic=kt.nn.KCSCritic(BODY, width=8))
+    before = copy.deepcopy(module.critic.state_dict())
+    trainer = lightning.Trainer(max_epochs=2, accelerator="cpu", num_sanity_val_steps=0, **QUIET)
+    batches = torch.utils.data.DataLoader([batch], batch_size=None)
+    trainer.fit(module, batches, batches)
+    assert module.trouble is None
+    assert all(math.isfinite(value) for value in trainer.callback_metrics.values())
+    assert not all(torch.equal(before[name], value) for name, value in module.critic.state_dict().items())
+
+
 def test_a_refined_network_keeps_to_the_tracks_and_can_be_saved(tmp_path):
     torch.manual_seed(0)
     solver = kt.nn.UnrolledSfAM(BODY, num_steps=4, mu=0.01, articulate_from=0, learnable_lengths=True)
@@ -516,12 +601,14 @@ def test_a_refined_network_keeps_to_the_tracks_and_can_be_saved(tmp_path):
 
 
 @pytest.mark.parametrize("gradient", ["unrolled", "implicit", kt.solvers.Implicit(7, 1e-3, 5, 0.1)], ids=str)
-@pytest.mark.parametrize("solver", ["UnrolledFPC", "UnrolledSfAM"])
+@pytest.mark.parametrize("solver", ["UnrolledFPC", "UnrolledSfAM", "UnrolledPKC"])
 def test_files_tell_how_a_solver_is_differentiated(tmp_path, solver, gradient):
     """An implicit gradient is that of a fixed point, which the solver goes on to."""
     torch.manual_seed(0)
-    options = {"num_steps": 3, "mu": 0.1, "gradient": gradient}
-    own = kt.nn.UnrolledFPC(**options) if solver == "UnrolledFPC" else kt.nn.UnrolledSfAM(BODY, **options)
+    options = {"num_steps": 3, "gradient": gradient}
+    if solver == "UnrolledPKC":
+        options |= {"eps": 0.3, "realign_from": 0.3, "learnable_lengths": True}
+    own = kt.nn.UnrolledFPC(**options) if solver == "UnrolledFPC" else getattr(kt.nn, solver)(BODY, **options)
     network = kt.nn.RefinedLifter(kt.nn.TemporalLifter(BODY, channels=8), own).eval()
     again = load_lifter(save_lifter(tmp_path / "a.safetensors", network)).network.eval()
     assert again.solver.implicit == own.implicit
@@ -566,9 +653,8 @@ def test_a_network_of_ones_own_trains_and_is_told_that_it_has_no_file(tmp_path):
             overrides=[
                 "experiment=smoke",
                 "solver=sfam",
-                "solver._target_=kcs_torch.nn.UnrolledPKC",
+                "solver._target_=kcs_torch.nn.UnrolledKCS",
                 "solver.num_steps=1",
-                "~solver.mu",
                 "~solver.articulate_from",
                 "~solver.corner",
                 "+trainer.logger=false",

@@ -14,6 +14,7 @@ from kcs_torch.functional import bone_lengths
 from kcs_torch.methods import SfAM
 from kcs_torch.nn import MLPLifter, RefinedLifter, UnrolledFPC, UnrolledKCS, UnrolledPKC, UnrolledSfAM
 from kcs_torch.nn.steps import continuation, data_scale, estimate_lengths, shape_step, start_shape
+from kcs_torch.nn.unrolled.base import row_length
 
 LAYERS = [
     UnrolledFPC(40),
@@ -204,6 +205,45 @@ def test_steps_do_not_diverge_whatever_the_weights_and_the_cameras_scale(layer):
     got = layer(several[1], several[2], weights=several[0])
     assert_close(got[0], usual)
     assert_close(got[1], layer(tracks, cameras, weights=5 * weights))
+
+
+@pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: type(layer).__name__)
+@pytest.mark.parametrize("length", [0.5, 1.1, 4.0])
+def test_the_length_of_a_clips_rows_does_not_count(layer, length):
+    tracks, cameras, weights = scene(BODY, "gaps")
+    usual = layer(tracks, cameras, weights=weights)
+    assert_close(layer(length * tracks, length * cameras, weights=weights), usual)
+    one, other = torch.stack([tracks, length * tracks]), torch.stack([cameras, length * cameras])
+    assert_close(layer(one, other, weights=weights.expand(2, -1, -1)), torch.stack([usual, usual]))
+
+
+@pytest.mark.parametrize("layer", [LAYERS[0], LAYERS[1], LAYERS[3]], ids=lambda layer: type(layer).__name__)
+def test_longer_rows_make_a_shape_smaller_in_the_derivative_too(layer):
+    """At rows of length 1, which are left as they are; bounds of the scales of KCS are constants."""
+    tracks, cameras, weights = scene(BODY, "gaps")
+    usual = layer(tracks, cameras, weights=weights)
+    scale = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(layer(tracks, scale * cameras, weights=weights).square().sum(), scale)
+    assert_close(slope, -2 * usual.square().sum())
+
+
+@pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: type(layer).__name__)
+def test_one_clip_has_cameras_of_several_lengths(layer):
+    tracks, cameras, weights = scene(BODY, "gaps")
+    lengths = torch.tensor([1.0, 2.0], dtype=torch.float64)[:, None, None, None]
+    got = layer(tracks, lengths * cameras, weights=weights)
+    usual = layer(tracks, cameras, weights=weights)
+    assert_close(got, torch.stack([usual, usual / 2]))
+
+
+def test_lengths_of_rows():
+    cameras = rotations(5, seed=1)[:, :2]
+    assert torch.equal(row_length(cameras, of_clip=True), torch.ones(1, 1, 1, dtype=torch.float64))
+    assert torch.equal(row_length(cameras, of_clip=False), torch.ones(5, 1, 1, dtype=torch.float64))
+    padded = torch.cat([2 * cameras, torch.zeros_like(cameras)])
+    assert_close(row_length(padded, of_clip=True), torch.full((1, 1, 1), 2.0, dtype=torch.float64))
+    assert_close(row_length(padded, of_clip=False).flatten(), torch.tensor([2.0] * 5 + [1.0] * 5, dtype=torch.float64))
+    assert row_length(torch.zeros(2, 0, 2, 3), of_clip=True).flatten().tolist() == [1, 1]
 
 
 def test_solve_tells_of_convergence():

@@ -181,6 +181,15 @@ def test_solvers_export(name):
 
 
 @each_solver
+def test_solvers_are_traced(name):
+    module, (tracks, cameras, _) = SOLVERS[name](), clips()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # sizes are constants of the trace
+        traced = torch.jit.trace(module, (tracks[0], cameras[0]), check_trace=False)
+    assert_close(traced(tracks[1], cameras[1]), module(tracks[1], cameras[1]))
+
+
+@each_solver
 def test_an_ensemble_under_vmap(name):
     """Parameters and buffers of several solvers, stacked."""
     modules, (tracks, cameras, _) = [SOLVERS[name]() for _ in range(3)], clips()

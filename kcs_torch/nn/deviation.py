@@ -120,6 +120,8 @@ def template_scale(tracks: Tensor, weights: Tensor, rest: Tensor, bones: Tensor)
         (..., T), positive.
     """
     frames, device = tracks.shape[-3], tracks.device
+    if torch.jit.is_tracing():  # where sizes are tensors
+        frames = int(frames)
     size = rest.square().sum(-1).mean().sqrt().clamp_min(1e-12)
     fallback = (tracks.square().sum(-1).mean((-2, -1)).sqrt() / size).clamp_min(1e-12)
     if len(bones) == 0:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from kcs_torch.errors import FormatError, KcsError, OptionError, OutputError, listed, unknown
 from kcs_torch.io.atomic import atomic_path
 from kcs_torch.io.registry import check_fps, need, read_error
-from kcs_torch.nn import MLPLifter, RefinedLifter, TemporalLifter, UnrolledFPC, UnrolledSfAM
+from kcs_torch.nn import MLPLifter, RefinedLifter, TemporalLifter, UnrolledFPC, UnrolledPKC, UnrolledSfAM
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers import Implicit
 from kcs_torch.training.lifter import Lifter
@@ -26,7 +26,11 @@ __all__ = ["NETWORKS", "load_lifter", "save_lifter"]
 NETWORKS: dict[str, type[MLPLifter] | type[TemporalLifter]] = {"MLPLifter": MLPLifter, "TemporalLifter": TemporalLifter}
 """The networks that files may name."""
 
-SOLVERS: dict[str, type[UnrolledFPC] | type[UnrolledSfAM]] = {"UnrolledFPC": UnrolledFPC, "UnrolledSfAM": UnrolledSfAM}
+SOLVERS: dict[str, type[UnrolledFPC] | type[UnrolledSfAM] | type[UnrolledPKC]] = {
+    "UnrolledFPC": UnrolledFPC,
+    "UnrolledSfAM": UnrolledSfAM,
+    "UnrolledPKC": UnrolledPKC,
+}
 """The solvers that files may name behind a network (:class:`kcs_torch.nn.RefinedLifter`)."""
 
 KEY = "kcs_torch"
@@ -96,7 +100,7 @@ def describe(network: nn.Module) -> dict[str, Any]:
     if isinstance(network, RefinedLifter):
         inner, solver = network.network, network.solver
         kind = type(solver).__name__
-        if SOLVERS.get(kind) is not type(solver) or not isinstance(solver, (UnrolledFPC, UnrolledSfAM)):
+        if SOLVERS.get(kind) is not type(solver) or not isinstance(solver, (UnrolledFPC, UnrolledSfAM, UnrolledPKC)):
             raise unknown("solver to save", kind, SOLVERS)
         facts |= {"solver": kind, "solver_options": _solver_options(solver)}
     kind = type(inner).__name__
@@ -200,7 +204,7 @@ def _build(path: Path, facts: Any, tensors: Mapping[str, Tensor]) -> nn.Module:
             return network
         own: dict[str, Any] = {} if solver == "UnrolledFPC" else {"skeleton": skeleton}
         # What names no corner has none: its file says so, or is older than corners.
-        given = {"corner": math.inf, **more}
+        given = ({} if solver == "UnrolledPKC" else {"corner": math.inf}) | more
         if "gradient" in given:
             given["gradient"] = Implicit(*given["gradient"])
         return RefinedLifter(network, SOLVERS[solver](**own, **given))
@@ -253,15 +257,18 @@ def _checked(options: Any, count: int, what: str) -> dict[str, Any]:
     return options
 
 
-def _solver_options(solver: UnrolledFPC | UnrolledSfAM) -> dict[str, Any]:
+def _solver_options(solver: UnrolledFPC | UnrolledSfAM | UnrolledPKC) -> dict[str, Any]:
     """What its constructor takes that its weights do not tell."""
-    options: dict[str, Any] = {"num_steps": solver.num_steps, "momentum": solver.momentum}
-    if math.isfinite(solver.corner):
-        options["corner"] = solver.corner
+    options: dict[str, Any] = {"num_steps": solver.num_steps}
+    if not isinstance(solver, UnrolledPKC):
+        options["momentum"] = solver.momentum
+        if math.isfinite(solver.corner):
+            options["corner"] = solver.corner
     if solver.implicit is not None:  # its fixed point is what the network gives
         options["gradient"] = list(astuple(solver.implicit))
-    if isinstance(solver, UnrolledSfAM):
-        options["articulate_from"] = solver.first / solver.num_steps
+    if not isinstance(solver, UnrolledFPC):
+        first = "realign_from" if isinstance(solver, UnrolledPKC) else "articulate_from"
+        options[first] = solver.first / solver.num_steps
         if solver.has_lengths:
             options["lengths"] = [1.0] * solver.skeleton.num_bones
     return options

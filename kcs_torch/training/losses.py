@@ -12,7 +12,9 @@ from torch import Tensor, nn
 from kcs_torch.errors import OptionError, ShapeError
 from kcs_torch.functional import centre, orbit
 from kcs_torch.functional.guarded import safe_norm
+from kcs_torch.nn import KCSCritic
 from kcs_torch.training.batch import Batch
+from kcs_torch.training.options import AMOUNT, check_options
 
 __all__ = ["CycleConsistency", "LossTerm"]
 
@@ -36,7 +38,8 @@ class LossTerm:
             target, frames count by its weights.
 
     Raises:
-        OptionError: the loss needs something else, or ``clips`` is none of these.
+        OptionError: the loss needs something else, or is a critic; the weight is below 0, or ``clips`` is none of
+            these.
     """
 
     loss: nn.Module
@@ -48,6 +51,12 @@ class LossTerm:
             raise OptionError(f"LossTerm: clips: expected one of {', '.join(get_args(Clips))}, got {self.clips!r}")
         if not isinstance(self.loss, nn.Module):
             raise OptionError(f"LossTerm: loss: expected a torch.nn.Module, got {type(self.loss).__name__}")
+        if isinstance(_uncompiled(self.loss), KCSCritic):
+            raise OptionError(
+                "LossTerm: loss: expected a loss, got KCSCritic, which has to learn on its own what is true: "
+                "LiftingModule(critic=...)"
+            )
+        check_options("LossTerm", weight=(self.weight, AMOUNT))
         other = [name for name, p in self._wanted().items() if p.default is p.empty and name not in _GIVEN]
         if other:
             raise OptionError(
@@ -56,8 +65,7 @@ class LossTerm:
             )
 
     def _wanted(self) -> dict[str, inspect.Parameter]:
-        loss = getattr(self.loss, "_orig_mod", self.loss)  # of torch.compile, which takes anything
-        some = inspect.signature(loss.forward).parameters
+        some = inspect.signature(_uncompiled(self.loss).forward).parameters
         return {name: p for name, p in some.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
 
     def share(self, batch: Batch) -> Tensor:
@@ -88,9 +96,16 @@ class LossTerm:
         return (value * share).sum() / share.sum().clamp_min(1e-6)
 
 
+def _uncompiled(loss: nn.Module) -> nn.Module:
+    """The module itself: what torch.compile makes of it takes anything."""
+    own: nn.Module = getattr(loss, "_orig_mod", loss)
+    return own
+
+
 def _trust(batch: Batch) -> Tensor:
-    """Weight of each joint's target (B, T, N): 1 where it is the truth, else that of the pseudo-label."""
-    return torch.where(batch.labelled[:, None, None] > 0, torch.ones_like(batch.pseudo), batch.pseudo)
+    """Weight of each joint's target (B, T, N): 1 where it is the truth, else that of the pseudo-label; 0 of NaN."""
+    share = torch.where(batch.labelled[:, None, None] > 0, torch.ones_like(batch.pseudo), batch.pseudo)
+    return share * batch.points.isfinite().all(-1)
 
 
 class CycleConsistency(nn.Module):

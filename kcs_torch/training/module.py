@@ -16,7 +16,7 @@ from kcs_torch.metrics.torch_metrics import MPJPE, BoneDeviation
 from kcs_torch.nn import RefinedLifter, critic_loss, generator_loss
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.training.augment import mirrored, turned, unit_size
-from kcs_torch.training.batch import Batch
+from kcs_torch.training.batch import Batch, check_batch
 from kcs_torch.training.losses import LossTerm
 from kcs_torch.training.options import AMOUNT, POSITIVE, SHARE, WHOLE, check_options
 
@@ -101,6 +101,7 @@ class LiftingModule(lightning.LightningModule):
                 f"LiftingModule: flip: expected a network that says its skeleton, got {type(network).__name__}; flip=0 "
                 "mirrors nothing"
             )
+        self._skeleton = skeleton if isinstance(skeleton, Skeleton) else None
         self.automatic_optimization = False  # network and critic take steps in turn
         self.network = network if refine is None else RefinedLifter(network, refine)
         self.critic, self.critic_weight = critic, critic_weight
@@ -198,11 +199,21 @@ class LiftingModule(lightning.LightningModule):
             )
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Lift a batch."""
+        """Lift a batch.
+
+        Raises:
+            ShapeError: it is no batch as :class:`Batch` says.
+        """
+        batch = check_batch(batch, self._skeleton)
         return self(batch.tracks, batch.weights)
 
     def training_step(self, batch: Batch, batch_idx: int) -> None:
-        """Make one step of the network, and one of the critic."""
+        """Make one step of the network, and one of the critic.
+
+        Raises:
+            ShapeError: it is no batch as :class:`Batch` says.
+        """
+        batch = check_batch(batch, self._skeleton)
         number = int(self.step)
         with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
             torch.manual_seed((self.seed * 1_000_003 + number) % 2**63)
@@ -228,12 +239,14 @@ class LiftingModule(lightning.LightningModule):
         if self.trouble is None and not bool(total.isfinite()):
             self.trouble = self._trouble(points, values)
         self._advance(optimisers[0], total)
-        if self.critic is not None and bool((batch.labelled > 0).any()):
-            true = centre(batch.points[batch.labelled > 0])[0]
-            rows = torch.randint(len(points), (len(true),), device=true.device)
-            cost = critic_loss(self.critic(true), self.critic(centre(points.detach()[rows])[0])).mean()
-            values["critic_own"] = cost
-            self._advance(optimisers[1], cost, counts=False)
+        if self.critic is not None:
+            true = batch.points[batch.labelled > 0]
+            whole = true.isfinite().all(-1).all(-1)  # poses
+            if bool(whole.any()):
+                rows = torch.randint(len(points), (len(true),), device=true.device)
+                own, fake = (centre(x[whole][:, None])[0] for x in (true, points.detach()[rows]))
+                values["critic_own"] = critic_loss(self.critic(own), self.critic(fake)).mean()
+                self._advance(optimisers[1], values["critic_own"], counts=False)
         self.log_dict({f"train/{name}": value.detach() for name, value in values.items()}, batch_size=len(points))
         self.log("train/loss", total.detach(), prog_bar=True, batch_size=len(points))
 
@@ -284,15 +297,18 @@ class LiftingModule(lightning.LightningModule):
         self._measure("test", batch)
 
     def _measure(self, stage: str, batch: Batch) -> None:
+        batch = check_batch(batch, self._skeleton)
         points = self(batch.tracks, batch.weights)
         if not bool(points.isfinite().all()):
             raise NotFiniteError(f"{type(self.network).__name__}: expected finite points, got NaN or infinity")
+        there = batch.points.isfinite().all(-1)
+        counts = None if bool(there.all()) else there.to(points)
         metrics: Any = self.measured[stage]
         for name, metric in metrics.items():
             if name == "bone_deviation":
                 metric.update(points)
             else:
-                metric.update(points, batch.points)
+                metric.update(points, batch.points, counts)
             self.log(f"{stage}/{name}", metric, on_step=False, on_epoch=True, batch_size=len(points))
 
     def configure_optimizers(self) -> Any:

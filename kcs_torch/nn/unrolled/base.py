@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from kcs_torch.errors import OptionError, ShapeError, SkeletonError
+from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.shapes import fit_together
 from kcs_torch.functional.weights import seen_weights
 from kcs_torch.nn.checks import check_beside, check_inside, check_joints, check_points, check_tensor, check_weights
@@ -21,7 +22,7 @@ from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.implicit import Implicit, fixed_point
 from kcs_torch.solvers.iterate import Solution, iterate, relative_change
 
-__all__ = ["Gradient", "Unrolled"]
+__all__ = ["Gradient", "Unrolled", "row_length"]
 
 Gradient = Literal["unrolled", "implicit"] | Implicit
 """How an unrolled solver is differentiated."""
@@ -35,8 +36,26 @@ SHARPEST = 1e-6
 STEEP = 1.01
 """Weights times squared rows of cameras up to this are 1 but for rounding."""
 
+UNIT = 8
+"""Lengths of rows that differ from 1 by fewer rounding errors than this are 1."""
+
 SHORTEST = 1e-6
 """Least relative length that a bone may learn: measured lengths are divided by it."""
+
+
+def row_length(cameras: Tensor, *, of_clip: bool) -> Tensor:
+    """Root mean square length of rows of cameras (..., T, 2, 3), what tracks and cameras are divided by.
+
+    Returns:
+        That of each clip, (..., 1, 1, 1), or else of each frame, (..., T, 1, 1). Cameras of 0, as of padding, do not
+        count, and where there are no others it is 1; so it is, exactly, where it is 1 but for rounding.
+    """
+    square = cameras.square().sum((-2, -1), keepdim=True) / 2
+    if of_clip:
+        square = square.sum(-3, keepdim=True) / (square > 0).sum(-3, keepdim=True).clamp_min(1)
+    length = or_one(square).sqrt()
+    near = (length - 1).abs() < UNIT * torch.finfo(length.dtype).eps
+    return torch.where(near, 1 + (length - length.detach()), length)
 
 
 class Unrolled(nn.Module):
@@ -171,8 +190,8 @@ class Unrolled(nn.Module):
     def _step_sizes(self, weights: Tensor, cameras: Tensor) -> Tensor:
         """Step size (...) of each step, for weights (..., T, N) and cameras (..., T, 2, 3).
 
-        Where weights are above 1 or rows of cameras longer, the slope of the data term changes by as much more, and
-        steps are shorter, or they would diverge. Where a fixed point is sought, which hardly depends on it, the
+        Where weights are above 1 or rows of cameras longer than 1, the slope of the data term changes by as much more,
+        and steps are shorter, or they would diverge. Where a fixed point is sought, which hardly depends on it, the
         derivative is 0: what has not settled leaves some slope. Adam, which divides by its size, would go on to steps
         that diverge.
         """

@@ -13,7 +13,7 @@ from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.weights import known
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.steps import continuation, data_scale, shape_step, start_shape
-from kcs_torch.nn.unrolled.base import Gradient, Unrolled
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled, row_length
 from kcs_torch.solvers.iterate import Solution
 
 __all__ = ["UnrolledFPC"]
@@ -119,6 +119,8 @@ class UnrolledFPC(Unrolled):
         weights = self._check(tracks, cameras, weights, start, inside=inside)
         given, tracks = tracks, wide(known(tracks, weights))
         cameras, weights = clear_padding(wide(cameras), inside), wide(weights)
+        length = row_length(cameras, of_clip=True)
+        tracks, cameras = tracks / length, cameras / length
         threshold, step = self._values("threshold", tracks), self._step_sizes(weights, cameras)
         with full_precision(tracks):
             scale = data_scale(tracks, cameras, weights)

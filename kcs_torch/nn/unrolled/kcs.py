@@ -28,7 +28,7 @@ from kcs_torch.nn.deviation import (
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.reprojection import centred_residual
 from kcs_torch.nn.steps import continuation
-from kcs_torch.nn.unrolled.base import Gradient, Unrolled
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled, row_length
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution
 from kcs_torch.solvers.pose import CameraFit, fit_cameras, steady_cameras
@@ -235,6 +235,9 @@ class UnrolledKCS(Unrolled):
         with full_precision(tracks):
             points, share = self._centred(wide(tracks), wide(weights))
             rows, rest = clear_padding(wide(cameras), inside), self.template(points)
+            length = row_length(rows, of_clip=True)
+            points, rows = points / length, rows / length
+            share = share.expand(points.shape[:-1])
             threshold, step = self._values("threshold", points), self._step_sizes(share, rows)
             matrix, inverse = self.matrix.to(points), self.inverse.to(points)
             scales, size = self._scales(scales, points, rows, share, rest, inside)

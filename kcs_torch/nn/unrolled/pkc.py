@@ -18,7 +18,7 @@ from kcs_torch.nn.majorise import majorise_step, turn_onto_mean
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.reprojection import centred_residual
 from kcs_torch.nn.steps import aimed_lengths, continuation, start_shape
-from kcs_torch.nn.unrolled.base import Gradient, Unrolled
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled, row_length
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution
 
@@ -157,7 +157,9 @@ class UnrolledPKC(Unrolled):
             rows = cameras.to(wide)
             if inside is not None:  # any rotation will do
                 rows = torch.where(inside[..., None, None], rows, torch.eye(3, dtype=wide, device=rows.device)[:2])
-            flat, share, size = _normalised(known(tracks, weights).to(wide), weights.to(wide))
+            length = row_length(rows, of_clip=False)
+            rows, flat = rows / length, known(tracks, weights).to(wide) / length
+            flat, share, size = _normalised(flat, weights.to(wide))
             begin = start_shape(flat, rows, share) if start is None else clear_padding(start, inside).to(wide) / size
             begin = clear_padding(begin - begin.mean(-2, keepdim=True), inside)
             step = self._descent(flat, share, None if lengths is None else lengths.to(wide) / size[..., 0, 0], inside)

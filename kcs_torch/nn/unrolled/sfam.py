@@ -15,7 +15,7 @@ from kcs_torch.functional.precision import full_precision, narrow, wide
 from kcs_torch.functional.weights import known
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.steps import aimed_lengths, continuation, data_scale, shape_step, start_shape
-from kcs_torch.nn.unrolled.base import Gradient, Unrolled
+from kcs_torch.nn.unrolled.base import Gradient, Unrolled, row_length
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.solvers.iterate import Solution
 
@@ -163,6 +163,8 @@ class UnrolledSfAM(Unrolled):
         )
         given, tracks = tracks, wide(known(tracks, weights))
         cameras, weights = clear_padding(wide(cameras), inside), wide(weights)
+        length = row_length(cameras, of_clip=True)
+        tracks, cameras = tracks / length, cameras / length
         threshold, step = self._values("threshold", tracks), self._step_sizes(weights, cameras)
         stiffness = self._values("stiffness", tracks)
         if lengths is not None:
