@@ -18,6 +18,7 @@ from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.spectral import dct_basis, nuclear_norm
 from kcs_torch.functional.temporal import interpolate, window_starts
+from kcs_torch.functional.weights import of_largest
 from kcs_torch.methods.answer.mirror import mirror_sign
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.clips.batches import Clips, in_batches, padded
@@ -143,7 +144,8 @@ class SfAM(Method):
 
     def _solve(self, tracks: Sequence[Tracks], cameras: Tensor | None) -> list[Estimate]:
         """Clips of one skeleton and one number of windows; known cameras (T, 2, 3) are those of a single clip."""
-        clips = _fill_blank_frames(Clips.of(tracks))
+        clips = Clips.of(tracks)
+        clips = _fill_blank_frames(replace(clips, weights=of_largest(clips.weights)))
         starts = [self._starts(count) for count in clips.counts]
         window = min(self.window or max(clips.counts), max(clips.counts))
         first = torch.tensor(starts, device=clips.points.device)  # (K, V)
