@@ -254,6 +254,16 @@ def test_scale_range_bounds_each_frames_scale():
         assert scales.max() / scales.min() <= bound**2 + 1e-9
 
 
+@pytest.mark.parametrize("scale_range", [1.1, math.inf])
+def test_frames_that_tell_no_scale_take_their_neighbours(scale_range):
+    weights = TRACKS.weights.clone()
+    weights[8:36] = 0
+    weights[20, 3] = 1  # alone
+    result = KCS(scale_range=scale_range)(replace(TRACKS, weights=weights))
+    assert result.scales[8:36].sub(1).abs().max() < 0.05
+    assert float(result.lengths.sum()) == pytest.approx(float(KCS()(TRACKS).lengths.sum()), rel=0.05)
+
+
 # ---------------------------------------------------------------------- real walks
 
 
