@@ -65,7 +65,7 @@ class SfAM(Method):
         num_steps: shrinkage steps; the weight of the nuclear norm falls with each.
         mu: first weight, a share of the data's largest singular value.
         final: last weight. The factor from step to step (the paper's rho) follows from the three.
-        tau: step size of the articulated steps, below 1; the others take twice that.
+        tau: step size of the articulated steps, below (1 + momentum) / (1 + 2 momentum); the others take twice that.
         momentum: share of the last change that the next step starts ahead by; 0 is the printed iteration.
         corner: singular values well above this share of the data's largest are hardly shrunk (the reweighted nuclear
             norm), where the viewpoint turns: by less than 45 degrees the norm is the plain one, which keeps depths
@@ -109,8 +109,9 @@ class SfAM(Method):
         self._expect(self.num_steps >= 1, "num_steps", "at least 1")
         self._expect(0 < self.mu < math.inf, "mu", "a positive number")
         self._expect(0 < self.final <= self.mu, "final", f"a positive number up to mu = {self.mu}")
-        self._expect(0 < self.tau < 1, "tau", "a number between 0 and 1")
         self._expect(0 <= self.momentum < 1, "momentum", "a share within [0, 1)")
+        limit = (1 + self.momentum) / (1 + 2 * self.momentum)
+        self._expect(0 < self.tau < limit, "tau", f"a positive number below {limit:.3g}, as steps diverge from there on")
         self._expect(self.corner > 0, "corner", "a positive number")
         self._expect(0 <= self.articulate_from <= 1, "articulate_from", "a share within 0..1")
         if not isinstance(self.lengths, str):
