@@ -40,7 +40,8 @@ class Denoised(NamedTuple):
     Attributes:
         points: (..., T, N, 2) smoothed and filled tracks, in the tracks' units.
         weights: (..., T, N) as given, 0 at outliers.
-        noise: (..., N) standard deviation of a coordinate's noise, white and lasting, in the tracks' units.
+        noise: (..., N) standard deviation of a coordinate's noise, white and lasting, in the tracks' units, at the
+            usual weight of what is seen.
         outliers: (..., T, N), True where a seen joint was rejected and its place filled.
         left: (..., N) standard deviation of what the noise leaves in the points, by the model, were all joints seen.
     """
@@ -147,7 +148,7 @@ def denoise_tracks(
         outliers = each_joint(far_off, error, given > 0)
     noise, left = (
         (power.sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints).reshape(*shape[:-3], joints).to(tracks.dtype)
-        for power in (model.measured + model.lasting.mean(1), model.left)
+        for power in (model.white + model.lasting.mean(1), model.left)
     )
     return Denoised(
         (points * unit).reshape(shape).to(tracks.dtype),
@@ -210,7 +211,8 @@ class _Model:
         self.ratio = (white / (motion + lasting))[:, None]  # (K, 1, L, M)
         self.moving = (motion / (motion + lasting))[:, None]
         usual = w.sum((1, 2, 3)) / (w > 0).sum((1, 2, 3)).clamp_min(1)  # weight of what is seen
-        spoilt = (self.measured / usual.clamp_min(1e-3))[:, None, None] + lasting
+        self.white = self.measured / usual.clamp_min(1e-3)
+        spoilt = self.white[:, None, None] + lasting
         self.left = (motion * spoilt / (motion + spoilt)).mean((1, 2))  # of the posterior
 
     def _lasting(self, z: Tensor, each: Tensor) -> Tensor:
