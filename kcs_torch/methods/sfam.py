@@ -111,7 +111,9 @@ class SfAM(Method):
         self._expect(0 < self.final <= self.mu, "final", f"a positive number up to mu = {self.mu}")
         self._expect(0 <= self.momentum < 1, "momentum", "a share within [0, 1)")
         limit = (1 + self.momentum) / (1 + 2 * self.momentum)
-        self._expect(0 < self.tau < limit, "tau", f"a positive number below {limit:.3g}, as steps diverge from there on")
+        self._expect(
+            0 < self.tau < limit, "tau", f"a positive number below {limit:.3g}, as steps diverge from there on"
+        )
         self._expect(self.corner > 0, "corner", "a positive number")
         self._expect(0 <= self.articulate_from <= 1, "articulate_from", "a share within 0..1")
         if not isinstance(self.lengths, str):
