@@ -355,7 +355,15 @@ def test_as_good_as_the_authors_code(method, figures_of):
 @quiet
 def test_any_tolerance_will_do():
     tracks, _ = seen_from(band_limited(20, 2), tumbling(20))
-    assert bool(PTA(tolerance=1e300)(tracks).points.isfinite().all())
+    for tolerance in (1e300, 2**63):
+        assert bool(PTA(tolerance=tolerance)(tracks).points.isfinite().all())
+
+
+@quiet
+def test_more_shapes_than_csf_takes_are_the_most_it_takes(monkeypatch):
+    monkeypatch.setattr("kcs_torch.methods.csf.MOST", 2)
+    tracks = walking_person(30, turn=180).tracks
+    assert torch.equal(CSF(rank=3)(tracks).points, CSF(rank=2)(tracks).points)
 
 
 @pytest.mark.parametrize("method", ["pta", "csf"])
