@@ -18,7 +18,7 @@ from kcs_torch.functional import (
     nuclear_norm,
     procrustes,
     project,
-    similarity,
+    superpose,
 )
 from kcs_torch.methods.answer.mirror import mirror_sign
 
@@ -35,7 +35,7 @@ def centred(points):
 def rigid_error(found, truth):
     """Mean distance after a rotation of each frame, the better of the result and its mirror image."""
     mirrors = (found, found * torch.tensor([1.0, 1.0, -1.0]).to(found))
-    return min(float((similarity(m, truth, scale=False) - truth).norm(dim=-1).mean()) for m in mirrors)
+    return min(float((superpose(m, truth, "rigid") - truth).norm(dim=-1).mean()) for m in mirrors)
 
 
 def flat(points):
