@@ -31,11 +31,13 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from options import at_least_one
 from torch import Tensor
 
 import kcs_torch as kt
+from kcs_torch.cli.demo import rigid_error
 from kcs_torch.data import SyntheticClip, random_motion, walking_person
-from kcs_torch.functional.align import similarity
+from kcs_torch.functional import centre
 from kcs_torch.io.atomic import write_table
 from kcs_torch.methods.pkc import Weights
 from kcs_torch.methods.pkc.limbs import SignCosts
@@ -218,27 +220,17 @@ MOVING_VARIANTS = {
 VARIANTS = {"fixed": FIXED_VARIANTS, "others": FIXED_VARIANTS, "moving": MOVING_VARIANTS}
 
 
-def both_signs(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Points and their mirror image in depth, which parallel rays do not tell apart; centred per frame."""
-    points = points - points.mean(1, keepdim=True)
-    return points, points * points.new_tensor([1.0, 1.0, -1.0])
-
-
-def rigid(points: Tensor, truth: Tensor) -> float:
-    """Mean distance after one rotation per frame, of the better of the two mirror images."""
-    return min(float((similarity(p, truth, scale=False) - truth).norm(dim=-1).mean()) for p in both_signs(points))
-
-
 def e3d(points: Tensor, truth: Tensor) -> float:
     """Mean distance after one orthogonal matrix for the clip, over the truth's standard deviation."""
-    flat, goal = (x.flatten(0, 1) for x in (both_signs(points)[0], both_signs(truth)[0]))
+    points, truth = centre(points)[0], centre(truth)[0]
+    flat, goal = points.flatten(0, 1), truth.flatten(0, 1)
     u, _, v = torch.linalg.svd(flat.mT @ goal)
-    spread = both_signs(truth)[0].square().mean(1).sqrt().mean()
+    spread = truth.square().mean(1).sqrt().mean()
     return float((flat @ u @ v - goal).norm(dim=-1).mean() / spread)
 
 
 FIGURES: dict[str, tuple[Callable[[Tensor, Tensor], float], str]] = {
-    **dict.fromkeys(("fixed", "others"), (rigid, ".1f")),
+    **dict.fromkeys(("fixed", "others"), (rigid_error, ".1f")),
     "moving": (e3d, ".4f"),
 }
 
@@ -325,12 +317,12 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--suites", nargs="+", choices=suites, metavar="SUITE", help="; ".join(suites))
     parser.add_argument("--variants", nargs="+", choices=variants, metavar="VARIANT", help="; ".join(variants))
     parser.add_argument("--shared", type=Path, default=SHARED, help="folder with protocol/protocol.py and data/")
-    parser.add_argument("--cases", type=int, default=5, help="of each of the protocol's suites, at most")
-    parser.add_argument("--frames", type=int, default=150, help="of most clips, at most; synthetic ones have up to 60")
+    parser.add_argument("--cases", type=at_least_one, default=5, help="of each of the protocol's suites, at most")
+    parser.add_argument(
+        "--frames", type=at_least_one, default=150, help="of most clips, at most; synthetic ones have up to 60"
+    )
     parser.add_argument("--csv", type=Path, help="also write every run here")
     options = parser.parse_args(words)
-    if options.cases < 1:
-        parser.error(f"--cases: expected at least 1, got {options.cases}")
     wanted = {suite for part in options.parts for suite in PARTS[part]}
     if options.suites and not wanted & set(options.suites):
         parser.error(f"--parts {' '.join(options.parts)}: has none of the suites {', '.join(options.suites)}")
@@ -345,8 +337,8 @@ def main(words: list[str] | None = None) -> None:
         names = [name for name in VARIANTS[part] if name in (*(options.variants or variants), EVERYTHING)]
         if chosen:
             runs += measure(part, names, chosen, options)
-    if options.csv:
-        write_table(options.csv, runs)
+        if options.csv:  # after each part: a later one may fail
+            write_table(options.csv, runs)
 
 
 if __name__ == "__main__":

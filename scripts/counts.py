@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from options import at_least_one
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -139,7 +140,7 @@ def main(words: list[str] | None = None) -> None:
     """Measure, count, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--methods", nargs="+", choices=list(kt.METHODS), default=["kcs", "sfam", "pkc"])
-    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--frames", type=at_least_one, default=300)
     parser.add_argument("--csv", type=Path, help="also write the rows here")
     options = parser.parse_args(words)
     if options.csv:
@@ -150,10 +151,12 @@ def main(words: list[str] | None = None) -> None:
     print(f"torch {torch.__version__}, 1 thread, float64")
     print(f"a call {1e6 * rates['call']:.2f} us, products {rates['matrix'] / 1e9:.0f} GFLOP/s,", end=" ")
     print(f"copies {rates['cached'] / 1e9:.0f} GB/s in the cache and {rates['beyond'] / 1e9:.0f} beyond\n")
-    rows = [count(name, options.frames, turn, rates) for name in options.methods for turn in (0.0, 180.0)]
+    rows: list[Row] = []
+    for name in options.methods:
+        rows += [count(name, options.frames, turn, rates) for turn in (0.0, 180.0)]
+        if options.csv:  # after each method: a later one may fail
+            write_table(options.csv, rows)
     print(table(rows))
-    if options.csv:
-        write_table(options.csv, rows)
 
 
 if __name__ == "__main__":

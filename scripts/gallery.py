@@ -160,8 +160,12 @@ def main() -> None:
             print(path, flush=True)
     for source in options.real:
         path = options.output / f"real_{Path(source).stem}.png"
+        try:
+            tracks = kt.load_tracks(source)
+        except kt.KcsError as error:
+            raise SystemExit(f"error: {error}") from None
         path.parent.mkdir(parents=True, exist_ok=True)
-        sheet(kt.reconstruct(kt.load_tracks(source)), frames=6).savefig(path, dpi=100)
+        sheet(kt.reconstruct(tracks), frames=6).savefig(path, dpi=100)
         print(path, flush=True)
 
 

@@ -134,6 +134,8 @@ def main(arguments: list[str]) -> None:
         if name not in kt.METHODS:
             raise SystemExit(f"methods: expected some of {', '.join(kt.METHODS)}, got {name}")
     found = runs_of(folders, options["metric"])
+    if not found:
+        raise SystemExit(f"{', '.join(map(str, folders))}: expected runs in results.csv, found none")
     experiment = options["experiment"] or next(iter(found)).split()[0]
     shares = sorted({share for one in found.values() for share in one}, key=float)
     seeds = sorted({seed for one in found.values() for row in one.values() for seed in row})

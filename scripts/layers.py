@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 
 import torch
+from options import at_least_one
 from torch import Tensor
 
 import kcs_torch as kt
@@ -161,7 +162,7 @@ def time_import(repeats: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--skeleton", default="h36m17", choices=kt.SKELETONS, metavar="NAME")
-    parser.add_argument("--repeats", type=int, default=40)
+    parser.add_argument("--repeats", type=at_least_one, default=40)
     parser.add_argument("--imports", type=int, default=5, help="fresh interpreters for each time of importing")
     options = parser.parse_args()
     torch.set_num_threads(1)

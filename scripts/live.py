@@ -25,20 +25,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from options import at_least_one
 from torch import Tensor
 
 import kcs_torch as kt
+from kcs_torch.cli.demo import rigid_error
 from kcs_torch.data import walking_person
-from kcs_torch.functional.align import similarity
 from kcs_torch.metrics import coverage
 
 WALKS = ((20.0, 0), (60.0, 1))
-
-
-def error(points: Tensor, truth: Tensor) -> float:
-    """Mean distance after one rotation per frame."""
-    flips = (points, points * torch.tensor([1.0, 1.0, -1.0]).to(points))
-    return min(float((similarity(p, truth, scale=False) - truth).norm(dim=-1).nanmean()) for p in flips)
 
 
 def synthetic(skeleton: str, frames: int, noise: float) -> Iterator[tuple[str, kt.Tracks, Tensor]]:
@@ -74,19 +69,19 @@ def measure(name: str, tracks: kt.Tracks, truth: Tensor, paced: bool) -> str:
         begin = time.process_time()
         offline = kt.PKC(viewpoint="fixed")(tracks).observed
         whole = time.process_time() - begin
-    later = "".join(f"{error(x[ready], truth[ready]) if ready.any() else math.nan:9.1f}" for x in (live, offline))
+    later = "".join(f"{rigid_error(x[ready], truth[ready]) if ready.any() else math.nan:9.1f}" for x in (live, offline))
     median, most, worst = 1e3 * np.percentile(waits, [50, 99, 100])
     return (
         f"{name:<32}{len(poses):>7}{len(poses) / used:>7.0f}{len(poses) / whole:>8.0f}"
-        f"{median:>8.1f}{most:>7.0f}{worst:>7.0f}{error(live, truth):>8.1f}{later}"
+        f"{median:>8.1f}{most:>7.0f}{worst:>7.0f}{rigid_error(live, truth):>8.1f}{later}"
         f"{100 * float(coverage(live[ready], spread[ready], truth[ready])):>9.0f}"
     )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--skeleton", default="coco17")
-    parser.add_argument("--frames", type=int, default=600)
+    parser.add_argument("--skeleton", default="coco17", choices=kt.SKELETONS, metavar="NAME")
+    parser.add_argument("--frames", type=at_least_one, default=600)
     parser.add_argument("--noise", type=float, default=3.0, help="standard deviation, mm")
     parser.add_argument("--inputs", type=Path)
     parser.add_argument("--truth", type=Path)

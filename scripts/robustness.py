@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 import torch
 from benchmark import load_input, load_protocol
+from options import at_least_one
 from scipy.interpolate import CubicSpline, PchipInterpolator, make_interp_spline
 from torch import Tensor
 
@@ -66,9 +67,9 @@ Case = tuple[str, kt.Tracks, dict[str, Any]]
 class Bench:
     """Cases of the protocol and their scores."""
 
-    def __init__(self, shared: Path, frames: int, sequences: int) -> None:
+    def __init__(self, shared: Path, frames: int, sequences: int, seeds: int = 1) -> None:
         self.protocol: ModuleType = load_protocol(shared)
-        self.data, self.frames, self.sequences = shared / "data", frames, sequences
+        self.data, self.frames, self.sequences, self.seeds = shared / "data", frames, sequences, seeds
 
     def cases(self, names: tuple[str, ...], views: list[dict[str, float]]) -> Iterator[Case]:
         """Yield label, tracks and truth of each sequence and view."""
@@ -110,13 +111,13 @@ class Bench:
         return {name: figures.get(name, math.nan) for name in FIGURES}  # no edges, no bones
 
 
-def lengths(bench: Bench, seeds: int) -> Iterator[Run]:
+def lengths(bench: Bench) -> Iterator[Run]:
     """SfAM with the true bone lengths, off by up to so many mm, and with those that it finds itself."""
     for label, tracks, truth in bench.orbits():
         found = bench.score(kt.SfAM()(tracks), truth)
         true = true_lengths(tracks, truth)
         for level in LENGTHS:
-            for seed in range(seeds if level else 1):
+            for seed in range(bench.seeds if level else 1):
                 off = level * (2 * torch.rand(true.shape, generator=generator(seed), dtype=true.dtype) - 1)
                 given = torch.maximum(true + off, 0.1 * true)  # of short bones something is left
                 figures = bench.score(kt.SfAM(lengths=given.tolist())(tracks), truth)
@@ -124,7 +125,7 @@ def lengths(bench: Bench, seeds: int) -> Iterator[Run]:
         yield {"setting": "lengths found by SfAM", "case": label, "seed": 0} | found
 
 
-def variation(bench: Bench, seeds: int) -> Iterator[Run]:
+def variation(bench: Bench) -> Iterator[Run]:
     """Standard deviation over mean of each bone's length over time, per cent, among bones that are truly rigid."""
     for label, tracks, truth in bench.orbits():
         bones = tracks.skeleton.bone_index()
@@ -140,7 +141,7 @@ def variation(bench: Bench, seeds: int) -> Iterator[Run]:
             yield {"setting": setting, "case": label, "seed": 0} | bench.score(result, truth) | {"bones": each}
 
 
-def noise(bench: Bench, seeds: int) -> Iterator[Run]:
+def noise(bench: Bench) -> Iterator[Run]:
     """Gaussian noise on the tracks of an orbit; with the true cameras, too, to tell cameras from shape."""
     for label, tracks, truth in bench.orbits():
         known = bench.orbit_cameras(tracks.num_frames)
@@ -152,20 +153,20 @@ def noise(bench: Bench, seeds: int) -> Iterator[Run]:
         }
         for name, (method, cameras) in methods.items():
             for level in NOISE:
-                for seed in range(seeds if level else 1):
+                for seed in range(bench.seeds if level else 1):
                     shift = torch.randn(tracks.points.shape, generator=generator(seed), dtype=tracks.points.dtype)
                     figures = bench.score(method(replace_points(tracks, tracks.points + level * shift), cameras), truth)
                     yield {"setting": f"{name}, noise {level} mm", "case": label, "seed": seed} | figures
 
 
-def template(bench: Bench, seeds: int) -> Iterator[Run]:
+def template(bench: Bench) -> Iterator[Run]:
     """KCS from templates that differ from the skeleton's own; the flat guess for comparison."""
     views: list[dict[str, float]] = [{"yaw": yaw} for yaw in (0, 45, 90, 135)]
     for label, tracks, truth in bench.cases(WALKS, views):
         flat = torch.nn.functional.pad(tracks.points, (0, 1))
         yield {"setting": "flat guess", "case": label, "seed": 0} | bench.score(flat, truth)
         for share, degrees in TEMPLATE:
-            for seed in range(seeds if share or degrees else 1):
+            for seed in range(bench.seeds if share or degrees else 1):
                 rest = perturbed(tracks.skeleton, share / 100, math.radians(degrees), generator(seed))
                 figures = bench.score(kt.KCS(template=rest.tolist())(tracks), truth)
                 setting = (
@@ -175,7 +176,7 @@ def template(bench: Bench, seeds: int) -> Iterator[Run]:
                 yield {"setting": setting, "case": label, "seed": seed} | figures
 
 
-def missing(bench: Bench, seeds: int) -> Iterator[Run]:
+def missing(bench: Bench) -> Iterator[Run]:
     """The protocol's clips with hidden joints. Curves know the true places of the body and of its seen joints."""
     cases = bench.protocol.suites()["missing"]
     for case in [c for c in cases if c["src"] in list(dict.fromkeys(c["src"] for c in cases))[: bench.sequences]]:
@@ -193,7 +194,7 @@ def missing(bench: Bench, seeds: int) -> Iterator[Run]:
                 yield {"setting": f"truth, {name}, {level}"} | run | bench.score(points, truth)
 
 
-def short(bench: Bench, seeds: int) -> Iterator[Run]:
+def short(bench: Bench) -> Iterator[Run]:
     """Clips of a few frames, of bodies of which nothing is known, before a camera that goes round meanwhile."""
     methods: dict[str, kt.Method] = {"SfAM": kt.SfAM(), "PKC": kt.PKC()}
     for frames in (count for count in FEW if count <= bench.frames):
@@ -212,10 +213,16 @@ PARTS = {f.__name__: f for f in (lengths, variation, noise, template, missing, s
 
 
 def filled(points: np.ndarray, seen: np.ndarray, curve: Callable[..., Any]) -> np.ndarray:
-    """Points (T, N, 3) with curves in place of what is not seen (T, N); the ends are held."""
-    out = points.copy()
+    """Points (T, N, 3) with curves in place of what is not seen (T, N); the ends are held.
+
+    Seen in one frame a joint stays where it was, and one that is never seen at the origin.
+    """
+    out = points * seen[..., None]
     for joint, shown in enumerate(seen.T):
         known = np.flatnonzero(shown)
+        if len(known) < 2:
+            out[:, joint] = out[:, joint].sum(0)
+            continue
         time = np.clip(np.flatnonzero(~shown), known[0], known[-1])
         out[~shown, joint] = curve(known, points[known, joint])(time)
     return out
@@ -290,33 +297,30 @@ def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--shared", type=Path, default=SHARED, help="folder with protocol/protocol.py and data/")
-    parser.add_argument("--seeds", type=int, default=3, help="random draws of each disturbance")
-    parser.add_argument("--frames", type=int, default=300, help="of each sequence, at most")
-    parser.add_argument("--sequences", type=int, default=len(MOTIONS), help="of each part, at most")
+    parser.add_argument("--seeds", type=at_least_one, default=3, help="random draws of each disturbance")
+    parser.add_argument("--frames", type=at_least_one, default=300, help="of each sequence, at most")
+    parser.add_argument("--sequences", type=at_least_one, default=len(MOTIONS), help="of each part, at most")
     parser.add_argument("--csv", type=Path, help="also write every run here")
     options = parser.parse_args(words)
-    for name in ("seeds", "frames", "sequences"):
-        if getattr(options, name) < 1:
-            parser.error(f"argument --{name}: expected at least 1, got {getattr(options, name)}")
     if options.csv:
         options.csv.parent.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", kt.KcsWarning)
     try:
-        bench = Bench(options.shared, options.frames, options.sequences)
+        bench = Bench(options.shared, options.frames, options.sequences, options.seeds)
     except kt.OptionError as error:
         raise SystemExit(f"error: {error}") from None
     everything: list[Run] = []
     for part in options.parts:
-        runs = list(PARTS[part](bench, options.seeds))
+        runs = list(PARTS[part](bench))
         print(f"\n{part}: {PARTS[part].__doc__}\n\n{means(runs)}", flush=True)
         if part == "variation":
             print(f"\n{bone_table(runs)}", flush=True)
         for run in runs:
             bones = run.pop("bones", {})
             everything.append({"part": part} | run | {f"variation of {name}": value for name, value in bones.items()})
-    if options.csv:
-        write_table(options.csv, everything)
+        if options.csv:  # after each part: a later one may fail
+            write_table(options.csv, everything)
 
 
 if __name__ == "__main__":

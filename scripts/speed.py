@@ -32,6 +32,7 @@ from types import ModuleType
 from typing import Any
 
 import torch
+from options import at_least_one
 
 import kcs_torch as kt
 from kcs_torch.data import SyntheticClip, random_motion, walking_person
@@ -323,26 +324,28 @@ def arguments(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--parts", nargs="+", choices=every, default=parts, metavar="PART", help=", ".join(every))
     known = list(kt.METHODS)
     parser.add_argument("--which", nargs="+", choices=known, default=FAST, metavar="METHOD", help=", ".join(known))
-    parser.add_argument("--clips", type=int, default=64, help="of the part batch")
-    parser.add_argument("--threads", type=int, default=1, help="of PyTorch's own")
-    parser.add_argument("--workers", type=int, default=1, help="of the part batch: also in so many processes")
-    parser.add_argument("--short", type=int, nargs="+", default=[30, 100], metavar="FRAMES", help="of its clips")
-    parser.add_argument("--scale", type=int, nargs="+", default=[1000, 100_000], metavar="FRAMES")
+    parser.add_argument("--clips", type=at_least_one, default=64, help="of the part batch")
+    parser.add_argument("--threads", type=at_least_one, default=1, help="of PyTorch's own")
+    parser.add_argument("--workers", type=at_least_one, default=1, help="of the part batch: also in so many processes")
+    parser.add_argument(
+        "--short", type=at_least_one, nargs="+", default=[30, 100], metavar="FRAMES", help="of its clips"
+    )
+    parser.add_argument("--scale", type=at_least_one, nargs="+", default=[1000, 100_000], metavar="FRAMES")
     parser.add_argument("--device", default="cuda", help="of the part gpu")
-    parser.add_argument("--batches", type=int, nargs="+", default=[1, 4, 16, 64, 256, 1024, 4096], metavar="CLIPS")
+    parser.add_argument(
+        "--batches", type=at_least_one, nargs="+", default=[1, 4, 16, 64, 256, 1024, 4096], metavar="CLIPS"
+    )
     parser.add_argument("--most", type=float, default=10.0, help="seconds after which it tries no larger batch")
-    parser.add_argument("--frames", type=int, default=FRAMES, help="of methods, kernels and joints")
-    parser.add_argument("--growth", type=int, nargs="+", default=[100, 300, 1000, 3000, 10000], metavar="FRAMES")
-    parser.add_argument("--memory", type=int, nargs="+", default=[1000, 10000], metavar="FRAMES")
-    parser.add_argument("--joints", type=int, nargs="+", default=[17, 41, 133], metavar="JOINTS")
-    parser.add_argument("--runs", type=int, default=5, help="of which the median is taken")
+    parser.add_argument("--frames", type=at_least_one, default=FRAMES, help="of methods, kernels and joints")
+    parser.add_argument(
+        "--growth", type=at_least_one, nargs="+", default=[100, 300, 1000, 3000, 10000], metavar="FRAMES"
+    )
+    parser.add_argument("--memory", type=at_least_one, nargs="+", default=[1000, 10000], metavar="FRAMES")
+    parser.add_argument("--joints", type=at_least_one, nargs="+", default=[17, 41, 133], metavar="JOINTS")
+    parser.add_argument("--runs", type=at_least_one, default=5, help="of which the median is taken")
     parser.add_argument("--csv", type=Path, help="also write all rows here")
     parser.add_argument("--peak", nargs=2, metavar=("METHOD", "FRAMES"), help=argparse.SUPPRESS)
-    options = parser.parse_args(words)
-    for name in ("runs", "workers", "clips"):
-        if (value := getattr(options, name)) < 1:
-            parser.error(f"--{name}: expected at least 1, got {value}")
-    return options
+    return parser.parse_args(words)
 
 
 def main(words: list[str] | None = None) -> None:
@@ -377,8 +380,8 @@ def main(words: list[str] | None = None) -> None:
             rows = list(parts[part]())
             print(f"\n{part}\n{show(rows)}", flush=True)
             everything += [{"part": part} | row for row in rows]
-    if options.csv:
-        write_table(options.csv, everything)
+            if options.csv:  # after each part: a later one may fail
+                write_table(options.csv, everything)
 
 
 if __name__ == "__main__":

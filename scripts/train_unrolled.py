@@ -16,10 +16,12 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from options import at_least_one
 from torch import Tensor
 
 import kcs_torch as kt
@@ -89,8 +91,6 @@ def build(kind: str, skeleton: kt.Skeleton, steps: int, *, trained: bool = False
     if kind == "fpc":
         return kt.nn.UnrolledFPC(steps, **options)
     kinds = {"sfam": kt.nn.UnrolledSfAM, "pkc": kt.nn.UnrolledPKC, "kcs": kt.nn.UnrolledKCS}
-    if kind == "kcs":
-        options = {"arrangement": "frames", **options}
     return kinds[kind](skeleton, steps, learnable_lengths=trained, **options)
 
 
@@ -134,27 +134,24 @@ def score(layer: Unrolled, clips: list[tuple[Tensor, Tensor, Tensor, Tensor]]) -
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--solver", choices=("fpc", "sfam", "kcs", "pkc"), default="sfam")
-    parser.add_argument("--steps", type=int, default=10, help="of the trained solver")
-    parser.add_argument("--many", type=int, default=300, help="steps of the untrained one")
+    parser.add_argument("--steps", type=at_least_one, default=10, help="of the trained solver")
+    parser.add_argument("--many", type=at_least_one, default=300, help="steps of the untrained one")
     parser.add_argument("--data", default=str(SHARED), help="folder of motion files, or 'synthetic'")
-    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--frames", type=at_least_one, default=60)
     parser.add_argument(
         "--turn", type=float, nargs=2, default=(30.0, 180.0), help="degrees that cameras turn in a window"
     )
     parser.add_argument("--noise", type=float, default=5.0, help="mm")
     parser.add_argument("--missing", type=float, default=0.05, help="share of hidden joints")
-    parser.add_argument("--rounds", type=int, default=400)
-    parser.add_argument("--batch", type=int, default=8)
-    parser.add_argument("--test", type=int, default=64, help="windows tested")
+    parser.add_argument("--rounds", type=at_least_one, default=400)
+    parser.add_argument("--batch", type=at_least_one, default=8)
+    parser.add_argument("--test", type=at_least_one, default=64, help="windows tested")
     parser.add_argument("--lr", type=float, default=0.05)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--fix", nargs="*", default=(), help="what is not learned, such as: corner length")
     parser.add_argument("--save", type=Path, help="write the trained parameters to this file")
     parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
-    for name in ("steps", "many", "frames", "rounds", "batch", "test"):
-        if getattr(options, name) < 1:
-            parser.error(f"--{name}: expected at least 1, got {getattr(options, name)}")
     torch.set_num_threads(1)
     skeleton, clips = motions(options.data, tested=False)
     others = motions(options.data, tested=True)[1]
@@ -165,18 +162,20 @@ def main() -> None:
     generator = torch.Generator().manual_seed(options.seed + 1)
     sizes = [min(options.batch, options.test - first) for first in range(0, options.test, options.batch)]
     held_out = [unseen.batch(size, generator) for size in sizes]
-    layer = build(options.solver, skeleton, options.steps, trained=True)
+    kind: dict[str, Any] = {"arrangement": "frames"} if options.solver == "kcs" else {}
+    make = partial(build, options.solver, skeleton, **kind)
+    layer = make(options.steps, trained=True)
     for name in options.fix:
         if not hasattr(layer, f"raw_{name}"):
             raise SystemExit(f"--fix {name}: {options.solver} learns {', '.join(learned(layer))}")
         getattr(layer, f"raw_{name}").requires_grad_(False)
     rows: list[tuple[str, Unrolled]] = [
-        ("untrained", build(options.solver, skeleton, options.steps)),
-        ("untrained", build(options.solver, skeleton, options.many)),
+        ("untrained", make(options.steps)),
+        ("untrained", make(options.many)),
     ]
     if options.solver != "pkc":
         known = [film.batch(options.batch, generator) for _ in range(2)]
-        grid = [build(options.solver, skeleton, options.many, final=10.0**k) for k in (-4, -3, -2, -1.5, -1)]
+        grid = [make(options.many, final=10.0**k) for k in (-4, -3, -2, -1.5, -1)]
         best = min(grid, key=lambda one: float(score(one, known)[0].mean()))
         rows.append(("untrained, last threshold by grid", best))
     seconds = train(layer, film, options)

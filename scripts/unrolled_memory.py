@@ -17,7 +17,9 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from options import at_least_one
 from torch import Tensor
+from train_unrolled import build
 
 import kcs_torch as kt
 from kcs_torch.nn.unrolled import Unrolled
@@ -28,13 +30,6 @@ MODES: dict[str, Callable[[int], dict[str, Any]]] = {
     "grad_steps=5": lambda steps: {"grad_steps": 5},
     "implicit": lambda steps: {"gradient": Implicit(settle=0)},
 }
-
-
-def build(kind: str, skeleton: kt.Skeleton, steps: int, **options: Any) -> Unrolled:
-    if kind == "fpc":
-        return kt.nn.UnrolledFPC(steps, **options)
-    kinds = {"sfam": kt.nn.UnrolledSfAM, "kcs": kt.nn.UnrolledKCS, "pkc": kt.nn.UnrolledPKC}
-    return kinds[kind](skeleton, steps, **options)
 
 
 def measure(layer: Unrolled, tracks: Tensor, cameras: Tensor) -> tuple[float, float]:
@@ -59,8 +54,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     solvers = ["fpc", "sfam", "kcs", "pkc"]
     parser.add_argument("--solvers", nargs="*", choices=solvers, default=solvers)
-    parser.add_argument("--steps", type=int, nargs="*", default=[10, 100, 300])
-    parser.add_argument("--frames", type=int, default=100)
+    parser.add_argument("--steps", type=at_least_one, nargs="*", default=[10, 100, 300])
+    parser.add_argument("--frames", type=at_least_one, default=100)
     parser.add_argument("--compile", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -85,7 +85,7 @@ def test_figures_are_the_protocols(script, shared, protocol):
     bent = truth + 30 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0), dtype=truth.dtype)
     for points in (bent, bent * torch.tensor([1.0, 1.0, -1.0])):
         expected = protocol.score(points.numpy(), truth.numpy(), None)
-        assert script.rigid(points, truth) == pytest.approx(expected["rigid"], rel=1e-6)
+        assert script.rigid_error(points, truth) == pytest.approx(expected["rigid"], rel=1e-6)
         assert script.e3d(points, truth) == pytest.approx(expected["e3d"], rel=1e-6)
 
 
@@ -95,10 +95,23 @@ def test_suites_of_another_part_are_told(script, capsys):
     assert "--parts fixed: has none of the suites arm" in capsys.readouterr().err
 
 
-def test_less_than_a_case_is_told(script, capsys):
+@pytest.mark.parametrize("name", ["cases", "frames"])
+def test_less_than_one_is_told(script, name, capsys):
     with pytest.raises(SystemExit):
-        script.main(["--cases", "-3"])
-    assert "--cases: expected at least 1, got -3" in capsys.readouterr().err
+        script.main([f"--{name}", "-3"])
+    assert f"--{name}: expected at least 1, got -3" in capsys.readouterr().err
+
+
+def test_parts_that_are_done_are_written(script, tmp_path, monkeypatch):
+    """A later one that fails takes nothing along."""
+
+    def measure(part, *_):
+        return [{"part": part, "error": 1.0}] if part == "fixed" else 1 / 0
+
+    monkeypatch.setattr(script, "measure", measure)
+    with pytest.raises(ZeroDivisionError):
+        script.main(["--suites", "walk", "arm", "--csv", str(tmp_path / "runs.csv")])
+    assert (tmp_path / "runs.csv").read_text().split() == ["part,error", "fixed,1.0"]
 
 
 @pytest.mark.parametrize(

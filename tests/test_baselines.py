@@ -1,5 +1,7 @@
 """Rigid factorisation, PTA, CSF and BMM: exact where their models hold, as good as their authors' code where not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,9 +10,10 @@ from numerics import camera_disagreement, normal, rotations, tumbling, turning
 from torch.testing import assert_close
 
 import kcs_torch as kt
+from kcs_torch.data import walking_person
 from kcs_torch.errors import OptionError
 from kcs_torch.functional import back_project, complete_rotation, dct_basis, project
-from kcs_torch.methods import BMM, CSF, PTA, Rigid
+from kcs_torch.methods import BMM, CSF, PND, PTA, SMSR, Rigid, SfAM
 from kcs_torch.methods.clips.cameras import most_shapes, still_cameras
 from kcs_torch.methods.csf import fit_column_space
 from kcs_torch.methods.factorised import camera_rows, fit_basis_shapes, trajectory_design
@@ -222,6 +225,14 @@ def test_bmm_finds_shapes_of_low_rank_that_are_seen_from_all_sides():
 # ---------------------------------------------------------------------- cameras
 
 
+@quiet
+@pytest.mark.parametrize("method", [SfAM(), BMM(), SMSR(), PND(num_steps=3)], ids=lambda method: method.name)
+def test_only_proportions_of_weights_count(method):
+    tracks = walking_person(30, turn=180, missing=0.2, generator=torch.Generator().manual_seed(0)).tracks
+    faint = method(replace(tracks, weights=tracks.weights / 8))
+    assert_close(faint.points, method(tracks).points)
+
+
 @pytest.mark.parametrize("evenness", [0.0, 1.0])
 def test_cameras_of_deforming_bodies(evenness):
     for world in (rigid_body(), low_rank(), low_rank(120, 30)):
@@ -344,7 +355,15 @@ def test_as_good_as_the_authors_code(method, figures_of):
 @quiet
 def test_any_tolerance_will_do():
     tracks, _ = seen_from(band_limited(20, 2), tumbling(20))
-    assert bool(PTA(tolerance=1e300)(tracks).points.isfinite().all())
+    for tolerance in (1e300, 2**63):
+        assert bool(PTA(tolerance=tolerance)(tracks).points.isfinite().all())
+
+
+@quiet
+def test_more_shapes_than_csf_takes_are_the_most_it_takes(monkeypatch):
+    monkeypatch.setattr("kcs_torch.methods.csf.MOST", 2)
+    tracks = walking_person(30, turn=180).tracks
+    assert torch.equal(CSF(rank=3)(tracks).points, CSF(rank=2)(tracks).points)
 
 
 @pytest.mark.parametrize("method", ["pta", "csf"])

@@ -239,7 +239,7 @@ MISTAKES = {
     "bad value": (
         ["lift", "IN", "-o", "OUT.npz", "-m", "sfam", "--set", "beta=much"],
         "OptionError",
-        "a finite number",
+        "a number",
     ),
     "skeleton": (["lift", "IN", "-o", "OUT.npz", "--skeleton", "body52"], "SkeletonError", "did you mean 'body25'"),
     "wrong skeleton": (["lift", "IN", "-o", "OUT.npz", "--skeleton", "hand21"], "SkeletonError", "hand21"),

@@ -1,5 +1,6 @@
 """Fields of methods by ``--set``, and what is no value of them."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -31,6 +32,7 @@ class Other:
     [
         ("beta=2", 2.0),
         ("beta = 1e-3", 1e-3),
+        ("beta=.inf", math.inf),
         ("rank=3", 3),
         ("rank=none", None),
         ("smooth=true", True),

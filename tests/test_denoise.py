@@ -60,6 +60,24 @@ def test_noise_is_measured_and_taken_away(share):
     assert not found.outliers.any()
 
 
+def test_what_is_not_known_is_unseen():
+    tracks = walk()
+    seen = gaps(*tracks.shape[:2])
+    found = denoise_tracks(torch.where(seen[..., None], tracks, 0), seen.double())
+    for other in (-1.0, math.nan):
+        weights = torch.where(seen, 1, other)
+        for points in (tracks, torch.where(seen[..., None], tracks, math.nan)):
+            assert torch.equal(denoise_tracks(points, weights).points, found.points)
+    assert torch.equal(denoise_tracks(points, torch.ones_like(weights)).points, found.points)
+
+
+def test_noise_does_not_depend_on_how_sure_all_joints_are():
+    tracks = walk()
+    noisy = tracks + 10 * normal(*tracks.shape)
+    sure, unsure = (denoise_tracks(noisy, torch.full(tracks.shape[:2], weight)) for weight in (1.0, 0.25))
+    assert_close(unsure.noise, sure.noise, rtol=0.1, atol=0)
+
+
 @pytest.mark.parametrize("kind", ["averaged", "interpolated", "persistent"])
 def test_noise_that_lasts_is_told(kind):
     """Filters, interpolation and detectors leave noise that is not white, and spectra without a floor."""

@@ -37,6 +37,26 @@ def test_unseen_joints_do_not_spoil_it():
     assert body.is_tree and [body.bones[i][1] for i in body.flexible] == [5]  # whose length nobody knows
 
 
+def test_unseen_frames_say_nothing_of_lengths_nor_of_rest():
+    points, _ = swinging_body()
+    weights = torch.ones(60, 6, dtype=torch.float64)
+    weights[10:50] = 0
+    broken = points.clone()
+    broken[10:50, 3:] += 100 * torch.arange(1.0, 4)[:, None]
+    assert find_skeleton(broken, weights=weights) == find_skeleton(points[weights[:, 0] > 0])
+    resting = points[:1].repeat(60, 1, 1)
+    resting[10:50] = points[10:50]
+    with pytest.warns(KcsWarning, match="a body at rest"):
+        find_skeleton(resting, weights=weights)
+
+
+@pytest.mark.parametrize("weight", [-1.0, float("nan"), float("inf")])
+def test_weights_that_are_none_are_refused(weight):
+    points, _ = swinging_body()
+    with pytest.raises(ShapeError, match="expected finite weights of 0 or more"):
+        find_skeleton(points, weights=torch.full((60, 6), weight))
+
+
 def test_takes_tracks_and_results():
     points, _ = swinging_body()
     tracks = Tracks.from_arrays(points[..., :2], joint_names=list("abcdef"))

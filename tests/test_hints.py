@@ -36,7 +36,7 @@ def test_what_fits(value, hint, fits):
 
 
 def test_words():
-    assert spoken(float | None) == "a finite number or none"
+    assert spoken(float | None) == "a number or none"
     assert spoken(bool | Literal["warn"]) == "true or false or warn"
     assert spoken(Sequence[float]).startswith("a list")
     assert spoken(np.ndarray) == "ndarray"

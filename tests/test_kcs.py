@@ -18,7 +18,7 @@ from kcs_torch.functional import (
     nuclear_norm,
     procrustes,
     project,
-    similarity,
+    superpose,
 )
 from kcs_torch.methods.answer.mirror import mirror_sign
 
@@ -35,7 +35,7 @@ def centred(points):
 def rigid_error(found, truth):
     """Mean distance after a rotation of each frame, the better of the result and its mirror image."""
     mirrors = (found, found * torch.tensor([1.0, 1.0, -1.0]).to(found))
-    return min(float((similarity(m, truth, scale=False) - truth).norm(dim=-1).mean()) for m in mirrors)
+    return min(float((superpose(m, truth, "rigid") - truth).norm(dim=-1).mean()) for m in mirrors)
 
 
 def flat(points):
@@ -252,6 +252,16 @@ def test_scale_range_bounds_each_frames_scale():
     for bound in (1.0, 1.05):
         scales = KCS(scale_range=bound)(TRACKS).scales
         assert scales.max() / scales.min() <= bound**2 + 1e-9
+
+
+@pytest.mark.parametrize("scale_range", [1.1, math.inf])
+def test_frames_that_tell_no_scale_take_their_neighbours(scale_range):
+    weights = TRACKS.weights.clone()
+    weights[8:36] = 0
+    weights[20, 3] = 1  # alone
+    result = KCS(scale_range=scale_range)(replace(TRACKS, weights=weights))
+    assert result.scales[8:36].sub(1).abs().max() < 0.05
+    assert float(result.lengths.sum()) == pytest.approx(float(KCS()(TRACKS).lengths.sum()), rel=0.05)
 
 
 # ---------------------------------------------------------------------- real walks

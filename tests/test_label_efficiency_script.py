@@ -52,6 +52,12 @@ def test_a_run_that_diverged_is_named(script, tmp_path):
         script.runs_of([tmp_path / "sweep"], "mpjpe")
 
 
+def test_a_table_without_runs_is_told(script, tmp_path):
+    (tmp_path / "results.csv").write_text("run,test/pa_mpjpe\n")
+    with pytest.raises(SystemExit, match=r"expected runs in results\.csv, found none"):
+        script.main([str(tmp_path)])
+
+
 def test_help_tells_the_options(script, capsys):
     with pytest.raises(SystemExit):
         script.main(["--help"])

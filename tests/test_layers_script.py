@@ -1,8 +1,6 @@
 """scripts/layers.py: the layers that are compared are the same one, and the tables are printed."""
 
-import runpy
 import sys
-from pathlib import Path
 
 import torch
 from numerics import normal
@@ -10,14 +8,12 @@ from torch.testing import assert_close
 
 import kcs_torch as kt
 
-SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "layers.py"
 
-
-def test_layers_agree_and_tables_are_printed(monkeypatch, capsys):
+def test_layers_agree_and_tables_are_printed(import_script, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["layers.py", "--repeats", "1", "--imports", "0"])
-    threads = torch.get_num_threads()
+    script, threads = import_script("layers"), torch.get_num_threads()
     try:
-        names = runpy.run_path(str(SCRIPT), run_name="__main__")
+        script.main()
     finally:
         torch.set_num_threads(threads)
     text = capsys.readouterr().out
@@ -27,5 +23,5 @@ def test_layers_agree_and_tables_are_printed(monkeypatch, capsys):
     assert energies - {name for name in energies if f"`{name}(" in text} == {"ContactEnergy", "ProportionEnergy"}
     body, points = kt.SKELETONS["hand21"], normal(3, 21, 3, dtype=torch.float32)
     expected = kt.nn.KCSMatrix(body)(points)
-    for make in ("tiled", "indexed"):
-        assert_close(names[make](body)(points), expected)
+    for make in (script.tiled, script.indexed):
+        assert_close(make(body)(points), expected)

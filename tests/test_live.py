@@ -12,7 +12,7 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.data import walking_person
-from kcs_torch.functional.align import similarity
+from kcs_torch.functional.align import superpose
 from kcs_torch.functional.chain import bone_lengths
 from kcs_torch.live import tracker as live
 from kcs_torch.live.filter import BodyFilter
@@ -47,7 +47,7 @@ def poses(clip):
 def error(points, truth):
     """Mean distance after one rotation per frame, in mm, of the better of the two mirror images."""
     flips = (points, points * torch.tensor([1.0, 1.0, -1.0]).to(points))
-    return min(float((similarity(p, truth, scale=False) - truth).norm(dim=-1).mean()) for p in flips)
+    return min(float((superpose(p, truth, "rigid") - truth).norm(dim=-1).mean()) for p in flips)
 
 
 def test_near_the_offline_method(clip, poses):

@@ -129,6 +129,7 @@ def test_bad_cameras(method, cameras, words):
         ("kcs", "mu", math.inf),
         ("kcs", "rho", 1.0),
         ("kcs", "rho", 0),
+        ("kcs", "rho", 1e-300),
         ("kcs", "num_weights", 0),
         ("kcs", "steps_per_weight", 0),
         ("kcs", "scale_range", 0.9),

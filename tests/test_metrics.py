@@ -8,7 +8,7 @@ from scipy.spatial import procrustes as scipy_procrustes
 from scipy.spatial.transform import Rotation
 
 from kcs_torch.errors import OptionError, ShapeError
-from kcs_torch.functional import similarity, superpose
+from kcs_torch.functional import superpose
 from kcs_torch.metrics import ALIGNMENTS, align, bone_deviation, coverage, e3d, mpjpe, pck
 from kcs_torch.skeleton import SKELETONS
 
@@ -113,11 +113,8 @@ def test_frames_without_the_root_count_nothing():
     assert torch.allclose(mpjpe(pred, truth, weights=weights, root=0), mpjpe(pred[kept], truth[kept], root=0))
 
 
-def test_similarity_against_scipy_and_our_own():
+def test_similarity_against_scipy():
     truth, pred = clip(), clip(seed=1)
-    assert torch.allclose(align(pred, truth, "similarity"), similarity(pred, truth))
-    assert torch.allclose(align(pred, truth, "sequence"), similarity(pred, truth, sequence=True))
-    assert torch.allclose(align(pred, truth, "rigid"), similarity(pred, truth, scale=False))
     for t in range(3):
         target = (truth[t] - truth[t].mean(0)).numpy()
         turn, _ = Rotation.align_vectors(target, (pred[t] - pred[t].mean(0)).numpy())

@@ -7,7 +7,7 @@ import torch
 
 import kcs_torch as kt
 from kcs_torch.data import walking_person
-from kcs_torch.functional.align import similarity
+from kcs_torch.functional.align import superpose
 from kcs_torch.methods.pkc.cleaning import MANY
 from kcs_torch.methods.pkc.gate import (
     HELD,
@@ -91,7 +91,7 @@ def test_a_fifth_of_all_joints_may_be_anywhere(share, most):
     wrong = torch.rand(points.shape[:2], generator=chance) < share
     points[wrong] = 6000 * torch.rand(int(wrong.sum()), 2, generator=chance, dtype=points.dtype) - 3000
     found = kt.reconstruct(replace(clip.tracks, points=points))
-    assert float((similarity(found.points, clip.points, scale=False) - clip.points).norm(dim=-1).mean()) < most
+    assert float((superpose(found.points, clip.points, "rigid") - clip.points).norm(dim=-1).mean()) < most
     assert share > MANY
 
 
@@ -162,7 +162,7 @@ def test_frames_that_repeat_show_nothing():
     error = {}
     for name, tracks in (("smooth", clip.tracks), ("stuttering", stuttering)):
         found = kt.reconstruct(tracks)
-        error[name] = float((similarity(found.points, clip.points, scale=False) - clip.points).norm(dim=-1).mean())
+        error[name] = float((superpose(found.points, clip.points, "rigid") - clip.points).norm(dim=-1).mean())
     assert error["stuttering"] < error["smooth"] + 6  # mm
     assert any("repeat the one before" in note for note in found.diagnostics.notes + found.tracks.notes)
 

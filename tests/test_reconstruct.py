@@ -230,7 +230,7 @@ def test_fields_of_the_other_method():
         ("kcs", "rounds", 0, "kcs: rounds: expected at least 1, got 0"),
         ("kcs", "rho", 1.5, "kcs: rho: expected a number between 0 and 1, got 1.5"),
         ("sfam", "beta", -1.0, "sfam: beta: expected a number >= 0, got -1.0"),
-        ("sfam", "beta", float("nan"), "sfam: beta: expected a finite number, got nan"),
+        ("sfam", "beta", float("nan"), "sfam: beta: expected a number, got nan"),
         ("sfam", "window", 20, "overlap: expected below the window of 20 frames, got 50"),
         ("sfam", "num_steps", "many", "sfam: num_steps: expected a whole number, got 'many'"),
     ],

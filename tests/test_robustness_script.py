@@ -47,6 +47,26 @@ def test_curves_go_through_what_is_seen_and_hold_the_ends(script, curve):
     assert np.allclose(got[:, 0, 0], [1, 1, 2, 3, 4, 5, 5])
 
 
+@pytest.mark.parametrize("curve", ["lines", "monotone cubics", "splines"])
+def test_curves_hold_what_is_hardly_seen(script, curve):
+    points = np.arange(1.0, 5)[:, None, None] * np.ones((4, 3, 3))
+    seen = np.array([[0, 0, 1], [1, 0, 0], [0, 0, 1], [0, 0, 1]], dtype=bool)
+    got = script.filled(points, seen, script.CURVES[curve])
+    assert np.array_equal(got[:, 0], np.full((4, 3), 2.0)) and not got[:, 1].any()
+    assert np.array_equal(got[seen], points[seen])
+
+
+def test_parts_that_are_done_are_written(script, tmp_path, monkeypatch):
+    """A later one that fails takes nothing along."""
+    run = {"setting": "none", "case": "walk", "seed": 0} | dict.fromkeys(script.FIGURES, 1.0)
+    monkeypatch.setattr(script, "Bench", lambda *_: None)
+    monkeypatch.setitem(script.PARTS, "noise", lambda _: [run])
+    monkeypatch.setitem(script.PARTS, "short", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        script.main(["--parts", "noise", "short", "--csv", str(tmp_path / "runs.csv")])
+    assert (tmp_path / "runs.csv").read_text().splitlines()[1] == "noise,none,walk,0,1.0,1.0,1.0"
+
+
 def test_without_the_data_it_says_what_it_needs(script, tmp_path):
     with pytest.raises(SystemExit, match="expected a folder with protocol"):
         script.main(["--shared", str(tmp_path)])

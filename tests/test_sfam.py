@@ -109,6 +109,12 @@ def test_singular_values_are_reweighted_only_where_the_viewpoint_turns(turn, pla
     assert torch.equal(*points) == plain
 
 
+def test_momentum_limits_the_step_size():
+    SfAM(tau=0.99, momentum=0.0)
+    with pytest.raises(OptionError, match=r"sfam: tau: expected a positive number below 0\.681"):
+        SfAM(tau=0.69)
+
+
 def test_printed_schedule_has_the_bones_in_every_step():
     method = SfAM(num_steps=5, momentum=0.0, articulate_from=0.0)
     tracks, weights = SHORT.tracks.points / 500, torch.ones(30, 17, dtype=torch.float64)

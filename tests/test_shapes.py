@@ -84,7 +84,6 @@ REFUSED = {
     "rotation_vector": ({"matrices": TURNS}, {"matrices": (5, 2, 3)}),
     "rows_to_cameras": ({"rows": ROWS}, {"rows": (5, 3, 3)}),
     "scatter_log_det": ({"values": WAY, "eps": 1.0}, {"values": (3,)}),
-    "similarity": ({"source": CLIP, "target": CLIP}, {"source": (3,), "target": (2, 5, 3, 3)}),
     "standing": ({"image": IMAGE, "weights": MASS}, {"image": (5, 4, 3), "weights": (2, 4, 4)}),
     "superpose": (
         {"source": CLIP, "target": CLIP, "how": "rigid", "weights": MASS},
@@ -126,7 +125,6 @@ FLOATING = {
     "rotation_vector": ("matrices",),
     "rows_to_cameras": ("rows",),
     "scatter_log_det": ("values",),
-    "similarity": ("source", "target"),
     "superpose": ("source", "target"),
     "viewpoint_turn": ("cameras",),
 }
@@ -176,12 +174,10 @@ def test_batches_that_do_not_fit_are_told(name):
             function(**{**arguments, what: torch.cat([arguments[what]] * 2)[:3]})
 
 
-@pytest.mark.parametrize("move", [F.similarity, lambda *pair, **_: F.superpose(*pair, "similarity")])
-def test_single_poses_are_moved_as_clips_are(move):
+def test_single_poses_are_moved_as_clips_are():
     turned = CLIP @ TURNS[0].mT + 1
-    torch.testing.assert_close(move(CLIP[0, 0], turned[0, 0]), move(CLIP, turned)[0, 0])
-    with pytest.raises(ShapeError, match=r"similarity: source: expected shape \(\.\.\., T, N, D\), got \(4, 3\)"):
-        F.similarity(CLIP[0, 0], turned[0, 0], sequence=True)
+    alone, clip = (F.superpose(*pair, "similarity") for pair in ((CLIP[0, 0], turned[0, 0]), (CLIP, turned)))
+    torch.testing.assert_close(alone, clip[0, 0])
     with pytest.raises(ShapeError, match=r"superpose: source: expected shape \(\.\.\., T, N, 3\), got \(4, 3\)"):
         F.superpose(CLIP[0, 0], turned[0, 0], "sequence")
 

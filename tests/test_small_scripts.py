@@ -1,4 +1,4 @@
-"""scripts/formats.py and scripts/live.py: what they are called wrongly with is a line."""
+"""scripts/formats.py, scripts/live.py and scripts/gallery.py: what they are called wrongly with is a line."""
 
 import sys
 
@@ -40,3 +40,11 @@ def test_formats_refuses_a_size_that_is_none(import_script, tracks, monkeypatch,
 def test_live_asks_for_the_truth_of_every_file(import_script, tracks, monkeypatch, capsys):
     code, out, err = called(import_script("live"), monkeypatch, capsys, "--inputs", tracks, "--truth", tracks.parent)
     assert code == 2 and not out and f"--truth {tracks.parent}: expected a file walk.npz" in err
+
+
+def test_gallery_tells_of_tracks_that_are_not_there(import_script, tmp_path, monkeypatch, capsys):
+    words = ("--output", tmp_path, "--real", tmp_path / "gone.json")
+    script = import_script("gallery")
+    monkeypatch.setattr(script, "PICTURES", {})
+    code, out, _ = called(script, monkeypatch, capsys, *words)
+    assert str(code).startswith("error: ") and "gone.json: there is no such file" in code and not out

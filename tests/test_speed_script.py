@@ -1,7 +1,6 @@
 """scripts/speed.py, and that the naive twins it measures do the same as the methods."""
 
 import csv
-import runpy
 import subprocess
 import sys
 
@@ -58,8 +57,8 @@ def test_after_the_context_the_fast_parts_are_back():
 
 
 @pytest.mark.parametrize("part", ["memory", "methods", "kernels", "growth", "joints", "batch", "scale", "gpu"])
-def test_script(root, tmp_path, capsys, part):
-    script = runpy.run_path(str(root / "scripts" / "speed.py"))
+def test_script(import_script, tmp_path, capsys, part):
+    script = import_script("speed")
     table = tmp_path / "made" / "speed.csv"
     sizes = ["--frames", "26", "--growth", "12", "--memory", "12", "--joints", "5", "--runs", "1"]
     sizes += [
@@ -77,7 +76,7 @@ def test_script(root, tmp_path, capsys, part):
         "--batches",
         "2",
     ]
-    script["main"](["--parts", part, *sizes, "--csv", str(table)])
+    script.main(["--parts", part, *sizes, "--csv", str(table)])
     shown = capsys.readouterr().out
     with table.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -89,9 +88,9 @@ def test_script(root, tmp_path, capsys, part):
         assert float(next(row[name] for name in least if row.get(name))) > 0
 
 
-def test_clips_in_several_processes(root, capsys):
-    script = runpy.run_path(str(root / "scripts" / "speed.py"))
-    script["main"](
+def test_clips_in_several_processes(import_script, capsys):
+    script = import_script("speed")
+    script.main(
         ["--parts", "batch", "--which", "kcs", "--clips", "3", "--short", "12", "--runs", "1", "--workers", "2"]
     )
     names, row = (line.split("  ") for line in capsys.readouterr().out.splitlines()[-2:])
@@ -103,22 +102,39 @@ def test_clips_in_several_processes(root, capsys):
     [
         ("speed", ["--runs", "0"], "--runs: expected at least 1, got 0"),
         ("speed", ["--workers", "0"], "--workers: expected at least 1, got 0"),
+        ("speed", ["--threads", "0"], "--threads: expected at least 1, got 0"),
+        ("speed", ["--growth", "100", "0"], "--growth: expected at least 1, got 0"),
+        ("counts", ["--frames", "0"], "--frames: expected at least 1, got 0"),
         ("layers", ["--skeleton", "foo"], "argument --skeleton: invalid choice: 'foo'"),
+        ("layers", ["--repeats", "0"], "--repeats: expected at least 1, got 0"),
+        ("live", ["--frames", "0"], "--frames: expected at least 1, got 0"),
+        ("live", ["--skeleton", "nope"], "argument --skeleton: invalid choice: 'nope'"),
         ("unrolled_memory", ["--solvers", "zz"], "argument --solvers: invalid choice: 'zz'"),
+        ("unrolled_memory", ["--frames", "0"], "--frames: expected at least 1, got 0"),
     ],
 )
-def test_wrong_options_are_told(root, monkeypatch, capsys, name, words, told):
+def test_wrong_options_are_told(import_script, monkeypatch, capsys, name, words, told):
     monkeypatch.setattr(sys, "argv", [name, *words])
     with pytest.raises(SystemExit):
-        runpy.run_path(str(root / "scripts" / f"{name}.py"), run_name="__main__")
+        import_script(name).main()
     assert told in capsys.readouterr().err
 
 
+def test_parts_that_are_done_are_written(import_script, tmp_path, monkeypatch):
+    """A later one that fails takes nothing along."""
+    script, table = import_script("speed"), tmp_path / "speed.csv"
+    monkeypatch.setattr(script, "compare_kernels", lambda *_: iter([{"ms": "svt", "median": 1.0}]))
+    monkeypatch.setattr(script, "grow_joints", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        script.main(["--parts", "kernels", "joints", "--csv", str(table)])
+    assert table.read_text().split() == ["part,ms,median", "kernels,svt,1.0"]
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is here")
-def test_script_says_that_there_is_no_gpu(root):
-    script = runpy.run_path(str(root / "scripts" / "speed.py"))
+def test_script_says_that_there_is_no_gpu(import_script):
+    script = import_script("speed")
     with pytest.raises(SystemExit, match="expected a GPU"):
-        script["main"](["--parts", "gpu"])
+        script.main(["--parts", "gpu"])
 
 
 @pytest.mark.parametrize(
@@ -135,22 +151,22 @@ def test_folders_that_are_not_there_are_told(root, tmp_path, words, told):
 
 
 @pytest.mark.parametrize("inference", [False, True])
-def test_counts_of_one_product_and_one_sum(root, inference):
+def test_counts_of_one_product_and_one_sum(import_script, inference):
     """By hand; in inference mode, in which methods run, too."""
-    script = runpy.run_path(str(root / "scripts" / "counts.py"))
+    script = import_script("counts")
     with torch.inference_mode(inference):
         left, right = normal(4, 3, 5), normal(4, 5, 2)
-        with script["Counter"]() as made:
+        with script.Counter() as made:
             (left @ right).mT.add(1)
     assert (made.calls, made.matrix, made.other) == (2, 2 * 4 * 3 * 5 * 2, 24)
     assert made.bytes == 8 * (60 + 40 + 24) + 8 * (24 + 24)
 
 
-def test_counts_of_operations(root, tmp_path, capsys):
+def test_counts_of_operations(import_script, tmp_path, capsys):
     """A row for each method and camera."""
-    script = runpy.run_path(str(root / "scripts" / "counts.py"))
+    script = import_script("counts")
     table = tmp_path / "made" / "counts.csv"
-    script["main"](["--methods", "kcs", "sfam", "--frames", "12", "--csv", str(table)])
+    script.main(["--methods", "kcs", "sfam", "--frames", "12", "--csv", str(table)])
     with table.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["method"] for row in rows] == ["kcs", "kcs", "sfam", "sfam"]

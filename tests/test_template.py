@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from kcs_torch import Skeleton, Tracks
 from kcs_torch.data import walking_person
-from kcs_torch.functional import similarity
+from kcs_torch.functional import superpose
 from kcs_torch.methods.clips.template import clip_scale, rigid_shape
 from kcs_torch.skeleton import SKELETONS
 
@@ -67,7 +67,8 @@ def test_rigid_shape_is_found(known):
     found = rigid_shape(tracks, cameras[:, :2]) if known else rigid_shape(tracks)
     if known:
         assert_close(found - found.mean(0), shape - shape.mean(0), rtol=0, atol=0.01)
-    assert_close(similarity(found, shape, reflect=True, scale=False), shape, rtol=0, atol=0.02)
+    mirrors = (superpose(found * sign, shape, "rigid") for sign in (1, torch.tensor([1.0, 1.0, -1.0])))
+    assert min(float((moved - shape).abs().max()) for moved in mirrors) < 0.02
 
 
 @pytest.mark.parametrize(("frames", "joints"), [(1, 5), (2, 2), (1, 2), (3, 3), (20, 2)])

@@ -59,7 +59,7 @@ class TestCommandLine:
             ("+trainer.accumulate_grad_batches=2", r"accumulate_grad_batches: .*data\.batch_size"),
             ("+data.noisy=1", "unknown field of data .*'noisy': did you mean 'noise'"),
             ("+module.lr=-1", "lr: expected a positive number"),
-            ("+module.lr=abc", "error: module.lr: expected a finite number, got 'abc'"),
+            ("+module.lr=abc", "error: module.lr: expected a number, got 'abc'"),
             ("trainer.max_epochs=hello", "error: trainer.max_epochs: expected a whole number or none, got 'hello'"),
             ("data.fresh_cameras=maybe", "error: data.fresh_cameras: expected true or false, got 'maybe'"),
             ("keep=no", "error: keep: expected true or false, got 'no'"),

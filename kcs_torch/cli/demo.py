@@ -65,9 +65,9 @@ def rigid_error(points: Tensor, truth: Tensor) -> float:
     """Mean distance after a rotation per frame, of the better of the points and their mirror image in depth."""
     import torch
 
-    from kcs_torch.functional import centre, similarity
+    from kcs_torch.functional import centre, superpose
 
     target = centre(truth)[0]
     flip = torch.tensor([1.0, 1.0, -1.0]).to(points)
-    moved = (similarity(p, target, scale=False) for p in (points, points * flip))
+    moved = (superpose(p, target, "rigid") for p in (points, points * flip))
     return min(float((m - target).norm(dim=-1).mean()) for m in moved)

@@ -68,7 +68,7 @@ def _convert(value: Any, hint: Any) -> Any:
     if hint in (int, float, str):
         if isinstance(value, (list, dict)) or value is None:
             raise ValueError(value)
-        return hint(value)
+        return hint(str(value).lower().replace(".inf", "inf") if hint is float else value)  # .inf, as YAML writes it
     if (origin or hint) in (tuple, list) or (isinstance(origin, type) and issubclass(origin, Iterable)):
         return _sequence(value, inner, list if (origin or hint) is list else tuple)
     raise ValueError(value)

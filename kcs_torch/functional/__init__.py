@@ -6,7 +6,6 @@ from kcs_torch.functional.align import (
     minimal_turn,
     nearest_rotation,
     procrustes,
-    similarity,
     superpose,
 )
 from kcs_torch.functional.angles import angle_between, flexion, joint_angles
@@ -91,7 +90,6 @@ __all__ = [
     "rotation_vector",
     "rows_to_cameras",
     "scatter_log_det",
-    "similarity",
     "singular_values",
     "spectral_norm",
     "standing",

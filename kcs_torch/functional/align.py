@@ -14,7 +14,7 @@ from kcs_torch.functional.precision import alike, full_precision, wide
 from kcs_torch.functional.rotation import skew
 from kcs_torch.functional.shapes import check_batches, check_core, check_floats
 
-__all__ = ["ALIGNMENTS", "centre", "minimal_turn", "nearest_rotation", "procrustes", "similarity", "superpose"]
+__all__ = ["ALIGNMENTS", "centre", "minimal_turn", "nearest_rotation", "procrustes", "superpose"]
 
 ALIGNMENTS = {
     "none": "as it stands",
@@ -168,42 +168,6 @@ def procrustes(
         size = (left * source).sum((-2, -1))
         overlap = ((left @ rotation) * target).sum((-2, -1))
     return rotation.to(dtype), (overlap / or_one(size)).to(dtype)
-
-
-def similarity(
-    source: Tensor, target: Tensor, *, sequence: bool = False, scale: bool = True, reflect: bool = False
-) -> Tensor:
-    """Return ``source`` moved onto ``target`` by rotation, translation and optionally scale.
-
-    Args:
-        source: (..., T, N, D), or (..., N, D) unless ``sequence``.
-        target: as the source.
-        sequence: True fits one rotation and scale to all frames together (frames are still centred one by one);
-            False fits each frame.
-        scale: False keeps the source's size.
-        reflect: True also admits reflections.
-
-    Returns:
-        (..., T, N, D).
-
-    Raises:
-        ShapeError: the shapes differ, or source or target is not in floating point.
-    """
-    core = ("T", "N", "D") if sequence else ("N", "D")
-    check_floats(source, "similarity: source", *core)
-    check_floats(target, "similarity: target", *source.shape[-len(core) :])
-    check_batches("similarity: source and target", source, target, cores=(len(core), len(core)))
-    dtype = torch.promote_types(source.dtype, target.dtype)
-    source, target = alike(source, target)
-    a, _ = centre(wide(source))
-    b, mean = centre(wide(target))
-    flat = (lambda x: x.flatten(-3, -2)) if sequence else (lambda x: x)
-    rotation, factor = procrustes(flat(a), flat(b), reflect=reflect)
-    if sequence:
-        rotation, factor = rotation[..., None, :, :], factor[..., None]
-    with full_precision(a):
-        moved = a @ rotation
-    return ((moved * factor[..., None, None] if scale else moved) + mean).to(dtype)
 
 
 def superpose(

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from kcs_torch.functional.guarded import largest, or_one
 
-__all__ = ["known", "known_frames", "rms", "seen_weights"]
+__all__ = ["known", "known_frames", "of_largest", "rms", "seen_weights"]
 
 
 def known(values: Tensor, weights: Tensor | None) -> Tensor:
@@ -15,6 +15,11 @@ def known(values: Tensor, weights: Tensor | None) -> Tensor:
     if weights is None:
         return values
     return torch.where(weights[..., None] > 0, values, torch.zeros((), dtype=values.dtype, device=values.device))
+
+
+def of_largest(weights: Tensor) -> Tensor:
+    """Weights (..., T, N) as shares of a clip's largest: steps made for weights of 1 are too short for less."""
+    return weights / or_one(largest(weights, 2))
 
 
 def rms(vectors: Tensor, weights: Tensor, dimensions: int | None = None) -> Tensor:

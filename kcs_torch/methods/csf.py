@@ -36,7 +36,7 @@ class CSF(Factorised):
 
     Args:
         rank: K basis shapes; at most a fifth of the joints, as 3K columns explain the tracks of as many joints anyway,
-            and no more than a third of the tracks' rank.
+            no more than a third of the tracks' rank, and 128.
         cosines: d, the share of the number of frames.
         num_steps: Gauss-Newton steps, at most.
         tolerance: stop where steps lower the cost by less than this share.
@@ -73,7 +73,7 @@ class CSF(Factorised):
         frames, joints = tracks.shape[:2]
         size = singular_values(tracks.mT.flatten(0, 1))
         told = int((size > FAINT * size[0]).sum())  # a stiff body has one shape: weights of others would be arbitrary
-        rank = max(1, min(self.rank, frames, (joints - 1) // 5, math.ceil(told / 3)))
+        rank = max(1, min(self.rank, frames, (joints - 1) // 5, math.ceil(told / 3), MOST))
         count = min(max(round(self.cosines * frames), rank), MOST, frames)
         basis = dct_basis(frames, count, dtype=tracks.dtype, device=tracks.device)
         fitted = fit_column_space(

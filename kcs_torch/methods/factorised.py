@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.camera import complete_rotation, factorize, rows_to_cameras
+from kcs_torch.functional.weights import of_largest
 from kcs_torch.methods.answer.mirror import mirror_sign
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.clips.batches import in_batches
@@ -28,7 +29,7 @@ EMPTY = 1e-6
 """Singular values of the tracks below this share of the largest are rounding."""
 
 FILLED = 0.1
-"""Weight of what completion put in place of an unseen joint, so that no system is singular."""
+"""Weight of what completion put in place of an unseen joint, a share of the largest: so no system is singular."""
 
 SETTLED = 1e-3
 """Share of the shape that the last step may change it by."""
@@ -81,7 +82,7 @@ class Factorised(Method):
         seen = (weights > 0)[..., known]
         filled = complete_tracks(points[:, :, known].to(precise), seen)
         filled = filled - filled.mean(-2, keepdim=True)
-        weights = torch.where(seen, weights[..., known].to(filled), FILLED)
+        weights = torch.where(seen, of_largest(weights)[..., known].to(filled), FILLED)
         weights = torch.where(seen.any(-1, keepdim=True), weights, torch.ones_like(weights))
         rows = self.find_cameras(filled) if cameras is None else cameras.to(filled)[None]
         if self.together:

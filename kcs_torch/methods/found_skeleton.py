@@ -11,8 +11,8 @@ from torch import Tensor
 
 from kcs_torch.clean.common import check_seen
 from kcs_torch.errors import KcsWarning, OptionError, ShapeError, users_level
-from kcs_torch.functional.chain import bone_lengths, bone_vectors
-from kcs_torch.functional.ranks import median
+from kcs_torch.functional.chain import bone_vectors
+from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.rigidity import distance_spread, rigid_tree
 from kcs_torch.methods.pkc import PKC
 from kcs_torch.methods.pkc.clip import LEAST_JOINTS
@@ -55,7 +55,7 @@ def find_skeleton(
 
     Raises:
         ShapeError: there are no two joints, points that are not finite (T, N, 3), or no tensor of them; the weights or
-            the joints' names do not fit them; tracks show no joint in any frame.
+            the joints' names do not fit them; a weight is negative or not finite; tracks show no joint in any frame.
         OptionError: ``rigid_below`` is no share, or negative.
 
     Warns:
@@ -81,12 +81,10 @@ def find_skeleton(
     points, weights, joints = _given(source, weights, joints)
     cost, ratio, apart = _variation(points, weights)
     bones = rigid_tree(cost)
-    size = bone_lengths(points, bones)
-    lengths = median(size, 0)
+    lengths, sway = _of_bones(points, weights, bones)
     ends = bones.unbind(-1)
     loose = (ratio[ends] > rigid_below) | apart[ends] | unsure
     flexible = tuple(loose.nonzero().flatten().tolist())
-    sway = bone_vectors(points, bones).std(0, correction=0).norm(dim=-1)
     _warn(len(flexible) == len(bones), len(bones) > 1 and bool((sway <= rigid_below * lengths).all()), rigid_below)
     return Skeleton(
         joints=tuple(joints) if joints is not None else tuple(f"joint{i}" for i in range(points.shape[1])),
@@ -119,6 +117,8 @@ def _given(
         weights = as_floats(weights, "find_skeleton: weights", None).to(source)
         if weights.shape != source.shape[:2]:
             raise ShapeError(f"find_skeleton: expected weights {tuple(source.shape[:2])}, got {tuple(weights.shape)}")
+        if not bool((weights.isfinite() & (weights >= 0)).all()):
+            raise ShapeError("find_skeleton: expected finite weights of 0 or more, 0 where a joint is unseen")
     if joints is not None and len(joints) != source.shape[1]:
         raise ShapeError(f"find_skeleton: joints: expected {source.shape[1]} names, got {len(joints)}")
     return source, weights, joints
@@ -156,6 +156,16 @@ def _variation(points: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, 
         return cost, ratio, torch.zeros_like(cost, dtype=torch.bool)
     apart = torch.minimum(weights[:, :, None], weights[:, None, :]).sum(0) == 0
     return torch.where(apart, 1e3 * (1 + cost.amax()) + mean, cost), ratio, apart
+
+
+def _of_bones(points: Tensor, weights: Tensor | None, bones: Tensor) -> tuple[Tensor, Tensor]:
+    """Median lengths (B,) of bones (B, 2), and how far their directions sway, over frames that show both ends."""
+    vectors = bone_vectors(points, bones)
+    if weights is not None:
+        shown = (weights[:, bones] > 0).all(-1)
+        vectors = torch.where((shown | ~shown.any(0))[..., None], vectors, torch.nan)
+    lengths = nanmedian(vectors.norm(dim=-1), 0)
+    return lengths, (vectors - vectors.nanmean(0)).square().nanmean(0).sum(-1).sqrt()
 
 
 def _warn(loose: bool, resting: bool, rigid_below: float) -> None:

@@ -16,6 +16,7 @@ from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.chain import bone_lengths, chain_inverse, incidence
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
+from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.answer.mirror import mirror_sign
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.clips.batches import Clips, in_batches, padded
@@ -109,8 +110,11 @@ class KCS(Method):
         self._expect(self.rounds >= 1, "rounds", "at least 1")
         self._expect(self.tolerance >= 0, "tolerance", "a number >= 0")
         self._expect(0 < self.mu < math.inf, "mu", "a positive number")
-        self._expect(0 < self.rho < 1, "rho", "a number between 0 and 1")
         self._expect(self.num_weights >= 1, "num_weights", "at least 1")
+        falls = 0 < self.rho < 1 and self.mu * self.rho ** (self.num_weights - 1) > 0
+        self._expect(
+            falls, "rho", "a number between 0 and 1 that leaves the last weight, mu rho^(num_weights - 1), above 0"
+        )
         self._expect(self.steps_per_weight >= 1, "steps_per_weight", "at least 1")
         self._expect(self.scale_range >= 1, "scale_range", "a factor >= 1")
         self._expect(self.robust is None or self.robust > 0, "robust", "None or a positive share")
@@ -176,6 +180,7 @@ class KCS(Method):
                 seen_from, size = self._cameras(part, shape[live], *bounds, rotations[live] if turn else None)
             else:
                 seen_from, size = known, frame_scales(shape, part.points, known[..., :2, :], part.weights, *bounds)
+            size = _told_scales(part, size)
             found, settled, steps = self._deviation(
                 part, rest[live], deviation[live], seen_from[..., :2, :], size, matrix, inverse
             )
@@ -287,6 +292,13 @@ class KCS(Method):
                     if bool(resting.all()):
                         break
         return state, resting, made
+
+
+def _told_scales(clips: Clips, scales: Tensor) -> Tensor:
+    """Scales (K, T), between those of their neighbours in frames that show fewer than two joints, and so tell none."""
+    told = clips.seen.sum(-1, keepdim=True) > 1
+    held = interpolate(scales[..., None, None], told)[..., 0, 0]
+    return clips.fill(torch.where(told.any(1), held, scales), 0)
 
 
 def _same(clips: Clips, before: Tensor, after: Tensor) -> Tensor:

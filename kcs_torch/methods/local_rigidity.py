@@ -171,7 +171,7 @@ def triangulation(
     frames = len(tracks)
     half = max(window // 2, 1)
     away = torch.arange(-half, half + 1, dtype=tracks.dtype, device=tracks.device)
-    share = (1 - away.abs() / (half + 1)) * torch.where(away == 0, 1.0, neighbours).to(away)
+    share = (1 - away.abs() / (half + 1)) * torch.where(away == 0, torch.ones_like(away), neighbours)
     own = weights[..., None, None] * (cameras.mT @ cameras)[:, None]  # (T, N, 3, 3)
     seen = weights[..., None] * back_project(tracks, cameras)
     smooth = lambda x: torch.nn.functional.conv1d(  # noqa: E731

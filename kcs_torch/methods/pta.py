@@ -81,7 +81,7 @@ class PTA(Factorised):
         cosines = dct_basis(frames, most, dtype=tracks.dtype, device=tracks.device)
         design = trajectory_design(cameras, cosines)
         normal, goal = design.mT @ design, design.mT @ tracks.mT.flatten(0, 1)
-        energy = tracks.square().sum()
+        energy, tolerance = tracks.square().sum(), float(self.tolerance)  # squares of whole numbers have no bound
         errors = {}
         rank = 1
         while rank <= most:
@@ -89,7 +89,7 @@ class PTA(Factorised):
             kept = (value > self.cutoff**2 * value[-1]) & (value > 0)
             told = (vector.mT @ goal[: 3 * rank]).square().sum(-1) / torch.where(kept, value, torch.ones_like(value))
             error = energy - (told * kept).sum()
-            if bool(error <= max(self.tolerance * self.tolerance, ROUNDING) * energy):
+            if bool(error <= max(tolerance * tolerance, ROUNDING) * energy):
                 return rank
             free = 1 - int(kept.sum()) / (2 * frames)
             if free < FREE:

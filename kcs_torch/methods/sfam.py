@@ -18,6 +18,7 @@ from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.spectral import dct_basis, nuclear_norm
 from kcs_torch.functional.temporal import interpolate, window_starts
+from kcs_torch.functional.weights import of_largest
 from kcs_torch.methods.answer.mirror import mirror_sign
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.clips.batches import Clips, in_batches, padded
@@ -64,7 +65,7 @@ class SfAM(Method):
         num_steps: shrinkage steps; the weight of the nuclear norm falls with each.
         mu: first weight, a share of the data's largest singular value.
         final: last weight. The factor from step to step (the paper's rho) follows from the three.
-        tau: step size of the articulated steps, below 1; the others take twice that.
+        tau: step size of the articulated steps, below (1 + momentum) / (1 + 2 momentum); the others take twice that.
         momentum: share of the last change that the next step starts ahead by; 0 is the printed iteration.
         corner: singular values well above this share of the data's largest are hardly shrunk (the reweighted nuclear
             norm), where the viewpoint turns: by less than 45 degrees the norm is the plain one, which keeps depths
@@ -108,8 +109,11 @@ class SfAM(Method):
         self._expect(self.num_steps >= 1, "num_steps", "at least 1")
         self._expect(0 < self.mu < math.inf, "mu", "a positive number")
         self._expect(0 < self.final <= self.mu, "final", f"a positive number up to mu = {self.mu}")
-        self._expect(0 < self.tau < 1, "tau", "a number between 0 and 1")
         self._expect(0 <= self.momentum < 1, "momentum", "a share within [0, 1)")
+        limit = (1 + self.momentum) / (1 + 2 * self.momentum)
+        self._expect(
+            0 < self.tau < limit, "tau", f"a positive number below {limit:.3g}, as steps diverge from there on"
+        )
         self._expect(self.corner > 0, "corner", "a positive number")
         self._expect(0 <= self.articulate_from <= 1, "articulate_from", "a share within 0..1")
         if not isinstance(self.lengths, str):
@@ -143,7 +147,8 @@ class SfAM(Method):
 
     def _solve(self, tracks: Sequence[Tracks], cameras: Tensor | None) -> list[Estimate]:
         """Clips of one skeleton and one number of windows; known cameras (T, 2, 3) are those of a single clip."""
-        clips = _fill_blank_frames(Clips.of(tracks))
+        clips = Clips.of(tracks)
+        clips = _fill_blank_frames(replace(clips, weights=of_largest(clips.weights)))
         starts = [self._starts(count) for count in clips.counts]
         window = min(self.window or max(clips.counts), max(clips.counts))
         first = torch.tensor(starts, device=clips.points.device)  # (K, V)

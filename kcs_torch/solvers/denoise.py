@@ -12,6 +12,7 @@ from torch import Tensor
 from kcs_torch.errors import ShapeError
 from kcs_torch.functional.shapes import check_floats
 from kcs_torch.functional.temporal import blend_windows, interpolate, window_starts
+from kcs_torch.functional.weights import known
 from kcs_torch.solvers.completion import complete_tracks
 from kcs_torch.solvers.spectrum import TINY, temporal_modes, unshared, white_power
 from kcs_torch.solvers.stray import body_size, each_joint, far_off, stray_from_neighbours
@@ -40,7 +41,8 @@ class Denoised(NamedTuple):
     Attributes:
         points: (..., T, N, 2) smoothed and filled tracks, in the tracks' units.
         weights: (..., T, N) as given, 0 at outliers.
-        noise: (..., N) standard deviation of a coordinate's noise, white and lasting, in the tracks' units.
+        noise: (..., N) standard deviation of a coordinate's noise, white and lasting, in the tracks' units, at the
+            usual weight of what is seen.
         outliers: (..., T, N), True where a seen joint was rejected and its place filled.
         left: (..., N) standard deviation of what the noise leaves in the points, by the model, were all joints seen.
     """
@@ -79,8 +81,8 @@ def denoise_tracks(
     from the model without the joint itself.
 
     Args:
-        tracks: (..., T, N, 2), finite.
-        weights: (..., T, N) in [0, 1], 0 where unseen.
+        tracks: (..., T, N, 2); NaN is unseen.
+        weights: (..., T, N) in [0, 1], 0 where unseen, and so is what is below, or NaN.
         time: (..., T) of each frame, in frames, where some of a long gap were left out; else 0, 1, 2 ... It tells how
             far joints may move from frame to frame.
         window: L, frames solved together; windows overlap by half.
@@ -112,10 +114,12 @@ def denoise_tracks(
     if time is not None and time.shape != shape[:-2]:
         raise ShapeError(f"denoise_tracks: time: expected shape {tuple(shape[:-2])}, got {tuple(time.shape)}")
     weights = weights.detach()
+    weights = torch.where((weights > 0) & tracks.isfinite().all(-1), weights, 0)  # False for NaN, too
     if not tracks.numel():
         none = tracks.new_zeros(*shape[:-3], shape[-2])
         return Denoised(tracks.detach(), weights, none, torch.zeros_like(weights, dtype=torch.bool), none)
-    values = tracks.detach().reshape(-1, *shape[-3:]).double()  # (K, T, N, 2): the spectra span more than float32
+    values = known(tracks.detach(), weights)
+    values = values.reshape(-1, *shape[-3:]).double()  # (K, T, N, 2): the spectra span more than float32
     given = weights.reshape(values.shape[:-1]).double()
     size = body_size(values, given > 0)
     unit = torch.where(size > TINY, size, torch.ones_like(size))[:, None, None, None]
@@ -147,7 +151,7 @@ def denoise_tracks(
         outliers = each_joint(far_off, error, given > 0)
     noise, left = (
         (power.sqrt()[:, None] * unit[:, 0, 0]).expand(-1, joints).reshape(*shape[:-3], joints).to(tracks.dtype)
-        for power in (model.measured + model.lasting.mean(1), model.left)
+        for power in (model.white + model.lasting.mean(1), model.left)
     )
     return Denoised(
         (points * unit).reshape(shape).to(tracks.dtype),
@@ -210,7 +214,8 @@ class _Model:
         self.ratio = (white / (motion + lasting))[:, None]  # (K, 1, L, M)
         self.moving = (motion / (motion + lasting))[:, None]
         usual = w.sum((1, 2, 3)) / (w > 0).sum((1, 2, 3)).clamp_min(1)  # weight of what is seen
-        spoilt = (self.measured / usual.clamp_min(1e-3))[:, None, None] + lasting
+        self.white = self.measured / usual.clamp_min(1e-3)
+        spoilt = self.white[:, None, None] + lasting
         self.left = (motion * spoilt / (motion + spoilt)).mean((1, 2))  # of the posterior
 
     def _lasting(self, z: Tensor, each: Tensor) -> Tensor:

@@ -61,7 +61,7 @@ def null_space_upgrade(motion: Tensor, *, softness: float = 1e-3, num_steps: int
 
     # Symmetric matrices as vectors of their triangle, off-diagonal entries times the root of 2: an isometry.
     row, column = torch.triu_indices(rank, rank, device=motion.device)
-    stretch = torch.where(row == column, 1.0, 2**0.5).to(motion)
+    stretch = (1 + (row != column).to(motion)).sqrt()
     place = torch.zeros(rank, rank, dtype=torch.long, device=motion.device)
     place[row, column] = place[column, row] = torch.arange(len(row), device=motion.device)
 

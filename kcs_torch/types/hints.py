@@ -13,7 +13,7 @@ __all__ = ["is_a", "spoken"]
 
 _WORDS = {
     int: "a whole number",
-    float: "a finite number",
+    float: "a number",
     bool: "true or false",
     str: "text",
     types.NoneType: "none",

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kcs_torch.functional.camera import complete_rotation
+from kcs_torch.functional.weights import of_largest
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.clips.batches import in_batches, padded
 from kcs_torch.methods.clips.unseen import place_unseen
@@ -84,6 +85,7 @@ class PND(Method):
         given = clips[0].points
         if given.device.type != "mps":  # what the noise leaves of a covariance is small beside the shapes
             clips = [replace(one, points=one.points.double(), weights=one.weights.double()) for one in clips]
+        clips = [replace(one, weights=of_largest(one.weights)) for one in clips]
         start = SfAM(beta=0.0, camera_path="free")
         if cameras is None:
             found = start.solve_all(clips)
