@@ -53,7 +53,8 @@ def spectrum_floor(power: Tensor) -> Tensor:
     first = max(3, length // 8)
     order = torch.arange(first, length, dtype=power.dtype, device=power.device) / first
     slope = torch.tensor([2.0, 3, 4, 5, 6, 8], dtype=power.dtype, device=power.device)[:, None, None]
-    level = torch.cat([torch.zeros(1), torch.logspace(-8, 0, 49)]).to(power)[:, None]
+    rising = torch.logspace(-8, 0, 49, dtype=power.dtype, device=power.device)
+    level = torch.cat([torch.zeros_like(rising[:1]), rising])[:, None]
     shape = (1 - level) * order**-slope + level  # (6, 50, I)
     power = power[:, None, None, first:].clamp_min(TINY)
     scale = (power / shape).mean(-1)

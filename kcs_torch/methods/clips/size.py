@@ -198,7 +198,7 @@ def _regress(value: Tensor, weight: Tensor, waves: Tensor) -> tuple[Tensor, Tens
     def stray() -> tuple[Tensor, Tensor, Tensor]:
         """What level and path leave, how steep it costs there, (K, T, P) each, and the deviations (K, P)."""
         off = value - level[:, None] - path[..., None]
-        slope = torch.where(off > 0, QUANTILE, 1 - QUANTILE).to(off)
+        slope = torch.where(off > 0, QUANTILE, torch.full_like(off, 1 - QUANTILE))
         return off, slope, ((weight * slope * off.abs()).sum(1) / total).clamp_min(FLOOR / 3)
 
     for _ in range(STEPS):

@@ -6,6 +6,7 @@ and that a detector did not find, bend the arms that they hang on.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -195,7 +196,7 @@ def _placed(points: Tensor, unsure: Tensor | None, kept: Sequence[int], body: Sk
             continue
         full[:, joint] = full[:, parent] + size * (bone @ turn)
         turned[joint] = turn
-        stray = 1.0 if body.spread is None else float(torch.deg2rad(torch.tensor(body.spread[number])).sin())
+        stray = 1.0 if body.spread is None else math.sin(math.radians(body.spread[number]))
         deep = min(stray * 2**-0.5, ANYWHERE)  # half of its square goes in depth
         variance[:, joint] = variance[:, parent] + (size * bone.norm() * deep).square()
     return full, None if unsure is None else variance.sqrt()
