@@ -115,7 +115,7 @@ def test_an_early_stop_still_records(grad_steps, iterations):
 
 def test_fpc_with_the_identity_is_one_shrinkage():
     target = normal(6, 4)
-    solution = fpc(torch.zeros(6, 4).double(), lambda x: x - target, step=1.0, weights=[3.0, 3.0, 0.5, 0.5])
+    solution = fpc(torch.zeros(6, 4).double(), lambda x: x - target, step=1.0, weights=[3.0, 0.5], steps_per_weight=2)
     assert_close(solution.value, shrink(target, 0.5))
     assert solution.iterations == 4
 
@@ -125,19 +125,58 @@ def test_fpc_is_optimal_for_matrix_completion(as_tensor):
     """At the optimum -grad f / weight is a subgradient of the nuclear norm."""
     target = normal(10, 2) @ normal(2, 8, seed=1)
     seen = (normal(10, 8, seed=2) > -0.8).double()
-    weights = [5.0] * 100 + [1.0] * 100 + [0.1] * 2000
+    weights = torch.tensor([5.0, 1.0, 0.1], dtype=torch.float64) if as_tensor else [5.0, 1.0, 0.1]
     grad = lambda x: seen * (x - target)  # noqa: E731
-    solution = fpc(
-        torch.zeros_like(target), grad, step=1.0, weights=torch.tensor(weights).double() if as_tensor else weights
-    )
+    solution = fpc(torch.zeros_like(target), grad, step=1.0, weights=weights, steps_per_weight=2000, tolerance=1e-12)
     dual = -grad(solution.value) / 0.1
+    assert solution.converged
     assert torch.linalg.matrix_norm(dual, 2) < 1 + 1e-6
     assert_close((dual * solution.value).sum(), torch.linalg.svdvals(solution.value).sum(), rtol=1e-6, atol=0)
 
 
+def test_fpc_takes_another_prox():
+    """Soft thresholding of numbers: the lasso with an orthonormal design."""
+    target = normal(30)[:, None]
+    soft = lambda x, t: x.sign() * (x.abs() - t).clamp_min(0)  # noqa: E731
+    found = fpc(torch.zeros(30, 1).double(), lambda x: x - target, soft, step=0.5, weights=[0.3], steps_per_weight=100)
+    assert_close(found.value, soft(target, 0.3))
+
+
+def test_fpc_counts_the_steps_it_makes():
+    target = normal(6, 4)
+    options = {"step": 1.0, "weights": [2.0, 1.0], "steps_per_weight": 50}
+    solution = fpc(torch.zeros(6, 4).double(), lambda x: x - target, tolerance=1e-8, **options)
+    assert (solution.converged, solution.iterations) == (True, 10)  # measured at each fifth step
+    slow = {"step": 0.01, "weights": [0.1], "steps_per_weight": 5, "tolerance": 1e-8}
+    short = fpc(target / 2, lambda x: x - target, **slow)
+    assert not short.converged
+
+
+@pytest.mark.parametrize("grad_steps", [0, 1, 3, 4, 5, None])
+def test_fpc_records_the_last_steps_over_all_weights(grad_steps):
+    target = normal(6, 4).requires_grad_()
+
+    def run(start, **more):
+        return fpc(start, lambda x: x - target, step=0.5, weights=[1.0, 0.3], steps_per_weight=3, **more).value
+
+    value = run(torch.zeros(6, 4).double(), grad_steps=grad_steps)
+    assert_close(value, run(torch.zeros(6, 4).double()))
+    if grad_steps == 0:
+        assert not value.requires_grad
+        return
+    # The same by hand: run the first steps without autograd.
+    recorded = 6 if grad_steps is None else grad_steps
+    x = torch.zeros(6, 4).double()
+    for k, weight in enumerate([1.0] * 3 + [0.3] * 3):
+        with torch.set_grad_enabled(k >= 6 - recorded):
+            x = shrink(x - 0.5 * (x - target), 0.5 * weight)
+    cotangent = normal(6, 4, seed=3)
+    assert_close(torch.autograd.grad(value, target, cotangent), torch.autograd.grad(x, target, cotangent))
+
+
 def test_fpc_gradient_and_batches():
     target, start = normal(5, 4), normal(5, 4, seed=1)
-    run = lambda t, s, w: fpc(s, lambda x: x - t, step=0.7, weights=w).value  # noqa: E731
+    run = lambda t, s, w: fpc(s, lambda x: x - t, step=0.7, weights=w, steps_per_weight=2).value  # noqa: E731
     assert gradcheck(run, target, start, torch.tensor([1.0, 0.4]).double())
     same_as_loop(lambda t, s: run(t, s, [1.0, 0.4]), (5, 4), (5, 4))
     each = torch.tensor([[1.0, 0.2], [0.5, 0.1]]).double()  # (L, batch): a weight for each matrix

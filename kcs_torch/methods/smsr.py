@@ -80,8 +80,8 @@ class SMSR(Factorised):
         start = back_project(smooth, cameras).flatten(-2)
         size = spectral_norm(start)
         falling = torch.stack([mu * size for mu in continuation(self.num_steps, self.mu, self.final)])
-        before = fpc(start, gradient, step=self.tau, weights=falling[:-1]).value
-        shape = fpc(before, gradient, step=self.tau, weights=falling[-1:]).value
+        before = fpc(start, gradient, step=self.tau, weights=falling[:-1], steps_per_weight=1).value
+        shape = fpc(before, gradient, step=self.tau, weights=falling[-1:], steps_per_weight=1).value
         change = relative_change(before, shape)
         shape = shape.unflatten(-1, (joints, 3))
         return Solution(shape, bool((change <= SETTLED).all()), self.num_steps, change=change)

@@ -71,7 +71,7 @@ def complete_tracks(
     ratio = (last / first) ** (1 / max(num_steps - 1, 1))
     top = singular_values(start)[..., 0]
     weights = [first * ratio**k * top for k in range(num_steps)]
-    found = fpc(start, lambda x: x * kept - goal, step=1.0, weights=weights).value
+    found = fpc(start, lambda x: x * kept - goal, step=1.0, weights=weights, steps_per_weight=1).value
     found = torch.where(seen[..., None], tracks, found.unflatten(-1, tracks.shape[-2:]) + mean)
     # The least nuclear norm puts a frame without any seen joint at the mean pose: a jump that no camera makes.
     return interpolate(found, seen.any(-1, keepdim=True)) * here

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -94,20 +94,32 @@ def iterate(
 
 
 def fpc(
-    start: Tensor, grad: Callable[[Tensor], Tensor], *, step: Tensor | float, weights: Tensor | Sequence[Tensor | float]
+    start: Tensor,
+    grad: Callable[[Tensor], Tensor],
+    prox: Callable[[Tensor, Tensor | float], Tensor] = shrink,
+    *,
+    step: Tensor | float,
+    weights: Tensor | list[float],
+    steps_per_weight: int = 10,
+    tolerance: float = 0.0,
+    grad_steps: int | None = None,
 ) -> Solution[Tensor]:
-    """Fixed-point continuation: X <- shrink(X - step grad(X), step weight), a step at each of a falling run of weights.
+    """Fixed-point continuation: X <- prox(X - step grad(X), step weight), for a falling run of weights.
 
-    Approaches the minimum of ``f(X) + weight |X|_*`` at the last weight by proximal gradient steps.
+    Minimises ``f(X) + weight g(X)`` at the last weight, by proximal gradient steps warm-started from the larger ones.
 
     Args:
-        start: first X (..., M, N).
+        start: first X, any shape that ``prox`` takes (for the nuclear norm (..., M, N)).
         grad: gradient of the smooth term f.
+        prox: proximal map ``prox(X, t)`` of g; singular value shrinkage by default.
         step: step size, a number or a tensor of one element, below 2 over the Lipschitz constant of ``grad``.
         weights: (L,) or (L, ...) weights mu in falling order; each row broadcasts against the batch of X.
+        steps_per_weight: steps at each weight, at most.
+        tolerance: go on to the next weight where a step changes X by less than this share of X.
+        grad_steps: as in :func:`iterate`, counted over all steps.
 
     Returns:
-        A :class:`Solution`; nothing is measured.
+        A :class:`Solution`; converged tells of the last weight (True where ``tolerance`` is 0: nothing is measured).
 
     Ma, Goldfarb, Chen 2011; Kovalenko et al. 2019, Algorithm 1, lines 8-11.
 
@@ -115,7 +127,20 @@ def fpc(
     >>> fpc(torch.zeros(2, 2), lambda X: X - Y, step=1.0, weights=[2.0]).value.round(decimals=4).tolist()
     [[1.0, 0.0], [0.0, 0.0]]
     """
-    return iterate(lambda x, k: shrink(x - step * grad(x), step * weights[k]), start, num_steps=len(weights))
+    value, converged, made = start, False, 0
+    for k, weight in enumerate(weights):
+        after = (len(weights) - 1 - k) * steps_per_weight  # steps at the weights to come
+        last = None if grad_steps is None else max(0, min(steps_per_weight, grad_steps - after))
+        solution = iterate(
+            lambda x, _, w=weight: prox(x - step * grad(x), step * w),  # type: ignore[misc]
+            value,
+            num_steps=steps_per_weight,
+            change=relative_change if tolerance > 0 else None,
+            tolerance=tolerance,
+            grad_steps=last,
+        )
+        value, converged, made = solution.value, solution.converged, made + solution.iterations
+    return Solution(value, converged, made)
 
 
 def svt(
