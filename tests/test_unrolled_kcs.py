@@ -20,6 +20,7 @@ from kcs_torch.solvers.pose import fit_cameras
 REST = normal(7, 3)
 CLIP = walking_person(30, turn=60.0, missing=0.1, generator=torch.Generator().manual_seed(0))
 TRACKS = CLIP.tracks
+BODY_17 = TRACKS.skeleton
 each_arrangement = pytest.mark.parametrize("arrangement", ["stacked", "frames"])
 
 
@@ -258,3 +259,14 @@ def test_an_empty_batch_has_no_cameras():
     tracks, _, _ = scene(BODY)
     rows, sizes = UnrolledKCS(BODY, 2, template=REST).find_cameras(tracks[None][:0])
     assert rows.shape == (0, len(tracks), 2, 3) and sizes.shape == (0, len(tracks))
+
+
+@pytest.mark.parametrize("padded", [False, True])
+def test_frames_that_show_nobody_do_not_make_the_body_small(padded):
+    layer = UnrolledKCS("h36m17", num_steps=4, scale_range=2.0)
+    weights = TRACKS.weights.clone()
+    weights[5:25] = 0
+    inside = torch.arange(30) < 28 if padded else None
+    whole, gap = (layer(TRACKS.points, CLIP.cameras, weights=w, inside=inside) for w in (TRACKS.weights, weights))
+    sizes = [bone_lengths(shape[:4], BODY_17.bones).sum() for shape in (whole, gap)]
+    assert_close(sizes[1], sizes[0], rtol=0.05, atol=0)

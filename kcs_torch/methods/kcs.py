@@ -16,12 +16,18 @@ from kcs_torch.functional.camera import complete_rotation
 from kcs_torch.functional.chain import bone_lengths, chain_inverse, incidence
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import median
-from kcs_torch.functional.temporal import interpolate
 from kcs_torch.methods.answer.mirror import mirror_sign
 from kcs_torch.methods.base import Estimate, Method
 from kcs_torch.methods.clips.batches import Clips, in_batches, padded
 from kcs_torch.methods.clips.template import clip_scale, guessed, rigid_shape
-from kcs_torch.nn.deviation import Arrangement, deviation_goal, deviation_scale, deviation_step, frame_scales
+from kcs_torch.nn.deviation import (
+    Arrangement,
+    deviation_goal,
+    deviation_scale,
+    deviation_step,
+    frame_scales,
+    told_scales,
+)
 from kcs_torch.nn.steps import continuation
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.solvers.iterate import relative_change
@@ -180,7 +186,7 @@ class KCS(Method):
                 seen_from, size = self._cameras(part, shape[live], *bounds, rotations[live] if turn else None)
             else:
                 seen_from, size = known, frame_scales(shape, part.points, known[..., :2, :], part.weights, *bounds)
-            size = _told_scales(part, size)
+            size = part.fill(told_scales(size, part.weights), 0)
             found, settled, steps = self._deviation(
                 part, rest[live], deviation[live], seen_from[..., :2, :], size, matrix, inverse
             )
@@ -292,13 +298,6 @@ class KCS(Method):
                     if bool(resting.all()):
                         break
         return state, resting, made
-
-
-def _told_scales(clips: Clips, scales: Tensor) -> Tensor:
-    """Scales (K, T), between those of their neighbours in frames that show fewer than two joints, and so tell none."""
-    told = clips.seen.sum(-1, keepdim=True) > 1
-    held = interpolate(scales[..., None, None], told)[..., 0, 0]
-    return clips.fill(torch.where(told.any(1), held, scales), 0)
 
 
 def _same(clips: Clips, before: Tensor, after: Tensor) -> Tensor:

@@ -16,8 +16,17 @@ from kcs_torch.functional.chain import bone_lengths, bone_vectors
 from kcs_torch.functional.guarded import or_one
 from kcs_torch.functional.ranks import nanmedian
 from kcs_torch.functional.spectral import spectral_norm, svt
+from kcs_torch.functional.temporal import interpolate
 
-__all__ = ["Arrangement", "deviation_goal", "deviation_scale", "deviation_step", "frame_scales", "template_scale"]
+__all__ = [
+    "Arrangement",
+    "deviation_goal",
+    "deviation_scale",
+    "deviation_step",
+    "frame_scales",
+    "template_scale",
+    "told_scales",
+]
 
 Arrangement = Literal["stacked", "frames"]
 """How deviations form one matrix: 3T x B as printed, or T x 3B (up to the order of rows and columns)."""
@@ -101,6 +110,18 @@ def frame_scales(rest: Tensor, tracks: Tensor, cameras: Tensor, weights: Tensor,
     size = (flat.square() * weights[..., None]).sum((-2, -1))
     free = match / or_one(size)
     return torch.minimum(torch.maximum(free, low), high)
+
+
+def told_scales(scales: Tensor, weights: Tensor) -> Tensor:
+    """Scales (..., T), between those of their neighbours in frames that show fewer than two joints, and so tell none.
+
+    Args:
+        scales: (..., T).
+        weights: (..., T, N), 0 where unseen.
+    """
+    told = (weights > 0).sum(-1, keepdim=True) > 1
+    held = interpolate(scales[..., None, None], told)[..., 0, 0]
+    return torch.where(told.any(-2), held, scales)
 
 
 def template_scale(tracks: Tensor, weights: Tensor, rest: Tensor, bones: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ from kcs_torch.nn.deviation import (
     deviation_step,
     frame_scales,
     template_scale,
+    told_scales,
 )
 from kcs_torch.nn.masks import clear_padding
 from kcs_torch.nn.reprojection import centred_residual
@@ -268,7 +269,7 @@ class UnrolledKCS(Unrolled):
         if scales is None:
             with torch.no_grad():
                 low, high = self._bounds(points, weights, rest, inside)
-            scales = frame_scales(rest, points, rows, weights, low, high)
+            scales = told_scales(frame_scales(rest, points, rows, weights, low, high), weights)
         scales = scales.to(points.dtype)
         if inside is None:
             size = scales.mean(-1)
