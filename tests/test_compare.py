@@ -186,6 +186,12 @@ def test_frames_without_the_root_are_told():
     assert compare(noisy(truth), hidden, align="rigid").notes == ()
 
 
+def test_a_pelvis_that_is_seldom_seen_is_no_root():
+    truth = walking_motion(20)
+    assert compare(noisy(truth), without_pelvis(truth, slice(0, 10))).root == "pelvis"
+    assert compare(noisy(truth), without_pelvis(truth, slice(0, 11))).root is None
+
+
 def test_roots_by_name():
     truth = walking_motion(20)
     found = compare(noisy(truth), truth, align=["root"], root="nose")

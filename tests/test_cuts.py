@@ -161,6 +161,14 @@ def test_shots_before_a_near_camera_share_its_lens():
     assert [error(part, x) < 20 for part, (_, x) in zip(found.points.split(20), shots, strict=True)] == [True, True]
 
 
+def test_a_lens_that_is_asked_for_is_found_in_several_shots():
+    shots = [filmed(2500.0, frames=20, yaw=yaw)[0].points for yaw in (30, 110)]
+    tracks = kt.Tracks.from_arrays(torch.cat(shots), skeleton="h36m17", fps=30.0, units="mm")  # no image
+    found = quietly(tracks, intrinsics="auto")
+    assert found.intrinsics is not None and abs(found.intrinsics.fx / 1500 - 1) < 0.3
+    assert quietly(tracks).intrinsics is None
+
+
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_cut_is_found_where_one_side_is_hidden(side):
     """Compared with its own mirror image hardly any joint is left there."""

@@ -573,6 +573,40 @@ def test_clips_of_which_some_joints_have_labels_train_and_measure():
     assert not all(torch.equal(before[name], value) for name, value in module.critic.state_dict().items())
 
 
+class _OfMotion(torch.nn.Module):
+    """A critic of clips."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen, self.layer = [], torch.nn.LazyLinear(1)
+
+    def forward(self, points):
+        self.seen.append(points.shape)
+        return self.layer(points.flatten(1))
+
+
+def test_a_critic_sees_clips_where_all_is_labelled():
+    critic = _OfMotion()
+    critic(torch.zeros(1, 5, 17, 3))
+    batches = torch.utils.data.DataLoader([batch_of(labelled=6, pseudo=0)], batch_size=None)
+    trainer = lightning.Trainer(max_epochs=1, accelerator="cpu", num_sanity_val_steps=0, **QUIET)
+    trainer.fit(module_of(critic=critic, turn=0.0), batches, batches)
+    assert critic.seen[1:] == [(6, 5, 17, 3)] * 3
+
+
+def test_a_loss_without_weights_does_not_see_what_is_not_labelled():
+    class Square(torch.nn.Module):
+        def forward(self, points, target):
+            return (points - target).square().mean((-1, -2))
+
+    batch = batch_of(labelled=6, pseudo=0)
+    points = batch.points.clone().requires_grad_()
+    target = torch.where(torch.arange(17)[:, None] == 9, torch.nan, batch.points + 1)
+    value = LossTerm(Square()).value(points, batch._replace(points=target), None)
+    assert value.item() == pytest.approx(16 / 17)
+    assert bool((torch.autograd.grad(value, points)[0][:, :, 9] == 0).all())
+
+
 def test_a_refined_network_keeps_to_the_tracks_and_can_be_saved(tmp_path):
     torch.manual_seed(0)
     solver = kt.nn.UnrolledSfAM(BODY, num_steps=4, mu=0.01, articulate_from=0, learnable_lengths=True)

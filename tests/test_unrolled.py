@@ -236,13 +236,22 @@ def test_one_clip_has_cameras_of_several_lengths(layer):
     assert_close(got, torch.stack([usual, usual / 2]))
 
 
+@pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: type(layer).__name__)
+def test_a_frame_without_a_camera_does_not_make_lengths_count(layer):
+    tracks, cameras, weights = scene(BODY, "gaps")
+    cameras = cameras.clone()
+    cameras[4] = 0
+    usual = layer(tracks, cameras, weights=weights)
+    assert_close(layer(64 * tracks, 64 * cameras, weights=weights), usual)  # without rounding, as the frame is a point
+
+
 def test_lengths_of_rows():
     cameras = rotations(5, seed=1)[:, :2]
     assert torch.equal(row_length(cameras, of_clip=True), torch.ones(1, 1, 1, dtype=torch.float64))
     assert torch.equal(row_length(cameras, of_clip=False), torch.ones(5, 1, 1, dtype=torch.float64))
     padded = torch.cat([2 * cameras, torch.zeros_like(cameras)])
     assert_close(row_length(padded, of_clip=True), torch.full((1, 1, 1), 2.0, dtype=torch.float64))
-    assert_close(row_length(padded, of_clip=False).flatten(), torch.tensor([2.0] * 5 + [1.0] * 5, dtype=torch.float64))
+    assert_close(row_length(padded, of_clip=False).flatten(), torch.full((10,), 2.0, dtype=torch.float64))
     assert row_length(torch.zeros(2, 0, 2, 3), of_clip=True).flatten().tolist() == [1, 1]
 
 

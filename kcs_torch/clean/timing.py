@@ -107,7 +107,8 @@ def resample(tracks: Tracks, fps: float, *, kind: str = "cubic", source_fps: flo
 
     Gaps stay gaps: a new frame sees a joint where the old frames on either side do, and as surely as the less sure of
     them. Nothing is smoothed: where the rate falls, noise stays what it is, so smooth first. Between two shots of a
-    film (:func:`split`) a new frame shows the old one that is nearer: shots stay apart, and stay seen.
+    film (:func:`split`) a new frame shows the old one that is nearer: shots stay apart, and those of four new frames or
+    more are found again.
 
     Args:
         tracks: what to resample.

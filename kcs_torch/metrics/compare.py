@@ -242,13 +242,14 @@ def _alignments(align: str | Iterable[str] | None, ratio: float | None, pred: Mo
 
 
 def _root(name: str | None, shared: Sequence[str], weights: Tensor) -> int | None:
-    """Where the root is among the compared joints, of weights (T, N): as named, or a pelvis that is seen."""
+    """Where the root is among the compared joints, of weights (T, N): as named, or a pelvis that is often seen."""
     if name is not None:
         if name not in shared:
             raise unknown("root among the compared joints", name, shared, SkeletonError)
         return shared.index(name)
+    often = (2 * (weights > 0).sum(0) >= len(weights)).tolist()
     found = [map_joints(shared, [pelvis])[0] for pelvis in ("pelvis", "mid_hip")]
-    return next((at for at in found if at is not None and bool((weights[:, at] > 0).any())), None)
+    return next((at for at in found if at is not None and often[at]), None)
 
 
 def _deviation(motion: Motion) -> float:

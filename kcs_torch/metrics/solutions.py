@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -51,7 +52,8 @@ class Difference:
         if self.mirrored:
             return f"nearly the mirror image in depth, {f'{self.beside_mirror:.3g} {self.units}'.rstrip()} from it"
         if not self.flipped:
-            return "depths differ, no bone tips the other way" if self.joints else "depths are the same"
+            differ = bool(self.joints) or math.isnan(self.rms)
+            return "depths differ, no bone tips the other way" if differ else "depths are the same"
         some = dict(list(self.flipped.items())[:4])
         more = f", and {counted(len(self.flipped) - 4, 'more bone')}" if len(self.flipped) > 4 else ""
         if min(some.values()) == 1:  # all the time, as in a single image

@@ -81,7 +81,8 @@ class LossTerm:
             ShapeError: the loss returns something else than a number for every clip or frame.
         """
         wanted = self._wanted()
-        given: dict[str, Any] = {"points": points, "tracks": batch.tracks, "target": batch.points, "network": network}
+        target = torch.where(batch.points.isfinite(), batch.points, points.detach())  # NaN is not labelled
+        given: dict[str, Any] = {"points": points, "tracks": batch.tracks, "target": target, "network": network}
         given["weights"] = _trust(batch) if "target" in wanted else batch.weights if "tracks" in wanted else None
         value: Tensor = self.loss(**{name: x for name, x in given.items() if name in wanted and x is not None})
         count, frames = points.shape[:2]

@@ -244,7 +244,10 @@ class LiftingModule(lightning.LightningModule):
             whole = true.isfinite().all(-1).all(-1)  # poses
             if bool(whole.any()):
                 rows = torch.randint(len(points), (len(true),), device=true.device)
-                own, fake = (centre(x[whole][:, None])[0] for x in (true, points.detach()[rows]))
+                fake = points.detach()[rows]
+                if not bool(whole.all()):  # single poses
+                    true, fake = true[whole][:, None], fake[whole][:, None]
+                own, fake = centre(true)[0], centre(fake)[0]
                 values["critic_own"] = critic_loss(self.critic(own), self.critic(fake)).mean()
                 self._advance(optimisers[1], values["critic_own"], counts=False)
         self.log_dict({f"train/{name}": value.detach() for name, value in values.items()}, batch_size=len(points))

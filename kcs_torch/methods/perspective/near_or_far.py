@@ -194,8 +194,9 @@ def _seen_by_two(
     path = view.first_distance(clean, rate) / unit
     standing = None if feet is None else feet[some]
     return PinholeEnergy(
-        outward(tracks.skeleton), view.rays, path, depth, rate, noise[some], standing=standing, focal=focal
-    )
+        outward(tracks.skeleton), view.rays, path, depth, rate, noise[some], standing=standing, focal=focal,
+        cuts=view.cuts,
+    )  # fmt: skip
 
 
 def _liveliest(image: Tensor, count: int) -> Tensor:

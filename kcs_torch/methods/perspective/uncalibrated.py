@@ -49,8 +49,8 @@ def reconstruct_uncalibrated(
     through the lens that such a camera usually has (:func:`lens_of_image`). Where nothing tells of the image, PKC
     solves them as if rays were parallel, but ends where it has found a body whose camera seems near all the same
     (:func:`likely_lens`), before it turns runs of signs over; the principal point is then taken to be the tracks'
-    middle. Of several shots of a film only the image tells whether they are near. Either way the focal length is found
-    together with depths, lengths, distances and signs by :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
+    middle. Either way the focal length is found together with depths, lengths, distances and signs by
+    :func:`kcs_torch.methods.perspective.reconstruct_perspective`.
 
     Args:
         method: any.
@@ -97,8 +97,7 @@ def _by_tracks(
     """A body before a camera of which the tracks tell whether it is near."""
     judge = method if isinstance(method, PKC) else PKC()
     result = looking(judge)(tracks, cameras) if lifted is None else lifted
-    far = SEEMS_FAR in result.diagnostics.notes or bool(cuts_of(tracks))
-    lens = None if far else likely_lens(result, cameras)
+    lens = None if SEEMS_FAR in result.diagnostics.notes else likely_lens(result, cameras)
     if lens is not None and likely is not None:
         return _by_image(method, tracks, cameras, likely)
     if lens is not None:

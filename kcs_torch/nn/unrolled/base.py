@@ -48,12 +48,12 @@ def row_length(cameras: Tensor, *, of_clip: bool) -> Tensor:
 
     Returns:
         That of each clip, (..., 1, 1, 1), or else of each frame, (..., T, 1, 1). Cameras of 0, as of padding, do not
-        count, and where there are no others it is 1; so it is, exactly, where it is 1 but for rounding.
+        count: they have the clip's length. Where there are no others it is 1; so it is, exactly, where it is 1 but for
+        rounding.
     """
     square = cameras.square().sum((-2, -1), keepdim=True) / 2
-    if of_clip:
-        square = square.sum(-3, keepdim=True) / (square > 0).sum(-3, keepdim=True).clamp_min(1)
-    length = or_one(square).sqrt()
+    usual = square.sum(-3, keepdim=True) / (square > 0).sum(-3, keepdim=True).clamp_min(1)
+    length = or_one(usual if of_clip else torch.where(square > 0, square, usual)).sqrt()
     near = (length - 1).abs() < UNIT * torch.finfo(length.dtype).eps
     return torch.where(near, 1 + (length - length.detach()), length)
 
