@@ -117,10 +117,9 @@ class KCS(Method):
         self._expect(self.tolerance >= 0, "tolerance", "a number >= 0")
         self._expect(0 < self.mu < math.inf, "mu", "a positive number")
         self._expect(self.num_weights >= 1, "num_weights", "at least 1")
-        falls = 0 < self.rho < 1 and self.mu * self.rho ** (self.num_weights - 1) > 0
-        self._expect(
-            falls, "rho", "a number between 0 and 1 that leaves the last weight, mu rho^(num_weights - 1), above 0"
-        )
+        self._expect(0 < self.rho < 1, "rho", "a number between 0 and 1")
+        last = self.mu * self.rho ** (self.num_weights - 1)
+        self._expect(last > 0, "rho", "a number that leaves the last weight, mu rho^(num_weights - 1), above 0")
         self._expect(self.steps_per_weight >= 1, "steps_per_weight", "at least 1")
         self._expect(self.scale_range >= 1, "scale_range", "a factor >= 1")
         self._expect(self.robust is None or self.robust > 0, "robust", "None or a positive share")
