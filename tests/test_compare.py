@@ -190,6 +190,9 @@ def test_a_pelvis_that_is_seldom_seen_is_no_root():
     truth = walking_motion(20)
     assert compare(noisy(truth), without_pelvis(truth, slice(0, 10))).root == "pelvis"
     assert compare(noisy(truth), without_pelvis(truth, slice(0, 11))).root is None
+    weights = truth.weights.clone()
+    weights[5:] = 0  # frames that are not compared say nothing of it
+    assert compare(noisy(truth), replace(truth, weights=weights)).root == "pelvis"
 
 
 def test_roots_by_name():

@@ -140,7 +140,7 @@ def _smooth_result(result: Reconstruction, method: str, cutoff: float, rate: flo
         note = f"smooth 3D ({words}): left as it is: {len(points)} frames are fewer than {chosen.least}"
         return replace(result, diagnostics=replace(result.diagnostics, notes=(*result.diagnostics.notes, note)))
     moved, short = _smooth_runs(points, known.astype(float), filters)
-    change = math.sqrt(float(np.square(moved - points).sum(-1)[known].mean()))
+    change = math.sqrt(float(np.square(moved - points).sum(-1)[known].sum()) / max(int(known.sum()), 1))
     told = f"joints moved by {change:.2g} {result.units} (root mean square)"
     told += _left(short, int(known.sum()), "points", chosen)
     note = f"smooth 3D ({words}): {told}; the reprojection is that before"

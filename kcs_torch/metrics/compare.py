@@ -85,8 +85,8 @@ def compare(
         truth: of any skeleton and unit; joints that it does not see do not count.
         align: one or more names in :data:`~kcs_torch.metrics.ALIGNMENTS`; all that make sense if None: those without a
             scale need a known size of both, ``none`` has to be asked for.
-        root: name of the truth's root joint; a pelvis, if None and one is seen. Frames without it do not count for
-            ``root`` and ``scale``; a note says so.
+        root: name of the truth's root joint; a pelvis, if None and one is seen in half of the frames. Frames without it
+            do not count for ``root`` and ``scale``; a note says so.
         mirror: compare the prediction's mirror image in depth.
         within: distance for PCK in the truth's unit; 150 mm if None.
 
@@ -242,12 +242,16 @@ def _alignments(align: str | Iterable[str] | None, ratio: float | None, pred: Mo
 
 
 def _root(name: str | None, shared: Sequence[str], weights: Tensor) -> int | None:
-    """Where the root is among the compared joints, of weights (T, N): as named, or a pelvis that is often seen."""
+    """Where the root is among the compared joints, of weights (T, N): as named, or a pelvis.
+
+    One that is seen in fewer than half of the frames that count is none: figures would rest on the others.
+    """
     if name is not None:
         if name not in shared:
             raise unknown("root among the compared joints", name, shared, SkeletonError)
         return shared.index(name)
-    often = (2 * (weights > 0).sum(0) >= len(weights)).tolist()
+    seen = weights > 0
+    often = (2 * seen.sum(0) >= seen.any(1).sum()).tolist()
     found = [map_joints(shared, [pelvis])[0] for pelvis in ("pelvis", "mid_hip")]
     return next((at for at in found if at is not None and often[at]), None)
 

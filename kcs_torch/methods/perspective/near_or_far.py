@@ -60,7 +60,7 @@ EVERY, HOPELESS, AWAY = 20, 10.0, 6.5
 def may_be_near(tracks: Tracks) -> bool:
     """Whether perspective can be told: from a body with a template and a whole trunk.
 
-    Of several shots only where the image tells the lens: under parallel rays each shot looks as near as any other.
+    Of several shots only where the image tells a lens: the tracks alone are believed to in a single shot.
 
     Hips alone, with the legs, lie on a line: what turns about it looks like perspective.
     """

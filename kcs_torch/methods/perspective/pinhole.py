@@ -129,7 +129,7 @@ class PinholeEnergy:
         usual: float | None = None,
         cuts: Sequence[int] = (),
     ) -> None:
-        self.cuts = list(cuts)
+        cuts = list(cuts)
         self.slow = 30.0 / rate  # more frames a second tell no more, and move less from one to the next
         self.skeleton, self.rate, self.known = skeleton, rate, lengths is not None
         self.rays = rays.permute(2, 1, 0).contiguous()  # (2, N, T)
@@ -149,10 +149,10 @@ class PinholeEnergy:
             ratio = median(lengths / self.lengths, -1, keepdim=True)
             self.path, self.lengths = self.path * ratio, lengths
             self.depth, self.own = self.depth * ratio[..., None], self.own * ratio[..., None]
-        waves = torch.block_diag(*(_waves(shot, rate) for shot in rays.tensor_split(self.cuts)))
+        waves = torch.block_diag(*(_waves(shot, rate) for shot in rays.tensor_split(cuts)))
         self.waves = waves[:, 0 if self.known else 1 :]  # (T, K); unknown lengths make up for the first
         self.follows = rays.new_ones(len(rays))  # (T,) 0 in the first frames of shots
-        self.follows[self.cuts] = 0
+        self.follows[cuts] = 0
         self.bends = self.follows * self.follows.roll(1)  # (T,) and in their second ones
         self.rough = (ROOT * self.slow**2) ** -2
         self.model: Objective | None = None

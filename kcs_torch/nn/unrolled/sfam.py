@@ -30,7 +30,8 @@ class UnrolledSfAM(Unrolled):
         num_steps: steps; each has its own step size, threshold, corner and stiffness.
         mu: first threshold, a share of the data's largest singular value.
         final: last threshold.
-        tau: step size of the articulated steps, below 1; the others take twice that.
+        tau: step size of the articulated steps; the others take twice that. From (1 + momentum) / (1 + 2 momentum) on
+            many steps diverge.
         momentum: as in :class:`UnrolledFPC`; few steps want less of it than the method's many.
         corner: as in :class:`UnrolledFPC`.
         beta: stiffness of the bones.
