@@ -157,6 +157,8 @@ def test_an_unknown_suffix_is_answered_with_the_known_ones(tmp_path, result, nam
     with pytest.raises(OutputError, match="suffixes " + ", ".join(WRITERS)):
         save(result, tmp_path / name)
     assert everything_below(tmp_path) == []
+    with pytest.raises(OutputError, match=r"got '\.fbx'; Blender and others import \.bvh"):
+        save(result, tmp_path / "w.fbx")
 
 
 def test_paths_that_cannot_be_written(tmp_path, result):

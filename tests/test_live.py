@@ -247,6 +247,16 @@ def test_the_image_may_be_of_any_size_and_place(clip):
     assert off.median() < 0.1 and (off < 5).double().mean() > 0.97  # whose sign is a toss-up, rounding tells
 
 
+def test_shares_of_an_image_of_known_size_are_its_pixels(clip):
+    frames = 0.2 * observed(clip)[:30] + 500
+    size = torch.tensor([1920.0, 1080.0], dtype=frames.dtype)
+    a, b = (
+        follow(kt.Tracker("coco17", fps=30, image_size=(1920, 1080)), given)[0].points
+        for given in (frames, frames / size)
+    )
+    torch.testing.assert_close(a, b)
+
+
 def test_without_a_template():
     body = replace(kt.SKELETONS["coco17"], template=None, spread=None, proportions=None)
     clip = walking_person(60, skeleton="coco17", turn=200)

@@ -10,7 +10,7 @@ import yaml
 from samples import grid, with_value
 from torch.testing import assert_close
 
-from kcs_torch import Motion, OptionError, SkeletonError, Tracks
+from kcs_torch import Motion, OptionError, ShapeError, SkeletonError, Tracks
 from kcs_torch.data import walking_person
 from kcs_torch.skeleton import SKELETONS
 from kcs_torch.types.size import check_size, size_factor
@@ -72,6 +72,24 @@ def test_an_image_that_most_joints_lie_outside_is_none():
     far = torch.where(torch.arange(17)[:, None] < 5, points, 4000.0)
     unseen = (torch.arange(17) < 5).float().expand(4, 17)  # and so they do not count
     assert Tracks.from_arrays(far, unseen, skeleton="h36m17", image_size=(1000, 500)).image_size == (1000, 500)
+
+
+def test_shares_of_an_image_of_known_size_become_pixels():
+    size = torch.tensor([1920.0, 1080.0])
+    points = 100 + 10 * torch.rand(5, 17, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points[2, 3] = float("nan")
+    pixels = Tracks.from_arrays(points, skeleton="h36m17", image_size=(1920, 1080))
+    shares = Tracks.from_arrays(points / size, skeleton="h36m17", image_size=(1920, 1080))
+    assert_close(shares.points, pixels.points)
+    assert shares.image_size == (1920, 1080) and not any("shares" in note for note in pixels.notes)
+    assert "coordinates are shares of the image: multiplied by its 1920 x 1080 pixels" in shares.notes
+
+
+def test_confidences_beside_the_places_are_told_where_to_go():
+    with pytest.raises(ShapeError, match=r"points\[..., :2\], confidence=points\[..., 2\]"):
+        Tracks.from_arrays(torch.rand(5, 17, 3), skeleton="h36m17")
+    with pytest.raises(ShapeError, match=r"expected shape \(5, 17\), got \(5, 17, 1\): confidence\[..., 0\] puts"):
+        Tracks.from_arrays(torch.rand(5, 17, 2), torch.rand(5, 17, 1), skeleton="h36m17")
 
 
 @pytest.mark.parametrize(

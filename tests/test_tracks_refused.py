@@ -55,7 +55,7 @@ ONES = torch.ones(4, 17)
     ("confidence", "words"),
     [
         (ONES[:, :5], "confidence: expected shape (4, 17), got (4, 5)"),
-        (ONES[..., None], "2 dimensions"),
+        (ONES[..., None], "confidence[..., 0] puts it right"),
         (with_value(ONES, (1, 2), -0.5), "frame 1, joint 'joint2' is negative"),
         (with_value(ONES, (1, 2), INF), "frame 1, joint 'joint2' is infinite"),
         (

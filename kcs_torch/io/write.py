@@ -27,6 +27,9 @@ UP = ("y", "z")
 LEANING = (12, 60)
 """Degrees by which a body leans in the mean if the camera may have looked down, or up, by so much."""
 
+SCENES = frozenset((".fbx", ".glb", ".gltf", ".usd", ".usda", ".usdc", ".dae", ".abc"))
+"""Suffixes of scenes, which nothing here writes."""
+
 _NO_UNIT = (
     "got motion in an unknown one: give it where the motion is made, with units=... (kcs-torch convert: --from-units "
     "cm), or the true size, with scaled(units=..., height=1.75) (--scale height=1.75m)"
@@ -209,7 +212,8 @@ def writer_for(path: str | Path) -> Writer:
     suffix = Path(path).suffix.lower()
     if suffix not in WRITERS:
         got = f"'{suffix}'" if suffix else "none"
-        raise OutputError(f"{path}: expected a file with one of the suffixes {', '.join(WRITERS)}, got {got}")
+        hint = "; Blender and others import .bvh" if suffix in SCENES else ""
+        raise OutputError(f"{path}: expected a file with one of the suffixes {', '.join(WRITERS)}, got {got}{hint}")
     return WRITERS[suffix]
 
 

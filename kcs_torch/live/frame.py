@@ -13,6 +13,7 @@ from kcs_torch.functional.chain import bone_vectors
 from kcs_torch.functional.ranks import median
 from kcs_torch.methods.clips.unseen import place_unseen
 from kcs_torch.skeleton import Skeleton
+from kcs_torch.types.image_size import are_shares
 from kcs_torch.types.intake import as_floats, as_weights, at_one_point, at_the_corner, check_places
 
 __all__ = ["Sight", "take_frame"]
@@ -30,7 +31,7 @@ unseen before they are believed."""
 
 
 def take_frame(
-    body: Skeleton, number: int, xy: Any, confidence: Any, threshold: float
+    body: Skeleton, number: int, xy: Any, confidence: Any, threshold: float, size: tuple[int, int] | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Check a frame of observed joints, and append the virtual ones.
 
@@ -42,6 +43,7 @@ def take_frame(
             or more joints that all lie at one point are unseen.
         confidence: (num_observed,) in 0..1; 1 where None.
         threshold: a joint with less confidence counts as unseen.
+        size: width and height of the image, of which coordinates from 0 to 1 are shares; None where unknown.
 
     Returns:
         Points (N, 2), 0 where unseen, and weights (N,), on the CPU in double precision; and ``xy`` as a tensor of the
@@ -68,6 +70,8 @@ def take_frame(
         weights = as_weights(told, seen, threshold, f"{where}: confidence", body.joints)
     weights = weights.masked_fill(at_one_point(points, weights > 0), 0.0)
     points = torch.where(weights[:, None] > 0, points, 0.0)
+    if size is not None and are_shares(points[weights > 0].numpy()):
+        points = points * points.new_tensor(size)
     return *body.complete(points, weights), given
 
 

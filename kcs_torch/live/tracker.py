@@ -99,7 +99,7 @@ class Tracker:
             few frames again, in up to four times the time of a usual one.
         method: whose fields :meth:`result` takes, and the solves, with fewer steps; ``PKC()`` if None.
         image_size: width and height of the image in pixels, which :meth:`tracks` have: by it :meth:`result` knows the
-            camera's lens roughly. Live poses are as before a far one.
+            camera's lens roughly, and shares of the image become pixels. Live poses are as before a far one.
 
     Raises:
         SkeletonError: the skeleton is unknown, or its bones are no tree.
@@ -192,7 +192,9 @@ class Tracker:
         """
         if self._closed:
             raise OptionError("Tracker: closed: it takes no frames any more; make another one")
-        points, weights, like = take_frame(self.skeleton, self._frame + 1, xy, confidence, self.threshold)
+        points, weights, like = take_frame(
+            self.skeleton, self._frame + 1, xy, confidence, self.threshold, self.image_size
+        )
         self._frame += 1
         last = self._image[-1] if self._image else None
         if last is not None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcs_torch.errors import OptionError
 
-__all__ = ["as_image_size", "fitting_size", "may_be_shares", "told_image_size", "usual_size"]
+__all__ = ["are_shares", "as_image_size", "fitting_size", "may_be_shares", "told_image_size", "usual_size"]
 
 LARGEST = 10**6
 """Pixels of an image's side, at most."""
@@ -29,6 +31,9 @@ INSIDE = 0.99
 
 SHARES = 0.9
 """Share of the joints within 0 and 1 from which on they may be shares of the image: a hand may leave it."""
+
+WHOLE = 2.0
+"""Coordinates in an image whose median is above this are no shares of it."""
 
 MOST = 0.5
 """Share of the joints that an image holds at least, or its size is wrong."""
@@ -89,6 +94,12 @@ def fitting_size(points: Tensor, size: tuple[int, int], notes: list[str]) -> tup
     if fix and _held(points, size, BESIDE) < 1 - CLEAR:
         notes.append(f"many joints lie far outside {image}{fix}")
     return size
+
+
+def are_shares(places: NDArray[np.float64]) -> bool:
+    """Whether places (..., 2) in an image, some of which may be NaN, are shares of it rather than pixels."""
+    known = places[np.isfinite(places)]
+    return len(known) > 0 and bool(np.median(np.abs(known)) <= WHOLE)
 
 
 def may_be_shares(points: Tensor) -> bool:

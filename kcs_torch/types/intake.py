@@ -259,9 +259,11 @@ def _shaped(points: Any, confidence: Any, dims: int, source: str) -> tuple[Tenso
             f"{_other_dimensions(xy.shape, dims)}"
         )
     if confidence is not None:
-        confidence = as_floats(confidence, f"{source}: confidence (frames, joints)", 2)
+        confidence = as_floats(confidence, f"{source}: confidence (frames, joints)", None)
     if xy.shape[-1] != dims:
-        hint = "; confidences go into an array of their own" if xy.shape[-1] == dims + 1 else ""
+        hint = ""
+        if xy.shape[-1] == dims + 1:
+            hint = f": confidences go apart, points[..., :{dims}], confidence=points[..., {dims}]"
         if xy.shape[1] == dims:
             hint = ": the last two axes are swapped, points.swapaxes(1, 2) puts them right"
         raise ShapeError(f"{source}: points: expected shape (frames, joints, {dims}), got {tuple(xy.shape)}{hint}")
@@ -271,7 +273,10 @@ def _shaped(points: Any, confidence: Any, dims: int, source: str) -> tuple[Tenso
     if num_joints < 2:
         raise ShapeError(f"{source}: expected at least 2 joints, got {num_joints}")
     if confidence is not None and confidence.shape != xy.shape[:2]:
-        raise ShapeError(f"{source}: confidence: expected shape {tuple(xy.shape[:2])}, got {tuple(confidence.shape)}")
+        hint = ": confidence[..., 0] puts it right" if confidence.shape == (*xy.shape[:2], 1) else ""
+        raise ShapeError(
+            f"{source}: confidence: expected shape {tuple(xy.shape[:2])}, got {tuple(confidence.shape)}{hint}"
+        )
     return xy, confidence
 
 

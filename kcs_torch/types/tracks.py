@@ -12,7 +12,7 @@ from torch import Tensor
 from kcs_torch.errors import counted
 from kcs_torch.skeleton import Skeleton
 from kcs_torch.types.bodies import no_bones
-from kcs_torch.types.image_size import as_image_size, fitting_size
+from kcs_torch.types.image_size import are_shares, as_image_size, fitting_size
 from kcs_torch.types.intake import take_in
 from kcs_torch.types.size import short_unit
 from kcs_torch.types.trajectories import Trajectories
@@ -85,8 +85,9 @@ class Tracks(Trajectories):
             fps: frames per second; NaN and None mean unknown.
             units: of the points.
             threshold: a joint with less confidence counts as unseen.
-            image_size: width and height of the image in pixels, where points are pixels of it; left out, which a note
-                tells, where most of them lie elsewhere. A note also tells where they seem to be the wrong way round.
+            image_size: width and height of the image in pixels, where points are pixels of it, or shares of it, 0 to 1,
+                which become pixels; left out, which a note tells, where most of them lie elsewhere. A note also tells
+                where they seem to be the wrong way round.
             source: for messages.
             notes: sentences to carry along.
 
@@ -110,10 +111,13 @@ class Tracks(Trajectories):
         body, remarks = taken.skeleton, taken.notes
         if skeleton is None and not body.bones:
             remarks.append(no_bones(body))
-        xy, weights = body.complete(taken.points, taken.weights)
-        remarks += unseen_notes(weights, body)
-        unit = short_unit(units)
+        unit, xy = short_unit(units), taken.points
         size = as_image_size(image_size, unit, source)
+        if size is not None and are_shares(xy[taken.weights > 0].numpy(force=True)):
+            remarks.append(f"coordinates are shares of the image: multiplied by its {size[0]} x {size[1]} pixels")
+            xy = xy * xy.new_tensor(size)
+        xy, weights = body.complete(xy, taken.weights)
+        remarks += unseen_notes(weights, body)
         if size is not None:
             size = fitting_size(xy[weights > 0], size, remarks)
         return cls(xy, weights, body, taken.fps, unit, source, tuple(remarks), image_size=size)

@@ -60,14 +60,18 @@ def read(path: Path, options: Options) -> list[Tracks]:
             f"{path}: expected 2D tracks under 'points2d', got 3D motion only (points3d): "
             "load_motion(path) reads it, and its .tracks() makes 2D tracks"
         )
+    if "points2d" not in file.keys:
+        raise FormatError(
+            f"{path}: expected an array 'points2d' (frames, joints, 2), as numpy.savez(path, points2d=..., "
+            f"confidence=..., joint_names=...) writes it, got {', '.join(file.keys) or 'none'}"
+        )
     points = file.array("points2d", "fiu", 3)
     units = file.text("units") if "units" in file else "px"
     notes = _json(file, "notes", list) if "notes" in file else []
     size = _size_in(file)
     written = "skeleton" in file  # by this library, with coordinates as they were
     shares = units == "px" and points.shape[-1] == 2 and are_shares(points)
-    kept = shares and written and size is not None and options.image_size is None
-    if shares and not kept:
+    if shares:
         points = in_pixels(points, options.size_of(size), notes)
     tracks = build_tracks(
         points,
@@ -83,8 +87,6 @@ def read(path: Path, options: Options) -> list[Tracks]:
         detector=_detector_in(file),
         size=size,
     )
-    if kept:
-        tracks = dataclasses.replace(tracks, image_size=size)
     return [dataclasses.replace(tracks, image_guess=_size_in(file, "image_guess", 0))]
 
 

@@ -29,7 +29,7 @@ def image_noise(tracks: Tracks, flat: Tensor, unit: float) -> Tensor:
     """Standard deviation (T, N) of tracks' joints in their clean image (T, N, 2), for a body of 1.75."""
     off = flat - flat.mean(1, keepdim=True)
     size = rms(off, torch.ones_like(off[..., 0])) / unit
-    stray = (flat - tracks.points).square().sum(-1)[tracks.seen]
+    stray = (flat - tracks.points.detach()).square().sum(-1)[tracks.seen]
     level = math.sqrt(float(stray.median()) / 1.39) / unit / 2 if len(stray) else 0.0  # whatever outliers there are
     share = gap_deviation(off / or_one(size * unit), tracks.seen, tracks.rate)
     return (size * share.maximum(detector_deviation(tracks))).clamp_min(level)

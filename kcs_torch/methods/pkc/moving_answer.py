@@ -94,7 +94,8 @@ def from_moving(
     elif leaps:
         doubt = f"depth is uncertain: from frame {leaps[0]} on all joints lie on the other side in depth. {needed}"
     elif shown < TURN:
-        doubt = f"depth may be drawn out or pressed flat: the viewpoint turned by only {shown:.0f} degrees. {needed}"
+        few = f"the viewpoint turned by only {math.floor(shown)} degrees"
+        doubt = f"depth may be drawn out or pressed flat: {few}. {needed}"
     elif rivalled:
         where = "" if moving.rivalled else " (see the alternatives)"
         doubt = f"depth is uncertain: bodies that differ fit the tracks nearly as well{where}. {needed}"
