@@ -33,6 +33,18 @@ def everything_below(folder):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_cannot_be_written_is_told(tmp_path, result, suffix):
+    motion = kt.Motion.of(result)
+    for empty in (motion.frames(9, 9), result.tracks.frames(9, 9)):
+        with pytest.raises(OutputError):
+            save(empty, tmp_path / f"out{suffix}")
+    for other, name in (([result, result], "list"), (result.points, "Tensor"), (None, "NoneType")):
+        with pytest.raises(OutputError, match=f"expected a result, motion or tracks, got {name}: .*save_people"):
+            save(other, tmp_path / f"out{suffix}")
+    assert everything_below(tmp_path) == []
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_every_suffix_is_written(tmp_path, result, suffix):
     path = save(result, tmp_path / f"out{suffix}")
     assert path == tmp_path / f"out{suffix}"
