@@ -207,6 +207,18 @@ def test_lift_leaves_out_who_is_hardly_seen(openpose_folder, tmp_path):
         assert "--least-seen: expected a share from 0 to 1, with --person all" in run(*words, *wrong, code=2).stderr
 
 
+def test_lift_tells_who_is_seen_in_few_of_the_frames_that_are_taken(openpose_folder, tmp_path):
+    for k, path in enumerate(sorted(openpose_folder.iterdir())):
+        read = json.loads(path.read_text())
+        seldom = read | {"people": read["people"][: 2 if k in (11, 13) else 1]}
+        (tmp_path / path.name).write_text(json.dumps(seldom))
+    words = ("lift", tmp_path, "-o", tmp_path / "out" / "a.npz", "--person", "all", "-m", "sfam")
+    warned = f"{tmp_path}, person 1: visible in only 5 % of the frames: the rest is guessed (--least-seen 0.1 leaves"
+    assert warned in run(*words).stderr
+    for frames in ("10:15", "seen"):
+        assert "visible in only" not in run(*words, "--frames", frames).stderr
+
+
 def test_lift_one_of_several(openpose_folder, tmp_path):
     done = run("lift", openpose_folder, "-o", tmp_path / "a.npz", "--person", 1, "-m", "sfam", "--json")
     (person,) = json.loads(done.stdout)["people"]

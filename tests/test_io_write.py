@@ -33,6 +33,18 @@ def everything_below(folder):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_cannot_be_written_is_told(tmp_path, result, suffix):
+    motion = kt.Motion.of(result)
+    for empty in (motion.frames(9, 9), result.tracks.frames(9, 9)):
+        with pytest.raises(OutputError):
+            save(empty, tmp_path / f"out{suffix}")
+    for other, name in (([result, result], "list"), (result.points, "Tensor"), (None, "NoneType")):
+        with pytest.raises(OutputError, match=f"expected a result, motion or tracks, got {name}: .*save_people"):
+            save(other, tmp_path / f"out{suffix}")
+    assert everything_below(tmp_path) == []
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_every_suffix_is_written(tmp_path, result, suffix):
     path = save(result, tmp_path / f"out{suffix}")
     assert path == tmp_path / f"out{suffix}"
@@ -244,3 +256,22 @@ def test_a_folder_that_somebody_else_filled_is_kept(tmp_path):
         (tmp_path / "new" / "theirs").write_text("kept")
         raise RuntimeError
     assert everything_below(tmp_path) == ["new", "new/theirs"]
+
+
+@pytest.mark.parametrize("theirs", ["made", "removed"])
+def test_another_process_makes_or_removes_the_folder_at_the_same_time(tmp_path, monkeypatch, theirs):
+    """Commands that begin together make a new folder to see whether they can write there, and remove it again."""
+    mkdir, first = Path.mkdir, []
+
+    def raced(self, *args, **options):
+        mkdir(self, *args, **options)
+        if not first:
+            first.append(self)
+            if theirs == "made":
+                raise FileExistsError
+            self.rmdir()
+
+    monkeypatch.setattr(Path, "mkdir", raced)
+    with atomic_path(tmp_path / "new" / "w.csv") as temporary:
+        temporary.write_text("whole")
+    assert first and everything_below(tmp_path) == ["new", "new/w.csv"]

@@ -210,6 +210,8 @@ def test_a_pinhole_sees_all_of_it():
     assert torch.allclose((far - centre) * 1e6 / 900, truth[..., :2], atol=1e-4)
     with pytest.raises(OptionError, match="distance: expected more than"):
         motion.tracks(intrinsics=lens, distance=0.1)
+    with pytest.raises(OptionError, match=r"distance: expected it with intrinsics=.*, got 5 alone"):
+        motion.tracks(distance=5)
 
 
 def test_noise_and_gaps_of_tracks():
@@ -267,6 +269,24 @@ def test_a_result_is_read_as_motion(tmp_path):
     assert torch.equal(load_motion(path).points, Motion.of(result).points)
     assert isinstance(load_any(path), kt.Reconstruction)
     assert load_motion(path, fps=50).fps == 50
+
+
+def test_the_rate_that_is_given_is_that_of_all_solutions(tmp_path):
+    result = walk_result()
+    path = save(replace(result, alternatives=(result.mirrored(),)), tmp_path / "r.npz")
+    assert load_any(path, fps=50).solution(2).fps == 50
+
+
+def test_motion_is_made_of_results_alone():
+    motion = walk(8)
+    for other, name in ((motion, "Motion"), (motion.tracks(), "Tracks"), (None, "NoneType")):
+        with pytest.raises(OptionError, match=rf"Motion\.of: expected a result of reconstruct\(\), got {name}"):
+            Motion.of(other)
+
+
+def test_motion_without_frames_is_not_filmed():
+    with pytest.raises(ShapeError, match="expected at least 1 frame, got none"):
+        walk(8).frames(8, 9).tracks()
 
 
 def test_tracks_are_written_and_read_back(tmp_path):

@@ -145,4 +145,5 @@ def test_files_keep_it_and_older_ones_lack_it(tmp_path):
     old = load_reconstruction(tmp_path / "old.npz")
     assert math.isnan(old.diagnostics.largest_bone_variation) and old.diagnostics.loosest_bone == ""
     assert str(old.diagnostics.variation) == "0.05 % (median)" == str(BoneVariation(0.05))
+    assert "nan" not in str(BoneVariation())
     assert "bone variation  0.05 % (median)\n" in describe(summary(old))

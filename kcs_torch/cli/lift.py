@@ -230,9 +230,9 @@ def lift(
             people = _often_seen(people, least_seen, None if _is_video(tracks) else frames)
         use_one_thread()
         together = results.together()
-        for number, one in people:
-            results.check(number, one, tracks, find, together)
         cleaned = [clean(one) for _, one in people]
+        for (number, _), one in zip(people, cleaned, strict=True):
+            results.check(number, one, tracks, find, together)
         chosen = (one.solution(solution) for one in _lifted(cleaned, learned or method, fields, find))
         found = [sized(finish(one.mirrored() if mirror else one), size_of) for one in chosen]
         everyone = zip(people, cleaned, found, strict=True)

@@ -165,7 +165,6 @@ def describe(facts: dict[str, Any], leave_out: Container[str] = ()) -> str:
 
     rate = f", {facts['fps']:g} frames a second" if facts["fps"] else ""
     variation = BoneVariation(facts["bone_variation"], facts["largest_bone_variation"], facts["loosest_bone"])
-    varied = "unknown: no bones that are rigid and seen" if math.isnan(variation.median) else str(variation)
     ended = "converged" if facts["converged"] else "did not converge"
     pace = 1000 * facts["seconds"] / facts["frames"]
     took = "" if math.isnan(pace) else f", {facts['seconds']:.2f} s ({pace:.1f} ms a frame)"
@@ -173,7 +172,7 @@ def describe(facts: dict[str, Any], leave_out: Container[str] = ()) -> str:
         "unseen joints": f"{100 * facts['unseen_share']:.1f} %",
         "method": f"{facts['method']}: {ended}, {facts['iterations']} iterations{took}",
         "viewpoint turn": counted(round(facts["viewpoint_turn"]), "degree"),
-        "bone variation": varied,
+        "bone variation": str(variation),
         "reprojection": f"{facts['reprojection_rms']:.3g} {facts['track_units']} (root mean square)",
     }
     if facts["frames"] == 1:  # of which neither is told

@@ -67,7 +67,7 @@ class Results:
 
         Args:
             number: of the person.
-            tracks: of theirs.
+            tracks: of theirs, cleaned.
             source: what they were read from, which no file may replace.
             found: whether the skeleton is still to be found.
             together: the files that hold everybody.
@@ -90,8 +90,8 @@ class Results:
         share = float(tracks.seen.any(1).double().mean())
         if self.everybody and share < FEW:
             say = f"visible in only {100 * share:.0f} % of the frames: the rest is guessed"
-            say += f" (--least-seen {FEW:g} leaves such people out)" if self.frames is None else ""
-            typer.echo(f"warning: {one_line(tracks.source)}: {say}", err=True)
+            hint = f"--least-seen {FEW:g} leaves such people out"
+            typer.echo(f"warning: {one_line(tracks.source)}: {say} ({hint})", err=True)
 
     def together(self) -> list[Path]:
         """The files that hold everybody; those that were asked for and cannot be written are told."""

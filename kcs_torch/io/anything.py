@@ -62,7 +62,7 @@ def load_any(
         if skeleton is not None or up is not None or units is not None or person is not None:
             raise OptionError(f"{path}: a result has its own skeleton, axes, units and person; save it as motion first")
         result = load_reconstruction(path)
-        return result if fps is None else replace(result, tracks=replace(result.tracks, fps=fps))
+        return result if fps is None else result.moved(lambda x: x, replace(result.tracks, fps=fps))
     if kind == "motion":
         if person is not None:
             raise OptionError(f"{path}: a person is chosen of 2D tracks, got 3D motion of one body")

@@ -17,6 +17,9 @@ __all__ = ["atomic_path", "write_table"]
 
 WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
+ATTEMPTS = 100
+"""How often a file is created in a folder that others, which write to it at the same time, make and remove."""
+
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
@@ -42,8 +45,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     temporary = target.parent / f".{secrets.token_hex(4)}{target.suffix}"
     done = False
     try:
-        _make_folders(target.parent, made)
-        temporary.open("xb").close()  # with the permissions that the user's umask gives, unlike the tempfile module's
+        _create(temporary, made)
         yield temporary
         os.replace(temporary, target)
         done = True
@@ -102,6 +104,18 @@ def _target(path: str | Path) -> Path:
     return target
 
 
+def _create(file: Path, made: list[Path]) -> None:
+    """Create an empty file, and again its folders where another process that made them removes them meanwhile."""
+    for attempt in range(1, ATTEMPTS + 1):
+        try:
+            _make_folders(file.parent, made)
+            file.open("xb").close()  # with the permissions that the user's umask gives, unlike the tempfile module's
+            return
+        except FileNotFoundError:
+            if attempt == ATTEMPTS:
+                raise
+
+
 def _make_folders(folder: Path, made: list[Path]) -> None:
     """Create a folder and its parents; each one created is added to ``made`` at once."""
     missing = []
@@ -109,5 +123,6 @@ def _make_folders(folder: Path, made: list[Path]) -> None:
         missing.append(folder)
         folder = folder.parent
     for new in reversed(missing):
-        new.mkdir()
-        made.append(new)
+        with contextlib.suppress(FileExistsError):  # another process was faster
+            new.mkdir()
+            made.append(new)

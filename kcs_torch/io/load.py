@@ -18,6 +18,7 @@ from kcs_torch.io.registry import Options, Probe, Reader, brief, check_fps, disc
 from kcs_torch.io.video import looks_like_video
 from kcs_torch.skeleton import Skeleton, get_skeleton
 from kcs_torch.types import Tracks
+from kcs_torch.types.hints import is_a
 from kcs_torch.types.image_size import as_image_size, may_be_shares
 from kcs_torch.types.intake import as_number
 from kcs_torch.types.people import guess_images, tell_apart
@@ -131,7 +132,7 @@ def load_tracks(
     Warns:
         KcsWarning: as :func:`~kcs_torch.io.load_people`.
     """
-    if person is not None and (isinstance(person, bool) or not isinstance(person, int) or person < 0):
+    if person is not None and not (is_a(person, int) and person >= 0):
         raise OptionError(f"person: expected None or a number from 0, got {person!r}")
     people = load_people(
         path, format=format, skeleton=skeleton, fps=fps, threshold=threshold, image_size=image_size, trust=trust

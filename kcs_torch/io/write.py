@@ -66,11 +66,19 @@ def save(
         The path.
 
     Raises:
-        OutputError: the suffix is unknown or does not suit, or the file cannot be written; nothing is left behind.
+        OutputError: the suffix is unknown or does not suit, the data is something else or has no frames, or the file
+            cannot be written; nothing is left behind.
         OptionError: ``up``, ``units`` or ``pitch`` is unknown or cannot be met.
     """
     writer = writer_for(path)
     saving = Saving(up or "y", Path(path).name)
+    if not isinstance(data, (Reconstruction, Motion, Tracks)):
+        raise OutputError(
+            f"{path}: expected a result, motion or tracks, got {type(data).__name__}: save each by itself, or several "
+            "people by kcs_torch.io.save_people"
+        )
+    if not len(data.points):
+        raise OutputError(f"{path}: expected at least 1 frame, got none")
     if up is not None and up not in UP:
         raise unknown("axis for up", up, UP)
     if isinstance(data, Tracks):

@@ -131,8 +131,11 @@ class Motion(Trajectories):
             pitch: degrees by which the camera looked down; below 0 where it looked up.
 
         Raises:
-            OptionError: the pitch is not within -90 to 90.
+            OptionError: the pitch is not within -90 to 90, or the result is something else.
         """
+        given: object = result
+        if not isinstance(given, Reconstruction):
+            raise OptionError(f"Motion.of: expected a result of reconstruct(), got {type(given).__name__}")
         degrees = check_pitch(pitch)
         notes = [*result.tracks.notes, *result.diagnostics.notes]
         known = result.distance is not None or result.root_depth is not None
@@ -216,7 +219,10 @@ class Motion(Trajectories):
 
         Raises:
             OptionError: an angle is no finite number.
+            ShapeError: there are no frames.
         """
+        if not self.num_frames:
+            raise ShapeError(f"{self.source}: expected at least 1 frame, got none")
         for name, angle in (("yaw", yaw), ("pitch", pitch), ("turn", turn)):
             if (degrees := as_number(angle)) is None or not math.isfinite(degrees):
                 raise OptionError(f"{name}: expected a finite number of degrees, got {angle!r}")
@@ -248,12 +254,14 @@ class Motion(Trajectories):
             intrinsics: of a pinhole camera, (fx, fy, cx, cy) or a matrix K; tracks are then in pixels. None: parallel
                 rays, and tracks in the motion's own units.
             distance: from the pinhole to the middle of the motion, in the motion's units; so far that all is in the
-                image if None.
+                image if None. Parallel rays have none.
             noise: standard deviation of the tracks, in their unit.
             generator: for the noise.
 
         Raises:
-            OptionError: a number is out of range, or the camera would stand within the motion.
+            OptionError: a number is out of range, the camera would stand within the motion, or a distance comes without
+                intrinsics.
+            ShapeError: there are no frames.
 
         >>> walk = Motion.from_arrays(torch.rand(10, 17, 3), skeleton="h36m17", units="m")
         >>> walk.tracks(yaw=45, intrinsics=(1000, 1000, 640, 360)).units
@@ -263,6 +271,8 @@ class Motion(Trajectories):
             raise OptionError(f"noise: expected a number not below 0, got {noise!r}")
         points = self.in_camera(yaw=yaw, pitch=pitch, turn=turn)
         if intrinsics is None:
+            if distance is not None:
+                raise OptionError(f"distance: expected it with intrinsics=(fx, fy, cx, cy), got {distance!r} alone")
             image, units = points[..., :2].clone(), self.units or "px"
         else:
             lens = Intrinsics.of(intrinsics)

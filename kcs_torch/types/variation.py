@@ -30,6 +30,8 @@ class BoneVariation(NamedTuple):
     bone: str = ""
 
     def __str__(self) -> str:
+        if math.isnan(self.median):
+            return "unknown: no bones that are rigid and seen"
         most = f", at most {self.largest:.2f} % ({self.bone})" if self.bone else ""  # older files lack it
         return f"{self.median:.2f} % (median){most}"
 
