@@ -196,6 +196,17 @@ def test_frames_go_before_times_and_their_steps_are_frames(tmp_path):
     assert tracks.fps == pytest.approx(6, abs=1e-3)
 
 
+@pytest.mark.parametrize("place", ["frame", "time"])
+def test_an_index_beside_frames_or_times_numbers_rows(tmp_path, place):
+    """It was taken for the frames, so that of two people each was seen in every other one."""
+    rows = [f"{2 * t + k},{t},{k},{1 + t},2,{3 + k},4" for t in range(3) for k in (0, 1)]
+    people = load_people(lines(tmp_path / "a.csv", f"index,{place},person,a_x,a_y,b_x,b_y", *rows))
+    assert [(p.num_frames, bool(p.seen.all())) for p in people] == [(3, True), (3, True)]
+    rows = [f"{3 * t + k},{t},{j},{1 + t},{2 + k}" for t in range(3) for k, j in enumerate("abc")]
+    tracks = load_tracks(lines(tmp_path / "b.csv", f"index,{place},joint,x,y", *rows))
+    assert tracks.num_frames == 3 and bool(tracks.seen.all())
+
+
 def test_shares_of_the_image_are_told_and_scaled_by_its_size(tmp_path):
     path = lines(tmp_path / "a.csv", "a_x,a_y,b_x,b_y", ".1,.2,.3,.4", ".1,.2,.3,.5")
     with pytest.warns(KcsWarning, match=r"a\.csv: .*if they are shares .*--image-size 1920x1080\); else the"):

@@ -22,7 +22,7 @@ WHO = (
 _WHAT = "|".join(("x", "y", "z", *CONFIDENCES, *VISIBILITIES))
 _NAMED = re.compile(rf"(?P<name>.+)[_. ](?P<what>{_WHAT})(?: \[(?P<unit>[^\]]*)\])?\Z", re.IGNORECASE | re.DOTALL)
 _NUMBERED = re.compile(rf"(?P<what>{_WHAT})_?(?P<name>[0-9]{{1,4}})\Z", re.IGNORECASE)
-_FRAME = re.compile(r"frame(?:[ _]?(?:#|no|nr|num|number|id|idx|index))?\.?|index\Z", re.IGNORECASE)
+_FRAME = re.compile(r"frame(?:[ _]?(?:#|no|nr|num|number|id|idx|index))?\.?", re.IGNORECASE)
 _LINE = re.compile(r'(?:[^"\n]+|"[^"]*")*')
 
 Columns = dict[str, dict[str, int]]
@@ -80,8 +80,9 @@ class Header:
 
     @cached_property
     def number(self) -> int | None:
-        """The column of frame numbers."""
-        return next((i for i, cell in enumerate(self.cells) if _FRAME.fullmatch(cell)), None)
+        """The column of frame numbers; beside it, or times, a column ``index`` numbers rows."""
+        frame = next((i for i, cell in enumerate(self.cells) if _FRAME.fullmatch(cell)), None)
+        return self.column(("index",)) if frame is None and self.time is None else frame
 
     @cached_property
     def who(self) -> int | None:
