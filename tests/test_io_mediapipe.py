@@ -118,6 +118,7 @@ LAYOUTS = {
     "message": lambda p: {"pose_landmarks": {"landmark": marks(p)}},
     "numbers": lambda p: {"pose_landmarks": [[m["x"], m["y"], m["z"], m["visibility"]] for m in marks(p)]},
     "by name": lambda p: {"pose_landmarks": {n.upper(): m for n, m in zip(NAMES, marks(p), strict=True)}},
+    "in JavaScript": lambda p: {"landmarks": [marks(p)], "worldLandmarks": [marks(p)]},
     "bare": lambda p: marks(p),
     "bare, a list a person": lambda p: [marks(p)],
 }
@@ -254,6 +255,18 @@ def test_csv_of_numbered_landmarks(tmp_path):
         tracks = load_tracks(tmp_path / "a.csv", image_size=SIZE)
         assert same(tracks, POSE)
         assert any("the first 33 are read" in n for n in tracks.notes) == (count == 501)
+
+
+@pytest.mark.parametrize(("count", "kind", "joints"), [(25, "csv", 25), (133, "csv", 133), (42, "mediapipe", 21)])
+def test_numbered_joints_of_other_detectors_are_no_landmarks(tmp_path, count, kind, joints):
+    """Those of BODY_25 were read as a hand's, those of two hands as a pose's."""
+    rows = [pose[:, :2].ravel().tolist() for pose in person(4, count)]
+    path = tmp_path / "a.csv"
+    path.write_text(table([f"{axis}{i}" for i in range(count) for axis in "xy"], rows))
+    tracks = load_tracks(path)
+    assert (detect_format(path), tracks.skeleton.num_observed) == (kind, joints)
+    assert np.allclose(tracks.points[:, :joints], person(4, count)[:, :joints, :2])
+    assert any("the first 21 are read, as a hand" in n for n in tracks.notes) == (count == 42)
 
 
 def table(columns, rows):

@@ -21,6 +21,9 @@ from kcs_torch.skeleton import SKELETONS, Skeleton, guess_skeleton
 
 __all__ = ["frame_shape", "npy_shape", "read_csv", "read_npy", "some_joints", "table_kind"]
 
+_ROWS = {21: 21, 42: 21} | dict.fromkeys((33, 54, 75, 501, 511, 543, 553), 33)
+"""How many landmarks a row of numbered ones may have, as of a hand or two, or of a pose with hands and a face behind
+it, and how many of them are read."""
 SOME = 10  # names of a body from which on a table is taken for one of it
 _LIMIT = 2**30  # bytes of a file
 
@@ -62,7 +65,7 @@ def table_kind(text: str) -> str:
         return "motion"  # as results are written, of whatever joints
     names = {_plain(name) for name in header.joints}
     named = len(_named() & names) >= SOME and (visible or bool(_own() & names))
-    if named or (len(names) >= 21 and all(name.isdecimal() for name in names)):
+    if named or (len(names) in _ROWS and all(name.isdecimal() for name in names)):
         return "landmarks"
     return "motion" if deep else "tracks"
 
@@ -98,11 +101,11 @@ def _layout(joints: Columns, notes: list[str]) -> Layout:
     marks = {_plain(name): columns for name, columns in joints.items()}
     if all(n.isdecimal() for n in marks):
         marks = dict(sorted(marks.items(), key=lambda item: int(item[0])))
-        for count in BODIES:
-            if len(marks) > count and len(marks) not in BODIES:
-                notes.append(f"of {len(marks)} numbered landmarks the first {count} are read, as the pose")
-                marks = dict(list(marks.items())[:count])
-        return None, list(marks.values())
+        count = _ROWS.get(len(marks), len(marks))
+        if count < len(marks):
+            read = "a hand" if count == 21 else "the pose"
+            notes.append(f"of {len(marks)} numbered landmarks the first {count} are read, as {read}")
+        return None, list(marks.values())[:count]
     if guess_skeleton(list(marks), ordered=False) is None:
         found = some_joints(joints, SKELETONS[BODIES[33]], notes)
         if found is not None:
