@@ -287,6 +287,30 @@ def test_csv_of_some_landmarks(tmp_path):
     assert np.allclose(tracks.points[:, 9], person(4, 17)[:, 0, :2])
 
 
+@pytest.mark.parametrize("more", ["{}_world", "left_hand_{}"])
+def test_the_pose_is_read_of_a_table_with_more_joints(tmp_path, more):
+    """All were read as joints that move freely."""
+    head = [f"{name}_{c}" for name in NAMES for c in ("x", "y", "z", "visibility")]
+    head += [f"{more.format(name)}_{c}" for name in NAMES[:21] for c in "xyz"]
+    rows = [[*(v for x, y, s in pose for v in (x / 1000, y / 1000, 0, s)), *[0.1] * 63] for pose in POSE]
+    (tmp_path / "a.csv").write_text(table(head, rows))
+    tracks = load_tracks(tmp_path / "a.csv", image_size=SIZE)
+    assert tracks.skeleton.name == "mediapipe33" and same(tracks, POSE)
+    assert tracks.notes[0].startswith(f"21 joints beside the pose left out: {more.format('nose')}, ")
+    assert tracks.notes[1] == "columns of joints that are left out: z"
+
+
+@pytest.mark.parametrize("prefix", ["landmark_", "pose_landmark_", "PoseLandmark."])
+def test_landmarks_are_known_behind_a_prefix(tmp_path, prefix):
+    """With z they were taken for 3D motion."""
+    for names in (range(33), NAMES):
+        head = [f"{prefix}{name}_{c}" for name in names for c in ("x", "y", "z", "visibility")]
+        rows = [[v for x, y, s in pose for v in (x / 1000, y / 1000, 0, s)] for pose in POSE]
+        (tmp_path / "a.csv").write_text(table(head, rows))
+        tracks = load_tracks(tmp_path / "a.csv", image_size=SIZE)
+        assert tracks.skeleton.name == "mediapipe33" and same(tracks, POSE)
+
+
 def test_a_missing_column_is_told(tmp_path):
     header, *rows = [line.split(",") for line in write_mediapipe_csv(tmp_path / "a.csv").read_text().splitlines()]
     at = header.index("left_knee_y")

@@ -101,14 +101,14 @@ class Header:
         return next((lower.index(name) for name in names if name in lower), None)
 
     def left_out(self, read: Iterable[int]) -> list[str]:
-        """What the columns of joints that are not among those that are read hold."""
+        """What the columns of joints that are not among those that are read hold besides x and y."""
         used = set(read)
         out: dict[str, None] = {}
         for i, cell in enumerate(self.cells):
-            for separator in () if i in used else re.finditer(r"[_. ]", cell):
-                if cell[: separator.start()] in self.joints:
-                    out[re.sub(r" \[[^\]]*\]\Z", "", cell[separator.end() :])] = None
-        return list(out)
+            ends = [s for s in re.finditer(r"[_. ]", cell) if i not in used and cell[: s.start()] in self.joints]
+            if ends:
+                out[re.sub(r" \[[^\]]*\]\Z", "", cell[ends[-1].end() :])] = None
+        return [what for what in out if what.lower() not in ("x", "y")]
 
     @cached_property
     def others(self) -> list[int]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-from kcs_torch.errors import FormatError
+from kcs_torch.errors import FormatError, counted, listed
 from kcs_torch.io.containers.jsonfile import MOST_PIXELS
 from kcs_torch.io.contents.landmarks import BODIES, VISIBILITIES, Landmarks
 from kcs_torch.io.contents.people import Sighting
@@ -24,6 +25,7 @@ __all__ = ["frame_shape", "npy_shape", "read_csv", "read_npy", "some_joints", "t
 _ROWS = {21: 21, 42: 21} | dict.fromkeys((33, 54, 75, 501, 511, 543, 553), 33)
 """How many landmarks a row of numbered ones may have, as of a hand or two, or of a pose with hands and a face behind
 it, and how many of them are read."""
+_PREFIX = re.compile(r"\A(?:pose_?landmark|pose|landmark)[._]")
 SOME = 10  # names of a body from which on a table is taken for one of it
 _LIMIT = 2**30  # bytes of a file
 
@@ -71,7 +73,7 @@ def table_kind(text: str) -> str:
 
 
 def _plain(name: str) -> str:
-    return name.lower().replace(" ", "_").removeprefix("pose_")
+    return _PREFIX.sub("", name.lower().replace(" ", "_"))
 
 
 def read_csv(path: Path) -> Landmarks:
@@ -106,8 +108,14 @@ def _layout(joints: Columns, notes: list[str]) -> Layout:
             read = "a hand" if count == 21 else "the pose"
             notes.append(f"of {len(marks)} numbered landmarks the first {count} are read, as {read}")
         return None, list(marks.values())[:count]
+    body = SKELETONS[BODIES[33]]
+    pose = body.joints[: body.num_observed]
+    if len(marks) == len(joints) and set(pose) < set(marks):
+        others = [name for name in joints if _plain(name) not in pose]
+        notes.append(f"{counted(len(others), 'joint')} beside the pose left out: {listed(others, 5)}")
+        return pose, [marks[name] for name in pose]
     if guess_skeleton(list(marks), ordered=False) is None:
-        found = some_joints(joints, SKELETONS[BODIES[33]], notes)
+        found = some_joints(joints, body, notes)
         if found is not None:
             return found
     return tuple(marks), list(marks.values())
