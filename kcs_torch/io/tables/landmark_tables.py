@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import re
 from collections.abc import Sequence
@@ -14,10 +15,11 @@ from kcs_torch.errors import FormatError, counted, listed
 from kcs_torch.io.containers.jsonfile import MOST_PIXELS
 from kcs_torch.io.contents.landmarks import BODIES, VISIBILITIES, Landmarks
 from kcs_torch.io.contents.people import Sighting
+from kcs_torch.io.contents.shares import are_shares
 from kcs_torch.io.registry import read_error
-from kcs_torch.io.tables.header import Columns, Header, Layout, first_line
+from kcs_torch.io.tables.header import Columns, Header, Layout, delimiter, first_line
 from kcs_torch.io.tables.long import LongHeader
-from kcs_torch.io.tables.wide import read_wide
+from kcs_torch.io.tables.wide import as_float, read_wide
 from kcs_torch.skeleton import SKELETONS, Skeleton, guess_skeleton
 
 __all__ = ["frame_shape", "npy_shape", "read_csv", "read_npy", "some_joints", "table_kind"]
@@ -48,7 +50,8 @@ def table_kind(text: str) -> str:
 
     Returns:
         "landmarks" of MediaPipe, by their numbers, or by names or visibilities that nobody else's have; "motion", where
-        every joint has z; other "tracks"; empty where it is no such table.
+        every joint has z, which of joints with landmarks' names, without visibilities, is no share of the image; other
+        "tracks"; empty where it is no such table.
 
     >>> table_kind("frame,a_x,a_y,b_x,b_y"), table_kind("a_x,a_y,a_z,b_x,b_y,b_z"), table_kind("track,frame,a_x,a_y")
     ('tracks', 'motion', '')
@@ -67,9 +70,23 @@ def table_kind(text: str) -> str:
         return "motion"  # as results are written, of whatever joints
     names = {_plain(name) for name in header.joints}
     named = len(_named() & names) >= SOME and (visible or bool(_own() & names))
-    if named or (len(names) in _ROWS and all(name.isdecimal() for name in names)):
+    numbered = len(names) in _ROWS and all(name.isdecimal() for name in names)
+    if numbered or (named and not (deep and not visible and _lengths(text, header))):
         return "landmarks"
     return "motion" if deep else "tracks"
+
+
+def _lengths(text: str, header: Header) -> bool:
+    """Whether z of the joints, by the first row that has any, are no shares of an image, as MediaPipe's are."""
+    line = first_line(text)
+    try:
+        for cells in csv.reader(text[len(line) :].splitlines(), delimiter=delimiter(line)):
+            z = np.array([as_float(cells[columns["z"]]) for columns in header.joints.values() if cells])
+            if np.isfinite(z).any():
+                return not are_shares(z)
+    except (csv.Error, ValueError, IndexError):  # no numbers, or a row that is cut short
+        pass
+    return False
 
 
 def _plain(name: str) -> str:
