@@ -24,10 +24,10 @@ from hypothesis import strategies as st
 
 import kcs_torch as kt
 from kcs_torch.errors import FormatError, ShapeError, SkeletonError
-from kcs_torch.io import READERS, load_people, load_tracks
+from kcs_torch.io import READERS, detect_format, load_people, load_tracks
 from kcs_torch.io.containers.pickles import load_arrays
 from kcs_torch.io.motion import detect_motion_format
-from kcs_torch.io.registry import Probe
+from kcs_torch.io.registry import HEAD, Probe
 
 pytest.importorskip("h5py")
 
@@ -49,6 +49,14 @@ def test_deeplabcut_layouts(tmp_path, layout):
     assert np.array_equal(tracks.points[0].numpy(), values[0].reshape(3, 3)[:, :2])
     assert tracks.weights[0, 0] == 0.9
     assert tracks.notes == (NO_BONES,)
+
+
+def test_a_long_header_is_recognised(tmp_path):
+    """SuperAnimal's names its network, in 60 letters, for each column of ten animals."""
+    columns = [("superanimal" * 20, *names) for _, *names in deeplabcut_columns([f"m{i}" for i in range(40)])]
+    path = write_deeplabcut_csv(tmp_path / "a.csv", columns, deeplabcut_values(columns))
+    assert path.read_bytes().index(b"\n") > HEAD
+    assert detect_format(path) == "deeplabcut" and len(load_people(path)) == 40
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

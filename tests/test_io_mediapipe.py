@@ -118,6 +118,7 @@ LAYOUTS = {
     "message": lambda p: {"pose_landmarks": {"landmark": marks(p)}},
     "numbers": lambda p: {"pose_landmarks": [[m["x"], m["y"], m["z"], m["visibility"]] for m in marks(p)]},
     "by name": lambda p: {"pose_landmarks": {n.upper(): m for n, m in zip(NAMES, marks(p), strict=True)}},
+    "in JavaScript": lambda p: {"landmarks": [marks(p)], "worldLandmarks": [marks(p)]},
     "bare": lambda p: marks(p),
     "bare, a list a person": lambda p: [marks(p)],
 }
@@ -256,6 +257,18 @@ def test_csv_of_numbered_landmarks(tmp_path):
         assert any("the first 33 are read" in n for n in tracks.notes) == (count == 501)
 
 
+@pytest.mark.parametrize(("count", "kind", "joints"), [(25, "csv", 25), (133, "csv", 133), (42, "mediapipe", 21)])
+def test_numbered_joints_of_other_detectors_are_no_landmarks(tmp_path, count, kind, joints):
+    """Those of BODY_25 were read as a hand's, those of two hands as a pose's."""
+    rows = [pose[:, :2].ravel().tolist() for pose in person(4, count)]
+    path = tmp_path / "a.csv"
+    path.write_text(table([f"{axis}{i}" for i in range(count) for axis in "xy"], rows))
+    tracks = load_tracks(path)
+    assert (detect_format(path), tracks.skeleton.num_observed) == (kind, joints)
+    assert np.allclose(tracks.points[:, :joints], person(4, count)[:, :joints, :2])
+    assert any("the first 21 are read, as a hand" in n for n in tracks.notes) == (count == 42)
+
+
 def table(columns, rows):
     return "\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)])
 
@@ -272,6 +285,30 @@ def test_csv_of_some_landmarks(tmp_path):
     assert tracks.skeleton.name == "mediapipe33"
     assert tracks.seen[0].sum() == 19  # with pelvis and neck
     assert np.allclose(tracks.points[:, 9], person(4, 17)[:, 0, :2])
+
+
+@pytest.mark.parametrize("more", ["{}_world", "left_hand_{}"])
+def test_the_pose_is_read_of_a_table_with_more_joints(tmp_path, more):
+    """All were read as joints that move freely."""
+    head = [f"{name}_{c}" for name in NAMES for c in ("x", "y", "z", "visibility")]
+    head += [f"{more.format(name)}_{c}" for name in NAMES[:21] for c in "xyz"]
+    rows = [[*(v for x, y, s in pose for v in (x / 1000, y / 1000, 0, s)), *[0.1] * 63] for pose in POSE]
+    (tmp_path / "a.csv").write_text(table(head, rows))
+    tracks = load_tracks(tmp_path / "a.csv", image_size=SIZE)
+    assert tracks.skeleton.name == "mediapipe33" and same(tracks, POSE)
+    assert tracks.notes[0].startswith(f"21 joints beside the pose left out: {more.format('nose')}, ")
+    assert tracks.notes[1] == "columns of joints that are left out: z"
+
+
+@pytest.mark.parametrize("prefix", ["landmark_", "pose_landmark_", "PoseLandmark."])
+def test_landmarks_are_known_behind_a_prefix(tmp_path, prefix):
+    """With z they were taken for 3D motion."""
+    for names in (range(33), NAMES):
+        head = [f"{prefix}{name}_{c}" for name in names for c in ("x", "y", "z", "visibility")]
+        rows = [[v for x, y, s in pose for v in (x / 1000, y / 1000, 0, s)] for pose in POSE]
+        (tmp_path / "a.csv").write_text(table(head, rows))
+        tracks = load_tracks(tmp_path / "a.csv", image_size=SIZE)
+        assert tracks.skeleton.name == "mediapipe33" and same(tracks, POSE)
 
 
 def test_a_missing_column_is_told(tmp_path):

@@ -108,6 +108,15 @@ def test_a_folder_with_a_file_an_image(tmp_path):
     assert load_tracks(tmp_path / "predictions" / "clip_3.json").num_frames == 1
 
 
+@pytest.mark.parametrize("nobody", [[], [{"keypoints": [], "keypoint_scores": []}]])
+def test_the_first_images_of_a_folder_may_show_nobody(tmp_path, nobody):
+    """Its files were taken for clips of their own."""
+    for i, frame in enumerate(mmpose_frames(17)[:4]):
+        write_json(tmp_path / f"{i:06d}.json", nobody if i < 2 else frame["instances"])
+    assert detect_format(tmp_path) == "mmpose"
+    assert load_tracks(tmp_path).seen.any(1).tolist() == [False, False, True, True]
+
+
 def test_two_recordings_in_a_folder_are_told(tmp_path):
     """They were joined to one clip; cam1 is the beginning of cam10, too."""
     for name in ("cam1", "cam10"):

@@ -89,16 +89,17 @@ def test_options_go_before_the_file(tmp_path):
     assert "matched by name" in tracks.notes[0]
 
 
-def test_shares_of_the_image_become_pixels(tmp_path):
+@pytest.mark.parametrize("units", ["px", "Pixels"])
+def test_shares_of_the_image_become_pixels(tmp_path, units):
     """--image-size went unheard."""
     points = arrays()["points2d"] * 0 + [0.25, 0.5]
-    path = written(tmp_path / "a.npz", points2d=points, units="px")
+    path = written(tmp_path / "a.npz", points2d=points, units=units)
     tracks = load_tracks(path, image_size=(1280, 720))
     assert tracks.points[tracks.seen].unique(dim=0).tolist() == [[320, 360]]
-    path = written(tmp_path / "b.npz", points2d=points * 1000, units="px")
+    path = written(tmp_path / "b.npz", points2d=points * 1000, units=units)
     tracks = load_tracks(path, image_size=(1280, 720))
     assert tracks.points[tracks.seen].unique(dim=0).tolist() == [[250, 500]]
-    assert tracks.image_size == (1280, 720) and not tracks.notes
+    assert tracks.image_size == (1280, 720) and tracks.units == "px" and not tracks.notes
 
 
 def test_the_file_may_tell_the_size_of_the_image(tmp_path):

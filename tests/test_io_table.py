@@ -196,6 +196,42 @@ def test_frames_go_before_times_and_their_steps_are_frames(tmp_path):
     assert tracks.fps == pytest.approx(6, abs=1e-3)
 
 
+def test_a_blank_row_is_a_frame_where_nothing_numbers_the_frames(tmp_path):
+    """It was left out, so that those after it came too soon."""
+    rows = ["1,2,3,4", ",,,", "2,2,3,4", "", "3,2,3,4", ",,,"]
+    tracks = load_tracks(lines(tmp_path / "a.csv", "a_x,a_y,b_x,b_y", *rows))
+    assert tracks.seen.all(1).tolist() == [True, False, True, True]
+    tracks = load_tracks(lines(tmp_path / "b.csv", "frame,a_x,a_y,b_x,b_y", "0,1,2,3,4", ",,,,", "1,2,2,3,4"))
+    assert tracks.num_frames == 2 and bool(tracks.seen.all())
+
+
+def test_landmarks_whose_z_is_a_length_are_motion(tmp_path):
+    """They were read as 2D tracks in pixels; lengths in metres are told from shares by nobody."""
+    body = SKELETONS["mediapipe33"]
+    head = ",".join(f"{name}_{axis}" for name in body.joints[:33] for axis in "xyz")
+    points = 1000 * body.template_points()[:33].numpy()
+    rows = [",".join(map(str, ((points + t) * scale).ravel())) for scale in (1, 1e-3) for t in range(3)]
+    path = lines(tmp_path / "a.csv", head, "," * 98, *rows[:3])
+    motion = load_any(path)
+    assert isinstance(motion, Motion) and detect_motion_format(path) == "csv" and motion.num_frames == 4
+    assert np.ptp(motion.points[1, :33].numpy(), 0).max() == pytest.approx(np.ptp(points, 0).max())
+    path = lines(tmp_path / "b.csv", head, *rows[3:])
+    with pytest.raises(FormatError, match="got landmarks of an image: .* name the format: csv;"):
+        load_motion(path)
+    assert load_motion(path, format="csv").num_frames == 3
+
+
+@pytest.mark.parametrize("place", ["frame", "time"])
+def test_an_index_beside_frames_or_times_numbers_rows(tmp_path, place):
+    """It was taken for the frames, so that of two people each was seen in every other one."""
+    rows = [f"{2 * t + k},{t},{k},{1 + t},2,{3 + k},4" for t in range(3) for k in (0, 1)]
+    people = load_people(lines(tmp_path / "a.csv", f"index,{place},person,a_x,a_y,b_x,b_y", *rows))
+    assert [(p.num_frames, bool(p.seen.all())) for p in people] == [(3, True), (3, True)]
+    rows = [f"{3 * t + k},{t},{j},{1 + t},{2 + k}" for t in range(3) for k, j in enumerate("abc")]
+    tracks = load_tracks(lines(tmp_path / "b.csv", f"index,{place},joint,x,y", *rows))
+    assert tracks.num_frames == 3 and bool(tracks.seen.all())
+
+
 def test_shares_of_the_image_are_told_and_scaled_by_its_size(tmp_path):
     path = lines(tmp_path / "a.csv", "a_x,a_y,b_x,b_y", ".1,.2,.3,.4", ".1,.2,.3,.5")
     with pytest.warns(KcsWarning, match=r"a\.csv: .*if they are shares .*--image-size 1920x1080\); else the"):
@@ -244,9 +280,9 @@ def test_what_no_reader_takes_says_what_a_table_needs(tmp_path):
 def test_mediapipes_tables_stay_mediapipes(tmp_path):
     path = write_mediapipe_csv(tmp_path / "a.csv")
     deep = lines(tmp_path / "b.csv", *path.read_text().replace("_visibility", "_z").splitlines())
-    for table in (path, deep):
+    for table, got in ((path, "got something else"), (deep, "got landmarks of an image: .* name the format: csv;")):
         assert [name for name, reader in READERS.items() if reader.recognises(Probe(table))] == ["mediapipe"]
-        with pytest.raises(FormatError, match="got something else"):
+        with pytest.raises(FormatError, match=got):
             detect_motion_format(table)
     assert load_motion(deep, format="csv").skeleton.name == "mediapipe33"
     assert isinstance(load_any(deep, format="csv"), kt.Motion)

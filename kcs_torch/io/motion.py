@@ -27,10 +27,15 @@ def detect_motion_format(path: str | Path) -> str:
     Raises:
         FormatError: nothing is there, it is empty, or no reader recognises it.
     """
-    found = only_format(MOTION_READERS, Probe(path))
+    probe = Probe(path)
+    found = only_format(MOTION_READERS, probe)
     if found is None:
+        maybe = next((r.name for r in MOTION_READERS.values() if r.holds is not None and r.holds(probe)), "")
+        got = (
+            f"landmarks of an image: if x, y and z are lengths, name the format: {maybe}" if maybe else "something else"
+        )
         raise FormatError(
-            f"{path}: expected 3D motion in one of the formats {', '.join(MOTION_READERS)}, got something else; "
+            f"{path}: expected 3D motion in one of the formats {', '.join(MOTION_READERS)}, got {got}; "
             "load_tracks() reads 2D tracks"
         )
     return found

@@ -22,12 +22,12 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
 PREFIXES = {"": "m", "centi": "cm", "milli": "mm"}
 SPELT = {f"{size}{word}": unit for size, unit in PREFIXES.items() for word in ("meter", "meters", "metre", "metres")}
-SPELT |= {"inch": "in", "inches": "in", "foot": "ft", "feet": "ft"}
+SPELT |= {"inch": "in", "inches": "in", "foot": "ft", "feet": "ft", "pixel": "px", "pixels": "px"}
 """Their names as words."""
 
 
 def short_unit(name: str) -> str:
-    """A unit of length as it is written here, whatever a file calls it; other units in small letters.
+    """A unit as it is written here, whatever a file calls it; other units in small letters.
 
     Raises:
         OptionError: it is no text.

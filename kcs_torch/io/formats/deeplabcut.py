@@ -29,6 +29,7 @@ __all__ = ["MOTION_READERS", "READERS"]
 
 _LEVELS = (("scorer", "bodyparts", "coords"), ("scorer", "individuals", "bodyparts", "coords"))
 _BOM = b"\xef\xbb\xbf"
+_HEAD = 2**22  # bytes that the header has at most
 
 
 def recognises(probe: Probe) -> bool:
@@ -54,7 +55,11 @@ def recognises_motion(probe: Probe) -> bool:
 
 
 def _first_lines(probe: Probe) -> list[bytes]:
-    lines = probe.head.removeprefix(_BOM).split(b"\n", 8)[:8]  # where line ends were doubled every other one is blank
+    head = probe.head.removeprefix(_BOM)
+    if head[:8].replace(b'"', b"").startswith(b"scorer"):  # a line repeats the network's long name for each column
+        with probe.path.open("rb") as file:
+            head = file.read(_HEAD).removeprefix(_BOM)
+    lines = head.split(b"\n", 8)[:8]  # where line ends were doubled every other one is blank
     return [line.replace(b'"', b"") for line in lines if line.strip()][:4]
 
 

@@ -25,6 +25,8 @@ def recognises(probe: Probe) -> bool:
     if routes:
         if any(route[-2] in KEYS and route[-1] in ("list", "dict", "null") for route in routes if len(route) > 1):
             return True
+        if any(route[-2:] == ("x", "number") and "landmarks" in route for route in routes):  # JavaScript's results
+            return True
         return any(route in routes for route in (("[]", "[]", "x", "number"), ("[]", "[]", "[]", "x", "number")))
     return table_kind(probe.text) == "landmarks"
 

@@ -41,10 +41,12 @@ def recognises(probe: Probe) -> bool:
             return bool(
                 {r[1] for r in routes if r[0] == "meta_info" and len(r) > 2} & {"dataset_name", "num_keypoints"}
             )
-        return {("[]", "keypoints", "[]", "list"), ("[]", "keypoint_scores", "list")} <= routes
-    files = probe.like(".json")
+        apart = {("[]", "keypoints", "list"), ("[]", "keypoint_scores", "list")} <= routes
+        return apart and ("[]", "keypoints", "[]", "number") not in routes  # an image may show nobody
+    files = map(Probe, probe.like(".json"))
     try:
-        return any(recognises(Probe(f)) for f in files[:1])
+        first = next((file for file in files if outline(file.head) != {("list",)}), None)
+        return first is not None and recognises(first)
     except FormatError:
         return False
 

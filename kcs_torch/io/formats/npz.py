@@ -42,6 +42,7 @@ from kcs_torch.types import Diagnostics, Intrinsics, Motion, Reconstruction, Tra
 from kcs_torch.types.arrays import as_array
 from kcs_torch.types.axes import AXES, from_y_up
 from kcs_torch.types.image_size import told_image_size
+from kcs_torch.types.size import short_unit
 
 __all__ = ["MOTION_READERS", "READERS", "WRITERS", "load_reconstruction"]
 
@@ -66,7 +67,7 @@ def read(path: Path, options: Options) -> list[Tracks]:
             f"confidence=..., joint_names=...) writes it, got {', '.join(file.keys) or 'none'}"
         )
     points = file.array("points2d", "fiu", 3)
-    units = file.text("units") if "units" in file else "px"
+    units = short_unit(file.text("units")) if "units" in file else "px"
     notes = _json(file, "notes", list) if "notes" in file else []
     size = _size_in(file)
     written = "skeleton" in file  # by this library, with coordinates as they were

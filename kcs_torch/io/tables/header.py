@@ -22,7 +22,7 @@ WHO = (
 _WHAT = "|".join(("x", "y", "z", *CONFIDENCES, *VISIBILITIES))
 _NAMED = re.compile(rf"(?P<name>.+)[_. ](?P<what>{_WHAT})(?: \[(?P<unit>[^\]]*)\])?\Z", re.IGNORECASE | re.DOTALL)
 _NUMBERED = re.compile(rf"(?P<what>{_WHAT})_?(?P<name>[0-9]{{1,4}})\Z", re.IGNORECASE)
-_FRAME = re.compile(r"frame(?:[ _]?(?:#|no|nr|num|number|id|idx|index))?\.?|index\Z", re.IGNORECASE)
+_FRAME = re.compile(r"frame(?:[ _]?(?:#|no|nr|num|number|id|idx|index))?\.?", re.IGNORECASE)
 _LINE = re.compile(r'(?:[^"\n]+|"[^"]*")*')
 
 Columns = dict[str, dict[str, int]]
@@ -80,8 +80,9 @@ class Header:
 
     @cached_property
     def number(self) -> int | None:
-        """The column of frame numbers."""
-        return next((i for i, cell in enumerate(self.cells) if _FRAME.fullmatch(cell)), None)
+        """The column of frame numbers; beside it, or times, a column ``index`` numbers rows."""
+        frame = next((i for i, cell in enumerate(self.cells) if _FRAME.fullmatch(cell)), None)
+        return self.column(("index",)) if frame is None and self.time is None else frame
 
     @cached_property
     def who(self) -> int | None:
@@ -100,14 +101,14 @@ class Header:
         return next((lower.index(name) for name in names if name in lower), None)
 
     def left_out(self, read: Iterable[int]) -> list[str]:
-        """What the columns of joints that are not among those that are read hold."""
+        """What the columns of joints that are not among those that are read hold besides x and y."""
         used = set(read)
         out: dict[str, None] = {}
         for i, cell in enumerate(self.cells):
-            for separator in () if i in used else re.finditer(r"[_. ]", cell):
-                if cell[: separator.start()] in self.joints:
-                    out[re.sub(r" \[[^\]]*\]\Z", "", cell[separator.end() :])] = None
-        return list(out)
+            ends = [s for s in re.finditer(r"[_. ]", cell) if i not in used and cell[: s.start()] in self.joints]
+            if ends:
+                out[re.sub(r" \[[^\]]*\]\Z", "", cell[ends[-1].end() :])] = None
+        return [what for what in out if what.lower() not in ("x", "y")]
 
     @cached_property
     def others(self) -> list[int]:

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+import csv
 import math
+import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-from kcs_torch.errors import FormatError
+from kcs_torch.errors import FormatError, counted, listed
 from kcs_torch.io.containers.jsonfile import MOST_PIXELS
 from kcs_torch.io.contents.landmarks import BODIES, VISIBILITIES, Landmarks
 from kcs_torch.io.contents.people import Sighting
+from kcs_torch.io.contents.shares import are_shares
 from kcs_torch.io.registry import read_error
-from kcs_torch.io.tables.header import Columns, Header, Layout, first_line
+from kcs_torch.io.tables.header import Columns, Header, Layout, delimiter, first_line
 from kcs_torch.io.tables.long import LongHeader
-from kcs_torch.io.tables.wide import read_wide
+from kcs_torch.io.tables.wide import as_float, read_wide
 from kcs_torch.skeleton import SKELETONS, Skeleton, guess_skeleton
 
 __all__ = ["frame_shape", "npy_shape", "read_csv", "read_npy", "some_joints", "table_kind"]
 
+_ROWS = {21: 21, 42: 21} | dict.fromkeys((33, 54, 75, 501, 511, 543, 553), 33)
+"""How many landmarks a row of numbered ones may have, as of a hand or two, or of a pose with hands and a face behind
+it, and how many of them are read."""
+_PREFIX = re.compile(r"\A(?:pose_?landmark|pose|landmark)[._]")
 SOME = 10  # names of a body from which on a table is taken for one of it
 _LIMIT = 2**30  # bytes of a file
 
@@ -43,7 +50,8 @@ def table_kind(text: str) -> str:
 
     Returns:
         "landmarks" of MediaPipe, by their numbers, or by names or visibilities that nobody else's have; "motion", where
-        every joint has z; other "tracks"; empty where it is no such table.
+        every joint has z, which of joints with landmarks' names, without visibilities, is no share of the image; other
+        "tracks"; empty where it is no such table.
 
     >>> table_kind("frame,a_x,a_y,b_x,b_y"), table_kind("a_x,a_y,a_z,b_x,b_y,b_z"), table_kind("track,frame,a_x,a_y")
     ('tracks', 'motion', '')
@@ -62,13 +70,27 @@ def table_kind(text: str) -> str:
         return "motion"  # as results are written, of whatever joints
     names = {_plain(name) for name in header.joints}
     named = len(_named() & names) >= SOME and (visible or bool(_own() & names))
-    if named or (len(names) >= 21 and all(name.isdecimal() for name in names)):
+    numbered = len(names) in _ROWS and all(name.isdecimal() for name in names)
+    if numbered or (named and not (deep and not visible and _lengths(text, header))):
         return "landmarks"
     return "motion" if deep else "tracks"
 
 
+def _lengths(text: str, header: Header) -> bool:
+    """Whether z of the joints, by the first row that has any, are no shares of an image, as MediaPipe's are."""
+    line = first_line(text)
+    try:
+        for cells in csv.reader(text[len(line) :].splitlines(), delimiter=delimiter(line)):
+            z = np.array([as_float(cells[columns["z"]]) for columns in header.joints.values() if cells])
+            if np.isfinite(z).any():
+                return not are_shares(z)
+    except (csv.Error, ValueError, IndexError):  # no numbers, or a row that is cut short
+        pass
+    return False
+
+
 def _plain(name: str) -> str:
-    return name.lower().replace(" ", "_").removeprefix("pose_")
+    return _PREFIX.sub("", name.lower().replace(" ", "_"))
 
 
 def read_csv(path: Path) -> Landmarks:
@@ -98,13 +120,19 @@ def _layout(joints: Columns, notes: list[str]) -> Layout:
     marks = {_plain(name): columns for name, columns in joints.items()}
     if all(n.isdecimal() for n in marks):
         marks = dict(sorted(marks.items(), key=lambda item: int(item[0])))
-        for count in BODIES:
-            if len(marks) > count and len(marks) not in BODIES:
-                notes.append(f"of {len(marks)} numbered landmarks the first {count} are read, as the pose")
-                marks = dict(list(marks.items())[:count])
-        return None, list(marks.values())
+        count = _ROWS.get(len(marks), len(marks))
+        if count < len(marks):
+            read = "a hand" if count == 21 else "the pose"
+            notes.append(f"of {len(marks)} numbered landmarks the first {count} are read, as {read}")
+        return None, list(marks.values())[:count]
+    body = SKELETONS[BODIES[33]]
+    pose = body.joints[: body.num_observed]
+    if len(marks) == len(joints) and set(pose) < set(marks):
+        others = [name for name in joints if _plain(name) not in pose]
+        notes.append(f"{counted(len(others), 'joint')} beside the pose left out: {listed(others, 5)}")
+        return pose, [marks[name] for name in pose]
     if guess_skeleton(list(marks), ordered=False) is None:
-        found = some_joints(joints, SKELETONS[BODIES[33]], notes)
+        found = some_joints(joints, body, notes)
         if found is not None:
             return found
     return tuple(marks), list(marks.values())

@@ -138,14 +138,19 @@ def read_wide(
         if left := header.left_out(i for triple in columns for i in triple):
             out.notes.append(f"columns of joints that are left out: {brief(', '.join(left))}")
         others = {i: header.cells[i] for i in header.others if not _NAMELESS.match(header.cells[i])}
+        placed = (header.number, header.time, header.who) != (None, None, None)
+        last = 0
         for i, cells in enumerate(cells_of, 2):
-            if any(cells):
+            if any(cells) or (not placed and len(cells) == len(header.cells)):  # a blank row is a frame without anybody
                 rows.append(_row(cells, header, columns, blank, f"{path}: row {i}"))
+            if any(cells):
+                last = len(rows)
                 for k in header.others:  # one without a name most often counts rows, as pandas writes it
                     if k not in others and cells[k].strip() not in ("", str(len(rows) - 1), str(len(rows))):
                         others[k] = "one without a name (call it 'frame' if it numbers the frames)"
         if others:
             out.notes.append(f"other columns are left out: {brief(', '.join(others.values()))}")
+        del rows[last:]
     out.unit = header.unit
     out.who = "" if header.who is None else header.cells[header.who]
     place_rows(rows, header.time[1] if header.time else "", out)
